@@ -1,0 +1,54 @@
+# Every target that needs it builds .venv first, from pyproject.toml and constraints.txt.
+# The only thing to have is Python 3.10 or newer: make PYTHON=/path/to/python3.12 test
+
+PYTHON ?= python3
+VENV := .venv
+PY := $(VENV)/bin/python
+STAMP := $(VENV)/.installed
+# python -m, not the scripts in .venv/bin: their first line breaks on a path with spaces.
+PIP := $(PY) -m pip --disable-pip-version-check --quiet
+
+CODE := sb3_yann envs examples tests
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check format clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+demo: $(STAMP)  ## run the example, examples/cstr.py
+	@$(PY) examples/cstr.py
+
+test: $(STAMP)  ## run the tests (make test ARGS="-k name" passes arguments to pytest)
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
+		$(PY) -m pytest $(ARGS)
+
+check: $(STAMP)  ## lint, check the formatting and the types
+	$(PY) -m ruff check $(CODE)
+	$(PY) -m ruff format --check $(CODE)
+	$(PY) -m mypy
+
+format: $(STAMP)  ## format the code and apply the linter's safe fixes
+	$(PY) -m ruff check --fix --exit-zero --quiet $(CODE)
+	$(PY) -m ruff format $(CODE)
+
+clean:  ## remove .venv, caches and build outputs
+	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find $(CODE) -type d -name __pycache__ -prune -exec rm -rf {} +
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+		echo "error: needs Python 3.10 or newer, and '$(PYTHON)' is not that:" \
+			"$$($(PYTHON) --version 2>&1 || true)" >&2; \
+		echo "       name another one: make PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+		echo "error: '$(PYTHON)' lacks its venv module" \
+			"(on Debian and Ubuntu: apt install python3-venv)" >&2; exit 1; }
+	@$(PY) -m pip --version >/dev/null 2>&1 || { \
+		echo "creating $(VENV) with $$($(PYTHON) --version) ..."; \
+		$(PYTHON) -m venv --clear $(VENV); }
+	@echo "installing into $(VENV), a few minutes the first time (torch is large) ..."
+	@$(PIP) install -c constraints.txt hatchling
+	@$(PIP) install -c constraints.txt --no-build-isolation -e '.[dev]'
+	@touch $@
+	@echo "installed into $(VENV)"

@@ -1,0 +1,350 @@
+"""The safety-critical reactor of Braniff & Tian: keep an exothermic CSTR below 480 K."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann_envs._checks import (
+    check_render_mode,
+    clipped_input,
+    constant,
+    not_reset,
+    start_option,
+    warn_no_render_mode,
+)
+from sb3_yann_envs.rendering import Frame, reactor_frame
+from sb3_yann_envs.spaces import ProblemBox
+
+DT = 1 / 60  # h
+SUBSTEPS = 2  # Runge-Kutta steps in a sample; the temperature is then exact to about 1e-8 K
+TEMPERATURE_LIMIT = 480.0  # K
+PENALTY = 1e5
+"""Added once to the cost of the step that exceeds the temperature limit."""
+MAX_INPUT = 55.0  # kJ/(h m2 K), largest deviation of the heat transfer coefficient
+
+GAS_CONSTANT = 8.314462618  # J/(mol K)
+LOG_FREQUENCY_1 = math.log(4e14)  # of L/(mol h)
+LOG_FREQUENCY_2 = 84 * math.log(10)  # of 1/h
+ACTIVATION_1 = 128e3  # J/mol
+ACTIVATION_2 = 800e3  # J/mol
+REACTION_HEAT_1 = 45.4e3  # J/mol, released
+REACTION_HEAT_2 = 320e3  # J/mol, released
+HEAT_CAPACITY = 3150.0  # J/(L K), density times specific heat of the mixture
+VOLUME = 4000.0  # L
+AREA = 5.3  # m2
+COOLANT_TEMPERATURE = 373.0  # K
+DILUTION = 0.0609  # 1/h, flow over volume
+FEED_A, FEED_B, FEED_S = 4.3, 5.1, 3.0  # mol/L
+
+_HEATING_1 = REACTION_HEAT_1 / HEAT_CAPACITY  # K L/mol
+_HEATING_2 = REACTION_HEAT_2 / HEAT_CAPACITY  # K L/mol
+_COOLING = 1000 * AREA / (HEAT_CAPACITY * VOLUME)  # m2 K/kJ
+
+
+def _rate_constants(temperature: float) -> tuple[float, float]:
+    """Return the Arrhenius rate constants in L/(mol h) and 1/h."""
+    thermal = GAS_CONSTANT * temperature
+    return (
+        math.exp(LOG_FREQUENCY_1 - ACTIVATION_1 / thermal),
+        math.exp(LOG_FREQUENCY_2 - ACTIVATION_2 / thermal),
+    )
+
+
+def _steady_state(temperature: float, transfer: float) -> tuple[float, float, float, float]:
+    """Return C_A, C_B, C_S and the feed temperature that balance at the given T and U.
+
+    The balances of A and B give ``C_B - C_A = FEED_B - FEED_A``, which leaves a quadratic equation
+    for C_A; that of S is linear; that of the heat then determines the feed temperature.
+    """
+    k1, k2 = _rate_constants(temperature)
+    excess = FEED_B - FEED_A
+    half = (k1 * excess + DILUTION) / 2
+    c_a = (math.sqrt(half**2 + k1 * DILUTION * FEED_A) - half) / k1
+    c_b = c_a + excess
+    c_s = DILUTION * FEED_S / (DILUTION + k2)
+    removed = _COOLING * transfer * (temperature - COOLANT_TEMPERATURE)
+    released = _HEATING_1 * k1 * c_a * c_b + _HEATING_2 * k2 * c_s
+    return c_a, c_b, c_s, temperature + (removed - released) / DILUTION
+
+
+_T_SS = 475.0
+_TRANSFER_SS = 55.0
+_A_SS, _B_SS, _S_SS, FEED_TEMPERATURE = _steady_state(_T_SS, _TRANSFER_SS)
+
+X_SS = constant([_A_SS, _B_SS, _S_SS, _T_SS])
+"""Steady state: C_A, C_B, C_S in mol/L, T in K."""
+U_SS = constant([_TRANSFER_SS])
+"""Heat transfer coefficient at the steady state in kJ/(h m2 K)."""
+
+Q = constant(0.1 * np.eye(4))
+"""State weights of the stage cost, for deviations in mol/L and K."""
+R = constant([[1e-4]])
+"""Input weight of the stage cost, for the deviation in kJ/(h m2 K)."""
+
+STATE_LOW = constant([-2.0, -2.0, -2.0, -70.0])
+"""Lower bounds that the paper puts on the deviations; no start may lie below them."""
+STATE_HIGH = constant([2.0, 2.0, 2.0, 5.0])
+"""Upper bounds that the paper puts on the deviations; no start may lie above them."""
+START_LOW = constant([-0.05, -0.4, -0.4, -7.5])
+"""Lower bounds of the random starts."""
+START_HIGH = constant([0.05, 0.4, 0.4, 4.0])
+"""Upper bounds of the random starts."""
+
+PRINTED_A = constant(
+    [
+        [0.9506, 0.0, 0.0, 0.0],
+        [-0.0484, 0.9943, 0.0, 0.0],
+        [0.0, 0.0, 0.9909, 0.0],
+        [0.6970, 0.0678, 0.0, 1.0030],
+    ]
+)
+"""State matrix as printed in the paper, for deviations and one sample."""
+PRINTED_B = constant([[0.0], [0.0], [0.0], [-0.0007]])
+"""Input matrix as printed in the paper, for deviations and one sample."""
+
+_STATE_NAMES = ("C_A deviation", "C_B deviation", "C_S deviation", "T deviation")
+_Quad = tuple[float, float, float, float]
+
+
+def dynamics(x: ArrayLike, u: ArrayLike) -> NDArray[np.float64]:
+    """Return the time derivative of the state in continuous time, in absolute coordinates.
+
+    Parameters
+    ----------
+    x : array_like, shape (4,)
+        C_A, C_B, C_S in mol/L and T in K, not deviations.
+    u : array_like, shape (1,)
+        Heat transfer coefficient U in kJ/(h m2 K), not a deviation.
+
+    Returns
+    -------
+    ndarray, shape (4,)
+        Derivatives in mol/(L h) and K/h. The balances are those of a stirred tank with feed
+        ``DILUTION * (feed - outflow)``; the class docstring says where the paper prints others.
+    """
+    c_a, c_b, c_s, temperature = np.asarray(x, dtype=np.float64).tolist()
+    (transfer,) = np.asarray(u, dtype=np.float64).tolist()
+    return np.array(_rates(c_a, c_b, c_s, temperature, transfer))
+
+
+def _rates(c_a: float, c_b: float, c_s: float, temperature: float, transfer: float) -> _Quad:
+    """Return `dynamics` on plain floats: three times as fast as on arrays of four."""
+    k1, k2 = _rate_constants(temperature)
+    r1 = k1 * c_a * c_b
+    r2 = k2 * c_s
+    return (
+        DILUTION * (FEED_A - c_a) - r1,
+        DILUTION * (FEED_B - c_b) - r1,
+        DILUTION * (FEED_S - c_s) - r2,
+        DILUTION * (FEED_TEMPERATURE - temperature)
+        + _HEATING_1 * r1
+        + _HEATING_2 * r2
+        - _COOLING * transfer * (temperature - COOLANT_TEMPERATURE),
+    )
+
+
+def _advance(deviation: _Quad, transfer: float) -> _Quad:
+    """Return the deviation one sample later (classical Runge-Kutta, `SUBSTEPS` equal steps).
+
+    The equations are not stiff below the limit. Deviations are stored rather than absolute values,
+    so that a state handed out by `step` restarts the same trajectory bit for bit.
+    """
+    a, b, s, t = deviation
+    h = DT / SUBSTEPS
+    for _ in range(SUBSTEPS):
+        x = (_A_SS + a, _B_SS + b, _S_SS + s, _T_SS + t)
+        p = _rates(*x, transfer)
+        q = _rates(*_moved(x, h / 2, p), transfer)
+        r = _rates(*_moved(x, h / 2, q), transfer)
+        v = _rates(*_moved(x, h, r), transfer)
+        w = h / 6
+        a += w * (p[0] + 2 * (q[0] + r[0]) + v[0])
+        b += w * (p[1] + 2 * (q[1] + r[1]) + v[1])
+        s += w * (p[2] + 2 * (q[2] + r[2]) + v[2])
+        t += w * (p[3] + 2 * (q[3] + r[3]) + v[3])
+    return a, b, s, t
+
+
+def _moved(x: _Quad, h: float, slope: _Quad) -> _Quad:
+    """Return ``x + h * slope``."""
+    return (x[0] + h * slope[0], x[1] + h * slope[1], x[2] + h * slope[2], x[3] + h * slope[3])
+
+
+class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """Bring an exothermic reactor to its steady state without passing 480 K.
+
+    ## Description
+
+    A continuous stirred tank reactor in which two reactions release heat: the wanted one,
+    A + B -> product, and the decomposition of the solvent S, which takes over within minutes once
+    the tank is too hot. It is the reactor of the accident at T2 Laboratories, with the data of
+    Fogler (*Elements of Chemical Reaction Engineering*, example 13-6). The only handle is the heat
+    transfer coefficient U of the cooling jacket. The goal is to regulate concentrations and
+    temperature to the steady state; the temperature must stay at or below 480 K.
+
+    With time in h, *F* = 0.0609 1/h, *k1 = 4e14 exp(-128000 / (R T))* L/(mol h) and
+    *k2 = 1e84 exp(-800000 / (R T))* 1/h:
+
+    - *dC_A/dt = F (4.3 - C_A) - k1 C_A C_B*
+    - *dC_B/dt = F (5.1 - C_B) - k1 C_A C_B*
+    - *dC_S/dt = F (3.0 - C_S) - k2 C_S*
+    - *dT/dt = F (452.483 - T) + (45400 k1 C_A C_B + 320000 k2 C_S) / 3150 - 4.20635e-4 U (T - 373)*
+
+    The steady state is (0.08616063, 0.88616063, 2.99475999) mol/L and 475 K at U = 55. A step is
+    one sample of 1/60 h, integrated with two Runge-Kutta steps of fourth order.
+
+    ## Action Space
+
+    An array of shape `(1,)`, float32, clipped to its bounds. A negative value cools less.
+
+    | Num | Action                                            | Min   | Max  | Unit         |
+    |-----|---------------------------------------------------|-------|------|--------------|
+    | 0   | Heat transfer coefficient, deviation from U = 55   | -55.0 | 55.0 | kJ/(h m2 K)  |
+
+    ## Observation Space
+
+    An array of shape `(4,)`, float32, in a `ProblemBox`: deviations from the steady state.
+
+    | Num | Observation                         | Min   | Max  | Unit  |
+    |-----|-------------------------------------|-------|------|-------|
+    | 0   | C_A, methylcyclopentadiene          | -3.0  | 3.0  | mol/L |
+    | 1   | C_B, sodium                         | -3.0  | 3.0  | mol/L |
+    | 2   | C_S, diglyme                        | -3.0  | 3.0  | mol/L |
+    | 3   | Temperature T (the limit is at 5.0) | -70.0 | 25.0 | K     |
+
+    The bounds hold for every observation, also the one beyond the limit that ends an episode, for
+    any inputs and any start that `reset` accepts. From the random starts the deviations within an
+    episode are much smaller: (-0.05, 0.21), (-0.40, 0.44), (-0.40, 0.40) mol/L and (-17.8, 5.1) K
+    were the extremes under bang-bang inputs.
+
+    ## Rewards
+
+    *r = -(0.1 (dC_A<sup>2</sup> + dC_B<sup>2</sup> + dC_S<sup>2</sup> + dT<sup>2</sup>)
+    + 0.0001 u<sup>2</sup>)*, with the deviations before the step and the clipped action, computed
+    from the state in float64. A step at whose end T > 480 K costs 1e5 more.
+
+    The `info` of a step holds `cost` (minus the reward, with the penalty) and `violation` (whether
+    this step passed 480 K). That of a step and of a reset holds `state`, the observation in
+    float64; given back as `options["state"]` it continues the same trajectory exactly.
+
+    ## Starting State
+
+    Deviations uniform in [-0.05, 0.05] (C_A), [-0.4, 0.4] (C_B, C_S) and [-7.5, 4] (T).
+    `reset(options={"state": [dC_A, dC_B, dC_S, dT]})` starts from any deviation within the bounds
+    that the paper sets, [-2, 2] mol/L and [-70, 5] K, as long as no concentration is negative.
+
+    ## Episode End
+
+    - Termination: the temperature exceeds 480 K at the end of a step. A further step needs a reset,
+      since the runaway beyond has no meaning for the controller and soon none numerically.
+    - Truncation: after 400 steps (6 h 40 min) if made with `gymnasium.make`.
+
+    ## Arguments
+
+    - `render_mode`: None, or `"rgb_array"` for a picture of shape (400, 600, 3) with the history of
+      temperature and input.
+
+    ```python
+    >>> import gymnasium
+    >>> import sb3_yann_envs
+    >>> env = gymnasium.make("CSTR-v0", render_mode="rgb_array")
+
+    ```
+
+    ## Deviations from Braniff & Tian
+
+    The paper's equations and table do not give its printed A and B. The values above do, to the
+    four printed decimals, except for six entries of A.
+
+    - **Sample time.** Printed as 1/60 s. The frequency factors are per hour, and only 1/60 h
+      reproduces A and B.
+    - **Flow terms.** Printed with C_A in the balance of every species and as a difference of flows.
+      Here each species has its own, F (feed - concentration).
+    - **Density and heat capacity.** Printed as 36 mol/L and 430.91 J/(mol K), a product 4.9 times
+      larger than the 3150 J/(L K) that A and B need.
+    - **Heat of reaction 1.** Printed as -45.6 kJ/mol; A needs -45.4.
+    - **Feed temperature.** Not printed. It follows from the heat balance at 475 K and U = 55.
+    - **Entries of A.** The true A[0, 1], A[0, 3], A[1, 3] and A[3, 2] are -0.0047, -0.0003, -0.0003
+      and 0.0002 where the paper prints 0; A[2, 2] is 0.9990, not 0.9909; and A[3, 3] is 1.0029, not
+      1.0030 (a U of 50 at the steady state would round to the printed value). The true steady state
+      is stable; the printed A has the eigenvalue 1.003. `PRINTED_A` keeps the paper's values,
+      because a controller built on them is what the paper improves.
+    - **Weights.** Q is printed as 0.1 times the 2 x 2 identity, for four states; here 4 x 4.
+    - **Chosen here.** U = 55 at the steady state (so that |u| <= 55 never makes U negative), the
+      feed of S, 400 steps, and the starts. The starts are such that the linear MPC on the printed A
+      and B costs about as much as in the paper: 90 on average over 1,000 starts, none of which
+      violates the limit, where the paper has 94 over ten.
+    - **Limit.** Checked at the end of a sample, since the paper does not say when.
+
+    ## Version History
+
+    * v0: Initial version.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = check_render_mode(render_mode, self)
+        self.observation_space = ProblemBox(
+            np.array([-3.0, -3.0, -3.0, -70.0], dtype=np.float32),
+            np.array([3.0, 3.0, 3.0, 25.0], dtype=np.float32),
+            problem="sb3_yann_envs.problems:cstr",
+        )
+        self.action_space = gymnasium.spaces.Box(-MAX_INPUT, MAX_INPUT, (1,), np.float32)
+        self._deviation: _Quad | None = None
+        self._terminated = False
+        self._temperatures: list[float] = []  # only filled to be drawn
+        self._inputs: list[float] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode, from a random state or from ``options["state"]``, shape (4,)."""
+        super().reset(seed=seed)
+        # A concentration cannot be negative, so the deviation cannot be below minus the steady one.
+        low = np.maximum(STATE_LOW, [*-X_SS[:3], -np.inf])
+        start = start_option(options, low, STATE_HIGH, _STATE_NAMES)
+        if start is None:
+            start = tuple(self.np_random.uniform(START_LOW, START_HIGH).tolist())
+        a, b, s, t = start
+        self._deviation = (a, b, s, t)
+        self._terminated = False
+        self._temperatures, self._inputs = [_T_SS + t], []
+        state = np.array(self._deviation)
+        return state.astype(np.float32), {"state": state}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Hold a heat transfer coefficient for one sample of 1/60 h."""
+        if self._deviation is None:
+            raise not_reset("step", "the reactor has no state yet")
+        if self._terminated:
+            raise not_reset("step", "the reactor passed its temperature limit")
+        u = clipped_input(action, MAX_INPUT)
+        a, b, s, t = self._deviation
+        cost = 0.1 * (a * a + b * b + s * s + t * t) + 1e-4 * u * u
+        self._deviation = _advance(self._deviation, _TRANSFER_SS + u)
+        self._terminated = _T_SS + self._deviation[3] > TEMPERATURE_LIMIT
+        if self._terminated:
+            cost += PENALTY
+        if self.render_mode is not None:
+            self._temperatures.append(_T_SS + self._deviation[3])
+            self._inputs.append(u)
+        state = np.array(self._deviation)
+        info = {"cost": cost, "violation": self._terminated, "state": state}
+        return state.astype(np.float32), -cost, self._terminated, False, info
+
+    def render(self) -> Frame | None:
+        """Return a picture of shape (400, 600, 3), or None without a render mode."""
+        if self.render_mode is None:
+            warn_no_render_mode(self)
+            return None
+        if self._deviation is None:
+            raise not_reset("render", "the reactor has no state yet")
+        return reactor_frame(DT, self._temperatures, self._inputs, TEMPERATURE_LIMIT, MAX_INPUT)

@@ -1,0 +1,51 @@
+"""The linear MPC problems of the environments, with the settings of Braniff & Tian.
+
+Both give the partition that the paper's parameter counts imply: 7 regions with 32 half-spaces for
+the pendulum, 7 with 56 for the reactor. Where its text says otherwise, the docstrings say so.
+"""
+
+from __future__ import annotations
+
+from sb3_yann.control import LinearModel, LinearMPC
+from sb3_yann_envs import clipped_pendulum as pendulum
+from sb3_yann_envs import cstr as reactor
+
+
+def clipped_pendulum() -> LinearMPC:
+    """Return the pendulum's MPC: N = 2, states and input in their boxes, undiscounted.
+
+    Q is diag(1, 0.1), the weights of the environment's own cost. The identity, which the paper
+    prints, gives 9 regions and 40 half-spaces instead.
+    """
+    model = LinearModel(pendulum.PRINTED_A, pendulum.PRINTED_B, pendulum.DT)
+    return LinearMPC(
+        model,
+        Q=pendulum.Q,
+        R=pendulum.R,
+        horizon=2,
+        x_min=[-2.0, -8.0],
+        x_max=[2.0, 8.0],
+        u_min=-2.0,
+        u_max=2.0,
+    )
+
+
+def cstr() -> LinearMPC:
+    """Return the reactor's MPC: N = 2, deviations from the steady state, undiscounted.
+
+    The box of -2 to 2 mol/L and -70 to 5 K bounds the parameter only. With predicted
+    states bounded as well, as the paper's text has it, there are 79 half-spaces instead of 56.
+    """
+    model = LinearModel(
+        reactor.PRINTED_A, reactor.PRINTED_B, reactor.DT, reactor.X_SS, reactor.U_SS
+    )
+    return LinearMPC(
+        model,
+        Q=reactor.Q,
+        R=reactor.R,
+        horizon=2,
+        u_min=-55.0,
+        u_max=55.0,
+        theta_min=[-2.0, -2.0, -2.0, -70.0],
+        theta_max=[2.0, 2.0, 2.0, 5.0],
+    )

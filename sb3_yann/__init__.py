@@ -1,0 +1,28 @@
+"""Reinforcement learning that starts as a linear MPC: a Stable-Baselines3 plugin.
+
+Importing registers the environments ``CSTR-v0`` and ``ClippedPendulum-v0`` with Gymnasium and the
+policy alias ``"YannPolicy"`` with TD3 and DDPG.
+"""
+
+import sb3_yann_envs
+from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
+from sb3_yann.control import ExplicitSolutionError, LinearModel, LinearMPC, PiecewiseAffine
+from sb3_yann.policies import YannActor, YannCritic, YannPolicy
+from sb3_yann.problems import register_problem
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ControlDiagnostics",
+    "ExplicitSolutionError",
+    "LinearMPC",
+    "LinearModel",
+    "NoActionNoise",
+    "PiecewiseAffine",
+    "YannActor",
+    "YannCritic",
+    "YannPolicy",
+    "register_problem",
+]
+
+sb3_yann_envs.register_envs()

@@ -1,0 +1,136 @@
+"""Callbacks: no action noise, and what a control engineer wants to see in tensorboard."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_yann.policies import YannPolicy
+
+
+class NoActionNoise(BaseCallback):
+    """Lets the policy act alone, from the first step of every `learn` on.
+
+    It takes away the model's action noise, and sets ``learning_starts`` to 0, for which SB3 would
+    play uniformly random actions (again at each later `learn`, and after a load). Both stay
+    off after `learn` returns. TD3's smoothing of the *target* policy is no exploration and stays.
+
+    Raises
+    ------
+    TypeError
+        If the model is not an off-policy algorithm.
+    """
+
+    model: OffPolicyAlgorithm
+
+    def _init_callback(self) -> None:
+        # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            raise TypeError(
+                f"NoActionNoise needs an off-policy algorithm such as DDPG or TD3, not "
+                f"{type(self.model).__name__}."
+            )
+        self.model.action_noise = None
+        self.model.learning_starts = 0
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class ControlDiagnostics(BaseCallback):
+    """Records what SB3 does not: how far the policy is from its MPC, and whether limits held.
+
+    Scalars, over the steps since the last dump where nothing else is said:
+
+    - ``yann/distance_from_mpc_mean``, ``yann/distance_from_mpc_max``: distance of the executed
+      action from the MPC's, as a fraction of the input range (largest over the inputs).
+    - ``yann/region``: the region that was in use most often; ``yann/regions_visited``: how many.
+    - ``yann/violations``: steps with ``info["violation"]``, since the start of this `learn`.
+    - ``yann/critic_error``: mean over the last finished episode of ``|Q(s, a) - G|`` relative to
+      mean ``|G|``, where G is the discounted return that followed, plus the critic's own value
+      of the last state where the episode was cut off rather than over.
+
+    Raises
+    ------
+    TypeError
+        If the model's policy is not a YannPolicy.
+    """
+
+    model: OffPolicyAlgorithm
+
+    def _init_callback(self) -> None:
+        policy = self.model.policy
+        if not isinstance(policy, YannPolicy):
+            raise TypeError(
+                "ControlDiagnostics compares a YannPolicy with its MPC; the policy of this model "
+                f"is {type(policy).__name__}."
+            )
+        self.policy = policy
+        self.violations = 0
+        self._forget()
+        self._episodes: list[list[tuple[Any, ...]]] = [
+            [] for _ in range(self.training_env.num_envs)
+        ]
+
+    def _on_step(self) -> bool:
+        if "yann/violations" not in self.logger.name_to_value and self._recorded:
+            self._forget()  # the logger was dumped
+        observations = np.asarray(self.model._last_obs)  # still s_t: SB3 advances it later
+        actions = self.locals["buffer_actions"]  # in [-1, 1]
+        layer = self.policy.actor.mu
+        with th.no_grad():
+            theta = th.as_tensor(observations, dtype=th.float32, device=self.model.device)
+            law = layer.law(theta).cpu().numpy()
+            self._regions.extend(layer.locate(theta)[0].tolist())
+        self._distances.extend(np.max(np.abs(actions - law), axis=1) / 2)
+        dones, infos = self.locals["dones"], self.locals["infos"]
+        self.violations += sum(bool(info.get("violation", False)) for info in infos)
+        for i, episode in enumerate(self._episodes):
+            episode.append((observations[i], actions[i], self.locals["rewards"][i]))
+            if dones[i]:
+                self._record_critic_error(episode, infos[i])
+                episode.clear()
+        if np.any(dones):
+            self._record()
+        return True
+
+    def _forget(self) -> None:
+        self._distances: list[float] = []
+        self._regions: list[int] = []
+        self._recorded = False
+
+    def _record(self) -> None:
+        self.logger.record("yann/distance_from_mpc_mean", float(np.mean(self._distances)))
+        self.logger.record("yann/distance_from_mpc_max", float(np.max(self._distances)))
+        self.logger.record("yann/region", int(np.bincount(self._regions).argmax()))
+        self.logger.record("yann/regions_visited", len(set(self._regions)))
+        self.logger.record("yann/violations", self.violations)
+        self._recorded = True
+
+    def _record_critic_error(self, episode: list[tuple[Any, ...]], info: dict[str, Any]) -> None:
+        observations, actions, rewards = (np.array(part) for part in zip(*episode, strict=True))
+        value = 0.0
+        if info.get("TimeLimit.truncated", False):
+            last = th.as_tensor(info["terminal_observation"], dtype=th.float32)[None]
+            last = last.to(self.model.device)
+            value = float(self._value(last, self.policy.actor(last).detach())[0])
+        returns = np.empty(len(rewards))
+        for t in reversed(range(len(rewards))):
+            returns[t] = value = rewards[t] + self.model.gamma * value
+        error = np.abs(self._value(observations, actions) - returns)
+        size = max(float(np.abs(returns).mean()), 1e-30)
+        self.logger.record("yann/critic_error", float(error.mean()) / size)
+
+    def _value(self, theta: Any, actions: Any) -> NDArray[np.float32]:
+        """Return the first critic's Q, shape (batch,)."""
+        with th.no_grad():
+            q = self.policy.critic.q1_forward(
+                th.as_tensor(theta, dtype=th.float32, device=self.model.device),
+                th.as_tensor(actions, dtype=th.float32, device=self.model.device),
+            )
+        return np.asarray(q.cpu().numpy()[:, 0])

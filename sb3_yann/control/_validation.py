@@ -1,0 +1,128 @@
+"""Checks of user input that name the value, what was expected and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def as_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array:
+    """Return ``value`` as a read-only float64 array of ``shape``; ``None`` leaves a size free.
+
+    Raises
+    ------
+    TypeError
+        If ``value`` does not convert to real numbers.
+    ValueError
+        If the shape is another one or an entry is NaN or infinite.
+    """
+    array = _to_float(name, value)
+    if array.ndim != len(shape) or any(
+        want is not None and got != want for got, want in zip(array.shape, shape, strict=True)
+    ):
+        wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
+        raise ValueError(f"{name} has shape {array.shape}, expected {wanted}.")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} holds NaN or infinite entries: {array.tolist()}.")
+    return _frozen(array)
+
+
+def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool) -> Array:
+    """Return ``value`` as a symmetric positive (semi-)definite ``(size, size)`` matrix.
+
+    Raises
+    ------
+    ValueError
+        If it is not symmetric, or an eigenvalue is negative (or zero where ``definite``).
+    """
+    matrix = as_array(name, value, (size, size))
+    scale = max(float(np.max(np.abs(matrix))), np.finfo(float).tiny)
+    if np.max(np.abs(matrix - matrix.T)) > 1e-9 * scale:
+        raise ValueError(
+            f"{name} is not symmetric: {matrix.tolist()}. Pass ({name} + {name}.T) / 2."
+        )
+    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    if definite and smallest <= 0:
+        raise ValueError(
+            f"{name} must be positive definite, its smallest eigenvalue is {smallest:g}. "
+            "Give every input a positive weight."
+        )
+    if smallest < -1e-9 * scale:
+        raise ValueError(
+            f"{name} must be positive semi-definite, its smallest eigenvalue is {smallest:g}."
+        )
+    return _frozen((matrix + matrix.T) / 2)
+
+
+def as_bounds(
+    name: str, lower: ArrayLike | None, upper: ArrayLike | None, size: int
+) -> tuple[Array, Array]:
+    """Return lower and upper bounds of shape ``(size,)``; a scalar is for all entries.
+
+    ``None`` is no bound.
+
+    Raises
+    ------
+    ValueError
+        If the shape is another one, an entry is NaN, or a lower bound is not below its upper bound.
+    """
+    low = _bound(f"{name}_min", lower, size, -np.inf)
+    high = _bound(f"{name}_max", upper, size, np.inf)
+    if np.any(low >= high):
+        i = int(np.argmax(low >= high))
+        raise ValueError(
+            f"{name}_min must lie below {name}_max, but entry {i} has "
+            f"{name}_min = {low[i]:g} and {name}_max = {high[i]:g}."
+        )
+    return low, high
+
+
+def as_positive(name: str, value: float) -> float:
+    """Return ``value`` as a finite float above zero."""
+    number = float(_to_float(name, value).reshape(()))
+    if not (np.isfinite(number) and number > 0):
+        raise ValueError(f"{name} = {value!r} must be a finite number above 0.")
+    return number
+
+
+def as_discount(value: float) -> float:
+    """Return ``value`` as a discount factor in (0, 1]."""
+    number = float(_to_float("gamma", value).reshape(()))
+    if not 0 < number <= 1:
+        raise ValueError(f"gamma = {value!r} must lie in (0, 1].")
+    return number
+
+
+def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
+    """Tell whether the named attributes of two objects are equal, arrays entry by entry."""
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:
+    if value is None:
+        return _frozen(np.full(size, missing))
+    array = _to_float(name, value)
+    if array.ndim == 0:
+        array = np.full(size, float(array))
+    if array.shape != (size,):
+        raise ValueError(f"{name} has shape {array.shape}, expected ({size},) or a single number.")
+    if np.any(np.isnan(array)):
+        raise ValueError(f"{name} holds NaN: {array.tolist()}. Use inf for 'no bound'.")
+    return _frozen(array)
+
+
+def _to_float(name: str, value: Any) -> Array:
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} = {value!r} is not an array of real numbers: {error}.") from None
+
+
+def _frozen(array: Array) -> Array:
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,95 @@
+"""Discounted linear-quadratic control: value, gain, and the state-action value matrix.
+
+Costs are ``sum_k gamma^k (x' Q x + u' R u)``. The discount is absorbed by the substitution
+``A -> sqrt(gamma) A``, ``B -> sqrt(gamma) B``, after which the undiscounted equations hold.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import linalg
+
+from sb3_yann.control._validation import Array
+from sb3_yann.control.linear_model import LinearModel
+
+
+def riccati(model: LinearModel, Q: Array, R: Array, gamma: float = 1.0) -> Array:
+    """Return P (n, n) with ``x' P x`` the smallest discounted cost from x, without constraints.
+
+    It solves ``P = Q + g A'PA - g A'PB (R + g B'PB)^-1 g B'PA`` for ``g = gamma``.
+
+    Raises
+    ------
+    ValueError
+        If a mode that the discount does not make stable cannot be reached by any input, or the
+        cost does not see a mode on the unit circle: no stabilising solution exists.
+    """
+    root = np.sqrt(gamma)
+    _require_stabilisable(root * model.A, root * model.B)
+    try:
+        P = linalg.solve_discrete_are(root * model.A, root * model.B, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ValueError(
+            f"The Riccati equation has no stabilising solution ({error}): a mode on the unit "
+            "circle carries no weight in Q. Give it a positive weight, or use gamma < 1."
+        ) from None
+    return np.asarray((P + P.T) / 2)
+
+
+def gain(model: LinearModel, R: Array, P: Array, gamma: float = 1.0) -> Array:
+    """Return K (m, n) such that ``u = -K x`` minimises ``u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
+    PB = P @ model.B
+    return np.asarray(
+        linalg.solve(R + gamma * model.B.T @ PB, gamma * PB.T @ model.A, assume_a="pos")
+    )
+
+
+def policy_value(model: LinearModel, Q: Array, R: Array, K: Array, gamma: float) -> Array:
+    """Return P (n, n) with ``x' P x`` the discounted cost of the law ``u = -K x``, whatever K is.
+
+    It solves the Lyapunov equation ``P = Q + K'RK + gamma (A - BK)' P (A - BK)``. For the
+    optimal K of the same discount this is the Riccati solution; for any other K it is the only P
+    that makes the state-action value of :func:`state_action_matrix` satisfy Bellman's equation
+    along the law.
+
+    Raises
+    ------
+    ValueError
+        If the discounted closed loop is not stable, so that the cost is infinite.
+    """
+    closed = np.sqrt(gamma) * (model.A - model.B @ K)
+    radius = float(np.max(np.abs(np.linalg.eigvals(closed))))
+    if radius >= 1:
+        raise ValueError(
+            f"The law u = -K x with K = {K.tolist()} has infinite cost: the spectral radius of "
+            f"sqrt(gamma) (A - BK) is {radius:.6g}, it must be below 1. Lengthen the horizon, use "
+            "the default terminal cost, or a smaller gamma."
+        )
+    P = linalg.solve_discrete_lyapunov(closed.T, Q + K.T @ R @ K)
+    return np.asarray((P + P.T) / 2)
+
+
+def state_action_matrix(model: LinearModel, Q: Array, R: Array, P: Array, gamma: float) -> Array:
+    """Return M (n+m, n+m) with ``[x; u]' M [x; u] = x'Qx + u'Ru + gamma (Ax+Bu)' P (Ax+Bu)``.
+
+    The state-action value of Braniff & Tian, Section 4.2. Their P is that of the undiscounted
+    Riccati equation, which does not satisfy Bellman's equation for gamma < 1: pass that of
+    :func:`policy_value`.
+    """
+    AB = np.hstack([model.A, model.B])
+    return np.asarray(linalg.block_diag(Q, R) + gamma * AB.T @ P @ AB)
+
+
+def _require_stabilisable(A: Array, B: Array) -> None:
+    """Raise unless every mode on or outside the unit circle can be reached (Hautus' test)."""
+    n = A.shape[0]
+    for pole in np.linalg.eigvals(A):
+        if abs(pole) < 1:
+            continue
+        hautus = np.hstack([pole * np.eye(n) - A, B])
+        if np.linalg.svd(hautus, compute_uv=False)[-1] < 1e-10 * max(1.0, np.abs(hautus).max()):
+            raise ValueError(
+                f"The model has an unstable mode that no input reaches: eigenvalue {pole:.6g} of "
+                "sqrt(gamma) A is not controllable, so the Riccati equation has no solution. "
+                "Remove the mode from the model, add an input, or use a smaller gamma."
+            )

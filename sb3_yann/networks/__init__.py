@@ -1,0 +1,7 @@
+"""Networks that start as something known, exactly, and are trainable. torch, no SB3."""
+
+from sb3_yann.networks.value import QuadraticStateActionValue
+from sb3_yann.networks.yann import YannLayer
+from sb3_yann.networks.zero_output import ZeroOutputNetwork
+
+__all__ = ["QuadraticStateActionValue", "YannLayer", "ZeroOutputNetwork"]

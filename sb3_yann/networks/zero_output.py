@@ -1,0 +1,173 @@
+"""Networks whose output is exactly zero at first, for any input, and which train all the same.
+
+Braniff & Tian, Theorems 1 and 2. Nodes come in pairs with opposite weights and biases, and each
+pair is summed *before* the activation s: with s(0) = 0 the layer puts out zero. Here the weights
+of a pair are added before they meet the input, so the zero is exact; the sum of two matrix
+products would vanish to rounding only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch as th
+from torch import nn
+
+Activation = Callable[[th.Tensor], th.Tensor]
+
+
+class PairedLinear(nn.Module):
+    """``x -> sum_j (W_j x + b_j)`` over nodes in pairs of opposite sign: exactly zero at first.
+
+    With ``n_stacked`` it holds that many independent layers in one tensor, and each row of a
+    batch goes through the one that ``index`` names.
+
+    Parameters
+    ----------
+    in_features, out_features : int
+    n_nodes : int, default 2
+        Nodes summed into each output, at least 2. An odd one out starts with zero weights
+        (the corollary to Theorem 1).
+    n_stacked : int, default 1
+        Number of independent layers.
+    scale : float, default 0.01
+        Initial weights and biases are uniform in [-scale, scale].
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        n_nodes: int = 2,
+        n_stacked: int = 1,
+        scale: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if n_nodes < 2:
+            raise ValueError(f"n_nodes = {n_nodes} must be at least 2: zero needs a pair of nodes.")
+        self.n_pairs = n_nodes // 2
+        shape = (n_stacked, out_features, in_features + 1)  # the last column is the bias
+        first = th.empty(self.n_pairs, *shape).uniform_(-scale, scale)
+        rest = th.zeros(n_nodes - 2 * self.n_pairs, *shape)
+        self.nodes = nn.Parameter(th.cat([first, -first, rest]))
+
+    def forward(self, x: th.Tensor, index: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
+        """Return ``W x`` (batch, out_features) and ``b`` of the summed nodes, which adds to it.
+
+        Parameters
+        ----------
+        x : Tensor, shape (batch, in_features)
+        index : Tensor of int, shape (batch,)
+            The layer of the stack for each row; None where there is only one.
+        """
+        nodes = self.nodes if self.nodes.shape[1] == 1 else self.nodes[:, index]
+        summed = (nodes[: self.n_pairs] + nodes[self.n_pairs : 2 * self.n_pairs]).sum(0)
+        return _affine(summed + nodes[2 * self.n_pairs :].sum(0), x)
+
+
+class StackedLinear(nn.Module):
+    """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names."""
+
+    def __init__(
+        self, in_features: int, out_features: int, *, n_stacked: int = 1, scale: float = 0.01
+    ) -> None:
+        super().__init__()
+        weight = th.empty(n_stacked, out_features, in_features + 1).uniform_(-scale, scale)
+        weight[..., -1] = 0  # Theorem 2: the biases of later layers start at zero
+        self.weight = nn.Parameter(weight)
+
+    def forward(self, x: th.Tensor, index: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
+        """Return ``W x`` (batch, out_features) and ``b``, which adds to it."""
+        return _affine(self.weight if len(self.weight) == 1 else self.weight[index], x)
+
+
+def _affine(weight: th.Tensor, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Return ``W x`` and ``b`` for one weight (1, out, in + 1), or one for each row of x."""
+    if len(weight) == 1:
+        return x @ weight[0, :, :-1].T, weight[:, :, -1]
+    return th.einsum("boi,bi->bo", weight[..., :-1], x), weight[..., -1]
+
+
+class ZeroOutputNetwork(nn.Module):
+    """A stack of networks with one or two hidden layers, exactly zero at first, and trainable.
+
+    The first layer is a :class:`PairedLinear`. All parameters have moved after the second update:
+    the first moves the first layer, which then feeds the others.
+
+    Where ``pinned``, every layer is ``s(W x + b) - s(b)``. The output at x = 0 then stays zero for
+    good, whatever the parameters become, so training cannot shift the equilibrium; the network is
+    not confined to odd functions, as one without biases would be.
+
+    Parameters
+    ----------
+    in_features, out_features : int
+    hidden : sequence of int
+        Widths of the one or two hidden layers, odd or even.
+    activation : callable, default torch.tanh
+        Any s with s(0) = 0 and a slope at 0.
+    n_nodes : int, default 2
+        Nodes summed into each unit of the first layer.
+    pinned : Tensor of bool, shape (n_stacked,), optional
+        Networks whose output at 0 stays 0; the number of entries is the size of the stack. The
+        default is one network that is not pinned.
+    scale : float, default 0.01
+        Initial weights are uniform in [-scale, scale].
+
+    Raises
+    ------
+    ValueError
+        If there are not one or two hidden layers, or ``activation(0)`` is not 0.
+    """
+
+    pinned: th.Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        hidden: tuple[int, ...] = (16, 16),
+        *,
+        activation: Activation = th.tanh,
+        n_nodes: int = 2,
+        pinned: th.Tensor | None = None,
+        scale: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if len(hidden) not in (1, 2) or min(hidden) < 1:
+            raise ValueError(f"hidden = {hidden} must name one or two widths of at least 1.")
+        at_zero = float(activation(th.zeros(())))
+        if at_zero != 0:
+            raise ValueError(
+                f"activation(0) = {at_zero:g}, but a zero output needs activation(0) = 0. "
+                "Use e.g. torch.tanh or torch.relu."
+            )
+        pinned = th.zeros(1, dtype=th.bool) if pinned is None else pinned
+        stack = len(pinned)
+        self.activation = activation
+        self.first = PairedLinear(
+            in_features, hidden[0], n_nodes=n_nodes, n_stacked=stack, scale=scale
+        )
+        widths = (*hidden, out_features)
+        self.rest = nn.ModuleList(
+            StackedLinear(a, b, n_stacked=stack, scale=scale) for a, b in pairwise(widths)
+        )
+        self.register_buffer("pinned", pinned.float()[:, None])
+
+    def forward(self, x: th.Tensor, index: th.Tensor | None = None) -> th.Tensor:
+        """Return (batch, out_features).
+
+        Parameters
+        ----------
+        x : Tensor, shape (batch, in_features)
+        index : Tensor of int, shape (batch,), optional
+            The network of the stack that each row goes through; None where there is only one.
+        """
+        pinned = self.pinned if len(self.pinned) == 1 else self.pinned[index]
+        for layer in (self.first, *self.rest[:-1]):
+            product, bias = layer(x, index)
+            x = self.activation(product + bias) - pinned * self.activation(bias)
+        product, bias = self.rest[-1](x, index)
+        output: th.Tensor = product + (1 - pinned) * bias
+        return output

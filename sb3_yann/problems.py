@@ -1,0 +1,84 @@
+"""Control problems by name: what ``policy_kwargs={"problem": ...}`` and the spaces refer to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from sb3_yann.control import LinearMPC
+from sb3_yann_envs.spaces import resolve_reference
+
+_registered: dict[str, LinearMPC | Callable[[], LinearMPC] | str] = {
+    "CSTR-v0": "sb3_yann_envs.problems:cstr",
+    "ClippedPendulum-v0": "sb3_yann_envs.problems:clipped_pendulum",
+}
+
+
+def register_problem(name: str, problem: LinearMPC | Callable[[], LinearMPC] | str) -> None:
+    """Make ``problem`` known as ``name``, for YAML files and ``policy_kwargs``.
+
+    Parameters
+    ----------
+    name : str
+        Without a colon. Registering a name again replaces its problem.
+    problem : LinearMPC, callable without arguments that returns one, or ``"module:attribute"``
+
+    Raises
+    ------
+    ValueError
+        If the name is empty or holds a colon.
+    """
+    if not name or ":" in name:
+        raise ValueError(f"name = {name!r} must be a non-empty name without ':'.")
+    _registered[name] = problem
+
+
+def resolve_problem(problem: LinearMPC | str | None, observation_space: Any) -> LinearMPC:
+    """Return the LinearMPC that is meant: given, named, or carried by the observation space.
+
+    A problem that was named is kept on the space, solved, so that it is saved with a model and
+    a load neither solves again nor needs the solver.
+
+    Raises
+    ------
+    TypeError
+        If what is meant is not a LinearMPC.
+    ValueError
+        If there is none, or a name or reference cannot be found.
+    """
+    if problem is None:
+        problem = getattr(observation_space, "problem", None)
+    if problem is None:
+        raise ValueError(
+            f"YannPolicy has no problem: the observation space {observation_space} carries none. "
+            'Pass policy_kwargs={"problem": mpc} with a LinearMPC, a registered name '
+            f'({", ".join(sorted(_registered))}) or "module:attribute".'
+        )
+    if not isinstance(problem, str):
+        return _as_mpc(problem, "problem")
+    kept = vars(observation_space).setdefault("_sb3_yann_problems", {})
+    if problem not in kept:
+        kept[problem] = _look_up(problem)
+    return _as_mpc(kept[problem], problem)
+
+
+def _look_up(name: str) -> LinearMPC:
+    found: Any = name
+    if ":" not in name:
+        if name not in _registered:
+            raise ValueError(
+                f"No problem is registered as {name!r}; there are {sorted(_registered)}. Call "
+                'sb3_yann.register_problem, or refer to it as "module:attribute".'
+            )
+        found = _registered[name]
+    if isinstance(found, str):
+        found = resolve_reference(found)
+    return _as_mpc(found, name)
+
+
+def _as_mpc(found: Any, name: str) -> LinearMPC:
+    if callable(found):
+        found = found()
+    if not isinstance(found, LinearMPC):
+        raise TypeError(f"{name} is {found!r}, expected a LinearMPC.")
+    return found

@@ -1,0 +1,254 @@
+"""The clipped pendulum: Gymnasium's simulator, observed as a state and started near upright."""
+
+from __future__ import annotations
+
+import copy
+import random
+from typing import Any
+
+import control
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
+from numpy.typing import NDArray
+
+from sb3_yann_envs import ProblemBox, clipped_pendulum
+from sb3_yann_envs.clipped_pendulum import ClippedPendulumEnv
+
+
+def act(torque: float) -> NDArray[np.float32]:
+    return np.array([torque], dtype=np.float32)
+
+
+def started(state: Any = (0.0, 0.0)) -> ClippedPendulumEnv:
+    env = ClippedPendulumEnv()
+    env.reset(options={"state": state})
+    return env
+
+
+def gymnasium_pendulum(state: Any) -> PendulumEnv:
+    env = PendulumEnv()
+    env.reset()
+    env.state = np.array(state, dtype=np.float64)
+    return env
+
+
+def side_it_falls_to(starts: NDArray[np.float64], torque: float) -> NDArray[np.float64]:
+    """Return the sign of the angle at which pendulums under a constant torque pass a quarter turn.
+
+    `starts` has shape (batch, 2). A pendulum that has not fallen after 400 steps counts as 0.
+    """
+    theta, speed = starts[:, 0], starts[:, 1]
+    side: NDArray[np.float64] = np.zeros(len(starts))
+    for _ in range(400):
+        speed = np.clip(speed + 0.05 * (15.0 * np.sin(theta) + 3.0 * torque), -8.0, 8.0)
+        theta = theta + 0.05 * speed
+        side = np.where((side == 0) & (np.abs(theta) > np.pi / 2), np.sign(theta), side)
+    return side
+
+
+# --- simulator ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_trajectory_is_gymnasiums_bit_for_bit(seed: int) -> None:
+    # Actions in float64: Gymnasium multiplies a float32 torque in float32, which rounds.
+    rng = np.random.default_rng(seed)
+    start = rng.uniform([-np.pi, -8.0], [np.pi, 8.0])
+    ours, theirs = started(start), gymnasium_pendulum(start)
+    for torque in rng.uniform(-3.0, 3.0, 200):
+        action = np.array([torque])
+        _, our_reward, *_, info = ours.step(action)
+        _, their_reward, *_ = theirs.step(action)  # type: ignore[no-untyped-call]
+        theta, speed = theirs.state
+        assert our_reward == their_reward
+        assert info["state"][1] == speed
+        assert info["state"][0] == (theta + np.pi) % (2 * np.pi) - np.pi
+
+
+def test_a_step_with_a_float32_torque_is_gymnasiums_to_its_rounding() -> None:
+    rng = np.random.default_rng(0)
+    for start in rng.uniform([-3.1, -7.0], [3.1, 7.0], (200, 2)):
+        action = rng.uniform(-2.0, 2.0, 1).astype(np.float32)
+        ours, theirs = started(start), gymnasium_pendulum(start)
+        _, our_reward, *_, info = ours.step(action)
+        _, their_reward, *_ = theirs.step(action)  # type: ignore[no-untyped-call]
+        assert info["state"][1] == pytest.approx(theirs.state[1], abs=1e-6)
+        assert our_reward == pytest.approx(their_reward, abs=1e-6)
+
+
+def test_the_cost_is_that_of_the_state_before_the_step_and_the_clipped_torque() -> None:
+    env = ClippedPendulumEnv()
+    _, info = env.reset(seed=3)
+    for torque in (0.5, -1.3, 10.0, -np.inf):
+        before, applied = info["state"], np.clip([torque], -2.0, 2.0)
+        _, reward, terminated, truncated, info = env.step(act(torque))
+        expected = before @ clipped_pendulum.Q @ before + applied @ clipped_pendulum.R @ applied
+        assert info["cost"] == pytest.approx(expected, rel=1e-6)
+        assert reward == -info["cost"]
+        assert isinstance(reward, float)
+        assert (terminated, truncated, info["violation"]) == (False, False, False)
+
+
+def test_upright_is_a_fixed_point() -> None:
+    rates = clipped_pendulum.dynamics(clipped_pendulum.X_SS, clipped_pendulum.U_SS)
+    np.testing.assert_array_equal(rates, 0.0)
+    observation, reward, *_ = started().step(act(0.0))
+    np.testing.assert_array_equal(observation, 0.0)
+    assert reward == 0.0
+
+
+# --- the printed model -------------------------------------------------------------------------
+
+
+def test_the_linearised_dynamics_give_the_printed_model() -> None:
+    plant = control.nlsys(
+        lambda t, x, u, params: clipped_pendulum.dynamics(x, u), None, states=2, inputs=1, outputs=2
+    )
+    model = control.linearize(plant, clipped_pendulum.X_SS, clipped_pendulum.U_SS)
+    model = model.sample(clipped_pendulum.DT, method="zoh")
+    np.testing.assert_array_equal(np.round(model.A, 4), clipped_pendulum.PRINTED_A)
+    np.testing.assert_array_equal(np.round(model.B, 4), clipped_pendulum.PRINTED_B)
+
+
+@pytest.mark.parametrize("name", ["X_SS", "U_SS", "Q", "R", "PRINTED_A", "PRINTED_B"])
+def test_the_constants_cannot_be_overwritten(name: str) -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(clipped_pendulum, name)[...] = 0.0
+
+
+# --- spaces ------------------------------------------------------------------------------------
+
+
+def test_the_observation_space_refers_to_the_problem() -> None:
+    space = ClippedPendulumEnv().observation_space
+    assert isinstance(space, ProblemBox)
+    assert "sb3_yann_envs.problems:clipped_pendulum" in repr(space)
+
+
+@pytest.mark.parametrize(
+    "theta", [np.pi, -np.pi, np.nextafter(np.pi, 0.0), np.nextafter(-np.pi, 0.0), np.float32(np.pi)]
+)
+def test_an_angle_that_rounds_to_pi_stays_in_the_space(theta: float) -> None:
+    observation, info = ClippedPendulumEnv().reset(options={"state": [theta, 8.0]})
+    env = ClippedPendulumEnv()
+    assert observation in env.observation_space
+    # And the observation itself is a valid start again.
+    assert env.reset(options={"state": observation})[0] in env.observation_space
+    assert -np.pi <= info["state"][0] <= np.pi
+
+
+def test_a_pendulum_at_full_speed_stays_in_the_space() -> None:
+    env = started([3.0, 8.0])
+    for k in range(400):
+        observation, *_ = env.step(act(2.0 if k < 200 else -2.0))
+        assert observation in env.observation_space
+
+
+# --- starts ------------------------------------------------------------------------------------
+
+
+def test_one_start_in_five_must_swing_round() -> None:
+    # A start is lost when it falls to one side although the torque pushes fully to the other.
+    # Dynamic programming on a grid of 241 x 241 classified 4,000 starts in the same way.
+    env = ClippedPendulumEnv()
+    starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(4000)])
+    lost = (side_it_falls_to(starts, -2.0) > 0) | (side_it_falls_to(starts, 2.0) < 0)
+    assert 0.18 < lost.mean() < 0.23
+
+
+def test_at_rest_the_torque_holds_up_to_the_angle_where_gravity_balances_it() -> None:
+    limit = np.arcsin(0.4)  # 15 sin(theta) = 3 * 2
+    starts = np.array([[limit - 1e-3, 0.0], [limit + 1e-3, 0.0]])
+    np.testing.assert_array_equal(side_it_falls_to(starts, -2.0), [-1.0, 1.0])
+
+
+def test_random_starts_fill_their_box() -> None:
+    env = ClippedPendulumEnv()
+    starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(500)])
+    reach = np.array([clipped_pendulum.START_ANGLE, clipped_pendulum.START_SPEED])
+    assert (np.abs(starts) <= reach).all()
+    assert (np.ptp(starts, axis=0) / (2 * reach) > 0.97).all()
+
+
+def test_a_seed_reproduces_an_episode() -> None:
+    def episode() -> list[NDArray[np.float32]]:
+        env = ClippedPendulumEnv()
+        observations = [env.reset(seed=5)[0]]
+        observations += [env.step(act(np.sin(k)))[0] for k in range(50)]
+        return [*observations, env.reset()[0]]
+
+    np.testing.assert_array_equal(episode(), episode())
+
+
+def test_the_global_random_states_are_untouched() -> None:
+    python, legacy = random.getstate(), copy.deepcopy(np.random.get_state())  # noqa: NPY002
+    env = ClippedPendulumEnv()
+    env.reset(seed=1)
+    env.step(act(1.0))
+    env.reset()
+    assert random.getstate() == python
+    for now, before in zip(np.random.get_state(), legacy, strict=True):  # noqa: NPY002
+        np.testing.assert_array_equal(now, before)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"state": 0.0}, r"must have shape \(2,\)"),
+        ({"state": [0.0, 0.0, 0.0]}, r"must have shape \(2,\)"),
+        ({"state": [np.nan, 0.0]}, "theta must be in .* got nan"),
+        ({"state": [3.2, 0.0]}, "theta must be in"),
+        ({"state": [0.0, -8.1]}, r"theta_dot must be in \[-8, 8\], got -8.1"),
+        ({"x_init": 1.0}, r"unknown keys \['x_init'\]"),
+    ],
+)
+def test_a_bad_start_is_refused_with_its_reason(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ClippedPendulumEnv().reset(options=options)
+
+
+# --- bad calls and rendering -------------------------------------------------------------------
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"env.reset\(\) before env.step\(\)"):
+        ClippedPendulumEnv().step(act(0.0))
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [(act(np.nan), "got array.*nan"), (np.zeros((1, 1)), r"shape \(1,\)"), ([], r"shape \(1,\)")],
+)
+def test_a_bad_action_is_refused(action: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        started().step(action)
+
+
+def test_a_frame_is_a_picture_that_changes_with_the_episode() -> None:
+    env = ClippedPendulumEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    env.step(act(2.0))
+    second = env.render()
+    assert first is not None and second is not None
+    assert first.shape == (400, 400, 3)
+    assert first.dtype == np.uint8
+    assert (first != second).any()
+
+
+def test_an_unknown_render_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+        ClippedPendulumEnv(render_mode="ansi")
+
+
+def test_rendering_before_the_first_reset_is_refused() -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before env.render\(\)"):
+        ClippedPendulumEnv(render_mode="rgb_array").render()
+
+
+def test_rendering_without_a_mode_warns_and_returns_nothing() -> None:
+    env = started()
+    with pytest.warns(UserWarning, match="without specifying any render mode"):
+        assert env.render() is None

@@ -1,0 +1,347 @@
+"""The reactor: its equations, its model, its limit, and how an episode starts and ends."""
+
+from __future__ import annotations
+
+import copy
+import random
+from typing import Any
+
+import control
+import gymnasium
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from sb3_yann_envs import ProblemBox, cstr
+from sb3_yann_envs.cstr import CSTREnv
+
+# Entries of the printed A that the true equations do not have, with the true values.
+NOT_REPRODUCED = {
+    (0, 1): -0.0047,
+    (0, 3): -0.0003,
+    (1, 3): -0.0003,
+    (2, 2): 0.9990,
+    (3, 2): 0.0002,
+    (3, 3): 1.0029,
+}
+
+
+def act(u: float) -> NDArray[np.float32]:
+    return np.array([u], dtype=np.float32)
+
+
+def started(state: Any = (0.0, 0.0, 0.0, 0.0)) -> CSTREnv:
+    env = CSTREnv()
+    env.reset(options={"state": state})
+    return env
+
+
+@pytest.fixture(scope="module")
+def linear_model() -> Any:
+    plant = control.nlsys(
+        lambda t, x, u, params: cstr.dynamics(x, u), None, states=4, inputs=1, outputs=4
+    )
+    return control.linearize(plant, cstr.X_SS, cstr.U_SS).sample(cstr.DT, method="zoh")
+
+
+# --- equations ---------------------------------------------------------------------------------
+
+
+def test_one_step_gives_the_reference_value() -> None:
+    # From an independent implementation of the same equations, given to nine decimals.
+    env = started([0.03, 0.3, -0.2, 3.0])
+    *_, info = env.step(act(-55.0))
+    expected = [0.111143870, 1.180869959, 2.794950099, 478.109431754]
+    np.testing.assert_allclose(info["state"] + cstr.X_SS, expected, rtol=0, atol=1e-8)
+
+
+def test_the_steady_state_is_the_published_one() -> None:
+    expected = [0.08616063, 0.88616063, 2.99475999, 475.0]
+    np.testing.assert_allclose(cstr.X_SS, expected, rtol=0, atol=5e-9)
+    assert cstr.FEED_TEMPERATURE == pytest.approx(452.48303, abs=5e-6)
+
+
+def test_the_dynamics_vanish_at_the_steady_state() -> None:
+    np.testing.assert_allclose(cstr.dynamics(cstr.X_SS, cstr.U_SS), 0.0, atol=1e-12)
+
+
+def test_a_reactor_in_steady_state_stays_there() -> None:
+    env = started()
+    for _ in range(400):
+        observation, reward, *_ = env.step(act(0.0))
+    np.testing.assert_allclose(observation, 0.0, atol=1e-9)
+    assert reward == pytest.approx(0.0, abs=1e-18)
+
+
+@pytest.mark.parametrize("u", [-55.0, 0.0, 55.0])
+@pytest.mark.parametrize(
+    "state",
+    [(0.05, 0.4, 0.4, 4.0), (-0.05, -0.4, -0.4, -7.5), (0.05, 0.4, 0.4, 4.99), (0.1, 0.4, 0, 5.0)],
+)
+def test_a_step_agrees_with_an_accurate_integrator(state: tuple[float, ...], u: float) -> None:
+    *_, info = started(state).step(act(u))
+    exact = solve_ivp(
+        lambda t, x: cstr.dynamics(x, cstr.U_SS + u),
+        (0.0, cstr.DT),
+        cstr.X_SS + state,
+        method="Radau",
+        rtol=1e-12,
+        atol=1e-14,
+    )
+    np.testing.assert_allclose(info["state"] + cstr.X_SS, exact.y[:, -1], rtol=0, atol=1e-7)
+
+
+def test_an_episode_into_the_limit_agrees_with_an_accurate_integrator() -> None:
+    start = np.array([0.05, 0.4, 0.4, 4.0])
+    env = started(start)
+    terminated, steps = False, 0
+    while not terminated:
+        *_, terminated, _, info = env.step(act(-55.0))
+        steps += 1
+    exact = solve_ivp(
+        lambda t, x: cstr.dynamics(x, cstr.U_SS - 55.0),
+        (0.0, steps * cstr.DT),
+        cstr.X_SS + start,
+        method="LSODA",
+        rtol=1e-12,
+        atol=1e-13,
+    )
+    assert info["state"][3] > 5.0
+    np.testing.assert_allclose(info["state"] + cstr.X_SS, exact.y[:, -1], rtol=0, atol=1e-6)
+
+
+# --- the printed model -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row", range(4))
+@pytest.mark.parametrize("column", range(4))
+def test_the_linearised_dynamics_give_the_printed_state_matrix_but_for_six_entries(
+    linear_model: Any, row: int, column: int
+) -> None:
+    printed = cstr.PRINTED_A[row, column]
+    expected = NOT_REPRODUCED.get((row, column), printed)
+    assert round(linear_model.A[row, column], 4) == expected
+    assert (expected != printed) == ((row, column) in NOT_REPRODUCED)
+
+
+def test_the_linearised_dynamics_give_the_printed_input_matrix(linear_model: Any) -> None:
+    np.testing.assert_array_equal(np.round(linear_model.B, 4), cstr.PRINTED_B)
+
+
+def test_the_steady_state_is_stable_although_the_printed_model_is_not(linear_model: Any) -> None:
+    assert np.abs(np.linalg.eigvals(linear_model.A)).max() < 0.9991
+    assert np.abs(np.linalg.eigvals(cstr.PRINTED_A)).max() == pytest.approx(1.0030)
+
+
+@pytest.mark.parametrize("name", ["X_SS", "U_SS", "Q", "R", "PRINTED_A", "PRINTED_B"])
+def test_the_constants_cannot_be_overwritten(name: str) -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(cstr, name)[...] = 0.0
+
+
+# --- reward and limit --------------------------------------------------------------------------
+
+
+def test_the_cost_is_that_of_the_state_before_the_step_and_the_clipped_action() -> None:
+    env = CSTREnv()
+    _, info = env.reset(seed=3)
+    for u in (-20.0, 33.0, 500.0, -np.inf):
+        before, applied = info["state"], np.clip([u], -55.0, 55.0)
+        _, reward, _, _, info = env.step(act(u))
+        expected = before @ cstr.Q @ before + applied @ cstr.R @ applied
+        assert info["cost"] == pytest.approx(expected, rel=1e-12)
+        assert reward == -info["cost"]
+        assert isinstance(reward, float)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_without_cooling_every_start_ends_beyond_the_limit_and_is_fined_once(seed: int) -> None:
+    env = CSTREnv()
+    env.reset(seed=seed)
+    infos = []
+    terminated = False
+    while not terminated:
+        observation, reward, terminated, truncated, info = env.step(act(-55.0))
+        assert (info["violation"], truncated) == (terminated, False)
+        assert terminated == (info["state"][3] > 5.0)
+        infos.append(info)
+    assert observation in env.observation_space
+    assert reward == -infos[-1]["cost"] < -cstr.PENALTY
+    assert sum(info["cost"] >= cstr.PENALTY for info in infos) == 1
+    assert infos[-1]["cost"] - cstr.PENALTY < 10.0
+
+
+def test_at_the_nominal_input_no_start_reaches_the_limit() -> None:
+    env = CSTREnv()
+    for seed in range(200):
+        env.reset(seed=seed)
+        assert not any(env.step(act(0.0))[2] for _ in range(400)), f"seed {seed}"
+
+
+def test_a_terminated_episode_cannot_be_continued() -> None:
+    env = started([0.05, 0.4, 0.4, 5.0])
+    *_, terminated, _, _ = env.step(act(-55.0))
+    assert terminated
+    with pytest.raises(gymnasium.error.ResetNeeded, match="passed its temperature limit"):
+        env.step(act(0.0))
+    env.reset()
+    env.step(act(0.0))
+
+
+# --- spaces ------------------------------------------------------------------------------------
+
+
+def test_the_observation_space_refers_to_the_problem() -> None:
+    space = CSTREnv().observation_space
+    assert isinstance(space, ProblemBox)
+    assert "sb3_yann_envs.problems:cstr" in repr(space)
+
+
+def test_bang_bang_inputs_from_the_corners_of_the_allowed_starts_stay_in_the_space() -> None:
+    rng = np.random.default_rng(0)
+    env = CSTREnv()
+    low = np.maximum(cstr.STATE_LOW, [*-cstr.X_SS[:3], -np.inf])
+    for _ in range(100):
+        start = np.where(rng.random(4) < 0.5, low, cstr.STATE_HIGH)
+        start[3] = rng.choice([-70.0, -30.0, 0.0, 5.0])
+        observation, _ = env.reset(options={"state": start})
+        assert observation in env.observation_space
+        u, terminated, steps = -55.0, False, 0
+        while not terminated and steps < 400:
+            u = -u if rng.random() < 0.03 else u
+            observation, _, terminated, *_ = env.step(act(u))
+            assert observation in env.observation_space, (start, observation)
+            steps += 1
+
+
+def test_one_step_from_the_limit_with_all_concentrations_at_their_bounds_stays_in_the_space() -> (
+    None
+):
+    # Heat release grows with every concentration, so no other step ends hotter.
+    high = np.asarray(CSTREnv().observation_space.high, dtype=np.float64)  # type: ignore[attr-defined]
+    worst = np.append(cstr.X_SS[:3] + high[:3], cstr.TEMPERATURE_LIMIT)
+    end = solve_ivp(
+        lambda t, x: cstr.dynamics(x, np.zeros(1)),
+        (0.0, cstr.DT),
+        worst,
+        method="Radau",
+        rtol=1e-10,
+    )
+    assert end.y[3].max() - cstr.X_SS[3] < high[3]
+
+
+# --- starts ------------------------------------------------------------------------------------
+
+
+def test_random_starts_fill_their_box() -> None:
+    env = CSTREnv()
+    starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(500)])
+    assert (starts >= cstr.START_LOW).all()
+    assert (starts <= cstr.START_HIGH).all()
+    covered = (starts.max(axis=0) - starts.min(axis=0)) / (cstr.START_HIGH - cstr.START_LOW)
+    assert (covered > 0.97).all()
+
+
+def test_a_seed_reproduces_an_episode() -> None:
+    def episode() -> list[NDArray[np.float32]]:
+        env = CSTREnv()
+        observations = [env.reset(seed=5)[0]]
+        observations += [env.step(act(10.0 * np.sin(k)))[0] for k in range(50)]
+        return [*observations, env.reset()[0]]
+
+    np.testing.assert_array_equal(episode(), episode())
+
+
+def test_the_global_random_states_are_untouched() -> None:
+    python, legacy = random.getstate(), copy.deepcopy(np.random.get_state())  # noqa: NPY002
+    env = CSTREnv()
+    env.reset(seed=1)
+    env.step(act(1.0))
+    env.reset()
+    assert random.getstate() == python
+    for now, before in zip(np.random.get_state(), legacy, strict=True):  # noqa: NPY002
+        np.testing.assert_array_equal(now, before)
+
+
+def test_a_chosen_start_is_taken_exactly() -> None:
+    start = [0.01, -0.2, 0.3, -1.7]
+    observation, info = CSTREnv().reset(options={"state": start})
+    np.testing.assert_array_equal(info["state"], start)
+    np.testing.assert_array_equal(observation, np.array(start, dtype=np.float32))
+
+
+def test_a_state_handed_out_continues_the_same_trajectory_bit_for_bit() -> None:
+    env = CSTREnv()
+    env.reset(seed=2)
+    for _ in range(7):
+        *_, info = env.step(act(-12.3))
+    twin = started(info["state"])
+    for _ in range(20):
+        *_, ours = env.step(act(21.0))
+        *_, theirs = twin.step(act(21.0))
+        np.testing.assert_array_equal(ours["state"], theirs["state"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"state": [0.0, 0.0, 0.0]}, r"must have shape \(4,\)"),
+        ({"state": [[0.0, 0.0, 0.0, 0.0]]}, r"must have shape \(4,\)"),
+        ({"state": [0.0, np.nan, 0.0, 0.0]}, "C_B deviation must be in .* got nan"),
+        ({"state": [0.0, 0.0, 0.0, np.inf]}, "T deviation must be in"),
+        ({"state": [0.0, 0.0, 0.0, 5.1]}, r"T deviation must be in \[-70, 5\], got 5.1"),
+        ({"state": [-0.09, 0.0, 0.0, 0.0]}, "C_A deviation must be in"),
+        ({"start": [0.0, 0.0, 0.0, 0.0]}, r"unknown keys \['start'\]"),
+    ],
+)
+def test_a_bad_start_is_refused_with_its_reason(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CSTREnv().reset(options=options)
+
+
+# --- bad calls and rendering -------------------------------------------------------------------
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"env.reset\(\) before env.step\(\)"):
+        CSTREnv().step(act(0.0))
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [(act(np.nan), "got array.*nan"), (np.zeros(2), r"shape \(1,\)"), (0.0, r"shape \(1,\)")],
+)
+def test_a_bad_action_is_refused_and_leaves_the_state_alone(action: Any, message: str) -> None:
+    env, twin = started([0.0, 0.1, 0.0, 1.0]), started([0.0, 0.1, 0.0, 1.0])
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    np.testing.assert_array_equal(env.step(act(1.0))[0], twin.step(act(1.0))[0])
+
+
+def test_a_frame_is_a_picture_that_changes_with_the_episode() -> None:
+    env = CSTREnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    env.step(act(-55.0))
+    second = env.render()
+    assert first is not None and second is not None
+    assert first.shape == (400, 600, 3)
+    assert first.dtype == np.uint8
+    assert (first != second).any()
+
+
+def test_an_unknown_render_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+        CSTREnv(render_mode="ansi")
+
+
+def test_rendering_before_the_first_reset_is_refused() -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before env.render\(\)"):
+        CSTREnv(render_mode="rgb_array").render()
+
+
+def test_rendering_without_a_mode_warns_and_returns_nothing() -> None:
+    env = started()
+    with pytest.warns(UserWarning, match="without specifying any render mode"):
+        assert env.render() is None

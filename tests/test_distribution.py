@@ -1,0 +1,184 @@
+"""What is installed: the wheel's contents, its metadata, and how the packages import."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+import zipfile
+from email.message import Message
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import sb3_yann
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = {"sb3_yann": ROOT / "sb3_yann", "sb3_yann_envs": ROOT / "envs" / "sb3_yann_envs"}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from hatchling.builders.wheel import WheelBuilder
+
+    target = tmp_path_factory.mktemp("dist")
+    (path,) = WheelBuilder(str(ROOT)).build(directory=str(target), versions=["standard"])
+    return Path(path)
+
+
+@pytest.fixture(scope="module")
+def wheel_names(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: Path, wheel_names: set[str]) -> Message:
+    (name,) = (name for name in wheel_names if name.endswith(".dist-info/METADATA"))
+    with zipfile.ZipFile(wheel) as archive:
+        return Parser().parsestr(archive.read(name).decode())
+
+
+def test_metadata(metadata: Message) -> None:
+    assert metadata["Name"] == "sb3-yann"
+    assert metadata["Version"] == sb3_yann.__version__
+    assert metadata["License-Expression"] == "MIT"
+    assert metadata["Requires-Python"] == ">=3.10"
+    assert metadata.get_all("Provides-Extra") == ["dev", "zoo"]
+
+
+def test_the_wheel_holds_every_file_of_both_packages_and_nothing_else(
+    wheel_names: set[str],
+) -> None:
+    expected = {
+        f"{package}/{file.relative_to(folder).as_posix()}"
+        for package, folder in PACKAGES.items()
+        for file in folder.rglob("*")
+        if file.is_file() and "__pycache__" not in file.parts and file.suffix != ".pyc"
+    }
+    found = {name for name in wheel_names if ".dist-info/" not in name}
+    assert found == expected
+    assert {"sb3_yann/py.typed", "sb3_yann_envs/py.typed"} <= found
+    assert [name for name in found if name.startswith("sb3_yann/hyperparams/")]
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in wheel_names)
+
+
+def _pins() -> dict[str, str]:
+    """Return the versions constraints.txt pins for this interpreter, by canonical name."""
+    pins: dict[str, str] = {}
+    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        pin = Requirement(text)
+        (specifier,) = pin.specifier
+        assert specifier.operator == "==", f"not an exact pin: {text}"
+        if pin.marker is None or pin.marker.evaluate():
+            name = canonicalize_name(pin.name)
+            assert name not in pins, f"pinned twice: {text}"
+            pins[name] = specifier.version
+    return pins
+
+
+def test_every_requirement_is_pinned_to_a_version_it_allows(metadata: Message) -> None:
+    pins = _pins()
+    for text in metadata.get_all("Requires-Dist", []):
+        requirement = Requirement(text)
+        name = canonicalize_name(requirement.name)
+        if name == "sb3-yann":  # one extra naming another
+            continue
+        assert name in pins, f"constraints.txt does not pin {text}"
+        assert requirement.specifier.contains(pins[name]), f"{text} rules out {pins[name]}"
+
+
+def _imported_packages(source: Path) -> set[str]:
+    """Return the top-level packages a file imports absolutely, anywhere in it."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"), str(source))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+def _imported_modules(source: Path) -> set[str]:
+    """Return the modules of sb3_yann a file imports, relatively or not, as dotted names."""
+    package = ["sb3_yann", *source.relative_to(PACKAGES["sb3_yann"]).parts[:-1]]
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"), str(source))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            names.add(module)
+            names.update(f"{module}.{alias.name}" for alias in node.names)
+    return {name for name in names if name.partition(".")[0] == "sb3_yann"}
+
+
+@pytest.mark.parametrize(
+    ("layer", "libraries", "own"),
+    [
+        pytest.param(
+            "control",
+            {"torch", "stable_baselines3", "sb3_contrib", "rl_zoo3", "sb3_yann_envs"},
+            ("sb3_yann.control",),
+            id="control",
+        ),
+        pytest.param(
+            "networks",
+            {"stable_baselines3", "sb3_contrib", "rl_zoo3", "sb3_yann_envs"},
+            ("sb3_yann.control", "sb3_yann.networks"),
+            id="networks",
+        ),
+    ],
+)
+def test_a_lower_layer_imports_nothing_from_above(
+    layer: str, libraries: set[str], own: tuple[str, ...]
+) -> None:
+    folder = PACKAGES["sb3_yann"] / layer
+    sources = sorted(folder.rglob("*.py")) or [folder.with_suffix(".py")]
+    for source in sources:
+        assert not _imported_packages(source) & libraries, source
+        above = {
+            name
+            for name in _imported_modules(source)
+            if name != "sb3_yann" and not any(f"{name}.".startswith(f"{part}.") for part in own)
+        }
+        assert not above, source
+
+
+@pytest.mark.parametrize("package", sorted(PACKAGES))
+def test_importing_prints_nothing_and_writes_no_file(package: str, tmp_path: Path) -> None:
+    # Matplotlib, which Stable-Baselines3 may load, keeps a font cache. Fill it first and
+    # lend it, so that only what the package itself does can show.
+    import matplotlib.font_manager
+
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    environment = {
+        **os.environ,
+        "HOME": str(folder),
+        "MPLCONFIGDIR": matplotlib.get_cachedir(),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONPATH": os.pathsep.join(str(path.parent) for path in PACKAGES.values()),
+        "TMPDIR": str(folder),
+    }
+    for name in [name for name in environment if name.startswith("XDG_")]:
+        del environment[name]
+    result = subprocess.run(
+        [sys.executable, "-c", f"import {package}"],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    assert list(folder.rglob("*")) == []
