@@ -1,0 +1,63 @@
+"""DDPG on the safety-critical reactor, from its linear MPC onward, without exploration.
+
+python examples/cstr.py [--episodes 50] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+from rich.console import Console
+from stable_baselines3 import DDPG
+
+from sb3_yann import ControlDiagnostics, NoActionNoise, YannPolicy
+from sb3_yann.evaluation import evaluate
+from sb3_yann.reporting import comparison_table, save_trajectories
+from sb3_yann_envs.cstr import DT, TEMPERATURE_LIMIT, X_SS
+
+STEPS = 400  # of one episode
+TEST_SEEDS = range(1000, 1010)  # starts that training never sees
+
+
+def main() -> None:
+    """Train, then compare the policy with the MPC that it was at the start."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)  # the networks are too small to share among cores
+    console = Console()
+
+    model = DDPG(YannPolicy, "CSTR-v0", tensorboard_log="out/tensorboard", seed=arguments.seed)
+    console.print(f"The policy starts as {model.policy.problem.explicit()}.")
+    before = evaluate(model, "CSTR-v0", TEST_SEEDS)
+
+    diagnostics = ControlDiagnostics()
+    console.print(f"Training for {arguments.episodes} episodes without action noise ...")
+    model.learn(
+        STEPS * arguments.episodes, callback=[NoActionNoise(), diagnostics], progress_bar=True
+    )
+    after = evaluate(model, "CSTR-v0", TEST_SEEDS)
+
+    console.print(comparison_table("Cost of ten test episodes, CSTR-v0", before, after))
+    console.print(f"Violations of {TEMPERATURE_LIMIT:g} K in training: {diagnostics.violations}")
+    if after.costs.mean() > before.costs.mean():
+        console.print(
+            "[yellow]Training made the policy worse than the MPC it started from.[/yellow] Without "
+            "exploration this critic sees too little to tell better actions from worse."
+        )
+    picture = save_trajectories(
+        "out/cstr.png",
+        {"before (linear MPC)": before, "after training": after},
+        states={0: "ΔC_A [mol/L]", 3: "ΔT [K]"},
+        inputs=["ΔU [kJ/(h m² K)]"],
+        dt=DT,
+        time_unit="h",
+        limits={3: (TEMPERATURE_LIMIT - X_SS[3], f"limit, {TEMPERATURE_LIMIT:g} K")},
+    )
+    console.print(f"Trajectories: {picture}    Curves: tensorboard --logdir out/tensorboard")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""Problems, plants and an independent online QP that several tests share."""
+
+from __future__ import annotations
+
+import daqp
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann_envs import problems
+
+
+class LinearPlant(gym.Env):
+    """The prediction model itself as the plant, with the cost of the MPC, in float64."""
+
+    def __init__(self, mpc: LinearMPC, start: float = 1.0) -> None:
+        self.mpc, self.start = mpc, start
+        n = mpc.n_theta
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (n,), np.float32)
+        self.action_space = gym.spaces.Box(
+            mpc.u_min.astype(np.float32), mpc.u_max.astype(np.float32)
+        )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.start * self.np_random.uniform(-1, 1, self.mpc.n_theta)
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        u = np.asarray(action, dtype=np.float64)
+        reward = -float(self.mpc.stage_cost(self.x, u))
+        self.x = self.mpc.model.step(self.x, u)
+        return self.x.astype(np.float32), reward, False, False, {}
+
+
+def two_input_mpc(**changes) -> LinearMPC:
+    """Three states, two inputs, asymmetric bounds on everything: 153 regions."""
+    A = [[1, 0.1, 0], [0, 1, 0.1], [0, 0, 0.9]]
+    B = [[0, 0.1], [0.1, 0], [0, 1]]
+    design = {
+        "Q": np.eye(3),
+        "R": np.diag([0.1, 0.2]),
+        "horizon": 2,
+        "x_min": -5,
+        "x_max": [5, 6, 7],
+        "u_min": [-1, -0.5],
+        "u_max": [2, 0.7],
+    }
+    return LinearMPC(LinearModel(A, B, 0.1), **{**design, **changes})
+
+
+def asymmetric_pendulum_mpc() -> LinearMPC:
+    """The pendulum's problem with a motor that pulls harder to one side."""
+    base = problems.clipped_pendulum()
+    return LinearMPC(
+        base.model,
+        Q=base.Q,
+        R=base.R,
+        horizon=2,
+        x_min=base.x_min,
+        x_max=base.x_max,
+        u_min=-1.0,
+        u_max=3.0,
+    )
+
+
+PROBLEMS = {
+    "pendulum": problems.clipped_pendulum,
+    "cstr": problems.cstr,
+    "asymmetric pendulum": asymmetric_pendulum_mpc,
+    "two inputs": two_input_mpc,
+}
+
+
+@pytest.fixture(scope="session", params=PROBLEMS, ids=lambda name: name.replace(" ", "-"))
+def mpc(request) -> LinearMPC:
+    return PROBLEMS[request.param]()
+
+
+class OnlineMPC:
+    """The MPC solved at each state as a QP in inputs *and* states, by DAQP; nothing condensed."""
+
+    def __init__(self, mpc: LinearMPC) -> None:
+        n, m, N = mpc.n_theta, mpc.model.n_inputs, mpc.horizon
+        self.mpc, self.n_inputs = mpc, m
+        stage = [mpc.gamma**k * mpc.R for k in range(N)]
+        states = [mpc.gamma**k * mpc.Q for k in range(1, N)]
+        states.append(mpc.gamma**N * mpc.terminal_cost)
+        size = N * (n + m)  # z = (u_0 .. u_{N-1}, x_1 .. x_N)
+        self.H = np.zeros((size, size))
+        for k in range(N):
+            u, x = slice(k * m, (k + 1) * m), slice(N * m + k * n, N * m + (k + 1) * n)
+            self.H[u, u], self.H[x, x] = 2 * stage[k], 2 * states[k]
+        self.dynamics = np.zeros((N * n, size))
+        for k in range(N):
+            rows = slice(k * n, (k + 1) * n)
+            self.dynamics[rows, N * m + k * n : N * m + (k + 1) * n] = np.eye(n)
+            self.dynamics[rows, k * m : (k + 1) * m] = -mpc.model.B
+            if k:
+                self.dynamics[rows, N * m + (k - 1) * n : N * m + k * n] = -mpc.model.A
+        # DAQP takes bounds on z first, then rows
+        self.low = np.concatenate([np.tile(mpc.u_min, N), np.tile(mpc.x_min, N)])
+        self.high = np.concatenate([np.tile(mpc.u_max, N), np.tile(mpc.x_max, N)])
+        self.sense = np.concatenate(
+            [np.zeros(size, dtype=np.intc), np.full(N * n, 5, dtype=np.intc)]
+        )
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray | None:
+        """Return u_0 (m,), or None where the problem is infeasible."""
+        n, N = self.mpc.n_theta, self.mpc.horizon
+        initial = np.concatenate([self.mpc.model.A @ theta, np.zeros((N - 1) * n)])
+        z, _, status, _ = daqp.solve(
+            self.H,
+            np.zeros(len(self.H)),
+            self.dynamics,
+            np.concatenate([np.minimum(self.high, 1e30), initial]),
+            np.concatenate([np.maximum(self.low, -1e30), initial]),
+            self.sense,
+            primal_tol=1e-11,
+        )
+        return np.asarray(z)[: self.n_inputs] if status >= 1 else None
+
+
+def feasible_states(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` float32-exact states at which the online QP is feasible, and its inputs."""
+    online, rng = OnlineMPC(mpc), np.random.default_rng(seed)
+    states, inputs = [], []
+    while len(states) < count:
+        theta = rng.uniform(mpc.theta_min, mpc.theta_max).astype(np.float32).astype(np.float64)
+        u = online(theta)
+        if u is not None:
+            states.append(theta)
+            inputs.append(u)
+    return np.array(states), np.array(inputs)

@@ -1,0 +1,386 @@
+"""The policy in SB3: exact at the start, fed by problems of every kind, saved and loaded."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+import textwrap
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import LinearPlant, feasible_states, two_input_mpc
+from gymnasium import spaces
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+import sb3_yann
+from sb3_yann import LinearModel, LinearMPC, NoActionNoise, YannActor, YannCritic, YannPolicy
+from sb3_yann_envs import problems
+
+ENVS = ("CSTR-v0", "ClippedPendulum-v0")
+POLICIES = pytest.mark.parametrize("algorithm", [DDPG, TD3])
+
+
+def named_problem() -> LinearMPC:
+    return problems.clipped_pendulum()
+
+
+def scalar_mpc(**changes) -> LinearMPC:
+    """An unstable first-order plant: small enough to solve in a few milliseconds."""
+    design = {"Q": [[1]], "R": [[1]], "horizon": 2, "x_min": -5, "x_max": 5}
+    bounds = {"u_min": -1, "u_max": 1}
+    return LinearMPC(LinearModel([[1.1]], [[1]], 1), **{**design, **bounds, **changes})
+
+
+def build(algorithm=DDPG, mpc: LinearMPC | None = None, **kwargs):
+    mpc = scalar_mpc() if mpc is None else mpc
+    return algorithm(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc}, **kwargs)
+
+
+def test_predict_equals_an_independent_online_qp_at_ten_thousand_feasible_states(mpc) -> None:
+    model = build(mpc=mpc)
+    states, expected = feasible_states(mpc, 10_000)
+    actions, _ = model.predict(states.astype(np.float32))
+    assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+@POLICIES
+def test_our_envs_need_no_policy_kwargs_and_start_as_their_mpc(algorithm, env_id) -> None:
+    model = algorithm(YannPolicy, env_id)
+    mpc = gym.make(env_id).observation_space.problem
+    states, expected = feasible_states(mpc, 500)
+    actions, _ = model.predict(states.astype(np.float32))
+    assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
+
+
+@POLICIES
+def test_the_policy_is_known_by_name(algorithm) -> None:
+    assert isinstance(algorithm("YannPolicy", "CSTR-v0").policy, YannPolicy)
+
+
+@POLICIES
+@pytest.mark.parametrize("n_critics", [1, 2])
+def test_actor_and_critic_are_those_of_sb3_with_yann_networks(algorithm, n_critics) -> None:
+    mpc = scalar_mpc()
+    model = algorithm(
+        YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc, "n_critics": n_critics}
+    )
+    assert isinstance(model.actor, YannActor)
+    assert isinstance(model.critic, YannCritic)
+    assert len(model.critic.q_networks) == n_critics
+    model.learn(60, callback=NoActionNoise())
+
+
+def test_ddpg_has_one_critic_and_td3_two() -> None:
+    assert build(DDPG).critic.n_critics == 1
+    assert build(TD3).critic.n_critics == 2
+
+
+@pytest.mark.parametrize("make", [problems.clipped_pendulum, problems.cstr])
+@pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
+@pytest.mark.parametrize("discounted", [False, True], ids=["paper's MPC", "discounted MPC"])
+def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted) -> None:
+    base = make()
+    mpc = LinearMPC(
+        base.model,
+        Q=base.Q,
+        R=base.R,
+        horizon=2,
+        u_min=base.u_min,
+        u_max=base.u_max,
+        theta_min=base.theta_min,
+        theta_max=base.theta_max,
+        gamma=gamma if discounted else 1.0,
+    )
+    model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0)
+    model.learn(1)  # sets up the logger
+    law, rng = mpc.explicit(), np.random.default_rng(0)
+    origin = law.locate(np.zeros(mpc.n_theta))
+    stored = 0
+    model.replay_buffer.reset()
+    while stored < 2000:
+        # A third of the box around the origin: the next state is in the same region mostly.
+        theta = rng.uniform(mpc.theta_min, mpc.theta_max) / 3
+        theta = theta.astype(np.float32).astype(np.float64)
+        u = law(theta)
+        following = mpc.model.step(theta, u)
+        if law.locate(theta) != origin or law.locate(following) != origin:
+            continue
+        action = model.policy.scale_action(u.astype(np.float32))
+        reward = -mpc.stage_cost(theta, u)
+        model.replay_buffer.add(theta, following, action, reward, np.zeros(1), [{}])
+        stored += 1
+    sample = model.replay_buffer.sample(2000)
+    with th.no_grad():
+        q = model.critic.q1_forward(sample.observations, sample.actions)
+    model.train(gradient_steps=1, batch_size=2000)
+    loss = model.logger.name_to_value["train/critic_loss"]
+    assert loss < 1e-12 * float((q**2).mean())
+    assert float((q**2).mean()) > 0
+
+
+def test_the_critic_takes_the_discount_of_the_algorithm() -> None:
+    assert build(gamma=0.9).policy.gamma == 0.9
+    assert build().policy.gamma == 0.99
+    given = DDPG(
+        YannPolicy,
+        LinearPlant(scalar_mpc()),
+        gamma=0.9,
+        policy_kwargs={"problem": scalar_mpc(), "gamma": 0.95},
+    )
+    assert given.policy.gamma == 0.95
+
+
+def test_a_subclass_of_the_policy_gets_the_discount_as_well() -> None:
+    class Mine(YannPolicy):
+        def __init__(self, *args, **kwargs) -> None:
+            super().__init__(*args, **kwargs)
+
+    mpc = scalar_mpc()
+    model = DDPG(Mine, LinearPlant(mpc), gamma=0.8, policy_kwargs={"problem": mpc})
+    assert model.policy.gamma == 0.8
+
+
+def test_actor_and_critic_step_at_their_own_rates() -> None:
+    model = build(learning_rate=1e-2, learning_starts=0)
+    model.policy.actor.optimizer.param_groups[0]["lr_mult"] = 0.1
+    model.learn(2)
+    rates = []
+    for network in (model.actor, model.critic):
+        before = [p.clone() for p in network.parameters()]
+        for p in network.parameters():
+            p.grad = th.ones_like(p)
+        network.optimizer.state.clear()  # the first step of Adam is the learning rate itself
+        network.optimizer.step()
+        steps = [(b - p).detach() for b, p in zip(before, network.parameters(), strict=True)]
+        rates.append(float(steps[0].abs().max()))
+    assert rates == pytest.approx([1e-3, 1e-2], rel=1e-2)
+    assert model.actor.optimizer.param_groups[0]["lr"] == 1e-2  # SB3's own, untouched
+
+
+@pytest.mark.parametrize("frozen", ["actor", "critic"])
+def test_a_rate_of_zero_freezes_one_of_them(frozen) -> None:
+    mpc = scalar_mpc()
+    kwargs = {"problem": mpc, f"{frozen}_lr_mult": 0.0}
+    model = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs=kwargs, seed=0)
+    before = {name: p.clone() for name, p in model.policy.named_parameters()}
+    model.learn(20, callback=NoActionNoise())
+    moved = {
+        name.split(".")[0]
+        for name, p in model.policy.named_parameters()
+        if not th.equal(p, before[name])
+    }
+    assert frozen not in moved
+    assert ("actor" in moved) != (frozen == "actor")
+
+
+@pytest.mark.parametrize(
+    "reference", ["CSTR-v0", "sb3_yann_envs.problems:cstr", "my reactor", None]
+)
+def test_a_problem_may_be_an_object_a_name_or_a_reference(reference) -> None:
+    sb3_yann.register_problem("my reactor", "sb3_yann_envs.problems:cstr")
+    plant = LinearPlant(problems.cstr())
+    problem = problems.cstr() if reference is None else reference
+    model = DDPG(YannPolicy, plant, policy_kwargs={"problem": problem})
+    assert model.policy.problem == problems.cstr()
+
+
+def test_the_given_problem_goes_before_the_one_in_the_space() -> None:
+    mpc = LinearMPC(
+        problems.clipped_pendulum().model,
+        Q=np.eye(2),
+        R=[[0.001]],
+        horizon=1,
+        x_min=[-2, -8],
+        x_max=[2, 8],
+        u_min=-2,
+        u_max=2,
+    )
+    model = DDPG(YannPolicy, "ClippedPendulum-v0", policy_kwargs={"problem": mpc})
+    assert model.policy.problem is mpc
+
+
+@POLICIES
+def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, tmp_path) -> None:
+    model = algorithm(YannPolicy, "ClippedPendulum-v0", seed=0)
+    model.learn(50, callback=NoActionNoise())
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = algorithm.load(tmp_path / "model", env=gym.make("ClippedPendulum-v0"))
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    for name, value in model.policy.state_dict().items():
+        assert th.equal(value, loaded.policy.state_dict()[name]), name
+    group = loaded.actor.optimizer.param_groups[0]
+    assert group["lr_mult"] == 0.1
+    for each in (model, loaded):
+        each.set_random_seed(1)
+        each.set_logger(model.logger)
+        each.train(gradient_steps=3, batch_size=32)
+    for name, value in model.policy.state_dict().items():
+        assert th.equal(value, loaded.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("problem", [None, "CSTR-v0", "sb3_yann_envs.problems:cstr"])
+def test_a_fresh_process_predicts_without_any_solver(problem, tmp_path) -> None:
+    kwargs = {} if problem is None else {"policy_kwargs": {"problem": problem}}
+    model = DDPG(YannPolicy, "CSTR-v0" if problem is None else plain_cstr(), **kwargs)
+    model.learn(20, callback=NoActionNoise())
+    model.save(tmp_path / "model")
+    state = np.array([0.01, 0.1, -0.1, -2], dtype=np.float32)
+    script = """
+        import sys
+        for solver in ("ppopt", "cvxopt", "daqp", "gurobipy", "quadprog", "control"):
+            sys.modules[solver] = None  # an import of it now fails
+        import numpy as np
+        from stable_baselines3 import DDPG
+        model = DDPG.load(sys.argv[1])
+        print(repr(float(model.predict(np.array([0.01, 0.1, -0.1, -2], dtype=np.float32))[0][0])))
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "model")],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={"PYTHONPATH": ":".join(sys.path)},
+    )
+    assert float(done.stdout) == float(model.predict(state)[0][0])
+
+
+def plain_cstr() -> gym.Env:
+    """The reactor under a wrapper that loses the space's problem."""
+    env = gym.make("CSTR-v0")
+    env.observation_space = spaces.Box(env.observation_space.low, env.observation_space.high)
+    return env
+
+
+def test_the_policy_alone_saves_and_loads(tmp_path) -> None:
+    model = build(mpc=two_input_mpc(), gamma=0.9)
+    model.policy.save(tmp_path / "policy")
+    loaded = YannPolicy.load(tmp_path / "policy")
+    assert loaded.gamma == 0.9
+    states = np.random.default_rng(0).uniform(-5, 5, (50, 3)).astype(np.float32)
+    np.testing.assert_array_equal(loaded.predict(states)[0], model.predict(states)[0])
+
+
+def test_load_accepts_the_same_policy_kwargs_again(tmp_path) -> None:
+    mpc = scalar_mpc()
+    model = TD3(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc})
+    model.save(tmp_path / "model")
+    TD3.load(tmp_path / "model", policy_kwargs={"problem": scalar_mpc()})
+    with pytest.raises(ValueError, match="policy kwargs"):
+        TD3.load(tmp_path / "model", policy_kwargs={"problem": scalar_mpc(gamma=0.5)})
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+def test_it_trains_on_several_envs_at_once(vec_env) -> None:
+    env = make_vec_env("sb3_yann:CSTR-v0", n_envs=2, vec_env_cls=vec_env)
+    try:
+        model = DDPG(YannPolicy, env)
+        model.learn(20, callback=NoActionNoise())
+        assert model.policy.problem == problems.cstr()
+    finally:
+        env.close()
+
+
+def test_a_policy_pickles() -> None:
+    model = build()
+    again = pickle.loads(pickle.dumps(model.policy.problem))
+    assert again == model.policy.problem
+    assert again.explicit() == model.policy.problem.explicit()
+
+
+def test_constants_are_no_parameters_and_target_updates_leave_them_alone() -> None:
+    model = build()
+    learnt = {name for name, _ in model.actor.named_parameters()}
+    assert all(name.startswith("mu.network.") for name in learnt)
+    assert not any("running_" in name for name in model.policy.state_dict())
+
+
+def unbounded() -> spaces.Box:
+    return spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+
+def actions(low: float = -1, high: float = 1, size: int = 1) -> spaces.Box:
+    return spaces.Box(low, high, (size,), np.float32)
+
+
+def make_policy(observation_space, action_space, **kwargs) -> YannPolicy:
+    return YannPolicy(observation_space, action_space, lambda _: 1e-3, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("observation_space", "action_space", "error", "message"),
+    [
+        (spaces.Dict({"x": unbounded()}), actions(), TypeError, "observation_space is a Dict"),
+        (spaces.Discrete(3), actions(), TypeError, "observation_space is a Discrete"),
+        (spaces.Box(0, 255, (3, 36, 36), np.uint8), actions(), ValueError, "one dimension"),
+        (unbounded(), spaces.Discrete(2), TypeError, "action_space is a Discrete"),
+        (unbounded(), spaces.MultiDiscrete([2]), TypeError, "action_space is a MultiDiscrete"),
+        (unbounded(), unbounded(), ValueError, "must have finite bounds"),
+        (unbounded(), spaces.Box(-1, 1, (1, 1), np.float32), ValueError, "one dimension"),
+        (unbounded(), actions(-2, 1), ValueError, r"u_min = \[-1.0\]"),
+        (unbounded(), actions(size=2), ValueError, "They must be the same"),
+        (spaces.Box(-1, 1, (2,), np.float32), actions(), ValueError, r"theta of shape \(1,\)"),
+    ],
+)
+def test_spaces_that_do_not_fit_are_named(observation_space, action_space, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make_policy(observation_space, action_space, problem=scalar_mpc())
+
+
+def test_a_policy_without_a_problem_says_how_to_give_one() -> None:
+    with pytest.raises(ValueError, match=r'policy_kwargs=\{"problem": mpc\}'):
+        DDPG(YannPolicy, "Pendulum-v1")
+
+
+@pytest.mark.parametrize(
+    ("problem", "error", "message"),
+    [
+        ("no such name", ValueError, "'no such name'"),
+        ("no_such_module:mpc", ValueError, "no_such_module"),
+        ("sb3_yann_envs.problems:nothing", ValueError, "nothing"),
+        ("math:pi", TypeError, "expected a LinearMPC"),
+        (42, TypeError, "expected a LinearMPC"),
+    ],
+)
+def test_a_problem_that_cannot_be_found_is_named(problem, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make_policy(unbounded(), actions(), problem=problem)
+
+
+def test_a_law_without_input_bounds_is_no_policy() -> None:
+    with pytest.raises(ValueError, match="u_min"):
+        make_policy(unbounded(), actions(), problem=scalar_mpc(u_min=None, u_max=None))
+
+
+@pytest.mark.parametrize("algorithm", [SAC, PPO])
+def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
+    mpc = scalar_mpc()
+    with pytest.raises(TypeError, match=algorithm.__name__):
+        algorithm(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc})
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"actor_lr_mult": -1}, ValueError, "actor_lr_mult"),
+        ({"critic_lr_mult": float("nan")}, ValueError, "critic_lr_mult"),
+        ({"gamma": 1.5}, ValueError, "gamma"),
+        ({"hidden": 3}, TypeError, "'hidden'"),
+        ({"net_arch": {"pi": [4, 4, 4], "qf": [8, 8]}}, ValueError, "hidden"),
+        ({"activation_fn": th.nn.Sigmoid}, ValueError, "activation"),
+    ],
+)
+def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make_policy(unbounded(), actions(), problem=scalar_mpc(), **kwargs)
+
+
+def test_a_name_for_a_problem_must_be_a_name() -> None:
+    with pytest.raises(ValueError, match="colon|':'"):
+        sb3_yann.register_problem("a:b", problems.cstr)

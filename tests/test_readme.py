@@ -1,0 +1,32 @@
+"""The README's Python runs as it stands."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import gymnasium as gym
+from conftest import LinearPlant
+
+from sb3_yann import LinearModel, LinearMPC
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = "\n".join(re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))
+    shortened = code.replace("20_000", "500").replace(", progress_bar=True", "")
+    assert shortened != code
+    exec(compile(shortened, "README.md", "exec"), {"env": double_integrator()})
+    assert (tmp_path / "law.npz").exists()
+
+
+def double_integrator() -> gym.Env:
+    """Return the README's plant, as the env that its reader brings."""
+    plant = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
+    return LinearPlant(
+        LinearMPC(
+            plant, Q=[[1, 0], [0, 1]], R=[[0.1]], horizon=1, x_min=-5, x_max=5, u_min=-1, u_max=1
+        )
+    )
