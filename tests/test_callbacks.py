@@ -88,7 +88,7 @@ def test_a_loaded_model_does_not_explore_either(tmp_path) -> None:
 
 
 def test_training_starts_at_once_and_still_without_noise() -> None:
-    model, env = noisy(gradient_steps=1)
+    model, _ = noisy(gradient_steps=1)
     model.learn(5, callback=NoActionNoise())
     assert model._n_updates == 5
 
@@ -96,10 +96,14 @@ def test_training_starts_at_once_and_still_without_noise() -> None:
 def test_running_without_learning_leaves_the_random_state_of_the_process_alone() -> None:
     model, _ = noisy()
     model.learn(1, callback=NoActionNoise())
-    before = random.getstate(), np.random.get_state()[1].tolist(), th.get_rng_state().tolist()
+    before = random_states()
     model.learn(250, callback=[NoActionNoise(), ControlDiagnostics()])
-    after = random.getstate(), np.random.get_state()[1].tolist(), th.get_rng_state().tolist()
-    assert before == after
+    assert random_states() == before
+
+
+def random_states() -> list[object]:
+    legacy = np.random.get_state()[1].tolist()  # noqa: NPY002
+    return [random.getstate(), legacy, th.get_rng_state().tolist()]
 
 
 def test_an_on_policy_algorithm_is_refused() -> None:
@@ -148,7 +152,7 @@ def test_violations_are_counted(tmp_path) -> None:
 
 
 def test_the_critic_error_compares_q_with_the_return_that_followed() -> None:
-    model, env = noisy(env=FixedRewards(gym.make("ClippedPendulum-v0")), gamma=0.5)
+    model, _ = noisy(env=FixedRewards(gym.make("ClippedPendulum-v0")), gamma=0.5)
     states: list[np.ndarray] = []
     diagnostics = ControlDiagnostics()
     record = diagnostics._record_critic_error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from io import StringIO
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -65,9 +67,8 @@ def fake(costs: list[float]) -> Episodes:
 
 
 def test_the_table_shows_losses_as_well_as_gains() -> None:
-    console = Console(record=True, width=100, file=open("/dev/null", "w"))  # noqa: SIM115
-    with console.file:
-        console.print(comparison_table("costs", fake([10.0, 20.0]), fake([9.0, 27.0])))
+    console = Console(record=True, width=100, file=StringIO())
+    console.print(comparison_table("costs", fake([10.0, 20.0]), fake([9.0, 27.0])))
     text = console.export_text()
     assert "-1.00" in text
     assert "+7.00" in text

@@ -147,20 +147,17 @@ def test_a_subclass_of_the_policy_gets_the_discount_as_well() -> None:
 
 
 def test_actor_and_critic_step_at_their_own_rates() -> None:
-    model = build(learning_rate=1e-2, learning_starts=0)
-    model.policy.actor.optimizer.param_groups[0]["lr_mult"] = 0.1
-    model.learn(2)
-    rates = []
-    for network in (model.actor, model.critic):
+    mpc = scalar_mpc()
+    kwargs = {"problem": mpc, "actor_lr_mult": 0.1, "critic_lr_mult": 0.5}
+    model = DDPG(YannPolicy, LinearPlant(mpc), learning_rate=1e-2, policy_kwargs=kwargs)
+    for network, rate in ((model.actor, 1e-3), (model.critic, 5e-3)):
         before = [p.clone() for p in network.parameters()]
         for p in network.parameters():
             p.grad = th.ones_like(p)
-        network.optimizer.state.clear()  # the first step of Adam is the learning rate itself
-        network.optimizer.step()
-        steps = [(b - p).detach() for b, p in zip(before, network.parameters(), strict=True)]
-        rates.append(float(steps[0].abs().max()))
-    assert rates == pytest.approx([1e-3, 1e-2], rel=1e-2)
-    assert model.actor.optimizer.param_groups[0]["lr"] == 1e-2  # SB3's own, untouched
+        network.optimizer.step()  # the first step of Adam is the learning rate itself
+        for old, new in zip(before, network.parameters(), strict=True):
+            np.testing.assert_allclose((old - new).detach(), rate, rtol=1e-3)
+        assert network.optimizer.param_groups[0]["lr"] == 1e-2  # SB3's own, untouched
 
 
 @pytest.mark.parametrize("frozen", ["actor", "critic"])
@@ -216,7 +213,7 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, tmp_path
     for name, value in model.policy.state_dict().items():
         assert th.equal(value, loaded.policy.state_dict()[name]), name
     group = loaded.actor.optimizer.param_groups[0]
-    assert group["lr_mult"] == 0.1
+    assert group["lr_mult"] == 0.01
     for each in (model, loaded):
         each.set_random_seed(1)
         each.set_logger(model.logger)
@@ -382,5 +379,5 @@ def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> No
 
 
 def test_a_name_for_a_problem_must_be_a_name() -> None:
-    with pytest.raises(ValueError, match="colon|':'"):
+    with pytest.raises(ValueError, match="'a:b'"):
         sb3_yann.register_problem("a:b", problems.cstr)

@@ -1,0 +1,177 @@
+"""RL Zoo trains, continues and replays our policy from the hyperparameters that are shipped."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import yaml
+from conftest import LinearPlant, feasible_states
+from stable_baselines3 import DDPG, TD3
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import sb3_yann
+import sb3_yann_envs
+
+ALGORITHMS = {"ddpg": DDPG, "td3": TD3}
+EPISODE = {"CSTR-v0": 400, "ClippedPendulum-v0": 200}
+NOT_THE_MODEL_S = {"n_timesteps", "callback"}  # what the zoo itself uses of an entry
+HYPERPARAMETERS = files("sb3_yann") / "hyperparams"
+
+ENTRIES = pytest.mark.parametrize(
+    ("algo", "env_id"), [(algo, env_id) for algo in ALGORITHMS for env_id in EPISODE]
+)
+
+
+def entry_of(algo: str, env_id: str) -> dict:
+    return yaml.safe_load((HYPERPARAMETERS / f"{algo}.yml").read_text(encoding="utf-8"))[env_id]
+
+
+def build(algo: str, env_id: str, env: gym.Env | str, **changes):
+    """Return the model that the entry describes; an unknown key is a TypeError."""
+    entry = {k: v for k, v in entry_of(algo, env_id).items() if k not in NOT_THE_MODEL_S}
+    entry["policy_kwargs"] = {**entry["policy_kwargs"], **changes.pop("policy_kwargs", {})}
+    return ALGORITHMS[algo](env=env, seed=0, **entry, **changes)
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_each_file_has_an_entry_for_every_environment_and_no_other(algo) -> None:
+    entries = yaml.safe_load((HYPERPARAMETERS / f"{algo}.yml").read_text(encoding="utf-8"))
+    assert set(entries) == set(EPISODE)
+
+
+@ENTRIES
+def test_an_entry_builds_a_model_that_starts_as_the_mpc(algo, env_id) -> None:
+    model = build(algo, env_id, env_id)
+    mpc = model.policy.problem
+    states, expected = feasible_states(mpc, 200)
+    actions, _ = model.predict(states.astype(np.float32))
+    assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
+
+
+@ENTRIES
+def test_the_critic_of_an_entry_starts_exact_on_the_linear_plant(algo, env_id) -> None:
+    mpc = gym.make(env_id).observation_space.problem
+    plant = LinearPlant(mpc, start=0.01)  # stays in the region that holds the origin
+    model = build(algo, env_id, plant, policy_kwargs={"problem": mpc}, gradient_steps=0)
+    model.learn(50, callback=sb3_yann.NoActionNoise())
+    sample = model.replay_buffer.sample(50)
+    q = model.critic.q1_forward(sample.observations, sample.actions).detach()
+    size = float(q.square().mean())
+    model.train(gradient_steps=1, batch_size=50)
+    # Measured 1e-14; with TD3's default target_policy_noise it is above 100.
+    assert model.logger.name_to_value["train/critic_loss"] < 1e-10 * size
+
+
+@ENTRIES
+def test_an_entry_runs_for_fifty_episodes_without_noise_and_with_diagnostics(algo, env_id) -> None:
+    entry = entry_of(algo, env_id)
+    assert entry["n_timesteps"] == 50 * gym.spec(env_id).max_episode_steps
+    assert {"sb3_yann.NoActionNoise", "sb3_yann.ControlDiagnostics"} <= set(entry["callback"])
+
+
+@dataclass
+class Run:
+    """One run of ``rl_zoo3.train``."""
+
+    algo: str
+    env_id: str
+    folder: Path
+
+    def zoo(self, script: str, *arguments: str) -> str:
+        """Run a script of the zoo in the folder, return what it printed."""
+        packages = (Path(package.__file__).parents[1] for package in (sb3_yann, sb3_yann_envs))
+        command = [sys.executable, "-m", f"rl_zoo3.{script}", "--gym-packages", "sb3_yann"]
+        command += ["--algo", self.algo, "--env", self.env_id, "-f", "logs", "--seed", "0"]
+        done = subprocess.run(
+            [*command, *arguments],
+            cwd=self.folder,
+            env={
+                **os.environ,
+                "OMP_NUM_THREADS": "1",
+                "PYTHONPATH": os.pathsep.join(str(package) for package in packages),
+            },
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def train(self, *arguments: str) -> None:
+        with as_file(HYPERPARAMETERS / f"{self.algo}.yml") as conf_file:
+            self.zoo("train", "--conf-file", str(conf_file), *arguments)
+
+    def log(self, number: int = 1) -> Path:
+        return self.folder / "logs" / self.algo / f"{self.env_id}_{number}"
+
+    def model(self, number: int = 1):
+        return ALGORITHMS[self.algo].load(self.log(number) / f"{self.env_id}.zip")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[("ddpg", "CSTR-v0"), ("td3", "ClippedPendulum-v0")],
+    ids=["ddpg-CSTR", "td3-pendulum"],
+)
+def run(request, tmp_path_factory) -> Run:
+    """Return a run of one episode, evaluated at its end."""
+    run = Run(*request.param, tmp_path_factory.mktemp("zoo"))
+    steps = str(EPISODE[run.env_id])
+    evaluation = ["--eval-freq", steps, "--eval-episodes", "1"]
+    run.train("-n", steps, "--tensorboard-log", "tb", "--log-interval", "1", *evaluation)
+    return run
+
+
+def test_a_trained_model_loads_without_solving_its_problem_again(run, monkeypatch) -> None:
+    monkeypatch.delattr("sb3_yann.control.mpc.solve_explicit")
+    model = run.model()
+    mpc = model.policy.problem
+    assert model.num_timesteps == EPISODE[run.env_id]
+    assert isinstance(model.policy, sb3_yann.YannPolicy)
+    assert np.all(np.abs(model.predict(np.zeros((1, mpc.n_theta), np.float32))[0]) <= mpc.u_max)
+
+
+def test_no_training_step_explored(run) -> None:
+    model = run.model()
+    assert model.action_noise is None
+    assert model.learning_starts == 0
+
+
+def test_evaluation_keeps_the_best_model_and_the_rewards(run) -> None:
+    assert (run.log() / "best_model.zip").is_file()
+    assert np.load(run.log() / "evaluations.npz")["results"].shape == (1, 1)
+
+
+def test_tensorboard_gets_the_diagnostics_of_control(run) -> None:
+    (events,) = (run.folder / "tb").rglob("events.out.tfevents.*")
+    scalars = EventAccumulator(str(events)).Reload()
+    names = {name for name in scalars.Tags()["scalars"] if name.startswith("yann/")}
+    assert {"yann/distance_from_mpc_max", "yann/violations", "yann/critic_error"} <= names
+    assert scalars.Scalars("yann/violations")[-1].value == 0
+
+
+def test_training_continues_from_a_saved_model(run) -> None:
+    before = run.model()
+    run.train("-n", "5", "-i", str(run.log() / f"{run.env_id}.zip"))
+    assert run.model(2).policy.problem == before.policy.problem
+    assert run.model(2)._n_updates > before._n_updates
+
+
+def test_enjoy_replays_the_trained_model(run) -> None:
+    steps = str(EPISODE[run.env_id])
+    run.zoo("enjoy", "--exp-id", "1", "--no-render", "-n", steps, "--reward-log", "rewards")
+    with (run.folder / "rewards" / "0.monitor.csv").open() as file:
+        next(file)  # a comment
+        (episode,) = csv.DictReader(file)
+    assert episode["l"] == steps
+    assert np.isfinite(float(episode["r"]))
