@@ -129,9 +129,9 @@ class YannPolicy(TD3Policy):
         or two hidden layers for each region of the actor, and for each critic.
     activation_fn : type, default torch.nn.Tanh
         An activation that is 0 at 0.
-    actor_lr_mult, critic_lr_mult : float, default 0.01 and 0.1
-        Learning rates of actor and critic, as multiples of the algorithm's ``learning_rate``. Small
-        steps keep both near what they are at the start; 0 freezes.
+    actor_lr_mult, critic_lr_mult : float, default 0.1 and 1
+        Learning rates of actor and critic, as multiples of the algorithm's ``learning_rate``; 0
+        freezes.
     n_critics : int, default 2
         TD3's two critics; DDPG sets 1.
     features_extractor_class, features_extractor_kwargs, normalize_images, share_features_extractor
@@ -161,8 +161,8 @@ class YannPolicy(TD3Policy):
         gamma: float | None = None,
         net_arch: dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.Tanh,
-        actor_lr_mult: float = 0.01,
-        critic_lr_mult: float = 0.1,
+        actor_lr_mult: float = 0.1,
+        critic_lr_mult: float = 1.0,
         n_critics: int = 2,
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,

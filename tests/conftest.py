@@ -1,11 +1,11 @@
-"""Problems, plants and an independent online QP that several tests share."""
+"""Problems and plants that several tests share."""
 
 from __future__ import annotations
 
-import daqp
 import gymnasium as gym
 import numpy as np
 import pytest
+from online_mpc import OnlineMPC
 
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann_envs import problems
@@ -76,50 +76,6 @@ PROBLEMS = {
 @pytest.fixture(scope="session", params=PROBLEMS, ids=lambda name: name.replace(" ", "-"))
 def mpc(request) -> LinearMPC:
     return PROBLEMS[request.param]()
-
-
-class OnlineMPC:
-    """The MPC solved at each state as a QP in inputs *and* states, by DAQP; nothing condensed."""
-
-    def __init__(self, mpc: LinearMPC) -> None:
-        n, m, N = mpc.n_theta, mpc.model.n_inputs, mpc.horizon
-        self.mpc, self.n_inputs = mpc, m
-        stage = [mpc.gamma**k * mpc.R for k in range(N)]
-        states = [mpc.gamma**k * mpc.Q for k in range(1, N)]
-        states.append(mpc.gamma**N * mpc.terminal_cost)
-        size = N * (n + m)  # z = (u_0 .. u_{N-1}, x_1 .. x_N)
-        self.H = np.zeros((size, size))
-        for k in range(N):
-            u, x = slice(k * m, (k + 1) * m), slice(N * m + k * n, N * m + (k + 1) * n)
-            self.H[u, u], self.H[x, x] = 2 * stage[k], 2 * states[k]
-        self.dynamics = np.zeros((N * n, size))
-        for k in range(N):
-            rows = slice(k * n, (k + 1) * n)
-            self.dynamics[rows, N * m + k * n : N * m + (k + 1) * n] = np.eye(n)
-            self.dynamics[rows, k * m : (k + 1) * m] = -mpc.model.B
-            if k:
-                self.dynamics[rows, N * m + (k - 1) * n : N * m + k * n] = -mpc.model.A
-        # DAQP takes bounds on z first, then rows
-        self.low = np.concatenate([np.tile(mpc.u_min, N), np.tile(mpc.x_min, N)])
-        self.high = np.concatenate([np.tile(mpc.u_max, N), np.tile(mpc.x_max, N)])
-        self.sense = np.concatenate(
-            [np.zeros(size, dtype=np.intc), np.full(N * n, 5, dtype=np.intc)]
-        )
-
-    def __call__(self, theta: np.ndarray) -> np.ndarray | None:
-        """Return u_0 (m,), or None where the problem is infeasible."""
-        n, N = self.mpc.n_theta, self.mpc.horizon
-        initial = np.concatenate([self.mpc.model.A @ theta, np.zeros((N - 1) * n)])
-        z, _, status, _ = daqp.solve(
-            self.H,
-            np.zeros(len(self.H)),
-            self.dynamics,
-            np.concatenate([np.minimum(self.high, 1e30), initial]),
-            np.concatenate([np.maximum(self.low, -1e30), initial]),
-            self.sense,
-            primal_tol=1e-11,
-        )
-        return np.asarray(z)[: self.n_inputs] if status >= 1 else None
 
 
 def feasible_states(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -213,7 +213,7 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, tmp_path
     for name, value in model.policy.state_dict().items():
         assert th.equal(value, loaded.policy.state_dict()[name]), name
     group = loaded.actor.optimizer.param_groups[0]
-    assert group["lr_mult"] == 0.01
+    assert group["lr_mult"] == 0.1
     for each in (model, loaded):
         each.set_random_seed(1)
         each.set_logger(model.logger)

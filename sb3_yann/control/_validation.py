@@ -21,12 +21,13 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array:
     ValueError
         If the shape is another one or an entry is NaN or infinite.
     """
-    array = _to_float(name, value)
+    array = to_float(name, value)
     if array.ndim != len(shape) or any(
         want is not None and got != want for got, want in zip(array.shape, shape, strict=True)
     ):
-        wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
-        raise ValueError(f"{name} has shape {array.shape}, expected {wanted}.")
+        sizes = ["any" if size is None else str(size) for size in shape]
+        wanted = ", ".join(sizes) if len(sizes) > 1 else f"{sizes[0]},"
+        raise ValueError(f"{name} has shape {array.shape}, expected ({wanted}).")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds NaN or infinite entries: {array.tolist()}.")
     return _frozen(array)
@@ -84,7 +85,7 @@ def as_bounds(
 
 def as_positive(name: str, value: float) -> float:
     """Return ``value`` as a finite float above zero."""
-    number = float(_to_float(name, value).reshape(()))
+    number = _number(name, value)
     if not (np.isfinite(number) and number > 0):
         raise ValueError(f"{name} = {value!r} must be a finite number above 0.")
     return number
@@ -92,10 +93,36 @@ def as_positive(name: str, value: float) -> float:
 
 def as_discount(value: float) -> float:
     """Return ``value`` as a discount factor in (0, 1]."""
-    number = float(_to_float("gamma", value).reshape(()))
+    number = _number("gamma", value)
     if not 0 < number <= 1:
         raise ValueError(f"gamma = {value!r} must lie in (0, 1].")
     return number
+
+
+def to_float(name: str, value: Any) -> Array:
+    """Return ``value`` as a new float64 array of any shape.
+
+    Raises
+    ------
+    TypeError
+        If it does not convert to real numbers.
+    """
+    try:
+        if np.iscomplexobj(value):
+            raise TypeError("it is complex")
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} = {value!r} is not an array of real numbers ({error}).") from None
+
+
+class ReadOnlyArrays:
+    """Keeps the arrays of a frozen dataclass read-only in its copies and after unpickling."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+        self.__dict__.update(state)
 
 
 def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
@@ -106,7 +133,7 @@ def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:
     if value is None:
         return _frozen(np.full(size, missing))
-    array = _to_float(name, value)
+    array = to_float(name, value)
     if array.ndim == 0:
         array = np.full(size, float(array))
     if array.shape != (size,):
@@ -116,13 +143,14 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
     return _frozen(array)
 
 
-def _to_float(name: str, value: Any) -> Array:
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} = {value!r} is not an array of real numbers: {error}.") from None
+def _number(name: str, value: float) -> float:
+    array = to_float(name, value)
+    if array.size != 1:
+        raise ValueError(f"{name} = {value!r} must be a single number.")
+    return float(array.reshape(()))
 
 
 def _frozen(array: Array) -> Array:
+    array[array == 0] = 0.0  # -0.0 equals 0.0 but has other bytes; equal objects share a hash
     array.setflags(write=False)
     return array

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,15 +59,18 @@ class ParametricQP:
         return np.asarray(U) if status == 1 else None
 
     def scaled(self, center: Array, half: Array, reach: Array) -> ParametricQP:
-        """Return the same program in ``U / reach`` and ``(theta - center) / half``."""
+        """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows."""
         size = np.mean(np.diag(self.H) * reach**2)
+        G, S = self.G * reach, self.S * half
+        length = np.linalg.norm(np.hstack([G, S]), axis=1)
+        length[length == 0] = 1.0
         return ParametricQP(
             H=self.H * np.outer(reach, reach) / size,
             F=self.F * np.outer(reach, half) / size,
             c=(self.c + self.F @ center) * reach / size,
-            G=self.G * reach,
-            w=self.w + self.S @ center,
-            S=self.S * half,
+            G=G / length[:, None],
+            w=(self.w + self.S @ center) / length,
+            S=S / length[:, None],
             theta_min=(self.theta_min - center) / half,
             theta_max=(self.theta_max - center) / half,
         )
@@ -120,17 +124,16 @@ def solve_explicit(
     offsets = np.stack([reach[:m] * region.offset[:m] for region in regions]) - gains @ center
     A = np.concatenate([region.A / half for region in regions])
     b = np.concatenate([region.b for region in regions]) + A @ center
-    length = np.linalg.norm(A, axis=1)
     return PiecewiseAffine(
         gains=gains,
         offsets=offsets,
-        A=A / length[:, None],
-        b=b / length,
+        A=A,
+        b=b,
         starts=np.cumsum([0, *(len(region.b) for region in regions[:-1])]),
-        u_min=u_min.copy(),
-        u_max=u_max.copy(),
-        theta_min=program.theta_min.copy(),
-        theta_max=program.theta_max.copy(),
+        u_min=u_min,
+        u_max=u_max,
+        theta_min=program.theta_min,
+        theta_max=program.theta_max,
         outside=outside,
     )
 
@@ -194,27 +197,34 @@ def _check(program: ParametricQP, regions: list[_Region], center: Array, half: A
     """Check the regions against the program they came from, without trusting ppopt.
 
     An independent QP is solved at the innermost point of every region, which finds wrong thin
-    regions that random points miss. At random points of the box the law must satisfy the
-    Karush-Kuhn-Tucker conditions, and where no region lies the QP must be infeasible. Everything
-    is in scaled units, so the tolerances are relative to the box and the input range.
+    regions that random points miss. At random points of the box, and at a point just across every
+    facet, which finds thin gaps, the law must satisfy the Karush-Kuhn-Tucker conditions, and where
+    no region lies the QP must be infeasible. Everything is in scaled units, so the tolerances are
+    relative to the box and the input range.
     """
+    if not regions:
+        _fail("no region was found", center)
     for index, region in enumerate(regions):
-        inner = _innermost(region)
+        inner, _ = _innermost(region)
         U = program.solve(inner)
         if U is None or np.max(np.abs(U - region.gain @ inner - region.offset)) > 1e-6:
             _fail(f"the law of region {index} is not optimal inside it", inner * half + center)
 
     n = program.F.shape[1]
-    for point in np.random.default_rng(0).uniform(-1, 1, (200 * n, n)):
-        slacks = [np.min(region.b - region.A @ point) for region in regions]
-        best = int(np.argmax(slacks)) if slacks else -1
-        if best >= 0 and slacks[best] >= 0:
+    points = [*np.random.default_rng(0).uniform(-1, 1, (200 * n, n))]
+    points += [point for region in regions for point in _across_facets(region)]
+    A, b = (np.concatenate([getattr(region, name) for region in regions]) for name in "Ab")
+    starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
+    for point in points:
+        slacks = np.minimum.reduceat(b - A @ point, starts)
+        best = int(np.argmax(slacks))
+        if slacks[best] >= 0:
             U = regions[best].gain @ point + regions[best].offset
             if _kkt_residual(program, point, U) > 1e-6:
                 _fail(
                     f"the law of region {best} violates the KKT conditions", point * half + center
                 )
-        elif (best < 0 or slacks[best] < -1e-6) and program.solve(point) is not None:
+        elif slacks[best] < -1e-6 and program.solve(point) is not None:
             _fail("no region covers a feasible parameter", point * half + center)
 
 
@@ -228,13 +238,35 @@ def _kkt_residual(program: ParametricQP, theta: Array, U: Array) -> float:
     return float(max(-slack.min(initial=0.0), stationarity / size))
 
 
-def _innermost(region: _Region) -> Array:
-    """Return the centre of the largest ball inside a region (its rows have unit length)."""
+def _across_facets(region: _Region, step: float = 1e-5) -> Iterator[Array]:
+    """Yield a point just across the middle of each facet of a region, inside the unit box."""
+    for index, normal in enumerate(region.A):
+        middle, distance = _innermost(region, facet=index)
+        point = middle + step * normal
+        # A half-space that only touches the region has no facet to cross.
+        if distance > step and np.max(np.abs(point)) <= 1:
+            yield point
+
+
+def _innermost(region: _Region, facet: int | None = None) -> tuple[Array, float]:
+    """Return the point of a region, or of one facet, farthest from its (other) half-spaces.
+
+    With it comes the distance, negative for an empty facet (the rows have unit length).
+    """
     n = region.A.shape[1]
     rows = np.hstack([region.A, np.ones((len(region.b), 1))])
+    if facet is not None:
+        rows[facet, -1] = 0.0
     cost = np.append(np.zeros(n), -1.0)
-    ball = optimize.linprog(cost, A_ub=rows, b_ub=region.b, bounds=[(None, None)] * (n + 1))
-    return np.asarray(ball.x[:n])
+    ball = optimize.linprog(
+        cost,
+        A_ub=rows,
+        b_ub=region.b,
+        A_eq=None if facet is None else rows[[facet]],
+        b_eq=None if facet is None else region.b[[facet]],
+        bounds=[(None, None)] * (n + 1),
+    )
+    return np.asarray(ball.x[:n]), float(ball.x[-1])
 
 
 def _fail(what: str, theta: Array) -> None:

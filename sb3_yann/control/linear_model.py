@@ -8,11 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann.control._validation import Array, as_array, as_positive, same_fields
+from sb3_yann.control._validation import (
+    Array,
+    ReadOnlyArrays,
+    as_array,
+    as_positive,
+    same_fields,
+)
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class LinearModel:
+class LinearModel(ReadOnlyArrays):
     """The plant near an operating point: ``x[k+1] = A x[k] + B u[k]``, sampled every ``dt``.
 
     ``x`` and ``u`` are deviations from the operating point ``(x_ss, u_ss)``. Arrays are stored

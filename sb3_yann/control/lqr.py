@@ -24,24 +24,24 @@ def riccati(model: LinearModel, Q: Array, R: Array, gamma: float = 1.0) -> Array
         If a mode that the discount does not make stable cannot be reached by any input, or the
         cost does not see a mode on the unit circle: no stabilising solution exists.
     """
-    root = np.sqrt(gamma)
-    _require_stabilisable(root * model.A, root * model.B)
+    A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
     try:
-        P = linalg.solve_discrete_are(root * model.A, root * model.B, Q, R)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(
-            f"The Riccati equation has no stabilising solution ({error}): a mode on the unit "
-            "circle carries no weight in Q. Give it a positive weight, or use gamma < 1."
-        ) from None
+        P = linalg.solve_discrete_are(A, B, Q, R)
+        radius = _spectral_radius(A - B @ gain(model, R, P, gamma))
+    except (np.linalg.LinAlgError, ValueError):
+        radius = np.inf
+    # SciPy also returns matrices that do not stabilise, where a mode on the unit circle cannot be
+    # reached or has no weight; the closed loop then keeps it there to rounding.
+    if not radius < 1 - 1e-9:
+        raise ValueError(_why_no_solution(A, B))
     return np.asarray((P + P.T) / 2)
 
 
 def gain(model: LinearModel, R: Array, P: Array, gamma: float = 1.0) -> Array:
     """Return K (m, n) such that ``u = -K x`` minimises ``u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
     PB = P @ model.B
-    return np.asarray(
-        linalg.solve(R + gamma * model.B.T @ PB, gamma * PB.T @ model.A, assume_a="pos")
-    )
+    factor = linalg.cho_factor(R + gamma * model.B.T @ PB)
+    return np.asarray(linalg.cho_solve(factor, gamma * PB.T @ model.A))
 
 
 def policy_value(model: LinearModel, Q: Array, R: Array, K: Array, gamma: float) -> Array:
@@ -58,7 +58,7 @@ def policy_value(model: LinearModel, Q: Array, R: Array, K: Array, gamma: float)
         If the discounted closed loop is not stable, so that the cost is infinite.
     """
     closed = np.sqrt(gamma) * (model.A - model.B @ K)
-    radius = float(np.max(np.abs(np.linalg.eigvals(closed))))
+    radius = _spectral_radius(closed)
     if radius >= 1:
         raise ValueError(
             f"The law u = -K x with K = {K.tolist()} has infinite cost: the spectral radius of "
@@ -80,16 +80,23 @@ def state_action_matrix(model: LinearModel, Q: Array, R: Array, P: Array, gamma:
     return np.asarray(linalg.block_diag(Q, R) + gamma * AB.T @ P @ AB)
 
 
-def _require_stabilisable(A: Array, B: Array) -> None:
-    """Raise unless every mode on or outside the unit circle can be reached (Hautus' test)."""
+def _spectral_radius(matrix: Array) -> float:
+    return float(np.max(np.abs(np.linalg.eigvals(matrix))))
+
+
+def _why_no_solution(A: Array, B: Array) -> str:
+    """Say which of the two conditions of the Riccati equation fails (Hautus' test)."""
     n = A.shape[0]
     for pole in np.linalg.eigvals(A):
-        if abs(pole) < 1:
-            continue
         hautus = np.hstack([pole * np.eye(n) - A, B])
-        if np.linalg.svd(hautus, compute_uv=False)[-1] < 1e-10 * max(1.0, np.abs(hautus).max()):
-            raise ValueError(
+        smallest = np.linalg.svd(hautus, compute_uv=False)[-1]
+        if abs(pole) > 1 - 1e-9 and smallest < 1e-10 * max(1.0, np.abs(hautus).max()):
+            return (
                 f"The model has an unstable mode that no input reaches: eigenvalue {pole:.6g} of "
                 "sqrt(gamma) A is not controllable, so the Riccati equation has no solution. "
                 "Remove the mode from the model, add an input, or use a smaller gamma."
             )
+    return (
+        "The Riccati equation has no stabilising solution: a mode on the unit circle carries no "
+        "weight in Q. Give it a positive weight, use gamma < 1, or pass terminal_cost."
+    )

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from sb3_yann.control import lqr
 from sb3_yann.control._validation import (
     Array,
+    ReadOnlyArrays,
     as_array,
     as_bounds,
     as_discount,
@@ -23,7 +24,7 @@ from sb3_yann.control.piecewise_affine import OUTSIDE, PiecewiseAffine
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class LinearMPC:
+class LinearMPC(ReadOnlyArrays):
     r"""The linear MPC problem, in deviations from the model's operating point.
 
     .. math::
@@ -106,7 +107,7 @@ class LinearMPC:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         n, m = model.n_states, model.n_inputs
-        if outside not in OUTSIDE:
+        if not (isinstance(outside, str) and outside in OUTSIDE):
             raise ValueError(f"outside = {outside!r} must be one of {OUTSIDE}.")
         values: dict[str, object] = {"model": model, "outside": outside}
         values["horizon"] = _as_horizon(horizon)
@@ -155,7 +156,9 @@ class LinearMPC:
         """
         law = self.explicit()
         origin = np.zeros(self.n_theta)
-        if not law.in_domain(origin) or np.max(np.abs(law(origin))) > 1e-9:
+        width = self.u_max - self.u_min
+        rest = 1e-9 * np.where(np.isfinite(width), width, 1.0)
+        if not law.in_domain(origin) or np.any(np.abs(law(origin)) > rest):
             raise ValueError(
                 "The law does not rest at the origin: theta = 0 must be feasible with u = 0. "
                 "Choose an operating point inside the bounds."

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from os import PathLike, fspath, replace
+from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann.control._validation import Array, same_fields
+from sb3_yann.control._validation import (
+    Array,
+    ReadOnlyArrays,
+    as_array,
+    as_bounds,
+    same_fields,
+    to_float,
+)
 
 OUTSIDE = ("nearest", "zero")
 
 
 @dataclass(frozen=True, eq=False)
-class PiecewiseAffine:
+class PiecewiseAffine(ReadOnlyArrays):
     """The law ``u = gains[i] theta + offsets[i]`` for theta in region i, total and bounded.
 
     One region is chosen at every theta: the one whose smallest slack ``b - A theta`` over its own
@@ -34,7 +42,8 @@ class PiecewiseAffine:
     gains : ndarray, shape (p, m, n)
     offsets : ndarray, shape (p, m)
     A : ndarray, shape (q, n)
-        Half-spaces ``A theta <= b`` of all regions, region after region, rows of unit length.
+        Half-spaces ``A theta <= b`` of all regions, region after region. A slack ``b - A theta``
+        is a distance in half-widths of the box: whatever the units of theta, the law is the same.
     b : ndarray, shape (q,)
     starts : ndarray of int, shape (p,)
         The first row of each region in ``A``.
@@ -56,29 +65,33 @@ class PiecewiseAffine:
     theta_max: Array
     outside: str = "nearest"
 
-    # How far outside every region a point may lie, in the units of theta, and still count as
+    # How far outside every region a point may lie, in half-widths of the box, and still count as
     # inside: facets of neighbours agree to rounding only.
     tolerance = 1e-8
 
     def __post_init__(self) -> None:
-        """Check the shapes against each other and make the arrays read-only."""
-        p, m, n = self.gains.shape
-        q = self.A.shape[0]
-        expected = {
-            **{"offsets": (p, m), "A": (q, n), "b": (q,), "starts": (p,)},
-            **{"u_min": (m,), "u_max": (m,), "theta_min": (n,), "theta_max": (n,)},
-        }
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(
-                    f"{name} has shape {getattr(self, name).shape}, expected {shape} "
-                    f"for gains of shape {self.gains.shape}."
-                )
+        """Check the arrays against each other and store them as read-only float64."""
+        gains = as_array("gains", self.gains, (None, None, None))
+        p, m, n = gains.shape
+        A = as_array("A", self.A, (None, n))
+        values = {"gains": gains, "A": A, "b": as_array("b", self.b, (len(A),))}
+        values["offsets"] = as_array("offsets", self.offsets, (p, m))
+        values["u_min"], values["u_max"] = as_bounds("u", self.u_min, self.u_max, m)
+        values["theta_min"], values["theta_max"] = as_bounds(
+            "theta", self.theta_min, self.theta_max, n
+        )
         if self.outside not in OUTSIDE:
             raise ValueError(f"outside = {self.outside!r} must be one of {OUTSIDE}.")
-        for field in fields(self):
-            if field.name != "outside":
-                getattr(self, field.name).setflags(write=False)
+        rows = as_array("starts", self.starts, (p,))
+        if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):
+            raise ValueError(
+                f"starts = {rows.tolist()} must be the first row of each region in A, which has "
+                f"{len(A)} rows: whole numbers that increase from 0 on."
+            )
+        starts = rows.astype(np.int64)
+        starts.setflags(write=False)
+        for name, value in {**values, "starts": starts}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def n_regions(self) -> int:
@@ -105,8 +118,8 @@ class PiecewiseAffine:
 
         Raises
         ------
-        ValueError
-            If theta has another shape or holds NaN or infinite entries.
+        TypeError, ValueError
+            If theta is not numeric, has another shape or holds NaN or infinite entries.
         """
         points = self._as_theta(theta)
         slack = self._smallest_slack(points)
@@ -129,9 +142,12 @@ class PiecewiseAffine:
     def save(self, path: str | PathLike[str]) -> None:
         """Write the law to ``path`` as an ``.npz`` file of plain arrays (no pickle)."""
         part = f"{fspath(path)}.part"
-        with open(part, "wb") as file:
-            np.savez(file, **{field.name: getattr(self, field.name) for field in fields(self)})
-        replace(part, path)  # a reader never sees half a file
+        try:
+            with open(part, "wb") as file:
+                np.savez(file, **{field.name: getattr(self, field.name) for field in fields(self)})
+            replace(part, path)  # a reader never sees half a file
+        finally:
+            Path(part).unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> PiecewiseAffine:
@@ -145,11 +161,12 @@ class PiecewiseAffine:
         try:
             with np.load(path, allow_pickle=False) as data:
                 values = {field.name: data[field.name] for field in fields(cls)}
-        except (KeyError, ValueError, EOFError, BadZipFile) as error:
+            return cls(**{**values, "outside": str(values["outside"])})
+        except (KeyError, TypeError, ValueError, EOFError, BadZipFile) as error:
             raise ValueError(
-                f"{path} does not hold a PiecewiseAffine: {error}. Write it with law.save(path)."
+                f"{fspath(path)} does not hold a PiecewiseAffine ({error}). "
+                "Write it with law.save(path)."
             ) from None
-        return cls(**{**values, "outside": str(values["outside"])})
 
     def __eq__(self, other: object) -> bool:
         """Tell whether both laws have the same regions, gains and options."""
@@ -173,7 +190,7 @@ class PiecewiseAffine:
         return np.minimum.reduceat(self.b - points @ self.A.T, self.starts, axis=-1)
 
     def _as_theta(self, theta: ArrayLike) -> Array:
-        points = np.asarray(theta, dtype=np.float64)
+        points = to_float("theta", theta)
         if points.ndim not in (1, 2) or points.shape[-1] != self.n_theta:
             raise ValueError(
                 f"theta has shape {points.shape}, expected ({self.n_theta},) "

@@ -43,7 +43,7 @@ class LiteralYann(nn.Module):
 
         # Rows of the suppression layer: (sign, region, output). It takes the indicators, the
         # signed laws and the nodes of the network; node j of a region serves output j mod m.
-        suppression = 2 * _largest(law) + 1
+        suppression = _largest(law) + width  # the nodes of a region add up to at most width
         active = np.tile(np.kron(np.eye(p), np.ones((m, 1))), (2, 1))
         share = np.array([[float(j % m == i) for j in range(width)] for i in range(m)])
         nodes = np.concatenate([s * np.kron(np.eye(p), share) for s in sign])
@@ -100,7 +100,7 @@ def _largest(law: PiecewiseAffine) -> float:
 
 
 def _fixed(value: Array) -> nn.Parameter:
-    return nn.Parameter(th.as_tensor(value, dtype=th.get_default_dtype()), requires_grad=False)
+    return nn.Parameter(th.tensor(value, dtype=th.get_default_dtype()), requires_grad=False)
 
 
 def _step(x: th.Tensor) -> th.Tensor:

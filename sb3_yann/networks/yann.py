@@ -59,13 +59,14 @@ class YannLayer(nn.Module):
         self.outside, self.tolerance = law.outside, law.tolerance
         middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
         A, b = _padded_half_spaces(law)
+        # Float64: in float32 points near a facet fall into the wrong region, and the large terms
+        # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
         self._constant("gains", law.gains / reach[:, None])
         self._constant("offsets", (law.offsets - middle) / reach)
         self._constant("resting", np.clip(-middle / reach, -1, 1))
-        # Location stays in float64: float32 puts points near a facet into the wrong region.
-        self._constant("half_space_A", A, th.float64)
-        self._constant("half_space_b", b, th.float64)
-        self._constant("theta_half", (law.theta_max - law.theta_min) / 2)
+        self._constant("half_space_A", A)
+        self._constant("half_space_b", b)
+        self._constant("theta_half", (law.theta_max - law.theta_min) / 2, th.float32)
         at_origin = np.minimum.reduceat(law.b, law.starts) >= -law.tolerance
         self.network = ZeroOutputNetwork(
             law.n_theta,
@@ -88,30 +89,33 @@ class YannLayer(nn.Module):
     @th.no_grad()
     def locate(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return the region in use and whether it holds theta, both (batch,)."""
-        slack = self.half_space_b - th.einsum("pqn,bn->bpq", self.half_space_A, theta.double())
-        largest, region = slack.amin(-1).max(-1)
+        slack = th.addmm(self.half_space_b, theta.double(), self.half_space_A, alpha=-1)
+        largest, region = th.unflatten(slack, 1, (-1, len(self.gains))).amin(1).max(-1)
         return region, largest >= -self.tolerance
 
     def _law(self, theta: th.Tensor, region: th.Tensor, inside: th.Tensor) -> th.Tensor:
-        u = th.einsum("bmn,bn->bm", self.gains[region], theta) + self.offsets[region]
+        u = (self.gains[region] * theta[:, None]).sum(-1) + self.offsets[region]
         if self.outside == "zero":
             u = th.where(inside[:, None], u, self.resting)
-        return u.clamp(-1, 1)
+        return u.clamp(-1, 1).to(theta.dtype)
 
-    def _constant(self, name: str, value: Any, dtype: th.dtype = th.float32) -> None:
+    def _constant(self, name: str, value: Array, dtype: th.dtype = th.float64) -> None:
         # A buffer, not a parameter: optimizers and SB3's target updates leave it alone.
         self.register_buffer(name, th.as_tensor(np.array(value), dtype=dtype))
 
 
 def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
-    """Return (p, q_max, n) and (p, q_max): each region's half-spaces, then rows that never bind."""
+    """Return (n, q_max p) and (q_max p,): the first half-space of every region, the second, ...
+
+    Regions with fewer than q_max are filled up with half-spaces that never bind.
+    """
     counts = np.diff([*law.starts, law.n_halfspaces])
-    A = np.zeros((law.n_regions, counts.max(), law.n_theta))
-    b = np.full((law.n_regions, counts.max()), np.inf)
+    A = np.zeros((law.n_theta, counts.max(), law.n_regions))
+    b = np.full((counts.max(), law.n_regions), np.inf)
     for i, (start, count) in enumerate(zip(law.starts, counts, strict=True)):
-        A[i, :count] = law.A[start : start + count]
-        b[i, :count] = law.b[start : start + count]
-    return A, b
+        A[:, :count, i] = law.A[start : start + count].T
+        b[:count, i] = law.b[start : start + count]
+    return A.reshape(law.n_theta, -1), b.ravel()
 
 
 class _ClampAlive(th.autograd.Function):

@@ -1,0 +1,104 @@
+"""An explicit solution that is wrong never leaves `explicit()`: the error names a theta."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from online_mpc import OnlineMPC
+from sample_problems import PROBLEMS, solved
+
+from sb3_yann.control import ExplicitSolutionError
+from sb3_yann.control import explicit as module
+
+Regions = list[Any]
+THIN = "a final state held to 1e-4"
+DROPS = {"pendulum": 7, "reactor": 7, "benchmark": 9, THIN: 15}
+
+
+def error_of(
+    monkeypatch: pytest.MonkeyPatch, name: str, spoil: Callable[[Regions], Regions]
+) -> tuple[str, np.ndarray]:
+    """Solve with spoilt regions; return the error's message and the theta that it names."""
+    with monkeypatch.context() as patch:
+        find = module._critical_regions
+        patch.setattr(module, "_critical_regions", lambda program: spoil(find(program)))
+        with pytest.raises(ExplicitSolutionError, match="failed its check: ") as error:
+            PROBLEMS[name]().explicit()
+    theta = re.search(r"theta = (\[.*?\])", str(error.value))
+    assert theta is not None
+    return str(error.value), np.array(ast.literal_eval(theta.group(1)))
+
+
+def thinnest(regions: Regions) -> int:
+    return int(np.argmin([module._innermost(region)[1] for region in regions]))
+
+
+def with_changed_gain(regions: Regions, index: int, factor: float) -> Regions:
+    changed = dataclasses.replace(regions[index], gain=regions[index].gain * factor + factor - 1)
+    return [*regions[:index], changed, *regions[index + 1 :]]
+
+
+@pytest.mark.parametrize(
+    ("name", "index"), [(name, i) for name, count in DROPS.items() for i in range(count)]
+)
+def test_a_dropped_region_is_found_and_theta_lies_in_it(
+    name: str, index: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    message, theta = error_of(monkeypatch, name, lambda found: found[:index] + found[index + 1 :])
+    assert "no region covers a feasible parameter" in message
+    assert solved(name).explicit().locate(theta) == index
+
+
+@pytest.mark.parametrize("index", range(7))
+@pytest.mark.parametrize("name", ["pendulum", "reactor"])
+def test_a_gain_off_by_a_thousandth_is_found(
+    name: str, index: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    message, theta = error_of(
+        monkeypatch, name, lambda found: with_changed_gain(found, index, 1.001)
+    )
+    assert f"the law of region {index} is not optimal inside it" in message
+    assert solved(name).explicit().locate(theta) == index
+
+
+def test_a_wrong_law_in_a_thin_region_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    widths: list[float] = []
+
+    def spoil(regions: Regions) -> Regions:
+        widths.append(module._innermost(regions[thinnest(regions)])[1])
+        return with_changed_gain(regions, thinnest(regions), 1.1)
+
+    message, theta = error_of(monkeypatch, THIN, spoil)
+    assert widths[0] < 1e-4  # of the box's half-width: random points miss it
+    assert "is not optimal inside it" in message
+    assert OnlineMPC(solved(THIN))(theta) is not None
+
+
+def test_a_region_that_reaches_too_far_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoil(regions: Regions) -> Regions:
+        wide = dataclasses.replace(regions[0], b=regions[0].b + 0.05)
+        return [wide, *regions[1:]]
+
+    message, theta = error_of(monkeypatch, "benchmark", spoil)
+    assert "region 0" in message
+    assert solved("benchmark").explicit().locate(theta) != 0
+
+
+def test_finding_no_region_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    message, _ = error_of(monkeypatch, "benchmark", lambda regions: [])
+    assert "no region was found" in message
+
+
+def test_a_failed_check_is_not_kept_as_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    mpc = PROBLEMS["benchmark"]()
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_critical_regions", lambda program: [])
+        with pytest.raises(ExplicitSolutionError):
+            mpc.explicit()
+    assert mpc.explicit().n_regions == 9

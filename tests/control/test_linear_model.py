@@ -1,0 +1,123 @@
+"""A LinearModel is sampled exactly, is linearised rightly, and cannot be changed."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from sb3_yann import LinearModel
+from sb3_yann_envs import clipped_pendulum as pendulum
+
+MODEL = LinearModel([[1, 0.1], [0, 0.9]], [[0], [1]], 0.5, x_ss=[1, 2], u_ss=[3])
+
+
+@settings(derandomize=True, max_examples=50, deadline=None)
+@given(st.integers(1, 4), st.integers(1, 3), st.floats(1e-3, 2.0), st.integers(0, 2**32 - 1))
+def test_sampling_is_the_matrix_exponential(n: int, m: int, dt: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    # x' = A x + B u with u' = 0, in one exponential (Van Loan 1978)
+    both = expm(dt * np.vstack([np.hstack([A, B]), np.zeros((m, n + m))]))
+    model = LinearModel.from_continuous(A, B, dt)
+    np.testing.assert_allclose(np.hstack([model.A, model.B]), both[:n], rtol=1e-11, atol=1e-12)
+
+
+def test_sampling_takes_a_singular_state_matrix() -> None:
+    model = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], 0.1)
+    np.testing.assert_allclose(model.A, [[1, 0.1], [0, 1]], atol=1e-15)
+    np.testing.assert_allclose(model.B, [[0.005], [0.1]], atol=1e-15)
+
+
+def test_sampling_keeps_the_operating_point_and_the_sampling_time() -> None:
+    model = LinearModel.from_continuous([[-1.0]], [[1.0]], 0.25, x_ss=[2.0], u_ss=[3.0])
+    assert (model.dt, model.x_ss.tolist(), model.u_ss.tolist()) == (0.25, [2.0], [3.0])
+
+
+def test_dynamics_are_linearised_by_their_jacobian() -> None:
+    def f(x: Any, u: Any) -> Any:
+        return [np.sin(x[1]) * x[0] + u[0] ** 2, np.exp(x[0]) - x[1] * u[1]]
+
+    x, u = np.array([0.3, -0.7]), np.array([0.5, 2.0])
+    A = [[np.sin(x[1]), x[0] * np.cos(x[1])], [np.exp(x[0]), -u[1]]]  # by hand
+    B = [[2 * u[0], 0], [0, -x[1]]]
+    model, exact = LinearModel.from_dynamics(f, x, u, 0.1), LinearModel.from_continuous(A, B, 0.1)
+    np.testing.assert_allclose(model.A, exact.A, atol=1e-6)
+    np.testing.assert_allclose(model.B, exact.B, atol=1e-6)
+
+
+def test_pendulum_linearises_to_the_printed_matrices() -> None:
+    model = LinearModel.from_dynamics(pendulum.dynamics, pendulum.X_SS, pendulum.U_SS, pendulum.DT)
+    # printed to 4 decimals
+    np.testing.assert_allclose(model.A, pendulum.PRINTED_A, atol=0.5e-4)
+    np.testing.assert_allclose(model.B, pendulum.PRINTED_B, atol=0.5e-4)
+
+
+def test_step_takes_one_state_and_a_batch() -> None:
+    x, u = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[1.0], [-1.0]])
+    expected = [[1.2, 2.8], [3.4, 2.6]]  # by hand
+    np.testing.assert_allclose(MODEL.step(x, u), expected)
+    np.testing.assert_allclose(MODEL.step(x[0], u[0]), expected[0])
+
+
+@pytest.mark.parametrize("name", ["A", "B", "x_ss", "u_ss"])
+@pytest.mark.parametrize(
+    "copied", [lambda m: m, copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))]
+)
+def test_arrays_are_read_only_in_every_copy(name: str, copied: Any) -> None:
+    array = getattr(copied(MODEL), name)
+    with pytest.raises(ValueError, match="read-only"):
+        array[...] = 0
+
+
+def test_fields_cannot_be_replaced() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        MODEL.dt = 1.0  # type: ignore[misc]
+
+
+def test_model_does_not_follow_the_array_it_was_made_from() -> None:
+    A = np.array([[0.5]])
+    model = LinearModel(A, [[1]], 1.0)
+    A[0, 0] = 7
+    assert model.A[0, 0] == 0.5
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))]
+)
+def test_copies_are_equal_and_share_a_hash(copied: Any) -> None:
+    assert copied(MODEL) == MODEL
+    assert hash(copied(MODEL)) == hash(MODEL)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"A": [[1, 0.1], [0, 0.8]]},
+        {"B": [[0], [2]]},
+        {"dt": 0.6},
+        {"x_ss": [0, 0]},
+        {"u_ss": [0]},
+    ],
+)
+def test_models_that_differ_in_one_field_are_not_equal(changes: dict[str, Any]) -> None:
+    values = {"A": MODEL.A, "B": MODEL.B, "dt": MODEL.dt, "x_ss": MODEL.x_ss, "u_ss": MODEL.u_ss}
+    assert LinearModel(**values) == MODEL
+    assert LinearModel(**{**values, **changes}) != MODEL
+
+
+def test_negative_zero_is_zero_to_equality_and_hash() -> None:
+    one, other = (LinearModel([[1, 1], [zero, 1]], [[0], [1]], 1.0) for zero in (0.0, -0.0))
+    assert one == other
+    assert hash(one) == hash(other)
+
+
+def test_a_model_is_not_equal_to_something_else() -> None:
+    assert MODEL != "a model"

@@ -1,0 +1,180 @@
+"""The discounted linear-quadratic formulas satisfy the equations they stand for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sample_problems import DOUBLE_INTEGRATOR, input_bounds_only
+from scipy import optimize
+
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann.control import lqr
+from sb3_yann_envs import problems
+
+GAMMAS = [0.9, 0.99, 1 - 1e-3]
+TWO_BY_TWO = LinearModel([[1.1, 0.3], [-0.2, 0.8]], [[1, 0.2], [0.1, 0.7]], 1.0)
+Q, R = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([[1.0, 0.2], [0.2, 0.5]])
+MPCS = {
+    "pendulum": problems.clipped_pendulum,
+    "reactor": problems.cstr,
+    "two inputs": lambda: input_bounds_only(TWO_BY_TWO, Q=Q, R=R),
+}
+
+
+def discounted(mpc: LinearMPC, gamma: float) -> LinearMPC:
+    """The same problem with the MPC's own discount."""
+    return LinearMPC(
+        mpc.model,
+        Q=mpc.Q,
+        R=mpc.R,
+        horizon=mpc.horizon,
+        x_min=mpc.x_min,
+        x_max=mpc.x_max,
+        u_min=mpc.u_min,
+        u_max=mpc.u_max,
+        theta_min=mpc.theta_min,
+        theta_max=mpc.theta_max,
+        gamma=gamma,
+    )
+
+
+def quadratic(M: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return np.einsum("bi,ij,bj->b", points, M, points)
+
+
+@pytest.mark.parametrize("gamma", [*GAMMAS, 1.0])
+def test_riccati_solution_satisfies_the_discounted_equation(gamma: float) -> None:
+    A, B = TWO_BY_TWO.A, TWO_BY_TWO.B
+    P = lqr.riccati(TWO_BY_TWO, Q, R, gamma)
+    inner = np.linalg.inv(R + gamma * B.T @ P @ B)
+    right = Q + gamma * A.T @ P @ A - gamma**2 * A.T @ P @ B @ inner @ B.T @ P @ A
+    np.testing.assert_allclose(P, right, atol=1e-12)
+
+
+@pytest.mark.parametrize("gamma", [*GAMMAS, 1.0])
+def test_gain_minimises_cost_plus_discounted_value(gamma: float) -> None:
+    P = lqr.riccati(TWO_BY_TWO, Q, R, gamma)
+    x = np.array([0.7, -1.3])
+
+    def cost(u: np.ndarray) -> float:
+        after = TWO_BY_TWO.step(x, u)
+        return float(u @ R @ u + gamma * after @ P @ after)
+
+    best = optimize.minimize(cost, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-9})
+    np.testing.assert_allclose(-lqr.gain(TWO_BY_TWO, R, P, gamma) @ x, best.x, atol=1e-6)
+
+
+def test_golden_ratio_is_the_riccati_solution_of_the_unit_integrator() -> None:
+    # x+ = x + u, Q = R = 1: P = 1 + P - P^2 / (1 + P), so P^2 = 1 + P.
+    P = lqr.riccati(LinearModel([[1]], [[1]], 1.0), np.eye(1), np.eye(1))
+    assert P[0, 0] == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-14)
+
+
+@pytest.mark.parametrize("gamma", GAMMAS)
+def test_policy_value_is_the_simulated_discounted_sum(gamma: float) -> None:
+    K = np.array([[0.6, 0.1], [0.0, 0.4]])  # stabilising, and optimal for no weights in use
+    x = np.array([1.0, -2.0])
+    P, total, state = lqr.policy_value(TWO_BY_TWO, Q, R, K, gamma), 0.0, x
+    for k in range(2000):
+        u = -K @ state
+        total += gamma**k * float(state @ Q @ state + u @ R @ u)
+        state = TWO_BY_TWO.step(state, u)
+    assert x @ P @ x == pytest.approx(total, rel=1e-12)
+
+
+@pytest.mark.parametrize("gamma", GAMMAS)
+def test_policy_value_of_the_optimal_gain_is_the_riccati_solution(gamma: float) -> None:
+    P = lqr.riccati(TWO_BY_TWO, Q, R, gamma)
+    K = lqr.gain(TWO_BY_TWO, R, P, gamma)
+    np.testing.assert_allclose(lqr.policy_value(TWO_BY_TWO, Q, R, K, gamma), P, rtol=1e-12)
+
+
+def test_no_gain_has_a_smaller_value_than_the_optimal_one() -> None:
+    P = lqr.riccati(TWO_BY_TWO, Q, R, 0.95)
+    K = lqr.gain(TWO_BY_TWO, R, P, 0.95)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        other = lqr.policy_value(TWO_BY_TWO, Q, R, K + 0.05 * rng.normal(size=K.shape), 0.95)
+        assert np.linalg.eigvalsh(other - P)[0] > -1e-12
+
+
+def test_a_law_that_does_not_stabilise_has_no_value() -> None:
+    with pytest.raises(ValueError, match=r"infinite cost: the spectral radius .* below 1"):
+        lqr.policy_value(DOUBLE_INTEGRATOR, np.eye(2), np.eye(1), np.zeros((1, 2)), 1.0)
+
+
+@pytest.mark.parametrize("own_discount", [False, True], ids=["undiscounted MPC", "discounted MPC"])
+@pytest.mark.parametrize("gamma", GAMMAS)
+@pytest.mark.parametrize("name", MPCS)
+def test_state_action_matrix_satisfies_bellman_under_the_law(
+    name: str, gamma: float, own_discount: bool
+) -> None:
+    mpc = discounted(MPCS[name](), gamma) if own_discount else MPCS[name]()
+    law, M = mpc.explicit(), mpc.state_action_matrix(gamma)
+    rng = np.random.default_rng(0)
+    small = 1e-3 * (mpc.theta_max - mpc.theta_min)  # the law stays linear
+    x = small * rng.uniform(-1, 1, (200, mpc.n_theta))
+    u = 1e-2 * mpc.u_max * rng.uniform(-1, 1, (200, mpc.model.n_inputs))
+    after = mpc.model.step(x, u)
+    assert np.all(law.locate(after) == law.locate(np.zeros(mpc.n_theta)))
+
+    value = quadratic(M, np.hstack([x, u]))
+    target = mpc.stage_cost(x, u) + gamma * quadratic(M, np.hstack([after, law(after)]))
+    assert np.max(np.abs(value - target)) <= 1e-12 * np.max(np.abs(value))
+
+
+@pytest.mark.parametrize("gamma", GAMMAS)
+@pytest.mark.parametrize("name", MPCS)
+def test_with_equal_discounts_the_law_maximises_its_own_critic(name: str, gamma: float) -> None:
+    mpc = discounted(MPCS[name](), gamma)
+    M, n = mpc.state_action_matrix(gamma), mpc.n_theta
+    law = mpc.explicit()
+    gain = law.gains[law.locate(np.zeros(n))]
+    np.testing.assert_allclose(-np.linalg.solve(M[n:, n:], M[n:, :n]), gain, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("gamma", GAMMAS)
+@pytest.mark.parametrize("name", MPCS)
+def test_with_equal_discounts_the_critic_is_that_of_the_riccati_solution(
+    name: str, gamma: float
+) -> None:
+    mpc = discounted(MPCS[name](), gamma)
+    P = lqr.riccati(mpc.model, mpc.Q, mpc.R, gamma)
+    expected = lqr.state_action_matrix(mpc.model, mpc.Q, mpc.R, P, gamma)
+    actual = mpc.state_action_matrix(gamma)
+    np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-12 * np.max(expected))
+    np.testing.assert_array_equal(mpc.terminal_cost, P)
+
+
+def test_state_action_matrix_needs_a_law_that_rests_at_the_origin() -> None:
+    mpc = input_bounds_only(LinearModel([[0.9]], [[1]], 1.0), u_min=0.2)
+    with pytest.raises(ValueError, match=r"does not rest at the origin: theta = 0 must be feas"):
+        mpc.state_action_matrix(0.9)
+
+
+def test_state_action_matrix_does_not_depend_on_the_units_of_the_input() -> None:
+    # Bounds about 0 that are not symmetric leave a rounding offset of the size of the unit.
+    unit = 1e9
+    model = LinearModel(DOUBLE_INTEGRATOR.A, DOUBLE_INTEGRATOR.B / unit, 1.0)
+    mpc = input_bounds_only(
+        model, R=[[1 / unit**2]], u_min=-0.3 * unit, u_max=unit, theta_min=-1, theta_max=7
+    )
+    scale = np.array([1, 1, unit])
+    plain = input_bounds_only(u_min=-0.3, u_max=1, theta_min=-1, theta_max=7)
+    np.testing.assert_allclose(
+        mpc.state_action_matrix(0.9) * np.outer(scale, scale),
+        plain.state_action_matrix(0.9),
+        rtol=1e-9,
+    )
+
+
+def test_riccati_solution_does_not_depend_on_the_units_of_the_states() -> None:
+    units = np.array([1e-9, 1e7])
+    model = LinearModel(
+        np.diag(units) @ DOUBLE_INTEGRATOR.A @ np.diag(1 / units),
+        np.diag(units) @ DOUBLE_INTEGRATOR.B,
+        1.0,
+    )
+    P = lqr.riccati(model, np.diag(units**-2.0), np.eye(1))
+    expected = lqr.riccati(DOUBLE_INTEGRATOR, np.eye(2), np.eye(1))
+    np.testing.assert_allclose(P * np.outer(units, units), expected, rtol=1e-9)

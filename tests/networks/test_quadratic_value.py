@@ -1,0 +1,228 @@
+"""The critic: the linear plant's state-action value, plus a network that is zero at first."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch as th
+from numpy.typing import NDArray
+from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
+
+from sb3_yann.networks import QuadraticStateActionValue, YannLayer
+
+GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
+EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> Iterator[None]:
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        yield
+
+
+def critic(name: str, gamma: float = 0.99) -> QuadraticStateActionValue:
+    mpc = solved(name)
+    half = (mpc.theta_max - mpc.theta_min) / 2
+    return QuadraticStateActionValue(mpc.state_action_matrix(gamma), half, mpc.u_min, mpc.u_max)
+
+
+def random_rows(name: str, count: int) -> th.Tensor:
+    """Rows [theta, a] over the box and all actions."""
+    theta = box_points(law_of(name), count)
+    return th.cat([theta, 2 * th.rand(count, law_of(name).n_inputs) - 1], dim=1)
+
+
+def in_physical_units(name: str, rows: th.Tensor) -> NDArray[np.float64]:
+    law = law_of(name)
+    theta, action = np.split(rows.double().numpy(), [law.n_theta], axis=1)
+    u = (law.u_max + law.u_min) / 2 + action * (law.u_max - law.u_min) / 2
+    return np.hstack([theta, u])
+
+
+def at_rest(name: str) -> th.Tensor:
+    law = law_of(name)
+    action = to_action(law, np.zeros((1, law.n_inputs)))
+    return th.cat([th.zeros(1, law.n_theta), action.float()], dim=1)
+
+
+def train(value: QuadraticStateActionValue, rows: th.Tensor, steps: int) -> None:
+    """Adam steps of 1e-3 towards a return that is not a quadratic form."""
+    optimizer = th.optim.Adam(value.parameters(), 1e-3)
+    target = 0.7 * value(rows).detach() - 3.0
+    for _ in range(steps):
+        optimizer.zero_grad()
+        (value(rows) - target).square().mean().backward()
+        optimizer.step()
+
+
+def matrix(value: QuadraticStateActionValue) -> th.Tensor:
+    """M in physical units, as it now is."""
+    return value.entries.detach() * th.outer(value.root, value.root)
+
+
+# --- at first ----------------------------------------------------------------------------------
+
+
+@GAMMAS
+@EVERY_PROBLEM
+def test_value_is_the_quadratic_form_to_the_rounding_of_float32(name: str, gamma: float) -> None:
+    rows = random_rows(name, 2000)
+    z = in_physical_units(name, rows)
+    exact = -np.einsum("bi,ij,bj->b", z, solved(name).state_action_matrix(gamma), z)[:, None]
+    with th.no_grad():
+        got = critic(name, gamma)(rows)
+    assert got.shape == (2000, 1)
+    assert got.dtype == th.float32
+    np.testing.assert_allclose(got.numpy(), exact, rtol=np.finfo(np.float32).eps, atol=0)
+
+
+@GAMMAS
+@EVERY_PROBLEM
+def test_bellmans_equation_holds_along_the_law(name: str, gamma: float) -> None:
+    # On the linear plant, from states from which the law stays in the unconstrained region.
+    mpc, law = solved(name), law_of(name)
+    origin = law.locate(np.zeros(law.n_theta))
+    points = box_points(law, 4000).numpy() * np.geomspace(1e-3, 1, 4000)[:, None]
+    theta, visits = points.astype(np.float64), np.ones(len(points), dtype=bool)
+    for _ in range(2):
+        visits &= (law.locate(theta) == origin) & law.in_domain(theta)
+        theta = theta @ mpc.model.A.T + law(theta) @ mpc.model.B.T
+    start = th.as_tensor(points[visits], dtype=th.float32)
+    assert len(start) > 300
+
+    value, actor = critic(name, gamma), YannLayer(law)
+    with th.no_grad():
+        action = actor(start)
+        x, u = np.split(in_physical_units(name, th.cat([start, action], 1)), [law.n_theta], axis=1)
+        following = th.as_tensor(x @ mpc.model.A.T + u @ mpc.model.B.T, dtype=th.float32)
+        now = value(th.cat([start, action], 1)).double().numpy()
+        then = value(th.cat([following, actor(following)], 1)).double().numpy()
+    error = now - (-mpc.stage_cost(x, u)[:, None] + gamma * then)
+    assert np.mean(error**2) < 1e-12 * np.mean(now**2)
+
+
+@EVERY_PROBLEM
+def test_scaled_entries_are_of_the_order_of_one(name: str) -> None:
+    # M is positive definite, so the correlations it leaves behind are at most 1.
+    entries = critic(name).entries.detach()
+    th.testing.assert_close(entries.diag(), th.ones(len(entries), dtype=th.float64))
+    assert entries.abs().max() <= 1 + 1e-12
+
+
+def test_matrix_with_a_zero_on_the_diagonal_is_kept() -> None:
+    # A state that neither costs nor acts has a row of zeros.
+    M = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.5], [0.0, 0.5, 1.0]])
+    one = np.ones(1)
+    value = QuadraticStateActionValue(M, np.ones(2), -one, one)
+    np.testing.assert_allclose(value(th.tensor([[5.0, 1.0, 1.0]])).item(), -4.0)
+
+
+# --- the equilibrium ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["pendulum", "reactor"])
+def test_value_of_the_equilibrium_is_zero_and_stays_so(name: str) -> None:
+    value = critic(name)
+    assert value(at_rest(name)).item() == 0
+    train(value, random_rows(name, 256), steps=50)
+    assert value(at_rest(name)).item() == 0
+
+
+@pytest.mark.parametrize("name", ["asymmetric bounds", "two inputs"])
+def test_value_of_an_equilibrium_off_the_middle_is_zero_and_stays_so(name: str) -> None:
+    # u = 0 is an action such as -1/3, which float32 rounds.
+    value, rows = critic(name), random_rows(name, 256)
+    assert abs(value(at_rest(name)).item()) < 1e-12
+    train(value, rows, steps=50)
+    assert abs(value(at_rest(name)).item()) < 1e-6 * value(rows).abs().mean().item()
+
+
+# --- training ----------------------------------------------------------------------------------
+
+
+@EVERY_PROBLEM
+def test_one_step_of_adam_moves_every_entry_by_its_learning_rate(name: str) -> None:
+    # Relative to sqrt(M_ii M_jj), whatever the units of the plant: 1e-3 for a rate of 1e-3.
+    value = critic(name)
+    before, scale = matrix(value), th.outer(value.root, value.root)
+    train(value, random_rows(name, 256), steps=1)
+    th.testing.assert_close(
+        (matrix(value) - before).abs() / scale,
+        th.full_like(scale, 1e-3),
+        rtol=1e-3,
+        atol=0,
+    )
+
+
+def test_twenty_steps_of_adam_do_not_flip_the_sign_of_the_reactors_smallest_entry() -> None:
+    # Raw entries would: M_uu is of the order of 1e-4, one step of Adam is 1e-3.
+    value = critic("reactor")
+    before = matrix(value).diag()
+    assert before.min() < 1e-3
+    train(value, random_rows("reactor", 256), steps=20)
+    change = matrix(value).diag() / before - 1
+    assert change.abs().max() < 0.021
+    assert change.abs().min() > 0
+
+
+@EVERY_PROBLEM
+def test_matrix_stays_symmetric(name: str) -> None:
+    value = critic(name)
+    train(value, random_rows(name, 256), steps=20)
+    M = value.entries.detach()
+    th.testing.assert_close(M, M.T, rtol=0, atol=1e-12)
+
+
+def test_all_parameters_learn() -> None:
+    value = critic("reactor")
+    before = copy.deepcopy(value)
+    train(value, random_rows("reactor", 256), steps=2)
+    for new, old in zip(value.parameters(), before.parameters(), strict=True):
+        assert th.mean((new != old).float()) > 0.9
+
+
+def test_training_fits_what_the_quadratic_cannot() -> None:
+    rows = random_rows("pendulum", 512)
+    value = critic("pendulum")
+    target = value(rows).detach() + 5 * th.sin(3 * rows[:, :1])
+    optimizer = th.optim.Adam(value.network.parameters(), 1e-2)
+    for _ in range(300):
+        optimizer.zero_grad()
+        loss = (value(rows) - target).square().mean()
+        loss.backward()
+        optimizer.step()
+    assert loss.item() < 0.2 * (5 * th.sin(3 * rows[:, :1])).square().mean().item()
+
+
+@EVERY_PROBLEM
+def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str) -> None:
+    law = law_of(name)
+    rows = random_rows(name, 256).requires_grad_()
+    critic(name)(rows).sum().backward()
+    assert rows.grad is not None
+    z = in_physical_units(name, rows.detach())
+    slope = -2 * z @ solved(name).state_action_matrix(0.99)
+    scale = np.concatenate([np.ones(law.n_theta), (law.u_max - law.u_min) / 2])
+    np.testing.assert_allclose(
+        rows.grad.numpy(), slope * scale, rtol=1e-5, atol=1e-6 * np.abs(slope * scale).max()
+    )
+
+
+def test_constants_are_buffers_and_no_key_contains_running() -> None:
+    value = critic("pendulum")
+    trained = {name.split(".")[0] for name, _ in value.named_parameters()}
+    assert trained == {"entries", "network"}
+    assert not [key for key in value.state_dict() if "running_" in key]
+
+
+def test_state_dict_brings_everything_back() -> None:
+    rows = random_rows("reactor", 256)
+    value, other = critic("reactor"), critic("reactor")
+    train(value, rows, steps=5)
+    assert not th.equal(other(rows), value(rows))
+    other.load_state_dict(value.state_dict())
+    assert th.equal(other(rows), value(rows))

@@ -1,0 +1,317 @@
+"""Networks that are exactly zero at first and train all the same (Theorems 1 and 2)."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch as th
+from torch.nn import functional as F
+
+from sb3_yann.networks import ZeroOutputNetwork
+from sb3_yann.networks.zero_output import PairedLinear
+
+ACTIVATIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
+    "tanh": th.tanh,
+    "relu": th.relu,
+    "elu": F.elu,
+    "softsign": F.softsign,
+    "sin": th.sin,
+    "gelu": F.gelu,
+}
+HIDDEN = [(1,), (16,), (7,), (16, 16), (7, 5), (8, 3)]
+OPTIMIZERS: dict[str, Callable[[ZeroOutputNetwork], th.optim.Optimizer]] = {
+    "sgd": lambda net: th.optim.SGD(net.parameters(), 0.1),
+    "adam": lambda net: th.optim.Adam(net.parameters(), 1e-3),
+}
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> Iterator[None]:
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        yield
+
+
+def pins(*flags: bool) -> th.Tensor:
+    return th.tensor(flags)
+
+
+def square(count: int = 256, dtype: th.dtype = th.float32) -> th.Tensor:
+    """Points of the square [-1, 1]^2."""
+    return th.rand(count, 2, dtype=dtype) * 2 - 1
+
+
+def curved(x: th.Tensor) -> th.Tensor:
+    """x1 x2 + x1^2: even, so that an odd network cannot fit it; 0 at 0."""
+    return x[:, :1] * x[:, 1:] + x[:, :1] ** 2
+
+
+def train(
+    net: ZeroOutputNetwork,
+    optimizer: th.optim.Optimizer,
+    steps: int,
+    x: th.Tensor,
+    target: th.Tensor,
+    index: th.Tensor | None = None,
+) -> None:
+    for _ in range(steps):
+        optimizer.zero_grad()
+        F.mse_loss(net(x, index), target).backward()
+        optimizer.step()
+
+
+def unexplained(net: ZeroOutputNetwork, x: th.Tensor) -> float:
+    """The share of the variance of the curved target that the network misses."""
+    with th.no_grad():
+        return float(F.mse_loss(net(x), curved(x)) / curved(x).var())
+
+
+def is_positive_zero(x: th.Tensor) -> bool:
+    return not bool(th.any(x != 0)) and not bool(th.any(th.signbit(x)))
+
+
+# --- zero at first -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [th.float32, th.float64])
+@pytest.mark.parametrize("stack", [1, 3])
+@pytest.mark.parametrize("n_nodes", [2, 3, 4, 7])
+@pytest.mark.parametrize("hidden", HIDDEN)
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_output_is_zero_bit_for_bit_at_first(
+    activation: str, hidden: tuple[int, ...], n_nodes: int, stack: int, dtype: th.dtype
+) -> None:
+    net = ZeroOutputNetwork(
+        3,
+        2,
+        hidden,
+        activation=ACTIVATIONS[activation],
+        n_nodes=n_nodes,
+        pinned=pins(True, False, True)[:stack],
+    ).to(dtype)
+    for size in (1.0, 1e3, 1e6):
+        x = size * (2 * th.rand(200, 3, dtype=dtype) - 1)
+        output = net(x, th.randint(stack, (200,)))
+        assert output.shape == (200, 2)
+        assert is_positive_zero(output)
+
+
+def test_output_is_zero_bit_for_bit_for_many_seeds_and_batch_sizes() -> None:
+    # A sum of two matrix products would vanish to rounding only, in some of these.
+    for seed in range(100):
+        th.manual_seed(seed)
+        net = ZeroOutputNetwork(4, 1, (64, 64), n_nodes=6)
+        assert is_positive_zero(net(1e6 * th.randn(seed + 1, 4)))
+
+
+def test_initial_weights_are_nonzero_and_within_a_hundredth() -> None:
+    net = ZeroOutputNetwork(3, 2, (16, 16), n_nodes=4, pinned=pins(False, True))
+    for parameter in net.parameters():
+        assert 0.009 < parameter.abs().max() <= 0.01
+
+
+def test_scale_sets_the_range_of_the_initial_weights() -> None:
+    net = ZeroOutputNetwork(3, 2, (16, 16), scale=0.5)
+    for parameter in net.parameters():
+        assert 0.4 < parameter.abs().max() <= 0.5
+
+
+def test_odd_node_out_starts_with_zero_weights() -> None:
+    layer = PairedLinear(3, 4, n_nodes=5)
+    assert th.equal(layer.nodes[:2], -layer.nodes[2:4])
+    assert is_positive_zero(layer.nodes[4])
+
+
+def test_networks_of_a_stack_differ() -> None:
+    net = ZeroOutputNetwork(3, 1, (8, 8), pinned=pins(False, False))
+    assert not th.any(net.first.nodes[:, 0] == net.first.nodes[:, 1])
+
+
+# --- training ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize("n_nodes", [2, 3, 5])
+@pytest.mark.parametrize("hidden", [(6,), (5, 6)])
+@pytest.mark.parametrize("activation", ["tanh", "gelu"])
+@pytest.mark.parametrize("pinned", [False, True])
+def test_every_entry_has_moved_after_the_second_update(
+    pinned: bool, activation: str, hidden: tuple[int, ...], n_nodes: int, optimizer: str
+) -> None:
+    # Every single entry, weights and biases; only the output bias of a pinned network cancels.
+    # In float64: the biases of a pinned tanh network have a gradient of the order (W x)^2.
+    net = ZeroOutputNetwork(
+        2, 1, hidden, activation=ACTIVATIONS[activation], n_nodes=n_nodes, pinned=pins(pinned)
+    ).double()
+    before = copy.deepcopy(net)
+    x = square(dtype=th.float64)
+    train(net, OPTIMIZERS[optimizer](net), 2, x, curved(x) + 0.3 * x.sum(1, keepdim=True))
+    moved = [(a != b) for a, b in zip(net.parameters(), before.parameters(), strict=True)]
+    assert bool(moved[-1][..., -1]) is not pinned
+    moved[-1][..., -1] = True
+    assert all(bool(entries.all()) for entries in moved)
+
+
+def test_relu_network_moves_most_of_every_layer_by_the_second_update() -> None:
+    # torch's slope of ReLU at 0 is 0, and all units start at 0. After the first update some units
+    # are off for the whole batch, and what leads from them stays.
+    net = ZeroOutputNetwork(2, 1, (16, 16), activation=th.relu)
+    before = copy.deepcopy(net)
+    x = square()
+    train(net, th.optim.Adam(net.parameters(), 1e-3), 2, x, curved(x))
+    for a, b in zip(net.parameters(), before.parameters(), strict=True):
+        assert th.mean((a != b).float()) > 0.5
+
+
+def test_relu_network_keeps_the_gradient_of_relu_away_from_zero() -> None:
+    net = ZeroOutputNetwork(1, 1, (1,), activation=th.relu)
+    with th.no_grad():
+        net.first.nodes.zero_()
+        net.first.nodes[0, 0, 0, 0] = 1.0
+        net.rest[0].weight.fill_(1.0)
+    x = th.tensor([[-2.0], [3.0]], requires_grad=True)
+    net(x).sum().backward()
+    assert x.grad is not None
+    assert x.grad.tolist() == [[0.0], [1.0]]
+
+
+@pytest.mark.parametrize("pinned", [False, True])
+@pytest.mark.parametrize("hidden", [(16,), (16, 16)])
+@pytest.mark.parametrize("activation", ["tanh", "softsign", "sin"])
+def test_network_learns_an_even_nonlinear_function(
+    activation: str, hidden: tuple[int, ...], pinned: bool
+) -> None:
+    net = ZeroOutputNetwork(2, 1, hidden, activation=ACTIVATIONS[activation], pinned=pins(pinned))
+    x = square()
+    train(net, th.optim.Adam(net.parameters(), 1e-2), 500, x, curved(x))
+    assert unexplained(net, square()) < 0.05
+
+
+@pytest.mark.parametrize("pinned", [False, True])
+def test_relu_network_of_two_layers_learns_the_same(pinned: bool) -> None:
+    net = ZeroOutputNetwork(2, 1, (16, 16), activation=th.relu, pinned=pins(pinned))
+    x = square()
+    train(net, th.optim.Adam(net.parameters(), 1e-2), 500, x, curved(x))
+    assert unexplained(net, square()) < 0.1
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_units_of_a_layer_differ_after_training(optimizer: str) -> None:
+    net = ZeroOutputNetwork(2, 1, (8, 8))
+    x = square()
+    train(net, OPTIMIZERS[optimizer](net), 50, x, curved(x) + x[:, :1])
+    first = net.first.nodes.detach()[:, 0].sum(0)
+    for weight in (first, net.rest[0].weight.detach()[0]):
+        apart = th.cdist(weight, weight) + th.eye(8)
+        assert apart.min() > 0
+
+
+def test_each_network_of_a_stack_learns_from_its_own_rows_only() -> None:
+    net = ZeroOutputNetwork(2, 1, (8, 8), pinned=pins(False, False, False))
+    before = copy.deepcopy(net)
+    x = square()
+    index = 2 * th.randint(2, (256,))  # the networks 0 and 2
+    train(net, th.optim.Adam(net.parameters(), 1e-2), 20, x, curved(x), index)
+    for a, b in zip(net.parameters(), before.parameters(), strict=True):
+        a, b = (t if t.dim() == 3 else t.transpose(0, 1) for t in (a, b))
+        assert th.equal(a[1], b[1])
+        assert not th.equal(a[0], b[0])
+        assert not th.equal(a[2], b[2])
+
+
+def test_stack_computes_what_its_networks_compute_alone() -> None:
+    stack = ZeroOutputNetwork(2, 1, (8, 8), n_nodes=3, pinned=pins(True, False, True)).double()
+    for parameter in stack.parameters():
+        th.nn.init.normal_(parameter)
+    x, index = square(dtype=th.float64), th.randint(3, (256,))
+    for i in range(3):
+        alone = ZeroOutputNetwork(2, 1, (8, 8), n_nodes=3, pinned=stack.pinned[i].bool()).double()
+        with th.no_grad():
+            alone.first.nodes.copy_(stack.first.nodes[:, i : i + 1])
+            for mine, theirs in zip(alone.rest, stack.rest, strict=True):
+                mine.weight.copy_(theirs.weight[i : i + 1])
+        rows = index == i
+        th.testing.assert_close(stack(x, index)[rows], alone(x[rows]), rtol=1e-12, atol=1e-12)
+
+
+# --- the pinned output -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hidden", [(16,), (16, 16)])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_pinned_output_at_zero_stays_exactly_zero(activation: str, hidden: tuple[int, ...]) -> None:
+    # With a target that is not 0 there, and in batches of odd sizes, where vectorised kernels
+    # round differently from entry to entry.
+    net = ZeroOutputNetwork(
+        2, 1, hidden, activation=ACTIVATIONS[activation], pinned=pins(True, True)
+    )
+    x, index = square(), th.randint(2, (256,))
+    train(net, th.optim.Adam(net.parameters(), 1e-2), 100, x, curved(x) + 1, index)
+    for count in (1, 2, 7, 33, 256):
+        x = square(count)
+        x[::2] = 0
+        output = net(x, th.randint(2, (count,)))
+        assert not th.any(output[::2])
+        assert th.all(output[1::2] != 0)
+
+
+def test_output_at_zero_can_be_learnt_where_it_is_not_pinned() -> None:
+    net = ZeroOutputNetwork(2, 1)
+    x = square()
+    train(net, th.optim.Adam(net.parameters(), 1e-2), 500, x, curved(x) + 1)
+    assert net(th.zeros(1, 2)).item() == pytest.approx(1, abs=0.2)
+
+
+def test_pinned_network_is_not_confined_to_odd_functions() -> None:
+    net = ZeroOutputNetwork(2, 1, pinned=pins(True))
+    x = square()
+    train(net, th.optim.Adam(net.parameters(), 1e-2), 500, x, curved(x))
+    even, odd = net(x) + net(-x), net(x) - net(-x)
+    assert even.abs().mean() > 5 * odd.abs().mean()
+
+
+def test_pinned_network_does_not_jump_at_zero() -> None:
+    net = ZeroOutputNetwork(2, 1, activation=F.gelu, pinned=pins(True))
+    x = square()
+    train(net, th.optim.Adam(net.parameters(), 1e-2), 200, x, curved(x) + x[:, :1])
+    assert net(th.full((1, 2), 1e-6)).abs() < 1e-4
+
+
+# --- bad input, copies -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("activation", [th.sigmoid, F.softplus, th.cos, th.nn.Sigmoid()])
+def test_activation_that_is_not_zero_at_zero_is_refused(
+    activation: Callable[[th.Tensor], th.Tensor],
+) -> None:
+    with pytest.raises(ValueError, match=r"activation\(0\) = (0\.5|0\.693147|1), but .*torch.tanh"):
+        ZeroOutputNetwork(2, 1, activation=activation)
+
+
+@pytest.mark.parametrize("hidden", [(), (4, 4, 4), (0,), (4, 0)])
+def test_other_than_one_or_two_hidden_layers_are_refused(hidden: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"hidden = .* one or two widths of at least 1"):
+        ZeroOutputNetwork(2, 1, hidden)
+
+
+def test_fewer_than_two_nodes_are_refused() -> None:
+    with pytest.raises(ValueError, match="n_nodes = 1 must be at least 2"):
+        ZeroOutputNetwork(2, 1, n_nodes=1)
+
+
+def test_stack_without_an_index_is_refused() -> None:
+    net = ZeroOutputNetwork(2, 1, pinned=pins(True, False))
+    with pytest.raises(ValueError, match="index is None, but there are 2 networks"):
+        net(square())
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_network_survives_copies_and_pickles(activation: str) -> None:
+    net = ZeroOutputNetwork(2, 1, (8,), activation=ACTIVATIONS[activation])
+    x = square()
+    train(net, th.optim.Adam(net.parameters(), 1e-2), 5, x, curved(x))
+    for other in (copy.deepcopy(net), pickle.loads(pickle.dumps(net))):
+        assert th.equal(other(x), net(x))
