@@ -50,7 +50,7 @@ def main() -> None:
     picture = save_trajectories(
         "out/cstr.png",
         {"before (linear MPC)": before, "after training": after},
-        states={0: "ΔC_A [mol/L]", 3: "ΔT [K]"},
+        states={3: "ΔT [K]", 0: "ΔC_A [mol/L]"},
         inputs=["ΔU [kJ/(h m² K)]"],
         dt=DT,
         time_unit="h",

@@ -79,6 +79,7 @@ def save_trajectories(
     for panel, i in zip(panels, states, strict=False):
         if limits and i in limits:
             panel.axhline(limits[i][0], color="black", linestyle="--", label=limits[i][1])
+            panel.legend(loc="best")
     for panel, label in zip(panels, [*states.values(), *inputs], strict=True):
         panel.set_ylabel(label)
         panel.grid(alpha=0.3)
