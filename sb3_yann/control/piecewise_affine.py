@@ -69,6 +69,10 @@ class PiecewiseAffine(ReadOnlyArrays):
     # inside: facets of neighbours agree to rounding only.
     tolerance = 1e-8
 
+    # Slacks that differ by less, relative to 1 + their size, tie. Outside the feasible set whole
+    # areas violate two regions alike, at a border that these share: rounding must not choose.
+    tie_tolerance = 1e-12
+
     def __post_init__(self) -> None:
         """Check the arrays against each other and store them as read-only float64."""
         gains = as_array("gains", self.gains, (None, None, None))
@@ -122,22 +126,19 @@ class PiecewiseAffine(ReadOnlyArrays):
             If theta is not numeric, has another shape or holds NaN or infinite entries.
         """
         points = self._as_theta(theta)
-        slack = self._smallest_slack(points)
-        region = np.argmax(slack, axis=-1)
+        region, largest = self._choose(points)
         u = np.einsum("...mn,...n->...m", self.gains[region], points) + self.offsets[region]
         if self.outside == "zero":
-            inside = np.max(slack, axis=-1) >= -self.tolerance
-            u = np.where(inside[..., None], u, 0.0)
+            u = np.where((largest >= -self.tolerance)[..., None], u, 0.0)
         return np.asarray(np.clip(u, self.u_min, self.u_max))
 
     def locate(self, theta: ArrayLike) -> NDArray[np.int64]:
         """Return the index of the region in use at theta, one for each row of a batch."""
-        return np.asarray(np.argmax(self._smallest_slack(self._as_theta(theta)), axis=-1))
+        return self._choose(self._as_theta(theta))[0]
 
     def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
         """Tell whether the MPC has a solution at theta, for each row of a batch."""
-        slack = self._smallest_slack(self._as_theta(theta))
-        return np.asarray(np.max(slack, axis=-1) >= -self.tolerance)
+        return np.asarray(self._choose(self._as_theta(theta))[1] >= -self.tolerance)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the law to ``path`` as an ``.npz`` file of plain arrays (no pickle)."""
@@ -185,9 +186,12 @@ class PiecewiseAffine(ReadOnlyArrays):
             f"theta={self.n_theta}, inputs={self.n_inputs}, outside={self.outside!r})"
         )
 
-    def _smallest_slack(self, points: Array) -> Array:
-        """Return (..., p): how far each point lies inside each region, negative outside."""
-        return np.minimum.reduceat(self.b - points @ self.A.T, self.starts, axis=-1)
+    def _choose(self, points: Array) -> tuple[NDArray[np.int64], Array]:
+        """Return the region in use and how far inside it each point lies, negative outside."""
+        slack = np.minimum.reduceat(self.b - points @ self.A.T, self.starts, axis=-1)
+        largest = np.max(slack, axis=-1)
+        nearly = largest - self.tie_tolerance * (1 + np.abs(largest))
+        return np.asarray(np.argmax(slack >= nearly[..., None], axis=-1)), largest
 
     def _as_theta(self, theta: ArrayLike) -> Array:
         points = to_float("theta", theta)

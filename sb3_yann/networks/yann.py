@@ -56,7 +56,8 @@ class YannLayer(nn.Module):
                 f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
                 "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
             )
-        self.outside, self.tolerance = law.outside, law.tolerance
+        self.outside = law.outside
+        self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
         middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
         A, b = _padded_half_spaces(law)
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
@@ -90,8 +91,10 @@ class YannLayer(nn.Module):
     def locate(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return the region in use and whether it holds theta, both (batch,)."""
         slack = th.addmm(self.half_space_b, theta.double(), self.half_space_A, alpha=-1)
-        largest, region = th.unflatten(slack, 1, (-1, len(self.gains))).amin(1).max(-1)
-        return region, largest >= -self.tolerance
+        slack = th.unflatten(slack, 1, (-1, len(self.gains))).amin(1)
+        largest = slack.amax(-1)
+        nearly = largest - self.tie_tolerance * (1 + largest.abs())
+        return (slack >= nearly[:, None]).byte().argmax(-1), largest >= -self.tolerance
 
     def _law(self, theta: th.Tensor, region: th.Tensor, inside: th.Tensor) -> th.Tensor:
         u = (self.gains[region] * theta[:, None]).sum(-1) + self.offsets[region]

@@ -80,16 +80,6 @@ def smallest_slack(law: PiecewiseAffine, theta: th.Tensor) -> Array:
     return np.stack([part.min(axis=1) for part in np.split(slack, law.starts[1:], axis=1)], axis=1)
 
 
-def choice_is_clear(law: PiecewiseAffine, theta: th.Tensor, margin: float = 1e-9) -> th.Tensor:
-    """Where the best region leads the second by more than rounding.
-
-    Elsewhere two regions tie: on facets, and outside the feasible set wherever two regions are
-    violated at a border that they share.
-    """
-    best = np.sort(smallest_slack(law, theta), axis=1)
-    return th.as_tensor(best[:, -1] - best[:, -2] > margin)
-
-
 def to_action(law: PiecewiseAffine, u: Array) -> th.Tensor:
     """Inputs in physical units as actions, u_min at -1 and u_max at 1."""
     return th.as_tensor(2 * (u - law.u_min) / (law.u_max - law.u_min) - 1)
