@@ -53,7 +53,8 @@ class ControlDiagnostics(BaseCallback):
     - ``yann/violations``: steps with ``info["violation"]``, since the start of this `learn`.
     - ``yann/critic_error``: mean over the last finished episode of ``|Q(s, a) - G|`` relative to
       mean ``|G|``, where G is the discounted return that followed, plus the critic's own value
-      of the last state where the episode was cut off rather than over.
+      of the last state where the episode was cut off rather than over. It starts above 0 wherever
+      constraints act or the plant is not the linear model.
 
     Raises
     ------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -123,15 +124,16 @@ class YannPolicy(TD3Policy):
         The MPC, the name of a registered one, or ``"module:attribute"``. The default is the
         ``problem`` that the observation space carries, as those of our environments do.
     gamma : float, optional
-        Discount of the critic. The default is that of the algorithm that builds the policy.
-    net_arch : dict, optional
+        Discount of the critic. The default is that of the algorithm that builds the policy, or
+        0.99 where the policy is built by hand.
+    net_arch : dict or list, optional
         Widths of the trainable networks, ``{"pi": [16, 16], "qf": [64, 64]}`` by default: one
         or two hidden layers for each region of the actor, and for each critic.
     activation_fn : type, default torch.nn.Tanh
         An activation that is 0 at 0.
     actor_lr_mult, critic_lr_mult : float, default 0.1 and 1
-        Learning rates of actor and critic, as multiples of the algorithm's ``learning_rate``; 0
-        freezes.
+        Learning rates of actor and critic, as multiples of the algorithm's ``learning_rate``, which
+        is what SB3 logs; 0 freezes.
     n_critics : int, default 2
         TD3's two critics; DDPG sets 1.
     features_extractor_class, features_extractor_kwargs, normalize_images, share_features_extractor
@@ -142,9 +144,10 @@ class YannPolicy(TD3Policy):
     Raises
     ------
     TypeError
-        If a space is not a one-dimensional Box, or the algorithm is not TD3 or DDPG.
+        If a space is not a Box, or the algorithm is not TD3 or DDPG. (DDPG and TD3 themselves
+        refuse actions that are no Box, or have no bounds, with an AssertionError of their own.)
     ValueError
-        If there is no problem, or the spaces do not fit it.
+        If there is no problem, the spaces do not fit it, or the env normalises.
     """
 
     actor: YannActor
@@ -159,7 +162,7 @@ class YannPolicy(TD3Policy):
         lr_schedule: Schedule,
         problem: LinearMPC | str | None = None,
         gamma: float | None = None,
-        net_arch: dict[str, list[int]] | None = None,
+        net_arch: dict[str, list[int]] | list[int] | None = None,
         activation_fn: type[nn.Module] = nn.Tanh,
         actor_lr_mult: float = 0.1,
         critic_lr_mult: float = 1.0,
@@ -173,7 +176,7 @@ class YannPolicy(TD3Policy):
         **other: Any,
     ) -> None:
         algorithm = _algorithm_under_construction()
-        _require_td3(algorithm, other)
+        _require_plain_td3(algorithm, other)
         if features_extractor_class is not FlattenExtractor:
             raise ValueError(
                 f"features_extractor_class = {features_extractor_class.__name__} would change the "
@@ -182,10 +185,17 @@ class YannPolicy(TD3Policy):
         _require_box("observation_space", observation_space)
         _require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
+        if algorithm is not None and isinstance(problem, str):
+            # Saved by value with the model: a load then neither looks it up nor solves it again.
+            algorithm.policy_kwargs = {**algorithm.policy_kwargs, "problem": self.problem}
         _require_matching(self.problem, observation_space, action_space)
-        if gamma is None:
-            gamma = getattr(algorithm, "gamma", 0.99)
-        self.gamma = gamma
+        self.gamma = getattr(algorithm, "gamma", 0.99) if gamma is None else gamma
+        if isinstance(n_critics, bool) or not isinstance(n_critics, int) or n_critics < 1:
+            raise ValueError(f"n_critics = {n_critics!r} must be a whole number of at least 1.")
+        if not (isinstance(activation_fn, type) and issubclass(activation_fn, nn.Module)):
+            raise TypeError(
+                f"activation_fn = {activation_fn!r} must be a class such as torch.nn.Tanh."
+            )
         self.lr_mult = {
             "actor": _as_multiplier("actor_lr_mult", actor_lr_mult),
             "critic": _as_multiplier("critic_lr_mult", critic_lr_mult),
@@ -194,7 +204,7 @@ class YannPolicy(TD3Policy):
             observation_space,
             action_space,
             lr_schedule,
-            net_arch={"pi": [16, 16], "qf": [64, 64]} if net_arch is None else net_arch,
+            net_arch=_as_net_arch(net_arch),
             activation_fn=activation_fn,
             features_extractor_class=features_extractor_class,
             features_extractor_kwargs=features_extractor_kwargs,
@@ -207,8 +217,16 @@ class YannPolicy(TD3Policy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        _multiply_learning_rate(self.actor.optimizer, self.lr_mult["actor"])
-        _multiply_learning_rate(self.critic.optimizer, self.lr_mult["critic"])
+        self._multiply_learning_rates()
+
+    def _multiply_learning_rates(self) -> None:
+        for network, factor in ((self.actor, "actor"), (self.critic, "critic")):
+            _multiply_learning_rate(network.optimizer, self.lr_mult[factor])
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy or a pickle; torch drops the hooks of optimizers on the way."""
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self._multiply_learning_rates()
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
         """Return an actor that equals the explicit law, with networks that are zero."""
@@ -248,11 +266,17 @@ def _algorithm_under_construction() -> BaseAlgorithm | None:
     return caller if isinstance(caller, BaseAlgorithm) else None
 
 
-def _require_td3(algorithm: BaseAlgorithm | None, other: dict[str, Any]) -> None:
+def _require_plain_td3(algorithm: BaseAlgorithm | None, other: dict[str, Any]) -> None:
     if algorithm is not None and not isinstance(algorithm, TD3):
         raise TypeError(
             f"YannPolicy starts from a deterministic law and works with DDPG and TD3, not with "
             f"{type(algorithm).__name__}. Use e.g. DDPG(YannPolicy, env)."
+        )
+    normalize = None if algorithm is None else algorithm.get_vec_normalize_env()
+    if normalize is not None and (normalize.norm_obs or normalize.norm_reward):
+        raise ValueError(
+            "The env is a VecNormalize: normalised observations are not the state that the law "
+            "takes, normalised rewards not the cost that the critic stands for. Train without it."
         )
     if other:
         raise TypeError(
@@ -282,6 +306,11 @@ def _require_matching(
             f"The observation has shape {observation_space.shape}, but the law of the problem "
             f"takes theta of shape ({problem.n_theta},). Give the policy the problem of this plant."
         )
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise TypeError(
+            f"action_space has dtype {action_space.dtype}, but the inputs of an MPC are real: make "
+            "it a Box of numpy.float32."
+        )
     if not action_space.is_bounded():
         raise ValueError(f"action_space = {action_space} must have finite bounds.")
     law = (problem.u_min, problem.u_max)
@@ -298,24 +327,41 @@ def _require_matching(
 
 
 def _as_multiplier(name: str, value: float) -> float:
-    number = float(value)
-    if not (np.isfinite(number) and number >= 0):
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+        raise TypeError(f"{name} = {value!r} must be a number: 0 freezes, 1 is SB3's own rate.")
+    if not (np.isfinite(value) and value >= 0):
         raise ValueError(f"{name} = {value!r} must be a finite number, 0 (frozen) or above.")
-    return number
+    return float(value)
+
+
+def _as_net_arch(value: dict[str, list[int]] | list[int] | None) -> dict[str, list[int]]:
+    known = {"pi": [16, 16], "qf": [64, 64]}
+    if value is None:
+        return known
+    if isinstance(value, list):  # SB3's short form
+        value = dict.fromkeys(known, value)
+    if not isinstance(value, dict) or not set(value) <= set(known):
+        raise ValueError(f"net_arch = {value!r} must be a dict such as {known}.")
+    for name, widths in value.items():
+        sizes = list(widths) if isinstance(widths, (list, tuple)) else []
+        if len(sizes) not in (1, 2) or not all(isinstance(n, int) and n > 0 for n in sizes):
+            raise ValueError(
+                f"net_arch[{name!r}] = {widths!r} must name the widths of one or two hidden "
+                f"layers, such as {known[name]}."
+            )
+    return {**known, **value}
 
 
 def _multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:
     """Make each step of the optimizer use ``factor`` times the rate that SB3 keeps setting."""
-    for group in optimizer.param_groups:
-        group["lr_mult"] = factor  # in the group, so it is saved and loaded with the optimizer
-    optimizer.register_step_pre_hook(_apply_multiplier)
+    optimizer.register_step_pre_hook(partial(_apply_multiplier, factor))
     optimizer.register_step_post_hook(_remove_multiplier)
 
 
-def _apply_multiplier(optimizer: th.optim.Optimizer, *_: Any) -> None:
+def _apply_multiplier(factor: float, optimizer: th.optim.Optimizer, *_: Any) -> None:
     for group in optimizer.param_groups:
         group["scheduled_lr"] = group["lr"]
-        group["lr"] = group["lr"] * group["lr_mult"]
+        group["lr"] = factor * group["lr"]
 
 
 def _remove_multiplier(optimizer: th.optim.Optimizer, *_: Any) -> None:

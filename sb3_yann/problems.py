@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -25,19 +26,21 @@ def register_problem(name: str, problem: LinearMPC | Callable[[], LinearMPC] | s
 
     Raises
     ------
-    ValueError
-        If the name is empty or holds a colon.
+    TypeError, ValueError
+        If the name is empty or holds a colon, or the problem is of another type.
     """
-    if not name or ":" in name:
-        raise ValueError(f"name = {name!r} must be a non-empty name without ':'.")
+    if not isinstance(name, str) or not name or ":" in name:
+        raise ValueError(f"name = {name!r} must be a non-empty string without ':'.")
+    if not (isinstance(problem, LinearMPC | str) or inspect.isroutine(problem)):
+        raise TypeError(
+            f"problem = {problem!r} must be a LinearMPC, a function that returns one, or a "
+            '"module:attribute" string.'
+        )
     _registered[name] = problem
 
 
 def resolve_problem(problem: LinearMPC | str | None, observation_space: Any) -> LinearMPC:
     """Return the LinearMPC that is meant: given, named, or carried by the observation space.
-
-    A problem that was named is kept on the space, solved, so that it is saved with a model and
-    a load neither solves again nor needs the solver.
 
     Raises
     ------
@@ -54,15 +57,15 @@ def resolve_problem(problem: LinearMPC | str | None, observation_space: Any) -> 
             'Pass policy_kwargs={"problem": mpc} with a LinearMPC, a registered name '
             f'({", ".join(sorted(_registered))}) or "module:attribute".'
         )
-    if not isinstance(problem, str):
-        return _as_mpc(problem, "problem")
-    kept = vars(observation_space).setdefault("_sb3_yann_problems", {})
-    if problem not in kept:
-        kept[problem] = _look_up(problem)
-    return _as_mpc(kept[problem], problem)
+    found = _look_up(problem) if isinstance(problem, str) else problem
+    if inspect.isroutine(found):
+        found = found()
+    if not isinstance(found, LinearMPC):
+        raise TypeError(f"problem = {problem!r} is {found!r}, expected a LinearMPC.")
+    return found
 
 
-def _look_up(name: str) -> LinearMPC:
+def _look_up(name: str) -> Any:
     found: Any = name
     if ":" not in name:
         if name not in _registered:
@@ -71,14 +74,4 @@ def _look_up(name: str) -> LinearMPC:
                 'sb3_yann.register_problem, or refer to it as "module:attribute".'
             )
         found = _registered[name]
-    if isinstance(found, str):
-        found = resolve_reference(found)
-    return _as_mpc(found, name)
-
-
-def _as_mpc(found: Any, name: str) -> LinearMPC:
-    if callable(found):
-        found = found()
-    if not isinstance(found, LinearMPC):
-        raise TypeError(f"{name} is {found!r}, expected a LinearMPC.")
-    return found
+    return resolve_reference(found) if isinstance(found, str) else found

@@ -92,5 +92,6 @@ def save_trajectories(
 
 
 def _change(value: float) -> str:
+    value = round(value, 2) + 0.0  # no "-0.00"
     color = "red" if value >= 0.005 else "green" if value <= -0.005 else "white"
     return f"[{color}]{value:+,.2f}[/{color}]"

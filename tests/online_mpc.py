@@ -36,12 +36,11 @@ class OnlineMPC:
         steps = np.hstack([np.kron(np.eye(N), -B), np.eye(N * n) - np.kron(np.eye(N, k=-1), A)])
         self.steps = steps * unit / np.tile(x_unit, N)[:, None]
         self.start = np.vstack([A, np.zeros(((N - 1) * n, n))]) / np.tile(x_unit, N)[:, None]
-        self.last = np.hstack(
-            [np.zeros((len(mpc.terminal_g), N * m + (N - 1) * n)), mpc.terminal_F]
-        )
+        terminal_F, terminal_g = mpc.terminal_set
+        self.last = np.hstack([np.zeros((len(terminal_g), N * m + (N - 1) * n)), terminal_F])
         self.last_length = np.maximum(np.linalg.norm(self.last * unit, axis=1), 1e-9)
         self.last = self.last * unit / self.last_length[:, None]
-        self.last_upper = mpc.terminal_g / self.last_length
+        self.last_upper = terminal_g / self.last_length
 
         weights = [mpc.gamma**k * mpc.R for k in range(N)]
         weights += [mpc.gamma**k * mpc.Q for k in range(1, N)]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 import subprocess
 import sys
 import textwrap
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from conftest import LinearPlant, feasible_states, two_input_mpc
 from gymnasium import spaces
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import sb3_yann
 from sb3_yann import LinearModel, LinearMPC, NoActionNoise, YannActor, YannCritic, YannPolicy
@@ -146,18 +148,42 @@ def test_a_subclass_of_the_policy_gets_the_discount_as_well() -> None:
     assert model.policy.gamma == 0.8
 
 
-def test_actor_and_critic_step_at_their_own_rates() -> None:
+def first_step(network) -> float:
+    """Return the length of Adam's first step, which is the learning rate itself."""
+    before = [p.clone() for p in network.parameters()]
+    for p in network.parameters():
+        p.grad = th.ones_like(p)
+    network.optimizer.state.clear()
+    network.optimizer.step()
+    steps = [(a - b).detach() for a, b in zip(before, network.parameters(), strict=True)]
+    np.testing.assert_allclose(steps[-1], float(steps[0].mean()), rtol=1e-2)
+    return float(steps[0].mean())
+
+
+@pytest.mark.parametrize("way", ["as built", "deep copy", "pickle", "saved and loaded"])
+def test_actor_and_critic_step_at_their_own_rates(way, tmp_path) -> None:
     mpc = scalar_mpc()
     kwargs = {"problem": mpc, "actor_lr_mult": 0.1, "critic_lr_mult": 0.5}
     model = DDPG(YannPolicy, LinearPlant(mpc), learning_rate=1e-2, policy_kwargs=kwargs)
-    for network, rate in ((model.actor, 1e-3), (model.critic, 5e-3)):
-        before = [p.clone() for p in network.parameters()]
-        for p in network.parameters():
-            p.grad = th.ones_like(p)
-        network.optimizer.step()  # the first step of Adam is the learning rate itself
-        for old, new in zip(before, network.parameters(), strict=True):
-            np.testing.assert_allclose((old - new).detach(), rate, rtol=1e-3)
-        assert network.optimizer.param_groups[0]["lr"] == 1e-2  # SB3's own, untouched
+    policy = model.policy
+    if way == "deep copy":
+        policy = copy.deepcopy(policy)
+    elif way == "pickle":
+        policy = cloudpickle.loads(cloudpickle.dumps(policy))
+    elif way == "saved and loaded":
+        model.save(tmp_path / "model")
+        policy = DDPG.load(tmp_path / "model").policy
+    assert first_step(policy.actor) == pytest.approx(1e-3, rel=1e-2)
+    assert first_step(policy.critic) == pytest.approx(5e-3, rel=1e-2)
+    assert policy.actor.optimizer.param_groups[0]["lr"] == 1e-2  # SB3's own, untouched
+
+
+def test_rates_given_to_load_are_those_in_use(tmp_path) -> None:
+    model = build(learning_rate=1e-2)
+    model.save(tmp_path / "model")
+    kwargs = {**model.policy_kwargs, "actor_lr_mult": 0.5}
+    loaded = DDPG.load(tmp_path / "model", custom_objects={"policy_kwargs": kwargs})
+    assert first_step(loaded.actor) == pytest.approx(5e-3, rel=1e-2)
 
 
 @pytest.mark.parametrize("frozen", ["actor", "critic"])
@@ -212,8 +238,6 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, tmp_path
     loaded.load_replay_buffer(tmp_path / "buffer")
     for name, value in model.policy.state_dict().items():
         assert th.equal(value, loaded.policy.state_dict()[name]), name
-    group = loaded.actor.optimizer.param_groups[0]
-    assert group["lr_mult"] == 0.1
     for each in (model, loaded):
         each.set_random_seed(1)
         each.set_logger(model.logger)
@@ -343,6 +367,9 @@ def test_a_policy_without_a_problem_says_how_to_give_one() -> None:
         ("sb3_yann_envs.problems:nothing", ValueError, "nothing"),
         ("math:pi", TypeError, "expected a LinearMPC"),
         (42, TypeError, "expected a LinearMPC"),
+        (LinearMPC, TypeError, "expected a LinearMPC"),
+        ("sb3_yann:LinearMPC", TypeError, "expected a LinearMPC"),
+        (scalar_mpc().explicit(), TypeError, "is PiecewiseAffine.*expected a LinearMPC"),
     ],
 )
 def test_a_problem_that_cannot_be_found_is_named(problem, error, message) -> None:
@@ -369,13 +396,52 @@ def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
         ({"critic_lr_mult": float("nan")}, ValueError, "critic_lr_mult"),
         ({"gamma": 1.5}, ValueError, "gamma"),
         ({"hidden": 3}, TypeError, "'hidden'"),
-        ({"net_arch": {"pi": [4, 4, 4], "qf": [8, 8]}}, ValueError, "hidden"),
+        ({"actor_lr_mult": "a"}, TypeError, "actor_lr_mult = 'a'"),
+        ({"actor_lr_mult": None}, TypeError, "actor_lr_mult = None"),
+        ({"n_critics": 0}, ValueError, "n_critics = 0"),
+        ({"net_arch": {"pi": [4, 4, 4], "qf": [8, 8]}}, ValueError, r"net_arch\['pi'\]"),
+        ({"net_arch": {"pi": ["a"]}}, ValueError, r"net_arch\['pi'\]"),
+        ({"net_arch": {"vf": [4]}}, ValueError, "net_arch"),
+        ({"activation_fn": th.tanh}, TypeError, "activation_fn"),
         ({"activation_fn": th.nn.Sigmoid}, ValueError, "activation"),
     ],
 )
 def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> None:
     with pytest.raises(error, match=message):
         make_policy(unbounded(), actions(), problem=scalar_mpc(), **kwargs)
+
+
+def test_a_net_arch_may_leave_out_or_join_actor_and_critic() -> None:
+    policy = make_policy(unbounded(), actions(), problem=scalar_mpc(), net_arch={"pi": [3, 5]})
+    assert policy.net_arch == {"pi": [3, 5], "qf": [64, 64]}
+    policy = make_policy(unbounded(), actions(), problem=scalar_mpc(), net_arch=[7, 7])
+    assert policy.net_arch == {"pi": [7, 7], "qf": [7, 7]}
+
+
+def test_integer_actions_are_refused() -> None:
+    with pytest.raises(TypeError, match="int32"):
+        make_policy(unbounded(), spaces.Box(-1, 1, (1,), np.int32), problem=scalar_mpc())
+
+
+@pytest.mark.parametrize("normalised", ["norm_obs", "norm_reward"])
+def test_a_normalising_env_is_refused(normalised) -> None:
+    switches = {"norm_obs": False, "norm_reward": False, normalised: True}
+    env = VecNormalize(make_vec_env("sb3_yann:CSTR-v0"), **switches)
+    with pytest.raises(ValueError, match="VecNormalize"):
+        DDPG(YannPolicy, env)
+
+
+def test_a_name_registered_again_means_the_new_problem() -> None:
+    env = LinearPlant(scalar_mpc())
+    for weight in (1, 10):
+        sb3_yann.register_problem("again", scalar_mpc(R=[[weight]]))
+        model = DDPG(YannPolicy, env, policy_kwargs={"problem": "again"})
+        assert model.policy.problem.R == [[weight]]
+
+
+def test_only_problems_can_be_registered() -> None:
+    with pytest.raises(TypeError, match="problem = 3"):
+        sb3_yann.register_problem("three", 3)
 
 
 def test_a_name_for_a_problem_must_be_a_name() -> None:

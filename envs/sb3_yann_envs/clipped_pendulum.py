@@ -193,7 +193,7 @@ class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         torque = clipped_input(action, MAX_TORQUE)
         cost = _wrapped(theta) ** 2 + 0.1 * speed**2 + 0.001 * torque**2
         # numpy's sine, not math's: the two differ in the last bit on some machines, and the
-        # trajectories are to be Gymnasium's bit for bit.
+        # trajectories are to be Gymnasium's bit for bit (with float64 actions).
         acceleration = _GRAVITY_GAIN * float(np.sin(theta)) + _TORQUE_GAIN * torque
         speed = min(max(speed + acceleration * DT, -MAX_SPEED), MAX_SPEED)
         theta += speed * DT

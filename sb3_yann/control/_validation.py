@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
-def as_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array:
-    """Return ``value`` as a read-only float64 array of ``shape``; ``None`` leaves a size free.
+def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
+    """Return ``value`` as a read-only float64 array of ``shape``; a letter leaves a size free.
 
     Raises
     ------
@@ -23,11 +23,15 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Array:
     """
     array = to_float(name, value)
     if array.ndim != len(shape) or any(
-        want is not None and got != want for got, want in zip(array.shape, shape, strict=True)
+        isinstance(want, int) and got != want for got, want in zip(array.shape, shape, strict=True)
     ):
-        sizes = ["any" if size is None else str(size) for size in shape]
-        wanted = ", ".join(sizes) if len(sizes) > 1 else f"{sizes[0]},"
-        raise ValueError(f"{name} has shape {array.shape}, expected ({wanted}).")
+        wanted = ", ".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]},"
+        hint = (
+            " Write a matrix as a list of rows, [[...], [...]]."
+            if array.ndim < len(shape) == 2
+            else ""
+        )
+        raise ValueError(f"{name} has shape {array.shape}, expected ({wanted}).{hint}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds NaN or infinite entries: {array.tolist()}.")
     return _frozen(array)
@@ -127,7 +131,13 @@ class ReadOnlyArrays:
 
 def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
     """Tell whether the named attributes of two objects are equal, arrays entry by entry."""
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+    return all(_same(getattr(one, name), getattr(other, name)) for name in names)
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, tuple):
+        return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+    return bool(np.array_equal(one, other))
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:

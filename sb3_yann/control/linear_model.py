@@ -57,11 +57,11 @@ class LinearModel(ReadOnlyArrays):
         x_ss: ArrayLike | None = None,
         u_ss: ArrayLike | None = None,
     ) -> None:
-        state = as_array("A", A, (None, None))
+        state = as_array("A", A, ("n", "n"))
         n = state.shape[0]
         if n == 0 or state.shape[1] != n:
             raise ValueError(f"A has shape {state.shape}, expected a square matrix (n, n), n >= 1.")
-        inputs = as_array("B", B, (n, None))
+        inputs = as_array("B", B, (n, "m"))
         m = inputs.shape[1]
         if m == 0:
             raise ValueError(f"B has shape {inputs.shape}: the model needs at least one input.")
@@ -120,13 +120,23 @@ class LinearModel(ReadOnlyArrays):
         Raises
         ------
         ValueError
-            If ``f`` returns another shape or NaN at the operating point.
+            If ``f`` returns another shape or NaN at the operating point, or the operating point
+            moves by more than 0.1 % (of 1, where it is smaller) within one sample.
         """
         import control
 
-        x = as_array("x_ss", x_ss, (None,))
-        u = as_array("u_ss", u_ss, (None,))
-        as_array("f(x_ss, u_ss)", f(x, u), (x.size,))
+        x = as_array("x_ss", x_ss, ("n",))
+        u = as_array("u_ss", u_ss, ("m",))
+        dt = as_positive("dt", dt)
+        if not callable(f):
+            raise TypeError(f"f = {f!r} must be a function (x, u) -> dx/dt.")
+        drift = dt * np.abs(as_array("f(x_ss, u_ss)", f(x, u), (x.size,)))
+        if np.any(drift > 1e-3 * np.maximum(np.abs(x), 1)):
+            raise ValueError(
+                f"x_ss = {x.tolist()}, u_ss = {u.tolist()} is no steady state: within one sample "
+                f"of {dt:g} the state would move by {drift.tolist()}. Solve f(x, u) = 0 first, "
+                "e.g. with scipy.optimize.root."
+            )
         plant = control.nlsys(
             lambda t, x, u, params: np.asarray(f(x, u), dtype=np.float64),
             inputs=u.size,

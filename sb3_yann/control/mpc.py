@@ -54,7 +54,8 @@ class LinearMPC(ReadOnlyArrays):
         and leave the predicted states free.
     terminal_cost : array_like, shape (n, n), optional
         P, symmetric positive semi-definite. The default is the Riccati solution of the same
-        discount, with which the law is the LQR wherever no constraint acts.
+        discount, with which the law is the LQR wherever no constraint acts. It is stored, so
+        `dataclasses.replace` keeps it: replace it by None too, to have it solved anew.
     terminal_set : tuple of array_like, optional
         ``(F, g)`` of shapes (c, n) and (c,) for ``F x_N <= g``.
     gamma : float, default 1
@@ -81,8 +82,7 @@ class LinearMPC(ReadOnlyArrays):
     theta_min: Array
     theta_max: Array
     terminal_cost: Array
-    terminal_F: Array
-    terminal_g: Array
+    terminal_set: tuple[Array, Array]
     gamma: float
     outside: str
 
@@ -127,7 +127,7 @@ class LinearMPC(ReadOnlyArrays):
             if terminal_cost is None
             else as_symmetric("terminal_cost", terminal_cost, n, definite=False)
         )
-        values["terminal_F"], values["terminal_g"] = _as_half_spaces(terminal_set, n)
+        values["terminal_set"] = _as_half_spaces(terminal_set, n)
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -209,7 +209,8 @@ class LinearMPC(ReadOnlyArrays):
         rows += [(-np.eye(N * m), -np.tile(self.u_min, N), np.zeros((N * m, n)))]
         for k in range(1, N + 1):
             rows += [(forced[k], self.x_max, -powers[k]), (-forced[k], -self.x_min, powers[k])]
-        rows += [(self.terminal_F @ forced[N], self.terminal_g, -self.terminal_F @ powers[N])]
+        last, upper = self.terminal_set
+        rows += [(last @ forced[N], upper, -last @ powers[N])]
         G, w, S = (np.concatenate(parts) for parts in zip(*rows, strict=True))
         bounded = np.isfinite(w)
         return ParametricQP(
@@ -261,5 +262,5 @@ def _as_half_spaces(
             "terminal_set must be a pair (F, g) of arrays for F x_N <= g, "
             f"got {type(value).__name__}."
         ) from None
-    F = as_array("terminal_set F", F, (None, n_states))
+    F = as_array("terminal_set F", F, ("rows", n_states))
     return F, as_array("terminal_set g", g, (F.shape[0],))

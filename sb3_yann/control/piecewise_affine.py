@@ -75,9 +75,9 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     def __post_init__(self) -> None:
         """Check the arrays against each other and store them as read-only float64."""
-        gains = as_array("gains", self.gains, (None, None, None))
+        gains = as_array("gains", self.gains, ("p", "m", "n"))
         p, m, n = gains.shape
-        A = as_array("A", self.A, (None, n))
+        A = as_array("A", self.A, ("q", n))
         values = {"gains": gains, "A": A, "b": as_array("b", self.b, (len(A),))}
         values["offsets"] = as_array("offsets", self.offsets, (p, m))
         values["u_min"], values["u_max"] = as_bounds("u", self.u_min, self.u_max, m)

@@ -15,16 +15,16 @@ TURN = [[np.cos(1), np.sin(1), 0], [-np.sin(1), np.cos(1), 0], [0, 0, 0.5]]
 
 BAD_MODELS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"A": [[1, 2, 3], [4, 5, 6]]}, ValueError, r"A has shape \(2, 3\), expected a square matrix"),
-    ({"A": [1, 2]}, ValueError, r"A has shape \(2,\), expected \(any, any\)"),
+    ({"A": [1, 2]}, ValueError, r"A has shape \(2,\), expected \(n, n\)"),
     ({"A": np.zeros((0, 0))}, ValueError, r"A has shape \(0, 0\), expected a square matrix"),
-    ({"A": None}, ValueError, r"A has shape \(\), expected \(any, any\)"),
+    ({"A": None}, ValueError, r"A has shape \(\), expected \(n, n\)"),
     ({"A": [[1, NAN], [0, 1]]}, ValueError, "A holds NaN or infinite entries"),
     ({"A": [[1, INF], [0, 1]]}, ValueError, "A holds NaN or infinite entries"),
     ({"A": [["a", 1], [0, 1]]}, TypeError, "A = .* is not an array of real numbers"),
     ({"A": [[1, 2], [3]]}, TypeError, "A = .* is not an array of real numbers"),
     ({"A": np.array([[1j, 0], [0, 1]])}, TypeError, "(?s)A = .* is not an array of real numbers"),
-    ({"B": [[1], [2], [3]]}, ValueError, r"B has shape \(3, 1\), expected \(2, any\)"),
-    ({"B": [1, 2]}, ValueError, r"B has shape \(2,\), expected \(2, any\)"),
+    ({"B": [[1], [2], [3]]}, ValueError, r"B has shape \(3, 1\), expected \(2, m\)"),
+    ({"B": [1, 2]}, ValueError, r"B has shape \(2,\), expected \(2, m\)"),
     ({"B": np.zeros((2, 0))}, ValueError, r"B has shape \(2, 0\): the model needs at least one"),
     ({"B": [[NAN], [1]]}, ValueError, "B holds NaN or infinite entries"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
@@ -54,7 +54,9 @@ BAD_DYNAMICS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"f": lambda x, u: x * NAN}, ValueError, r"f\(x_ss, u_ss\) holds NaN"),
     ({"f": lambda x, u: x + 1j}, TypeError, r"f\(x_ss, u_ss\) = .* is not an array of real"),
     ({"x_ss": [NAN, 0]}, ValueError, "x_ss holds NaN"),
-    ({"u_ss": 0.0}, ValueError, r"u_ss has shape \(\), expected \(any,\)"),
+    ({"u_ss": 0.0}, ValueError, r"u_ss has shape \(\), expected \(m,\)"),
+    ({"f": lambda x, u: [1, 0]}, ValueError, "is no steady state.*Solve f"),
+    ({"f": 3}, TypeError, "f = 3 must be a function"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
 ]
 

@@ -42,10 +42,14 @@ def test_sampling_keeps_the_operating_point_and_the_sampling_time() -> None:
 
 
 def test_dynamics_are_linearised_by_their_jacobian() -> None:
-    def f(x: Any, u: Any) -> Any:
-        return [np.sin(x[1]) * x[0] + u[0] ** 2, np.exp(x[0]) - x[1] * u[1]]
+    def raw(x: Any, u: Any) -> Any:
+        return np.array([np.sin(x[1]) * x[0] + u[0] ** 2, np.exp(x[0]) - x[1] * u[1]])
 
     x, u = np.array([0.3, -0.7]), np.array([0.5, 2.0])
+
+    def f(state: Any, inputs: Any) -> Any:
+        return raw(state, inputs) - raw(x, u)  # at rest in (x, u)
+
     A = [[np.sin(x[1]), x[0] * np.cos(x[1])], [np.exp(x[0]), -u[1]]]  # by hand
     B = [[2 * u[0], 0], [0, -x[1]]]
     model, exact = LinearModel.from_dynamics(f, x, u, 0.1), LinearModel.from_continuous(A, B, 0.1)
