@@ -6,7 +6,6 @@ import sys
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import TD3
@@ -17,6 +16,13 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
+from sb3_yann._checks import (
+    as_multiplier,
+    as_net_arch,
+    require_box,
+    require_matching,
+    require_plain_td3,
+)
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import QuadraticStateActionValue, YannLayer
 from sb3_yann.problems import resolve_problem
@@ -176,19 +182,19 @@ class YannPolicy(TD3Policy):
         **other: Any,
     ) -> None:
         algorithm = _algorithm_under_construction()
-        _require_plain_td3(algorithm, other)
+        require_plain_td3(algorithm, other)
         if features_extractor_class is not FlattenExtractor:
             raise ValueError(
                 f"features_extractor_class = {features_extractor_class.__name__} would change the "
                 "parameter of the law; leave it at FlattenExtractor."
             )
-        _require_box("observation_space", observation_space)
-        _require_box("action_space", action_space)
+        require_box("observation_space", observation_space)
+        require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
         if algorithm is not None and isinstance(problem, str):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             algorithm.policy_kwargs = {**algorithm.policy_kwargs, "problem": self.problem}
-        _require_matching(self.problem, observation_space, action_space)
+        require_matching(self.problem, observation_space, action_space)
         self.gamma = getattr(algorithm, "gamma", 0.99) if gamma is None else gamma
         if isinstance(n_critics, bool) or not isinstance(n_critics, int) or n_critics < 1:
             raise ValueError(f"n_critics = {n_critics!r} must be a whole number of at least 1.")
@@ -197,14 +203,14 @@ class YannPolicy(TD3Policy):
                 f"activation_fn = {activation_fn!r} must be a class such as torch.nn.Tanh."
             )
         self.lr_mult = {
-            "actor": _as_multiplier("actor_lr_mult", actor_lr_mult),
-            "critic": _as_multiplier("critic_lr_mult", critic_lr_mult),
+            "actor": as_multiplier("actor_lr_mult", actor_lr_mult),
+            "critic": as_multiplier("critic_lr_mult", critic_lr_mult),
         }
         super().__init__(
             observation_space,
             action_space,
             lr_schedule,
-            net_arch=_as_net_arch(net_arch),
+            net_arch=as_net_arch(net_arch),
             activation_fn=activation_fn,
             features_extractor_class=features_extractor_class,
             features_extractor_kwargs=features_extractor_kwargs,
@@ -264,92 +270,6 @@ def _algorithm_under_construction() -> BaseAlgorithm | None:
         frame = frame.f_back
     caller = frame.f_locals.get("self")
     return caller if isinstance(caller, BaseAlgorithm) else None
-
-
-def _require_plain_td3(algorithm: BaseAlgorithm | None, other: dict[str, Any]) -> None:
-    if algorithm is not None and not isinstance(algorithm, TD3):
-        raise TypeError(
-            f"YannPolicy starts from a deterministic law and works with DDPG and TD3, not with "
-            f"{type(algorithm).__name__}. Use e.g. DDPG(YannPolicy, env)."
-        )
-    normalize = None if algorithm is None else algorithm.get_vec_normalize_env()
-    if normalize is not None and (normalize.norm_obs or normalize.norm_reward):
-        raise ValueError(
-            "The env is a VecNormalize: normalised observations are not the state that the law "
-            "takes, normalised rewards not the cost that the critic stands for. Train without it."
-        )
-    if other:
-        raise TypeError(
-            f"YannPolicy takes no {', '.join(map(repr, other))}. Its own policy_kwargs are "
-            "problem, gamma, net_arch, activation_fn, actor_lr_mult and critic_lr_mult."
-        )
-
-
-def _require_box(name: str, space: spaces.Space[Any]) -> None:
-    if not isinstance(space, spaces.Box):
-        raise TypeError(
-            f"{name} is a {type(space).__name__}, YannPolicy needs a Box. "
-            "Wrap the env so that observations and actions are vectors of real numbers."
-        )
-    if len(space.shape) != 1:
-        raise ValueError(
-            f"{name} has shape {space.shape}, YannPolicy needs one dimension, (n,). "
-            "Wrap the env in gymnasium.wrappers.FlattenObservation, or observe the plant's state."
-        )
-
-
-def _require_matching(
-    problem: LinearMPC, observation_space: spaces.Space[Any], action_space: spaces.Box
-) -> None:
-    if observation_space.shape != (problem.n_theta,):
-        raise ValueError(
-            f"The observation has shape {observation_space.shape}, but the law of the problem "
-            f"takes theta of shape ({problem.n_theta},). Give the policy the problem of this plant."
-        )
-    if not np.issubdtype(action_space.dtype, np.floating):
-        raise TypeError(
-            f"action_space has dtype {action_space.dtype}, but the inputs of an MPC are real: make "
-            "it a Box of numpy.float32."
-        )
-    if not action_space.is_bounded():
-        raise ValueError(f"action_space = {action_space} must have finite bounds.")
-    law = (problem.u_min, problem.u_max)
-    env = (action_space.low, action_space.high)
-    reach = np.where(np.isfinite(law[1] - law[0]), law[1] - law[0], 1.0)
-    if env[0].shape != law[0].shape or any(
-        np.any(np.abs(ours - theirs) > 1e-6 * reach) for ours, theirs in zip(law, env, strict=True)
-    ):
-        raise ValueError(
-            f"The action space is [{env[0].tolist()}, {env[1].tolist()}], but the MPC has u_min = "
-            f"{law[0].tolist()} and u_max = {law[1].tolist()}. They must be the same: build the "
-            "LinearMPC with the bounds of the env, and leave out wrappers that rescale actions."
-        )
-
-
-def _as_multiplier(name: str, value: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise TypeError(f"{name} = {value!r} must be a number: 0 freezes, 1 is SB3's own rate.")
-    if not (np.isfinite(value) and value >= 0):
-        raise ValueError(f"{name} = {value!r} must be a finite number, 0 (frozen) or above.")
-    return float(value)
-
-
-def _as_net_arch(value: dict[str, list[int]] | list[int] | None) -> dict[str, list[int]]:
-    known = {"pi": [16, 16], "qf": [64, 64]}
-    if value is None:
-        return known
-    if isinstance(value, list):  # SB3's short form
-        value = dict.fromkeys(known, value)
-    if not isinstance(value, dict) or not set(value) <= set(known):
-        raise ValueError(f"net_arch = {value!r} must be a dict such as {known}.")
-    for name, widths in value.items():
-        sizes = list(widths) if isinstance(widths, (list, tuple)) else []
-        if len(sizes) not in (1, 2) or not all(isinstance(n, int) and n > 0 for n in sizes):
-            raise ValueError(
-                f"net_arch[{name!r}] = {widths!r} must name the widths of one or two hidden "
-                f"layers, such as {known[name]}."
-            )
-    return {**known, **value}
 
 
 def _multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:
