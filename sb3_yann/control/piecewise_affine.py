@@ -160,7 +160,10 @@ class PiecewiseAffine(ReadOnlyArrays):
             If the file is not such a law.
         """
         try:
-            with np.load(path, allow_pickle=False) as data:
+            data = np.load(path, allow_pickle=False)
+            if isinstance(data, np.ndarray):
+                raise ValueError("it is a single array")
+            with data:
                 values = {field.name: data[field.name] for field in fields(cls)}
             return cls(**{**values, "outside": str(values["outside"])})
         except (KeyError, TypeError, ValueError, EOFError, BadZipFile) as error:
