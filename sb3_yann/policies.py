@@ -118,6 +118,9 @@ class YannPolicy(TD3Policy):
     The actor's output is the explicit law of the MPC plus networks that are zero at first; the
     critic is the state-action value of the law on the linear model, plus such a network.
 
+    TD3 adds noise to the target policy by default, which teaches the critic the value of a noisy
+    controller: pass ``target_policy_noise=0.0`` to TD3, so that the exact critic stays the target.
+
     Parameters
     ----------
     observation_space : gymnasium.spaces.Box, shape (n,)
