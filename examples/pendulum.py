@@ -1,6 +1,6 @@
-"""TD3 on the clipped pendulum, from its linear MPC onward, without exploration.
+"""TD3 or DDPG on the clipped pendulum, from its linear MPC onward, without exploration.
 
-python examples/pendulum.py [--episodes 50] [--seed 0]
+python examples/pendulum.py [--algo td3] [--episodes 50] [--seed 0]
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import argparse
 
 import torch
 from rich.console import Console
-from stable_baselines3 import TD3
+from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import ControlDiagnostics, NoActionNoise, YannPolicy
 from sb3_yann.evaluation import evaluate
@@ -23,14 +23,18 @@ TEST_SEEDS = range(1000, 1010)  # starts that training never sees
 def main() -> None:
     """Train, then compare the policy with the MPC that it was at the start."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--algo", choices=["td3", "ddpg"], default="td3")
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # the networks are too small to share among cores
     console = Console()
 
-    # Noise on the target policy, TD3's default, would spoil the critic's exact start.
-    model = TD3(YannPolicy, "ClippedPendulum-v0", target_policy_noise=0.0, seed=arguments.seed)
+    if arguments.algo == "td3":
+        # Noise on the target policy, TD3's default, would spoil the critic's exact start.
+        model = TD3(YannPolicy, "ClippedPendulum-v0", target_policy_noise=0.0, seed=arguments.seed)
+    else:
+        model = DDPG(YannPolicy, "ClippedPendulum-v0", seed=arguments.seed)
     console.print(f"The policy starts as {model.policy.problem.explicit()}.")
     before = evaluate(model, "ClippedPendulum-v0", TEST_SEEDS)
     model.learn(

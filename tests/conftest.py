@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -35,7 +37,7 @@ class LinearPlant(gym.Env):
 
 
 def two_input_mpc(**changes) -> LinearMPC:
-    """Three states, two inputs, asymmetric bounds on everything: 153 regions."""
+    """Three states, two inputs, asymmetric bounds on everything."""
     A = [[1, 0.1, 0], [0, 1, 0.1], [0, 0, 0.9]]
     B = [[0, 0.1], [0.1, 0], [0, 1]]
     design = {
@@ -52,17 +54,7 @@ def two_input_mpc(**changes) -> LinearMPC:
 
 def asymmetric_pendulum_mpc() -> LinearMPC:
     """The pendulum's problem with a motor that pulls harder to one side."""
-    base = problems.clipped_pendulum()
-    return LinearMPC(
-        base.model,
-        Q=base.Q,
-        R=base.R,
-        horizon=2,
-        x_min=base.x_min,
-        x_max=base.x_max,
-        u_min=-1.0,
-        u_max=3.0,
-    )
+    return dataclasses.replace(problems.clipped_pendulum(), u_min=-1.0, u_max=3.0)
 
 
 PROBLEMS = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 import subprocess
 import sys
@@ -87,18 +88,7 @@ def test_ddpg_has_one_critic_and_td3_two() -> None:
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 @pytest.mark.parametrize("discounted", [False, True], ids=["paper's MPC", "discounted MPC"])
 def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted) -> None:
-    base = make()
-    mpc = LinearMPC(
-        base.model,
-        Q=base.Q,
-        R=base.R,
-        horizon=2,
-        u_min=base.u_min,
-        u_max=base.u_max,
-        theta_min=base.theta_min,
-        theta_max=base.theta_max,
-        gamma=gamma if discounted else 1.0,
-    )
+    mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal_cost=None)
     model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0)
     model.learn(1)  # sets up the logger
     law, rng = mpc.explicit(), np.random.default_rng(0)
@@ -214,16 +204,7 @@ def test_a_problem_may_be_an_object_a_name_or_a_reference(reference) -> None:
 
 
 def test_the_given_problem_goes_before_the_one_in_the_space() -> None:
-    mpc = LinearMPC(
-        problems.clipped_pendulum().model,
-        Q=np.eye(2),
-        R=[[0.001]],
-        horizon=1,
-        x_min=[-2, -8],
-        x_max=[2, 8],
-        u_min=-2,
-        u_max=2,
-    )
+    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal_cost=None)
     model = DDPG(YannPolicy, "ClippedPendulum-v0", policy_kwargs={"problem": mpc})
     assert model.policy.problem is mpc
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 from typing import Any
 
@@ -296,3 +297,15 @@ def test_negative_zero_is_zero_to_the_hash_of_a_problem() -> None:
 def test_arrays_of_a_problem_stay_read_only_in_a_copy() -> None:
     with pytest.raises(ValueError, match="read-only"):
         copy.deepcopy(small_mpc()).Q[0, 0] = 2
+
+
+@pytest.mark.parametrize("entry", [0, 1])
+def test_a_terminal_set_stays_read_only_in_a_copy(entry: int) -> None:
+    twin = copy.deepcopy(small_mpc(terminal_set=([[1, 1]], [3])))
+    with pytest.raises(ValueError, match="read-only"):
+        twin.terminal_set[entry][0] = 2
+
+
+def test_a_problem_with_one_thing_replaced_is_that_problem() -> None:
+    changed = dataclasses.replace(small_mpc(), Q=np.diag([1, 2]), terminal_cost=None)
+    assert changed == small_mpc(Q=np.diag([1, 2]))
