@@ -7,6 +7,7 @@ policy alias ``"YannPolicy"`` with TD3 and DDPG.
 import sb3_yann_envs
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import ExplicitSolutionError, LinearModel, LinearMPC, PiecewiseAffine
+from sb3_yann.guard import Decision, ImprovementGuard
 from sb3_yann.policies import YannActor, YannCritic, YannPolicy
 from sb3_yann.problems import register_problem
 
@@ -14,7 +15,9 @@ __version__ = "0.1.0"
 
 __all__ = [
     "ControlDiagnostics",
+    "Decision",
     "ExplicitSolutionError",
+    "ImprovementGuard",
     "LinearMPC",
     "LinearModel",
     "NoActionNoise",

@@ -28,7 +28,8 @@ def require_plain_td3(algorithm: BaseAlgorithm | None, other: dict[str, Any]) ->
     if other:
         raise TypeError(
             f"YannPolicy takes no {', '.join(map(repr, other))}. Its own policy_kwargs are "
-            "problem, gamma, net_arch, activation_fn, actor_lr_mult and critic_lr_mult."
+            "problem, gamma, net_arch, activation_fn, actor_lr_mult, critic_lr_mult, critic, "
+            "prediction_model, value_scale, critic_warmup, max_correction and pin_equilibrium."
         )
 
 
@@ -75,12 +76,47 @@ def require_matching(
         )
 
 
-def as_multiplier(name: str, value: float) -> float:
-    """Return a factor of a learning rate, a finite float of at least 0."""
+def as_factor(name: str, value: float) -> float:
+    """Return a factor, a finite float of at least 0."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise TypeError(f"{name} = {value!r} must be a number: 0 freezes, 1 is SB3's own rate.")
+        raise TypeError(f"{name} = {value!r} must be a number.")
     if not (np.isfinite(value) and value >= 0):
-        raise ValueError(f"{name} = {value!r} must be a finite number, 0 (frozen) or above.")
+        raise ValueError(f"{name} = {value!r} must be a finite number of at least 0.")
+    return float(value)
+
+
+def require_critic_options(
+    critic: str, prediction_model: object, value_scale: float, critic_warmup: int
+) -> None:
+    """Raise unless these are options of a critic."""
+    if critic not in ("afterstate", "state_action"):
+        raise ValueError(f"critic = {critic!r} must be 'afterstate' or 'state_action'.")
+    if prediction_model is not None and not callable(prediction_model):
+        raise TypeError(
+            f"prediction_model = {prediction_model!r} must be a function of tensors (theta, u) "
+            "that returns the next theta, or None for the linear model."
+        )
+    if prediction_model is not None and critic == "state_action":
+        raise ValueError(
+            "prediction_model is for critic='afterstate'; critic='state_action' predicts nothing."
+        )
+    if as_factor("value_scale", value_scale) == 0:
+        raise ValueError("value_scale = 0 would leave the network without effect; give e.g. 30.")
+    whole = isinstance(critic_warmup, (int, np.integer)) and not isinstance(critic_warmup, bool)
+    if not whole or critic_warmup < 0:
+        raise ValueError(
+            f"critic_warmup = {critic_warmup!r} must be a whole number of updates, 0 for none."
+        )
+
+
+def as_max_correction(value: float | None) -> float | None:
+    """Return the bound on the distance from the MPC, a fraction of the input range."""
+    if value is None:
+        return None
+    if as_factor("max_correction", value) > 1:
+        raise ValueError(
+            f"max_correction = {value!r} is a fraction of the input range, 0 to 1, or None."
+        )
     return float(value)
 
 

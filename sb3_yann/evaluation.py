@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann.control import PiecewiseAffine
 
 Array = NDArray[np.float64]
 
@@ -41,7 +44,10 @@ class Episodes:
 
 
 def evaluate(
-    policy: Predictor | Callable[[Any], Any], env: gym.Env[Any, Any] | str, seeds: Iterable[int]
+    policy: Predictor | Callable[[Any], Any],
+    env: gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]],
+    seeds: Iterable[int],
+    starts: Sequence[ArrayLike] | None = None,
 ) -> Episodes:
     """Return one whole episode for each seed, under the policy without any noise.
 
@@ -50,41 +56,76 @@ def evaluate(
     policy : model or callable
         Something with ``predict(observation, deterministic=True)``, or a function from an
         observation to an action, such as the explicit law.
-    env : gymnasium.Env or str
-        Must end its episodes. One that is named is made here, and closed.
+    env : gymnasium.Env, str or callable
+        Must end its episodes. Of one that is named, or made by a function without arguments,
+        there are as many as seeds: they run side by side, the policy sees them as one batch, and
+        they are closed. One that is given runs its episodes one after the other.
     seeds : iterable of int
         ``env.reset(seed=seed)`` starts each episode.
+    starts : sequence of array_like, optional
+        The state of each start, ``env.reset(options={"state": ...})``, for envs that have one.
     """
-    made = gym.make(env) if isinstance(env, str) else env
-    act = _as_function(policy)
-    try:
-        episodes = [_episode(act, made, seed) for seed in seeds]
-    finally:
-        if isinstance(env, str):
-            made.close()
-    costs, violations, observations, actions = zip(*episodes, strict=True)
-    return Episodes(np.array(costs), np.array(violations), observations, actions)
+    seeds = [*seeds]
+    options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]
+    resets = [*zip(seeds, options, strict=True)]
+    act = _as_batch_function(policy)
+    if isinstance(env, gym.Env):
+        episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
+    else:
+        make = partial(gym.make, env, disable_env_checker=True) if isinstance(env, str) else env
+        envs = [make() for _ in seeds]
+        try:
+            episodes = _side_by_side(act, envs, resets)
+        finally:
+            for each in envs:
+                each.close()
+    return Episodes(
+        np.array([episode.cost for episode in episodes]),
+        np.array([episode.violations for episode in episodes], dtype=np.int64),
+        tuple(np.array(episode.observations, float) for episode in episodes),
+        tuple(np.array(episode.actions, float) for episode in episodes),
+    )
 
 
-def _as_function(policy: Predictor | Callable[[Any], Any]) -> Callable[[Any], Any]:
+@dataclass
+class _Episode:
+    observations: list[Any]
+    actions: list[Any] = field(default_factory=list)
+    cost: float = 0.0
+    violations: int = 0
+
+
+def _as_batch_function(policy: Predictor | Callable[[Any], Any]) -> Callable[[Any], Any]:
     if hasattr(policy, "predict"):
-        return lambda observation: policy.predict(observation, deterministic=True)[0]
-    if callable(policy):
+        return lambda observations: policy.predict(observations, deterministic=True)[0]
+    if isinstance(policy, PiecewiseAffine):
         return policy
+    if callable(policy):
+        return lambda observations: [policy(observation) for observation in observations]
     raise TypeError(f"policy = {policy!r} must have a predict method or be callable.")
 
 
-def _episode(
-    act: Callable[[Any], Any], env: gym.Env[Any, Any], seed: int
-) -> tuple[float, int, Array, Array]:
-    observation, _ = env.reset(seed=seed)
-    observations, actions, cost, violations, done = [observation], [], 0.0, 0, False
-    while not done:
-        action = act(observation)
-        observation, reward, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        cost -= float(reward)
-        violations += bool(info.get("violation", False))
-        observations.append(observation)
-        actions.append(action)
-    return cost, violations, np.array(observations, float), np.array(actions, float)
+def _side_by_side(
+    act: Callable[[Any], Any],
+    envs: Sequence[gym.Env[Any, Any]],
+    resets: Sequence[tuple[int, dict[str, Any] | None]],
+) -> list[_Episode]:
+    """Run one episode in each env; those that are over wait for the others."""
+    episodes = [
+        _Episode([env.reset(seed=seed, options=options)[0]])
+        for env, (seed, options) in zip(envs, resets, strict=True)
+    ]
+    running = [*zip(envs, episodes, strict=True)]
+    while running:
+        actions = act(np.stack([episode.observations[-1] for _, episode in running]))
+        going_on = []
+        for (env, episode), action in zip(running, actions, strict=True):
+            observation, reward, terminated, truncated, info = env.step(action)
+            episode.observations.append(observation)
+            episode.actions.append(action)
+            episode.cost -= float(reward)
+            episode.violations += bool(info.get("violation", False))
+            if not (terminated or truncated):
+                going_on.append((env, episode))
+        running = going_on
+    return episodes

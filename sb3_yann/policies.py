@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
+from scipy import linalg
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ContinuousCritic
@@ -17,22 +17,31 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
 from sb3_yann._checks import (
-    as_multiplier,
+    as_factor,
+    as_max_correction,
     as_net_arch,
     require_box,
+    require_critic_options,
     require_matching,
     require_plain_td3,
 )
 from sb3_yann.control import LinearMPC
-from sb3_yann.networks import QuadraticStateActionValue, YannLayer
+from sb3_yann.networks import (
+    AfterstateValue,
+    LinearPrediction,
+    QuadraticStateActionValue,
+    YannLayer,
+)
+from sb3_yann.networks.value import PredictionModel
 from sb3_yann.problems import resolve_problem
 
 
 class YannActor(Actor):
     """SB3's actor with a :class:`YannLayer` in place of the multi-layer perceptron.
 
-    Parameters are those of SB3's `Actor`, and ``problem``, the MPC whose explicit law it starts
-    from. ``net_arch`` is the width of each region's network.
+    Parameters are those of SB3's `Actor`; ``problem``, the MPC whose explicit law it starts from;
+    and ``max_correction`` and ``pin_equilibrium`` of :class:`YannPolicy`. ``net_arch`` is the width
+    of each region's network.
     """
 
     mu: YannLayer  # type: ignore[assignment]
@@ -47,6 +56,8 @@ class YannActor(Actor):
         problem: LinearMPC,
         activation_fn: type[nn.Module] = nn.Tanh,
         normalize_images: bool = True,
+        max_correction: float | None = None,
+        pin_equilibrium: bool = True,
     ) -> None:
         super().__init__(
             observation_space,
@@ -58,18 +69,29 @@ class YannActor(Actor):
             normalize_images,
         )
         self.net_arch = net_arch
-        self.problem = problem
-        self.mu = YannLayer(problem.explicit(), tuple(net_arch), activation_fn())
+        self.options = {
+            "problem": problem,
+            "max_correction": max_correction,
+            "pin_equilibrium": pin_equilibrium,
+        }
+        self.mu = YannLayer(
+            problem.explicit(),
+            tuple(net_arch),
+            activation_fn(),
+            max_correction=max_correction,
+            pinned=pin_equilibrium,
+        )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "problem": self.problem}
+        return {**super()._get_constructor_parameters(), **self.options}
 
 
 class YannCritic(ContinuousCritic):
-    """SB3's critic with :class:`QuadraticStateActionValue` networks, one for each critic.
+    """SB3's critic with networks that start as the value of the law on the linear plant.
 
-    Parameters are those of SB3's `ContinuousCritic`; ``problem``, the MPC; and ``gamma``, the
-    discount of the return that it puts out.
+    Parameters are those of SB3's `ContinuousCritic`; ``problem``, the MPC; ``gamma``, the
+    discount of the return that it puts out; and ``critic`` (here ``kind``), ``prediction_model``,
+    ``value_scale`` and ``pin_equilibrium`` of :class:`YannPolicy`.
     """
 
     def __init__(
@@ -85,6 +107,10 @@ class YannCritic(ContinuousCritic):
         normalize_images: bool = True,
         n_critics: int = 2,
         share_features_extractor: bool = False,
+        kind: str = "afterstate",
+        prediction_model: PredictionModel | None = None,
+        value_scale: float = 30.0,
+        pin_equilibrium: bool = True,
     ) -> None:
         super().__init__(
             observation_space,
@@ -97,17 +123,30 @@ class YannCritic(ContinuousCritic):
             n_critics,
             share_features_extractor,
         )
-        M = problem.state_action_matrix(gamma)
+        common: dict[str, Any] = {
+            "theta_half": (problem.theta_max - problem.theta_min) / 2,
+            "u_min": problem.u_min,
+            "u_max": problem.u_max,
+            "hidden": tuple(net_arch),
+            "pinned": pin_equilibrium,
+        }
         self.q_networks = []
         for i in range(n_critics):
-            q_network = QuadraticStateActionValue(
-                M,
-                (problem.theta_max - problem.theta_min) / 2,
-                problem.u_min,
-                problem.u_max,
-                tuple(net_arch),
-                activation_fn(),
-            )
+            q_network: nn.Module
+            if kind == "state_action":
+                q_network = QuadraticStateActionValue(
+                    problem.state_action_matrix(gamma), activation=activation_fn(), **common
+                )
+            else:
+                q_network = AfterstateValue(
+                    linalg.block_diag(problem.Q, problem.R),
+                    problem.value_matrix(gamma),
+                    prediction_model or LinearPrediction(problem.model.A, problem.model.B),
+                    gamma,
+                    activation=activation_fn(),
+                    scale=value_scale,
+                    **common,
+                )
             self.add_module(f"qf{i}", q_network)
             self.q_networks.append(q_network)
 
@@ -143,6 +182,23 @@ class YannPolicy(TD3Policy):
     actor_lr_mult, critic_lr_mult : float, default 0.1 and 1
         Learning rates of actor and critic, as multiples of the algorithm's ``learning_rate``, which
         is what SB3 logs; 0 freezes.
+    critic : {"afterstate", "state_action"}, default "afterstate"
+        What the critic learns: the value of the predicted next state (:class:`AfterstateValue`), or
+        the paper's function of state and action (:class:`QuadraticStateActionValue`).
+    prediction_model : callable, optional
+        ``(theta, u) -> next theta`` for the afterstate critic, differentiable, of float64 tensors
+        (batch, n) and (batch, m) in physical units. The default is the MPC's ``A theta + B u``.
+    value_scale : float, default 30
+        Factor of the afterstate critic's network, in units of the cost-to-go: of the order of the
+        changes of V that there are to learn.
+    critic_warmup : int, default 2000
+        Updates of the critic before the first one of the actor, which is the MPC until then.
+    max_correction : float, optional
+        Bound on the distance from the MPC, as a fraction of the input range, 0 to 1: exact,
+        whatever is learnt. The default is none.
+    pin_equilibrium : bool, default True
+        Whether actor and critic keep their value at ``theta = 0`` for good. Leave it free where the
+        steady-state input of the model is not the plant's.
     n_critics : int, default 2
         TD3's two critics; DDPG sets 1.
     features_extractor_class, features_extractor_kwargs, normalize_images, share_features_extractor
@@ -163,6 +219,7 @@ class YannPolicy(TD3Policy):
     actor_target: YannActor
     critic: YannCritic
     critic_target: YannCritic
+    critic_updates: th.Tensor
 
     def __init__(
         self,
@@ -175,6 +232,12 @@ class YannPolicy(TD3Policy):
         activation_fn: type[nn.Module] = nn.Tanh,
         actor_lr_mult: float = 0.1,
         critic_lr_mult: float = 1.0,
+        critic: str = "afterstate",
+        prediction_model: PredictionModel | None = None,
+        value_scale: float = 30.0,
+        critic_warmup: int = 2000,
+        max_correction: float | None = None,
+        pin_equilibrium: bool = True,
         n_critics: int = 2,
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
@@ -206,8 +269,22 @@ class YannPolicy(TD3Policy):
                 f"activation_fn = {activation_fn!r} must be a class such as torch.nn.Tanh."
             )
         self.lr_mult = {
-            "actor": as_multiplier("actor_lr_mult", actor_lr_mult),
-            "critic": as_multiplier("critic_lr_mult", critic_lr_mult),
+            "actor": as_factor("actor_lr_mult", actor_lr_mult),
+            "critic": as_factor("critic_lr_mult", critic_lr_mult),
+        }
+        require_critic_options(critic, prediction_model, value_scale, critic_warmup)
+        self.actor_step = 1.0
+        """Another factor of the actor's learning rate, which an ImprovementGuard sets."""
+        self.critic_warmup = critic_warmup
+        self.actor_options: dict[str, Any] = {
+            "max_correction": as_max_correction(max_correction),
+            "pin_equilibrium": pin_equilibrium,
+        }
+        self.critic_options: dict[str, Any] = {
+            "kind": critic,
+            "prediction_model": prediction_model,
+            "value_scale": value_scale,
+            "pin_equilibrium": pin_equilibrium,
         }
         super().__init__(
             observation_space,
@@ -226,26 +303,42 @@ class YannPolicy(TD3Policy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        self._multiply_learning_rates()
+        # A buffer travels with the parameters: a model that is loaded goes on where it was.
+        self.register_buffer("critic_updates", th.zeros((), dtype=th.int64))
+        self._attach_hooks()
 
-    def _multiply_learning_rates(self) -> None:
-        for network, factor in ((self.actor, "actor"), (self.critic, "critic")):
-            _multiply_learning_rate(network.optimizer, self.lr_mult[factor])
+    def _attach_hooks(self) -> None:
+        for optimizer, before in (
+            (self.actor.optimizer, self._before_actor_step),
+            (self.critic.optimizer, self._before_critic_step),
+        ):
+            optimizer.register_step_pre_hook(before)
+            optimizer.register_step_post_hook(_restore_learning_rate)
+
+    def _before_actor_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
+        if self.critic_updates < self.critic_warmup:
+            optimizer.zero_grad()  # no gradient at all: neither parameters nor moments move
+        _multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
+
+    def _before_critic_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
+        self.critic_updates += 1
+        _multiply_learning_rate(optimizer, self.lr_mult["critic"])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or a pickle; torch drops the hooks of optimizers on the way."""
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._multiply_learning_rates()
+        self._attach_hooks()
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
         """Return an actor that equals the explicit law, with networks that are zero."""
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return YannActor(**kwargs, problem=self.problem).to(self.device)
+        return YannActor(**kwargs, problem=self.problem, **self.actor_options).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannCritic:
         """Return a critic that is the law's value on the linear model, with networks of zero."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return YannCritic(**kwargs, problem=self.problem, gamma=self.gamma).to(self.device)
+        critic = YannCritic(**kwargs, problem=self.problem, gamma=self.gamma, **self.critic_options)
+        return critic.to(self.device)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -255,6 +348,11 @@ class YannPolicy(TD3Policy):
             "gamma": self.gamma,
             "actor_lr_mult": self.lr_mult["actor"],
             "critic_lr_mult": self.lr_mult["critic"],
+            "critic": self.critic_options["kind"],
+            "prediction_model": self.critic_options["prediction_model"],
+            "value_scale": self.critic_options["value_scale"],
+            "critic_warmup": self.critic_warmup,
+            **self.actor_options,
         }
 
 
@@ -276,17 +374,12 @@ def _algorithm_under_construction() -> BaseAlgorithm | None:
 
 
 def _multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:
-    """Make each step of the optimizer use ``factor`` times the rate that SB3 keeps setting."""
-    optimizer.register_step_pre_hook(partial(_apply_multiplier, factor))
-    optimizer.register_step_post_hook(_remove_multiplier)
-
-
-def _apply_multiplier(factor: float, optimizer: th.optim.Optimizer, *_: Any) -> None:
+    """Make one step use ``factor`` times the rate that SB3 keeps setting."""
     for group in optimizer.param_groups:
         group["scheduled_lr"] = group["lr"]
         group["lr"] = factor * group["lr"]
 
 
-def _remove_multiplier(optimizer: th.optim.Optimizer, *_: Any) -> None:
+def _restore_learning_rate(optimizer: th.optim.Optimizer, *_: Any) -> None:
     for group in optimizer.param_groups:
         group["lr"] = group.pop("scheduled_lr")

@@ -141,8 +141,8 @@ class LinearMPC(ReadOnlyArrays):
         x, v = np.asarray(theta, dtype=np.float64), np.asarray(u, dtype=np.float64)
         return np.asarray(np.sum((x @ self.Q) * x, axis=-1) + np.sum((v @ self.R) * v, axis=-1))
 
-    def state_action_matrix(self, gamma: float) -> Array:
-        """Return M (n+m, n+m): ``[x; u]' M [x; u]`` is the cost of u now and the law ever after.
+    def value_matrix(self, gamma: float) -> Array:
+        """Return P (n, n): ``x' P x`` is the cost of the law from x on, under the discount gamma.
 
         Exact wherever the linear plant stays in the region of the law that holds the origin, for
         any ``gamma``, whichever discount the MPC has: P is the cost of the gain that this region
@@ -164,7 +164,15 @@ class LinearMPC(ReadOnlyArrays):
                 "Choose an operating point inside the bounds."
             )
         K = -law.gains[law.locate(origin)]
-        P = lqr.policy_value(self.model, self.Q, self.R, K, as_discount(gamma))
+        return lqr.policy_value(self.model, self.Q, self.R, K, as_discount(gamma))
+
+    def state_action_matrix(self, gamma: float) -> Array:
+        """Return M (n+m, n+m): ``[x; u]' M [x; u]`` is the cost of u now and the law ever after.
+
+        That is the stage cost and, from the next state on, :meth:`value_matrix`, which raises the
+        same errors and holds in the same region.
+        """
+        P = self.value_matrix(gamma)
         return lqr.state_action_matrix(self.model, self.Q, self.R, P, gamma)
 
     def explicit(self) -> PiecewiseAffine:

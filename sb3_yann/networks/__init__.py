@@ -1,8 +1,19 @@
 """Networks that start as something known, exactly, and are trainable. torch, no SB3."""
 
 from sb3_yann.networks.literal import LiteralYann
-from sb3_yann.networks.value import QuadraticStateActionValue
+from sb3_yann.networks.value import (
+    AfterstateValue,
+    LinearPrediction,
+    QuadraticStateActionValue,
+)
 from sb3_yann.networks.yann import YannLayer
 from sb3_yann.networks.zero_output import ZeroOutputNetwork
 
-__all__ = ["LiteralYann", "QuadraticStateActionValue", "YannLayer", "ZeroOutputNetwork"]
+__all__ = [
+    "AfterstateValue",
+    "LinearPrediction",
+    "LiteralYann",
+    "QuadraticStateActionValue",
+    "YannLayer",
+    "ZeroOutputNetwork",
+]

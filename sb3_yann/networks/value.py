@@ -1,6 +1,8 @@
-"""The state-action value of the linear plant, exactly, plus a network that is zero at first."""
+"""State-action values that are those of the linear plant, exactly, until they are trained."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import torch as th
@@ -9,16 +11,49 @@ from torch import nn
 
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
+Array = NDArray[np.float64]
+PredictionModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
+"""``(theta, u) -> next theta``: (batch, n), (batch, m) to (batch, n), float64, physical units."""
 
-class QuadraticStateActionValue(nn.Module):
-    """``Q(theta, a) = -[theta; u]' M [theta; u] + network``: u now, the law ever after.
 
-    ``u`` is the input in physical units for an action ``a`` in [-1, 1]. Both parts are zero at
-    ``theta = 0, u = 0`` and stay so.
+class QuadraticForm(nn.Module):
+    """``z -> z' M z``, trainable.
 
     M is trained in scaled entries, ``M = D M^ D`` with ``D = sqrt(|diag M|)`` kept constant: the
     raw entries of a real plant span many orders of magnitude, and a step of Adam, which is the
     same for every entry, would flip the sign of the smallest. Those of ``M^`` are about 1.
+
+    Parameters
+    ----------
+    M : ndarray, shape (k, k)
+    """
+
+    root: th.Tensor
+
+    def __init__(self, M: Array) -> None:
+        super().__init__()
+        diagonal = np.abs(np.diag(M))
+        root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        # Float64: along the law the terms of the form cancel, by a factor of up to some hundreds.
+        self.entries = nn.Parameter(th.as_tensor(M / np.outer(root, root), dtype=th.float64))
+        self.register_buffer("root", th.as_tensor(root))
+
+    def forward(self, z: th.Tensor) -> th.Tensor:
+        """Return the form, shape (batch, 1), for z of shape (batch, k) in float64."""
+        weighted = z * self.root
+        form: th.Tensor = ((weighted @ self.entries) * weighted).sum(-1, keepdim=True)
+        return form
+
+
+class QuadraticStateActionValue(nn.Module):
+    """``Q(theta, a) = -[theta; u]' M [theta; u] + network``: u now, the law ever after.
+
+    The critic of Braniff & Tian, Section 4.2. ``u`` is the input in physical units for an action
+    ``a`` in [-1, 1]. Both parts are zero at ``theta = 0, u = 0``; the network stays so where it
+    is ``pinned``.
+
+    Data of a policy that does not explore say nothing of how Q depends on a: this network makes
+    that up. :class:`AfterstateValue` takes it from the model.
 
     Parameters
     ----------
@@ -30,31 +65,29 @@ class QuadraticStateActionValue(nn.Module):
         The inputs at action -1 and 1.
     hidden : tuple of int, default (64, 64)
     activation : callable, default torch.tanh
+    pinned : bool, default True
+        Whether the network's output at the equilibrium stays zero for good.
     """
 
-    root: th.Tensor
     to_input: th.Tensor
     middle: th.Tensor
     network_scale: th.Tensor
 
     def __init__(
         self,
-        M: NDArray[np.float64],
-        theta_half: NDArray[np.float64],
-        u_min: NDArray[np.float64],
-        u_max: NDArray[np.float64],
+        M: Array,
+        theta_half: Array,
+        u_min: Array,
+        u_max: Array,
         hidden: tuple[int, ...] = (64, 64),
         activation: Activation = th.tanh,
+        pinned: bool = True,
     ) -> None:
         super().__init__()
         n, m = len(theta_half), len(u_min)
-        diagonal = np.abs(np.diag(M))
-        root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-        # Float64: along the law the terms of the form cancel, by a factor of up to some hundreds.
-        self.entries = nn.Parameter(th.as_tensor(M / np.outer(root, root), dtype=th.float64))
         reach = (u_max - u_min) / 2
+        self.quadratic = QuadraticForm(M)
         constants = {
-            "root": root,
             "to_input": np.concatenate([np.ones(n), reach]),
             "middle": np.concatenate([np.zeros(n), (u_max + u_min) / 2]),
             "network_scale": 1 / np.concatenate([theta_half, reach]),
@@ -62,13 +95,103 @@ class QuadraticStateActionValue(nn.Module):
         for name, value in constants.items():
             self.register_buffer(name, th.as_tensor(value, dtype=th.float64))
         self.network = ZeroOutputNetwork(
-            n + m, 1, hidden, activation=activation, pinned=th.ones(1, dtype=th.bool)
+            n + m, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
         z = theta_and_action * self.to_input + self.middle
-        weighted = z * self.root
-        quadratic = ((weighted @ self.entries) * weighted).sum(-1, keepdim=True)
-        learnt: th.Tensor = self.network((z * self.network_scale).float())
-        return learnt - quadratic.float()
+        learnt = self.network((z * self.network_scale).float())
+        q: th.Tensor = learnt - self.quadratic(z).float()
+        return q
+
+
+class AfterstateValue(nn.Module):
+    """``Q(theta, a) = -(theta'Q theta + u'Ru + gamma V(f(theta, u)))``, V quadratic plus network.
+
+    At first it is the same function as :class:`QuadraticStateActionValue`, to rounding, where f is
+    the linear model ``A theta + B u``. What is learnt is V alone, over predicted next states, of
+    which even a policy that never explores sees a whole neighbourhood of each state. How Q depends
+    on the action follows from the known stage cost and from the model: an error of the model bends
+    the direction of improvement, but not the values that are compared, since V is fitted to the
+    plant's own returns at the states the model predicts.
+
+    Parameters
+    ----------
+    W : ndarray, shape (n + m, n + m)
+        The stage cost is ``[theta; u]' W [theta; u]``.
+    P : ndarray, shape (n, n)
+        V is ``theta' P theta`` at first.
+    model : callable
+        The prediction ``(theta, u) -> next theta``, of float64 tensors in physical units; a module
+        is moved and saved with this one, but it is not trained.
+    gamma : float
+    theta_half, u_min, u_max, hidden, activation, pinned
+        As in :class:`QuadraticStateActionValue`.
+    scale : float, default 30
+        The network's output is multiplied by it: its units are those of the cost-to-go.
+    """
+
+    to_input: th.Tensor
+    middle: th.Tensor
+    network_scale: th.Tensor
+    W: th.Tensor
+
+    def __init__(
+        self,
+        W: Array,
+        P: Array,
+        model: PredictionModel,
+        gamma: float,
+        theta_half: Array,
+        u_min: Array,
+        u_max: Array,
+        hidden: tuple[int, ...] = (64, 64),
+        activation: Activation = th.tanh,
+        pinned: bool = True,
+        scale: float = 30.0,
+    ) -> None:
+        super().__init__()
+        self.model, self.gamma, self.scale = model, gamma, scale
+        self.quadratic = QuadraticForm(P)
+        constants = {
+            "W": W,
+            "to_input": (u_max - u_min) / 2,
+            "middle": (u_max + u_min) / 2,
+            "network_scale": 1 / theta_half,
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, th.as_tensor(value, dtype=th.float64))
+        self.network = ZeroOutputNetwork(
+            len(theta_half), 1, hidden, activation=activation, pinned=th.tensor([pinned])
+        )
+
+    def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
+        """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
+        theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
+        u = action * self.to_input + self.middle
+        z = th.cat([theta, u], 1)
+        stage = ((z @ self.W) * z).sum(-1, keepdim=True)
+        return -(stage + self.gamma * self.value(self.model(theta, u))).float()
+
+    def value(self, theta: th.Tensor) -> th.Tensor:
+        """Return V, the discounted cost to go in float64, shape (batch, 1), for (batch, n)."""
+        learnt: th.Tensor = self.network((theta * self.network_scale).float())
+        total: th.Tensor = self.quadratic(theta) + self.scale * learnt.double()
+        return total
+
+
+class LinearPrediction(nn.Module):
+    """``(theta, u) -> A theta + B u``."""
+
+    A: th.Tensor
+    B: th.Tensor
+
+    def __init__(self, A: Array, B: Array) -> None:
+        super().__init__()
+        self.register_buffer("A", th.as_tensor(A.T.copy()))
+        self.register_buffer("B", th.as_tensor(B.T.copy()))
+
+    def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+        """Return the predicted next theta, (batch, n)."""
+        return theta @ self.A + u @ self.B

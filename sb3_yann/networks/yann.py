@@ -18,7 +18,8 @@ class YannLayer(nn.Module):
 
     At first the networks are exactly zero and the layer is the law (to float32 rounding). Only
     the active region's law and network are computed. In a region that holds the origin the
-    network is zero at the origin for good, so the equilibrium stays where it is.
+    network is zero at the origin for good, so the equilibrium stays where it is; unless it is
+    not ``pinned``.
 
     Neighbouring regions have networks of their own: once trained, the layer may jump where it
     passes from one region to the next.
@@ -30,6 +31,12 @@ class YannLayer(nn.Module):
     hidden : tuple of int, default (16, 16)
         Widths of each region's network.
     activation : callable, default torch.tanh
+    max_correction : float, optional
+        The output is never further from the law than this fraction of the input range, whatever
+        the networks become. The default is no bound but those of the input.
+    pinned : bool, default True
+        Whether training must leave the equilibrium where it is. A law whose steady-state input is
+        wrong has to be free to move it.
 
     Raises
     ------
@@ -49,6 +56,8 @@ class YannLayer(nn.Module):
         law: PiecewiseAffine,
         hidden: tuple[int, ...] = (16, 16),
         activation: Activation = th.tanh,
+        max_correction: float | None = None,
+        pinned: bool = True,
     ) -> None:
         super().__init__()
         if not np.all(np.isfinite([law.u_min, law.u_max])):
@@ -57,6 +66,8 @@ class YannLayer(nn.Module):
                 "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
             )
         self.outside = law.outside
+        # The input range is 2 here. A little is left for the float32 rounding of what follows.
+        self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
         self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
         middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
         A, b = _padded_half_spaces(law)
@@ -74,13 +85,15 @@ class YannLayer(nn.Module):
             law.n_inputs,
             hidden,
             activation=activation,
-            pinned=th.as_tensor(at_origin),
+            pinned=th.as_tensor(at_origin & pinned),
         )
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
         region, inside = self.locate(theta)
         correction = self.network(theta / self.theta_half, region)
+        if self.reach is not None:
+            correction = clamp_alive(correction, self.reach)
         return clamp_alive(self._law(theta, region, inside) + correction)
 
     def law(self, theta: th.Tensor) -> th.Tensor:
@@ -122,27 +135,28 @@ def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
 
 
 class _ClampAlive(th.autograd.Function):
-    """Clamp to [-1, 1]; backward, stop only what would push further out."""
+    """Clamp to [-limit, limit]; backward, stop only what would push further out."""
 
     @staticmethod
-    def forward(ctx: Any, x: th.Tensor) -> th.Tensor:
+    def forward(ctx: Any, x: th.Tensor, limit: float) -> th.Tensor:
         ctx.save_for_backward(x)
-        return x.clamp(-1, 1)
+        ctx.limit = limit
+        return x.clamp(-limit, limit)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: th.Tensor) -> th.Tensor:
+    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, None]:
         (x,) = ctx.saved_tensors
         (grad,) = grad_outputs
         # Descent moves x against its gradient.
-        outward = ((x >= 1) & (grad < 0)) | ((x <= -1) & (grad > 0))
-        return grad.masked_fill(outward, 0.0)
+        outward = ((x >= ctx.limit) & (grad < 0)) | ((x <= -ctx.limit) & (grad > 0))
+        return grad.masked_fill(outward, 0.0), None
 
 
-def clamp_alive(x: th.Tensor) -> th.Tensor:
-    """Return x clamped to [-1, 1], with a gradient that can still lead back inside.
+def clamp_alive(x: th.Tensor, limit: float = 1.0) -> th.Tensor:
+    """Return x clamped to [-limit, limit], with a gradient that can still lead back inside.
 
     The gradient of `torch.clamp` vanishes beyond the bounds, so a saturated region would never
     learn to leave its bound.
     """
-    clamped: th.Tensor = _ClampAlive.apply(x)  # type: ignore[no-untyped-call]
+    clamped: th.Tensor = _ClampAlive.apply(x, limit)  # type: ignore[no-untyped-call]
     return clamped

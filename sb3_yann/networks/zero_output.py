@@ -50,10 +50,10 @@ class PairedLinear(nn.Module):
             raise ValueError(f"n_nodes = {n_nodes} must be at least 2: zero needs a pair of nodes.")
         n_pairs = n_nodes // 2
         self.parts = [n_pairs, n_pairs, n_nodes % 2]
-        shape = (n_stacked, out_features, in_features + 1)  # the last column is the bias
-        first = th.empty(n_pairs, *shape).uniform_(-scale, scale)
-        rest = th.zeros(n_nodes % 2, *shape)
-        self.nodes = nn.Parameter(th.cat([first, -first, rest]))
+        shape = (out_features, in_features + 1)  # the last column is the bias
+        first = th.empty(n_stacked, n_pairs, *shape).uniform_(-scale, scale)
+        rest = th.zeros(n_stacked, n_nodes % 2, *shape)
+        self.nodes = nn.Parameter(th.cat([first, -first, rest], 1))
 
     def forward(self, x: th.Tensor, index: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
         """Return ``W x`` (batch, out_features) and ``b`` of the summed nodes, which adds to it.
@@ -64,8 +64,8 @@ class PairedLinear(nn.Module):
         index : Tensor of int, shape (batch,)
             The layer of the stack for each row; None where there is only one.
         """
-        first, opposite, rest = th.split(self.nodes, self.parts)
-        return _affine(th.cat([first + opposite, rest]).sum(0), x, index)
+        first, opposite, rest = th.split(self.nodes, self.parts, 1)
+        return _affine(th.cat([first + opposite, rest], 1).sum(1), x, index)
 
 
 class StackedLinear(nn.Module):
@@ -101,6 +101,8 @@ def _alive_at_zero(activation: Activation, x: th.Tensor) -> th.Tensor:
 
 class ZeroOutputNetwork(nn.Module):
     """A stack of networks with one or two hidden layers, exactly zero at first, and trainable.
+
+    The first axis of every parameter is the stack.
 
     The first layer is a :class:`PairedLinear`. All parameters have moved after the second update:
     the first moves the first layer, which then feeds the others.

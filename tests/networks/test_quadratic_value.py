@@ -61,7 +61,7 @@ def train(value: QuadraticStateActionValue, rows: th.Tensor, steps: int) -> None
 
 def matrix(value: QuadraticStateActionValue) -> th.Tensor:
     """M in physical units, as it now is."""
-    return value.entries.detach() * th.outer(value.root, value.root)
+    return value.quadratic.entries.detach() * th.outer(value.quadratic.root, value.quadratic.root)
 
 
 # --- at first ----------------------------------------------------------------------------------
@@ -108,7 +108,7 @@ def test_bellmans_equation_holds_along_the_law(name: str, gamma: float) -> None:
 @EVERY_PROBLEM
 def test_scaled_entries_are_of_the_order_of_one(name: str) -> None:
     # M is positive definite, so the correlations it leaves behind are at most 1.
-    entries = critic(name).entries.detach()
+    entries = critic(name).quadratic.entries.detach()
     th.testing.assert_close(entries.diag(), th.ones(len(entries), dtype=th.float64))
     assert entries.abs().max() <= 1 + 1e-12
 
@@ -148,7 +148,7 @@ def test_value_of_an_equilibrium_off_the_middle_is_zero_and_stays_so(name: str) 
 def test_one_step_of_adam_moves_every_entry_by_its_learning_rate(name: str) -> None:
     # Relative to sqrt(M_ii M_jj), whatever the units of the plant: 1e-3 for a rate of 1e-3.
     value = critic(name)
-    before, scale = matrix(value), th.outer(value.root, value.root)
+    before, scale = matrix(value), th.outer(value.quadratic.root, value.quadratic.root)
     train(value, random_rows(name, 256), steps=1)
     th.testing.assert_close(
         (matrix(value) - before).abs() / scale,
@@ -173,7 +173,7 @@ def test_twenty_steps_of_adam_do_not_flip_the_sign_of_the_reactors_smallest_entr
 def test_matrix_stays_symmetric(name: str) -> None:
     value = critic(name)
     train(value, random_rows(name, 256), steps=20)
-    M = value.entries.detach()
+    M = value.quadratic.entries.detach()
     th.testing.assert_close(M, M.T, rtol=0, atol=1e-12)
 
 
@@ -215,7 +215,7 @@ def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str) -> None
 def test_constants_are_buffers_and_no_key_contains_running() -> None:
     value = critic("pendulum")
     trained = {name.split(".")[0] for name, _ in value.named_parameters()}
-    assert trained == {"entries", "network"}
+    assert trained == {"quadratic", "network"}
     assert not [key for key in value.state_dict() if "running_" in key]
 
 

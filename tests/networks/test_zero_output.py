@@ -121,13 +121,13 @@ def test_scale_sets_the_range_of_the_initial_weights() -> None:
 
 def test_odd_node_out_starts_with_zero_weights() -> None:
     layer = PairedLinear(3, 4, n_nodes=5)
-    assert th.equal(layer.nodes[:2], -layer.nodes[2:4])
-    assert is_positive_zero(layer.nodes[4])
+    assert th.equal(layer.nodes[:, :2], -layer.nodes[:, 2:4])
+    assert is_positive_zero(layer.nodes[:, 4])
 
 
 def test_networks_of_a_stack_differ() -> None:
     net = ZeroOutputNetwork(3, 1, (8, 8), pinned=pins(False, False))
-    assert not th.any(net.first.nodes[:, 0] == net.first.nodes[:, 1])
+    assert not th.any(net.first.nodes[0] == net.first.nodes[1])
 
 
 # --- training ----------------------------------------------------------------------------------
@@ -203,7 +203,7 @@ def test_units_of_a_layer_differ_after_training(optimizer: str) -> None:
     net = ZeroOutputNetwork(2, 1, (8, 8))
     x = square()
     train(net, OPTIMIZERS[optimizer](net), 50, x, curved(x) + x[:, :1])
-    first = net.first.nodes.detach()[:, 0].sum(0)
+    first = net.first.nodes.detach()[0].sum(0)
     for weight in (first, net.rest[0].weight.detach()[0]):
         apart = th.cdist(weight, weight) + th.eye(8)
         assert apart.min() > 0
@@ -216,7 +216,6 @@ def test_each_network_of_a_stack_learns_from_its_own_rows_only() -> None:
     index = 2 * th.randint(2, (256,))  # the networks 0 and 2
     train(net, th.optim.Adam(net.parameters(), 1e-2), 20, x, curved(x), index)
     for a, b in zip(net.parameters(), before.parameters(), strict=True):
-        a, b = (t if t.dim() == 3 else t.transpose(0, 1) for t in (a, b))
         assert th.equal(a[1], b[1])
         assert not th.equal(a[0], b[0])
         assert not th.equal(a[2], b[2])
@@ -230,7 +229,7 @@ def test_stack_computes_what_its_networks_compute_alone() -> None:
     for i in range(3):
         alone = ZeroOutputNetwork(2, 1, (8, 8), n_nodes=3, pinned=stack.pinned[i].bool()).double()
         with th.no_grad():
-            alone.first.nodes.copy_(stack.first.nodes[:, i : i + 1])
+            alone.first.nodes.copy_(stack.first.nodes[i : i + 1])
             for mine, theirs in zip(alone.rest, stack.rest, strict=True):
                 mine.weight.copy_(theirs.weight[i : i + 1])
         rows = index == i

@@ -1,0 +1,218 @@
+"""The callback, and the part of it that both ways to decide share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_yann._checks import as_factor
+from sb3_yann.guard.plant import PlantTrials
+from sb3_yann.guard.record import Decision, GuardState, write_csv
+from sb3_yann.guard.simulator import SimulatorTrials
+from sb3_yann.guard.snapshot import Snapshot, same
+from sb3_yann.policies import YannPolicy
+
+
+class ImprovementGuard(BaseCallback):
+    """Keeps the policy from ever being worse than its MPC: what does not improve is taken back.
+
+    Every few training episodes the present actor is a candidate. It is accepted where it is no
+    worse than the last accepted one; otherwise actor, target actor and the actor's optimizer return
+    to the accepted state, bit for bit, while the critic goes on learning. A rejection shrinks the
+    actor's steps and an acceptance lets them grow again. When `learn` returns, the model *is* the
+    accepted policy.
+
+    **With a simulator** (``env`` given) the deterministic policy plays seeded episodes there,
+    from the same starts as the accepted policy and the untouched MPC did. It is refused if its
+    mean cost is above the accepted policy's, if one start costs more than with the MPC by more than
+    the margin, or if it violates a limit where the accepted policy does not. Where the whole
+    is refused, the networks of single regions may still be accepted, under the same conditions.
+
+    **On a plant alone** (``env=None``) the training episodes decide. The actor learns for
+    ``trial_episodes`` episodes, then rests for as many, of which all are played by one and the same
+    policy. It is accepted if it costs less than the accepted policy did, by a one-sided test of
+    size ``significance`` (:func:`sb3_yann.guard.judging.probability_of_chance`: an analysis of
+    covariance on the cost that the linear model predicts for each start). A violation at any time
+    brings the accepted policy back at once. The first policy that is accepted is the MPC. Each
+    test errs with probability ``significance``, so a policy that is worse *can* pass; the
+    simulator's paired episodes have no such chance, but hold for their starts only.
+
+    The guard draws no random numbers and leaves the training env and the buffer alone. Its state
+    is an attribute of the model, ``model.guard_state``, and is saved and loaded with it: another
+    guard with the same settings goes on where the last one stopped. Scalars in tensorboard are
+    ``guard/candidate_cost``, ``guard/accepted_cost``, ``guard/mpc_cost``, ``guard/worst_start``,
+    ``guard/step``, ``guard/accepted`` and ``guard/rejected``.
+
+    Parameters
+    ----------
+    env : str, gymnasium.Env, callable or None
+        The simulator: an id, an env of its own (not the training env), or a function that makes
+        one; the first and the last run all starts side by side. None decides from the training
+        episodes.
+    n_starts : int, default 50
+        Number of seeded starts.
+    seed : int, default 1_000_000
+        The seed of the first start; the others follow.
+    every : int, default 1
+        Training episodes from one candidate to the next.
+    margin : float, default 0.005
+        What one start may cost more than with the MPC, as a fraction of the MPC's median cost.
+    by_region : bool, default True
+        Whether to try single regions where the whole is refused.
+    shrink, grow, smallest_step : float, default 0.5, 1.5 and 0.1
+        Factors of the step at a rejection and an acceptance (up to 1), and what it never falls
+        below.
+    trial_episodes : int, default 10
+        Training episodes of a block, on a plant alone.
+    significance : float, default 0.05
+        Size of the test, on a plant alone.
+    record : path-like, optional
+        A CSV file of all decisions, up to date after each one; ``guard.decisions`` has them too.
+    verbose : int, default 0
+        1 prints each decision.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is out of range; when training starts, if the policy is no YannPolicy or the
+        simulator is the training env.
+    """
+
+    model: OffPolicyAlgorithm
+
+    def __init__(
+        self,
+        env: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | None,
+        *,
+        n_starts: int = 50,
+        seed: int = 1_000_000,
+        every: int = 1,
+        margin: float = 0.005,
+        by_region: bool = True,
+        shrink: float = 0.5,
+        grow: float = 1.5,
+        smallest_step: float = 0.1,
+        trial_episodes: int = 10,
+        significance: float = 0.05,
+        record: str | PathLike[str] | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        if not (env is None or isinstance(env, str | gym.Env) or callable(env)):
+            raise TypeError(
+                f"env = {env!r} must be the id of an environment, a gymnasium.Env, a function that "
+                "makes one, or None to decide from the training episodes."
+            )
+        for name, value, least in (
+            ("n_starts", n_starts, 1),
+            ("seed", seed, 0),
+            ("every", every, 1),
+            ("trial_episodes", trial_episodes, 3),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}.")
+        for name, factor, low, high in (
+            ("margin", margin, 0.0, np.inf),
+            ("shrink", shrink, 0.0, 1.0),
+            ("grow", grow, 1.0, np.inf),
+            ("smallest_step", smallest_step, 0.0, 1.0),
+            ("significance", significance, 0.0, 0.5),
+        ):
+            if not low <= as_factor(name, factor) <= high:
+                raise ValueError(f"{name} = {factor!r} must be between {low:g} and {high:g}.")
+        self.shrink, self.grow, self.smallest_step = shrink, grow, smallest_step
+        self.record = None if record is None else Path(record)
+        self.trials: SimulatorTrials | PlantTrials
+        if env is None:
+            self.trials = PlantTrials(trial_episodes, significance)
+        else:
+            self.trials = SimulatorTrials(env, n_starts, seed, every, margin, by_region)
+
+    @property
+    def decisions(self) -> list[Decision]:
+        """All decisions so far, those before a resumed run included."""
+        return self.state.decisions
+
+    @property
+    def state(self) -> GuardState:
+        """What has been accepted, and on which evidence."""
+        state: GuardState = self.model.guard_state  # type: ignore[attr-defined]
+        return state
+
+    def _init_callback(self) -> None:
+        policy = self.model.policy
+        if not isinstance(policy, YannPolicy):
+            raise TypeError(
+                "ImprovementGuard compares a YannPolicy with its MPC; the policy of this model is "
+                f"{type(policy).__name__}."
+            )
+        self.policy = policy
+
+    def _on_training_start(self) -> None:
+        self.trials.start(self)
+        known = getattr(self.model, "guard_state", None)
+        if known is None or known.settings != self.trials.settings:
+            self.model.guard_state = GuardState(  # type: ignore[attr-defined]
+                self.trials.settings, Snapshot.of(self.policy), evidence=None
+            )
+            self.trials.first_evidence(self)
+        self.policy.actor_step = self.state.step
+
+    def _on_step(self) -> bool:
+        self.state.episodes += int(np.sum(self.locals["dones"]))
+        self.trials.step(self)
+        return True
+
+    def _on_training_end(self) -> None:
+        self.trials.end(self)
+        if not same(self.state.accepted, self.policy):
+            self.state.accepted.restore(self.policy)
+        self.policy.actor_step = 1.0
+
+    # What the trials call.
+
+    def accept(self, evidence: Any, snapshot: Snapshot | None = None) -> None:
+        """Make the present policy the accepted one; its snapshot may be at hand already."""
+        self.state.accepted = Snapshot.of(self.policy) if snapshot is None else snapshot
+        self.state.evidence = evidence
+
+    def accept_the_mpc(self) -> None:
+        """Put the MPC itself in the policy's place, with its optimizer as new."""
+        with th.random.fork_rng():  # building an actor draws weights
+            actor = self.policy.make_actor()
+        parameters = actor.state_dict()
+        optimizer = {**self.policy.actor.optimizer.state_dict(), "state": {}}
+        Snapshot(parameters, parameters, optimizer).restore(self.policy)
+
+    def decide(self, decision: Decision) -> None:
+        """Set the step, and write a decision to the record, the logger and the screen."""
+        step = self.state.step
+        if decision.verdict == "accepted":
+            step = min(1.0, step * self.grow)
+        elif decision.verdict == "rejected":
+            step = max(min(self.smallest_step, step), step * self.shrink)
+        self.state.step = self.policy.actor_step = step
+        decision = replace(decision, step=step)
+        self.decisions.append(decision)
+        for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
+            self.logger.record(f"guard/{name}", getattr(decision, name))
+        rejected = sum(each.verdict == "rejected" for each in self.decisions)
+        self.logger.record("guard/rejected", rejected)
+        self.logger.record("guard/accepted", len(self.decisions) - rejected)
+        if self.record is not None:
+            write_csv(self.record, self.decisions)
+        if self.verbose:
+            print(
+                f"Episode {decision.episode}: {decision.verdict}"
+                + (f" ({decision.reason})" if decision.reason else "")
+                + f"; mean cost {decision.accepted_cost:.6g}, MPC {decision.mpc_cost:.6g}"
+            )

@@ -1,0 +1,89 @@
+"""When a policy counts as no worse: in paired episodes of a simulator, or on a plant alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Episodes from the same starts, under the MPC and under the accepted policy.
+
+    Attributes
+    ----------
+    mpc_costs, costs : ndarray, shape (starts,)
+        Of the MPC and of the accepted policy.
+    violations : ndarray of int, shape (starts,)
+        Of the accepted policy.
+    margin : float
+        By how much one start may cost more than with the MPC, in units of the cost.
+    """
+
+    mpc_costs: Array
+    costs: Array
+    violations: NDArray[np.int64]
+    margin: float
+
+    def objection(self, costs: Array, violations: NDArray[np.int64]) -> str:
+        """Return why a policy with these episodes is refused, empty where it is not.
+
+        Comparisons are written so that a cost that is not a number is refused.
+        """
+        more = np.flatnonzero(violations > self.violations)
+        if len(more):
+            return f"{len(more)} starts with violations, the first is number {more[0]}"
+        excess = costs - self.mpc_costs
+        worst = int(np.argmax(np.where(np.isnan(excess), np.inf, excess)))
+        if not excess[worst] <= self.margin:
+            return f"start {worst} costs {excess[worst]:.4g} more than with the MPC"
+        if not costs.mean() <= self.costs.mean():
+            return f"mean cost {costs.mean():.6g}, accepted {self.costs.mean():.6g}"
+        return ""
+
+
+@dataclass(frozen=True)
+class PlantEpisodes:
+    """Training episodes played by one and the same policy on the plant.
+
+    Attributes
+    ----------
+    costs : ndarray, shape (episodes,)
+    predicted : ndarray, shape (episodes,)
+        What the MPC would cost from the same start on its own linear model: it explains most of
+        the difference between starts, which is not to be taken for one between policies.
+    """
+
+    costs: Array
+    predicted: Array
+
+
+def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
+    """Return the one-sided p-value of "the candidate costs less" against "it does not".
+
+    Analysis of covariance: ordinary least squares of the cost on the cost predicted by the linear
+    model and on which policy played; Student's t test of the policy's coefficient. It assumes
+    independent episodes with normal residuals of one variance and one slope for both policies
+    (e.g. Montgomery, *Design and Analysis of Experiments*, chapter 15).
+    """
+    costs = np.concatenate([candidate.costs, accepted.costs])
+    is_candidate = np.arange(len(costs)) < len(candidate.costs)
+    predicted = np.concatenate([candidate.predicted, accepted.predicted])
+    columns = [np.ones(len(costs)), is_candidate.astype(float)]
+    if np.all(np.isfinite(predicted)) and np.ptp(predicted) > 1e-9 * np.abs(predicted).max():
+        columns.append((predicted - predicted.mean()) / predicted.std())
+    X = np.column_stack(columns)
+    freedom = len(costs) - X.shape[1]
+    if freedom < 1:
+        raise ValueError(f"{len(costs)} episodes are too few to compare two policies.")
+    coefficients, *_ = np.linalg.lstsq(X, costs, rcond=None)
+    variance = np.sum((costs - X @ coefficients) ** 2) / freedom
+    error = np.sqrt(variance * np.linalg.pinv(X.T @ X)[1, 1])
+    # Without any scatter the sign alone decides, and "no difference" is no improvement.
+    t = coefficients[1] / error if error > 0 else np.sign(coefficients[1]) * np.inf
+    return float(stats.t.cdf(t, freedom)) if np.isfinite(t) or coefficients[1] else 1.0

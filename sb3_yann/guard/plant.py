@@ -1,0 +1,146 @@
+"""Decisions by the training episodes alone, for a plant without a simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann.control import LinearMPC
+from sb3_yann.guard.judging import PlantEpisodes, probability_of_chance
+from sb3_yann.guard.record import Decision
+from sb3_yann.guard.snapshot import same
+
+if TYPE_CHECKING:
+    from sb3_yann.guard.callback import ImprovementGuard
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Evidence:
+    """Episodes of the MPC, of the accepted policy, and of the block that is being played."""
+
+    phase: Literal["mpc", "learning", "trial"] = "mpc"
+    mpc: PlantEpisodes | None = None
+    accepted: PlantEpisodes | None = None
+    costs: list[float] = field(default_factory=list)
+    predicted: list[float] = field(default_factory=list)
+
+
+class PlantTrials:
+    """Lets the actor learn for a block of episodes, then rest for one that is tested."""
+
+    def __init__(self, trial_episodes: int, significance: float) -> None:
+        self.trial_episodes, self.significance = trial_episodes, significance
+        self.settings = {"env": None, "trial_episodes": trial_episodes}
+
+    def start(self, guard: ImprovementGuard) -> None:
+        """Begin with the episodes that start now; one that is under way is not counted."""
+        n_envs = guard.training_env.num_envs
+        self.costs, self.lengths = np.zeros(n_envs), np.zeros(n_envs, dtype=int)
+        self.starts: list[Array] = [np.empty(0)] * n_envs
+        self.blocks = np.full(n_envs, -1)
+        self.block = 0
+
+    def first_evidence(self, guard: ImprovementGuard) -> None:
+        """Begin with a block of episodes that the MPC plays."""
+        guard.accept_the_mpc()
+        guard.accept(Evidence())
+
+    def step(self, guard: ImprovementGuard) -> None:
+        """Count the step; decide where a block is over."""
+        evidence: Evidence = guard.state.evidence
+        guard.policy.actor_step = guard.state.step if evidence.phase == "learning" else 0.0
+        observations = np.asarray(guard.model._last_obs, dtype=np.float64)  # s_t, before the step
+        dones, infos = guard.locals["dones"], guard.locals["infos"]
+        for i, done in enumerate(dones):
+            if self.lengths[i] == 0:
+                self.starts[i], self.blocks[i] = observations[i].copy(), self.block
+            self.costs[i] -= float(guard.locals["rewards"][i])
+            self.lengths[i] += 1
+            if infos[i].get("violation", False):
+                self._violated(guard, evidence)
+            if done:
+                if self.blocks[i] == self.block:
+                    evidence.costs.append(float(self.costs[i]))
+                    if evidence.phase != "learning":
+                        evidence.predicted.append(
+                            predicted_cost(guard.policy.problem, self.starts[i], self.lengths[i])
+                        )
+                self.costs[i], self.lengths[i] = 0.0, 0
+        if len(evidence.costs) >= self.trial_episodes:
+            self._block_is_over(guard, evidence)
+
+    def end(self, guard: ImprovementGuard) -> None:
+        """Leave an unfinished trial undecided: the accepted policy stays."""
+
+    def _next(self, evidence: Evidence, phase: Literal["learning", "trial"]) -> None:
+        evidence.phase = phase
+        evidence.costs, evidence.predicted = [], []
+        self.block += 1
+
+    def _violated(self, guard: ImprovementGuard, evidence: Evidence) -> None:
+        if same(guard.state.accepted, guard.policy):
+            return  # the accepted policy itself did it: there is nothing better to return to
+        guard.state.accepted.restore(guard.policy)
+        self._report(guard, evidence, "rejected", "a limit was violated", np.nan)
+        self._next(evidence, "learning")
+
+    def _block_is_over(self, guard: ImprovementGuard, evidence: Evidence) -> None:
+        if evidence.phase == "learning":
+            self._next(evidence, "trial")
+            return
+        played = PlantEpisodes(np.array(evidence.costs), np.array(evidence.predicted))
+        if evidence.phase == "mpc":
+            evidence.mpc = evidence.accepted = played
+        elif not same(guard.state.accepted, guard.policy):
+            assert evidence.accepted is not None
+            chance = probability_of_chance(played, evidence.accepted)
+            reason = f"p = {chance:.3g}"
+            if chance < self.significance:
+                evidence.accepted = played
+                guard.accept(evidence)
+                self._report(guard, evidence, "accepted", reason, played.costs.mean())
+            else:
+                guard.state.accepted.restore(guard.policy)
+                self._report(guard, evidence, "rejected", reason, played.costs.mean())
+        self._next(evidence, "learning")
+
+    def _report(
+        self,
+        guard: ImprovementGuard,
+        evidence: Evidence,
+        verdict: Literal["accepted", "rejected"],
+        reason: str,
+        cost: float,
+    ) -> None:
+        def mean(episodes: PlantEpisodes | None) -> float:
+            return np.nan if episodes is None else float(episodes.costs.mean())
+
+        guard.decide(
+            Decision(
+                guard.num_timesteps,
+                guard.state.episodes,
+                verdict,
+                reason,
+                float(cost),
+                mean(evidence.accepted),
+                mean(evidence.mpc),
+                np.nan,
+                (),
+                guard.state.step,
+            )
+        )
+
+
+def predicted_cost(problem: LinearMPC, start: Array, steps: int) -> float:
+    """Return what the MPC costs on its own linear model, from a start, over a number of steps."""
+    law, theta, cost = problem.explicit(), start, 0.0
+    for _ in range(steps):
+        u = law(theta)
+        cost += float(problem.stage_cost(theta, u))
+        theta = problem.model.step(theta, u)
+    return cost

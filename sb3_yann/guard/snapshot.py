@@ -1,0 +1,73 @@
+"""Copies of an actor, its target and its optimizer, and putting them back, whole or in part."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch as th
+
+from sb3_yann.policies import YannActor, YannPolicy
+
+Parameters = dict[str, th.Tensor]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What makes an actor and its learning go on as if nothing had happened since."""
+
+    actor: Parameters
+    target: Parameters
+    optimizer: dict[str, Any]
+
+    @classmethod
+    def of(cls, policy: YannPolicy) -> Snapshot:
+        """Return a copy of the policy's present actor, its target and its optimizer."""
+        return cls(
+            copy.deepcopy(policy.actor.state_dict()),
+            copy.deepcopy(policy.actor_target.state_dict()),
+            copy.deepcopy(policy.actor.optimizer.state_dict()),
+        )
+
+    def restore(self, policy: YannPolicy) -> None:
+        """Put them back, bit for bit."""
+        policy.actor.load_state_dict(self.actor)
+        policy.actor_target.load_state_dict(self.target)
+        policy.actor.optimizer.load_state_dict(copy.deepcopy(self.optimizer))
+
+    def with_regions(self, other: Snapshot, regions: Iterable[int]) -> Snapshot:
+        """Return a copy that has the networks of some regions, with their moments, from other."""
+        index = th.tensor(sorted(regions), dtype=th.long)
+        mixed = copy.deepcopy(self)
+        for name in ("actor", "target"):
+            ours, theirs = getattr(mixed, name), getattr(other, name)
+            for key in ours:
+                if ".network." in key and not key.endswith("pinned"):
+                    _copy_rows(ours[key], theirs[key], index)
+        ours, theirs = mixed.optimizer["state"], other.optimizer["state"]
+        for key, state in theirs.items():
+            # A parameter without moments has not been stepped yet: they are zero.
+            known = ours.setdefault(key, {k: th.zeros_like(v) for k, v in state.items()})
+            for entry, value in state.items():
+                if value.dim() > 0:
+                    _copy_rows(known[entry], value, index)
+                else:  # the number of steps, which all regions share
+                    known[entry].copy_(value)
+        return mixed
+
+
+def _copy_rows(ours: th.Tensor, theirs: th.Tensor, index: th.Tensor) -> None:
+    ours[index] = theirs[index]
+
+
+def network_of(actor: YannActor) -> list[th.Tensor]:
+    """Return the trainable parameters; the first axis of each is the region."""
+    return [parameter.detach() for parameter in actor.mu.network.parameters()]
+
+
+def same(snapshot: Snapshot, policy: YannPolicy) -> bool:
+    """Return whether the policy's actor is still that of the snapshot, bit for bit."""
+    now = policy.actor.state_dict()
+    return all(th.equal(value, now[name]) for name, value in snapshot.actor.items())
