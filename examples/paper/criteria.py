@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+
+from paper.markdown import number
 from paper.measures import HELD, MPC, NEAR, OPTIMUM, OURS, Row, Standing, standing
 from paper.runner import Outcome, Run
 
@@ -91,7 +93,7 @@ def _held(at: Standing) -> Iterator[Criterion]:
     yield Criterion(
         at.plant,
         "and costs at most 0.05 more",
-        f"largest {more.max():+.3f}",
+        f"largest {number(more.max(), 3, '+')}",
         bool(more.max() <= 0.05),
         len(final),
     )
@@ -111,7 +113,7 @@ def _safe_and_better(at: Standing) -> Iterator[Criterion]:
     unsafe = f"{row.unsafe_training} episodes in {row.seeds} seeds"
     largest = f"largest {100 * (means.max() - base) / base:+.2f} %"
     improved = f"{-row.change:.2f} %"
-    worst = f"{row.worst_share:+.2f} % ({row.worst:+.2f})"
+    worst = f"{number(row.worst_share, sign='+')} % ({number(row.worst, sign='+')})"
     for required, figure, holds in (
         ("no violation in training", unsafe, row.unsafe_training == 0),
         ("final mean below the MPC's in every seed", largest, row.below == row.seeds),

@@ -8,8 +8,9 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from paper.runner import Outcome, Run
 from scipy.stats import bootstrap, trim_mean
+
+from paper.runner import Outcome, Run
 
 Array = NDArray[np.float64]
 

@@ -282,9 +282,10 @@ def _lookahead(values: Array, x: Array) -> Array:
     theta, speed = _wrapped(_pendulum_step(pairs, torch.from_numpy(TORQUES))).numpy().T
     i = (theta / math.pi + 1) / 2 * (angles - 1)
     j = (speed / pendulum.MAX_SPEED + 1) / 2 * (speeds - 1)
-    ahead = map_coordinates(values, [i.T, j.T], order=1, mode="nearest")
+    ahead: Array = map_coordinates(values, [i.T, j.T], order=1, mode="nearest")
     now = _wrapped(torch.from_numpy(x)).numpy() ** 2 @ pendulum.Q.diagonal()
-    return now[:, None] + PENDULUM.R * TORQUES**2 + ahead
+    ahead += now[:, None] + PENDULUM.R * TORQUES**2
+    return ahead
 
 
 def pendulum_values(steps: int, angles: int = 161, speeds: int = 97) -> list[Array]:
@@ -295,7 +296,7 @@ def pendulum_values(steps: int, angles: int = 161, speeds: int = 97) -> list[Arr
     theta = np.linspace(-math.pi, math.pi, angles)
     speed = np.linspace(-pendulum.MAX_SPEED, pendulum.MAX_SPEED, speeds)
     grid = np.stack(np.meshgrid(theta, speed, indexing="ij"), -1).reshape(-1, 2)
-    values = [np.zeros((angles, speeds))]
+    values: list[Array] = [np.zeros((angles, speeds))]
     for _ in range(steps):
         values.append(_lookahead(values[-1], grid).min(1).reshape(angles, speeds))
     return values

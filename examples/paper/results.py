@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+import sb3_yann
 from paper.criteria import EPISODES, SEEDS, criteria
+from paper.markdown import number, table
 from paper.measures import HELD, OPTIMUM, OURS, Row, plants_of, standing
 from paper.pictures import save_pictures
 from paper.published import paper_table
@@ -17,7 +19,18 @@ from paper.runner import Outcome, Run
 
 LONG = 200
 NOTES = Path(__file__).with_name("notes.md")
-PACKAGES = ("sb3-yann", "stable-baselines3", "torch", "gymnasium", "numpy", "scipy", "ppopt")
+PACKAGES = ("stable-baselines3", "torch", "gymnasium", "numpy", "scipy", "ppopt")
+CURVES = (
+    "The line is the median over the seeds, the band goes from the first to the third quartile. "
+    "Where the seeds were trained for different times, the curve ends with the shortest."
+)
+LEGEND = (
+    "Mean cost over all test starts, median over the seeds [smallest, largest]; its "
+    "interquartile mean (IQM) with the 95 % bootstrap interval over the seeds; *gap closed*: "
+    f"of the way from the MPC to the {OPTIMUM}; *worst start*: the largest cost above the "
+    "MPC's over all seeds and starts, and in per cent of the MPC's mean. *Excess cost*: what "
+    "the training episodes cost, as played, above the MPC from the same starts."
+)
 Column = tuple[str, Callable[[Row], str]]
 
 
@@ -33,38 +46,22 @@ def write_report(
     Learners and plants that are not there are left out. The text of `notes` is included as it is.
     """
     pictures = save_pictures(outcomes, folder)
+    as_printed = [paper_table(outcomes, plant, EPISODES) for plant in plants_of(outcomes)]
+    curves = [f"![{plant}]({path.name})" for plant, path in pictures.items()]
     parts = [
         "# Results",
         how_it_was_made(outcomes, command),
         what_was_reached(outcomes),
-        "## The paper's tables",
-        *filter(None, (paper_table(outcomes, plant, EPISODES) for plant in plants_of(outcomes))),
+        *_headed("## The paper's tables", as_printed),
         *_tables(outcomes, EPISODES),
         *_variants(outcomes, EPISODES),
         *_tables(outcomes, LONG),
-        "## Learning curves",
-        "The line is the median over the seeds, the band goes from the first to the third quartile.",
-        *(f"![{plant}]({path.name})" for plant, path in pictures.items()),
+        *_headed(f"## Learning curves\n\n{CURVES}", curves),
         notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
     ]
     report = folder / "results.md"
     report.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
     return [report, *pictures.values()]
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table in Markdown, all columns but the first to the right."""
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def number(value: float | None, digits: int = 2, sign: str = "") -> str:
-    """Return a number for a cell: a dash for None, a power of ten where it is large."""
-    if value is None:
-        return "—"
-    if not np.isfinite(value) or abs(value) >= 1e5:
-        return f"{value:{sign}.2e}"
-    return f"{round(value, digits) + 0.0:{sign},.{digits}f}"
 
 
 def how_it_was_made(outcomes: Mapping[Run, Outcome], command: str) -> str:
@@ -81,12 +78,12 @@ def how_it_was_made(outcomes: Mapping[Run, Outcome], command: str) -> str:
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     text = (
         f"Made with `{command}`: {len(outcomes)} runs, {hours:.1f} hours of one core altogether. "
-        f"Every policy was tested on the same {starts} starts, without noise; no start of the tests "
-        f"is one of training.\n\nPython {platform.python_version()} on {platform.system()}, "
-        f"{versions}.\n\n"
+        f"Every policy was tested on the same {starts} starts, without noise."
+        f"\n\nPython {platform.python_version()} on {platform.system()}, "
+        f"sb3-yann {sb3_yann.__version__}, {versions}.\n\n"
     )
     header = ("plant", "learner", "training episodes", "seeds", "seconds per run, median")
-    return f"## How this was made\n\n{text}{table(header, rows)}"
+    return f"## How this was made\n\n{text}{table(header, rows, texts=2)}"
 
 
 def what_was_reached(outcomes: Mapping[Run, Outcome]) -> str:
@@ -99,8 +96,12 @@ def what_was_reached(outcomes: Mapping[Run, Outcome]) -> str:
         f"## What was required, and what was reached\n\nAfter {EPISODES} training episodes, with "
         f"{SEEDS} seeds; computed from the runs. A start is held if it costs less than {HELD:g}. "
         "Means that agree to 0.01 % count as equal.\n\n"
-        + table(("plant", "required", "found", "reached"), rows)
+        + table(("plant", "required", "found", "reached"), rows, texts=4)
     )
+
+
+def _headed(heading: str, parts: list[str]) -> list[str]:
+    return [heading, *parts] if any(parts) else []
 
 
 def _tables(outcomes: Mapping[Run, Outcome], episodes: int) -> list[str]:
@@ -116,15 +117,8 @@ def _tables(outcomes: Mapping[Run, Outcome], episodes: int) -> list[str]:
             parts += [f"### {plant}", tested, "While learning:", taught]
     if not parts:
         return []
-    return [
-        f"## After {episodes} training episodes",
-        "Mean cost over all test starts, median over the seeds [smallest, largest]; its "
-        "interquartile mean (IQM) with the 95 % bootstrap interval over the seeds; *gap closed*: "
-        f"of the way from the MPC to the {OPTIMUM}; *worst start*: the largest cost above the "
-        "MPC's over all seeds and starts, and in per cent of the MPC's mean. *Excess cost*: what "
-        "the training episodes cost, as played, above the MPC from the same starts.",
-        *parts,
-    ]
+    explained = [LEGEND] if episodes == EPISODES else []
+    return [f"## After {episodes} training episodes", *explained, *parts]
 
 
 def _variants(outcomes: Mapping[Run, Outcome], episodes: int) -> list[str]:
@@ -173,7 +167,9 @@ def _variant_columns() -> list[Column]:
 
 
 def _cells(columns: Sequence[Column], rows: Iterable[Row]) -> str:
-    return table([name for name, _ in columns], [[cell(row) for _, cell in columns] for row in rows])
+    return table(
+        [name for name, _ in columns], [[cell(row) for _, cell in columns] for row in rows]
+    )
 
 
 def _spread(row: Row) -> str:

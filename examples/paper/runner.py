@@ -224,10 +224,10 @@ def _on_this_machine(
         for run, error in results:
             del left[run]
             yield run, error
-    except BrokenProcessPool as broken:  # killed from outside, or for want of memory
+    except BrokenProcessPool:  # one was killed from outside, or for want of memory
+        reason = f"Not done, since the processes stopped:\n{traceback.format_exc()}"
         for run in left:
-            done = load(run, folder, fingerprint) is not None
-            yield run, None if done else f"Not done, since a process was killed: {broken}"
+            yield run, None if load(run, folder, fingerprint) else reason
 
 
 def _with_progress(

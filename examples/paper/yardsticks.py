@@ -4,16 +4,18 @@ Each builder takes ``make_env``, a function without arguments that returns the p
 (once, so that it may record what is executed), and a seed. It returns a `Learner`, ready for
 ``learner.model.learn(steps, callback=learner.callbacks)``.
 
-All learners share what makes them strong: two hidden layers of 256, and inputs of about unit size.
-The reactor's deviations are divided by the largest of its starts (0.05 mol/L and 7.5 K are then
-alike), the pendulum's angle becomes its cosine and sine. Inputs are scaled by SB3.
+All learners share what makes them strong: two hidden layers of 256, and observations that suit
+them. The pendulum's angle becomes its cosine and sine. The reactor's deviations stay as they are,
+in mol/L and K: the temperature then dominates the input as it dominates the cost, and DDPG is much
+better than with every deviation divided by the largest of its starts. Batches of 100 cost half the
+time of SB3's 256. Inputs are scaled by SB3. Where SB3 starts from random networks it also plays its
+first 100 actions at random, its default; a learner that starts from the MPC never does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, TypeAlias
 
 import gymnasium as gym
@@ -41,10 +43,8 @@ BURN_IN = 2_000
 """Gradient steps for which an actor that starts well waits for its critic, which does not."""
 CLONING_SEEDS = range(500, 540)
 """Starts from which the MPC shows the cloned actor what it does."""
-CLONING_STEPS = 3_000
+CLONING_STEPS = 2_000
 """Gradient steps of the cloning, each on 256 states."""
-SPREAD_SEEDS = range(500, 600)
-"""Starts whose largest entries scale the observation."""
 
 _SETTINGS: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [256, 256]},
@@ -58,7 +58,7 @@ _SETTINGS: dict[str, Any] = {
 class Learner:
     """A model to train, and the policy that comes of it.
 
-    Attributes
+    Parameters
     ----------
     model : DDPG or TD3
         It learns on a wrapped environment; use `policy` to ask it for actions.
@@ -75,7 +75,16 @@ class Learner:
 
 @dataclass(frozen=True)
 class Controller:
-    """Maps plain observations to plain actions: a model alone, or on top of a law."""
+    """Maps plain observations to plain actions: a model alone, or on top of a law.
+
+    Parameters
+    ----------
+    model : DDPG or TD3
+    features : callable
+        From plain observations, one or a batch, to those of the model.
+    combine : callable, optional
+        From plain observations and the model's actions to plain actions.
+    """
 
     model: TD3
     features: Law
@@ -137,12 +146,23 @@ class BurnIn(BaseCallback):
 
 
 def sb3_ddpg(make_env: MakeEnv, seed: int) -> Learner:
-    """Return SB3's DDPG with Gaussian noise (Lillicrap et al. 2016), from random networks."""
+    """Return SB3's DDPG with Gaussian noise, from random networks.
+
+    References
+    ----------
+    T. Lillicrap et al., Continuous control with deep reinforcement learning, ICLR 2016.
+    """
     return _plain(DDPG, make_env, seed)
 
 
 def sb3_td3(make_env: MakeEnv, seed: int) -> Learner:
-    """Return SB3's TD3 with Gaussian noise (Fujimoto et al. 2018), from random networks."""
+    """Return SB3's TD3 with Gaussian noise, from random networks.
+
+    References
+    ----------
+    S. Fujimoto, H. van Hoof, D. Meger, Addressing function approximation error in actor-critic
+    methods, ICML 2018.
+    """
     return _plain(TD3, make_env, seed)
 
 
@@ -180,9 +200,16 @@ def residual_rl(make_env: MakeEnv, seed: int, noise: float = NOISE) -> Learner:
 def cloned(make_env: MakeEnv, seed: int) -> Learner:
     """Return DDPG from an actor that was fitted to the linear MPC before.
 
-    Behaviour cloning (Pomerleau 1991) minimises the squared error of the input, with Adam, on
-    states that the MPC visits from the environment's own starts, and as many around them. As in
-    `residual_rl` the actor then waits for its critic, and nothing uniformly random is played.
+    Behaviour cloning minimises the squared error of the input, with Adam, on
+    states that the MPC visits from the environment's own starts, and as many around them. The root
+    mean squared error at states from other starts is below 1 % of the input range wherever the MPC
+    has a solution; outside, where the pendulum's law jumps, it is larger. As in `residual_rl` the
+    actor then waits for its critic, and nothing uniformly random is played.
+
+    References
+    ----------
+    D. Pomerleau, Efficient training of artificial neural networks for autonomous navigation,
+    Neural Computation 3(1), 1991.
     """
     learner = _plain(DDPG, make_env, seed, learning_starts=0)
     env = learner.model.get_env().envs[0]
@@ -217,7 +244,10 @@ def lqr(problem: LinearMPC) -> Law:
 
 
 def visited_states(env: Env, law: Law, seeds: range) -> Array:
-    """Return the states (count, n) that ``law`` visits in one episode from each seed's start."""
+    """Return the states (count, n) that ``law`` visits in one episode from each seed's start.
+
+    They come from a new environment of the same id, so nothing is recorded in ``env``.
+    """
     fresh, states = gym.make(env.unwrapped.spec.id), []
     for seed in seeds:
         observation, done = fresh.reset(seed=seed)[0], False
@@ -256,10 +286,7 @@ def _features(env: Env) -> Law:
     """Return the function from plain observations, one or a batch, to the networks' inputs."""
     if isinstance(env.unwrapped, ClippedPendulumEnv):
         return _circle
-    fresh = gym.make(env.unwrapped.spec.id)
-    starts = np.array([fresh.reset(seed=seed)[0] for seed in SPREAD_SEEDS])
-    fresh.close()
-    return partial(_divided, np.abs(starts).max(axis=0))
+    return _unchanged
 
 
 def _circle(observation: ArrayLike) -> Array:
@@ -268,8 +295,8 @@ def _circle(observation: ArrayLike) -> Array:
     return np.stack([np.cos(angle), np.sin(angle), speed], axis=-1)
 
 
-def _divided(scale: Array, observation: ArrayLike) -> Array:
-    return np.asarray(observation, dtype=np.float32) / scale
+def _unchanged(observation: ArrayLike) -> Array:
+    return np.asarray(observation, dtype=np.float32)
 
 
 def _regress(

@@ -98,6 +98,7 @@ class ImprovementGuard(BaseCallback):
         every: int = 1,
         margin: float = 0.005,
         by_region: bool = True,
+        patience: int = 1,
         shrink: float = 0.5,
         grow: float = 1.5,
         smallest_step: float = 0.1,
@@ -135,7 +136,7 @@ class ImprovementGuard(BaseCallback):
         if env is None:
             self.trials = PlantTrials(trial_episodes, significance)
         else:
-            self.trials = SimulatorTrials(env, n_starts, seed, every, margin, by_region)
+            self.trials = SimulatorTrials(env, n_starts, seed, every, margin, by_region, patience)
 
     @property
     def decisions(self) -> list[Decision]:

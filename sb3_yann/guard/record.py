@@ -36,7 +36,7 @@ class Decision:
 
     timestep: int
     episode: int
-    verdict: Literal["accepted", "accepted in part", "rejected"]
+    verdict: Literal["accepted", "accepted in part", "waiting", "rejected"]
     reason: str
     candidate_cost: float
     accepted_cost: float

@@ -43,8 +43,10 @@ class SimulatorTrials:
         every: int,
         margin: float,
         by_region: bool,
+        patience: int,
     ) -> None:
         self.env, self.every, self.margin, self.by_region = env, every, margin, by_region
+        self.patience, self.rejections = patience, 0
         self.seeds = range(seed, seed + n_starts)
         self.settings = {"env": _name(env), "seeds": self.seeds, "margin": margin}
 
@@ -88,19 +90,27 @@ class SimulatorTrials:
             played = self._play(guard, self.seeds)
             reason = evidence.paired.objection(played.costs, played.violations)
         regions: list[int] = []
+        returned = False
         if played is not None and not reason:
             guard.accept(self._evidence(guard, evidence.paired, played))
+            self.rejections = 0
         else:
             candidate = Snapshot.of(guard.policy)
-            guard.state.accepted.restore(guard.policy)
             if self.by_region and played is not None:
                 regions = self._accept_regions(guard, candidate)
+            self.rejections += 1
+            returned = self.rejections >= self.patience or played is None or bool(
+                np.any(played.violations > evidence.paired.violations)
+            )
+            if returned:
+                self.rejections = 0
+            (guard.state.accepted if returned else candidate).restore(guard.policy)
         paired = guard.state.evidence.paired
         guard.decide(
             Decision(
                 guard.num_timesteps,
                 guard.state.episodes,
-                "accepted" if not reason else "accepted in part" if regions else "rejected",
+                "accepted" if not reason else "accepted in part" if regions else "rejected" if returned else "waiting",
                 reason,
                 np.nan if played is None else float(played.costs.mean()),
                 float(paired.costs.mean()),
@@ -135,7 +145,6 @@ class SimulatorTrials:
                 paired = replace(evidence.paired, costs=costs, violations=violations)
                 guard.accept(Evidence(paired, visits), mixed)
                 accepted.append(region)
-        guard.state.accepted.restore(guard.policy)
         return accepted
 
     def _play(self, guard: ImprovementGuard, seeds: Sequence[int]) -> Episodes:

@@ -91,7 +91,7 @@ def test_equal_seeds_give_equal_results(name, quick_cloning) -> None:
     def trained(seed: int) -> np.ndarray:
         env = recorder("ClippedPendulum-v0")
         learner = BUILDERS[name](lambda: env, seed)
-        learner.model.learn(150, callback=learner.callbacks)
+        learner.model.learn(120, callback=learner.callbacks)
         return np.concatenate([env.recorded()[1], learner.policy.predict(random_states(env))[0]])
 
     first = trained(1)
@@ -113,12 +113,12 @@ def test_the_residual_policy_is_the_mpc_before_training(env_id) -> None:
 def test_without_noise_the_residual_executes_the_mpc_until_the_actor_moves(env_id) -> None:
     env = recorder(env_id)
     learner = residual_rl(lambda: env, 0, noise=0.0)
-    learner.callbacks[0].steps = 250
-    learner.model.learn(300, callback=learner.callbacks)
+    learner.callbacks[0].steps = 100
+    learner.model.learn(120, callback=learner.callbacks)
     observations, executed = env.recorded()
     expected = law_of(env)(observations).astype(np.float32)
-    np.testing.assert_array_equal(executed[:250], expected[:250])
-    assert np.any(executed[251:] != expected[251:])
+    np.testing.assert_array_equal(executed[:100], expected[:100])
+    assert np.any(executed[101:] != expected[101:])
 
 
 @pytest.mark.parametrize("env_id", ENVS)
@@ -158,13 +158,15 @@ def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
     assert np.any(learner.policy.predict(states)[0] != before)
 
 
-def test_a_cloned_actor_is_close_to_the_mpc_from_other_starts() -> None:
-    env = recorder("CSTR-v0")
+@pytest.mark.parametrize("env_id", ENVS)
+def test_a_cloned_actor_is_close_to_the_mpc_from_other_starts(env_id) -> None:
+    env = recorder(env_id)
     learner = cloned(lambda: env, 0)
-    assert env.pairs == []  # the caller's environment is not the one the MPC was watched on
+    assert env.pairs == []  # the MPC was watched on an environment of its own
     law = law_of(env)
-    states = yardsticks.visited_states(env, law, range(5000, 5005))
-    error = (learner.policy.predict(states)[0] - law(states)) / 110
+    states = yardsticks.visited_states(env, law, range(5000, 5010))
+    states = states[law.in_domain(states)]  # the law jumps outside, which no such network does
+    error = (learner.policy.predict(states)[0] - law(states)) / (2 * env.action_space.high)
     assert np.sqrt(np.mean(error**2)) < 0.01
 
 
@@ -178,11 +180,11 @@ def test_networks_see_the_pendulum_as_gymnasium_shows_it() -> None:
     np.testing.assert_array_equal(learner.policy.predict(plain)[0], learner.model.predict(seen)[0])
 
 
-def test_networks_see_the_reactor_s_starts_in_unit_size() -> None:
-    env = sb3_ddpg(lambda: gym.make("CSTR-v0"), 0).model.env.envs[0]
-    seen = np.array([env.reset(seed=seed)[0] for seed in range(200)])
-    largest = np.abs(seen).max(axis=0)
-    np.testing.assert_allclose(largest, 1.0, rtol=0.1)
+def test_networks_see_the_reactor_as_it_is() -> None:
+    learner = sb3_ddpg(lambda: gym.make("CSTR-v0"), 0)
+    seen, info = learner.model.env.envs[0].reset(seed=3)
+    np.testing.assert_array_equal(seen, info["state"].astype(np.float32))
+    np.testing.assert_array_equal(learner.policy.predict(seen)[0], learner.model.predict(seen)[0])
 
 
 @pytest.mark.parametrize("problem", [problems.clipped_pendulum(), problems.cstr()], ids=ENVS[::-1])

@@ -1,0 +1,290 @@
+"""What is run: plants, learners, seeds, and how one run is made.
+
+Test starts and the guard's starts are seeds of their own, which no training episode has: SB3 seeds
+the training env with the seed of the run.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+
+import sb3_yann
+from paper import optimum, yardsticks
+from paper.runner import Outcome, Run
+from paper.yardsticks import Learner
+from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
+from sb3_yann.evaluation import Episodes, evaluate
+from sb3_yann_envs import clipped_pendulum, cstr, problems
+
+TEST_SEEDS = range(1000, 1100)
+"""Test starts; the first ten are those of the paper's tables."""
+CHECKPOINTS = (0, 5, 10, 20, 30, 40, 50, 75, 100, 150, 200)
+"""Training episodes after which the policy is tested."""
+FINGERPRINT = f"{sb3_yann.__version__}-1"
+"""Results of another version are not taken for those of this one."""
+
+
+@dataclass(frozen=True)
+class Plant:
+    """An environment and the MPC to start from."""
+
+    env_id: str
+    steps: int  # of one episode
+    problem: Callable[[], LinearMPC]
+    optimum: Callable[..., Any]
+    guard: dict[str, Any]
+
+
+def true_reactor() -> LinearMPC:
+    """Return the reactor's MPC with the model that its equations give, not the printed one."""
+    model = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
+    return replace(problems.cstr(), model=model, terminal_cost=None)
+
+
+def printed_pendulum() -> LinearMPC:
+    """Return the pendulum's MPC with the printed weight, Q = I: nine regions instead of seven."""
+    return replace(problems.clipped_pendulum(), Q=np.eye(2), terminal_cost=None)
+
+
+_REACTOR = Plant("CSTR-v0", 400, problems.cstr, optimum.cstr_optimum, {})
+_PENDULUM = Plant(
+    "ClippedPendulum-v0",
+    200,
+    problems.clipped_pendulum,
+    optimum.clipped_pendulum_optimum,
+    {},
+)
+PLANTS = {
+    "CSTR": _REACTOR,
+    "CSTR, true model": replace(_REACTOR, problem=true_reactor),
+    "pendulum, Q = diag(1, 0.1)": _PENDULUM,
+    "pendulum, Q = I": replace(_PENDULUM, problem=printed_pendulum),
+}
+
+
+def yann(
+    make_env: Callable[[], Any],
+    seed: int,
+    plant: Plant,
+    algorithm: type[TD3] = DDPG,
+    guard: dict[str, Any] | None = {},  # noqa: B006 (never written to)
+    noise: float = 0.0,
+    gamma: float = 0.99,
+    outside: str | None = None,
+    plant_alone: bool = False,
+    **policy_kwargs: Any,
+) -> Learner:
+    """Return a YANN learner; None as guard trains without one."""
+    problem = plant.problem()
+    if outside is not None:
+        problem = replace(problem, outside=outside)
+    env = make_env()
+    model = algorithm(
+        YannPolicy,
+        env,
+        gamma=gamma,
+        seed=seed,
+        device="cpu",
+        buffer_size=200_000,
+        policy_kwargs={"problem": problem, **policy_kwargs},
+        **({"target_policy_noise": 0.0} if algorithm is TD3 else {}),
+    )
+    callbacks: list[BaseCallback] = [NoActionNoise()]
+    if noise:
+        m = env.action_space.shape[0]
+        model.action_noise = NormalActionNoise(np.zeros(m), np.full(m, noise))
+        model.learning_starts = 0
+        callbacks = []
+    if guard is not None:
+        simulator = None if plant_alone else plant.env_id
+        callbacks.append(ImprovementGuard(simulator, **{**plant.guard, **guard}))
+    return Learner(model, model.policy, callbacks)
+
+
+def _yardstick(build: Callable[..., Learner], **options: Any) -> Callable[..., Learner]:
+    return lambda make_env, seed, plant: build(make_env, seed, **options)
+
+
+LEARNERS: dict[str, Callable[..., Learner]] = {
+    "YANN-RL": yann,
+    "YANN-RL, guard off": partial(yann, guard=None),
+    "YANN-RL, guard off, noise 0.1": partial(yann, guard=None, noise=0.1),
+    "YANN-RL, whole actor or nothing": partial(yann, guard={"by_region": False}),
+    "YANN-RL, decided on the plant alone": partial(yann, plant_alone=True),
+    "YANN-RL, paper's critic": partial(yann, critic="state_action"),
+    "YANN-RL, paper's critic, guard off": partial(yann, critic="state_action", guard=None),
+    "YANN-RL, paper's critic, TD3, guard off": partial(
+        yann, critic="state_action", guard=None, algorithm=TD3
+    ),
+    "YANN-RL, TD3": partial(yann, algorithm=TD3),
+    "YANN-RL, at most 5 % from the MPC": partial(yann, max_correction=0.05),
+    "YANN-RL, free equilibrium": partial(yann, pin_equilibrium=False),
+    "YANN-RL, discount 0.95": partial(yann, gamma=0.95),
+    "YANN-RL, discount 0.998": partial(yann, gamma=0.998),
+    "YANN-RL, zero outside": partial(yann, outside="zero"),
+    "DDPG": _yardstick(yardsticks.sb3_ddpg),
+    "TD3": _yardstick(yardsticks.sb3_td3),
+    "residual RL": _yardstick(yardsticks.residual_rl),
+    "residual RL, no noise": _yardstick(yardsticks.residual_rl, noise=0.0),
+    "cloned MPC, then DDPG": _yardstick(yardsticks.cloned),
+}
+FIXED = ("MPC", "LQR", "optimum")
+
+
+def _runs() -> list[Run]:
+    runs = [Run(plant, name, 0, 0) for plant in PLANTS for name in FIXED]
+    ten, five = range(10), range(5)
+
+    def add(plant: str, learner: str, seeds: range, long: range = range(0)) -> None:
+        runs.extend(Run(plant, learner, s, 200 if s in long else 50) for s in seeds)
+
+    for plant in PLANTS:
+        add(plant, "YANN-RL", ten, long=range(0) if "true" in plant else five)
+    for plant in ("CSTR", "pendulum, Q = diag(1, 0.1)"):
+        add(plant, "DDPG", ten, long=five)
+        add(plant, "residual RL", ten)
+        for learner in LEARNERS:
+            outside = learner.endswith("zero outside")  # the reactor never is
+            if learner in ("YANN-RL", "DDPG", "residual RL") or (outside and plant == "CSTR"):
+                continue
+            add(plant, learner, five)
+    add("CSTR, true model", "YANN-RL, guard off", five)
+    return runs
+
+
+RUNS = _runs()
+QUICK = [
+    *(Run(plant, name, 0, 0) for plant in ("CSTR", "pendulum, Q = I") for name in FIXED),
+    Run("CSTR", "YANN-RL", 0, 5),
+    Run("CSTR", "DDPG", 0, 5),
+    Run("pendulum, Q = I", "YANN-RL", 0, 5),
+]
+
+
+class Recorder(gym.Wrapper[Any, Any, Any, Any]):
+    """Keeps start, cost and violations of every episode that is played."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.starts: list[Any] = []
+        self.costs: list[float] = []
+        self.violations: list[int] = []
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(**kwargs)
+        self.starts.append(info["state"])
+        self.costs.append(0.0)
+        self.violations.append(0)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Add the cost of a step."""
+        result = self.env.step(action)
+        self.costs[-1] -= float(result[1])
+        self.violations[-1] += bool(result[-1]["violation"])
+        return result
+
+
+class Checkpoints(BaseCallback):
+    """Tests the policy after so many training episodes: with a guard, the accepted one."""
+
+    def __init__(self, test: Callable[[Any], Episodes], policy: Any, recorder: Recorder) -> None:
+        super().__init__()
+        self.test, self.tested_policy, self.recorder = test, policy, recorder
+        self.tests: dict[int, Episodes] = {}
+
+    def _on_training_start(self) -> None:
+        self.tests[0] = self.test(self.tested_policy)
+
+    def _on_step(self) -> bool:
+        if self.locals["dones"][0] and len(self.recorder.costs) - 1 in CHECKPOINTS:
+            policy = self.tested_policy
+            if hasattr(self.model, "guard_state"):
+                policy = copy.deepcopy(policy)
+                self.model.guard_state.accepted.restore(policy)
+            self.tests[len(self.recorder.costs) - 1] = self.test(policy)
+        return True
+
+
+def execute(run: Run) -> Outcome:
+    """Return the outcome of a run."""
+    began = time.perf_counter()
+    torch.set_num_threads(1)
+    plant = PLANTS[run.plant]
+    test = partial(evaluate, env=plant.env_id, seeds=TEST_SEEDS)
+    if run.learner in FIXED:
+        return _fixed(run.learner, plant, test)
+    recorder = Recorder(gym.make(plant.env_id))
+    learner = LEARNERS[run.learner](lambda: recorder, run.seed, plant=plant)
+    checkpoints = Checkpoints(test, learner.policy, recorder)
+    # An episode that ends early makes room for another one: so many episodes, not so many steps.
+    stop = _StopAfter(run.episodes, recorder)
+    learner.model.learn(
+        2 * plant.steps * run.episodes, callback=[*learner.callbacks, checkpoints, stop]
+    )
+    checkpoints.tests[run.episodes] = test(learner.policy)
+    e = run.episodes
+    starts = recorder.starts[:e]
+    mpc = evaluate(plant.problem().explicit(), plant.env_id, range(e), starts)
+    tests = checkpoints.tests
+    return Outcome(
+        checkpoints=np.array([*tests]),
+        test_costs=np.array([each.costs for each in tests.values()]),
+        test_violations=np.array([each.violations for each in tests.values()]),
+        training_costs=np.array(recorder.costs[:e]),
+        training_mpc_costs=mpc.costs,
+        training_violations=np.array(recorder.violations[:e]),
+        extra=_decisions(learner.model),
+        seconds=time.perf_counter() - began,
+    )
+
+
+class _StopAfter(BaseCallback):
+    def __init__(self, episodes: int, recorder: Recorder) -> None:
+        super().__init__()
+        self.episodes, self.recorder = episodes, recorder
+
+    def _on_step(self) -> bool:
+        # The vectorised env has begun the next episode already where one is over.
+        return len(self.recorder.costs) <= self.episodes
+
+
+def _decisions(model: Any) -> dict[str, Any]:
+    state = getattr(model, "guard_state", None)
+    if state is None:
+        return {}
+    verdicts = [decision.verdict for decision in state.decisions]
+    costs = [decision.accepted_cost for decision in state.decisions]
+    return {"guard_verdicts": np.array(verdicts), "guard_accepted_costs": np.array(costs)}
+
+
+@lru_cache
+def _test_starts(env_id: str) -> Any:
+    env = gym.make(env_id)
+    return np.array([env.reset(seed=seed)[1]["state"] for seed in TEST_SEEDS])
+
+
+def _fixed(name: str, plant: Plant, test: Callable[..., Episodes]) -> Outcome:
+    """Return the outcome of a controller that does not learn."""
+    if name == "optimum":
+        costs = plant.optimum(_test_starts(plant.env_id), plant.steps)
+        violations = np.zeros(len(costs), dtype=int)
+    else:
+        problem = plant.problem()
+        episodes = test(problem.explicit() if name == "MPC" else yardsticks.lqr(problem))
+        costs, violations = episodes.costs, episodes.violations
+    none = np.zeros(0)
+    return Outcome(np.zeros(1), costs[None], violations[None], none, none, none)

@@ -1,0 +1,30 @@
+"""Tables and numbers in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
+    """Return a table in Markdown, with the first columns to the left and the others to the right.
+
+    Parameters
+    ----------
+    header : sequence of str
+    rows : iterable of sequence of str
+    texts : int
+        How many columns go to the left.
+    """
+    lines = [header, [*["---"] * texts, *["---:"] * (len(header) - texts)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def number(value: float | None, digits: int = 2, sign: str = "") -> str:
+    """Return a number for a cell: a dash for None, a power of ten where it is large."""
+    if value is None:
+        return "—"
+    if not np.isfinite(value) or abs(value) >= 1e5:
+        return f"{value:{sign}.2e}"
+    return f"{round(value, digits) + 0.0:{sign},.{digits}f}"
