@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
@@ -73,12 +74,9 @@ def evaluate(
         episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
     else:
         make = partial(gym.make, env, disable_env_checker=True) if isinstance(env, str) else env
-        envs = [make() for _ in seeds]
-        try:
+        with ExitStack() as stack:
+            envs = [stack.enter_context(closing(make())) for _ in seeds]
             episodes = _side_by_side(act, envs, resets)
-        finally:
-            for each in envs:
-                each.close()
     return Episodes(
         np.array([episode.cost for episode in episodes]),
         np.array([episode.violations for episode in episodes], dtype=np.int64),

@@ -88,9 +88,13 @@ def test_a_loaded_model_does_not_explore_either(tmp_path) -> None:
 
 
 def test_training_starts_at_once_and_still_without_noise() -> None:
-    model, _ = noisy(gradient_steps=1)
+    model, env = noisy(gradient_steps=1, policy_kwargs={"critic_warmup": 0}, learning_rate=0.1)
     model.learn(5, callback=NoActionNoise())
     assert model._n_updates == 5
+    observations, executed = (np.array(part) for part in zip(*env.pairs, strict=True))
+    with pytest.raises(AssertionError):  # the policy has moved on since
+        assert_all_actions_are_the_policy_s(model, env)
+    np.testing.assert_allclose(executed[0], DDPG(YannPolicy, env).predict(observations[0])[0])
 
 
 def test_running_without_learning_leaves_the_random_state_of_the_process_alone() -> None:

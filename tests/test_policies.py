@@ -8,6 +8,7 @@ import pickle
 import subprocess
 import sys
 import textwrap
+from functools import cache
 
 import cloudpickle
 import gymnasium as gym
@@ -22,10 +23,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 import sb3_yann
 from sb3_yann import LinearModel, LinearMPC, NoActionNoise, YannActor, YannCritic, YannPolicy
+from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue
 from sb3_yann_envs import problems
 
 ENVS = ("CSTR-v0", "ClippedPendulum-v0")
 POLICIES = pytest.mark.parametrize("algorithm", [DDPG, TD3])
+CRITICS = pytest.mark.parametrize("critic", ["afterstate", "state_action"])
 
 
 def named_problem() -> LinearMPC:
@@ -39,9 +42,10 @@ def scalar_mpc(**changes) -> LinearMPC:
     return LinearMPC(LinearModel([[1.1]], [[1]], 1), **{**design, **bounds, **changes})
 
 
-def build(algorithm=DDPG, mpc: LinearMPC | None = None, **kwargs):
+def build(algorithm=DDPG, mpc: LinearMPC | None = None, policy_kwargs=None, **kwargs):
     mpc = scalar_mpc() if mpc is None else mpc
-    return algorithm(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc}, **kwargs)
+    policy_kwargs = {"problem": mpc, **(policy_kwargs or {})}
+    return algorithm(YannPolicy, LinearPlant(mpc), policy_kwargs=policy_kwargs, **kwargs)
 
 
 def test_predict_equals_an_independent_online_qp_at_ten_thousand_feasible_states(mpc) -> None:
@@ -67,16 +71,30 @@ def test_the_policy_is_known_by_name(algorithm) -> None:
 
 
 @POLICIES
+@CRITICS
 @pytest.mark.parametrize("n_critics", [1, 2])
-def test_actor_and_critic_are_those_of_sb3_with_yann_networks(algorithm, n_critics) -> None:
-    mpc = scalar_mpc()
-    model = algorithm(
-        YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc, "n_critics": n_critics}
-    )
+def test_actor_and_critic_are_those_of_sb3_with_yann_networks(algorithm, critic, n_critics) -> None:
+    kwargs = {"critic": critic, "n_critics": n_critics, "critic_warmup": 0}
+    model = build(algorithm, policy_kwargs=kwargs)
     assert isinstance(model.actor, YannActor)
     assert isinstance(model.critic, YannCritic)
-    assert len(model.critic.q_networks) == n_critics
+    network = {"afterstate": AfterstateValue, "state_action": QuadraticStateActionValue}[critic]
+    for each in (model.critic, model.critic_target):
+        assert [type(q) for q in each.q_networks] == [network] * n_critics
+    before = copy.deepcopy(model.policy)
     model.learn(60, callback=NoActionNoise())
+    for name in ("actor", "actor_target", "critic", "critic_target"):
+        assert changed(getattr(model.policy, name), getattr(before, name)), name
+
+
+@POLICIES
+def test_the_critic_is_an_afterstate_one_by_default(algorithm) -> None:
+    assert isinstance(build(algorithm).critic.qf0, AfterstateValue)
+
+
+def changed(one: th.nn.Module, other: th.nn.Module) -> bool:
+    pairs = zip(one.parameters(), other.parameters(), strict=True)
+    return any(not th.equal(a, b) for a, b in pairs)
 
 
 def test_ddpg_has_one_critic_and_td3_two() -> None:
@@ -84,12 +102,14 @@ def test_ddpg_has_one_critic_and_td3_two() -> None:
     assert build(TD3).critic.n_critics == 2
 
 
+@CRITICS
 @pytest.mark.parametrize("make", [problems.clipped_pendulum, problems.cstr])
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 @pytest.mark.parametrize("discounted", [False, True], ids=["paper's MPC", "discounted MPC"])
-def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted) -> None:
+def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted, critic) -> None:
     mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal_cost=None)
-    model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0)
+    kwargs = {"critic": critic}
+    model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0, policy_kwargs=kwargs)
     model.learn(1)  # sets up the logger
     law, rng = mpc.explicit(), np.random.default_rng(0)
     origin = law.locate(np.zeros(mpc.n_theta))
@@ -153,7 +173,7 @@ def first_step(network) -> float:
 @pytest.mark.parametrize("way", ["as built", "deep copy", "pickle", "saved and loaded"])
 def test_actor_and_critic_step_at_their_own_rates(way, tmp_path) -> None:
     mpc = scalar_mpc()
-    kwargs = {"problem": mpc, "actor_lr_mult": 0.1, "critic_lr_mult": 0.5}
+    kwargs = {"problem": mpc, "actor_lr_mult": 0.1, "critic_lr_mult": 0.5, "critic_warmup": 0}
     model = DDPG(YannPolicy, LinearPlant(mpc), learning_rate=1e-2, policy_kwargs=kwargs)
     policy = model.policy
     if way == "deep copy":
@@ -169,7 +189,7 @@ def test_actor_and_critic_step_at_their_own_rates(way, tmp_path) -> None:
 
 
 def test_rates_given_to_load_are_those_in_use(tmp_path) -> None:
-    model = build(learning_rate=1e-2)
+    model = build(learning_rate=1e-2, policy_kwargs={"critic_warmup": 0})
     model.save(tmp_path / "model")
     kwargs = {**model.policy_kwargs, "actor_lr_mult": 0.5}
     loaded = DDPG.load(tmp_path / "model", custom_objects={"policy_kwargs": kwargs})
@@ -179,7 +199,7 @@ def test_rates_given_to_load_are_those_in_use(tmp_path) -> None:
 @pytest.mark.parametrize("frozen", ["actor", "critic"])
 def test_a_rate_of_zero_freezes_one_of_them(frozen) -> None:
     mpc = scalar_mpc()
-    kwargs = {"problem": mpc, f"{frozen}_lr_mult": 0.0}
+    kwargs = {"problem": mpc, f"{frozen}_lr_mult": 0.0, "critic_warmup": 0}
     model = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs=kwargs, seed=0)
     before = {name: p.clone() for name, p in model.policy.named_parameters()}
     model.learn(20, callback=NoActionNoise())
@@ -210,8 +230,10 @@ def test_the_given_problem_goes_before_the_one_in_the_space() -> None:
 
 
 @POLICIES
-def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, tmp_path) -> None:
-    model = algorithm(YannPolicy, "ClippedPendulum-v0", seed=0)
+@CRITICS
+def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, critic, tmp_path) -> None:
+    kwargs = {"critic": critic, "critic_warmup": 0}
+    model = algorithm(YannPolicy, "ClippedPendulum-v0", seed=0, policy_kwargs=kwargs)
     model.learn(50, callback=NoActionNoise())
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
@@ -229,8 +251,9 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, tmp_path
 
 @pytest.mark.parametrize("problem", [None, "CSTR-v0", "sb3_yann_envs.problems:cstr"])
 def test_a_fresh_process_predicts_without_any_solver(problem, tmp_path) -> None:
-    kwargs = {} if problem is None else {"policy_kwargs": {"problem": problem}}
-    model = DDPG(YannPolicy, "CSTR-v0" if problem is None else plain_cstr(), **kwargs)
+    kwargs = {"critic_warmup": 0} if problem is None else {"critic_warmup": 0, "problem": problem}
+    env = "CSTR-v0" if problem is None else plain_cstr()
+    model = DDPG(YannPolicy, env, policy_kwargs=kwargs)
     model.learn(20, callback=NoActionNoise())
     model.save(tmp_path / "model")
     state = np.array([0.01, 0.1, -0.1, -2], dtype=np.float32)
@@ -282,9 +305,11 @@ def test_load_accepts_the_same_policy_kwargs_again(tmp_path) -> None:
 def test_it_trains_on_several_envs_at_once(vec_env) -> None:
     env = make_vec_env("sb3_yann:CSTR-v0", n_envs=2, vec_env_cls=vec_env)
     try:
-        model = DDPG(YannPolicy, env)
+        model = DDPG(YannPolicy, env, policy_kwargs={"critic_warmup": 0})
+        before = copy.deepcopy(model.actor)
         model.learn(20, callback=NoActionNoise())
         assert model.policy.problem == problems.cstr()
+        assert changed(model.actor, before)
     finally:
         env.close()
 
@@ -300,7 +325,276 @@ def test_constants_are_no_parameters_and_target_updates_leave_them_alone() -> No
     model = build()
     learnt = {name for name, _ in model.actor.named_parameters()}
     assert all(name.startswith("mu.network.") for name in learnt)
+    learnt = {name.split(".")[1] for name, _ in model.critic.named_parameters()}
+    assert learnt == {"quadratic", "network"}
     assert not any("running_" in name for name in model.policy.state_dict())
+
+
+# --- critic_warmup -----------------------------------------------------------------------------
+
+
+two_inputs = cache(two_input_mpc)  # solved once
+
+
+def with_full_buffer(algorithm=DDPG, mpc: LinearMPC | None = None, **policy_kwargs):
+    """Return a model that has acted but not learnt, for `updates` to train."""
+    kwargs = {"buffer_size": 200, "gradient_steps": 0, "seed": 0, "learning_rate": 1e-2}
+    model = build(algorithm, mpc, policy_kwargs, **kwargs)
+    return model.learn(100, callback=NoActionNoise())
+
+
+def updates(model, count: int) -> None:
+    model.train(gradient_steps=count, batch_size=16)
+
+
+def starts(mpc: LinearMPC, count: int = 200, stretch: float = 1.0) -> np.ndarray:
+    """Return states of the box, and of ever larger ones up to ``stretch`` times it."""
+    box = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (count, mpc.n_theta))
+    return (np.linspace(1, stretch, count)[:, None] * box).astype(np.float32)
+
+
+@CRITICS
+@pytest.mark.parametrize("policy_delay", [1, 2])
+def test_the_actor_stays_the_mpc_bit_for_bit_until_the_critic_is_warm(policy_delay, critic) -> None:
+    model = with_full_buffer(TD3, two_inputs(), critic=critic, critic_warmup=6)
+    model.policy_delay = policy_delay
+    first, theta = copy.deepcopy(model.policy), th.as_tensor(starts(two_inputs()))
+    law = first.actor(theta)
+    for _ in range(5):
+        updates(model, 1)
+        assert not changed(model.actor, first.actor)
+        assert th.equal(model.actor(theta), law)
+        assert th.equal(model.actor_target(theta), law)
+        assert not model.actor.optimizer.state
+        assert changed(model.critic, first.critic)
+    updates(model, 1)  # the sixth of the critic, and then the actor's first
+    assert changed(model.actor, first.actor)
+    assert not th.equal(model.actor(theta), law)
+    assert {int(state["step"]) for state in model.actor.optimizer.state.values()} == {1}
+    updates(model, 2)  # the first step moves one layer of zeros only
+    assert not th.equal(model.actor_target(theta), law)
+
+
+def test_the_delay_of_td3_is_kept_after_the_warm_up() -> None:
+    model = with_full_buffer(TD3, critic_warmup=5)
+    first = copy.deepcopy(model.actor)
+    updates(model, 5)  # TD3's actor has a turn at every second update only
+    assert not changed(model.actor, first)
+    updates(model, 1)
+    assert changed(model.actor, first)
+
+
+def test_without_a_warm_up_the_actor_steps_at_once() -> None:
+    model = with_full_buffer(critic_warmup=0)
+    first = copy.deepcopy(model.actor)
+    updates(model, 1)
+    assert changed(model.actor, first)
+
+
+@pytest.mark.parametrize("way", ["deep copy", "pickle", "saved and loaded", "parameters"])
+def test_a_warm_up_goes_on_where_it_was(way, tmp_path) -> None:
+    model = with_full_buffer(critic_warmup=5)
+    updates(model, 3)
+    policy = model.policy
+    if way == "deep copy":
+        policy = copy.deepcopy(policy)
+    elif way == "pickle":
+        policy = cloudpickle.loads(cloudpickle.dumps(policy))
+    elif way == "saved and loaded":
+        model.save(tmp_path / "model")
+        policy = DDPG.load(tmp_path / "model").policy
+    else:
+        other = with_full_buffer(critic_warmup=5)
+        other.set_parameters(model.get_parameters())
+        policy = other.policy
+    assert policy.critic_updates == 3
+    model.policy = policy
+    model._create_aliases()
+    first = copy.deepcopy(policy.actor)
+    updates(model, 1)
+    assert not changed(policy.actor, first)
+    updates(model, 1)
+    assert changed(policy.actor, first)
+
+
+def test_a_policy_starts_with_no_update_counted() -> None:
+    assert build().policy.critic_updates == 0
+
+
+# --- max_correction ----------------------------------------------------------------------------
+
+
+def distances(model, mpc: LinearMPC, states: np.ndarray) -> np.ndarray:
+    """Distances from the MPC in float64 and from the policy that it starts as, (2, batch, m)."""
+    actions, _ = model.predict(states)
+    start, _ = build(mpc=mpc).predict(states)
+    laws = np.array([mpc.explicit()(states), start], dtype=np.float64)
+    return np.abs(actions.astype(np.float64) - laws)
+
+
+def scramble(model) -> None:
+    """Give the actor huge weights."""
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        for parameter in model.actor.parameters():
+            th.nn.init.normal_(parameter, std=1e3)
+
+
+@pytest.mark.parametrize("bound", [0.1, 0.5, 1])
+def test_no_action_is_ever_further_from_the_mpc_than_the_bound(mpc, bound) -> None:
+    model = build(mpc=mpc, policy_kwargs={"max_correction": bound})
+    scramble(model)
+    states = starts(mpc, 10_000, stretch=3)
+    assert 500 < mpc.explicit().in_domain(states).sum() < 9500
+    reach = mpc.u_max - mpc.u_min
+    far = distances(model, mpc, states)
+    assert np.all(far <= bound * reach)  # no tolerance
+    assert np.all(far.max(axis=1) > 0.99 * min(bound, 0.5) * reach)  # it is the bound that acts
+
+
+def test_a_bound_of_zero_is_the_mpc_bit_for_bit(mpc) -> None:
+    model = build(mpc=mpc, policy_kwargs={"max_correction": 0})
+    scramble(model)
+    states = starts(mpc, 10_000, stretch=3)
+    np.testing.assert_array_equal(model.predict(states)[0], build(mpc=mpc).predict(states)[0])
+
+
+@POLICIES
+def test_the_bound_holds_after_training(algorithm) -> None:
+    mpc = two_inputs()
+    kwargs = {"max_correction": 0.1, "critic_warmup": 0, "actor_lr_mult": 10.0}
+    model = with_full_buffer(algorithm, mpc, **kwargs)
+    updates(model, 60)
+    far = distances(model, mpc, starts(mpc, 10_000, stretch=3)) / (mpc.u_max - mpc.u_min)
+    assert 0.09 < far.max()
+    assert far.max() <= 0.1
+
+
+def test_a_bound_survives_saving(tmp_path) -> None:
+    model = build(policy_kwargs={"max_correction": 0.25, "pin_equilibrium": False})
+    scramble(model)
+    model.save(tmp_path / "model")
+    model.policy.save(tmp_path / "policy")
+    states = starts(scalar_mpc())
+    for loaded in (DDPG.load(tmp_path / "model"), YannPolicy.load(tmp_path / "policy")):
+        np.testing.assert_array_equal(loaded.predict(states)[0], model.predict(states)[0])
+
+
+# --- pin_equilibrium ---------------------------------------------------------------------------
+
+
+@POLICIES
+@CRITICS
+@pytest.mark.parametrize("pinned", [True, False])
+def test_training_moves_the_equilibrium_only_where_it_is_not_pinned(
+    algorithm, critic, pinned
+) -> None:
+    mpc = two_inputs()
+    kwargs = {"critic": critic, "pin_equilibrium": pinned, "critic_warmup": 0}
+    model = with_full_buffer(algorithm, mpc, **kwargs)
+    origin = np.zeros((1, 3), np.float32)
+    before, _ = model.predict(origin)
+    updates(model, 20)
+    after, _ = model.predict(origin)
+    assert np.array_equal(after, before) == pinned
+    at_rest = model.policy.scale_action(np.zeros((1, 2), np.float32))
+    with th.no_grad():
+        q = model.critic.q1_forward(th.as_tensor(origin), th.as_tensor(at_rest))
+    assert (abs(float(q)) < 1e-5) == pinned  # u = 0 is an action that float32 rounds
+
+
+# --- prediction_model --------------------------------------------------------------------------
+
+A, B = (th.as_tensor(M.T.copy()) for M in (two_input_mpc().model.A, two_input_mpc().model.B))
+
+
+def linear_prediction(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+    return theta @ A + u @ B
+
+
+class LinearModule(th.nn.Module):
+    """The linear model with parameters of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.A, self.B = th.nn.Parameter(A.clone()), th.nn.Parameter(B.clone())
+
+    def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+        return theta @ self.A + u @ self.B
+
+
+MODELS = pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModule])
+
+
+@POLICIES
+@MODELS
+def test_the_linear_model_given_as_prediction_model_changes_nothing(algorithm, make) -> None:
+    mine = with_full_buffer(algorithm, two_inputs(), prediction_model=make(), critic_warmup=3)
+    default = with_full_buffer(algorithm, two_inputs(), critic_warmup=3)
+    for model in (mine, default):
+        model.set_random_seed(1)
+        updates(model, 10)
+    for name in ("actor", "actor_target", "critic", "critic_target"):
+        assert not changed(getattr(mine, name), getattr(default, name)), name
+    assert changed(mine.actor, build(mpc=two_inputs(), seed=0).actor)
+
+
+def test_a_module_that_predicts_is_not_trained() -> None:
+    module = LinearModule()
+    model = with_full_buffer(mpc=two_inputs(), prediction_model=module, critic_warmup=0)
+    updates(model, 20)
+    for each in (module, model.critic.qf0.model, model.critic_target.qf0.model):
+        assert th.equal(each.A, A)
+        assert th.equal(each.B, B)
+
+
+@CRITICS
+def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) -> None:
+    if critic == "state_action":
+        kwargs = {"critic": critic}
+    else:
+        kwargs = {"prediction_model": lambda theta, u: 0 * theta}
+    mpc = two_inputs()
+    model = build(mpc=mpc, policy_kwargs=kwargs)
+    theta, u = starts(mpc), mpc.explicit()(starts(mpc))
+    action = th.as_tensor(model.policy.scale_action(u.astype(np.float32)))
+    with th.no_grad():
+        q = model.critic.q1_forward(th.as_tensor(theta), action).numpy()[:, 0]
+    stage = -mpc.stage_cost(theta, u)  # all there is, where the next state is the origin
+    assert np.allclose(q, stage, rtol=1e-5) == (critic == "afterstate")
+
+
+@pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModule, lambda: bent])
+def test_a_saved_model_brings_its_prediction_model_with_it(make, tmp_path) -> None:
+    model = with_full_buffer(mpc=two_inputs(), prediction_model=make(), critic_warmup=0)
+    updates(model, 5)
+    model.save(tmp_path / "model")
+    model.policy.save(tmp_path / "policy")
+    theta = th.as_tensor(starts(two_inputs()))
+    expected = model.critic(theta, model.actor(theta))[0]
+    for policy in (DDPG.load(tmp_path / "model").policy, YannPolicy.load(tmp_path / "policy")):
+        assert th.equal(policy.critic(theta, policy.actor(theta))[0], expected)
+
+
+def bent(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+    return th.sin(linear_prediction(theta, u))
+
+
+def test_a_saved_model_may_predict_with_a_lambda(tmp_path) -> None:
+    model = build(policy_kwargs={"prediction_model": lambda theta, u: th.sin(1.1 * theta + u)})
+    model.save(tmp_path / "model")
+    theta = th.as_tensor(starts(scalar_mpc()))
+    critic = DDPG.load(tmp_path / "model").critic
+    expected = model.critic(theta, model.actor(theta))[0]
+    assert th.equal(critic(theta, model.actor(theta))[0], expected)
+
+
+def test_value_scale_is_that_of_the_critic_s_network() -> None:
+    assert build().critic.qf0.scale == 30
+    assert build(policy_kwargs={"value_scale": 7.0}).critic.qf0.scale == 7
+
+
+# --- what is refused ---------------------------------------------------------------------------
 
 
 def unbounded() -> spaces.Box:
@@ -385,6 +679,26 @@ def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
         ({"net_arch": {"vf": [4]}}, ValueError, "net_arch"),
         ({"activation_fn": th.tanh}, TypeError, "activation_fn"),
         ({"activation_fn": th.nn.Sigmoid}, ValueError, "activation"),
+        ({"critic": "quadratic"}, ValueError, "critic = 'quadratic'"),
+        ({"critic": None}, ValueError, "critic = None"),
+        ({"prediction_model": 3}, TypeError, "prediction_model = 3"),
+        ({"prediction_model": "f", "critic": "state_action"}, TypeError, "prediction_model = 'f'"),
+        (
+            {"prediction_model": lambda theta, u: theta, "critic": "state_action"},
+            ValueError,
+            "prediction_model is for critic='afterstate'",
+        ),
+        ({"value_scale": 0}, ValueError, "value_scale = 0"),
+        ({"value_scale": -30.0}, ValueError, "value_scale = -30.0"),
+        ({"value_scale": float("nan")}, ValueError, "value_scale = nan"),
+        ({"value_scale": "big"}, TypeError, "value_scale = 'big'"),
+        ({"critic_warmup": -1}, ValueError, "critic_warmup = -1"),
+        ({"critic_warmup": 1.5}, ValueError, r"critic_warmup = 1\.5"),
+        ({"critic_warmup": True}, ValueError, "critic_warmup = True"),
+        ({"max_correction": -0.1}, ValueError, r"max_correction = -0\.1"),
+        ({"max_correction": 1.5}, ValueError, r"max_correction = 1\.5"),
+        ({"max_correction": float("nan")}, ValueError, "max_correction = nan"),
+        ({"max_correction": "x"}, TypeError, "max_correction = 'x'"),
     ],
 )
 def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> None:

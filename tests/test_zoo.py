@@ -58,10 +58,12 @@ def test_an_entry_builds_a_model_that_starts_as_the_mpc(algo, env_id) -> None:
 
 
 @ENTRIES
-def test_the_critic_of_an_entry_starts_exact_on_the_linear_plant(algo, env_id) -> None:
+@pytest.mark.parametrize("critic", ["afterstate", "state_action"])
+def test_the_critic_of_an_entry_starts_exact_on_the_linear_plant(algo, env_id, critic) -> None:
     mpc = gym.make(env_id).observation_space.problem
     plant = LinearPlant(mpc, start=0.01)  # stays in the region that holds the origin
-    model = build(algo, env_id, plant, policy_kwargs={"problem": mpc}, gradient_steps=0)
+    kwargs = {"problem": mpc, "critic": critic}
+    model = build(algo, env_id, plant, policy_kwargs=kwargs, gradient_steps=0)
     model.learn(50, callback=sb3_yann.NoActionNoise())
     sample = model.replay_buffer.sample(50)
     q = model.critic.q1_forward(sample.observations, sample.actions).detach()

@@ -26,7 +26,7 @@ from paper.runner import Outcome, Run
 from paper.yardsticks import Learner
 from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
 from sb3_yann.evaluation import Episodes, evaluate
-from sb3_yann_envs import clipped_pendulum, cstr, problems
+from sb3_yann_envs import cstr, problems
 
 TEST_SEEDS = range(1000, 1100)
 """Test starts; the first ten are those of the paper's tables."""

@@ -64,10 +64,14 @@ class ImprovementGuard(BaseCallback):
         The seed of the first start; the others follow.
     every : int, default 1
         Training episodes from one candidate to the next.
-    margin : float, default 0.005
+    margin : float, default 0.01
         What one start may cost more than with the MPC, as a fraction of the MPC's median cost.
     by_region : bool, default True
         Whether to try single regions where the whole is refused.
+    patience : int, default 1
+        Rejections in a row after which the actor returns; a violation brings it back at once. With
+        1 every rejection does. A larger number lets learning pass through worse policies, which
+        then play training episodes, where no better one lies next to the MPC.
     shrink, grow, smallest_step : float, default 0.5, 1.5 and 0.1
         Factors of the step at a rejection and an acceptance (up to 1), and what it never falls
         below.
@@ -96,7 +100,7 @@ class ImprovementGuard(BaseCallback):
         n_starts: int = 50,
         seed: int = 1_000_000,
         every: int = 1,
-        margin: float = 0.005,
+        margin: float = 0.01,
         by_region: bool = True,
         patience: int = 1,
         shrink: float = 0.5,
@@ -117,6 +121,7 @@ class ImprovementGuard(BaseCallback):
             ("n_starts", n_starts, 1),
             ("seed", seed, 0),
             ("every", every, 1),
+            ("patience", patience, 1),
             ("trial_episodes", trial_episodes, 3),
         ):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
@@ -199,7 +204,7 @@ class ImprovementGuard(BaseCallback):
         step = self.state.step
         if decision.verdict == "accepted":
             step = min(1.0, step * self.grow)
-        elif decision.verdict == "rejected":
+        elif decision.verdict == "rejected" and decision.returned:
             step = max(min(self.smallest_step, step), step * self.shrink)
         self.state.step = self.policy.actor_step = step
         decision = replace(decision, step=step)

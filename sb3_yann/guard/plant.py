@@ -126,6 +126,7 @@ class PlantTrials:
                 guard.state.episodes,
                 verdict,
                 reason,
+                verdict == "rejected",
                 float(cost),
                 mean(evidence.accepted),
                 mean(evidence.mpc),

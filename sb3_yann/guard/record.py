@@ -23,6 +23,8 @@ class Decision:
         "accepted", "accepted in part" (the networks of some regions only) or "rejected".
     reason : str
         Why not all of it was accepted.
+    returned : bool
+        Whether the actor went back to the accepted state.
     candidate_cost, accepted_cost, mpc_cost : float
         Mean cost of an episode of the policy that was tried, of the one that is accepted now, and
         of the MPC.
@@ -36,8 +38,9 @@ class Decision:
 
     timestep: int
     episode: int
-    verdict: Literal["accepted", "accepted in part", "waiting", "rejected"]
+    verdict: Literal["accepted", "accepted in part", "rejected"]
     reason: str
+    returned: bool
     candidate_cost: float
     accepted_cost: float
     mpc_cost: float

@@ -95,13 +95,12 @@ class SimulatorTrials:
             guard.accept(self._evidence(guard, evidence.paired, played))
             self.rejections = 0
         else:
+            broken = played is None or np.any(played.violations > evidence.paired.violations)
             candidate = Snapshot.of(guard.policy)
-            if self.by_region and played is not None:
+            if self.by_region and not broken:
                 regions = self._accept_regions(guard, candidate)
             self.rejections += 1
-            returned = self.rejections >= self.patience or played is None or bool(
-                np.any(played.violations > evidence.paired.violations)
-            )
+            returned = bool(broken) or self.rejections >= self.patience
             if returned:
                 self.rejections = 0
             (guard.state.accepted if returned else candidate).restore(guard.policy)
@@ -110,8 +109,9 @@ class SimulatorTrials:
             Decision(
                 guard.num_timesteps,
                 guard.state.episodes,
-                "accepted" if not reason else "accepted in part" if regions else "rejected" if returned else "waiting",
+                "accepted" if not reason else "accepted in part" if regions else "rejected",
                 reason,
+                returned,
                 np.nan if played is None else float(played.costs.mean()),
                 float(paired.costs.mean()),
                 float(paired.mpc_costs.mean()),
@@ -122,7 +122,10 @@ class SimulatorTrials:
         )
 
     def _accept_regions(self, guard: ImprovementGuard, candidate: Snapshot) -> list[int]:
-        """Take over the regions of the candidate that improve the accepted policy, one by one."""
+        """Take over the regions of the candidate that improve the accepted policy, one by one.
+
+        Only the episodes that come through a region are played again. Leaves the policy changed.
+        """
         accepted = []
         for region in np.argsort(-guard.state.evidence.visits.sum(0), kind="stable").tolist():
             evidence: Evidence = guard.state.evidence

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import numpy as np
@@ -123,8 +124,8 @@ class AfterstateValue(nn.Module):
     P : ndarray, shape (n, n)
         V is ``theta' P theta`` at first.
     model : callable
-        The prediction ``(theta, u) -> next theta``, of float64 tensors in physical units; a module
-        is moved and saved with this one, but it is not trained.
+        The prediction ``(theta, u) -> next theta``, of float64 tensors in physical units. Of a
+        module a copy is moved and saved with this one, but it is not trained.
     gamma : float
     theta_half, u_min, u_max, hidden, activation, pinned
         As in :class:`QuadraticStateActionValue`.
@@ -152,7 +153,8 @@ class AfterstateValue(nn.Module):
         scale: float = 30.0,
     ) -> None:
         super().__init__()
-        self.model, self.gamma, self.scale = model, gamma, scale
+        self.model = _untrained(model) if isinstance(model, nn.Module) else model
+        self.gamma, self.scale = gamma, scale
         self.quadratic = QuadraticForm(P)
         constants = {
             "W": W,
@@ -195,3 +197,13 @@ class LinearPrediction(nn.Module):
     def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
         """Return the predicted next theta, (batch, n)."""
         return theta @ self.A + u @ self.B
+
+
+def _untrained(model: nn.Module) -> nn.Module:
+    """Return a copy with buffers for parameters: no optimizer or target update moves those."""
+    model = copy.deepcopy(model)
+    for module in model.modules():
+        for name, parameter in [*module.named_parameters(recurse=False)]:
+            delattr(module, name)
+            module.register_buffer(name, parameter.detach())
+    return model

@@ -190,8 +190,14 @@ def test_output_far_out_is_within_the_bounds_at_first(name: str, outside: str) -
     assert bool(th.all(YannLayer(law)(theta).abs() <= 1))
 
 
-def test_clamp_alive_is_the_clamp() -> None:
+@pytest.mark.parametrize("limit", [0.0, 0.1, 1.0, 2.0])
+def test_clamp_alive_is_the_clamp(limit: float) -> None:
     x = th.cat([3 * th.randn(1000), th.tensor([-1.0, 1.0, th.inf, -th.inf, 0.0])])
+    assert th.equal(clamp_alive(x, limit), x.clamp(-limit, limit))
+
+
+def test_clamp_alive_has_a_limit_of_one_by_default() -> None:
+    x = 3 * th.randn(1000)
     assert th.equal(clamp_alive(x), x.clamp(-1, 1))
 
 
@@ -207,13 +213,14 @@ def test_clamp_alive_is_the_clamp() -> None:
         (-2.5, True, False),
     ],
 )
+@pytest.mark.parametrize("limit", [0.25, 1.0, 2.0])
 def test_clamp_alive_stops_only_what_would_push_further_out(
-    x: float, passes_up: bool, passes_down: bool
+    limit: float, x: float, passes_up: bool, passes_down: bool
 ) -> None:
     # Descent moves x up where its gradient is negative.
     for gradient, passes in ((-0.7, passes_up), (0.7, passes_down)):
-        leaf = th.tensor([x], requires_grad=True)
-        clamp_alive(leaf).backward(th.tensor([gradient]))
+        leaf = th.tensor([limit * x], requires_grad=True)
+        clamp_alive(leaf, limit).backward(th.tensor([gradient]))
         assert leaf.grad is not None
         assert leaf.grad.item() == pytest.approx(gradient if passes else 0.0)
 
@@ -253,6 +260,77 @@ def test_saturated_region_learns_to_leave_its_bound() -> None:
     theta = theta[(layer(theta) == 1).all(1)]
     train(layer, theta, target=0.0, steps=100)
     assert layer(theta).abs().mean() < 0.2
+
+
+# --- the bound on the correction ---------------------------------------------------------------
+
+
+@OUTSIDE
+@EVERY_LAW
+@pytest.mark.parametrize("bound", [0.1, 0.5])
+def test_output_is_never_further_from_the_law_than_the_bound(
+    name: str, outside: str, bound: float
+) -> None:
+    law = law_of(name, outside)
+    layer = scrambled(YannLayer(law, max_correction=bound), 1e3)
+    theta = box_points(law, 5000, stretch=3)
+    with th.no_grad():
+        distance = (layer(theta).double() - to_action(law, law(theta.numpy()))).abs() / 2
+    assert 0.99 * bound < distance.max() <= bound
+
+
+@EVERY_LAW
+@pytest.mark.parametrize("bound", [0, 1e-8])
+def test_bound_of_zero_is_the_law_bit_for_bit(name: str, bound: float) -> None:
+    layer = scrambled(YannLayer(law_of(name), max_correction=bound), 1e3)
+    theta = box_points(law_of(name), 5000, stretch=3)
+    assert th.equal(layer(theta), layer.law(theta))
+
+
+@EVERY_LAW
+def test_bound_that_is_not_reached_changes_nothing(name: str) -> None:
+    law = law_of(name)
+    free = scrambled(YannLayer(law), 1e-3)
+    bound = YannLayer(law, max_correction=0.5)
+    bound.load_state_dict(free.state_dict())
+    theta = box_points(law, 1000)
+    assert th.equal(bound(theta), free(theta))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_correction_at_its_bound_gets_the_gradient_that_leads_back_and_no_other(side: int) -> None:
+    law = law_of("pendulum")
+    layer = YannLayer(law, max_correction=0.1, pinned=False)
+    with th.no_grad():  # the bias of the output alone: far beyond the bound
+        layer.network.rest[-1].weight[..., -1] = 3.0 * side
+    theta = box_points(law, 4000)
+    theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
+    bias = layer.network.rest[-1].weight
+    for slope, alive in ((side, True), (-side, False)):  # descent goes against the slope
+        layer.zero_grad()
+        (slope * layer(theta)).sum().backward()
+        assert bias.grad is not None
+        assert bool(bias.grad[..., -1].any()) is alive
+
+
+def test_correction_learns_to_leave_its_bound() -> None:
+    law = law_of("pendulum")
+    layer = YannLayer(law, max_correction=0.1, pinned=False)
+    with th.no_grad():
+        layer.network.rest[-1].weight[..., -1] = 3.0
+    theta = box_points(law, 2000)
+    theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
+
+    def distance() -> float:
+        return (layer(theta) - layer.law(theta)).abs().mean().item()
+
+    assert distance() > 0.199
+    optimizer = th.optim.Adam(layer.parameters(), 1e-1)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (layer(theta) - layer.law(theta)).square().mean().backward()
+        optimizer.step()
+    assert distance() < 0.05
 
 
 # --- training ----------------------------------------------------------------------------------
@@ -320,6 +398,18 @@ def test_region_away_from_the_origin_is_not_pinned() -> None:
     pinned = YannLayer(law).network.pinned.flatten().bool()
     assert int(pinned.sum()) == 1
     assert bool(pinned[law.locate(np.zeros(2))])
+
+
+@OUTSIDE
+@EVERY_LAW
+def test_equilibrium_moves_where_no_region_is_pinned(name: str, outside: str) -> None:
+    law = law_of(name, outside)
+    layer = YannLayer(law, pinned=False)
+    assert not layer.network.pinned.any()
+    origin = th.zeros(1, law.n_theta)
+    assert th.equal(layer(origin), layer.law(origin))
+    train(layer, origin, target=0.3, steps=100)
+    assert (layer(origin) - 0.3).abs().max() < 0.05
 
 
 # --- what torch and Stable-Baselines3 see --------------------------------------------------------

@@ -125,6 +125,13 @@ def test_odd_node_out_starts_with_zero_weights() -> None:
     assert is_positive_zero(layer.nodes[:, 4])
 
 
+@pytest.mark.parametrize("hidden", [(8,), (8, 6)])
+def test_first_axis_of_every_parameter_and_buffer_is_the_stack(hidden: tuple[int, ...]) -> None:
+    net = ZeroOutputNetwork(3, 2, hidden, n_nodes=4, pinned=pins(False, True, True, False, False))
+    for tensor in (*net.parameters(), *net.buffers()):
+        assert len(tensor) == 5
+
+
 def test_networks_of_a_stack_differ() -> None:
     net = ZeroOutputNetwork(3, 1, (8, 8), pinned=pins(False, False))
     assert not th.any(net.first.nodes[0] == net.first.nodes[1])

@@ -1,0 +1,254 @@
+"""The afterstate critic: a known stage cost, a model, and a value function that learns."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from numpy.typing import NDArray
+from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
+from scipy import linalg
+
+from sb3_yann.networks import AfterstateValue, LinearPrediction, QuadraticStateActionValue
+from sb3_yann.networks.value import PredictionModel
+
+GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
+EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> Iterator[None]:
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        yield
+
+
+def common(name: str) -> dict[str, Any]:
+    mpc = solved(name)
+    half = (mpc.theta_max - mpc.theta_min) / 2
+    return {"theta_half": half, "u_min": mpc.u_min, "u_max": mpc.u_max}
+
+
+def critic(
+    name: str, gamma: float = 0.99, model: PredictionModel | None = None, **changes: Any
+) -> AfterstateValue:
+    mpc = solved(name)
+    return AfterstateValue(
+        linalg.block_diag(mpc.Q, mpc.R),
+        mpc.value_matrix(gamma),
+        model or LinearPrediction(mpc.model.A, mpc.model.B),
+        gamma,
+        **common(name),
+        **changes,
+    )
+
+
+def random_rows(name: str, count: int) -> th.Tensor:
+    """Rows [theta, a] over the box and all actions."""
+    theta = box_points(law_of(name), count)
+    return th.cat([theta, 2 * th.rand(count, law_of(name).n_inputs) - 1], dim=1)
+
+
+def in_physical_units(name: str, rows: th.Tensor) -> tuple[NDArray[np.float64], ...]:
+    law = law_of(name)
+    theta, action = np.split(rows.double().numpy(), [law.n_theta], axis=1)
+    return theta, (law.u_max + law.u_min) / 2 + action * (law.u_max - law.u_min) / 2
+
+
+def train(value: AfterstateValue, rows: th.Tensor, target: th.Tensor, steps: int) -> float:
+    """Adam steps of 1e-3 towards the target; the last loss."""
+    optimizer = th.optim.Adam(value.parameters(), 1e-3)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        loss = (value(rows) - target).square().mean()
+        loss.backward()
+        optimizer.step()
+    return loss.item()
+
+
+# --- at first ----------------------------------------------------------------------------------
+
+
+@GAMMAS
+@EVERY_PROBLEM
+def test_value_is_that_of_the_papers_critic_to_the_rounding_of_float32(
+    name: str, gamma: float
+) -> None:
+    rows = random_rows(name, 2000)
+    papers = QuadraticStateActionValue(solved(name).state_action_matrix(gamma), **common(name))
+    with th.no_grad():
+        got, expected = critic(name, gamma)(rows), papers(rows)
+    assert got.shape == (2000, 1)
+    assert got.dtype == th.float32
+    np.testing.assert_allclose(got.numpy(), expected.numpy(), rtol=np.finfo(np.float32).eps, atol=0)
+
+
+@EVERY_PROBLEM
+def test_value_is_minus_the_stage_cost_and_the_discounted_cost_to_go(name: str) -> None:
+    mpc, rows = solved(name), random_rows(name, 500)
+    theta, u = in_physical_units(name, rows)
+    after = theta @ mpc.model.A.T + u @ mpc.model.B.T
+    to_go = np.einsum("bi,ij,bj->b", after, mpc.value_matrix(0.9), after)
+    with th.no_grad():
+        q = critic(name, 0.9)(rows).numpy()[:, 0]
+    np.testing.assert_allclose(q, -(mpc.stage_cost(theta, u) + 0.9 * to_go), rtol=1e-6)
+
+
+@GAMMAS
+@EVERY_PROBLEM
+def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str, gamma: float) -> None:
+    law = law_of(name)
+    rows = random_rows(name, 256).requires_grad_()
+    critic(name, gamma)(rows).sum().backward()
+    assert rows.grad is not None
+    z = np.hstack(in_physical_units(name, rows.detach()))
+    slope = -2 * z @ solved(name).state_action_matrix(gamma)
+    scale = np.concatenate([np.ones(law.n_theta), (law.u_max - law.u_min) / 2])
+    expected = (slope * scale)[:, law.n_theta :]
+    np.testing.assert_allclose(
+        rows.grad.numpy()[:, law.n_theta :], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max()
+    )
+
+
+# --- the equilibrium ---------------------------------------------------------------------------
+
+
+@EVERY_PROBLEM
+@pytest.mark.parametrize("pinned", [True, False])
+def test_cost_to_go_of_the_origin_is_learnt_only_where_it_is_not_pinned(
+    name: str, pinned: bool
+) -> None:
+    value, rows = critic(name, pinned=pinned), random_rows(name, 256)
+    origin = th.zeros(1, law_of(name).n_theta, dtype=th.float64)
+    assert value.value(origin).item() == 0
+    train(value, rows, value(rows).detach() - 20, steps=50)
+    assert (value.value(origin).item() == 0) is pinned
+
+
+@EVERY_PROBLEM
+def test_value_at_rest_is_zero_and_stays_so(name: str) -> None:
+    law, value, rows = law_of(name), critic(name), random_rows(name, 256)
+    action = to_action(law, np.zeros((1, law.n_inputs)))
+    rest = th.cat([th.zeros(1, law.n_theta), action.float()], dim=1)
+    train(value, rows, 0.7 * value(rows).detach() - 3, steps=50)
+    # u = 0 may be an action such as -1/3, which float32 rounds.
+    assert abs(value(rest).item()) < 1e-6 * value(rows).abs().mean().item()
+
+
+# --- training ----------------------------------------------------------------------------------
+
+
+def test_training_fits_a_cost_to_go_that_is_not_quadratic() -> None:
+    value, rows = critic("pendulum"), random_rows("pendulum", 512)
+    law = law_of("pendulum")
+    theta = box_points(law, 256).double() / 2
+    with th.no_grad():
+        assert (value.value(2 * theta) - 4 * value.value(theta)).abs().max() < 1e-9
+    # A cost to go that is even and flattens out: its share of the discounted return.
+    bend = 30 * th.tanh(4 * (rows[:, :1] / law.theta_max[0]) ** 2)
+    target = value(rows).detach() - bend
+    before = bend.square().mean().item()
+    assert train(value, rows, target, steps=600) < 0.2 * before
+    with th.no_grad():
+        assert (value.value(2 * theta) - 4 * value.value(theta)).abs().max() > 5
+
+
+def test_all_parameters_learn_and_the_model_has_none() -> None:
+    value, rows = critic("reactor"), random_rows("reactor", 256)
+    assert {name.split(".")[0] for name, _ in value.named_parameters()} == {"quadratic", "network"}
+    before = copy.deepcopy(value)
+    train(value, rows, 0.7 * value(rows).detach() - 3, steps=2)
+    for new, old in zip(value.parameters(), before.parameters(), strict=True):
+        assert th.mean((new != old).float()) > 0.9
+
+
+def test_network_counts_by_its_scale() -> None:
+    small, large = critic("pendulum", scale=1.0), critic("pendulum", scale=100.0)
+    th.nn.init.normal_(small.network.rest[-1].weight)
+    th.nn.init.normal_(small.network.first.nodes)
+    large.load_state_dict(small.state_dict())
+    theta = box_points(law_of("pendulum"), 100).double()
+    with th.no_grad():
+        learnt = [each.value(theta) - each.quadratic(theta) for each in (small, large)]
+    assert learnt[0].abs().max() > 0.01
+    th.testing.assert_close(100 * learnt[0], learnt[1], rtol=1e-6, atol=1e-6)
+
+
+# --- the model ---------------------------------------------------------------------------------
+
+
+@EVERY_PROBLEM
+def test_model_sees_physical_units_in_float64(name: str) -> None:
+    seen: list[th.Tensor] = []
+
+    def model(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+        seen[:] = [theta.detach(), u.detach()]
+        return theta
+
+    rows = random_rows(name, 50)
+    critic(name, model=model)(rows)
+    for got, expected in zip(seen, in_physical_units(name, rows), strict=True):
+        assert got.dtype == th.float64
+        np.testing.assert_allclose(got.numpy(), expected, rtol=1e-12, atol=1e-15)
+
+
+@EVERY_PROBLEM
+def test_linear_model_as_a_function_gives_the_same_value(name: str) -> None:
+    model = solved(name).model
+    A, B = (th.as_tensor(M.T.copy()) for M in (model.A, model.B))
+    rows = random_rows(name, 500)
+    other = critic(name, model=lambda theta, u: theta @ A + u @ B)
+    assert th.equal(other(rows), critic(name)(rows))
+
+
+class Halving(th.nn.Module):
+    """A model with a parameter, in a module of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = th.nn.Linear(2, 2, bias=False, dtype=th.float64)
+        with th.no_grad():
+            self.inner.weight.copy_(0.5 * th.eye(2))
+
+    def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+        return self.inner(theta)
+
+
+def test_model_that_is_given_says_where_the_value_is_taken() -> None:
+    rows = random_rows("pendulum", 100)
+    theta, u = in_physical_units("pendulum", rows)
+    P, mpc = solved("pendulum").value_matrix(0.99), solved("pendulum")
+    expected = mpc.stage_cost(theta, u) + 0.99 * np.einsum("bi,ij,bj->b", theta, P, theta) / 4
+    for model in (Halving(), lambda theta, u: theta / 2):
+        q = critic("pendulum", model=model)(rows).detach().numpy()[:, 0]
+        np.testing.assert_allclose(q, -expected, rtol=1e-6)
+
+
+def test_module_is_copied_saved_and_never_trained() -> None:
+    module, rows = Halving(), random_rows("pendulum", 100)
+    value = critic("pendulum", model=module)
+    train(value, rows, value(rows).detach() - 3, steps=3)
+    assert th.equal(value.model.inner.weight, 0.5 * th.eye(2, dtype=th.float64))
+    assert module.inner.weight.grad is None
+    assert isinstance(module.inner.weight, th.nn.Parameter)  # the caller's own is left as it was
+    assert "model.inner.weight" in value.state_dict()
+    with th.no_grad():
+        module.inner.weight.zero_()
+    assert th.equal(value.model.inner.weight, 0.5 * th.eye(2, dtype=th.float64))
+
+
+# --- what torch and Stable-Baselines3 see --------------------------------------------------------
+
+
+def test_state_dict_brings_everything_back() -> None:
+    rows = random_rows("reactor", 256)
+    value, other = critic("reactor"), critic("reactor")
+    train(value, rows, 0.7 * value(rows).detach() - 3, steps=5)
+    assert not th.equal(other(rows), value(rows))
+    other.load_state_dict(value.state_dict())
+    assert th.equal(other(rows), value(rows))
+    assert not [key for key in value.state_dict() if "running_" in key]
