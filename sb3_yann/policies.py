@@ -130,6 +130,8 @@ class YannCritic(ContinuousCritic):
             "hidden": tuple(net_arch),
             "pinned": pin_equilibrium,
         }
+        if prediction_model is None:
+            prediction_model = LinearPrediction(problem.model.A, problem.model.B)
         self.q_networks = []
         for i in range(n_critics):
             q_network: nn.Module
@@ -141,7 +143,7 @@ class YannCritic(ContinuousCritic):
                 q_network = AfterstateValue(
                     linalg.block_diag(problem.Q, problem.R),
                     problem.value_matrix(gamma),
-                    prediction_model or LinearPrediction(problem.model.A, problem.model.B),
+                    prediction_model,
                     gamma,
                     activation=activation_fn(),
                     scale=value_scale,
@@ -273,6 +275,8 @@ class YannPolicy(TD3Policy):
             "critic": as_factor("critic_lr_mult", critic_lr_mult),
         }
         require_critic_options(critic, prediction_model, value_scale, critic_warmup)
+        if not isinstance(pin_equilibrium, bool):
+            raise TypeError(f"pin_equilibrium = {pin_equilibrium!r} must be True or False.")
         self.actor_step = 1.0
         """Another factor of the actor's learning rate, which an ImprovementGuard sets."""
         self.critic_warmup = critic_warmup
