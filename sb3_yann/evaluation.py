@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -73,9 +72,8 @@ def evaluate(
     if isinstance(env, gym.Env):
         episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
     else:
-        make = partial(gym.make, env, disable_env_checker=True) if isinstance(env, str) else env
         with ExitStack() as stack:
-            envs = [stack.enter_context(closing(make())) for _ in seeds]
+            envs = [stack.enter_context(one_env(env)) for _ in seeds]
             episodes = _side_by_side(act, envs, resets)
     return Episodes(
         np.array([episode.cost for episode in episodes]),
@@ -83,6 +81,19 @@ def evaluate(
         tuple(np.array(episode.observations, float) for episode in episodes),
         tuple(np.array(episode.actions, float) for episode in episodes),
     )
+
+
+@contextmanager
+def one_env(
+    env: gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]],
+) -> Iterator[gym.Env[Any, Any]]:
+    """Yield the env that is given, or make the one that is named, and close it afterwards."""
+    if isinstance(env, gym.Env):
+        yield env
+        return
+    made = gym.make(env, disable_env_checker=True) if isinstance(env, str) else env()
+    with closing(made):
+        yield made
 
 
 @dataclass

@@ -42,9 +42,10 @@ class ImprovementGuard(BaseCallback):
     policy. It is accepted if it costs less than the accepted policy did, by a one-sided test of
     size ``significance`` (:func:`sb3_yann.guard.judging.probability_of_chance`: an analysis of
     covariance on the cost that the linear model predicts for each start). A violation at any time
-    brings the accepted policy back at once. The first policy that is accepted is the MPC. Each
-    test errs with probability ``significance``, so a policy that is worse *can* pass; the
-    simulator's paired episodes have no such chance, but hold for their starts only.
+    brings the accepted policy back at once. The first policy that is accepted is the one that
+    training starts with, and plays the first block. Each test errs with probability
+    ``significance``, so a policy that is worse *can* pass; the simulator's paired episodes have no
+    such chance, but hold for their starts only.
 
     The guard draws no random numbers and leaves the training env and the buffer alone. Its state
     is an attribute of the model, ``model.guard_state``, and is saved and loaded with it: another
@@ -191,9 +192,9 @@ class ImprovementGuard(BaseCallback):
         self.state.accepted = Snapshot.of(self.policy) if snapshot is None else snapshot
         self.state.evidence = evidence
 
-    def accept_the_mpc(self) -> None:
+    def become_the_mpc(self) -> None:
         """Put the MPC itself in the policy's place, with its optimizer as new."""
-        with th.random.fork_rng():  # building an actor draws weights
+        with th.random.fork_rng(devices=[]):  # building an actor draws weights
             actor = self.policy.make_actor()
         parameters = actor.state_dict()
         optimizer = {**self.policy.actor.optimizer.state_dict(), "state": {}}

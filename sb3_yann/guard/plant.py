@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 class Evidence:
     """Episodes of the MPC, of the accepted policy, and of the block that is being played."""
 
-    phase: Literal["mpc", "learning", "trial"] = "mpc"
+    phase: Literal["first", "learning", "trial"] = "first"
     mpc: PlantEpisodes | None = None
     accepted: PlantEpisodes | None = None
     costs: list[float] = field(default_factory=list)
@@ -46,8 +46,7 @@ class PlantTrials:
         self.block = 0
 
     def first_evidence(self, guard: ImprovementGuard) -> None:
-        """Begin with a block of episodes that the MPC plays."""
-        guard.accept_the_mpc()
+        """Begin with a block of episodes that the present policy plays."""
         guard.accept(Evidence())
 
     def step(self, guard: ImprovementGuard) -> None:
@@ -75,7 +74,10 @@ class PlantTrials:
             self._block_is_over(guard, evidence)
 
     def end(self, guard: ImprovementGuard) -> None:
-        """Leave an unfinished trial undecided: the accepted policy stays."""
+        """Leave an unfinished block undecided: the accepted policy stays, and learns again."""
+        evidence: Evidence = guard.state.evidence
+        if evidence.phase != "first":
+            self._next(evidence, "learning")
 
     def _next(self, evidence: Evidence, phase: Literal["learning", "trial"]) -> None:
         evidence.phase = phase
@@ -94,8 +96,10 @@ class PlantTrials:
             self._next(evidence, "trial")
             return
         played = PlantEpisodes(np.array(evidence.costs), np.array(evidence.predicted))
-        if evidence.phase == "mpc":
-            evidence.mpc = evidence.accepted = played
+        if evidence.phase == "first":
+            evidence.accepted = played
+            if guard.policy.actor.mu.network.is_zero():
+                evidence.mpc = played
         elif not same(guard.state.accepted, guard.policy):
             assert evidence.accepted is not None
             chance = probability_of_chance(played, evidence.accepted)

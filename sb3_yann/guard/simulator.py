@@ -11,10 +11,10 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann.evaluation import Episodes, evaluate
+from sb3_yann.evaluation import Episodes, evaluate, one_env
 from sb3_yann.guard.judging import Paired
 from sb3_yann.guard.record import Decision
-from sb3_yann.guard.snapshot import Snapshot, network_of, same
+from sb3_yann.guard.snapshot import Snapshot, same
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
@@ -51,25 +51,37 @@ class SimulatorTrials:
         self.settings = {"env": _name(env), "seeds": self.seeds, "margin": margin}
 
     def start(self, guard: ImprovementGuard) -> None:
-        """Check that the simulator is not the training env."""
+        """Check that the simulator is another env than the training env, and a like one."""
         training = [env.unwrapped for env in getattr(guard.training_env, "envs", [])]
         if isinstance(self.env, gym.Env) and any(self.env.unwrapped is env for env in training):
             raise ValueError(
                 "The guard's env is the training env, whose episodes its own would interrupt. "
                 "Give it another one, e.g. its id."
             )
+        with one_env(self.env) as env:
+            ours, theirs = env.observation_space.shape, guard.training_env.observation_space.shape
+            if ours != theirs or env.action_space != guard.training_env.action_space:
+                raise ValueError(
+                    f"The guard's env {_name(self.env)} has observations of shape {ours} and "
+                    f"{env.action_space}; the training env has {theirs} and "
+                    f"{guard.training_env.action_space}. Give the guard a simulator of this plant."
+                )
         self.last_trial = -self.every  # the first episode that ends is always followed by a trial
 
     def first_evidence(self, guard: ImprovementGuard) -> None:
-        """Play the episodes of the MPC, and accept the policy if it is no worse at the start."""
+        """Play the MPC's episodes, and accept the policy if it is no worse at the start."""
         mpc = evaluate(guard.policy.problem.explicit(), self.env, self.seeds)
         margin = self.margin * float(np.median(np.abs(mpc.costs)))
         paired = Paired(mpc.costs, mpc.costs, mpc.violations, margin)
-        present = self._play(guard, self.seeds)
-        if paired.objection(present.costs, present.violations) and _has_learnt(guard):
-            guard.accept_the_mpc()
-            present = self._play(guard, self.seeds)
-        guard.accept(self._evidence(guard, paired, present))
+        present, reason = None, ""
+        if not guard.policy.actor.mu.network.is_zero():
+            present, reason = self._judged(guard, paired)
+            if reason:
+                guard.become_the_mpc()
+        played = self._play(guard, self.seeds) if present is None or reason else present
+        guard.accept(self._evidence(guard, paired, played))
+        if reason:
+            self._report(guard, present, f"before training, {reason}", [], returned=True)
 
     def step(self, guard: ImprovementGuard) -> None:
         """Try the present policy where an episode has ended and it is time."""
@@ -85,25 +97,37 @@ class SimulatorTrials:
         if same(guard.state.accepted, guard.policy):
             return
         evidence: Evidence = guard.state.evidence
-        played, reason = None, "a parameter of the actor is not a finite number"
-        if all(bool(th.isfinite(each).all()) for each in network_of(guard.policy.actor)):
-            played = self._play(guard, self.seeds)
-            reason = evidence.paired.objection(played.costs, played.violations)
-        regions: list[int] = []
-        returned = False
+        played, reason = self._judged(guard, evidence.paired)
         if played is not None and not reason:
             guard.accept(self._evidence(guard, evidence.paired, played))
             self.rejections = 0
-        else:
-            broken = played is None or np.any(played.violations > evidence.paired.violations)
-            candidate = Snapshot.of(guard.policy)
-            if self.by_region and not broken:
-                regions = self._accept_regions(guard, candidate)
-            self.rejections += 1
-            returned = bool(broken) or self.rejections >= self.patience
-            if returned:
-                self.rejections = 0
-            (guard.state.accepted if returned else candidate).restore(guard.policy)
+            self._report(guard, played, reason, [], returned=False)
+            return
+        broken = played is None or bool(np.any(played.violations > evidence.paired.violations))
+        candidate = Snapshot.of(guard.policy)
+        regions = self._accept_regions(guard, candidate) if self.by_region and not broken else []
+        self.rejections += 1
+        returned = broken or self.rejections >= self.patience
+        if returned:
+            self.rejections = 0
+        (guard.state.accepted if returned else candidate).restore(guard.policy)
+        self._report(guard, played, reason, regions, returned)
+
+    def _judged(self, guard: ImprovementGuard, paired: Paired) -> tuple[Episodes | None, str]:
+        """Return the episodes of the present policy and what speaks against it, if anything."""
+        if not all(bool(th.isfinite(each).all()) for each in guard.policy.actor.parameters()):
+            return None, "a parameter of the actor is not a finite number"
+        played = self._play(guard, self.seeds)
+        return played, paired.objection(played.costs, played.violations)
+
+    def _report(
+        self,
+        guard: ImprovementGuard,
+        played: Episodes | None,
+        reason: str,
+        regions: list[int],
+        returned: bool,
+    ) -> None:
         paired = guard.state.evidence.paired
         guard.decide(
             Decision(
@@ -166,11 +190,6 @@ def _visits(guard: ImprovementGuard, played: Episodes) -> NDArray[np.bool_]:
         theta = th.as_tensor(states[:-1], dtype=th.float32, device=guard.model.device)
         visited[layer.locate(theta)[0].cpu().numpy()] = True
     return visits
-
-
-def _has_learnt(guard: ImprovementGuard) -> bool:
-    """Return whether the actor may differ from the MPC at all."""
-    return bool(guard.policy.actor.optimizer.state_dict()["state"])
 
 
 def _name(env: Any) -> str:

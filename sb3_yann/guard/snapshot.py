@@ -9,7 +9,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_yann.policies import YannActor, YannPolicy
+from sb3_yann.policies import YannPolicy
 
 Parameters = dict[str, th.Tensor]
 
@@ -60,11 +60,6 @@ class Snapshot:
 
 def _copy_rows(ours: th.Tensor, theirs: th.Tensor, index: th.Tensor) -> None:
     ours[index] = theirs[index]
-
-
-def network_of(actor: YannActor) -> list[th.Tensor]:
-    """Return the trainable parameters; the first axis of each is the region."""
-    return [parameter.detach() for parameter in actor.mu.network.parameters()]
 
 
 def same(snapshot: Snapshot, policy: YannPolicy) -> bool:

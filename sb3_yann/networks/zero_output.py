@@ -55,6 +55,11 @@ class PairedLinear(nn.Module):
         rest = th.zeros(n_stacked, n_nodes % 2, *shape)
         self.nodes = nn.Parameter(th.cat([first, -first, rest], 1))
 
+    def summed(self) -> th.Tensor:
+        """Return weights and, as the last column, biases: (n_stacked, out_features, n + 1)."""
+        first, opposite, rest = th.split(self.nodes, self.parts, 1)
+        return th.cat([first + opposite, rest], 1).sum(1)
+
     def forward(self, x: th.Tensor, index: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
         """Return ``W x`` (batch, out_features) and ``b`` of the summed nodes, which adds to it.
 
@@ -64,8 +69,7 @@ class PairedLinear(nn.Module):
         index : Tensor of int, shape (batch,)
             The layer of the stack for each row; None where there is only one.
         """
-        first, opposite, rest = th.split(self.nodes, self.parts, 1)
-        return _affine(th.cat([first + opposite, rest], 1).sum(1), x, index)
+        return _affine(self.summed(), x, index)
 
 
 class StackedLinear(nn.Module):
@@ -169,6 +173,12 @@ class ZeroOutputNetwork(nn.Module):
             StackedLinear(a, b, n_stacked=stack, scale=scale) for a, b in pairwise(widths)
         )
         self.register_buffer("pinned", pinned.float()[:, None])
+
+    @th.no_grad()
+    def is_zero(self) -> bool:
+        """Return whether nothing has been learnt: the output is zero whatever the input is."""
+        biases = [weight[..., -1] for weight in self.rest.parameters()]
+        return not any(bool(th.any(each != 0)) for each in (self.first.summed(), *biases))
 
     def forward(self, x: th.Tensor, index: th.Tensor | None = None) -> th.Tensor:
         """Return (batch, out_features).
