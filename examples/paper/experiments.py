@@ -45,6 +45,7 @@ class Plant:
     problem: Callable[[], LinearMPC]
     optimum: Callable[..., Any]
     gradient_steps: int = 1
+    critic_warmup: int = 2000
     patience: int = 1
 
 
@@ -67,6 +68,7 @@ _PENDULUM = Plant(
     problems.clipped_pendulum,
     optimum.clipped_pendulum_optimum,
     gradient_steps=2,
+    critic_warmup=4000,
     patience=10,
 )
 PLANTS = {
@@ -102,7 +104,11 @@ def yann(
         seed=seed,
         device="cpu",
         buffer_size=200_000,
-        policy_kwargs={"problem": problem, **policy_kwargs},
+        policy_kwargs={
+            "problem": problem,
+            "critic_warmup": plant.critic_warmup,
+            **policy_kwargs,
+        },
         **({"target_policy_noise": 0.0} if algorithm is TD3 else {}),
     )
     callbacks: list[BaseCallback] = [NoActionNoise()]

@@ -41,9 +41,10 @@ class ImprovementGuard(BaseCallback):
     ``trial_episodes`` episodes, then rests for as many, of which all are played by one and the same
     policy. It is accepted if it costs less than the accepted policy did, by a one-sided test of
     size ``significance`` (:func:`sb3_yann.guard.judging.probability_of_chance`: an analysis of
-    covariance on the cost that the linear model predicts for each start). A violation at any time
-    brings the accepted policy back at once. The first policy that is accepted is the one that
-    training starts with, and plays the first block. Each test errs with probability
+    covariance on the cost that the linear model predicts for each start). A violation at any time,
+    or a change of the actor while it rests, brings the accepted policy back at once; after a
+    violation the actor rests until that episode is over. The first policy that is accepted is the
+    one that training starts with, and plays the first block. Each test errs with probability
     ``significance``, so a policy that is worse *can* pass; the simulator's paired episodes have no
     such chance, but hold for their starts only.
 
@@ -127,6 +128,8 @@ class ImprovementGuard(BaseCallback):
         ):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}.")
+        if not isinstance(by_region, bool):
+            raise TypeError(f"by_region = {by_region!r} must be True or False.")
         for name, factor, low, high in (
             ("margin", margin, 0.0, np.inf),
             ("shrink", shrink, 0.0, 1.0),
@@ -152,7 +155,11 @@ class ImprovementGuard(BaseCallback):
     @property
     def state(self) -> GuardState:
         """What has been accepted, and on which evidence."""
-        state: GuardState = self.model.guard_state  # type: ignore[attr-defined]
+        state = getattr(getattr(self, "model", None), "guard_state", None)
+        if not isinstance(state, GuardState):
+            raise RuntimeError(
+                "The guard has no state yet: pass it to learn, as callback=guard, before asking."
+            )
         return state
 
     def _init_callback(self) -> None:
@@ -217,6 +224,7 @@ class ImprovementGuard(BaseCallback):
         self.logger.record("guard/accepted", len(self.decisions) - rejected)
         if self.record is not None:
             write_csv(self.record, self.decisions)
+        self.logger.dump(self.num_timesteps)  # as EvalCallback does, or the next would replace it
         if self.verbose:
             print(
                 f"Episode {decision.episode}: {decision.verdict}"

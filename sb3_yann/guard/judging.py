@@ -30,6 +30,10 @@ class Paired:
     violations: NDArray[np.int64]
     margin: float
 
+    def lost(self, costs: Array) -> NDArray[np.bool_]:
+        """Return which starts cost more than with the MPC by more than the margin."""
+        return np.asarray(~(costs - self.mpc_costs <= self.margin))
+
     def objection(self, costs: Array, violations: NDArray[np.int64]) -> str:
         """Return why a policy with these episodes is refused, empty where it is not.
 
@@ -72,6 +76,8 @@ def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> 
     (e.g. Montgomery, *Design and Analysis of Experiments*, chapter 15).
     """
     costs = np.concatenate([candidate.costs, accepted.costs])
+    if not np.all(np.isfinite(costs)):
+        return 1.0
     is_candidate = np.arange(len(costs)) < len(candidate.costs)
     predicted = np.concatenate([candidate.predicted, accepted.predicted])
     columns = [np.ones(len(costs)), is_candidate.astype(float)]
@@ -81,9 +87,14 @@ def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> 
     freedom = len(costs) - X.shape[1]
     if freedom < 1:
         raise ValueError(f"{len(costs)} episodes are too few to compare two policies.")
+    if np.linalg.matrix_rank(X) < X.shape[1]:
+        return 1.0  # the starts alone tell the two policies' episodes apart
     coefficients, *_ = np.linalg.lstsq(X, costs, rcond=None)
+    difference = coefficients[1]
+    if abs(difference) <= 1e-12 * np.abs(costs).max():
+        return 1.0  # rounding: "no difference" is no improvement
     variance = np.sum((costs - X @ coefficients) ** 2) / freedom
     error = np.sqrt(variance * np.linalg.pinv(X.T @ X)[1, 1])
-    # Without any scatter the sign alone decides, and "no difference" is no improvement.
-    t = coefficients[1] / error if error > 0 else np.sign(coefficients[1]) * np.inf
-    return float(stats.t.cdf(t, freedom)) if np.isfinite(t) or coefficients[1] else 1.0
+    # Without any scatter the sign alone decides.
+    t = difference / error if error > 0 else np.sign(difference) * np.inf
+    return float(stats.t.cdf(t, freedom))

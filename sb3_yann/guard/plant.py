@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sb3_yann.control import LinearMPC
 from sb3_yann.guard.judging import PlantEpisodes, probability_of_chance
 from sb3_yann.guard.record import Decision
-from sb3_yann.guard.snapshot import same
+from sb3_yann.guard.snapshot import Snapshot, same
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
@@ -21,13 +21,17 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Evidence:
-    """Episodes of the MPC, of the accepted policy, and of the block that is being played."""
+    """Episodes of the MPC, of the accepted policy, and of the block that is being played.
+
+    ``resting`` is the policy that plays a block in which the actor does not learn.
+    """
 
     phase: Literal["first", "learning", "trial"] = "first"
     mpc: PlantEpisodes | None = None
     accepted: PlantEpisodes | None = None
     costs: list[float] = field(default_factory=list)
     predicted: list[float] = field(default_factory=list)
+    resting: Snapshot | None = None
 
 
 class PlantTrials:
@@ -40,19 +44,22 @@ class PlantTrials:
     def start(self, guard: ImprovementGuard) -> None:
         """Begin with the episodes that start now; one that is under way is not counted."""
         n_envs = guard.training_env.num_envs
-        self.costs, self.lengths = np.zeros(n_envs), np.zeros(n_envs, dtype=int)
+        # SB3 goes on in the midst of an episode where its steps are not counted from 0 again.
+        self.costs, self.lengths = np.zeros(n_envs), np.full(n_envs, int(guard.num_timesteps > 0))
+        self.violated = np.zeros(n_envs, dtype=bool)
         self.starts: list[Array] = [np.empty(0)] * n_envs
         self.blocks = np.full(n_envs, -1)
         self.block = 0
 
     def first_evidence(self, guard: ImprovementGuard) -> None:
         """Begin with a block of episodes that the present policy plays."""
-        guard.accept(Evidence())
+        guard.accept(Evidence(resting=Snapshot.of(guard.policy)))
 
     def step(self, guard: ImprovementGuard) -> None:
         """Count the step; decide where a block is over."""
         evidence: Evidence = guard.state.evidence
-        guard.policy.actor_step = guard.state.step if evidence.phase == "learning" else 0.0
+        if evidence.resting is not None and not same(evidence.resting, guard.policy):
+            self._return(guard, evidence, "the actor was changed while it rested")
         observations = np.asarray(guard.model._last_obs, dtype=np.float64)  # s_t, before the step
         dones, infos = guard.locals["dones"], guard.locals["infos"]
         for i, done in enumerate(dones):
@@ -61,7 +68,9 @@ class PlantTrials:
             self.costs[i] -= float(guard.locals["rewards"][i])
             self.lengths[i] += 1
             if infos[i].get("violation", False):
-                self._violated(guard, evidence)
+                self.violated[i] = True
+                if not same(guard.state.accepted, guard.policy):
+                    self._return(guard, evidence, "a limit was violated")
             if done:
                 if self.blocks[i] == self.block:
                     evidence.costs.append(float(self.costs[i]))
@@ -69,31 +78,40 @@ class PlantTrials:
                         evidence.predicted.append(
                             predicted_cost(guard.policy.problem, self.starts[i], self.lengths[i])
                         )
-                self.costs[i], self.lengths[i] = 0.0, 0
+                self.costs[i], self.lengths[i], self.violated[i] = 0.0, 0, False
         if len(evidence.costs) >= self.trial_episodes:
             self._block_is_over(guard, evidence)
+        # Nor does the actor learn while an episode goes on in which a limit was violated: until
+        # it is over, it is the accepted policy that leads the plant back.
+        rests = evidence.phase != "learning" or self.violated.any()
+        guard.policy.actor_step = 0.0 if rests else guard.state.step
 
     def end(self, guard: ImprovementGuard) -> None:
         """Leave an unfinished block undecided: the accepted policy stays, and learns again."""
         evidence: Evidence = guard.state.evidence
         if evidence.phase != "first":
-            self._next(evidence, "learning")
+            self._next(guard, evidence, "learning")
 
-    def _next(self, evidence: Evidence, phase: Literal["learning", "trial"]) -> None:
+    def _next(
+        self,
+        guard: ImprovementGuard,
+        evidence: Evidence,
+        phase: Literal["first", "learning", "trial"],
+    ) -> None:
         evidence.phase = phase
         evidence.costs, evidence.predicted = [], []
+        evidence.resting = None if phase == "learning" else Snapshot.of(guard.policy)
         self.block += 1
 
-    def _violated(self, guard: ImprovementGuard, evidence: Evidence) -> None:
-        if same(guard.state.accepted, guard.policy):
-            return  # the accepted policy itself did it: there is nothing better to return to
+    def _return(self, guard: ImprovementGuard, evidence: Evidence, reason: str) -> None:
+        """Bring the accepted policy back at once, whatever the block."""
         guard.state.accepted.restore(guard.policy)
-        self._report(guard, evidence, "rejected", "a limit was violated", np.nan)
-        self._next(evidence, "learning")
+        self._report(guard, evidence, "rejected", reason, np.nan)
+        self._next(guard, evidence, "first" if evidence.accepted is None else "learning")
 
     def _block_is_over(self, guard: ImprovementGuard, evidence: Evidence) -> None:
         if evidence.phase == "learning":
-            self._next(evidence, "trial")
+            self._next(guard, evidence, "trial")
             return
         played = PlantEpisodes(np.array(evidence.costs), np.array(evidence.predicted))
         if evidence.phase == "first":
@@ -111,7 +129,7 @@ class PlantTrials:
             else:
                 guard.state.accepted.restore(guard.policy)
                 self._report(guard, evidence, "rejected", reason, played.costs.mean())
-        self._next(evidence, "learning")
+        self._next(guard, evidence, "learning")
 
     def _report(
         self,

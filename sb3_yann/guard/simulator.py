@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -11,13 +12,17 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann.evaluation import Episodes, evaluate, one_env
+from sb3_yann.evaluation import Episodes, Predictor, evaluate, one_env
 from sb3_yann.guard.judging import Paired
 from sb3_yann.guard.record import Decision
 from sb3_yann.guard.snapshot import Snapshot, same
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
+
+
+MOST_LOST = 0.2
+"""Share of losing starts beyond which no part of a candidate is looked for."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,21 @@ class Evidence:
 
     paired: Paired
     visits: NDArray[np.bool_]
+
+
+class _NotFinite(Exception):
+    """An action of the policy is not a finite number; envs need not put up with one."""
+
+
+@dataclass(frozen=True)
+class _FinitePolicy:
+    policy: Predictor
+
+    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
+        actions, state = self.policy.predict(observation, deterministic=deterministic)
+        if not np.all(np.isfinite(actions)):
+            raise _NotFinite
+        return actions, state
 
 
 class SimulatorTrials:
@@ -53,12 +73,12 @@ class SimulatorTrials:
     def start(self, guard: ImprovementGuard) -> None:
         """Check that the simulator is another env than the training env, and a like one."""
         training = [env.unwrapped for env in getattr(guard.training_env, "envs", [])]
-        if isinstance(self.env, gym.Env) and any(self.env.unwrapped is env for env in training):
-            raise ValueError(
-                "The guard's env is the training env, whose episodes its own would interrupt. "
-                "Give it another one, e.g. its id."
-            )
         with one_env(self.env) as env:
+            if any(env.unwrapped is each for each in training):
+                raise ValueError(
+                    "The guard's env is the training env, whose episodes its own would interrupt. "
+                    "Give it another one, e.g. its id."
+                )
             ours, theirs = env.observation_space.shape, guard.training_env.observation_space.shape
             if ours != theirs or env.action_space != guard.training_env.action_space:
                 raise ValueError(
@@ -67,6 +87,7 @@ class SimulatorTrials:
                     f"{guard.training_env.action_space}. Give the guard a simulator of this plant."
                 )
         self.last_trial = -self.every  # the first episode that ends is always followed by a trial
+        self.rejections = 0
 
     def first_evidence(self, guard: ImprovementGuard) -> None:
         """Play the MPC's episodes, and accept the policy if it is no worse at the start."""
@@ -91,6 +112,7 @@ class SimulatorTrials:
 
     def end(self, guard: ImprovementGuard) -> None:
         """Try the last candidate."""
+        self.rejections = self.patience - 1  # there is no later: what is refused now returns
         self._try(guard)
 
     def _try(self, guard: ImprovementGuard) -> None:
@@ -105,7 +127,10 @@ class SimulatorTrials:
             return
         broken = played is None or bool(np.any(played.violations > evidence.paired.violations))
         candidate = Snapshot.of(guard.policy)
-        regions = self._accept_regions(guard, candidate) if self.by_region and not broken else []
+        regions: list[int] = []
+        if self.by_region and played is not None and not broken:
+            regions = self._accept_the_rest(guard, candidate, played)
+            regions += self._accept_regions(guard, candidate)
         self.rejections += 1
         returned = broken or self.rejections >= self.patience
         if returned:
@@ -117,7 +142,10 @@ class SimulatorTrials:
         """Return the episodes of the present policy and what speaks against it, if anything."""
         if not all(bool(th.isfinite(each).all()) for each in guard.policy.actor.parameters()):
             return None, "a parameter of the actor is not a finite number"
-        played = self._play(guard, self.seeds)
+        try:
+            played = self._play(guard, self.seeds)
+        except _NotFinite:
+            return None, "an action of the actor is not a finite number"
         return played, paired.objection(played.costs, played.violations)
 
     def _report(
@@ -145,6 +173,37 @@ class SimulatorTrials:
             )
         )
 
+    def _accept_the_rest(
+        self, guard: ImprovementGuard, candidate: Snapshot, played: Episodes
+    ) -> list[int]:
+        """Give back the regions by which few starts lose, until what is left can be accepted.
+
+        The region to give back is the one that the losing starts come through and the winning ones
+        least. Leaves the policy changed.
+        """
+        evidence: Evidence = guard.state.evidence
+        paired, kept = evidence.paired, list(range(evidence.visits.shape[1]))
+        while len(kept) > 1:
+            lost = paired.lost(played.costs)
+            if not lost.any() or lost.mean() > MOST_LOST:
+                break
+            visits, won = _visits(guard, played), played.costs < paired.costs - paired.margin
+            blame, credit = visits[lost].sum(0)[kept], visits[won].sum(0)[kept]
+            if not blame.any():
+                break
+            kept.pop(int(np.argmax(blame / (blame + credit + 1e-9))))
+            mixed = guard.state.accepted.with_regions(candidate, kept)
+            mixed.restore(guard.policy)
+            try:
+                played = self._play(guard, self.seeds)
+            except _NotFinite:
+                break
+            gained = played.costs.mean() < paired.costs.mean()
+            if gained and not paired.objection(played.costs, played.violations):
+                guard.accept(self._evidence(guard, paired, played), mixed)
+                return kept
+        return []
+
     def _accept_regions(self, guard: ImprovementGuard, candidate: Snapshot) -> list[int]:
         """Take over the regions of the candidate that improve the accepted policy, one by one.
 
@@ -161,7 +220,10 @@ class SimulatorTrials:
             ):
                 continue
             mixed.restore(guard.policy)
-            played = self._play(guard, [self.seeds[i] for i in starts])
+            try:
+                played = self._play(guard, [self.seeds[i] for i in starts])
+            except _NotFinite:
+                continue
             costs, violations = evidence.paired.costs.copy(), evidence.paired.violations.copy()
             costs[starts], violations[starts] = played.costs, played.violations
             if costs.mean() < evidence.paired.costs.mean() and not evidence.paired.objection(
@@ -175,7 +237,7 @@ class SimulatorTrials:
         return accepted
 
     def _play(self, guard: ImprovementGuard, seeds: Sequence[int]) -> Episodes:
-        return evaluate(guard.policy, self.env, seeds)
+        return evaluate(_FinitePolicy(guard.policy), self.env, seeds)
 
     def _evidence(self, guard: ImprovementGuard, paired: Paired, played: Episodes) -> Evidence:
         paired = replace(paired, costs=played.costs, violations=played.violations)
@@ -197,4 +259,6 @@ def _name(env: Any) -> str:
         return env
     if isinstance(env, gym.Env):
         return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+    if isinstance(env, partial):  # its repr holds an address, which the next process does not have
+        return f"{_name(env.func)}{env.args}{env.keywords}"
     return getattr(env, "__qualname__", repr(env))

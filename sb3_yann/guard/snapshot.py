@@ -16,7 +16,10 @@ Parameters = dict[str, th.Tensor]
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What makes an actor and its learning go on as if nothing had happened since."""
+    """What makes an actor and its learning go on as if nothing had happened since.
+
+    It lies in the main memory, so that a model saved on one device loads on another.
+    """
 
     actor: Parameters
     target: Parameters
@@ -26,9 +29,9 @@ class Snapshot:
     def of(cls, policy: YannPolicy) -> Snapshot:
         """Return a copy of the policy's present actor, its target and its optimizer."""
         return cls(
-            copy.deepcopy(policy.actor.state_dict()),
-            copy.deepcopy(policy.actor_target.state_dict()),
-            copy.deepcopy(policy.actor.optimizer.state_dict()),
+            _copied(policy.actor.state_dict()),
+            _copied(policy.actor_target.state_dict()),
+            _copied(policy.actor.optimizer.state_dict()),
         )
 
     def restore(self, policy: YannPolicy) -> None:
@@ -58,6 +61,14 @@ class Snapshot:
         return mixed
 
 
+def _copied(value: Any) -> Any:
+    if isinstance(value, th.Tensor):
+        return value.detach().to("cpu", copy=True)
+    if isinstance(value, dict):
+        return {key: _copied(each) for key, each in value.items()}
+    return copy.deepcopy(value)
+
+
 def _copy_rows(ours: th.Tensor, theirs: th.Tensor, index: th.Tensor) -> None:
     ours[index] = theirs[index]
 
@@ -65,4 +76,4 @@ def _copy_rows(ours: th.Tensor, theirs: th.Tensor, index: th.Tensor) -> None:
 def same(snapshot: Snapshot, policy: YannPolicy) -> bool:
     """Return whether the policy's actor is still that of the snapshot, bit for bit."""
     now = policy.actor.state_dict()
-    return all(th.equal(value, now[name]) for name, value in snapshot.actor.items())
+    return all(th.equal(value, now[name].cpu()) for name, value in snapshot.actor.items())

@@ -1,0 +1,167 @@
+"""Where the whole candidate is refused, the regions that improve the policy may still stay."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch as th
+from guard_samples import (
+    CENTRE,
+    LEFT,
+    REGION,
+    RIGHT,
+    STEPS,
+    At,
+    Slide,
+    accepted_bits,
+    actor_bits,
+    bits,
+    build,
+    correct,
+    make_guard,
+    train,
+    verdicts,
+)
+from stable_baselines3 import DDPG, TD3
+
+from sb3_yann.evaluation import evaluate
+from sb3_yann.guard.snapshot import Snapshot
+from sb3_yann.policies import YannPolicy
+
+
+@th.no_grad()
+def spoil_centre(policy: YannPolicy) -> None:
+    network = policy.actor.mu.network
+    network.first.nodes[REGION[CENTRE]] = 3.0
+    network.rest[-1].weight[REGION[CENTRE]] = 3.0
+
+
+def half_good(policy: YannPolicy) -> None:
+    correct(policy, LEFT, -2.0)
+    correct(policy, RIGHT, 0.5)
+
+
+def rows(snapshot: Snapshot, region: int) -> list[object]:
+    """Return what belongs to a region: parameters of actor and target, and moments."""
+    parts = [snapshot.actor, snapshot.target, *snapshot.optimizer["state"].values()]
+    tensors = [
+        value
+        for part in parts
+        for key, value in part.items()
+        if value.dim() > 0 and (".network." in key or "exp_avg" in key)
+    ]
+    return [bits(value[region]) for value in tensors]
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorithm) -> None:
+    model, guard = build(algorithm), make_guard(margin=0.03)
+    snapshots: dict[str, Snapshot] = {}
+
+    def change(policy) -> None:
+        snapshots["accepted"] = guard.state.accepted
+        half_good(policy)
+        snapshots["candidate"] = Snapshot.of(policy)
+
+    step = 3 * STEPS
+    seen: list[bool] = []
+    look = At([step], lambda policy: seen.append(actor_bits(policy) == accepted_bits(guard)))
+    keep = At([step], lambda policy: snapshots.update(mixed=Snapshot.of(policy)))
+    train(model, step, At([step], change), guard, look, keep)
+    (decision,) = [each for each in guard.decisions if each.timestep == step][:1]
+    assert decision.verdict == "accepted in part"
+    assert REGION[RIGHT] in decision.regions
+    assert REGION[LEFT] not in decision.regions
+    assert "costs" in decision.reason
+    for region in REGION.values():
+        source = "candidate" if region in decision.regions else "accepted"
+        assert rows(snapshots["mixed"], region) == rows(snapshots[source], region)
+    assert rows(snapshots["candidate"], 0) != rows(snapshots["accepted"], 0)
+    assert seen == [True]
+
+
+def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
+    model, guard = build(gradient_steps=0), make_guard()
+    train(model, STEPS, At([STEPS], half_good), guard)
+    assert guard.decisions[0].regions == (REGION[RIGHT],)
+    played = evaluate(model, Slide, guard.trials.seeds)
+    np.testing.assert_allclose(guard.state.evidence.paired.costs, played.costs, atol=1e-5)
+    assert guard.decisions[0].accepted_cost == pytest.approx(played.costs.mean())
+    assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
+    assert guard.decisions[0].candidate_cost > guard.decisions[0].mpc_cost
+    assert guard.decisions[0].step == 1  # neither shrinks nor grows
+
+
+def test_only_the_starts_that_come_through_a_region_are_played_again() -> None:
+    simulator = Slide()
+    model, guard = build(gradient_steps=0), make_guard(simulator)
+    count: list[int] = []
+    tally = At([STEPS], lambda _: count.append(simulator.played))
+    train(model, STEPS, At([STEPS], half_good), tally, guard, tally)
+    visits = guard.state.evidence.visits
+    through = int(visits[:, [REGION[LEFT], REGION[RIGHT]]].sum())
+    assert 0 < through < 10
+    assert count[1] - count[0] == (10 + through) * STEPS
+
+
+def test_a_region_that_no_start_comes_through_is_never_taken_over() -> None:
+    simulator = partial(Slide, low=2.0)
+    model, guard = build(gradient_steps=0), make_guard(simulator)
+
+    def change(policy) -> None:
+        spoil_centre(policy)
+        correct(policy, RIGHT, 0.5)
+        correct(policy, LEFT, -0.5)
+
+    train(model, STEPS, At([STEPS], change), guard)
+    assert not guard.state.evidence.visits[:, REGION[LEFT]].any()
+    assert guard.decisions[0].regions == (REGION[RIGHT],)
+    assert not model.policy.actor.mu.network.rest[-1].weight[REGION[LEFT], :, -1].any()
+
+
+def test_without_by_region_the_whole_returns() -> None:
+    model, guard = build(gradient_steps=0), make_guard(by_region=False)
+    train(model, STEPS, At([STEPS], half_good), guard)
+    assert verdicts(guard) == ["rejected"]
+    assert guard.decisions[0].regions == ()
+    assert model.policy.actor.mu.network.is_zero()
+
+
+def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
+    # To the right half the input violates; nothing else does.
+    simulator = partial(Slide, low=-4.0, limits=(-1.1, 0.9))
+    model, guard = build(gradient_steps=0), make_guard(simulator)
+    train(model, STEPS, At([STEPS], lambda policy: correct(policy, RIGHT, 2.0)), guard)
+    assert verdicts(guard) == ["rejected"]
+    assert "violations" in guard.decisions[0].reason
+
+
+def test_regions_may_be_taken_over_while_patience_lasts() -> None:
+    model, guard = build(gradient_steps=0), make_guard(patience=2)
+    seen: list[bytes] = []
+    look = At([STEPS], lambda policy: seen.append(bits(policy.actor.state_dict())))
+    train(model, STEPS + 1, At([STEPS], half_good), look, guard, look)
+    assert seen[0] == seen[1]  # the actor goes on as it was
+    assert guard.decisions[0].verdict == "accepted in part"
+    weight = model.policy.actor.mu.network.rest[-1].weight
+    assert float(weight[REGION[RIGHT], 0, -1].detach()) == 0.5
+    assert float(weight[REGION[LEFT], 0, -1].detach()) == 0
+
+
+def test_moments_of_a_region_taken_over_before_any_other_step_are_zero_elsewhere() -> None:
+    model, guard = build(), make_guard(margin=0.03)
+    train(model, STEPS, At([STEPS], half_good), guard, look := At([STEPS], lambda _: None))
+    del look
+    decision = guard.decisions[0]
+    assert decision.verdict == "accepted in part"
+    others = [region for region in REGION.values() if region not in decision.regions]
+    # One more update followed; what the snapshot held is what counts.
+    first = build()
+    train(first, 2, At([2], half_good))
+    mixed = Snapshot.of(build().policy).with_regions(Snapshot.of(first.policy), decision.regions)
+    assert mixed.optimizer["state"]
+    for state in mixed.optimizer["state"].values():
+        assert float(state["step"]) == 2
+        assert all(not state["exp_avg"][region].any() for region in others)

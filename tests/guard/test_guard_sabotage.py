@@ -1,0 +1,242 @@
+"""Whatever happens to the actor, what does not improve is taken back, bit for bit."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from guard_samples import (
+    LEFT,
+    MPC,
+    RIGHT,
+    STEPS,
+    At,
+    Slide,
+    accepted_bits,
+    actor_bits,
+    better,
+    bits,
+    blow_up,
+    build,
+    correct,
+    critic_bits,
+    make_guard,
+    overwrite,
+    randomize,
+    train,
+    verdicts,
+    worse,
+)
+from stable_baselines3 import DDPG, TD3
+
+from sb3_yann.evaluation import evaluate
+
+ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
+SABOTAGE = {
+    "worse": worse,
+    "random": randomize,
+    "all ones": partial(overwrite, value=1.0),
+    "overflowing": blow_up,
+    "nan": partial(overwrite, value=np.nan),
+    "infinite": partial(overwrite, value=np.inf),
+    "minus infinity": partial(overwrite, value=-np.inf),
+}
+STATES = np.linspace(-5, 5, 101, dtype=np.float32)[:, None]
+
+
+@ALGORITHMS
+@pytest.mark.parametrize("sabotage", SABOTAGE.values(), ids=SABOTAGE)
+@pytest.mark.parametrize("place", ["before the guard", "after the guard"])
+def test_a_sabotaged_actor_is_rejected_and_restored_bit_for_bit(algorithm, sabotage, place) -> None:
+    # Without learning: what is not the accepted policy's is the sabotage's.
+    model, guard = build(algorithm, gradient_steps=0), make_guard()
+    step = 3 * STEPS if place == "before the guard" else 4 * STEPS  # the last one of all
+    good, bad = At([STEPS], better), At([step], sabotage)
+    callbacks = [good, bad, guard] if place == "before the guard" else [good, guard, bad]
+    seen: list[object] = []
+    train(
+        model,
+        4 * STEPS,
+        *callbacks,
+        At([step - 1, 4 * STEPS], lambda p: seen.append(bits(p.actor.state_dict()))),
+    )
+    assert verdicts(guard) == ["accepted", "rejected"]
+    assert guard.decisions[1].returned
+    assert actor_bits(model.policy) == accepted_bits(guard)
+    assert bits(model.policy.actor.state_dict()) == seen[0]
+
+
+@ALGORITHMS
+@pytest.mark.parametrize("sabotage", [worse, randomize], ids=["worse", "random"])
+def test_amid_learning_actor_target_and_moments_return_to_those_last_accepted(
+    algorithm, sabotage
+) -> None:
+    model, guard = build(algorithm), make_guard()
+    kept: dict[int, object] = {}
+    compared: list[bool] = []
+
+    def spoil(policy) -> None:
+        kept[0] = accepted_bits(guard)
+        sabotage(policy)
+        policy.actor.optimizer.state_dict()["state"][0]["exp_avg"].fill_(7.0)
+        policy.actor_target.load_state_dict(policy.actor.state_dict())
+
+    def compare(policy) -> None:
+        compared.append(actor_bits(policy) == kept[0] == accepted_bits(guard))
+
+    sabotages, steps = At([STEPS, 5 * STEPS], spoil), [STEPS, 5 * STEPS]
+    train(model, 6 * STEPS, At([1], better), sabotages, guard, At(steps, compare))
+    assert compared == [True, True]
+
+
+def test_a_rejection_leaves_the_critic_and_its_optimizer_alone() -> None:
+    model, guard = build(TD3), make_guard()
+    critics: list[object] = []
+    look = At([2 * STEPS], lambda policy: critics.append(critic_bits(policy)))
+    train(model, 3 * STEPS, At([2 * STEPS], randomize), look, guard, At([2 * STEPS], look.act))
+    assert "rejected" in verdicts(guard)
+    assert critics[0] == critics[1] != critic_bits(model.policy)
+
+
+def test_a_policy_that_is_worse_before_training_gives_way_to_the_mpc() -> None:
+    model, guard = build(gradient_steps=0), make_guard()
+    worse(model.policy)
+    train(model, STEPS, guard)
+    assert guard.decisions[0].reason.startswith("before training, ")
+    assert model.policy.actor.mu.network.is_zero()
+    np.testing.assert_array_equal(model.predict(STATES)[0], build().predict(STATES)[0])
+    np.testing.assert_allclose(model.predict(STATES)[0], MPC.explicit()(STATES), atol=1e-6)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
+def test_a_policy_that_diverged_before_training_gives_way_to_the_mpc(value) -> None:
+    model, guard = build(), make_guard()
+    overwrite(model.policy, value)
+    overwrite(model.policy, value)
+    before = At([1], lambda policy: seen.append(policy.actor.mu.network.is_zero()))
+    seen: list[bool] = []
+    train(model, STEPS, before, guard)
+    assert seen == [True]
+    assert model.policy.actor_target.mu.network.rest[0].weight.isfinite().all()
+    assert not np.isnan(guard.decisions[0].accepted_cost)
+
+
+def test_a_policy_that_is_better_before_training_is_kept() -> None:
+    model, guard = build(gradient_steps=0), make_guard()
+    better(model.policy)
+    before = actor_bits(model.policy)
+    train(model, 2 * STEPS, guard)
+    assert actor_bits(model.policy) == before == accepted_bits(guard)
+    assert guard.decisions == []
+    assert guard.state.evidence.paired.costs.mean() < guard.state.evidence.paired.mpc_costs.mean()
+
+
+def test_sabotage_before_a_second_learn_is_rejected_too() -> None:
+    model, guard = build(gradient_steps=0), make_guard()
+    train(model, STEPS, At([1], better), guard)
+    before = actor_bits(model.policy)
+    randomize(model.policy)
+    train(model, 2 * STEPS, guard)
+    assert verdicts(guard) == ["accepted", "rejected"]
+    assert actor_bits(model.policy) == before
+
+
+@ALGORITHMS
+def test_the_final_model_is_the_accepted_policy_also_when_loaded(algorithm, tmp_path) -> None:
+    model, guard = build(algorithm), make_guard(patience=3)
+    train(model, 10 * STEPS + 1, guard, At([4 * STEPS, 10 * STEPS + 1], randomize))
+    assert bits(model.policy.actor.state_dict()) == bits(guard.state.accepted.actor)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", device="cpu")
+    np.testing.assert_array_equal(loaded.predict(STATES)[0], model.predict(STATES)[0])
+    assert bits(loaded.guard_state.accepted.actor) == bits(loaded.policy.actor.state_dict())
+    played = evaluate(model, Slide, guard.trials.seeds)
+    np.testing.assert_allclose(played.costs, guard.state.evidence.paired.costs, atol=1e-6)
+    assert np.all(played.costs <= guard.state.evidence.paired.mpc_costs + 1e-2)
+
+
+def test_the_accepted_cost_never_rises_and_is_never_above_the_mpc_s() -> None:
+    model, guard = build(learning_rate=0.1), make_guard()
+    train(model, 40 * STEPS, guard, At(range(0, 200, 7 * STEPS), randomize))
+    costs = [guard.decisions[0].mpc_cost, *(each.accepted_cost for each in guard.decisions)]
+    assert np.all(np.diff(costs) <= 1e-6)
+    assert "rejected" in verdicts(guard)
+
+
+def test_a_violation_is_rejected_at_once_though_the_cost_falls_and_patience_is_left() -> None:
+    env = partial(Slide, limits=(-1.1, -0.6))  # positive starts: the MPC's -1 is allowed
+    env = partial(env, low=3.0)
+    model = build(env=env(), gradient_steps=0)
+    guard = make_guard(partial(Slide, limits=(-1.1, -0.6), low=3.9), patience=5)
+    guard.trials.seeds = range(2)
+    train(model, 2 * STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
+    assert verdicts(guard) == ["rejected"]
+    assert guard.decisions[0].returned
+    assert "2 starts with violations" in guard.decisions[0].reason
+    assert guard.decisions[0].candidate_cost < guard.decisions[0].mpc_cost
+    assert model.policy.actor.mu.network.is_zero()
+
+
+def test_with_patience_the_actor_goes_on_until_the_last_of_so_many_rejections() -> None:
+    model, guard = build(gradient_steps=0), make_guard(patience=3)
+    bad = At(
+        [STEPS, 2 * STEPS, 3 * STEPS],
+        lambda policy: correct(policy, LEFT, -1.8 - bad.n_calls / 100),
+    )
+    train(model, 4 * STEPS, bad, guard)
+    assert [each.returned for each in guard.decisions] == [False, False, True]
+    assert [each.step for each in guard.decisions] == [1, 1, 0.5]
+
+
+def test_with_patience_left_the_end_returns_all_the_same_and_says_so() -> None:
+    model, guard = build(gradient_steps=0), make_guard(patience=5)
+    train(model, 2 * STEPS, At([1], worse), guard)
+    assert guard.decisions[-1].returned
+    assert model.policy.actor.mu.network.is_zero()
+    worse(model.policy)
+    train(model, STEPS + 1, guard)  # five more, not what was left
+    assert [each.returned for each in guard.decisions[-2:]] == [False, True]
+
+
+def test_rejections_shrink_the_step_to_its_floor_and_acceptances_let_it_grow_to_one() -> None:
+    model = build(gradient_steps=0)
+    guard = make_guard(shrink=0.3, grow=2.5, smallest_step=0.2, margin=10.0)
+    values = iter([1.8, 1.9, 2.0, 0.3, 0.4, 0.5])
+    move = At(range(STEPS, 7 * STEPS, STEPS), lambda p: correct(p, RIGHT, next(values)))
+    steps: list[float] = []
+    watch = At(range(STEPS, 7 * STEPS, STEPS), lambda policy: steps.append(policy.actor_step))
+    train(model, 6 * STEPS, move, guard, watch)
+    assert verdicts(guard) == ["rejected"] * 3 + ["accepted"] * 3
+    assert steps == pytest.approx([0.3, 0.2, 0.2, 0.5, 1, 1])
+    assert [each.step for each in guard.decisions] == steps
+    assert model.policy.actor_step == 1  # a later run without a guard
+
+
+def test_the_step_multiplies_the_actor_s_learning_rate() -> None:
+    change = []
+    for step in (1.0, 0.5):
+        model = build()
+        train(model, 1)
+        before = model.actor.mu.network.first.nodes.detach().clone()
+        model.policy.actor_step = step
+        model.train(1, 8)
+        change.append(float((model.actor.mu.network.first.nodes.detach() - before).abs().max()))
+    assert change[1] == pytest.approx(change[0] / 2, rel=1e-3)
+
+
+def test_candidates_are_tried_every_so_many_episodes_and_at_the_end() -> None:
+    model, guard = build(gradient_steps=0), make_guard(every=3)
+    values = iter(np.linspace(0.1, 0.3, 20))
+    train(
+        model, 9 * STEPS, At(range(1, 100), lambda p: correct(p, RIGHT, next(values, 0.3))), guard
+    )
+    assert [each.episode for each in guard.decisions][:3] == [1, 4, 7]
+    assert guard.decisions[-1].episode in (7, 9)
+
+
+def test_while_nothing_has_moved_nothing_is_tried() -> None:
+    model, guard = build(actor={"critic_warmup": 2000}), make_guard()
+    train(model, 5 * STEPS, guard)
+    assert guard.decisions == []
+    assert model.policy.actor.mu.network.is_zero()

@@ -1,0 +1,138 @@
+"""The guard changes the actor and nothing else: neither training env, nor buffer, nor chance."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from guard_samples import (
+    RIGHT,
+    STEPS,
+    At,
+    Slide,
+    actor_bits,
+    better,
+    bits,
+    buffer_bits,
+    build,
+    correct,
+    critic_bits,
+    env_random_states,
+    make_guard,
+    random_states,
+    randomize,
+    train,
+    verdicts,
+)
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_yann import ImprovementGuard
+from sb3_yann.guard.judging import Paired
+
+ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
+
+
+def after_training(algorithm, *guards: ImprovementGuard, **kwargs):
+    model = build(algorithm, **kwargs)
+    train(model, 8 * STEPS + 2, *guards)
+    state = {
+        "critic": critic_bits(model.policy),
+        "buffer": buffer_bits(model),
+        "random": random_states(),
+        "envs": env_random_states(model),
+        "returns": [info["r"] for info in model.ep_info_buffer],
+        "steps": [env.unwrapped.played for env in model.get_env().envs],
+    }
+    return model, state
+
+
+@ALGORITHMS
+@pytest.mark.parametrize("env", [Slide, "an instance", "Slide-v0"], ids=["factory", "own", "id"])
+def test_a_run_whose_candidates_are_all_accepted_is_the_run_without_a_guard(
+    algorithm, env, monkeypatch
+) -> None:
+    monkeypatch.setattr(Paired, "objection", lambda *_: "")
+    guard = make_guard(Slide() if env == "an instance" else env)
+    free, expected = after_training(algorithm)
+    model, state = after_training(algorithm, guard)
+    assert set(verdicts(guard)) == {"accepted"}
+    assert state == expected
+    assert actor_bits(model.policy) == actor_bits(free.policy)
+
+
+@ALGORITHMS
+def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
+    algorithm, monkeypatch
+) -> None:
+    monkeypatch.setattr(Paired, "objection", lambda *_: "no")
+    free, expected = after_training(algorithm)
+    model, state = after_training(algorithm, guard := make_guard(patience=1000))
+    assert set(verdicts(guard)) == {"rejected"}
+    assert state == expected
+    assert model.policy.actor.mu.network.is_zero()
+    assert not free.policy.actor.mu.network.is_zero()
+
+
+@ALGORITHMS
+def test_a_guard_that_rejects_everything_leaves_the_mpc_while_the_critic_learns(
+    algorithm, monkeypatch
+) -> None:
+    monkeypatch.setattr(Paired, "objection", lambda *_: "no")
+    fresh = build(algorithm)
+    seen: list[bool] = []
+    look = At(range(STEPS, 9 * STEPS, STEPS), lambda p: seen.append(p.actor.mu.network.is_zero()))
+    model, guard = build(algorithm), make_guard()
+    train(model, 8 * STEPS, guard, look)
+    assert seen == [True] * 8
+    assert len(guard.decisions) >= 7
+    assert bits(model.policy.actor.state_dict()) == bits(fresh.policy.actor.state_dict())
+    assert critic_bits(model.policy)["critic"] != critic_bits(fresh.policy)["critic"]
+    assert model.policy.critic_updates == model._n_updates == 8 * STEPS
+
+
+def test_a_check_moves_no_random_state_and_not_the_training_env(monkeypatch) -> None:
+    model, guard = build(), make_guard()
+    checks: list[bool] = []
+
+    def unchanged(method, *args) -> None:
+        before = random_states(), env_random_states(model), model.env.envs[0].unwrapped.played
+        method(*args)
+        after = random_states(), env_random_states(model), model.env.envs[0].unwrapped.played
+        checks.append(before == after)
+
+    for name in ("start", "first_evidence", "step", "end"):
+        monkeypatch.setattr(guard.trials, name, partial(unchanged, getattr(guard.trials, name)))
+    randomize(model.policy)  # the MPC takes its place: that builds an actor
+    train(model, 3 * STEPS, guard, At([STEPS], better))
+    assert "rejected" in verdicts(guard)
+    assert len(checks) == 3 * STEPS + 3
+    assert all(checks)
+
+
+def test_the_guard_leaves_the_policy_in_the_mode_it_found_it_in_for_the_next_step() -> None:
+    model, guard = build(), make_guard()
+    modes: list[bool] = []
+    train(model, 2 * STEPS, guard, At(range(99), lambda policy: modes.append(policy.training)))
+    assert not any(modes)
+
+
+def test_two_training_envs_side_by_side_count_their_episodes_together() -> None:
+    model = build(env=DummyVecEnv([Slide, Slide]), gradient_steps=0)
+    guard = make_guard()
+    train(model, 4 * STEPS, At([1], better), guard)
+    assert [each.episode for each in guard.decisions] == [2]
+    assert guard.decisions[0].timestep == 2 * STEPS
+    assert guard.state.episodes == 4
+
+
+def test_id_instance_and_factory_are_the_same_simulator() -> None:
+    costs = []
+    for env in ("Slide-v0", Slide(), Slide, lambda: gym.make("Slide-v0")):
+        model, guard = build(gradient_steps=0), make_guard(env)
+        train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.4)), guard)
+        costs.append(guard.state.evidence.paired.costs)
+    for each in costs[1:]:
+        np.testing.assert_allclose(each, costs[0], atol=1e-6)
