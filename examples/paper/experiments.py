@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -46,7 +46,7 @@ class Plant:
     optimum: Callable[..., Any]
     gradient_steps: int = 1
     critic_warmup: int = 2000
-    patience: int = 1
+    guard: dict[str, Any] = field(default_factory=dict)
 
 
 def true_reactor() -> LinearMPC:
@@ -69,7 +69,7 @@ _PENDULUM = Plant(
     optimum.clipped_pendulum_optimum,
     gradient_steps=2,
     critic_warmup=4000,
-    patience=10,
+    guard={"patience": 10, "wander": True},
 )
 PLANTS = {
     "CSTR": _REACTOR,
@@ -119,7 +119,7 @@ def yann(
         callbacks = []
     if guard is not None:
         simulator = None if plant_alone else plant.env_id
-        callbacks.append(ImprovementGuard(simulator, **{"patience": plant.patience, **guard}))
+        callbacks.append(ImprovementGuard(simulator, **{**plant.guard, **guard}))
     return Learner(model, model.policy, callbacks)
 
 
@@ -169,10 +169,11 @@ FIXED = ("MPC", "LQR", "optimum")
 def _runs() -> list[Run]:
     """Return all runs: ten seeds where something is claimed of every seed, five elsewhere.
 
-    The long runs have seeds of their own. Where they stood after 50 episodes counts as well.
+    The long runs have seeds of their own; where they stood after 50 episodes counts as well. Seeds
+    below 20, and those from 100 on, were seen while the defaults were chosen.
     """
     reactor, true_model, pendulum, printed = PLANTS
-    ten, five, long = range(10), range(5), range(10, 15)
+    ten, five, long = range(20, 30), range(20, 25), range(30, 35)
     runs = [Run(plant, name, 0, 0) for plant in PLANTS for name in FIXED]
 
     def add(plant: str, learners: Iterable[str], seeds: range, episodes: int = 50) -> None:
@@ -194,9 +195,9 @@ def _runs() -> list[Run]:
 RUNS = _runs()
 QUICK = [
     *(Run(plant, name, 0, 0) for plant in ("CSTR", "pendulum, Q = I") for name in FIXED),
-    Run("CSTR", "YANN-RL", 0, 5),
-    Run("CSTR", "DDPG", 0, 5),
-    Run("pendulum, Q = I", "YANN-RL", 0, 5),
+    Run("CSTR", "YANN-RL", 20, 5),
+    Run("CSTR", "DDPG", 20, 5),
+    Run("pendulum, Q = I", "YANN-RL", 20, 5),
 ]
 
 

@@ -35,7 +35,8 @@ class ImprovementGuard(BaseCallback):
     from the same starts as the accepted policy and the untouched MPC did. It is refused if its
     mean cost is above the accepted policy's, if one start costs more than with the MPC by more than
     the margin, or if it violates a limit where the accepted policy does not. Where the whole
-    is refused, the networks of single regions may still be accepted, under the same conditions.
+    is refused, the networks of some regions may still be accepted, under the same conditions. A
+    refused candidate that is better than the MPC on average gets ``patience``.
 
     **On a plant alone** (``env=None``) the training episodes decide. The actor learns for
     ``trial_episodes`` episodes, then rests for as many, of which all are played by one and the same
@@ -70,10 +71,13 @@ class ImprovementGuard(BaseCallback):
         What one start may cost more than with the MPC, as a fraction of the MPC's median cost.
     by_region : bool, default True
         Whether to try single regions where the whole is refused.
-    patience : int, default 1
-        Rejections in a row after which the actor returns; a violation brings it back at once. With
-        1 every rejection does. A larger number lets learning pass through worse policies, which
-        then play training episodes, where no better one lies next to the MPC.
+    patience : int, default 5
+        Refusals in a row after which the actor returns. Until then it goes on from where it is, and
+        plays: the critic learns from that. 1 returns after each one.
+    wander : bool, default False
+        Whether that holds for a candidate whose mean cost is above the MPC's as well. By default it
+        returns at once; so it does after a violation, in any case. True where the way to a
+        better policy leads through worse ones, and nothing is at stake but cost.
     shrink, grow, smallest_step : float, default 0.5, 1.5 and 0.1
         Factors of the step at a rejection and an acceptance (up to 1), and what it never falls
         below.
@@ -104,7 +108,8 @@ class ImprovementGuard(BaseCallback):
         every: int = 1,
         margin: float = 0.01,
         by_region: bool = True,
-        patience: int = 1,
+        patience: int = 5,
+        wander: bool = False,
         shrink: float = 0.5,
         grow: float = 1.5,
         smallest_step: float = 0.1,
@@ -145,7 +150,9 @@ class ImprovementGuard(BaseCallback):
         if env is None:
             self.trials = PlantTrials(trial_episodes, significance)
         else:
-            self.trials = SimulatorTrials(env, n_starts, seed, every, margin, by_region, patience)
+            self.trials = SimulatorTrials(
+                env, n_starts, seed, every, margin, by_region, patience, wander
+            )
 
     @property
     def decisions(self) -> list[Decision]:

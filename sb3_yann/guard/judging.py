@@ -34,6 +34,10 @@ class Paired:
         """Return which starts cost more than with the MPC by more than the margin."""
         return np.asarray(~(costs - self.mpc_costs <= self.margin))
 
+    def loses_to_the_mpc(self, costs: Array) -> bool:
+        """Return whether the mean cost is above the MPC's."""
+        return not costs.mean() <= self.mpc_costs.mean()
+
     def objection(self, costs: Array, violations: NDArray[np.int64]) -> str:
         """Return why a policy with these episodes is refused, empty where it is not.
 

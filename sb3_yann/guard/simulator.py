@@ -64,9 +64,10 @@ class SimulatorTrials:
         margin: float,
         by_region: bool,
         patience: int,
+        wander: bool,
     ) -> None:
         self.env, self.every, self.margin, self.by_region = env, every, margin, by_region
-        self.patience, self.rejections = patience, 0
+        self.patience, self.wander, self.rejections = patience, wander, 0
         self.seeds = range(seed, seed + n_starts)
         self.settings = {"env": _name(env), "seeds": self.seeds, "margin": margin}
 
@@ -91,18 +92,23 @@ class SimulatorTrials:
 
     def first_evidence(self, guard: ImprovementGuard) -> None:
         """Play the MPC's episodes, and accept the policy if it is no worse at the start."""
-        mpc = evaluate(guard.policy.problem.explicit(), self.env, self.seeds)
+        present = Snapshot.of(guard.policy)
+        if not guard.policy.actor.mu.network.is_zero():
+            guard.become_the_mpc()
+        # By the actor, not the law in float64: the MPC itself is to be no worse to the last bit.
+        mpc = self._play(guard, self.seeds)
         margin = self.margin * float(np.median(np.abs(mpc.costs)))
         paired = Paired(mpc.costs, mpc.costs, mpc.violations, margin)
-        present, reason = None, ""
-        if not guard.policy.actor.mu.network.is_zero():
-            present, reason = self._judged(guard, paired)
-            if reason:
-                guard.become_the_mpc()
-        played = self._play(guard, self.seeds) if present is None or reason else present
-        guard.accept(self._evidence(guard, paired, played))
-        if reason:
-            self._report(guard, present, f"before training, {reason}", [], returned=True)
+        guard.accept(self._evidence(guard, paired, mpc))
+        if same(present, guard.policy):
+            return
+        present.restore(guard.policy)
+        played, reason = self._judged(guard, paired)
+        if played is not None and not reason:
+            guard.accept(self._evidence(guard, paired, played))
+        else:
+            guard.state.accepted.restore(guard.policy)
+            self._report(guard, played, f"before training, {reason}", [], returned=True)
 
     def step(self, guard: ImprovementGuard) -> None:
         """Try the present policy where an episode has ended and it is time."""
@@ -125,14 +131,16 @@ class SimulatorTrials:
             self.rejections = 0
             self._report(guard, played, reason, [], returned=False)
             return
-        broken = played is None or bool(np.any(played.violations > evidence.paired.violations))
         candidate = Snapshot.of(guard.policy)
         regions: list[int] = []
-        if self.by_region and played is not None and not broken:
-            regions = self._accept_the_rest(guard, candidate, played)
-            regions += self._accept_regions(guard, candidate)
+        hopeless = True
+        if played is not None and not np.any(played.violations > evidence.paired.violations):
+            hopeless = not self.wander and evidence.paired.loses_to_the_mpc(played.costs)
+            if self.by_region:
+                regions = self._accept_the_rest(guard, candidate, played)
+                regions += self._accept_regions(guard, candidate)
         self.rejections += 1
-        returned = broken or self.rejections >= self.patience
+        returned = hopeless or self.rejections >= self.patience
         if returned:
             self.rejections = 0
         (guard.state.accepted if returned else candidate).restore(guard.policy)
@@ -182,7 +190,9 @@ class SimulatorTrials:
         least. Leaves the policy changed.
         """
         evidence: Evidence = guard.state.evidence
-        paired, kept = evidence.paired, list(range(evidence.visits.shape[1]))
+        paired, visited = evidence.paired, (evidence.visits | _visits(guard, played)).any(0)
+        before = guard.state.accepted
+        kept = [i for i in np.flatnonzero(visited).tolist() if _differs(before, candidate, i)]
         while len(kept) > 1:
             lost = paired.lost(played.costs)
             if not lost.any() or lost.mean() > MOST_LOST:
@@ -192,7 +202,7 @@ class SimulatorTrials:
             if not blame.any():
                 break
             kept.pop(int(np.argmax(blame / (blame + credit + 1e-9))))
-            mixed = guard.state.accepted.with_regions(candidate, kept)
+            mixed = before.with_regions(candidate, kept)
             mixed.restore(guard.policy)
             try:
                 played = self._play(guard, self.seeds)
@@ -214,11 +224,9 @@ class SimulatorTrials:
             evidence: Evidence = guard.state.evidence
             starts = np.flatnonzero(evidence.visits[:, region])
             before = guard.state.accepted
-            mixed = before.with_regions(candidate, [region])
-            if len(starts) == 0 or all(
-                th.equal(value, before.actor[name]) for name, value in mixed.actor.items()
-            ):
+            if len(starts) == 0 or not _differs(before, candidate, region):
                 continue
+            mixed = before.with_regions(candidate, [region])
             mixed.restore(guard.policy)
             try:
                 played = self._play(guard, [self.seeds[i] for i in starts])
@@ -252,6 +260,12 @@ def _visits(guard: ImprovementGuard, played: Episodes) -> NDArray[np.bool_]:
         theta = th.as_tensor(states[:-1], dtype=th.float32, device=guard.model.device)
         visited[layer.locate(theta)[0].cpu().numpy()] = True
     return visits
+
+
+def _differs(before: Snapshot, candidate: Snapshot, region: int) -> bool:
+    """Return whether the region's network is another one."""
+    mixed = before.with_regions(candidate, [region])
+    return not all(th.equal(value, before.actor[name]) for name, value in mixed.actor.items())
 
 
 def _name(env: Any) -> str:

@@ -132,6 +132,18 @@ def test_a_policy_that_is_better_before_training_is_kept() -> None:
     assert guard.state.evidence.paired.costs.mean() < guard.state.evidence.paired.mpc_costs.mean()
 
 
+@pytest.mark.parametrize("margin", [0.0, 0.01])
+def test_rounding_alone_neither_refuses_a_policy_before_training_nor_a_candidate(margin) -> None:
+    for before in (True, False):
+        model, guard = build(gradient_steps=0), make_guard(partial(Slide, low=2.0), margin=margin)
+        change = partial(correct, region=LEFT, value=-0.5)  # no start comes there
+        if before:
+            change(model.policy)
+        train(model, STEPS, *([] if before else [At([1], change)]), guard)
+        assert verdicts(guard) == ([] if before else ["accepted"])
+        assert not model.policy.actor.mu.network.is_zero()
+
+
 def test_sabotage_before_a_second_learn_is_rejected_too() -> None:
     model, guard = build(gradient_steps=0), make_guard()
     train(model, STEPS, At([1], better), guard)

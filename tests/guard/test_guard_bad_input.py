@@ -1,0 +1,90 @@
+"""Bad input is an error that names what it was, before any training."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from guard_samples import STEPS, Slide, build, make_guard, train
+from gymnasium.wrappers import TransformObservation
+from stable_baselines3 import DDPG
+
+from sb3_yann import ImprovementGuard
+
+BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"env": 3}, TypeError, "env = 3 must be the id of an environment"),
+    ({"env": ["CSTR-v0"]}, TypeError, r"env = \['CSTR-v0'\] must be"),
+    ({"n_starts": 0}, ValueError, "n_starts = 0 must be a whole number of at least 1"),
+    ({"n_starts": 2.5}, ValueError, "n_starts = 2.5 must be a whole number"),
+    ({"n_starts": True}, ValueError, "n_starts = True must be a whole number"),
+    ({"seed": -1}, ValueError, "seed = -1 must be a whole number of at least 0"),
+    ({"every": 0}, ValueError, "every = 0 must be"),
+    ({"every": None}, ValueError, "every = None must be"),
+    ({"patience": 0}, ValueError, "patience = 0 must be"),
+    ({"trial_episodes": 2}, ValueError, "trial_episodes = 2 must be a whole number of at least 3"),
+    ({"margin": -0.1}, ValueError, "margin = -0.1 must be"),
+    ({"margin": np.nan}, ValueError, "margin = nan must be"),
+    ({"margin": "1 %"}, TypeError, "margin = '1 %' must be a number"),
+    ({"shrink": 1.5}, ValueError, "shrink = 1.5 must be between 0 and 1"),
+    ({"grow": 0.9}, ValueError, "grow = 0.9 must be between 1 and inf"),
+    ({"grow": np.inf}, ValueError, "grow = inf must be"),
+    ({"smallest_step": 2}, ValueError, "smallest_step = 2 must be between 0 and 1"),
+    ({"significance": 0.6}, ValueError, "significance = 0.6 must be between 0 and 0.5"),
+    ({"by_region": "no"}, TypeError, "by_region = 'no' must be True or False"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "error", "message"), BAD)
+def test_a_bad_argument_is_named_with_its_value(arguments, error, message) -> None:
+    with pytest.raises(error, match=message):
+        ImprovementGuard(**{"env": None, **arguments})
+
+
+def test_an_id_alone_is_enough() -> None:
+    assert isinstance(ImprovementGuard("CSTR-v0"), ImprovementGuard)
+
+
+@pytest.mark.parametrize("name", ["state", "decisions"])
+def test_before_learn_the_guard_says_that_it_has_no_state_yet(name) -> None:
+    with pytest.raises(RuntimeError, match="no state yet: pass it to learn"):
+        getattr(make_guard(), name)
+
+
+@pytest.mark.parametrize("how", ["itself", "wrapped", "by a function"])
+def test_the_training_env_is_refused(how) -> None:
+    env = Slide()
+    wrapped = gym.wrappers.TimeLimit(env, STEPS)
+    given = {"itself": env, "wrapped": wrapped, "by a function": lambda: env}[how]
+    model = build(env=env)
+    with pytest.raises(ValueError, match="the training env, whose episodes its own would"):
+        train(model, STEPS, make_guard(given))
+
+
+def two_observations() -> gym.Env:
+    space = gym.spaces.Box(-5, 5, (2,), np.float32)
+    return TransformObservation(Slide(), lambda x: np.repeat(x, 2), space)
+
+
+def other_actions(low: float) -> gym.Env:
+    env = Slide()
+    env.action_space = gym.spaces.Box(low, 1, (1,), np.float32)
+    return env
+
+
+@pytest.mark.parametrize("env", [two_observations, partial(other_actions, -2)])
+def test_a_simulator_of_another_shape_is_refused(env) -> None:
+    with pytest.raises(ValueError, match="Give the guard a simulator of this plant"):
+        train(build(), STEPS, make_guard(env))
+
+
+def test_a_policy_without_an_mpc_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"compares a YannPolicy with its MPC.*TD3Policy"):
+        train(DDPG("MlpPolicy", Slide()), STEPS, make_guard())
+
+
+def test_an_unknown_id_is_gymnasium_s_own_error() -> None:
+    with pytest.raises(gym.error.NameNotFound, match="Sldie"):
+        train(build(), STEPS, make_guard("Sldie-v0"))

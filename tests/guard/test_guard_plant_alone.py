@@ -1,0 +1,306 @@
+"""Without a simulator: blocks of training episodes, in which the actor learns or rests."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from guard_samples import (
+    MPC,
+    REGION,
+    RIGHT,
+    STEPS,
+    At,
+    Slide,
+    accepted_bits,
+    actor_bits,
+    better,
+    bits,
+    build,
+    correct,
+    critic_bits,
+    make_guard,
+    overwrite,
+    random_states,
+    randomize,
+    train,
+    verdicts,
+)
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_yann.guard.plant import predicted_cost
+
+BLOCK = 3 * STEPS
+# One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
+plant = partial(Slide, low=2.0, high=2.8)
+
+
+def guard_alone(**kwargs):
+    return make_guard(None, **({"trial_episodes": 3} | kwargs))
+
+
+def still(**kwargs):
+    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
+
+
+class Phases(At):
+    """Notes the phase after each step, and the actor."""
+
+    def __init__(self, guard) -> None:
+        super().__init__(range(10_000), self.note)
+        self.guard, self.phases, self.actors = guard, [], []
+
+    def note(self, policy) -> None:
+        self.phases.append(self.guard.state.evidence.phase)
+        self.actors.append(bits(policy.actor.state_dict()))
+
+
+def test_a_better_candidate_passes_after_a_first_a_learning_and_a_trial_block() -> None:
+    model, guard = still(), guard_alone()
+    train(model, 3 * BLOCK, At([BLOCK + 2], better), guard, phases := Phases(guard))
+    first, learning, trial = ["first"] * (BLOCK - 1), ["learning"] * BLOCK, ["trial"] * BLOCK
+    assert phases.phases == [*first, *learning, *trial, "learning"]
+    (decision,) = guard.decisions
+    assert decision.verdict == "accepted"
+    assert (decision.timestep, decision.episode) == (3 * BLOCK, 9)
+    assert decision.reason.startswith("p = ")
+    assert decision.candidate_cost == decision.accepted_cost == pytest.approx(4)
+    assert decision.mpc_cost == pytest.approx(4.25)
+    assert np.isnan(decision.worst_start)
+    assert actor_bits(model.policy) == accepted_bits(guard)
+    assert float(model.actor.mu.network.rest[-1].weight[REGION[RIGHT], 0, -1].detach()) == 0.5
+
+
+@pytest.mark.parametrize("value", [-0.5, 0.9, 1.2], ids=["no effect", "no better", "worse"])
+def test_a_candidate_that_is_no_better_is_taken_back(value) -> None:
+    model, guard = still(), guard_alone()
+    before = actor_bits(model.policy)
+    seen: list[bool] = []
+    look = At([3 * BLOCK], lambda policy: seen.append(actor_bits(policy) == before))
+    train(model, 3 * BLOCK, At([BLOCK], partial(correct, region=RIGHT, value=value)), guard, look)
+    # At the last step of the first block, before the guard: the actor was changed while it rested.
+    assert verdicts(guard)[0] == "rejected"
+    model, guard = still(), guard_alone()
+    move = At([BLOCK + 1], partial(correct, region=RIGHT, value=value + 0.2))
+    train(model, 3 * BLOCK, move, guard, look := At([3 * BLOCK], look.act))
+    assert verdicts(guard) == ["rejected"]
+    assert guard.decisions[0].step == 0.5
+    assert seen[-1]
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_the_actor_rests_in_the_first_and_in_trial_blocks_and_learns_in_between(algorithm) -> None:
+    model, guard = build(algorithm, env=Slide()), guard_alone(significance=0.0)
+    train(model, 5 * BLOCK, guard, phases := Phases(guard), reset_num_timesteps=True)
+    # What is noted after a step is the actor that has played it, or that was brought back then.
+    a = phases.actors
+    assert all(each == a[0] for each in a[:BLOCK])
+    assert sum(x != y for x, y in zip(a[BLOCK:], a[BLOCK + 1 : 2 * BLOCK], strict=False)) > 5
+    trial = a[2 * BLOCK : 3 * BLOCK - 1]
+    assert all(each == trial[0] for each in trial)
+    assert trial[0] != a[0]
+    assert a[3 * BLOCK - 1] == a[0]  # rejected: no size of zero is passed
+    assert a[4 * BLOCK - 1] != a[0]
+    assert verdicts(guard) == ["rejected", "rejected"]
+    assert bits(model.policy.actor.state_dict()) == a[0]
+
+
+def test_the_critic_learns_in_all_blocks() -> None:
+    model, guard = build(env=Slide()), guard_alone()
+    critics: list[Any] = []
+    look = At(range(1, 99), lambda policy: critics.append(critic_bits(policy)["critic"]))
+    train(model, 3 * BLOCK, guard, look)
+    assert all(a != b for a, b in zip(critics, critics[1:], strict=False))
+
+
+@pytest.mark.parametrize("where", ["learning", "trial"])
+def test_a_violation_brings_the_accepted_policy_back_at_once(where) -> None:
+    model, guard = still(env=plant(limits=(-1.1, 0.2))), guard_alone()
+    before = actor_bits(model.policy)
+    # Its input is 1 in the right region, at the first step of the next episode.
+    move = At([BLOCK + 2], partial(correct, region=RIGHT, value=2.0))
+    step = BLOCK + STEPS + 1
+    if where == "trial":
+        move, step = At([2 * BLOCK - 2], move.act), 2 * BLOCK + 1
+    seen: list[bool] = []
+    look = At([step], lambda policy: seen.append(actor_bits(policy) == before))
+    train(model, 2 * BLOCK + 2, move, guard, look)
+    assert seen == [True]
+    (decision,) = guard.decisions
+    assert decision.timestep == step
+    assert decision.reason == "a limit was violated"
+    assert decision.returned
+    assert np.isnan(decision.candidate_cost)
+    assert guard.state.evidence.phase == "learning"
+
+
+class LongViolations(gym.Wrapper):
+    """Limits are violated in the fifth episode, from its second step to its end."""
+
+    episodes, t = 0, 0
+
+    def reset(self, **kwargs):
+        self.episodes, self.t = self.episodes + 1, 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        *rest, info = self.env.step(action)
+        self.t += 1
+        return *rest, {**info, "violation": self.episodes == 5 and self.t > 1}
+
+
+def test_one_violation_of_many_steps_is_one_rejection_and_the_actor_rests_until_it_is_over() -> (
+    None
+):
+    model, guard = build(env=LongViolations(Slide())), guard_alone()
+    phases = Phases(guard)
+    train(model, BLOCK + 3 * STEPS, guard, phases)
+    assert [each.reason for each in guard.decisions] == ["a limit was violated"]
+    assert guard.decisions[0].step == 0.5
+    at = BLOCK + STEPS + 1  # the second step of the fifth episode, from 0
+    accepted = bits(guard.state.accepted.actor)
+    assert phases.actors[at - 1] != accepted
+    assert all(each == accepted for each in phases.actors[at : at + STEPS - 1])
+    assert phases.actors[-1] != accepted  # and then it learns again
+
+
+def test_a_violation_of_the_accepted_policy_itself_is_no_rejection() -> None:
+    model, guard = still(env=plant(limits=(-0.5, 1.1))), guard_alone()
+    train(model, 2 * BLOCK, guard)
+    assert guard.decisions == []
+    assert guard.state.evidence.phase == "trial" or guard.state.evidence.phase == "learning"
+
+
+@pytest.mark.parametrize("sabotage", [randomize, partial(overwrite, value=np.nan)])
+@pytest.mark.parametrize("place", ["before the guard", "after the guard"])
+@pytest.mark.parametrize("step", [STEPS + 1, 2 * BLOCK + STEPS + 1], ids=["first", "trial"])
+def test_sabotage_while_the_actor_rests_is_taken_back_at_once(sabotage, place, step) -> None:
+    model, guard = still(env=Steady(plant())), guard_alone()
+    before = actor_bits(model.policy)
+    good, bad = At([BLOCK + 1], partial(correct, region=RIGHT, value=0.3)), At([step], sabotage)
+    seen: list[bool] = []
+    late = place == "after the guard"
+    look = At([step + late], lambda policy: seen.append(actor_bits(policy) == before))
+    callbacks = [good, guard, bad] if late else [good, bad, guard]
+    train(model, 2 * BLOCK + 2 * STEPS, *callbacks, look)
+    assert seen == [True]
+    assert guard.decisions[0].reason == "the actor was changed while it rested"
+    assert guard.decisions[0].timestep == step + late
+    assert actor_bits(model.policy) == before
+    if guard.state.evidence.accepted is not None:  # without an episode of the saboteur's
+        np.testing.assert_allclose(guard.state.evidence.accepted.costs, 4.25)
+
+
+class Steady(gym.ActionWrapper):
+    """Puts up with inputs that are no numbers."""
+
+    def action(self, action):
+        return np.nan_to_num(action)
+
+
+def test_at_the_end_an_unfinished_trial_leaves_the_accepted_policy() -> None:
+    model, guard = still(), guard_alone()
+    before = actor_bits(model.policy)
+    train(model, 3 * BLOCK - 1, At([BLOCK + 1], better), guard)
+    assert guard.decisions == []
+    assert actor_bits(model.policy) == before == accepted_bits(guard)
+    evidence = guard.state.evidence
+    assert (evidence.phase, evidence.costs, evidence.predicted) == ("learning", [], [])
+    assert model.policy.actor_step == 1
+
+
+def test_a_second_learn_counts_whole_episodes_only() -> None:
+    model, guard = still(), guard_alone()
+    train(model, STEPS + 2, guard)
+    assert guard.state.evidence.costs == [pytest.approx(4.25)]
+    train(model, 2 * STEPS + 2, guard, reset_num_timesteps=False)  # from the middle of an episode
+    assert guard.state.evidence.costs == [pytest.approx(4.25)] * 2 or (
+        guard.state.evidence.phase == "learning"
+    )
+    evidence = guard.state.evidence
+    costs = evidence.costs if evidence.accepted is None else evidence.accepted.costs
+    np.testing.assert_allclose(costs, 4.25)
+
+
+def test_two_plants_side_by_side_count_the_episodes_that_began_in_the_block() -> None:
+    # The second plant's episodes are one step longer, so that they straddle the blocks.
+    longer = gym.wrappers.TransformReward(Slower(plant()), lambda reward: reward)
+    model = still(env=DummyVecEnv([plant, lambda: longer]))
+    guard = guard_alone(trial_episodes=4)
+    phases = Phases(guard)
+    train(model, 200, At([14], better), guard, phases)
+    assert {"first", "learning", "trial"} == set(phases.phases)
+    assert verdicts(guard)[0] == "accepted" or guard.decisions[0].reason.startswith("p = ")
+    assert len(guard.state.evidence.mpc.costs) >= 4
+    np.testing.assert_array_less(4, guard.state.evidence.mpc.costs)
+
+
+class Slower(gym.Wrapper):
+    """Goes on for one step after the episode's end."""
+
+    over = False
+
+    def step(self, action):
+        *rest, _, truncated, info = self.env.step(action)
+        over, self.over = self.over, truncated
+        self.over = truncated and not over
+        return *rest, False, over or self.env.unwrapped.t > STEPS, info
+
+
+def test_a_run_that_was_stopped_in_a_trial_goes_on_in_it(tmp_path) -> None:
+    model, guard = still(), guard_alone()
+    stop = 2 * BLOCK + STEPS + 1
+    save = CheckpointCallback(stop, str(tmp_path), "model")
+    train(model, stop + 1, At([BLOCK + 1], better), guard, save)
+    loaded = DDPG.load(tmp_path / f"model_{stop}_steps", env=plant(), device="cpu")
+    again = guard_alone()
+    train(loaded, 2 * STEPS, again, phases := Phases(again), reset_num_timesteps=False)
+    assert again.decisions == []  # the first episode after the load is not taken for a whole one
+    assert phases.phases == ["trial"] * 2 * STEPS
+    loaded = DDPG.load(tmp_path / f"model_{stop}_steps", env=plant(), device="cpu")
+    train(loaded, 3 * STEPS, again := guard_alone(), reset_num_timesteps=False)
+    assert verdicts(again) == ["accepted"]
+    np.testing.assert_allclose(again.state.evidence.mpc.costs, 4.25)
+    np.testing.assert_allclose(again.state.evidence.accepted.costs, 4.0)
+
+
+def test_a_policy_that_was_trained_already_is_the_first_accepted_one_not_the_mpc() -> None:
+    model, guard = still(), guard_alone()
+    better(model.policy)
+    before = actor_bits(model.policy)
+    train(model, BLOCK + 1, guard)
+    assert guard.state.evidence.mpc is None
+    np.testing.assert_allclose(guard.state.evidence.accepted.costs, 4.0)
+    assert actor_bits(model.policy) == before
+
+
+def test_the_covariate_is_the_cost_of_the_mpc_on_its_own_model_from_the_start_of_the_episode() -> (
+    None
+):
+    model, guard = still(env=Slide()), guard_alone()
+    train(model, BLOCK, guard)
+    predicted = guard.state.evidence.accepted.predicted
+    starts = model.replay_buffer.observations[:BLOCK:STEPS, 0]
+    for value, start in zip(predicted, starts, strict=True):
+        x, expected = start.astype(float), 0.0
+        for _ in range(STEPS):
+            u = MPC.explicit()(x)
+            expected += float(x[0] ** 2 + u[0] ** 2)
+            x = 1.1 * x + u
+        assert value == pytest.approx(expected)
+        assert predicted_cost(MPC, start.astype(float), STEPS) == pytest.approx(expected)
+
+
+def test_a_plant_alone_draws_no_random_numbers() -> None:
+    states = []
+    for callbacks in ([], [guard_alone()]):
+        model = build(env=Slide())
+        train(model, 4 * BLOCK, *callbacks)
+        states.append([random_states(), model.env.envs[0].unwrapped.np_random.bit_generator.state])
+        states[-1].append(model.env.envs[0].unwrapped.played)
+    assert states[0] == states[1]
