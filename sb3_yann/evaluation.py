@@ -20,7 +20,7 @@ class Predictor(Protocol):
     """What Stable-Baselines3's models and policies offer."""
 
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
-        """Return the action for an observation, and a recurrent state."""
+        """Return the actions for a batch of observations, and a recurrent state."""
 
 
 @dataclass(frozen=True)

@@ -133,8 +133,9 @@ class ImprovementGuard(BaseCallback):
         ):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}.")
-        if not isinstance(by_region, bool):
-            raise TypeError(f"by_region = {by_region!r} must be True or False.")
+        for name, flag in (("by_region", by_region), ("wander", wander)):
+            if not isinstance(flag, bool):
+                raise TypeError(f"{name} = {flag!r} must be True or False.")
         for name, factor, low, high in (
             ("margin", margin, 0.0, np.inf),
             ("shrink", shrink, 0.0, 1.0),

@@ -164,8 +164,17 @@ class AfterstateValue(nn.Module):
         }
         for name, value in constants.items():
             self.register_buffer(name, th.as_tensor(value, dtype=th.float64))
+        n, m = len(theta_half), len(u_min)
+        rest = th.zeros(2, n + m, dtype=th.float64)
+        predicted = self.model(rest[:, :n], rest[:, n:])
+        if not isinstance(predicted, th.Tensor) or predicted.shape != (2, n):
+            shape = getattr(predicted, "shape", type(predicted).__name__)
+            raise ValueError(
+                f"The prediction model returned {shape} for theta of shape (2, {n}) and u of shape "
+                f"(2, {m}); it must return the next theta, a tensor of shape (2, {n})."
+            )
         self.network = ZeroOutputNetwork(
-            len(theta_half), 1, hidden, activation=activation, pinned=th.tensor([pinned])
+            n, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
@@ -201,7 +210,7 @@ class LinearPrediction(nn.Module):
 
 def _untrained(model: nn.Module) -> nn.Module:
     """Return a copy with buffers for parameters: no optimizer or target update moves those."""
-    model = copy.deepcopy(model)
+    model = copy.deepcopy(model).double()
     for module in model.modules():
         for name, parameter in [*module.named_parameters(recurse=False)]:
             delattr(module, name)

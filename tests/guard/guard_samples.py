@@ -85,7 +85,7 @@ def build(algorithm=DDPG, env: Any = None, actor: dict[str, Any] | None = None, 
 
 
 def make_guard(env: Any = Slide, **kwargs) -> ImprovementGuard:
-    return ImprovementGuard(env, **({"n_starts": 10} | kwargs))
+    return ImprovementGuard(env, **({"n_starts": 10, "patience": 1} | kwargs))
 
 
 @th.no_grad()

@@ -33,6 +33,7 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"grow": np.inf}, ValueError, "grow = inf must be"),
     ({"smallest_step": 2}, ValueError, "smallest_step = 2 must be between 0 and 1"),
     ({"significance": 0.6}, ValueError, "significance = 0.6 must be between 0 and 0.5"),
+    ({"wander": 1}, TypeError, "wander = 1 must be True or False"),
     ({"by_region": "no"}, TypeError, "by_region = 'no' must be True or False"),
 ]
 

@@ -207,7 +207,7 @@ def test_a_second_learn_goes_on_and_the_step_is_the_one_decided_last() -> None:
 
 
 def test_one_guard_may_serve_two_models_one_after_the_other() -> None:
-    guard = make_guard(patience=2)
+    guard = make_guard(patience=2, wander=True)
     for _ in range(2):
         three_decisions(guard)
         assert verdicts(guard) == ["accepted in part", "rejected", "accepted"]

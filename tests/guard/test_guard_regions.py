@@ -148,7 +148,7 @@ def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
 
 
 def test_regions_may_be_taken_over_while_patience_lasts() -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=2)
+    model, guard = build(gradient_steps=0), make_guard(patience=2, wander=True)
     seen: list[bytes] = []
     before, after = (
         At([STEPS], lambda policy: seen.append(bits(policy.actor.state_dict()))) for _ in range(2)

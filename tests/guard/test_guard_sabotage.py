@@ -30,6 +30,7 @@ from guard_samples import (
 )
 from stable_baselines3 import DDPG, TD3
 
+from sb3_yann import ImprovementGuard
 from sb3_yann.evaluation import evaluate
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -190,19 +191,41 @@ def test_a_violation_is_rejected_at_once_though_the_cost_falls_and_patience_is_l
     assert model.policy.actor.mu.network.is_zero()
 
 
-def test_with_patience_the_actor_goes_on_until_the_last_of_so_many_rejections() -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=3)
-    bad = At(
-        [STEPS, 2 * STEPS, 3 * STEPS],
-        lambda policy: correct(policy, LEFT, -1.8 - bad.n_calls / 100),
-    )
-    train(model, 4 * STEPS, bad, guard)
-    assert [each.returned for each in guard.decisions] == [False, False, True]
-    assert [each.step for each in guard.decisions] == [1, 1, 0.5]
+@pytest.mark.parametrize(
+    ("wander", "values", "returned"),
+    [
+        (True, [1.8, 1.9, 2.0], [False, False, True]),
+        (False, [1.8, 1.9, 2.0], [True, True, True]),  # worse than the MPC
+        (False, [0.1, 0.2, 0.1], [False, False, True]),  # better than the MPC only
+        (False, [0.1, 0.4, 0.1], [False, False, False]),  # the second one is accepted
+    ],
+)
+def test_with_patience_the_actor_goes_on_until_the_last_of_so_many_rejections(
+    wander, values, returned
+) -> None:
+    model, guard = build(gradient_steps=0), make_guard(patience=3, wander=wander)
+    left = iter([0.3, *values])
+    move = At(range(STEPS, 5 * STEPS, STEPS), lambda p: correct(p, RIGHT, next(left)))
+    train(model, 4 * STEPS + 1, move, guard)
+    assert guard.decisions[0].verdict == "accepted"
+    assert [each.returned for each in guard.decisions][1:4] == returned
+    shrunk = [each.step < 1 for each in guard.decisions][1:4]
+    assert not any(shrunk[i] for i in range(3) if not any(returned[: i + 1]))
+
+
+@pytest.mark.parametrize("sabotage", [worse, randomize, partial(overwrite, value=np.nan)])
+def test_with_the_default_patience_what_is_worse_than_the_mpc_returns_at_once(sabotage) -> None:
+    model, guard = build(gradient_steps=0), ImprovementGuard(Slide, n_starts=10)
+    before = actor_bits(model.policy)
+    seen: list[bool] = []
+    look = At([2 * STEPS], lambda policy: seen.append(actor_bits(policy) == before))
+    train(model, 2 * STEPS + 1, At([2 * STEPS], sabotage), guard, look)
+    assert seen == [True]
+    assert verdicts(guard) == ["rejected"]
 
 
 def test_with_patience_left_the_end_returns_all_the_same_and_says_so() -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=5)
+    model, guard = build(gradient_steps=0), make_guard(patience=5, wander=True)
     train(model, 2 * STEPS, At([1], worse), guard)
     assert guard.decisions[-1].returned
     assert model.policy.actor.mu.network.is_zero()

@@ -69,7 +69,7 @@ def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
 ) -> None:
     monkeypatch.setattr(Paired, "objection", lambda *_: "no")
     free, expected = after_training(algorithm)
-    model, state = after_training(algorithm, guard := make_guard(patience=1000))
+    model, state = after_training(algorithm, guard := make_guard(patience=1000, wander=True))
     assert set(verdicts(guard)) == {"rejected"}
     assert state == expected
     assert model.policy.actor.mu.network.is_zero()
