@@ -15,7 +15,8 @@ def clipped_pendulum() -> LinearMPC:
     """Return the pendulum's MPC: N = 2, states and input in their boxes, undiscounted.
 
     Q is diag(1, 0.1), the weights of the environment's own cost. The identity, which the paper
-    prints, gives 9 regions and 40 half-spaces instead.
+    prints, gives 9 regions and 40 half-spaces instead. Where there is no solution, no torque is
+    applied, as by the paper's network: the pendulum then swings through, and is often caught.
     """
     model = LinearModel(pendulum.PRINTED_A, pendulum.PRINTED_B, pendulum.DT)
     return LinearMPC(
@@ -27,6 +28,7 @@ def clipped_pendulum() -> LinearMPC:
         x_max=[2.0, 8.0],
         u_min=-2.0,
         u_max=2.0,
+        outside="zero",
     )
 
 

@@ -46,15 +46,17 @@ def write_report(
     Learners and plants that are not there are left out. The text of `notes` is included as it is.
     """
     pictures = save_pictures(outcomes, folder)
-    as_printed = [paper_table(outcomes, plant, EPISODES) for plant in plants_of(outcomes)]
+    longest = max((run.episodes for run in outcomes), default=0)
+    episodes = min(EPISODES, longest)  # fewer only in a quick form
+    as_printed = [paper_table(outcomes, plant, episodes) for plant in plants_of(outcomes)]
     curves = [f"![{plant}]({path.name})" for plant, path in pictures.items()]
     parts = [
         "# Results",
         how_it_was_made(outcomes, command),
         what_was_reached(outcomes),
         *_headed("## The paper's tables", as_printed),
-        *_tables(outcomes, EPISODES),
-        *_variants(outcomes, EPISODES),
+        *_tables(outcomes, episodes, LEGEND),
+        *_variants(outcomes, episodes),
         *_tables(outcomes, LONG),
         *_headed(f"## Learning curves\n\n{CURVES}", curves),
         notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
@@ -104,7 +106,7 @@ def _headed(heading: str, parts: list[str]) -> list[str]:
     return [heading, *parts] if any(parts) else []
 
 
-def _tables(outcomes: Mapping[Run, Outcome], episodes: int) -> list[str]:
+def _tables(outcomes: Mapping[Run, Outcome], episodes: int, legend: str = "") -> list[str]:
     """Return the section of all learners after so many training episodes."""
     parts: list[str] = []
     for plant in plants_of(outcomes):
@@ -117,8 +119,7 @@ def _tables(outcomes: Mapping[Run, Outcome], episodes: int) -> list[str]:
             parts += [f"### {plant}", tested, "While learning:", taught]
     if not parts:
         return []
-    explained = [LEGEND] if episodes == EPISODES else []
-    return [f"## After {episodes} training episodes", *explained, *parts]
+    return [f"## After {episodes} training episodes", legend, *parts]
 
 
 def _variants(outcomes: Mapping[Run, Outcome], episodes: int) -> list[str]:
