@@ -7,7 +7,7 @@ policy alias ``"YannPolicy"`` with TD3 and DDPG.
 import sb3_yann_envs
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import ExplicitSolutionError, LinearModel, LinearMPC, PiecewiseAffine
-from sb3_yann.guard import Decision, ImprovementGuard
+from sb3_yann.guard import Decision, ImprovementGuard, restore_accepted
 from sb3_yann.policies import YannActor, YannCritic, YannPolicy
 from sb3_yann.problems import register_problem
 
@@ -26,6 +26,7 @@ __all__ = [
     "YannCritic",
     "YannPolicy",
     "register_problem",
+    "restore_accepted",
 ]
 
 sb3_yann_envs.register_envs()

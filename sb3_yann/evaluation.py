@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann.control import PiecewiseAffine
 
 Array = NDArray[np.float64]
+LONGEST = 1_000_000
+"""Steps after which an episode is taken for one that never ends."""
 
 
 class Predictor(Protocol):
@@ -35,12 +37,15 @@ class Episodes:
         Steps whose ``info["violation"]`` is true.
     observations : tuple of ndarray, shapes (steps + 1, n)
     actions : tuple of ndarray, shapes (steps, m)
+    terminated : ndarray of bool, shape (episodes,)
+        Whether the env ended the episode itself, other than by a time limit.
     """
 
     costs: Array
     violations: NDArray[np.int64]
     observations: tuple[Array, ...]
     actions: tuple[Array, ...]
+    terminated: NDArray[np.bool_]
 
 
 def evaluate(
@@ -57,13 +62,21 @@ def evaluate(
         Something with ``predict(observation, deterministic=True)``, or a function from an
         observation to an action, such as the explicit law.
     env : gymnasium.Env, str or callable
-        Must end its episodes. Of one that is named, or made by a function without arguments,
-        there are as many as seeds: they run side by side, the policy sees them as one batch, and
+        Must end its episodes, within a million steps. Of one that is named, or made by a function
+        without arguments, there are as many as seeds: they run side by side, the policy sees them
+        as one batch, and
         they are closed. One that is given runs its episodes one after the other.
     seeds : iterable of int
-        ``env.reset(seed=seed)`` starts each episode.
+        ``env.reset(seed=seed)`` starts each episode; the rest of it must follow from that.
     starts : sequence of array_like, optional
         The state of each start, ``env.reset(options={"state": ...})``, for envs that have one.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the policy or env is of another kind, or a function makes the same env twice.
+    RuntimeError
+        If an episode does not end.
     """
     seeds = [*seeds]
     options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]
@@ -74,12 +87,18 @@ def evaluate(
     else:
         with ExitStack() as stack:
             envs = [stack.enter_context(one_env(env)) for _ in seeds]
+            if len({id(each.unwrapped) for each in envs}) < len(envs):
+                raise ValueError(
+                    "The function that makes envs returned the same one twice, and their episodes "
+                    "run side by side. Make a new one each time, or pass the env itself."
+                )
             episodes = _side_by_side(act, envs, resets)
     return Episodes(
         np.array([episode.cost for episode in episodes]),
         np.array([episode.violations for episode in episodes], dtype=np.int64),
         tuple(np.array(episode.observations, float) for episode in episodes),
         tuple(np.array(episode.actions, float) for episode in episodes),
+        np.array([episode.terminated for episode in episodes], dtype=bool),
     )
 
 
@@ -92,6 +111,8 @@ def one_env(
         yield env
         return
     made = gym.make(env, disable_env_checker=True) if isinstance(env, str) else env()
+    if not isinstance(made, gym.Env):
+        raise TypeError(f"The function that makes envs returned {made!r}, not a gymnasium.Env.")
     with closing(made):
         yield made
 
@@ -102,6 +123,7 @@ class _Episode:
     actions: list[Any] = field(default_factory=list)
     cost: float = 0.0
     violations: int = 0
+    terminated: bool = False
 
 
 def _as_batch_function(policy: Predictor | Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -121,7 +143,8 @@ def _side_by_side(
 ) -> list[_Episode]:
     """Run one episode in each env; those that are over wait for the others."""
     episodes = [
-        _Episode([env.reset(seed=seed, options=options)[0]])
+        # A copy: an env may write its next observation into the same array.
+        _Episode([np.array(env.reset(seed=seed, options=options)[0])])
         for env, (seed, options) in zip(envs, resets, strict=True)
     ]
     running = [*zip(envs, episodes, strict=True)]
@@ -130,11 +153,17 @@ def _side_by_side(
         going_on = []
         for (env, episode), action in zip(running, actions, strict=True):
             observation, reward, terminated, truncated, info = env.step(action)
-            episode.observations.append(observation)
+            episode.observations.append(np.array(observation))
             episode.actions.append(action)
             episode.cost -= float(reward)
             episode.violations += bool(info.get("violation", False))
+            episode.terminated = bool(terminated)
             if not (terminated or truncated):
                 going_on.append((env, episode))
+            if len(episode.actions) == LONGEST:
+                raise RuntimeError(
+                    f"An episode of {env} has not ended after {LONGEST} steps. Give it a limit: "
+                    "max_episode_steps when it is registered, or gymnasium.wrappers.TimeLimit."
+                )
         running = going_on
     return episodes

@@ -199,7 +199,11 @@ def fake(costs: list[float]) -> Episodes:
     steps = np.linspace(0, 1, 11)[:, None]
     episodes = len(costs)
     return Episodes(
-        np.array(costs), np.zeros(episodes, int), (steps,) * episodes, (steps[1:],) * episodes
+        np.array(costs),
+        np.zeros(episodes, int),
+        (steps,) * episodes,
+        (steps[1:],) * episodes,
+        np.zeros(episodes, bool),
     )
 
 

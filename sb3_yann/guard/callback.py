@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -23,18 +24,21 @@ from sb3_yann.policies import YannPolicy
 
 
 class ImprovementGuard(BaseCallback):
-    """Keeps the policy from ever being worse than its MPC: what does not improve is taken back.
+    """Takes back what does not improve on the MPC, start by start.
 
     Every few training episodes the present actor is a candidate. It is accepted where it is no
-    worse than the last accepted one; otherwise actor, target actor and the actor's optimizer return
-    to the accepted state, bit for bit, while the critic goes on learning. A rejection shrinks the
-    actor's steps and an acceptance lets them grow again. When `learn` returns, the model *is* the
-    accepted policy.
+    worse than the last accepted one. Otherwise it is refused, at once or when ``patience`` is
+    over actor, target actor and the actor's optimizer return to the accepted state, bit for bit,
+    and the critic goes on learning. A return shrinks the actor's steps and an acceptance lets them
+    grow again. When `learn` returns, the model *is* the accepted policy. Until then, after an
+    exception and in the zips of a CheckpointCallback, it is a candidate:
+    :func:`restore_accepted` puts the accepted policy in its place.
 
     **With a simulator** (``env`` given) the deterministic policy plays seeded episodes there,
     from the same starts as the accepted policy and the untouched MPC did. It is refused if its
     mean cost is above the accepted policy's, if one start costs more than with the MPC by more than
-    the margin, or if it violates a limit where the accepted policy does not. Where the whole
+    the margin, or if an episode has more steps with ``info["violation"]`` than the accepted
+    policy's, or is terminated by the env where the accepted policy's is not. Where the whole
     is refused, the networks of some regions may still be accepted, under the same conditions. A
     refused candidate that is better than the MPC on average gets ``patience``.
 
@@ -46,7 +50,8 @@ class ImprovementGuard(BaseCallback):
     or a change of the actor while it rests, brings the accepted policy back at once; after a
     violation the actor rests until that episode is over. The first policy that is accepted is the
     one that training starts with, and plays the first block. Each test errs with probability
-    ``significance``, so a policy that is worse *can* pass; the simulator's paired episodes have no
+    ``significance``, so a policy that is worse *can* pass (one of ten tests that find no
+    difference does with a probability of about 20 %); the simulator's paired episodes have no
     such chance, but hold for their starts only.
 
     The guard draws no random numbers and leaves the training env and the buffer alone. Its state
@@ -86,7 +91,8 @@ class ImprovementGuard(BaseCallback):
     significance : float, default 0.05
         Size of the test, on a plant alone.
     record : path-like, optional
-        A CSV file of all decisions, up to date after each one; ``guard.decisions`` has them too.
+        A CSV file of all decisions, up to date after each one (see :class:`Decision`);
+        ``guard.decisions`` has them too. There are none before the critic's warm-up is over.
     verbose : int, default 0
         1 prints each decision.
 
@@ -124,6 +130,8 @@ class ImprovementGuard(BaseCallback):
                 f"env = {env!r} must be the id of an environment, a gymnasium.Env, a function that "
                 "makes one, or None to decide from the training episodes."
             )
+        if record is not None and Path(record).is_dir():
+            raise ValueError(f"record = {record!r} is a folder; name a file in it.")
         for name, value, least in (
             ("n_starts", n_starts, 1),
             ("seed", seed, 0),
@@ -131,7 +139,7 @@ class ImprovementGuard(BaseCallback):
             ("patience", patience, 1),
             ("trial_episodes", trial_episodes, 3),
         ):
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
                 raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}.")
         for name, flag in (("by_region", by_region), ("wander", wander)):
             if not isinstance(flag, bool):
@@ -183,11 +191,14 @@ class ImprovementGuard(BaseCallback):
         self.trials.start(self)
         known = getattr(self.model, "guard_state", None)
         if known is None or known.settings != self.trials.settings:
-            self.model.guard_state = GuardState(  # type: ignore[attr-defined]
-                self.trials.settings, Snapshot.of(self.policy), evidence=None
-            )
+            state = GuardState(self.trials.settings, Snapshot.of(self.policy), evidence=None)
+            if known is not None:  # other starts or another plant: the policies are tried anew
+                state.decisions, state.episodes = known.decisions, known.episodes
+            self.model.guard_state = state  # type: ignore[attr-defined]
             self.trials.first_evidence(self)
         self.policy.actor_step = self.state.step
+        if self.record is not None:
+            write_csv(self.record, self.decisions)
 
     def _on_step(self) -> bool:
         self.state.episodes += int(np.sum(self.locals["dones"]))
@@ -196,9 +207,7 @@ class ImprovementGuard(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.trials.end(self)
-        if not same(self.state.accepted, self.policy):
-            self.state.accepted.restore(self.policy)
-        self.policy.actor_step = 1.0
+        restore_accepted(self.model)
 
     # What the trials call.
 
@@ -239,3 +248,22 @@ class ImprovementGuard(BaseCallback):
                 + (f" ({decision.reason})" if decision.reason else "")
                 + f"; mean cost {decision.accepted_cost:.6g}, MPC {decision.mpc_cost:.6g}"
             )
+
+
+def restore_accepted(model: BaseAlgorithm) -> None:
+    """Make the policy that a guard accepted last the model's, in training or after a load.
+
+    For what `learn` does at its end and an exception leaves undone, and for a model that was saved
+    in the midst of training.
+
+    Raises
+    ------
+    ValueError
+        If no guard has been at work on the model.
+    """
+    state, policy = getattr(model, "guard_state", None), model.policy
+    if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
+        raise ValueError(f"No ImprovementGuard has been at work on this {type(model).__name__}.")
+    if not same(state.accepted, policy):
+        state.accepted.restore(policy)
+    policy.actor_step = 1.0

@@ -72,16 +72,22 @@ class PlantEpisodes:
 
 
 def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
-    """Return the one-sided p-value of "the candidate costs less" against "it does not".
+    """Return the one-sided p-value of "the candidate costs less" against "it does not"."""
+    return compared(candidate, accepted)[1]
+
+
+def compared(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, float]:
+    """Return how much more the candidate costs from the same starts, and the one-sided p-value.
 
     Analysis of covariance: ordinary least squares of the cost on the cost predicted by the linear
     model and on which policy played; Student's t test of the policy's coefficient. It assumes
     independent episodes with normal residuals of one variance and one slope for both policies
-    (e.g. Montgomery, *Design and Analysis of Experiments*, chapter 15).
+    (e.g. Montgomery, *Design and Analysis of Experiments*, chapter 15). Where nothing can be told
+    the difference is nan and p is 1.
     """
     costs = np.concatenate([candidate.costs, accepted.costs])
     if not np.all(np.isfinite(costs)):
-        return 1.0
+        return np.nan, 1.0
     is_candidate = np.arange(len(costs)) < len(candidate.costs)
     predicted = np.concatenate([candidate.predicted, accepted.predicted])
     columns = [np.ones(len(costs)), is_candidate.astype(float)]
@@ -92,13 +98,13 @@ def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> 
     if freedom < 1:
         raise ValueError(f"{len(costs)} episodes are too few to compare two policies.")
     if np.linalg.matrix_rank(X) < X.shape[1]:
-        return 1.0  # the starts alone tell the two policies' episodes apart
+        return np.nan, 1.0  # the starts alone tell the two policies' episodes apart
     coefficients, *_ = np.linalg.lstsq(X, costs, rcond=None)
     difference = coefficients[1]
     if abs(difference) <= 1e-12 * np.abs(costs).max():
-        return 1.0  # rounding: "no difference" is no improvement
+        return 0.0, 1.0  # rounding: "no difference" is no improvement
     variance = np.sum((costs - X @ coefficients) ** 2) / freedom
     error = np.sqrt(variance * np.linalg.pinv(X.T @ X)[1, 1])
     # Without any scatter the sign alone decides.
     t = difference / error if error > 0 else np.sign(difference) * np.inf
-    return float(stats.t.cdf(t, freedom))
+    return float(difference), float(stats.t.cdf(t, freedom))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann.control import LinearMPC
-from sb3_yann.guard.judging import PlantEpisodes, probability_of_chance
+from sb3_yann.guard.judging import PlantEpisodes, compared
 from sb3_yann.guard.record import Decision
 from sb3_yann.guard.snapshot import Snapshot, same
 
@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 class Evidence:
     """Episodes of the MPC, of the accepted policy, and of the block that is being played.
 
-    ``resting`` is the policy that plays a block in which the actor does not learn.
+    ``resting`` is the policy that plays a block in which the actor does not learn; ``terminates``
+    says whether an episode of an accepted policy was ended by the env itself.
     """
 
     phase: Literal["first", "learning", "trial"] = "first"
@@ -32,6 +33,7 @@ class Evidence:
     costs: list[float] = field(default_factory=list)
     predicted: list[float] = field(default_factory=list)
     resting: Snapshot | None = None
+    terminates: bool = False
 
 
 class PlantTrials:
@@ -67,10 +69,13 @@ class PlantTrials:
                 self.starts[i], self.blocks[i] = observations[i].copy(), self.block
             self.costs[i] -= float(guard.locals["rewards"][i])
             self.lengths[i] += 1
-            if infos[i].get("violation", False):
+            terminated = bool(done and not infos[i].get("TimeLimit.truncated", False))
+            if infos[i].get("violation", False) or (terminated and not evidence.terminates):
                 self.violated[i] = True
                 if not same(guard.state.accepted, guard.policy):
                     self._return(guard, evidence, "a limit was violated")
+                elif terminated:
+                    evidence.terminates = True
             if done:
                 if self.blocks[i] == self.block:
                     evidence.costs.append(float(self.costs[i]))
@@ -120,8 +125,8 @@ class PlantTrials:
                 evidence.mpc = played
         elif not same(guard.state.accepted, guard.policy):
             assert evidence.accepted is not None
-            chance = probability_of_chance(played, evidence.accepted)
-            reason = f"p = {chance:.3g}"
+            difference, chance = compared(played, evidence.accepted)
+            reason = f"{difference:+.4g} from the same starts by the linear model, p = {chance:.3g}"
             if chance < self.significance:
                 evidence.accepted = played
                 guard.accept(evidence)
@@ -144,17 +149,16 @@ class PlantTrials:
 
         guard.decide(
             Decision(
-                guard.num_timesteps,
-                guard.state.episodes,
-                verdict,
-                reason,
-                verdict == "rejected",
-                float(cost),
-                mean(evidence.accepted),
-                mean(evidence.mpc),
-                np.nan,
-                (),
-                guard.state.step,
+                timestep=guard.num_timesteps,
+                episode=guard.state.episodes,
+                verdict=verdict,
+                reason=reason,
+                returned=verdict == "rejected",
+                candidate_cost=float(cost),
+                accepted_cost=mean(evidence.accepted),
+                mpc_cost=mean(evidence.mpc),
+                worst_start=np.nan,
+                regions=(),
             )
         )
 

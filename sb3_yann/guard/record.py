@@ -33,7 +33,7 @@ class Decision:
     regions : tuple of int
         Regions whose networks were taken over, where it was a part.
     step : float
-        Factor of the actor's learning rate from now on.
+        Factor of the actor's learning rate from now on; the guard fills it in.
     """
 
     timestep: int
@@ -46,7 +46,7 @@ class Decision:
     mpc_cost: float
     worst_start: float
     regions: tuple[int, ...]
-    step: float
+    step: float = 1.0
 
 
 @dataclass
@@ -58,6 +58,7 @@ class GuardState:
     evidence: Any
     step: float = 1.0
     episodes: int = 0
+    rejections: int = 0
     decisions: list[Decision] = field(default_factory=list)
 
 

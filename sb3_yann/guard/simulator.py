@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
 
 
+PART: Final = "accepted in part"
 MOST_LOST = 0.2
 """Share of losing starts beyond which no part of a candidate is looked for."""
 
@@ -67,7 +68,7 @@ class SimulatorTrials:
         wander: bool,
     ) -> None:
         self.env, self.every, self.margin, self.by_region = env, every, margin, by_region
-        self.patience, self.wander, self.rejections = patience, wander, 0
+        self.patience, self.wander = patience, wander
         self.seeds = range(seed, seed + n_starts)
         self.settings = {"env": _name(env), "seeds": self.seeds, "margin": margin}
 
@@ -88,7 +89,6 @@ class SimulatorTrials:
                     f"{guard.training_env.action_space}. Give the guard a simulator of this plant."
                 )
         self.last_trial = -self.every  # the first episode that ends is always followed by a trial
-        self.rejections = 0
 
     def first_evidence(self, guard: ImprovementGuard) -> None:
         """Play the MPC's episodes, and accept the policy if it is no worse at the start."""
@@ -97,8 +97,16 @@ class SimulatorTrials:
             guard.become_the_mpc()
         # By the actor, not the law in float64: the MPC itself is to be no worse to the last bit.
         mpc = self._play(guard, self.seeds)
+        again = self._play(guard, self.seeds)
+        for seed, first, second in zip(self.seeds, mpc.costs, again.costs, strict=True):
+            if not np.isclose(first, second, rtol=1e-6, atol=0, equal_nan=True):
+                raise ValueError(
+                    f"The MPC played two episodes of the guard's env {_name(self.env)} from the "
+                    f"seed {seed}, at costs of {first:g} and {second:g}. Episodes are compared in "
+                    "pairs: all that is random in the env must come from self.np_random."
+                )
         margin = self.margin * float(np.median(np.abs(mpc.costs)))
-        paired = Paired(mpc.costs, mpc.costs, mpc.violations, margin)
+        paired = Paired(mpc.costs, mpc.costs, unsafe(mpc), margin)
         guard.accept(self._evidence(guard, paired, mpc))
         if same(present, guard.policy):
             return
@@ -118,7 +126,8 @@ class SimulatorTrials:
 
     def end(self, guard: ImprovementGuard) -> None:
         """Try the last candidate."""
-        self.rejections = self.patience - 1  # there is no later: what is refused now returns
+        # There is no later: what is refused now returns.
+        guard.state.rejections = self.patience - 1
         self._try(guard)
 
     def _try(self, guard: ImprovementGuard) -> None:
@@ -128,21 +137,21 @@ class SimulatorTrials:
         played, reason = self._judged(guard, evidence.paired)
         if played is not None and not reason:
             guard.accept(self._evidence(guard, evidence.paired, played))
-            self.rejections = 0
+            guard.state.rejections = 0
             self._report(guard, played, reason, [], returned=False)
             return
         candidate = Snapshot.of(guard.policy)
         regions: list[int] = []
         hopeless = True
-        if played is not None and not np.any(played.violations > evidence.paired.violations):
+        if played is not None and not np.any(unsafe(played) > evidence.paired.violations):
             hopeless = not self.wander and evidence.paired.loses_to_the_mpc(played.costs)
             if self.by_region:
                 regions = self._accept_the_rest(guard, candidate, played)
-                regions += self._accept_regions(guard, candidate)
-        self.rejections += 1
-        returned = hopeless or self.rejections >= self.patience
+                regions = sorted({*regions, *self._accept_regions(guard, candidate)})
+        guard.state.rejections += 1
+        returned = hopeless or guard.state.rejections >= self.patience
         if returned:
-            self.rejections = 0
+            guard.state.rejections = 0
         (guard.state.accepted if returned else candidate).restore(guard.policy)
         self._report(guard, played, reason, regions, returned)
 
@@ -154,7 +163,7 @@ class SimulatorTrials:
             played = self._play(guard, self.seeds)
         except _NotFinite:
             return None, "an action of the actor is not a finite number"
-        return played, paired.objection(played.costs, played.violations)
+        return played, paired.objection(played.costs, unsafe(played))
 
     def _report(
         self,
@@ -167,17 +176,16 @@ class SimulatorTrials:
         paired = guard.state.evidence.paired
         guard.decide(
             Decision(
-                guard.num_timesteps,
-                guard.state.episodes,
-                "accepted" if not reason else "accepted in part" if regions else "rejected",
-                reason,
-                returned,
-                np.nan if played is None else float(played.costs.mean()),
-                float(paired.costs.mean()),
-                float(paired.mpc_costs.mean()),
-                float(np.max(paired.costs - paired.mpc_costs)),
-                tuple(regions),
-                guard.state.step,
+                timestep=guard.num_timesteps,
+                episode=guard.state.episodes,
+                verdict="accepted" if not reason else PART if regions else "rejected",
+                reason=reason,
+                returned=returned,
+                candidate_cost=np.nan if played is None else float(played.costs.mean()),
+                accepted_cost=float(paired.costs.mean()),
+                mpc_cost=float(paired.mpc_costs.mean()),
+                worst_start=float(np.max(paired.costs - paired.mpc_costs)),
+                regions=tuple(regions),
             )
         )
 
@@ -209,7 +217,7 @@ class SimulatorTrials:
             except _NotFinite:
                 break
             gained = played.costs.mean() < paired.costs.mean()
-            if gained and not paired.objection(played.costs, played.violations):
+            if gained and not paired.objection(played.costs, unsafe(played)):
                 guard.accept(self._evidence(guard, paired, played), mixed)
                 return kept
         return []
@@ -233,7 +241,7 @@ class SimulatorTrials:
             except _NotFinite:
                 continue
             costs, violations = evidence.paired.costs.copy(), evidence.paired.violations.copy()
-            costs[starts], violations[starts] = played.costs, played.violations
+            costs[starts], violations[starts] = played.costs, unsafe(played)
             if costs.mean() < evidence.paired.costs.mean() and not evidence.paired.objection(
                 costs, violations
             ):
@@ -248,8 +256,13 @@ class SimulatorTrials:
         return evaluate(_FinitePolicy(guard.policy), self.env, seeds)
 
     def _evidence(self, guard: ImprovementGuard, paired: Paired, played: Episodes) -> Evidence:
-        paired = replace(paired, costs=played.costs, violations=played.violations)
+        paired = replace(paired, costs=played.costs, violations=unsafe(played))
         return Evidence(paired, _visits(guard, played))
+
+
+def unsafe(played: Episodes) -> NDArray[np.int64]:
+    """Return the violations of each episode; to be terminated counts as one."""
+    return np.maximum(played.violations, played.terminated)
 
 
 def _visits(guard: ImprovementGuard, played: Episodes) -> NDArray[np.bool_]:
@@ -264,15 +277,18 @@ def _visits(guard: ImprovementGuard, played: Episodes) -> NDArray[np.bool_]:
 
 def _differs(before: Snapshot, candidate: Snapshot, region: int) -> bool:
     """Return whether the region's network is another one."""
-    mixed = before.with_regions(candidate, [region])
-    return not all(th.equal(value, before.actor[name]) for name, value in mixed.actor.items())
+    return not all(
+        th.equal(value[region], candidate.actor[name][region])
+        for name, value in before.networks().items()
+    )
 
 
 def _name(env: Any) -> str:
     if isinstance(env, str):
         return env
     if isinstance(env, gym.Env):
-        return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+        spec = env.spec
+        return type(env.unwrapped).__name__ if spec is None else f"{spec.id}{spec.kwargs or ''}"
     if isinstance(env, partial):  # its repr holds an address, which the next process does not have
         return f"{_name(env.func)}{env.args}{env.keywords}"
     return getattr(env, "__qualname__", repr(env))

@@ -40,15 +40,22 @@ class Snapshot:
         policy.actor_target.load_state_dict(self.target)
         policy.actor.optimizer.load_state_dict(copy.deepcopy(self.optimizer))
 
+    def networks(self) -> Parameters:
+        """Return the actor's trainable parameters; the first axis of each is the region."""
+        return {
+            name: value
+            for name, value in self.actor.items()
+            if ".network." in name and not name.endswith("pinned")
+        }
+
     def with_regions(self, other: Snapshot, regions: Iterable[int]) -> Snapshot:
         """Return a copy that has the networks of some regions, with their moments, from other."""
         index = th.tensor(sorted(regions), dtype=th.long)
         mixed = copy.deepcopy(self)
         for name in ("actor", "target"):
             ours, theirs = getattr(mixed, name), getattr(other, name)
-            for key in ours:
-                if ".network." in key and not key.endswith("pinned"):
-                    _copy_rows(ours[key], theirs[key], index)
+            for key in self.networks():
+                _copy_rows(ours[key], theirs[key], index)
         ours, theirs = mixed.optimizer["state"], other.optimizer["state"]
         for key, state in theirs.items():
             # A parameter without moments has not been stepped yet: they are zero.

@@ -165,14 +165,7 @@ class AfterstateValue(nn.Module):
         for name, value in constants.items():
             self.register_buffer(name, th.as_tensor(value, dtype=th.float64))
         n, m = len(theta_half), len(u_min)
-        rest = th.zeros(2, n + m, dtype=th.float64)
-        predicted = self.model(rest[:, :n], rest[:, n:])
-        if not isinstance(predicted, th.Tensor) or predicted.shape != (2, n):
-            shape = getattr(predicted, "shape", type(predicted).__name__)
-            raise ValueError(
-                f"The prediction model returned {shape} for theta of shape (2, {n}) and u of shape "
-                f"(2, {m}); it must return the next theta, a tensor of shape (2, {n})."
-            )
+        _check_prediction(self.model, n, m)
         self.network = ZeroOutputNetwork(
             n, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
@@ -206,6 +199,28 @@ class LinearPrediction(nn.Module):
     def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
         """Return the predicted next theta, (batch, n)."""
         return theta @ self.A + u @ self.B
+
+
+def _check_prediction(model: PredictionModel, n: int, m: int) -> None:
+    """Raise unless the model returns a next theta for each row that depends on u."""
+    batch = n + m + 1  # no other size of the problem, so that a mistaken axis shows
+    theta = th.zeros(batch, n, dtype=th.float64)
+    u = th.zeros(batch, m, dtype=th.float64, requires_grad=True)
+    with th.enable_grad():
+        predicted = model(theta, u)
+    if not isinstance(predicted, th.Tensor) or predicted.shape != theta.shape:
+        shape = getattr(predicted, "shape", type(predicted).__name__)
+        raise ValueError(
+            f"The prediction model returned {shape} for theta of shape ({batch}, {n}) and u of "
+            f"shape ({batch}, {m}); it must return the next theta, shape ({batch}, {n})."
+        )
+    if not bool(th.isfinite(predicted).all()):
+        raise ValueError(f"The prediction model returned {predicted[0].tolist()} for zeros.")
+    if not predicted.requires_grad:
+        raise ValueError(
+            "The prediction of the model has no gradient with respect to u, by which the actor "
+            "learns: compute it by operations of torch on u itself, without detach or numpy."
+        )
 
 
 def _untrained(model: nn.Module) -> nn.Module:

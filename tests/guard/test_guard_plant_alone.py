@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -69,7 +70,7 @@ def test_a_better_candidate_passes_after_a_first_a_learning_and_a_trial_block() 
     (decision,) = guard.decisions
     assert decision.verdict == "accepted"
     assert (decision.timestep, decision.episode) == (3 * BLOCK, 9)
-    assert decision.reason.startswith("p = ")
+    assert re.fullmatch(r"-\S+ from the same starts by the linear model, p = \S+", decision.reason)
     assert decision.candidate_cost == decision.accepted_cost == pytest.approx(4)
     assert decision.mpc_cost == pytest.approx(4.25)
     assert np.isnan(decision.worst_start)

@@ -187,7 +187,7 @@ def test_model_sees_physical_units_in_float64(name: str) -> None:
 
     def model(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
         seen[:] = [theta.detach(), u.detach()]
-        return theta
+        return theta + 0 * u[:, :1]
 
     rows = random_rows(name, 50)
     critic(name, model=model)(rows)
@@ -215,7 +215,7 @@ class Halving(th.nn.Module):
             self.inner.weight.copy_(0.5 * th.eye(2))
 
     def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
-        return self.inner(theta)
+        return self.inner(theta) + 0 * u
 
 
 def test_model_that_is_given_says_where_the_value_is_taken() -> None:
@@ -223,7 +223,7 @@ def test_model_that_is_given_says_where_the_value_is_taken() -> None:
     theta, u = in_physical_units("pendulum", rows)
     P, mpc = solved("pendulum").value_matrix(0.99), solved("pendulum")
     expected = mpc.stage_cost(theta, u) + 0.99 * np.einsum("bi,ij,bj->b", theta, P, theta) / 4
-    for model in (Halving(), lambda theta, u: theta / 2):
+    for model in (Halving(), lambda theta, u: theta / 2 + 0 * u):
         q = critic("pendulum", model=model)(rows).detach().numpy()[:, 0]
         np.testing.assert_allclose(q, -expected, rtol=1e-6)
 
@@ -252,3 +252,25 @@ def test_state_dict_brings_everything_back() -> None:
     other.load_state_dict(value.state_dict())
     assert th.equal(other(rows), value(rows))
     assert not [key for key in value.state_dict() if "running_" in key]
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (lambda theta, u: theta.detach(), "no gradient with respect to u"),
+        (lambda theta, u: theta / 0 + u, "returned \\[nan"),
+        (lambda theta, u: theta[:, :1] + u, "must return the next theta, shape"),
+        (lambda theta, u: [theta, u], "returned list"),
+    ],
+)
+def test_a_prediction_model_is_tried_when_it_is_given(model, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        critic("pendulum", model=model)
+
+
+def test_a_module_in_float32_is_converted() -> None:
+    module = Halving().float()
+    rows = random_rows("pendulum", 20)
+    assert th.equal(
+        critic("pendulum", model=module)(rows), critic("pendulum", model=Halving())(rows)
+    )
