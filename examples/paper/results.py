@@ -95,9 +95,10 @@ def what_was_reached(outcomes: Mapping[Run, Outcome]) -> str:
         return ""
     rows = [(line.plant, line.required, line.figure, line.reached) for line in found]
     return (
-        f"## What was required, and what was reached\n\nAfter {EPISODES} training episodes; computed "
-        f"from the runs. {SEEDS} seeds were asked for; fewer are marked. A start is held if it costs "
-        f"less than {HELD:g}. Means that agree to 0.01 % count as equal.\n\n"
+        "## What was required, and what was reached\n\n"
+        f"After {EPISODES} training episodes; computed from the runs. {SEEDS} seeds are asked for; "
+        f"fewer are marked. A start is held if it costs less than {HELD:g}. Means that agree to "
+        "0.01 % count as equal.\n\n"
         + table(("plant", "required", "found", "reached"), rows, texts=4)
     )
 
