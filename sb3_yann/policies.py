@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from scipy import linalg
 from stable_baselines3 import TD3
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
@@ -24,6 +22,11 @@ from sb3_yann._checks import (
     require_critic_options,
     require_matching,
     require_plain_td3,
+)
+from sb3_yann._construction import (
+    algorithm_under_construction,
+    multiply_learning_rate,
+    restore_learning_rate,
 )
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import (
@@ -249,7 +252,7 @@ class YannPolicy(TD3Policy):
         optimizer_kwargs: dict[str, Any] | None = None,
         **other: Any,
     ) -> None:
-        algorithm = _algorithm_under_construction()
+        algorithm = algorithm_under_construction()
         require_plain_td3(algorithm, other)
         if features_extractor_class is not FlattenExtractor:
             raise ValueError(
@@ -317,16 +320,16 @@ class YannPolicy(TD3Policy):
             (self.critic.optimizer, self._before_critic_step),
         ):
             optimizer.register_step_pre_hook(before)
-            optimizer.register_step_post_hook(_restore_learning_rate)
+            optimizer.register_step_post_hook(restore_learning_rate)
 
     def _before_actor_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
         if self.critic_updates < self.critic_warmup:
             optimizer.zero_grad()  # no gradient at all: neither parameters nor moments move
-        _multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
+        multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
 
     def _before_critic_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
         self.critic_updates += 1
-        _multiply_learning_rate(optimizer, self.lr_mult["critic"])
+        multiply_learning_rate(optimizer, self.lr_mult["critic"])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or a pickle; torch drops the hooks of optimizers on the way."""
@@ -362,28 +365,3 @@ class YannPolicy(TD3Policy):
 
 # DDPG shares this table, so DDPG("YannPolicy", env) works as well.
 TD3.policy_aliases["YannPolicy"] = YannPolicy
-
-
-def _algorithm_under_construction() -> BaseAlgorithm | None:
-    """Return the algorithm whose `_setup_model` is building a policy, None where nobody is.
-
-    SB3 hands a policy its spaces and its learning rate, but not the discount, which the critic
-    needs to be exact; so the caller's frame is asked. Called from a policy's `__init__` only.
-    """
-    frame = sys._getframe(1)
-    while frame.f_code.co_name == "__init__" and frame.f_back is not None:
-        frame = frame.f_back
-    caller = frame.f_locals.get("self")
-    return caller if isinstance(caller, BaseAlgorithm) else None
-
-
-def _multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:
-    """Make one step use ``factor`` times the rate that SB3 keeps setting."""
-    for group in optimizer.param_groups:
-        group["scheduled_lr"] = group["lr"]
-        group["lr"] = factor * group["lr"]
-
-
-def _restore_learning_rate(optimizer: th.optim.Optimizer, *_: Any) -> None:
-    for group in optimizer.param_groups:
-        group["lr"] = group.pop("scheduled_lr")

@@ -81,3 +81,24 @@ def feasible_states(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarr
             states.append(theta)
             inputs.append(u)
     return np.array(states), np.array(inputs)
+
+
+class Recorder(gym.Wrapper):
+    """Keeps every observation and the action that met it."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.pairs: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def reset(self, **kwargs):
+        self.last, info = self.env.reset(**kwargs)
+        return self.last, info
+
+    def step(self, action):
+        self.pairs.append((self.last, np.array(action)))
+        self.last, *rest = self.env.step(action)
+        return self.last, *rest
+
+    def recorded(self) -> tuple[np.ndarray, np.ndarray]:
+        observations, actions = zip(*self.pairs, strict=True)
+        return np.array(observations), np.array(actions)

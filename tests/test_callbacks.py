@@ -8,28 +8,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from conftest import Recorder
 from stable_baselines3 import DDPG, PPO, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_yann import ControlDiagnostics, NoActionNoise, YannPolicy
-
-
-class Recorder(gym.Wrapper):
-    """Keeps every observation and the action that met it."""
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        self.pairs: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def reset(self, **kwargs):
-        self.last, info = self.env.reset(**kwargs)
-        return self.last, info
-
-    def step(self, action):
-        self.pairs.append((self.last, np.array(action)))
-        self.last, *rest = self.env.step(action)
-        return self.last, *rest
 
 
 class FixedRewards(gym.Wrapper):

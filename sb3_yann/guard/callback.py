@@ -27,9 +27,9 @@ class ImprovementGuard(BaseCallback):
     """Takes back what does not improve on the MPC, start by start.
 
     Every few training episodes the present actor is a candidate. It is accepted where it is no
-    worse than the last accepted one. Otherwise it is refused, at once or when ``patience`` is
-    over actor, target actor and the actor's optimizer return to the accepted state, bit for bit,
-    and the critic goes on learning. A return shrinks the actor's steps and an acceptance lets them
+    worse than the last accepted one. Otherwise it is refused: at once, or when ``patience`` is
+    over, actor, target actor and the actor's optimizer return to the accepted state, bit for bit,
+    while the critic goes on learning. A return shrinks the actor's steps, an acceptance lets them
     grow again. When `learn` returns, the model *is* the accepted policy. Until then, after an
     exception and in the zips of a CheckpointCallback, it is a candidate:
     :func:`restore_accepted` puts the accepted policy in its place.

@@ -7,6 +7,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+from conftest import Recorder
 
 from paper import yardsticks
 from paper.yardsticks import BurnIn, Learner, cloned, lqr, residual_rl, sb3_ddpg, sb3_td3
@@ -22,27 +23,6 @@ BUILDERS = {
     "quiet residual": partial(residual_rl, noise=0.0),
     "cloned": cloned,
 }
-
-
-class Recorder(gym.Wrapper):
-    """Keeps every observation and the action that met it."""
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        self.pairs: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def reset(self, **kwargs):
-        self.last, info = self.env.reset(**kwargs)
-        return self.last, info
-
-    def step(self, action):
-        self.pairs.append((self.last, np.array(action)))
-        self.last, *rest = self.env.step(action)
-        return self.last, *rest
-
-    def recorded(self) -> tuple[np.ndarray, np.ndarray]:
-        observations, actions = zip(*self.pairs, strict=True)
-        return np.array(observations), np.array(actions)
 
 
 def recorder(env_id: str) -> Recorder:

@@ -1,0 +1,35 @@
+"""What a policy does around SB3: ask for its algorithm, and step at a rate of its own."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+
+def algorithm_under_construction() -> BaseAlgorithm | None:
+    """Return the algorithm whose `_setup_model` is building a policy, None where nobody is.
+
+    SB3 hands a policy its spaces and its learning rate, but not the discount, which the critic
+    needs to be exact; so the caller's frame is asked. Called from a policy's `__init__` only.
+    """
+    frame = sys._getframe(1)
+    while frame.f_code.co_name == "__init__" and frame.f_back is not None:
+        frame = frame.f_back
+    caller = frame.f_locals.get("self")
+    return caller if isinstance(caller, BaseAlgorithm) else None
+
+
+def multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:
+    """Make one step use ``factor`` times the rate that SB3 keeps setting."""
+    for group in optimizer.param_groups:
+        group["scheduled_lr"] = group["lr"]
+        group["lr"] = factor * group["lr"]
+
+
+def restore_learning_rate(optimizer: th.optim.Optimizer, *_: Any) -> None:
+    """Undo :func:`multiply_learning_rate` after the step."""
+    for group in optimizer.param_groups:
+        group["lr"] = group.pop("scheduled_lr")
