@@ -553,7 +553,7 @@ def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) ->
     if critic == "state_action":
         kwargs = {"critic": critic}
     else:
-        kwargs = {"prediction_model": lambda theta, u: 0 * theta}
+        kwargs = {"prediction_model": lambda theta, u: 0 * theta + 0 * u.sum(1, keepdim=True)}
     mpc = two_inputs()
     model = build(mpc=mpc, policy_kwargs=kwargs)
     theta, u = starts(mpc), mpc.explicit()(starts(mpc))

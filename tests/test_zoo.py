@@ -39,7 +39,7 @@ def build(algo: str, env_id: str, env: gym.Env | str, **changes):
     """Return the model that the entry describes; an unknown key is a TypeError."""
     entry = {k: v for k, v in entry_of(algo, env_id).items() if k not in NOT_THE_MODEL_S}
     entry["policy_kwargs"] = {**entry["policy_kwargs"], **changes.pop("policy_kwargs", {})}
-    return ALGORITHMS[algo](env=env, seed=0, **entry, **changes)
+    return ALGORITHMS[algo](env=env, seed=0, **(entry | changes))
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
@@ -74,10 +74,16 @@ def test_the_critic_of_an_entry_starts_exact_on_the_linear_plant(algo, env_id, c
 
 
 @ENTRIES
-def test_an_entry_runs_for_fifty_episodes_without_noise_and_with_diagnostics(algo, env_id) -> None:
+def test_an_entry_runs_for_fifty_episodes_without_noise_guarded_and_watched(algo, env_id) -> None:
     entry = entry_of(algo, env_id)
     assert entry["n_timesteps"] == 50 * gym.spec(env_id).max_episode_steps
-    assert {"sb3_yann.NoActionNoise", "sb3_yann.ControlDiagnostics"} <= set(entry["callback"])
+    noise, guard, diagnostics = entry["callback"]
+    assert noise == "sb3_yann.NoActionNoise"
+    assert diagnostics == "sb3_yann.ControlDiagnostics"
+    (options,) = guard.values()
+    assert [*guard] == ["sb3_yann.ImprovementGuard"]
+    assert options["env"] == env_id
+    sb3_yann.ImprovementGuard(**options)
 
 
 @dataclass
