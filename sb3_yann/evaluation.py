@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann.control import PiecewiseAffine
@@ -84,6 +85,9 @@ def evaluate(
     act = _as_batch_function(policy)
     if isinstance(env, gym.Env):
         episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
+    elif isinstance(env, str) and (vector_env := _vector_env(env, len(seeds))) is not None:
+        with closing(vector_env):
+            return _as_one(act, vector_env, seeds, starts)
     else:
         with ExitStack() as stack:
             envs = [stack.enter_context(one_env(env)) for _ in seeds]
@@ -136,6 +140,59 @@ def _as_batch_function(policy: Predictor | Callable[[Any], Any]) -> Callable[[An
     raise TypeError(f"policy = {policy!r} must have a predict method or be callable.")
 
 
+def _vector_env(env_id: str, n: int) -> VectorEnv[Any, Any, Any] | None:
+    """Return n copies of an env that step as one array, None where there is no such env of it."""
+    spec = gym.spec(env_id)
+    if spec.vector_entry_point is None or spec.additional_wrappers or n == 0:
+        return None
+    made = gym.make_vec(env_id, num_envs=n, vectorization_mode="vector_entry_point")
+    if made.metadata.get("seeds_each", False):  # most take one seed for all of them together
+        return made
+    made.close()
+    return None
+
+
+def _as_one(
+    act: Callable[[Any], Any],
+    env: VectorEnv[Any, Any, Any],
+    seeds: Sequence[int],
+    starts: Sequence[ArrayLike] | None,
+) -> Episodes:
+    """Run an episode in each copy; those that are over begin another, which is ignored."""
+    options = None if starts is None else {"state": starts}
+    observations = [env.reset(seed=seeds, options=options)[0]]  # type: ignore[arg-type]
+    n = len(seeds)
+    running, lengths = np.ones(n, dtype=bool), np.zeros(n, dtype=int)
+    costs, violations = np.zeros(n), np.zeros(n, dtype=np.int64)
+    ended, actions = np.zeros(n, dtype=bool), []
+    while running.any():
+        actions.append(np.asarray(act(observations[-1])))
+        observation, rewards, terminated, truncated, info = env.step(actions[-1])
+        observations.append(np.array(observation))
+        costs[running] -= np.asarray(rewards, dtype=np.float64)[running]
+        violations[running] += np.asarray(info.get("violation", np.zeros(n)), dtype=bool)[running]
+        lengths[running] += 1
+        ended[running] |= terminated[running]
+        running &= ~(terminated | truncated)
+        if len(actions) == LONGEST:
+            raise _endless(env)
+    states, inputs = np.array(observations, float), np.array(actions, float)
+    return Episodes(
+        costs,
+        violations,
+        tuple(states[: k + 1, i].copy() for i, k in enumerate(lengths)),
+        tuple(inputs[:k, i].copy() for i, k in enumerate(lengths)),
+        ended,
+    )
+
+
+def _endless(env: Any) -> RuntimeError:
+    return RuntimeError(
+        f"An episode of {env} has not ended after {LONGEST} steps. Give it a limit: "
+        "max_episode_steps when it is registered, or gymnasium.wrappers.TimeLimit."
+    )
+
+
 def _side_by_side(
     act: Callable[[Any], Any],
     envs: Sequence[gym.Env[Any, Any]],
@@ -161,9 +218,6 @@ def _side_by_side(
             if not (terminated or truncated):
                 going_on.append((env, episode))
             if len(episode.actions) == LONGEST:
-                raise RuntimeError(
-                    f"An episode of {env} has not ended after {LONGEST} steps. Give it a limit: "
-                    "max_episode_steps when it is registered, or gymnasium.wrappers.TimeLimit."
-                )
+                raise _endless(env)
         running = going_on
     return episodes

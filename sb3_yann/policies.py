@@ -88,6 +88,11 @@ class YannActor(Actor):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.options}
 
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch the mode, which SB3 asks for at every step, where it is another one."""
+        if mode != self.training:
+            super().set_training_mode(mode)
+
 
 class YannCritic(ContinuousCritic):
     """SB3's critic with networks that start as the value of the law on the linear plant.
@@ -154,6 +159,26 @@ class YannCritic(ContinuousCritic):
                 )
             self.add_module(f"qf{i}", q_network)
             self.q_networks.append(q_network)
+
+    def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return the first critic's Q, (batch, 1), with a gradient by the actions alone.
+
+        SB3 asks for it to improve the actor, and throws the gradient by the critic's parameters
+        away: it is not computed.
+        """
+        trained = [each for each in self.q_networks[0].parameters() if each.requires_grad]
+        for parameter in trained:
+            parameter.requires_grad_(False)
+        try:
+            return super().q1_forward(obs, actions)
+        finally:
+            for parameter in trained:
+                parameter.requires_grad_(True)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch the mode, which SB3 asks for at every step, where it is another one."""
+        if mode != self.training:
+            super().set_training_mode(mode)
 
 
 class YannPolicy(TD3Policy):
@@ -280,6 +305,8 @@ class YannPolicy(TD3Policy):
         require_critic_options(critic, prediction_model, value_scale, critic_warmup)
         if not isinstance(pin_equilibrium, bool):
             raise TypeError(f"pin_equilibrium = {pin_equilibrium!r} must be True or False.")
+        if optimizer_class is th.optim.Adam and optimizer_kwargs is None:
+            optimizer_kwargs = {"fused": True}  # the same steps, in a third of the time
         self.actor_step = 1.0
         """Another factor of the actor's learning rate, which an ImprovementGuard sets."""
         self.critic_warmup = critic_warmup

@@ -57,7 +57,35 @@ def test_violations_are_counted_for_each_episode() -> None:
 @pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
 def test_episodes_side_by_side_are_those_of_one_env_after_the_other(env_id) -> None:
     law = gym.make(env_id).observation_space.problem.explicit()
-    assert_equal(evaluate(law, env_id, SEEDS), evaluate(law, gym.make(env_id), SEEDS))
+    made = evaluate(law, lambda: gym.make(env_id), SEEDS)
+    assert_equal(made, evaluate(law, gym.make(env_id), SEEDS))
+
+
+@pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
+@pytest.mark.parametrize("start", [None, -0.9])
+def test_episodes_of_a_vectorised_env_are_those_of_single_ones_to_rounding(env_id, start) -> None:
+    env = gym.make(env_id)
+    law, n = env.observation_space.problem.explicit(), env.observation_space.shape[0]
+    starts = None if start is None else [np.full(n, start * k / 2) * np.eye(n)[-1] for k in SEEDS]
+    assert gym.spec(env_id).vector_entry_point is not None
+    together, alone = evaluate(law, env_id, SEEDS, starts), evaluate(law, env, SEEDS, starts)
+    np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(together.violations, alone.violations)
+    np.testing.assert_array_equal(together.terminated, alone.terminated)
+    for name in ("observations", "actions"):
+        for a, b in zip(getattr(together, name), getattr(alone, name), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_an_episode_of_a_vectorised_env_stops_where_it_ends() -> None:
+    starts, u = [[0, 0.3, 0, 4.0], [0, 0, 0, -5.0]], np.full(1, -55, np.float32)
+    together = evaluate(lambda _: u, "CSTR-v0", [0, 1], starts)
+    alone = evaluate(lambda _: u, gym.make("CSTR-v0"), [0, 1], starts)
+    lengths = [len(each) for each in together.actions]
+    assert lengths == [len(each) for each in alone.actions] and lengths[0] < lengths[1]
+    assert together.violations.tolist() == alone.violations.tolist() == [1, 1]
+    np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-9)
+    assert [len(each) for each in together.observations] == [k + 1 for k in lengths]
 
 
 def test_a_policy_that_has_learnt_does_the_same_side_by_side_to_rounding() -> None:
@@ -138,7 +166,8 @@ def test_starts_are_the_states_of_the_episodes() -> None:
     firsts = np.array([each[0] for each in episodes.observations])
     np.testing.assert_allclose(firsts, starts, atol=1e-6)
     one_env = gym.make("ClippedPendulum-v0")
-    assert_equal(episodes, evaluate(law, one_env, SEEDS, starts=np.array(starts)))
+    alone = evaluate(law, one_env, SEEDS, starts=np.array(starts))
+    np.testing.assert_allclose(episodes.costs, alone.costs, rtol=1e-9)
 
 
 @pytest.mark.parametrize("env", [Countdown, Countdown(), "no such env"])

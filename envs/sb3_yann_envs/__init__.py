@@ -17,9 +17,13 @@ from sb3_yann_envs.spaces import ProblemBox
 
 __all__ = ["ProblemBox", "register_envs"]
 
-_ENTRY_POINTS: dict[str, tuple[str, int]] = {
-    "CSTR-v0": ("sb3_yann_envs.cstr:CSTREnv", 400),
-    "ClippedPendulum-v0": ("sb3_yann_envs.clipped_pendulum:ClippedPendulumEnv", 200),
+_ENTRY_POINTS: dict[str, tuple[str, str, int]] = {
+    "CSTR-v0": ("sb3_yann_envs.cstr:CSTREnv", "sb3_yann_envs.vector:CSTRVectorEnv", 400),
+    "ClippedPendulum-v0": (
+        "sb3_yann_envs.clipped_pendulum:ClippedPendulumEnv",
+        "sb3_yann_envs.vector:ClippedPendulumVectorEnv",
+        200,
+    ),
 }
 
 
@@ -29,10 +33,13 @@ def register_envs() -> None:
     Ids that are already registered are left as they are, so the call can be repeated, and a user's
     own registration under the same id wins.
     """
-    for env_id, (entry_point, max_episode_steps) in _ENTRY_POINTS.items():
+    for env_id, (entry_point, vector_entry_point, max_episode_steps) in _ENTRY_POINTS.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(
-                id=env_id, entry_point=entry_point, max_episode_steps=max_episode_steps
+                id=env_id,
+                entry_point=entry_point,
+                vector_entry_point=vector_entry_point,
+                max_episode_steps=max_episode_steps,
             )
 
 

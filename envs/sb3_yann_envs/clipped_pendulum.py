@@ -73,6 +73,16 @@ def dynamics(x: ArrayLike, u: ArrayLike) -> NDArray[np.float64]:
     return np.array([speed, _GRAVITY_GAIN * np.sin(theta) + _TORQUE_GAIN * torque])
 
 
+def stage_cost(theta: Any, speed: Any, torque: Any) -> Any:
+    """Return the stage cost, of floats or arrays."""
+    return wrapped(theta) ** 2 + 0.1 * speed**2 + 0.001 * torque**2
+
+
+def next_speed(sine: Any, speed: Any, torque: Any) -> Any:
+    """Return the speed one sample later, not yet clipped, of floats or arrays."""
+    return speed + (_GRAVITY_GAIN * sine + _TORQUE_GAIN * torque) * DT
+
+
 class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """Hold a pendulum upright with a torque too weak to lift it.
 
@@ -180,7 +190,7 @@ class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         theta, speed = start
         self._state = (theta, speed)
         self._torque = 0.0
-        state = np.array([_wrapped(theta), speed])
+        state = np.array([wrapped(theta), speed])
         return state.astype(np.float32), {"state": state}
 
     def step(
@@ -191,15 +201,15 @@ class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
             raise not_reset("step", "the pendulum has no state yet")
         theta, speed = self._state
         torque = clipped_input(action, MAX_TORQUE)
-        cost = _wrapped(theta) ** 2 + 0.1 * speed**2 + 0.001 * torque**2
+        cost = stage_cost(theta, speed, torque)
         # numpy's sine, not math's: the two differ in the last bit on some machines, and the
         # trajectories are to be Gymnasium's bit for bit (with float64 actions).
-        acceleration = _GRAVITY_GAIN * float(np.sin(theta)) + _TORQUE_GAIN * torque
-        speed = min(max(speed + acceleration * DT, -MAX_SPEED), MAX_SPEED)
+        speed = next_speed(float(np.sin(theta)), speed, torque)
+        speed = min(max(speed, -MAX_SPEED), MAX_SPEED)
         theta += speed * DT
         self._state = (theta, speed)
         self._torque = torque
-        state = np.array([_wrapped(theta), speed])
+        state = np.array([wrapped(theta), speed])
         info = {"cost": cost, "violation": False, "state": state}
         return state.astype(np.float32), -cost, False, False, info
 
@@ -213,6 +223,6 @@ class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         return pendulum_frame(self._state[0], self._torque, MAX_TORQUE)
 
 
-def _wrapped(angle: float) -> float:
-    """Return the angle in [-pi, pi)."""
+def wrapped(angle: Any) -> Any:
+    """Return the angle in [-pi, pi), of a float or an array."""
     return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -46,12 +47,12 @@ _HEATING_2 = REACTION_HEAT_2 / HEAT_CAPACITY  # K L/mol
 _COOLING = 1000 * AREA / (HEAT_CAPACITY * VOLUME)  # m2 K/kJ
 
 
-def _rate_constants(temperature: float) -> tuple[float, float]:
+def _rate_constants(temperature: Any, exp: Callable[[Any], Any] = math.exp) -> tuple[Any, Any]:
     """Return the Arrhenius rate constants in L/(mol h) and 1/h."""
     thermal = GAS_CONSTANT * temperature
     return (
-        math.exp(LOG_FREQUENCY_1 - ACTIVATION_1 / thermal),
-        math.exp(LOG_FREQUENCY_2 - ACTIVATION_2 / thermal),
+        exp(LOG_FREQUENCY_1 - ACTIVATION_1 / thermal),
+        exp(LOG_FREQUENCY_2 - ACTIVATION_2 / thermal),
     )
 
 
@@ -108,7 +109,8 @@ PRINTED_B = constant([[0.0], [0.0], [0.0], [-0.0007]])
 """Input matrix as printed in the paper, for deviations and one sample."""
 
 _STATE_NAMES = ("C_A deviation", "C_B deviation", "C_S deviation", "T deviation")
-_Quad = tuple[float, float, float, float]
+_Quad = tuple[Any, Any, Any, Any]
+"""The four states: floats, or arrays of many reactors."""
 
 
 def dynamics(x: ArrayLike, u: ArrayLike) -> NDArray[np.float64]:
@@ -132,9 +134,16 @@ def dynamics(x: ArrayLike, u: ArrayLike) -> NDArray[np.float64]:
     return np.array(_rates(c_a, c_b, c_s, temperature, transfer))
 
 
-def _rates(c_a: float, c_b: float, c_s: float, temperature: float, transfer: float) -> _Quad:
+def _rates(
+    c_a: Any,
+    c_b: Any,
+    c_s: Any,
+    temperature: Any,
+    transfer: Any,
+    exp: Callable[[Any], Any] = math.exp,
+) -> _Quad:
     """Return `dynamics` on plain floats: three times as fast as on arrays of four."""
-    k1, k2 = _rate_constants(temperature)
+    k1, k2 = _rate_constants(temperature, exp)
     r1 = k1 * c_a * c_b
     r2 = k2 * c_s
     return (
@@ -148,8 +157,15 @@ def _rates(c_a: float, c_b: float, c_s: float, temperature: float, transfer: flo
     )
 
 
-def _advance(deviation: _Quad, transfer: float) -> _Quad:
+def stage_cost(a: Any, b: Any, s: Any, t: Any, u: Any) -> Any:
+    """Return the stage cost of deviations and input, without the penalty."""
+    return 0.1 * (a * a + b * b + s * s + t * t) + 1e-4 * u * u
+
+
+def advance(deviation: _Quad, transfer: Any, exp: Callable[[Any], Any] = math.exp) -> _Quad:
     """Return the deviation one sample later (classical Runge-Kutta, `SUBSTEPS` equal steps).
+
+    Of floats, or of arrays of many reactors with ``exp`` for arrays.
 
     The equations are not stiff below the limit. Deviations are stored rather than absolute values,
     so that a state handed out by `step` restarts the same trajectory bit for bit.
@@ -158,10 +174,10 @@ def _advance(deviation: _Quad, transfer: float) -> _Quad:
     h = DT / SUBSTEPS
     for _ in range(SUBSTEPS):
         x = (_A_SS + a, _B_SS + b, _S_SS + s, _T_SS + t)
-        p = _rates(*x, transfer)
-        q = _rates(*_moved(x, h / 2, p), transfer)
-        r = _rates(*_moved(x, h / 2, q), transfer)
-        v = _rates(*_moved(x, h, r), transfer)
+        p = _rates(*x, transfer, exp)
+        q = _rates(*_moved(x, h / 2, p), transfer, exp)
+        r = _rates(*_moved(x, h / 2, q), transfer, exp)
+        v = _rates(*_moved(x, h, r), transfer, exp)
         w = h / 6
         a += w * (p[0] + 2 * (q[0] + r[0]) + v[0])
         b += w * (p[1] + 2 * (q[1] + r[1]) + v[1])
@@ -328,8 +344,8 @@ class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise not_reset("step", "the reactor passed its temperature limit")
         u = clipped_input(action, MAX_INPUT)
         a, b, s, t = self._deviation
-        cost = 0.1 * (a * a + b * b + s * s + t * t) + 1e-4 * u * u
-        self._deviation = _advance(self._deviation, _TRANSFER_SS + u)
+        cost = stage_cost(a, b, s, t, u)
+        self._deviation = advance(self._deviation, _TRANSFER_SS + u)
         self._terminated = _T_SS + self._deviation[3] > TEMPERATURE_LIMIT
         if self._terminated:
             cost += PENALTY

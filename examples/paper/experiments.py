@@ -28,11 +28,13 @@ from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, Ya
 from sb3_yann.evaluation import Episodes, evaluate
 from sb3_yann_envs import cstr, problems
 
-TEST_SEEDS = range(1000, 1100)
+TEST_SEEDS = range(2000, 2100)
 """Test starts; the first ten are those of the paper's tables."""
+GUARD_SEEDS = range(1_000_000, 1_000_100)
+"""The guard's starts, and those on which a rival may choose its best policy."""
 CHECKPOINTS = (0, 10, 20, 30, 40, 50, 75, 100, 150, 200)
 """Training episodes after which the policy is tested."""
-FINGERPRINT = f"{sb3_yann.__version__}-1"
+FINGERPRINT = f"{sb3_yann.__version__}-2"
 """Results of another version are not taken for those of this one."""
 
 
@@ -143,6 +145,7 @@ LEARNERS: dict[str, Callable[..., Learner]] = {
         yann, outside="nearest", guard={"n_starts": 50}
     ),
     "DDPG": _yardstick(yardsticks.sb3_ddpg),
+    "DDPG, best kept": _yardstick(yardsticks.best_of_ddpg, seeds=GUARD_SEEDS),
     "TD3": _yardstick(yardsticks.sb3_td3),
     "residual RL": _yardstick(yardsticks.residual_rl),
     "residual RL, no noise": _yardstick(yardsticks.residual_rl, noise=0.0),
@@ -175,7 +178,7 @@ def _runs() -> list[Run]:
     below 20, and those from 100 on, were seen while the defaults were chosen.
     """
     reactor, true_model, pendulum, printed = PLANTS
-    ten, five, long = range(20, 30), range(20, 25), range(30, 35)
+    ten, five, long = range(40, 50), range(40, 45), range(50, 55)
     runs = [Run(plant, name, 0, 0) for plant in PLANTS for name in FIXED]
 
     def add(plant: str, learners: Iterable[str], seeds: range, episodes: int = 50) -> None:
@@ -185,9 +188,10 @@ def _runs() -> list[Run]:
     add(pendulum, ["YANN-RL"], ten)
     add(printed, ["YANN-RL"], ten)
     add(true_model, ["YANN-RL", "YANN-RL, guard off"], five)
-    others = ["TD3", "residual RL", "residual RL, no noise", "cloned MPC, then DDPG"]
+    add(reactor, ["residual RL"], ten)
+    others = ["TD3", "DDPG, best kept", "residual RL, no noise", "cloned MPC, then DDPG"]
     add(reactor, others, five)
-    add(pendulum, ["DDPG", *others], five)
+    add(pendulum, ["DDPG", "residual RL", *others], five)
     for plant, variants in VARIANTS.items():
         add(plant, (f"YANN-RL, {name}" for name in variants), five)
     add(reactor, ["YANN-RL", "DDPG"], long, episodes=200)

@@ -15,6 +15,7 @@ does.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
@@ -27,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
 from sb3_yann import LinearMPC
@@ -83,7 +85,7 @@ class Controller:
     plain observations and the model's actions to plain actions.
     """
 
-    model: TD3
+    model: TD3 | BasePolicy
     features: Law
     combine: Callable[[ArrayLike, Array], Array] | None = None
 
@@ -133,6 +135,37 @@ class BurnIn(BaseCallback):
     def _on_step(self) -> bool:
         self.model.actor.requires_grad_(self.model._n_updates >= self.steps)
         return True
+
+
+class KeepBest(BaseCallback):
+    """Keeps a copy of the best policy so far, tried after every episode as SB3's EvalCallback does.
+
+    On the same starts in a simulator that the guard of a YANN policy has, so that the two have the
+    same choice.
+    """
+
+    def __init__(self, model: TD3, features: Law, seeds: range) -> None:
+        super().__init__()
+        self.features, self.seeds = features, seeds
+        self.env_id = model.get_env().envs[0].unwrapped.spec.id
+        self.kept = copy.deepcopy(model.policy)
+        self.cost = np.inf
+
+    def _on_step(self) -> bool:
+        if self.locals["dones"][0]:
+            policy = Controller(self.model.policy, self.features)
+            cost = float(evaluate(policy, self.env_id, self.seeds).costs.mean())
+            if cost < self.cost:
+                self.cost = cost
+                self.kept.load_state_dict(self.model.policy.state_dict())
+        return True
+
+
+def best_of_ddpg(make_env: MakeEnv, seed: int, seeds: range) -> Learner:
+    """Return `sb3_ddpg` whose policy is the best it had after any episode, on the starts given."""
+    learner = sb3_ddpg(make_env, seed)
+    best = KeepBest(learner.model, learner.policy.features, seeds)
+    return Learner(learner.model, Controller(best.kept, learner.policy.features), [best])
 
 
 def sb3_ddpg(make_env: MakeEnv, seed: int) -> Learner:

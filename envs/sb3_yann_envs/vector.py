@@ -1,0 +1,175 @@
+"""Many copies of an environment that step as one array: hundreds of episodes in less than a second.
+
+``gymnasium.make_vec("CSTR-v0", num_envs=100)`` makes them, since they are registered so. Each copy
+has a random generator of its own, so that ``reset(seed=[...])`` starts the same episodes as the
+single environment does from the same seeds; they then agree to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from sb3_yann_envs import clipped_pendulum, cstr
+from sb3_yann_envs._checks import not_reset
+
+Array = NDArray[np.float64]
+
+
+class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+    """What the vectorised environments share: starts, time limit, and resets at the next step.
+
+    Parameters
+    ----------
+    num_envs : int, default 1
+    max_episode_steps : int, optional
+        Steps after which an episode is truncated; `gymnasium.make_vec` passes the registered ones.
+
+    Attributes
+    ----------
+    metadata : dict
+        ``seeds_each`` says that `reset` takes a seed for each copy.
+    """
+
+    single: ClassVar[type[cstr.CSTREnv | clipped_pendulum.ClippedPendulumEnv]]
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+        "seeds_each": True,
+    }
+
+    def __init__(self, num_envs: int = 1, max_episode_steps: int | None = None) -> None:
+        self.num_envs, self.max_episode_steps = num_envs, max_episode_steps
+        self._env = self.single()
+        self.single_observation_space = self._env.observation_space
+        self.single_action_space = self._env.action_space
+        # A batch of ProblemBoxes would be a plain Box all the same.
+        box = gymnasium.spaces.Box(
+            self._env.observation_space.low, self._env.observation_space.high, dtype=np.float32
+        )
+        self.observation_space = batch_space(box, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._generators: list[np.random.Generator] = []
+        self._over = np.zeros(num_envs, dtype=bool)
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start all episodes.
+
+        Parameters
+        ----------
+        seed : int or sequence of int, optional
+            One for each copy, or the first of as many consecutive ones.
+        options : dict, optional
+            ``{"state": starts}``, shape (num_envs, n).
+        """
+        if seed is None:
+            seeds: list[int | None] = [None] * self.num_envs
+        elif isinstance(seed, int):
+            seeds = [seed + i for i in range(self.num_envs)]
+        else:
+            seeds = [*seed]
+        starts = [None] * self.num_envs
+        if options:
+            unknown = sorted(map(str, set(options) - {"state"}))
+            if unknown:
+                raise ValueError(f"options has unknown keys {unknown}; the only key is 'state'.")
+            starts = [*options["state"]]
+        for name, given in (("seed", seeds), ("options['state']", starts)):
+            if len(given) != self.num_envs:
+                raise ValueError(f"{name} has {len(given)} entries for {self.num_envs} episodes.")
+        if not self._generators:
+            self._generators = [seeding.np_random()[0] for _ in seeds]
+        self._generators = [
+            generator if each is None else seeding.np_random(each)[0]
+            for generator, each in zip(self._generators, seeds, strict=True)
+        ]
+        states = [self._start(i, start) for i, start in enumerate(starts)]
+        self._state = np.array(states).T
+        self._over[:] = False
+        self._steps[:] = 0
+        observed = self._observed()
+        return observed.astype(np.float32), {"state": observed, "_state": ~self._over}
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Step every copy; those whose episode is over start a new one instead, with reward 0."""
+        if not self._generators:
+            raise not_reset("step", "no episode has begun")
+        limit = self.single_action_space.high
+        u = np.asarray(actions, dtype=np.float64)
+        if u.shape != (self.num_envs, 1) or np.isnan(u).any():
+            raise ValueError(
+                f"actions must be numbers of shape ({self.num_envs}, 1), got {actions!r}."
+            )
+        begun = np.flatnonzero(self._over)
+        cost, terminated = self._advance(np.clip(u, -limit, limit)[:, 0])
+        self._steps += 1
+        for i in begun:
+            self._state[:, i] = self._start(i, None)
+        cost[begun], terminated[begun], self._steps[begun] = 0.0, False, 0
+        truncated = np.zeros(self.num_envs, dtype=bool)
+        if self.max_episode_steps is not None:
+            truncated = self._steps >= self.max_episode_steps
+        self._over = terminated | truncated
+        observed = self._observed()
+        info = {"cost": cost, "violation": terminated, "state": observed}
+        info |= {f"_{name}": np.ones(self.num_envs, dtype=bool) for name in info}
+        return observed.astype(np.float32), -cost, terminated, truncated, info
+
+    def _start(self, i: int, start: Any) -> Any:
+        """Return the i-th start, by the rules of the single environment."""
+        self._env.np_random = self._generators[i]
+        return self._env.reset(options=None if start is None else {"state": start})[1]["state"]
+
+    def _observed(self) -> Array:
+        """Return the observation of each copy in float64, shape (num_envs, n)."""
+        return self._state.T.copy()
+
+    def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Replace the state (n, num_envs) by the next one; return the costs and who terminated."""
+        raise NotImplementedError
+
+
+class CSTRVectorEnv(_VectorEnv):
+    """Many `sb3_yann_envs.cstr.CSTREnv`."""
+
+    single = cstr.CSTREnv
+
+    def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
+        cost = cstr.stage_cost(*self._state, u)
+        # Runs that are over may be far beyond the limit, where the rates overflow.
+        with np.errstate(all="ignore"):
+            self._state = np.array(cstr.advance(tuple(self._state), cstr.U_SS[0] + u, np.exp))
+        terminated = cstr.X_SS[3] + self._state[3] > cstr.TEMPERATURE_LIMIT
+        return cost + cstr.PENALTY * terminated, terminated
+
+
+class ClippedPendulumVectorEnv(_VectorEnv):
+    """Many `sb3_yann_envs.clipped_pendulum.ClippedPendulumEnv`."""
+
+    single = clipped_pendulum.ClippedPendulumEnv
+
+    def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
+        theta, speed = self._state
+        cost = clipped_pendulum.stage_cost(theta, speed, u)
+        speed = clipped_pendulum.next_speed(np.sin(theta), speed, u)
+        speed = np.clip(speed, -clipped_pendulum.MAX_SPEED, clipped_pendulum.MAX_SPEED)
+        self._state = np.array([theta + speed * clipped_pendulum.DT, speed])
+        return cost, np.zeros(self.num_envs, dtype=bool)
+
+    def _observed(self) -> Array:
+        return np.column_stack([clipped_pendulum.wrapped(self._state[0]), self._state[1]])
