@@ -30,7 +30,7 @@ from sb3_yann_envs import cstr, problems
 
 TEST_SEEDS = range(2000, 2100)
 """Test starts; the first ten are those of the paper's tables."""
-GUARD_SEEDS = range(1_000_000, 1_000_100)
+GUARD_SEEDS = range(1_000_000, 1_000_200)
 """The guard's starts, and those on which a rival may choose its best policy."""
 CHECKPOINTS = (0, 10, 20, 30, 40, 50, 75, 100, 150, 200)
 """Training episodes after which the policy is tested."""
@@ -62,7 +62,13 @@ def printed_pendulum() -> LinearMPC:
     return replace(problems.clipped_pendulum(), Q=np.eye(2), terminal_cost=None)
 
 
-_REACTOR = Plant("CSTR-v0", 400, problems.cstr, optimum.cstr_optimum)
+_REACTOR = Plant(
+    "CSTR-v0",
+    400,
+    problems.cstr,
+    optimum.cstr_optimum,
+    guard={"n_starts": len(GUARD_SEEDS), "margin": 0.005},
+)
 # The way from a pendulum that hangs to one that swings leads through worse policies.
 _PENDULUM = Plant(
     "ClippedPendulum-v0",
@@ -71,13 +77,14 @@ _PENDULUM = Plant(
     optimum.clipped_pendulum_optimum,
     gradient_steps=2,
     critic_warmup=4000,
-    guard={"patience": 10, "wander": True, "n_starts": 100},
+    guard={"n_starts": len(GUARD_SEEDS), "patience": 10, "wander": True},
 )
 PLANTS = {
     "CSTR": _REACTOR,
     "CSTR, true model": replace(_REACTOR, problem=true_reactor),
     "pendulum, Q = diag(1, 0.1)": _PENDULUM,
-    "pendulum, Q = I": replace(_PENDULUM, problem=printed_pendulum),
+    # This MPC never swings: what fifty episodes show of it has to be learnt from the more often.
+    "pendulum, Q = I": replace(_PENDULUM, problem=printed_pendulum, gradient_steps=4),
 }
 
 
@@ -141,9 +148,7 @@ LEARNERS: dict[str, Callable[..., Learner]] = {
     "YANN-RL, at most 5 % from the MPC": partial(yann, max_correction=0.05),
     "YANN-RL, free equilibrium": partial(yann, pin_equilibrium=False),
     "YANN-RL, discount 0.95": partial(yann, gamma=0.95),
-    "YANN-RL, nearest outside, 50 guard starts": partial(
-        yann, outside="nearest", guard={"n_starts": 50}
-    ),
+    "YANN-RL, nearest outside": partial(yann, outside="nearest"),
     "DDPG": _yardstick(yardsticks.sb3_ddpg),
     "DDPG, best kept": _yardstick(yardsticks.best_of_ddpg, seeds=GUARD_SEEDS),
     "TD3": _yardstick(yardsticks.sb3_td3),
@@ -164,7 +169,7 @@ VARIANTS = {
         "guard off",
         "paper's critic, TD3, guard off",
         "free equilibrium",
-        "nearest outside, 50 guard starts",
+        "nearest outside",
     ],
 }
 """What is changed on which plant, one thing at a time."""
@@ -187,7 +192,8 @@ def _runs() -> list[Run]:
     add(reactor, ["YANN-RL", "DDPG"], ten)
     add(pendulum, ["YANN-RL"], ten)
     add(printed, ["YANN-RL"], ten)
-    add(true_model, ["YANN-RL", "YANN-RL, guard off"], five)
+    add(true_model, ["YANN-RL"], ten)
+    add(true_model, ["YANN-RL, guard off"], five)
     add(reactor, ["residual RL"], ten)
     others = ["TD3", "DDPG, best kept", "residual RL, no noise", "cloned MPC, then DDPG"]
     add(reactor, others, five)
