@@ -196,6 +196,36 @@ def test_rates_given_to_load_are_those_in_use(tmp_path) -> None:
     assert first_step(loaded.actor) == pytest.approx(5e-3, rel=1e-2)
 
 
+def test_the_actors_loss_leaves_the_critic_alone_which_still_learns() -> None:
+    model = build(policy_kwargs={"critic_warmup": 0})
+    critic, theta = model.critic, th.rand(32, model.observation_space.shape[0])
+    actions = th.zeros(32, model.action_space.shape[0], requires_grad=True)
+    q = critic.q1_forward(theta, actions)
+    th.testing.assert_close(q, critic(theta, actions)[0], rtol=0, atol=0)
+    q.sum().backward()
+    assert bool((actions.grad != 0).any())
+    assert all(each.grad is None and each.requires_grad for each in critic.parameters())
+    critic(theta, actions)[0].sum().backward()
+    assert all(each.grad is not None for each in critic.parameters())
+
+
+def test_an_optimizer_of_the_users_choice_is_taken_as_it_is() -> None:
+    assert build().actor.optimizer.defaults["fused"] is True
+    kwargs = {"optimizer_kwargs": {"eps": 1e-5}}
+    chosen = build(policy_kwargs=kwargs).actor.optimizer.defaults
+    assert (chosen["fused"], chosen["eps"]) == (None, 1e-5)
+    kwargs = {"optimizer_class": th.optim.SGD}
+    assert type(build(policy_kwargs=kwargs).actor.optimizer) is th.optim.SGD
+
+
+def test_the_mode_is_switched_for_every_module() -> None:
+    policy = build().policy
+    for mode in (False, True):
+        policy.set_training_mode(mode)
+        for part in (policy.actor, policy.critic):
+            assert {module.training for module in part.modules()} == {mode}
+
+
 @pytest.mark.parametrize("frozen", ["actor", "critic"])
 def test_a_rate_of_zero_freezes_one_of_them(frozen) -> None:
     mpc = scalar_mpc()

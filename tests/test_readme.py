@@ -30,3 +30,11 @@ def double_integrator() -> gym.Env:
             plant, Q=[[1, 0], [0, 1]], R=[[0.1]], horizon=1, x_min=-5, x_max=5, u_min=-1, u_max=1
         )
     )
+
+
+def test_the_results_it_quotes_are_those_of_the_report() -> None:
+    report = (Path(__file__).parents[1] / "docs" / "results.md").read_text(encoding="utf-8")
+    in_short = report.partition("## In short\n")[2].partition("\n## ")[0]
+    quoted = README.partition("<!-- results: begin -->")[2].partition("<!-- results: end -->")[0]
+    assert "| **YANN-RL** |" in quoted
+    assert quoted.strip() == in_short.strip()

@@ -39,7 +39,7 @@ class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any
     """
 
     single: ClassVar[type[cstr.CSTREnv | clipped_pendulum.ClippedPendulumEnv]]
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata = {
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
         "seeds_each": True,
@@ -48,16 +48,16 @@ class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any
     def __init__(self, num_envs: int = 1, max_episode_steps: int | None = None) -> None:
         self.num_envs, self.max_episode_steps = num_envs, max_episode_steps
         self._env = self.single()
-        self.single_observation_space = self._env.observation_space
-        self.single_action_space = self._env.action_space
-        # A batch of ProblemBoxes would be a plain Box all the same.
-        box = gymnasium.spaces.Box(
-            self._env.observation_space.low, self._env.observation_space.high, dtype=np.float32
-        )
-        self.observation_space = batch_space(box, num_envs)
+        self.single_observation_space = states = self._env.observation_space
+        self.single_action_space = inputs = self._env.action_space
+        assert isinstance(states, gymnasium.spaces.Box)
+        assert isinstance(inputs, gymnasium.spaces.Box)
+        self._limit = float(inputs.high[0])
+        box = gymnasium.spaces.Box(states.low, states.high, dtype=np.float32)
+        self.observation_space = batch_space(box, num_envs)  # of a ProblemBox it would be the same
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator] = []
-        self._over = np.zeros(num_envs, dtype=bool)
+        self._over: NDArray[np.bool_] = np.zeros(num_envs, dtype=bool)
         self._steps = np.zeros(num_envs, dtype=np.int64)
 
     def reset(
@@ -109,21 +109,19 @@ class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any
         """Step every copy; those whose episode is over start a new one instead, with reward 0."""
         if not self._generators:
             raise not_reset("step", "no episode has begun")
-        limit = self.single_action_space.high
         u = np.asarray(actions, dtype=np.float64)
         if u.shape != (self.num_envs, 1) or np.isnan(u).any():
             raise ValueError(
                 f"actions must be numbers of shape ({self.num_envs}, 1), got {actions!r}."
             )
         begun = np.flatnonzero(self._over)
-        cost, terminated = self._advance(np.clip(u, -limit, limit)[:, 0])
+        cost, terminated = self._advance(np.clip(u[:, 0], -self._limit, self._limit))
         self._steps += 1
         for i in begun:
             self._state[:, i] = self._start(i, None)
         cost[begun], terminated[begun], self._steps[begun] = 0.0, False, 0
-        truncated = np.zeros(self.num_envs, dtype=bool)
-        if self.max_episode_steps is not None:
-            truncated = self._steps >= self.max_episode_steps
+        longest = np.inf if self.max_episode_steps is None else self.max_episode_steps
+        truncated = self._steps >= longest
         self._over = terminated | truncated
         observed = self._observed()
         info = {"cost": cost, "violation": terminated, "state": observed}
@@ -150,10 +148,11 @@ class CSTRVectorEnv(_VectorEnv):
     single = cstr.CSTREnv
 
     def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
-        cost = cstr.stage_cost(*self._state, u)
+        a, b, s, t = self._state
+        cost = cstr.stage_cost(a, b, s, t, u)
         # Runs that are over may be far beyond the limit, where the rates overflow.
         with np.errstate(all="ignore"):
-            self._state = np.array(cstr.advance(tuple(self._state), cstr.U_SS[0] + u, np.exp))
+            self._state = np.array(cstr.advance((a, b, s, t), cstr.U_SS[0] + u, np.exp))
         terminated = cstr.X_SS[3] + self._state[3] > cstr.TEMPERATURE_LIMIT
         return cost + cstr.PENALTY * terminated, terminated
 

@@ -14,8 +14,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from paper.results import write_report
+from paper.results import in_short, write_report
 from paper.runner import Outcome, Run, RunsFailed, load_all, run_all
+from paper.summary import quote
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = f'make paper ARGS="{shlex.join(given)}"' if given else "make paper"
         for path in write_report(outcomes, report_folder, command=command):
             console.print(f"Written: {path}")
+        if not options.quick and quote(in_short(outcomes), Path("README.md")):
+            console.print("Written: the results in README.md")
     console.print(f"{len(outcomes)} of {len(runs)} runs are in {folder}.")
     if failed:
         console.print(str(failed), style="red", markup=False)

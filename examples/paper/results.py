@@ -16,6 +16,7 @@ from paper.measures import HELD, OPTIMUM, OURS, Row, plants_of, standing
 from paper.pictures import save_pictures
 from paper.published import paper_table
 from paper.runner import Outcome, Run
+from paper.summary import summary
 
 LONG = 200
 NOTES = Path(__file__).with_name("notes.md")
@@ -52,6 +53,7 @@ def write_report(
     curves = [f"![{plant}]({path.name})" for plant, path in pictures.items()]
     parts = [
         "# Results",
+        f"## In short\n\n{in_short(outcomes)}",
         how_it_was_made(outcomes, command),
         what_was_reached(outcomes),
         *_headed("## The paper's tables", as_printed),
@@ -64,6 +66,12 @@ def write_report(
     report = folder / "results.md"
     report.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
     return [report, *pictures.values()]
+
+
+def in_short(outcomes: Mapping[Run, Outcome]) -> str:
+    """Return the rows that the README quotes as well."""
+    longest = max((run.episodes for run in outcomes), default=0)
+    return summary(outcomes, min(EPISODES, longest))
 
 
 def how_it_was_made(outcomes: Mapping[Run, Outcome], command: str) -> str:

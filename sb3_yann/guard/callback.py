@@ -66,7 +66,7 @@ class ImprovementGuard(BaseCallback):
         The simulator: an id, an env of its own (not the training env), or a function that makes
         one; the first and the last run all starts side by side. None decides from the training
         episodes.
-    n_starts : int, default 50
+    n_starts : int, default 100
         Number of seeded starts.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
@@ -109,7 +109,7 @@ class ImprovementGuard(BaseCallback):
         self,
         env: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | None,
         *,
-        n_starts: int = 50,
+        n_starts: int = 100,
         seed: int = 1_000_000,
         every: int = 1,
         margin: float = 0.01,

@@ -190,6 +190,10 @@ class ZeroOutputNetwork(nn.Module):
         )
         self.register_buffer("pinned", pinned.float()[:, None])
 
+    def layers(self) -> list[PairedLinear | StackedLinear]:
+        """Return the layers, the first of them paired."""
+        return [self.first, *(each for each in self.rest if isinstance(each, StackedLinear))]
+
     @th.no_grad()
     def is_zero(self) -> bool:
         """Return whether nothing has been learnt: the output is zero whatever the input is."""
@@ -215,13 +219,14 @@ class ZeroOutputNetwork(nn.Module):
         rows = Rows(index, len(self.pinned), x.dtype)
         pinned = rows.each(lambda pinned: pinned, self.pinned)
         at_zero = (x == 0).all(-1, keepdim=True) & (pinned > 0)
-        for layer in (self.first, *self.rest[:-1]):
+        *hidden, last = self.layers()
+        for layer in hidden:
             matrix = layer.matrix()
             weight, bias = matrix[..., :-1], matrix[..., -1]
             x = self.activation(rows.affine(weight, bias, x)) - rows.each(
                 lambda bias, pinned: pinned * self.activation(bias), bias, self.pinned
             )
-        matrix = self.rest[-1].matrix()
+        matrix = last.matrix()
         bias = (1 - self.pinned) * matrix[..., -1]
         output: th.Tensor = rows.affine(matrix[..., :-1], bias, x)
         # Many kernels round s differently at the end of a row of memory: s(b) - s(b) is not 0.

@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from torch.nn import functional as F
 
-from sb3_yann.networks import ZeroOutputNetwork
+from sb3_yann.networks import ZeroOutputNetwork, zero_output
 from sb3_yann.networks.zero_output import PairedLinear
 
 ACTIVATIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
@@ -321,3 +321,39 @@ def test_network_survives_copies_and_pickles(activation: str) -> None:
     train(net, th.optim.Adam(net.parameters(), 1e-2), 5, x, curved(x))
     for other in (copy.deepcopy(net), pickle.loads(pickle.dumps(net))):
         assert th.equal(other(x), net(x))
+
+
+# --- large stacks ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hidden", HIDDEN)
+def test_a_stack_too_large_to_be_multiplied_as_a_whole_does_the_same(hidden, monkeypatch) -> None:
+    stack = 5
+    net = ZeroOutputNetwork(3, 2, hidden, pinned=pins(True, False, True, False, True))
+    with th.no_grad():
+        for parameter in net.parameters():
+            parameter += th.randn_like(parameter)
+    x, index = th.randn(64, 3), th.randint(stack, (64,))
+    x[:8] = 0
+    outcomes = []
+    for few in (stack, stack - 1):
+        monkeypatch.setattr(zero_output, "FEW", few)
+        net.zero_grad()
+        output = net(x, index)
+        output.square().sum().backward()
+        outcomes.append([output.detach(), *(each.grad.clone() for each in net.parameters())])
+    for whole, gathered in zip(*outcomes, strict=True):
+        assert bool(whole.abs().max() > 0)
+        th.testing.assert_close(whole, gathered, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("few", [0, 100])
+def test_networks_that_no_row_goes_through_get_no_gradient(few, monkeypatch) -> None:
+    monkeypatch.setattr(zero_output, "FEW", few)
+    net = ZeroOutputNetwork(3, 2, (8, 8), pinned=pins(True, False, True))
+    with th.no_grad():
+        for parameter in net.parameters():
+            parameter += th.randn_like(parameter)
+    net(th.randn(64, 3), th.randint(2, (64,))).square().sum().backward()
+    for parameter in net.parameters():
+        assert bool((parameter.grad[:2] != 0).any()) and bool((parameter.grad[2] == 0).all())

@@ -17,6 +17,7 @@ from paper.measures import interval_of, standing
 from paper.published import paper_table
 from paper.results import write_report
 from paper.runner import Outcome, Run
+from paper.summary import BEGIN, END, quote
 
 MPC_COSTS = np.array([100.0, 300.0])  # mean 200
 OPTIMUM = np.array([90.0, 290.0])  # mean 190
@@ -246,3 +247,14 @@ def test_the_command_reports_what_failed(experiments, tmp_path, capsys) -> None:
     assert len(list((tmp_path / "elsewhere").iterdir())) == 3
     assert (tmp_path / "docs/results.md").exists()
     assert main(["--report-only", "--results", "elsewhere"]) == 0
+
+
+def test_the_readme_gets_the_short_tables_between_its_marks(tmp_path) -> None:
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n", encoding="utf-8")
+    assert quote("| new |", readme)
+    assert readme.read_text(encoding="utf-8") == f"before\n{BEGIN}\n| new |\n\n{END}\nafter\n"
+    readme.write_text("nothing to replace", encoding="utf-8")
+    assert not quote("| new |", readme)
+    assert readme.read_text(encoding="utf-8") == "nothing to replace"
+    assert not quote("| new |", tmp_path / "missing.md")

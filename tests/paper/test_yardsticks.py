@@ -8,9 +8,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import Recorder
+from stable_baselines3.common.callbacks import BaseCallback
 
 from paper import yardsticks
-from paper.yardsticks import BurnIn, Learner, cloned, lqr, residual_rl, sb3_ddpg, sb3_td3
+from paper.yardsticks import (
+    BurnIn,
+    Learner,
+    best_of_ddpg,
+    cloned,
+    lqr,
+    residual_rl,
+    sb3_ddpg,
+    sb3_td3,
+)
 from sb3_yann.control import lqr as formulas
 from sb3_yann.evaluation import evaluate
 from sb3_yann_envs import problems
@@ -184,3 +194,22 @@ def test_lqr_is_linear_inside_and_clipped_outside(problem) -> None:
     np.testing.assert_allclose(actions[~outside], u[~outside], rtol=1e-6)
     np.testing.assert_allclose(actions[outside], (np.sign(u) * problem.u_max)[outside], rtol=1e-6)
     np.testing.assert_array_equal(law(states[0]), actions[0])
+
+
+def test_the_best_is_kept_of_what_ddpg_was_after_any_episode() -> None:
+    starts = range(700, 703)
+    learner = best_of_ddpg(lambda: gym.make("ClippedPendulum-v0"), 0, starts)
+    (keep,) = learner.callbacks
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.locals["dones"][0]:
+                now = yardsticks.Controller(learner.model, learner.policy.features)
+                seen.append(evaluate(now, "ClippedPendulum-v0", starts).costs.mean())
+                kept = evaluate(learner.policy, "ClippedPendulum-v0", starts).costs.mean()
+                assert kept == pytest.approx(min(seen), rel=1e-6)
+            return True
+
+    learner.model.learn(1000, callback=[keep, Watch()])
+    assert len(set(seen)) == 5
