@@ -68,6 +68,11 @@ class ImprovementGuard(BaseCallback):
         episodes.
     n_starts : int, default 100
         Number of seeded starts.
+    fresh : int, default 50
+        Number of new starts, others each time, on which a policy is tried once more before it is
+        accepted, and ten times as many when training ends. Starts by which it loses against the
+        MPC join the others for good, and what was accepted before is put back: or the MPC, where
+        that loses there as well. 0 is for none.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
     every : int, default 1
@@ -110,6 +115,7 @@ class ImprovementGuard(BaseCallback):
         env: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | None,
         *,
         n_starts: int = 100,
+        fresh: int = 50,
         seed: int = 1_000_000,
         every: int = 1,
         margin: float = 0.01,
@@ -134,6 +140,7 @@ class ImprovementGuard(BaseCallback):
             raise ValueError(f"record = {record!r} is a folder; name a file in it.")
         for name, value, least in (
             ("n_starts", n_starts, 1),
+            ("fresh", fresh, 0),
             ("seed", seed, 0),
             ("every", every, 1),
             ("patience", patience, 1),
@@ -160,7 +167,7 @@ class ImprovementGuard(BaseCallback):
             self.trials = PlantTrials(trial_episodes, significance)
         else:
             self.trials = SimulatorTrials(
-                env, n_starts, seed, every, margin, by_region, patience, wander
+                env, n_starts, fresh, seed, every, margin, by_region, patience, wander
             )
 
     @property
@@ -186,6 +193,7 @@ class ImprovementGuard(BaseCallback):
                 f"{type(policy).__name__}."
             )
         self.policy = policy
+        self._mpc: Snapshot | None = None
 
     def _on_training_start(self) -> None:
         self.trials.start(self)
@@ -216,13 +224,15 @@ class ImprovementGuard(BaseCallback):
         self.state.accepted = Snapshot.of(self.policy) if snapshot is None else snapshot
         self.state.evidence = evidence
 
-    def become_the_mpc(self) -> None:
-        """Put the MPC itself in the policy's place, with its optimizer as new."""
-        with th.random.fork_rng(devices=[]):  # building an actor draws weights
-            actor = self.policy.make_actor()
-        parameters = actor.state_dict()
-        optimizer = {**self.policy.actor.optimizer.state_dict(), "state": {}}
-        Snapshot(parameters, parameters, optimizer).restore(self.policy)
+    @property
+    def mpc(self) -> Snapshot:
+        """The MPC itself, with an optimizer as new."""
+        if self._mpc is None:
+            with th.random.fork_rng(devices=[]):  # building an actor draws weights
+                actor = self.policy.make_actor()
+            optimizer = {**self.policy.actor.optimizer.state_dict(), "state": {}}
+            self._mpc = Snapshot.of_parts(actor.state_dict(), optimizer)
+        return self._mpc
 
     def decide(self, decision: Decision) -> None:
         """Set the step, and write a decision to the record, the logger and the screen."""

@@ -30,6 +30,15 @@ class Paired:
     violations: NDArray[np.int64]
     margin: float
 
+    def and_also(self, other: Paired) -> Paired:
+        """Return the episodes of both, with the margin of this one."""
+        return Paired(
+            np.concatenate([self.mpc_costs, other.mpc_costs]),
+            np.concatenate([self.costs, other.costs]),
+            np.concatenate([self.violations, other.violations]),
+            self.margin,
+        )
+
     def lost(self, costs: Array) -> NDArray[np.bool_]:
         """Return which starts cost more than with the MPC by more than the margin."""
         return np.asarray(~(costs - self.mpc_costs <= self.margin))

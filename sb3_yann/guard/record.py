@@ -59,6 +59,7 @@ class GuardState:
     step: float = 1.0
     episodes: int = 0
     rejections: int = 0
+    fresh: int = 0
     decisions: list[Decision] = field(default_factory=list)
 
 

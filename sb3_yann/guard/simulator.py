@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 import numpy as np
-import torch as th
-from numpy.typing import NDArray
 
-from sb3_yann.evaluation import Episodes, Predictor, evaluate, one_env
+from sb3_yann.evaluation import Episodes, one_env
+from sb3_yann.guard.episodes import Evidence, evidence_of, judged, play, unsafe, visits_of
+from sb3_yann.guard.fresh import VIOLATES, settle
 from sb3_yann.guard.judging import Paired
 from sb3_yann.guard.record import Decision
+from sb3_yann.guard.regions import accept_parts, taken_over
 from sb3_yann.guard.snapshot import Snapshot, same
 
 if TYPE_CHECKING:
@@ -22,44 +22,16 @@ if TYPE_CHECKING:
 
 
 PART: Final = "accepted in part"
-MOST_LOST = 0.2
-"""Share of losing starts beyond which no part of a candidate is looked for."""
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """The accepted policy's episodes: what a candidate is compared with.
-
-    ``visits[i, r]`` says whether the episode from start i comes through region r: the others go on
-    as they are, whatever the network of r becomes.
-    """
-
-    paired: Paired
-    visits: NDArray[np.bool_]
-
-
-class _NotFinite(Exception):
-    """An action of the policy is not a finite number; envs need not put up with one."""
-
-
-@dataclass(frozen=True)
-class _FinitePolicy:
-    policy: Predictor
-
-    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
-        actions, state = self.policy.predict(observation, deterministic=deterministic)
-        if not np.all(np.isfinite(actions)):
-            raise _NotFinite
-        return actions, state
 
 
 class SimulatorTrials:
-    """Tries each candidate on the same seeded starts."""
+    """Tries each candidate on the same seeded starts, and what is to be accepted on new ones."""
 
     def __init__(
         self,
         env: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]],
         n_starts: int,
+        fresh: int,
         seed: int,
         every: int,
         margin: float,
@@ -68,7 +40,7 @@ class SimulatorTrials:
         wander: bool,
     ) -> None:
         self.env, self.every, self.margin, self.by_region = env, every, margin, by_region
-        self.patience, self.wander = patience, wander
+        self.patience, self.wander, self.fresh = patience, wander, fresh
         self.seeds = range(seed, seed + n_starts)
         self.settings = {"env": _name(env), "seeds": self.seeds, "margin": margin}
 
@@ -88,16 +60,17 @@ class SimulatorTrials:
                     f"{env.action_space}; the training env has {theirs} and "
                     f"{guard.training_env.action_space}. Give the guard a simulator of this plant."
                 )
+        self._settled: Snapshot | None = None
         self.last_trial = -self.every  # the first episode that ends is always followed by a trial
 
     def first_evidence(self, guard: ImprovementGuard) -> None:
         """Play the MPC's episodes, and accept the policy if it is no worse at the start."""
         present = Snapshot.of(guard.policy)
         if not guard.policy.actor.mu.network.is_zero():
-            guard.become_the_mpc()
+            guard.mpc.restore(guard.policy)
         # By the actor, not the law in float64: the MPC itself is to be no worse to the last bit.
-        mpc = self._play(guard, self.seeds)
-        again = self._play(guard, self.seeds)
+        mpc = play(guard, self.env, self.seeds)
+        again = play(guard, self.env, self.seeds)
         for seed, first, second in zip(self.seeds, mpc.costs, again.costs, strict=True):
             if not np.isclose(first, second, rtol=1e-6, atol=0, equal_nan=True):
                 raise ValueError(
@@ -107,13 +80,13 @@ class SimulatorTrials:
                 )
         margin = self.margin * float(np.median(np.abs(mpc.costs)))
         paired = Paired(mpc.costs, mpc.costs, unsafe(mpc), margin)
-        guard.accept(self._evidence(guard, paired, mpc))
+        guard.accept(Evidence((*self.seeds,), paired, visits_of(guard, mpc)))
         if same(present, guard.policy):
             return
         present.restore(guard.policy)
-        played, reason = self._judged(guard, paired)
+        played, reason = judged(guard, self.env)
         if played is not None and not reason:
-            guard.accept(self._evidence(guard, paired, played))
+            guard.accept(evidence_of(guard, played))
         else:
             guard.state.accepted.restore(guard.policy)
             self._report(guard, played, f"before training, {reason}", [], returned=True)
@@ -125,45 +98,47 @@ class SimulatorTrials:
             self._try(guard)
 
     def end(self, guard: ImprovementGuard) -> None:
-        """Try the last candidate."""
+        """Try the last candidate, and what is accepted then on ten times as many new starts."""
         # There is no later: what is refused now returns.
         guard.state.rejections = self.patience - 1
         self._try(guard)
+        if guard.state.accepted is self._settled:
+            return
+        last = guard.state.accepted
+        reason = settle(guard, self, None, 10 * self.fresh)
+        self._settled = guard.state.accepted
+        if reason:
+            self._settled.restore(guard.policy)
+            regions = taken_over(guard.mpc, last, self._settled)
+            self._report(guard, None, f"at the end, {reason}", regions, returned=True)
 
     def _try(self, guard: ImprovementGuard) -> None:
         if same(guard.state.accepted, guard.policy):
             return
-        evidence: Evidence = guard.state.evidence
-        played, reason = self._judged(guard, evidence.paired)
-        if played is not None and not reason:
-            guard.accept(self._evidence(guard, evidence.paired, played))
-            guard.state.rejections = 0
-            self._report(guard, played, reason, [], returned=False)
-            return
+        before = guard.state.accepted, guard.state.evidence
         candidate = Snapshot.of(guard.policy)
-        regions: list[int] = []
-        hopeless = True
-        if played is not None and not np.any(unsafe(played) > evidence.paired.violations):
-            hopeless = not self.wander and evidence.paired.loses_to_the_mpc(played.costs)
+        played, reason = judged(guard, self.env)
+        hopeless = played is None or bool(np.any(unsafe(played) > before[1].paired.violations))
+        if played is not None and not reason:
+            guard.accept(evidence_of(guard, played), candidate)
+        elif played is not None and not hopeless:
+            hopeless = not self.wander and before[1].paired.loses_to_the_mpc(played.costs)
             if self.by_region:
-                regions = self._accept_the_rest(guard, candidate, played)
-                regions = sorted({*regions, *self._accept_regions(guard, candidate)})
+                accept_parts(guard, self.env, candidate, played)
+        lost = settle(guard, self, before, self.fresh)
+        if not reason and not lost:
+            guard.state.rejections = 0
+            self._report(guard, played, "", [], returned=False)
+            return
         guard.state.rejections += 1
+        hopeless = hopeless or VIOLATES in lost
         returned = hopeless or guard.state.rejections >= self.patience
         if returned:
             guard.state.rejections = 0
-        (guard.state.accepted if returned else candidate).restore(guard.policy)
-        self._report(guard, played, reason, regions, returned)
-
-    def _judged(self, guard: ImprovementGuard, paired: Paired) -> tuple[Episodes | None, str]:
-        """Return the episodes of the present policy and what speaks against it, if anything."""
-        if not all(bool(th.isfinite(each).all()) for each in guard.policy.actor.parameters()):
-            return None, "a parameter of the actor is not a finite number"
-        try:
-            played = self._play(guard, self.seeds)
-        except _NotFinite:
-            return None, "an action of the actor is not a finite number"
-        return played, paired.objection(played.costs, unsafe(played))
+        accepted = guard.state.accepted
+        (accepted if returned else candidate).restore(guard.policy)
+        regions = taken_over(before[0], candidate, accepted)
+        self._report(guard, played, reason or lost, regions, returned)
 
     def _report(
         self,
@@ -188,99 +163,6 @@ class SimulatorTrials:
                 regions=tuple(regions),
             )
         )
-
-    def _accept_the_rest(
-        self, guard: ImprovementGuard, candidate: Snapshot, played: Episodes
-    ) -> list[int]:
-        """Give back the regions by which few starts lose, until what is left can be accepted.
-
-        The region to give back is the one that the losing starts come through and the winning ones
-        least. Leaves the policy changed.
-        """
-        evidence: Evidence = guard.state.evidence
-        paired, visited = evidence.paired, (evidence.visits | _visits(guard, played)).any(0)
-        before = guard.state.accepted
-        kept = [i for i in np.flatnonzero(visited).tolist() if _differs(before, candidate, i)]
-        while len(kept) > 1:
-            lost = paired.lost(played.costs)
-            if not lost.any() or lost.mean() > MOST_LOST:
-                break
-            visits, won = _visits(guard, played), played.costs < paired.costs - paired.margin
-            blame, credit = visits[lost].sum(0)[kept], visits[won].sum(0)[kept]
-            if not blame.any():
-                break
-            kept.pop(int(np.argmax(blame / (blame + credit + 1e-9))))
-            mixed = before.with_regions(candidate, kept)
-            mixed.restore(guard.policy)
-            try:
-                played = self._play(guard, self.seeds)
-            except _NotFinite:
-                break
-            gained = played.costs.mean() < paired.costs.mean()
-            if gained and not paired.objection(played.costs, unsafe(played)):
-                guard.accept(self._evidence(guard, paired, played), mixed)
-                return kept
-        return []
-
-    def _accept_regions(self, guard: ImprovementGuard, candidate: Snapshot) -> list[int]:
-        """Take over the regions of the candidate that improve the accepted policy, one by one.
-
-        Only the episodes that come through a region are played again. Leaves the policy changed.
-        """
-        accepted = []
-        for region in np.argsort(-guard.state.evidence.visits.sum(0), kind="stable").tolist():
-            evidence: Evidence = guard.state.evidence
-            starts = np.flatnonzero(evidence.visits[:, region])
-            before = guard.state.accepted
-            if len(starts) == 0 or not _differs(before, candidate, region):
-                continue
-            mixed = before.with_regions(candidate, [region])
-            mixed.restore(guard.policy)
-            try:
-                played = self._play(guard, [self.seeds[i] for i in starts])
-            except _NotFinite:
-                continue
-            costs, violations = evidence.paired.costs.copy(), evidence.paired.violations.copy()
-            costs[starts], violations[starts] = played.costs, unsafe(played)
-            if costs.mean() < evidence.paired.costs.mean() and not evidence.paired.objection(
-                costs, violations
-            ):
-                visits = evidence.visits.copy()
-                visits[starts] = _visits(guard, played)
-                paired = replace(evidence.paired, costs=costs, violations=violations)
-                guard.accept(Evidence(paired, visits), mixed)
-                accepted.append(region)
-        return accepted
-
-    def _play(self, guard: ImprovementGuard, seeds: Sequence[int]) -> Episodes:
-        return evaluate(_FinitePolicy(guard.policy), self.env, seeds)
-
-    def _evidence(self, guard: ImprovementGuard, paired: Paired, played: Episodes) -> Evidence:
-        paired = replace(paired, costs=played.costs, violations=unsafe(played))
-        return Evidence(paired, _visits(guard, played))
-
-
-def unsafe(played: Episodes) -> NDArray[np.int64]:
-    """Return the violations of each episode; to be terminated counts as one."""
-    return np.maximum(played.violations, played.terminated)
-
-
-def _visits(guard: ImprovementGuard, played: Episodes) -> NDArray[np.bool_]:
-    """Return which regions each episode comes through, shape (episodes, regions)."""
-    layer = guard.policy.actor.mu
-    visits = np.zeros((len(played.costs), len(layer.gains)), dtype=bool)
-    for visited, states in zip(visits, played.observations, strict=True):
-        theta = th.as_tensor(states[:-1], dtype=th.float32, device=guard.model.device)
-        visited[layer.locate(theta)[0].cpu().numpy()] = True
-    return visits
-
-
-def _differs(before: Snapshot, candidate: Snapshot, region: int) -> bool:
-    """Return whether the region's network is another one."""
-    return not all(
-        th.equal(value[region], candidate.actor[name][region])
-        for name, value in before.networks().items()
-    )
 
 
 def _name(env: Any) -> str:

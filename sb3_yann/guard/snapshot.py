@@ -34,6 +34,11 @@ class Snapshot:
             _copied(policy.actor.optimizer.state_dict()),
         )
 
+    @classmethod
+    def of_parts(cls, actor: Parameters, optimizer: dict[str, Any]) -> Snapshot:
+        """Return a copy of an actor that is its own target, and of an optimizer."""
+        return cls(_copied(actor), _copied(actor), _copied(optimizer))
+
     def restore(self, policy: YannPolicy) -> None:
         """Put them back, bit for bit."""
         policy.actor.load_state_dict(self.actor)
@@ -84,3 +89,9 @@ def same(snapshot: Snapshot, policy: YannPolicy) -> bool:
     """Return whether the policy's actor is still that of the snapshot, bit for bit."""
     now = policy.actor.state_dict()
     return all(th.equal(value, now[name].cpu()) for name, value in snapshot.actor.items())
+
+
+def same_networks(one: Snapshot, other: Snapshot) -> bool:
+    """Return whether both hold the same actor, whatever its optimizer remembers."""
+    networks = other.networks()
+    return all(th.equal(value, networks[name]) for name, value in one.networks().items())

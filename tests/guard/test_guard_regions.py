@@ -27,7 +27,7 @@ from guard_samples import (
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann.evaluation import evaluate
-from sb3_yann.guard import simulator as simulator_trials
+from sb3_yann.guard import regions as guard_regions
 from sb3_yann.guard.snapshot import Snapshot
 from sb3_yann.policies import YannPolicy
 
@@ -102,9 +102,9 @@ def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
 def test_only_the_starts_that_come_through_a_region_are_played_again(
     most_lost, monkeypatch
 ) -> None:
-    monkeypatch.setattr(simulator_trials, "MOST_LOST", most_lost)
+    monkeypatch.setattr(guard_regions, "MOST_LOST", most_lost)
     simulator = Slide()
-    model, guard = build(gradient_steps=0), make_guard(simulator)
+    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=0)
     count: list[int] = []
     before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
     train(model, STEPS, At([STEPS], half_good), before, guard, after)
