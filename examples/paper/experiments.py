@@ -31,7 +31,7 @@ from sb3_yann_envs import cstr, problems
 TEST_SEEDS = range(2000, 2100)
 """Test starts; the first ten are those of the paper's tables."""
 GUARD_SEEDS = range(1_000_000, 1_000_200)
-"""Starts on which a rival may choose its best policy: the guard's, and the first of its new ones."""
+"""Starts on which a rival may choose its best policy: as many as the guard's, and new ones."""
 CHECKPOINTS = (0, 10, 20, 30, 40, 50, 75, 100, 150, 200)
 """Training episodes after which the policy is tested."""
 FINGERPRINT = f"{sb3_yann.__version__}-2"
@@ -77,7 +77,7 @@ _PENDULUM = Plant(
     optimum.clipped_pendulum_optimum,
     gradient_steps=2,
     critic_warmup=4000,
-    guard={"fresh": 100, "patience": 10, "wander": True},
+    guard={"fresh": 100, "margin": 0.03, "patience": 10, "wander": True},
 )
 PLANTS = {
     "CSTR": _REACTOR,

@@ -193,7 +193,8 @@ class ImprovementGuard(BaseCallback):
                 f"{type(policy).__name__}."
             )
         self.policy = policy
-        self._mpc: Snapshot | None = None
+        untrained = policy.actor.mu.network.is_zero()
+        self._mpc = Snapshot.of(policy) if untrained else None
 
     def _on_training_start(self) -> None:
         self.trials.start(self)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sb3_yann.evaluation import Episodes
 from sb3_yann.guard.episodes import Evidence, NotFinite, judged, play, unsafe, visits_of
 from sb3_yann.guard.judging import Paired
 from sb3_yann.guard.regions import accept_parts
-from sb3_yann.guard.snapshot import Snapshot, same_networks
+from sb3_yann.guard.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
@@ -26,47 +26,39 @@ VIOLATES: Final = "violates a limit"
 
 @dataclass(frozen=True)
 class _Hard:
-    """New starts by which a policy lost, and how the MPC does there."""
+    """New starts by which a policy lost."""
 
     reason: str
     seeds: tuple[int, ...]
-    mpc_costs: NDArray[np.float64]
-    mpc_violations: NDArray[np.int64]
 
 
-def settle(
-    guard: ImprovementGuard,
-    trials: SimulatorTrials,
-    before: tuple[Snapshot, Evidence] | None,
-    n_starts: int,
-) -> str:
-    """Try what is accepted on new starts; where it loses, go back to what was before.
+def settle(guard: ImprovementGuard, trials: SimulatorTrials, n_starts: int) -> str:
+    """Try what is accepted on new starts; where it loses, go back to what was accepted before.
 
-    Or to the MPC, if that loses there as well, or nothing is known. The starts by which it lost
-    are among those of every later trial. The regions of either may be accepted one by one, and are
-    then tried on new starts as well. Returns why it went back, empty where it did not. Leaves
-    the policy changed.
+    That is the last of what passed such a test and does not lose on these starts, or the MPC. The
+    starts are among those of every later trial. The regions of what lost may be accepted one by
+    one, and are then tried on new starts as well. Returns why it went back, empty where it did
+    not. Leaves the policy changed.
     """
     first, state = "", guard.state
     for _ in range(ROUNDS):
-        if before is not None and same_networks(state.accepted, before[0]):
-            return first
         lost = state.accepted
         hard = _hard_starts(guard, trials, n_starts)
         if hard is None:
+            trials.remember(lost)
             return first
         first = first or hard.reason
-        tested = () if before is None else (before[0],)
-        _go_back(guard, trials.env, before, hard)
-        before = state.accepted, state.evidence
-        for snapshot in (*tested, lost) if trials.by_region else ():
-            if not same_networks(state.accepted, snapshot):
-                snapshot.restore(guard.policy)
-                played, _ = judged(guard, trials.env)
-                if played is not None:
-                    accept_parts(guard, trials.env, snapshot, played)
-    # What has not been tried on new starts is not accepted.
-    state.accepted, state.evidence = before or (state.accepted, state.evidence)
+        trials.forget(lost)
+        _go_back(guard, trials, hard)
+        safe = state.accepted, state.evidence
+        if trials.by_region:
+            lost.restore(guard.policy)
+            played, _ = judged(guard, trials.env)
+            if played is not None:
+                accept_parts(guard, trials.env, lost, played)
+        if state.accepted is safe[0]:
+            return first
+    state.accepted, state.evidence = safe  # what has not been tried on new starts is not accepted
     return first
 
 
@@ -86,7 +78,7 @@ def _hard_starts(guard: ImprovementGuard, trials: SimulatorTrials, n_starts: int
         played = play(guard, trials.env, seeds)
     except NotFinite:
         reason = "an action of the actor is not a finite number on new starts"
-        return _Hard(reason, (seeds[0],), mpc.costs[:1], unsafe(mpc)[:1])
+        return _Hard(reason, (seeds[0],))
     excess, more = played.costs - mpc.costs, unsafe(played) > unsafe(mpc)
     worse = ~(excess <= state.evidence.paired.margin) | more
     if not worse.any():
@@ -99,25 +91,37 @@ def _hard_starts(guard: ImprovementGuard, trials: SimulatorTrials, n_starts: int
     )
     if more.any():
         reason += f" and {VIOLATES}"
-    return _Hard(reason, tuple(seeds[i] for i in hardest), mpc.costs[hardest], unsafe(mpc)[hardest])
+    return _Hard(reason, tuple(seeds[i] for i in hardest))
 
 
-def _go_back(
-    guard: ImprovementGuard, env: Any, before: tuple[Snapshot, Evidence] | None, hard: _Hard
-) -> None:
-    """Accept what was before, or the MPC, with the hard starts among the others."""
-    margin = guard.state.evidence.paired.margin
-    if before is not None:
-        snapshot, evidence = before
-        snapshot.restore(guard.policy)
-        played = play(guard, env, hard.seeds)
-        paired = Paired(hard.mpc_costs, played.costs, unsafe(played), margin)
-        if not (paired.lost(played.costs) | (paired.violations > hard.mpc_violations)).any():
-            there = Evidence(hard.seeds, paired, visits_of(guard, played))
-            guard.accept(evidence.and_also(there), snapshot)
-            return
+def _go_back(guard: ImprovementGuard, trials: SimulatorTrials, hard: _Hard) -> None:
+    """Accept the last of what was accepted that does not lose on any start, or the MPC."""
+    paired = guard.state.evidence.paired
     seeds = (*guard.state.evidence.seeds, *hard.seeds)
     guard.mpc.restore(guard.policy)
-    played = play(guard, env, seeds)
-    paired = Paired(played.costs, played.costs, unsafe(played), margin)
-    guard.accept(Evidence(seeds, paired, visits_of(guard, played)), guard.mpc)
+    mpc = play(guard, trials.env, seeds)
+    for snapshot in reversed(trials.passed):
+        snapshot.restore(guard.policy)
+        for some in (hard.seeds, seeds):  # most fail on the first, which are few
+            played = play(guard, trials.env, some)
+            rest = slice(len(seeds) - len(some), None)
+            more = unsafe(played) > unsafe(mpc)[rest]
+            if not np.all(played.costs - mpc.costs[rest] <= paired.margin) or more.any():
+                break
+        else:
+            _accept(guard, snapshot, seeds, mpc, played)
+            return
+    _accept(guard, guard.mpc, seeds, mpc, mpc)
+
+
+def _accept(
+    guard: ImprovementGuard,
+    snapshot: Snapshot,
+    seeds: tuple[int, ...],
+    mpc: Episodes,
+    played: Episodes,
+) -> None:
+    snapshot.restore(guard.policy)
+    margin = guard.state.evidence.paired.margin
+    paired = Paired(mpc.costs, played.costs, unsafe(played), margin)
+    guard.accept(Evidence(seeds, paired, visits_of(guard, played)), snapshot)

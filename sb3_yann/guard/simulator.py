@@ -15,13 +15,15 @@ from sb3_yann.guard.fresh import VIOLATES, settle
 from sb3_yann.guard.judging import Paired
 from sb3_yann.guard.record import Decision
 from sb3_yann.guard.regions import accept_parts, taken_over
-from sb3_yann.guard.snapshot import Snapshot, same
+from sb3_yann.guard.snapshot import Snapshot, same, same_networks
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
 
 
 PART: Final = "accepted in part"
+MEMORY = 50_000_000
+"""Bytes of earlier accepted policies that are kept to go back to."""
 
 
 class SimulatorTrials:
@@ -60,7 +62,8 @@ class SimulatorTrials:
                     f"{env.action_space}; the training env has {theirs} and "
                     f"{guard.training_env.action_space}. Give the guard a simulator of this plant."
                 )
-        self._settled: Snapshot | None = None
+        self.passed: list[Snapshot] = []
+        self._final: Snapshot | None = None
         self.last_trial = -self.every  # the first episode that ends is always followed by a trial
 
     def first_evidence(self, guard: ImprovementGuard) -> None:
@@ -102,15 +105,26 @@ class SimulatorTrials:
         # There is no later: what is refused now returns.
         guard.state.rejections = self.patience - 1
         self._try(guard)
-        if guard.state.accepted is self._settled:
-            return
         last = guard.state.accepted
-        reason = settle(guard, self, None, 10 * self.fresh)
-        self._settled = guard.state.accepted
+        if last is self._final:  # the Zoo ends its first callback a second time
+            return
+        reason = settle(guard, self, 10 * self.fresh)
+        self._final = accepted = guard.state.accepted
+        accepted.restore(guard.policy)
         if reason:
-            self._settled.restore(guard.policy)
-            regions = taken_over(guard.mpc, last, self._settled)
+            regions = taken_over(guard.mpc, last, accepted)
             self._report(guard, None, f"at the end, {reason}", regions, returned=True)
+
+    def remember(self, snapshot: Snapshot) -> None:
+        """Keep what passed on new starts, as far as memory allows."""
+        self.forget(snapshot)
+        self.passed.append(snapshot)
+        most = max(1, min(len(self.passed), MEMORY // snapshot.size))
+        del self.passed[:-most]
+
+    def forget(self, snapshot: Snapshot) -> None:
+        """Remove what lost on new starts after all."""
+        self.passed = [each for each in self.passed if not same_networks(each, snapshot)]
 
     def _try(self, guard: ImprovementGuard) -> None:
         if same(guard.state.accepted, guard.policy):
@@ -125,7 +139,8 @@ class SimulatorTrials:
             hopeless = not self.wander and before[1].paired.loses_to_the_mpc(played.costs)
             if self.by_region:
                 accept_parts(guard, self.env, candidate, played)
-        lost = settle(guard, self, before, self.fresh)
+        moved = not same_networks(before[0], guard.state.accepted)
+        lost = settle(guard, self, self.fresh) if moved else ""
         if not reason and not lost:
             guard.state.rejections = 0
             self._report(guard, played, "", [], returned=False)

@@ -45,6 +45,12 @@ class Snapshot:
         policy.actor_target.load_state_dict(self.target)
         policy.actor.optimizer.load_state_dict(copy.deepcopy(self.optimizer))
 
+    @property
+    def size(self) -> int:
+        """Bytes of the actor, its target and two moments of each trained parameter."""
+        stored = [*self.actor.values(), *self.target.values(), *2 * [*self.networks().values()]]
+        return sum(each.numel() * each.element_size() for each in stored)
+
     def networks(self) -> Parameters:
         """Return the actor's trainable parameters; the first axis of each is the region."""
         return {
