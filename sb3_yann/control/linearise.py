@@ -105,10 +105,10 @@ def _linearise(
         check_rest(simulator, point, found.value, scales)
     A, B = found.value[:, :n], found.value[:, n:]
     return LinearModel(A, B, dt, point[:n], point[n:]).with_notes(
-        f"Linearised by central differences over one step. The state was set by "
+        "Linearised by central differences over one step. The state was set by "
         f"{simulator.setter} and read from {simulator.reader}.",
-        f"Of the operating point, {np.count_nonzero(~free)} entries were given and "
-        f"{np.count_nonzero(free)} solved for.",
+        f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
+        "for and the others given or taken from the middle of the action space.",
         *_remarks(simulator, point),
         *_curvature(found, (n, u.size)),
     )
