@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_yann.control._validation import Array
 
-LEVELS = 5
+LEVELS = 6
 RATIO = 4.0
 """Each point is approached with `LEVELS` steps, each this much shorter than the one before."""
 
@@ -124,7 +124,7 @@ def _column(
     # Unequal sides (a point that is rounded) would leave a first-order error in the mean.
     value, error = _extrapolated(slope, RATIO**2, 2 * noise / span)
     kink, doubt = _extrapolated(one - other, RATIO, 4 * noise / span)
-    steepest = np.max(np.abs([one[-1], other[-1]]))
+    steepest = np.max(np.abs(value) + np.abs(kink) / 2)
     floor = np.max(2 * noise / span[0])
     if np.any((np.abs(kink) > 5 * doubt) & (np.abs(kink) > 0.01 * steepest)):
         raise NotDifferentiableError(i, "its slopes to the two sides differ (a kink)")

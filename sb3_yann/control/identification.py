@@ -16,6 +16,8 @@ from sb3_yann.control.regression import Regression, regress
 
 AHEAD = 10
 """Steps of the longer prediction whose fit is stated."""
+FAR = 5.0
+"""Spreads from the mean of the data beyond which a model is extrapolated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +117,8 @@ def identify(
     disturbances : array_like, shape (T, d), or a sequence of such, optional
         Measured disturbances, which make E.
     x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
-        The operating point. Left out, inputs and disturbances take their mean, and the state where
-        the fitted model rests with them.
+        The operating point. Left out, inputs and disturbances take their mean, and the state is
+        where the fitted model rests with them; the mean, if that is far outside the data.
     offset : bool, default True
         Fit c too, so that the operating point need not be a steady state exactly. Without it,
         deviations from (x_ss, u_ss, d_ss), zeros where left out, are fitted with c = 0.
@@ -192,8 +194,10 @@ def _operating_point(
     scale = np.where(found.spread > 0, found.spread, 1.0)
     moves = (found.coefficients - np.eye(n, scale.size)) * scale / scale[:n, None]
     drift = (found.predict(start[None])[0] - start[:n]) / scale[:n]
-    # A plant that integrates does not rest anywhere but by luck: it is not sent far for it.
-    start[ways] += scale[ways] * np.linalg.lstsq(moves[:, ways], -drift, rcond=1e-3)[0]
+    way = np.linalg.lstsq(moves[:, ways], -drift, rcond=None)[0]
+    # A plant that integrates, or nearly, rests far away if anywhere: the data do not tell of there.
+    if np.max(np.abs(way)) <= FAR:
+        start[ways] += scale[ways] * way
     return start
 
 
@@ -213,11 +217,10 @@ def _model(
             f"At the operating point the fitted plant moves by {_list(drift)} in one step. The "
             "model leaves that out."
         )
-    away = np.abs(x - found.centre[:n]) > 5 * found.spread[:n]
+    away = np.abs(x - found.centre[:n]) > FAR * found.spread[:n]
     if np.any(away):
         model = model.with_notes(
-            f"The operating point x_ss[{int(np.argmax(away))}] lies outside the data: the model is "
-            "extrapolated there. Pass x_ss."
+            f"x_ss[{int(np.argmax(away))}] lies far outside the data: the model is extrapolated."
         )
     return model
 

@@ -174,9 +174,10 @@ class LinearModel(ReadOnlyArrays):
     ) -> LinearModel:
         """Linearise one step of a simulator at a steady state, by central differences.
 
-        A step of the environment, with its wrappers, is the discrete-time plant already. An id or a function makes an environment of its own, closed in the
-        end. An environment is deep-copied and left as it is; one that cannot be copied is used
-        itself, without a seed, and needs a reset afterwards, which the notes then say.
+        A step of the environment, with its wrappers, is the discrete-time plant already. An id or
+        a function makes an environment of its own, closed in the end. An environment is deep-copied
+        and left as it is; one that cannot be copied is used itself, without a seed, and needs a
+        reset afterwards, which the notes then say.
 
         Parameters
         ----------

@@ -283,6 +283,16 @@ def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | No
             f"{again.tolist()}: setting it does not work, or the plant is random or has states "
             "besides these (then identify it: LinearModel.from_data)"
         )
+    pushed = simulator.next_state(other, u + 0.1 * _room(simulator, u))
+    if np.array_equal(moved, other) and np.array_equal(pushed, other):
+        return f"no step changes it from {other.tolist()}, whatever the action"
     if not simulator.resets and np.array_equal(first, moved):
         return f"the next state is {first.tolist()} from {x.tolist()} and {other.tolist()} alike"
     return None
+
+
+def _room(simulator: Simulator, u: Array) -> Array:
+    """Return the way from u to the farther bound of the actions, signed, and at most 1000."""
+    space = simulator.env.action_space
+    up, down = space.high - u, u - space.low
+    return np.asarray(np.where(up >= down, np.minimum(up, 1e3), -np.minimum(down, 1e3)))
