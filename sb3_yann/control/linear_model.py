@@ -172,39 +172,35 @@ class LinearModel(ReadOnlyArrays):
         get_state: Callable[[Any], ArrayLike] | None = None,
         scale: ArrayLike | None = None,
     ) -> LinearModel:
-        """Linearise one step of a simulator at a steady state, by central differences.
+        """Linearise one step of a simulator, wrappers and all, by central differences.
 
-        A step of the environment, with its wrappers, is the discrete-time plant already. An id or
-        a function makes an environment of its own, closed in the end. An environment is deep-copied
-        and left as it is; one that cannot be copied is used itself, without a seed, and needs a
-        reset afterwards, which the notes then say.
+        An id or a function makes an environment of its own, closed in the end. An environment is
+        deep-copied and left as it is; one that cannot be copied is used itself, without a seed, and
+        needs a reset afterwards, which the notes then say.
 
         Parameters
         ----------
         env : gymnasium.Env, str or callable
             A single environment with a one-dimensional Box of actions, its id, or its maker.
         state : array_like, shape (n,), optional
-            The operating point in the coordinates of the environment. NaN entries are solved for
-            (`scipy.optimize.least_squares`). Without it all are, from the state of a reset on.
+            The operating point, as the environment has it. NaN entries are solved for; all are if
+            it is left out, from the state of a reset on.
         action : array_like, shape (m,), optional
-            Likewise. Without it: the middle of the action space if ``state`` is left out as
-            well, else solved for.
+            Likewise; the middle of the action space if both are left out.
         dt : float, optional
-            Time of one step. The default is looked for as ``dt``, ``tau`` or ``DT`` of the
-            unwrapped environment and as ``DT`` of its module; never is it ``render_fps``. A
-            wrapper that repeats actions makes a step longer: pass ``dt`` then.
+            Time of one step. The default is ``dt``, ``tau`` or ``DT`` of the unwrapped environment,
+            or ``DT`` of its module, never ``render_fps``. Pass it if a wrapper repeats actions.
         set_state : callable, optional
             ``set_state(env, x)`` puts the environment into the state x. The default tries
             ``env.reset(options={"state": x})``, then ``env.unwrapped.state = x``, and takes the
             first that is seen to work.
         get_state : callable, optional
             ``get_state(env)`` returns the state, shape (n,). The default takes the first of
-            ``info["state"]``, ``env.unwrapped.state`` and the observation that returns the state
-            that was set.
+            ``info["state"]``, ``env.unwrapped.state`` and the observation that is what was set.
         scale : array_like, shape (n,), optional
-            How far each state moves in use: sets the step sizes (1 % of it at most) and what
-            counts as steady (0.1 % of it). The default is half the width of the observation
-            space, or the size of the state, at least 1.
+            How far each state moves in use: sets the step sizes (at most 1 % of it, 5 % where
+            states are float32) and how far off a given steady state may be (1 %). The default is
+            half the width of the observation space, or the size of the state, at least 1.
 
         Raises
         ------
@@ -229,8 +225,8 @@ class LinearModel(ReadOnlyArrays):
     ) -> LinearModel:
         """Return the model that fits measured episodes best, by least squares.
 
-        The short form of :func:`sb3_yann.control.identify`, which takes the same arguments, says
-        what they are, and returns the standard errors and fits too. :meth:`report` tells the fit.
+        The short form of :func:`sb3_yann.control.identify`, which takes the same options and
+        returns the standard errors and fits too. :meth:`report` tells the fit.
         """
         from sb3_yann.control.identification import identify
 

@@ -16,6 +16,8 @@ ON_CIRCLE = 1e-6
 UNREACHED = 1e-6
 HARDLY_REACHED = 1e-3
 """Directions that the inputs move this much less than the others."""
+DOUBLINGS = 16
+"""Of the horizon over which the reach of the inputs is summed: 65,536 samples."""
 GONE = 0.1
 """Time constants, in samples, below which a mode counts as a delay: gone within one sample."""
 SLOW_SAMPLING, FAST_SAMPLING = 1.0, 50.0
@@ -55,7 +57,7 @@ def _head(model: LinearModel) -> list[str]:
 
 
 def poles(model: LinearModel) -> Array:
-    """Return the eigenvalues of A, the slowest first, one of each complex pair."""
+    """Return the eigenvalues of A, the largest first, one of each complex pair."""
     values = np.linalg.eigvals(model.A)
     values = values[values.imag >= 0]
     return np.asarray(values[np.argsort(-np.abs(values), kind="stable")])
@@ -78,11 +80,7 @@ def _mode(pole: complex, dt: float) -> str:
     constant = time_constant(pole)
     lasting = f"{abs(constant) * dt:.4g} ({abs(constant):.3g} samples)"
     if np.isinf(constant):
-        words = (
-            "stays where it is (integrates)"
-            if pole.real > 0 and pole.imag == 0
-            else "neither grows nor decays"
-        )
+        words = "integrates" if abs(pole - 1) <= ON_CIRCLE else "neither grows nor decays"
     elif abs(constant) < GONE:
         words = "gone within one sample"
     else:
@@ -111,14 +109,17 @@ def reach(model: LinearModel) -> tuple[Array, Array]:
     They are the principal axes of the controllability Gramian, each state in units of how far it
     is moved itself, so that units do not count; the largest first, relative to it. The rows of
     the second are the directions. The rank of ``control.ctrb`` would mislead: with short samples
-    A is near the identity and ``B, AB, ...`` are nearly parallel for any plant. An unstable A is
-    scaled down for it, which changes no reachable subspace; `control.gram` does not take it.
+    A is near the identity and ``B, AB, ...`` are nearly parallel for any plant. `control.gram`
+    needs slycot and a stable A; here A is scaled down, which changes no reachable subspace.
     """
     A, B = model.A, model.B / np.maximum(np.linalg.norm(model.B, axis=0), np.finfo(float).tiny)
     radius = np.max(np.abs(np.linalg.eigvals(A)))
     if radius > 0.999:
         A = A * (0.999 / radius)
-    gramian = linalg.solve_discrete_lyapunov(A, B @ B.T)
+    gramian, power = B @ B.T, A
+    # Smith's doubling: a sum of positive terms, which units cannot spoil as they do an equation.
+    for _ in range(DOUBLINGS):
+        gramian, power = gramian + power @ gramian @ power.T, power @ power
     moved = np.sqrt(np.maximum(np.diag(gramian), 0))
     # What rounding leaves of a state that no input moves is not to be blown up.
     still = moved <= 1e-12 * np.max(moved, initial=0)
