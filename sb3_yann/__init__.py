@@ -6,7 +6,14 @@ policy alias ``"YannPolicy"`` with TD3 and DDPG.
 
 import sb3_yann_envs
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
-from sb3_yann.control import ExplicitSolutionError, LinearModel, LinearMPC, PiecewiseAffine
+from sb3_yann.control import (
+    ExplicitSolutionError,
+    Identified,
+    LinearModel,
+    LinearMPC,
+    PiecewiseAffine,
+    identify,
+)
 from sb3_yann.guard import Decision, ImprovementGuard, restore_accepted
 from sb3_yann.policies import YannActor, YannCritic, YannPolicy
 from sb3_yann.problems import register_problem
@@ -17,6 +24,7 @@ __all__ = [
     "ControlDiagnostics",
     "Decision",
     "ExplicitSolutionError",
+    "Identified",
     "ImprovementGuard",
     "LinearMPC",
     "LinearModel",
@@ -25,6 +33,7 @@ __all__ = [
     "YannActor",
     "YannCritic",
     "YannPolicy",
+    "identify",
     "register_problem",
     "restore_accepted",
 ]

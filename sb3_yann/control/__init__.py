@@ -1,8 +1,17 @@
 """The design side: models, LQR, MPC and its explicit law. float64 numpy, no torch."""
 
 from sb3_yann.control.explicit import ExplicitSolutionError, ParametricQP
+from sb3_yann.control.identification import Identified, identify
 from sb3_yann.control.linear_model import LinearModel
 from sb3_yann.control.mpc import LinearMPC
 from sb3_yann.control.piecewise_affine import PiecewiseAffine
 
-__all__ = ["ExplicitSolutionError", "LinearMPC", "LinearModel", "ParametricQP", "PiecewiseAffine"]
+__all__ = [
+    "ExplicitSolutionError",
+    "Identified",
+    "LinearMPC",
+    "LinearModel",
+    "ParametricQP",
+    "PiecewiseAffine",
+    "identify",
+]

@@ -15,8 +15,11 @@ from scipy.linalg import expm
 
 from sb3_yann import LinearModel
 from sb3_yann_envs import clipped_pendulum as pendulum
+from sb3_yann_envs import cstr
 
-MODEL = LinearModel([[1, 0.1], [0, 0.9]], [[0], [1]], 0.5, x_ss=[1, 2], u_ss=[3])
+MODEL = LinearModel(
+    [[1, 0.1], [0, 0.9]], [[0], [1]], 0.5, x_ss=[1, 2], u_ss=[3], E=[[2], [0]], d_ss=[4]
+)
 
 
 @settings(derandomize=True, max_examples=50, deadline=None)
@@ -28,6 +31,14 @@ def test_sampling_is_the_matrix_exponential(n: int, m: int, dt: float, seed: int
     both = expm(dt * np.vstack([np.hstack([A, B]), np.zeros((m, n + m))]))
     model = LinearModel.from_continuous(A, B, dt)
     np.testing.assert_allclose(np.hstack([model.A, model.B]), both[:n], rtol=1e-11, atol=1e-12)
+
+
+def test_disturbances_are_sampled_like_inputs() -> None:
+    A, B, E = [[0, 1], [-2, -1]], [[0], [1]], [[1], [3]]
+    model = LinearModel.from_continuous(A, B, 0.3, E=E, d_ss=[5])
+    other = LinearModel.from_continuous(A, E, 0.3)
+    np.testing.assert_allclose(model.E, other.B, rtol=1e-12)
+    assert model.d_ss == [5]
 
 
 def test_sampling_takes_a_singular_state_matrix() -> None:
@@ -57,6 +68,35 @@ def test_dynamics_are_linearised_by_their_jacobian() -> None:
     np.testing.assert_allclose(model.B, exact.B, atol=1e-6)
 
 
+def test_dynamics_take_measured_disturbances() -> None:
+    def f(x: Any, u: Any, d: Any) -> Any:
+        return [-x[0] * d[0] + u[0] + 6 + d[1] ** 2 - 1]
+
+    model = LinearModel.from_dynamics(f, [3], [0], 0.1, d_ss=[2, 1])  # at rest
+    exact = LinearModel.from_continuous([[-2]], [[1]], 0.1, E=[[-3, 2]])  # by hand
+    np.testing.assert_allclose(model.A, exact.A, atol=1e-9)
+    np.testing.assert_allclose(model.E, exact.E, atol=1e-9)
+    assert model.d_ss.tolist() == [2, 1]
+
+
+def test_dynamics_are_exact_to_nine_digits_in_coordinates_of_hundreds() -> None:
+    x, u = cstr.X_SS, cstr.U_SS
+    truth = np.zeros((4, 5))
+    for i in range(5):  # complex steps: no difference is taken, so nothing is lost to rounding
+        z = np.concatenate([x, u]).astype(complex)
+        z[i] += 1e-30j
+        truth[:, i] = np.array(cstr._rates(*z, exp=np.exp)).imag / 1e-30
+    model = LinearModel.from_dynamics(cstr.dynamics, x, u, cstr.DT)
+    exact = LinearModel.from_continuous(truth[:, :4], truth[:, 4:], cstr.DT)
+    np.testing.assert_allclose(model.A, exact.A, atol=1e-9)
+    np.testing.assert_allclose(model.B, exact.B, atol=1e-9)
+
+
+def test_kink_in_the_dynamics_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"along u\[0\], its slopes to the two sides differ"):
+        LinearModel.from_dynamics(lambda x, u: -x + np.maximum(u, 0), [0], [0], 0.1)
+
+
 def test_pendulum_linearises_to_the_printed_matrices() -> None:
     model = LinearModel.from_dynamics(pendulum.dynamics, pendulum.X_SS, pendulum.U_SS, pendulum.DT)
     # printed to 4 decimals
@@ -71,7 +111,27 @@ def test_step_takes_one_state_and_a_batch() -> None:
     np.testing.assert_allclose(MODEL.step(x[0], u[0]), expected[0])
 
 
-@pytest.mark.parametrize("name", ["A", "B", "x_ss", "u_ss"])
+def test_step_adds_the_disturbance() -> None:
+    x, u, d = np.ones((2, 2)), np.zeros((2, 1)), np.array([[1.0], [-1.0]])
+    np.testing.assert_allclose(MODEL.step(x, u, d), [[3.1, 0.9], [-0.9, 0.9]])  # by hand
+
+
+def test_a_model_without_disturbances_has_an_empty_matrix_of_them() -> None:
+    model = LinearModel([[1]], [[1]], 1.0)
+    assert (model.E.shape, model.d_ss.shape, model.n_disturbances) == ((1, 0), (0,), 0)
+
+
+def test_notes_are_no_part_of_equality() -> None:
+    noted = MODEL.with_notes("found in the attic")
+    assert (noted, hash(noted), repr(noted)) == (MODEL, hash(MODEL), repr(MODEL))
+    assert noted.notes == ("found in the attic",)
+
+
+def test_a_changed_model_loses_the_notes_on_the_old_one() -> None:
+    assert dataclasses.replace(MODEL.with_notes("fits"), dt=1.0).notes == ()
+
+
+@pytest.mark.parametrize("name", ["A", "B", "x_ss", "u_ss", "E", "d_ss"])
 @pytest.mark.parametrize(
     "copied", [lambda m: m, copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))]
 )
@@ -109,10 +169,13 @@ def test_copies_are_equal_and_share_a_hash(copied: Any) -> None:
         {"dt": 0.6},
         {"x_ss": [0, 0]},
         {"u_ss": [0]},
+        {"E": [[2], [1]]},
+        {"d_ss": [0]},
     ],
 )
 def test_models_that_differ_in_one_field_are_not_equal(changes: dict[str, Any]) -> None:
-    values = {"A": MODEL.A, "B": MODEL.B, "dt": MODEL.dt, "x_ss": MODEL.x_ss, "u_ss": MODEL.u_ss}
+    names = ("A", "B", "dt", "x_ss", "u_ss", "E", "d_ss")
+    values = {name: getattr(MODEL, name) for name in names}
     assert LinearModel(**values) == MODEL
     assert LinearModel(**{**values, **changes}) != MODEL
 

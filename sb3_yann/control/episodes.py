@@ -1,0 +1,106 @@
+"""Measured episodes as the transitions that a regression takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann.control._validation import Array, to_float
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """States (T+1, n), and the inputs and measured disturbances between them, (T, m+d)."""
+
+    states: Array
+    driven: Array
+
+    def __len__(self) -> int:
+        return int(self.driven.shape[0])
+
+    @property
+    def regressors(self) -> Array:
+        """State, inputs and disturbances of each step, shape (T, n+m+d)."""
+        return np.hstack([self.states[:-1], self.driven])
+
+    def part(self, start: int, stop: int) -> Episode:
+        """Return the steps from start to before stop."""
+        return Episode(self.states[start : stop + 1], self.driven[start:stop])
+
+
+def as_episodes(
+    states: ArrayLike | Sequence[ArrayLike],
+    actions: ArrayLike | Sequence[ArrayLike],
+    disturbances: ArrayLike | Sequence[ArrayLike] | None,
+) -> tuple[list[Episode], tuple[int, int, int]]:
+    """Return the checked episodes and the sizes (n, m, d).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the arrays are no matrices, do not fit each other, are empty, or hold NaN.
+    """
+    x, u = _matrices("states", states), _matrices("actions", actions)
+    if disturbances is None:
+        d: list[Array] = [np.zeros((len(each), 0)) for each in u]
+    else:
+        d = _matrices("disturbances", disturbances)
+    for name, parts in (("actions", u), ("disturbances", d)):
+        if len(parts) != len(x):
+            raise ValueError(f"{name} has {len(parts)} episodes, states has {len(x)}.")
+        for i, (part, state) in enumerate(zip(parts, x, strict=True)):
+            if len(part) + 1 != len(state) or not len(part):
+                raise ValueError(
+                    f"{name} of episode {i} has {len(part)} rows, states has {len(state)}. "
+                    "Expected T >= 1 and T + 1: the states before each action and after the last."
+                )
+    return [
+        Episode(state, np.hstack([inputs, others]))
+        for state, inputs, others in zip(x, u, d, strict=True)
+    ], (x[0].shape[1], u[0].shape[1], d[0].shape[1])
+
+
+def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list[Episode]]:
+    """Return the episodes to fit and those to test: whole ones, or the last part of a single one.
+
+    Raises
+    ------
+    ValueError
+        If ``held_out`` is not a fraction in [0, 1).
+    """
+    if not 0 <= held_out < 1:
+        raise ValueError(f"held_out = {held_out!r} must be a fraction in [0, 1).")
+    if held_out == 0:
+        return episodes, []
+    if len(episodes) > 1:
+        count = min(max(1, round(held_out * len(episodes))), len(episodes) - 1)
+        return episodes[:-count], episodes[-count:]
+    (episode,) = episodes
+    border = len(episode) - max(1, round(held_out * len(episode)))
+    return [episode.part(0, border)], [episode.part(border, len(episode))]
+
+
+def _matrices(name: str, value: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
+    """Return one float64 matrix for each episode, all with the same columns."""
+    several = isinstance(value, (list, tuple)) and len(value) > 0 and np.ndim(value[0]) == 2
+    array = None if several else to_float(name, value)
+    if array is not None and array.ndim != 3:
+        parts = [array]
+    else:
+        parts = [to_float(f"{name} of episode {i}", part) for i, part in enumerate(value)]  # type: ignore[arg-type]
+    for i, part in enumerate(parts):
+        if part.ndim != 2 or not part.shape[1] or part.shape[1] != parts[0].shape[1]:
+            raise ValueError(
+                f"{name} of episode {i} has shape {part.shape}, expected (rows, columns) with the "
+                "same columns in each episode. Of a single one write values.reshape(-1, 1)."
+            )
+        bad = np.flatnonzero(~np.all(np.isfinite(part), axis=1))
+        if bad.size:
+            raise ValueError(
+                f"{name} of episode {i} holds NaN or infinite entries in {bad.size} rows, first in "
+                f"row {bad[0]}. Leave them out by splitting the episode there into two."
+            )
+    return parts

@@ -1,0 +1,253 @@
+"""Data give the model back, with honest errors, and data that cannot are refused by name."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_yann import Identified, LinearModel, identify
+
+A = np.array([[0.9, 0.2], [0.0, 0.7]])
+B = np.array([[0.0], [1.0]])
+E = np.array([[0.3], [-0.1]])
+SPREAD = np.array([1.31, 1.38])
+"""Standard deviation of the states of this plant under inputs of plus and minus one."""
+
+
+def record(
+    seed: int,
+    steps: int = 400,
+    process: float = 0.0,
+    sensor: float = 0.0,
+    disturbed: bool = False,
+    offset: Any = 0.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return states, inputs and disturbances; noises are fractions of the states' spread."""
+    rng = np.random.default_rng(seed)
+    u = rng.choice([-1.0, 1.0], (steps, 1))
+    d = rng.normal(size=(steps, 1)) if disturbed else np.zeros((steps, 1))
+    x = np.zeros((steps + 1, 2))
+    noise = process * SPREAD * rng.normal(size=(steps, 2))
+    for k in range(steps):
+        x[k + 1] = A @ x[k] + B @ u[k] + E @ d[k] + noise[k] + offset
+    return x + sensor * SPREAD * rng.normal(size=x.shape), u, d
+
+
+def coverage(found: Identified) -> np.ndarray:
+    """Tell which true entries of A and B lie in their 95 % intervals, shape (6,)."""
+    inside = []
+    for name, truth in (("A", A), ("B", B)):
+        low, high = found.interval(name)
+        inside.append(((low <= truth) & (truth <= high)).ravel())
+    return np.concatenate(inside)
+
+
+def test_data_without_noise_give_the_matrices_back() -> None:
+    x, u, d = record(0, disturbed=True)
+    model = LinearModel.from_data(x, u, dt=0.5, disturbances=d)
+    np.testing.assert_allclose(model.A, A, atol=1e-8)
+    np.testing.assert_allclose(model.B, B, atol=1e-8)
+    np.testing.assert_allclose(model.E, E, atol=1e-8)
+    assert model.dt == 0.5
+
+
+def test_data_of_a_fast_sampled_plant_give_the_matrices_back() -> None:
+    plant = LinearModel.from_continuous([[0, 1], [-2, -0.3]], [[0], [1]], 0.01)
+    rng = np.random.default_rng(0)
+    u, x = np.repeat(rng.normal(size=(40, 1)), 25, axis=0), np.zeros((1001, 2))
+    for k in range(1000):
+        x[k + 1] = plant.step(x[k], u[k])
+    model = LinearModel.from_data(x, u, dt=0.01)
+    np.testing.assert_allclose(model.A, plant.A, atol=1e-8)
+    np.testing.assert_allclose(model.B, plant.B, atol=1e-8)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say_under_process_noise() -> None:
+    draws = [identify(*record(i, process=0.02)[:2], dt=1, held_out=0) for i in range(200)]
+    share = np.mean([coverage(found) for found in draws], axis=0)
+    # 0.95 in 200 draws has a standard deviation of 0.0154: four of these to either side.
+    assert np.all((share > 0.888) & (share < 1.0)), share
+    assert 0.92 < np.mean(share) < 0.98
+
+
+def test_residuals_are_white_under_process_noise() -> None:
+    warned = ["correlated" in identify(*record(i, process=0.02)[:2], dt=1).model.report()
+              for i in range(20)]  # fmt: skip
+    assert sum(warned) <= 2
+
+
+def test_sensor_noise_biases_the_poles_beyond_their_intervals_and_is_reported() -> None:
+    draws = [identify(*record(i, 4000, sensor=0.1)[:2], dt=1, held_out=0) for i in range(10)]
+    assert not any(coverage(found)[0] or coverage(found)[3] for found in draws)
+    bias = np.mean([np.diag(found.model.A - A) for found in draws], axis=0)
+    np.testing.assert_allclose(bias, -0.009, atol=0.002)  # what the docstring of identify states
+    assert all("sensor noise" in found.model.report() for found in draws)
+
+
+def test_sensor_noise_of_two_percent_biases_as_little_as_stated() -> None:
+    draws = [identify(*record(i, 4000, sensor=0.02)[:2], dt=1, held_out=0) for i in range(10)]
+    bias = np.mean([np.diag(found.model.A - A) for found in draws], axis=0)
+    np.testing.assert_allclose(bias, -0.0004, atol=0.0002)
+
+
+def test_episodes_are_not_joined_at_their_ends() -> None:
+    x, u, _ = record(0)
+    y, v, _ = record(1)
+    y += 100 * np.eye(2)[0] * 0.9 ** np.arange(len(y))[:, None]  # another start, far away
+    model = LinearModel.from_data([x, y], [u, v], dt=1, held_out=0)
+    np.testing.assert_allclose(model.A, A, atol=1e-8)
+
+
+def test_last_episodes_are_held_out_as_a_whole() -> None:
+    x, u, _ = record(0)
+    alone = identify(x, u, dt=1, held_out=0)
+    both = identify([x, 1 + 0 * x], [u, u], dt=1, held_out=0.2)  # the second is nonsense
+    assert both.model == alone.model
+
+
+def test_last_part_of_a_single_episode_is_held_out() -> None:
+    x, u, _ = record(0, process=0.1)
+    first = identify(x[:321], u[:320], dt=1, held_out=0)
+    assert identify(x, u, dt=1, held_out=0.2).model == first.model
+    assert np.isnan(first.one_step_fit).all()
+
+
+def test_fit_is_what_its_definition_says() -> None:
+    x, u, _ = record(0, process=0.1)
+    found = identify(x, u, dt=1, offset=False)
+    test, inputs = x[320:], u[320:]
+    for steps, fit in ((1, found.one_step_fit), (10, found.ten_step_fit)):
+        predicted = []
+        for k in range(80 - steps + 1):
+            state = test[k]
+            for j in range(steps):
+                state = found.model.A @ state + found.model.B @ inputs[k + j]
+            predicted.append(state)
+        missed = np.linalg.norm(np.array(predicted) - test[steps:], axis=0)
+        moved = np.linalg.norm(test[steps:] - test[steps:].mean(axis=0), axis=0)
+        np.testing.assert_allclose(fit, 100 * (1 - missed / moved))
+
+
+def test_operating_point_is_where_the_plant_rests() -> None:
+    x, u, _ = record(0, offset=np.array([1.0, 2.0]))
+    model = LinearModel.from_data(x[20:], u[20:] + 5, dt=1, u_ss=[5.5])
+    rest = np.linalg.solve(np.eye(2) - A, B @ [0.5] + [1.0, 2.0])
+    np.testing.assert_allclose(model.A, A, atol=1e-8)
+    np.testing.assert_allclose(model.x_ss, rest, atol=1e-6)
+    assert model.u_ss == [5.5]
+
+
+def test_input_that_holds_a_given_state_is_found() -> None:
+    x, u, _ = record(0)
+    model = LinearModel.from_data(x, u + 5, dt=1, x_ss=[2.0, 1.0])
+    np.testing.assert_allclose(model.u_ss, [5.3], atol=1e-6)  # (1 - .7) * 1 = .3
+
+
+def test_given_operating_point_that_moves_is_kept_and_reported() -> None:
+    x, u, _ = record(0)
+    model = LinearModel.from_data(x, u, dt=1, x_ss=[0, 1.0], u_ss=[0.0])
+    assert (model.x_ss.tolist(), model.u_ss.tolist()) == ([0, 1], [0])
+    assert "moves by 0.2, -0.3 in one step" in model.report()
+
+
+def test_integrator_keeps_an_operating_point_inside_its_data() -> None:
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(500, 1))
+    x = np.concatenate([[[0.0]], np.cumsum(u, axis=0)]) + 50
+    model = LinearModel.from_data(x, u, dt=1)
+    np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], 1, atol=1e-8)
+    assert x.min() <= model.x_ss[0] <= x.max()
+
+
+def closed_loop(test_signal: float) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    x, u = np.ones((201, 2)), np.zeros((200, 1))
+    for k in range(200):
+        u[k] = -0.4 * x[k, 0] - 0.2 * x[k, 1] + test_signal * rng.normal()
+        x[k + 1] = A @ x[k] + B @ u[k] + 0.1 * rng.normal(size=2)
+    return x, u
+
+
+def test_feedback_without_a_test_signal_is_refused_and_named() -> None:
+    with pytest.raises(ValueError, match=r"0\.4 x\[0\] \+0\.2 x\[1\] \+1 u\[0\] never changes|"
+                       r"1 x\[0\] \+0\.5 x\[1\] \+2\.5 u\[0\] never changes"):  # fmt: skip
+        LinearModel.from_data(*closed_loop(0.0), dt=1)
+
+
+def test_feedback_with_a_test_signal_is_identified() -> None:
+    found = identify(*closed_loop(0.5), dt=1)
+    assert np.all(np.abs(found.model.A - A) < 5 * found.standard_error_A)
+
+
+def test_ridge_takes_what_is_refused_otherwise_and_says_so() -> None:
+    model = LinearModel.from_data(*closed_loop(0.0), dt=1, ridge=1e-3)
+    assert "A ridge of 0.001 biases" in model.report()
+    assert "Weakly excited" in model.report()
+
+
+def test_ridge_pulls_towards_zero() -> None:
+    x, u, _ = record(0, process=0.02)
+    norms = [np.linalg.norm(LinearModel.from_data(x, u, dt=1, ridge=r).A) for r in (0, 10, 100)]
+    assert norms[0] > norms[1] > norms[2]
+
+
+@pytest.mark.parametrize("constant", [0.0, 0.1, 475.0])
+def test_input_that_never_moves_is_named(constant: float) -> None:
+    x, u, _ = record(0)
+    both = np.hstack([u, np.full_like(u, constant)])
+    with pytest.raises(ValueError, match=r"do not excite the plant: u\[1\] never changes\. What"):
+        LinearModel.from_data(x, both, dt=1)
+
+
+def test_states_that_are_sums_of_others_are_named() -> None:
+    x, u, _ = record(0)
+    with pytest.raises(ValueError, match=r"x\[0\] .*x\[1\] .*x\[2\] never changes"):
+        LinearModel.from_data(np.column_stack([x, x.sum(axis=1)]), u, dt=1)
+
+
+def test_units_do_not_count_in_what_is_refused() -> None:
+    x, u, _ = record(0)
+    model = LinearModel.from_data(x * [1e6, 1e-6], u, dt=1)
+    np.testing.assert_allclose(model.A, A * [[1, 1e12], [1e-12, 1]], rtol=1e-8, atol=1e-8)
+
+
+def test_copies_of_what_was_identified_are_read_only() -> None:
+    found = copy.deepcopy(identify(*record(0, process=0.02)[:2], dt=1))
+    with pytest.raises(ValueError, match="read-only"):
+        found.standard_error_A[0, 0] = 0
+
+
+X, U, _ = record(0)
+BROKEN = X.copy()
+BROKEN[[3, 7], 1] = np.nan
+BAD_DATA: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"states": BROKEN}, ValueError, "states of episode 0 holds NaN .* in 2 rows, first in row 3"),
+    ({"actions": [U, U * np.inf], "states": [X, X]}, ValueError, "actions of episode 1 holds NaN"),
+    ({"states": X[:-1]}, ValueError, r"actions of episode 0 has 400 rows, states has 400.*T \+ 1"),
+    ({"states": [X, X]}, ValueError, "actions has 1 episodes, states has 2"),
+    ({"states": X[:, 0]}, ValueError, r"states of episode 0 has shape \(401,\).*reshape"),
+    ({"states": [X, X[:, :1]], "actions": [U, U]}, ValueError, r"shape \(401, 1\), expected"),
+    ({"states": X[:1], "actions": U[:0]}, ValueError, "actions of episode 0 has 0 rows"),
+    ({"states": X[:5], "actions": U[:4]}, ValueError, "3 steps to fit 4 parameters"),
+    ({"disturbances": U[:-1]}, ValueError, "disturbances of episode 0 has 399 rows"),
+    ({"held_out": 1.0}, ValueError, r"held_out = 1\.0 must be a fraction"),
+    ({"ridge": -1}, ValueError, "ridge = -1 must be 0 or"),
+    ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
+    ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
+    ({"states": "many"}, TypeError, "states = 'many' is not an array"),
+]
+
+
+@pytest.mark.parametrize(("changes", "error", "message"), BAD_DATA)
+def test_bad_data_are_named(changes: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        identify(**{"states": X, "actions": U, "dt": 1, **changes})
+
+
+@pytest.mark.parametrize(("name", "level"), [("C", 0.95), ("A", 1.0), ("A", 0.0)])
+def test_bad_interval_is_named(name: str, level: float) -> None:
+    with pytest.raises(ValueError, match=r"must be 'A', 'B' or 'E'|must lie in \(0, 1\)"):
+        identify(X, U, dt=1).interval(name, level)

@@ -1,0 +1,246 @@
+"""A simulator is linearised where it rests; what cannot be is refused with the reason."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel
+from sb3_yann_envs import clipped_pendulum as pendulum
+from sb3_yann_envs import cstr
+
+# theta+ = theta + dt speed+, speed+ = speed + dt (15 sin(theta) + 3 u), at dt = 0.05 (Gymnasium's
+# Pendulum-v1, g = 10, m = l = 1), by hand:
+UPRIGHT_A, UPRIGHT_B = [[1.0375, 0.05], [0.75, 1.0]], [[0.0075], [0.15]]
+HANGING_A = [[0.9625, 0.05], [-0.75, 1.0]]
+
+
+class Plant(gym.Env):
+    """A plant of one state and one input whose step is given; reads the state it is set to."""
+
+    def __init__(self, step: Any = lambda x, u: 0.5 * x + u, low: float = -1.0) -> None:
+        self.observation_space = gym.spaces.Box(-5, 5, (1,), np.float64)
+        self.action_space = gym.spaces.Box(low, 1, (1,), np.float64)
+        self.advance = step
+        self.dt = 0.1
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.array((options or {}).get("state", [0.0]), dtype=float)
+        return self.x.copy(), {}
+
+    def step(self, action):
+        self.x = np.array(self.advance(self.x, np.asarray(action)), dtype=float)
+        return self.x.copy(), 0.0, False, False, {}
+
+
+def test_reactor_is_linearised_as_its_equations_are() -> None:
+    truth = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
+    model = LinearModel.from_env("CSTR-v0", np.zeros(4), [0.0])
+    # the environment integrates with two Runge-Kutta steps
+    np.testing.assert_allclose(model.A, truth.A, atol=1e-8)
+    np.testing.assert_allclose(model.B, truth.B, atol=1e-11)
+    assert model.dt == cstr.DT
+
+
+def test_steady_state_of_the_reactor_is_found() -> None:
+    model = LinearModel.from_env("CSTR-v0")
+    np.testing.assert_allclose(model.x_ss, np.zeros(4), atol=1e-6)
+    assert model.u_ss == [0]
+
+
+def test_entries_that_are_nan_are_solved_for() -> None:
+    nan = np.nan
+    model = LinearModel.from_env("CSTR-v0", [nan, nan, nan, 2.0])
+    f = cstr.dynamics(cstr.X_SS + model.x_ss, cstr.U_SS + model.u_ss)
+    assert model.x_ss[3] == 2.0
+    np.testing.assert_allclose(f, 0, atol=1e-5)
+
+
+def test_pendulum_is_linearised_as_its_integrator_is() -> None:
+    model = LinearModel.from_env("ClippedPendulum-v0", [0.0, 0.0])
+    np.testing.assert_allclose(model.A, UPRIGHT_A, atol=1e-10)
+    np.testing.assert_allclose(model.B, UPRIGHT_B, atol=1e-10)
+    assert (model.dt, model.u_ss.tolist()) == (pendulum.DT, [0])
+
+
+def test_input_that_holds_a_tilted_pendulum_is_found() -> None:
+    model = LinearModel.from_env("ClippedPendulum-v0", [0.3, 0.0])
+    np.testing.assert_allclose(model.u_ss, -5 * np.sin(0.3), atol=1e-6)
+    np.testing.assert_allclose(model.A[1, 0], 0.05 * 15 * np.cos(0.3), atol=1e-9)
+
+
+@pytest.mark.parametrize(("angle", "A"), [(0.0, UPRIGHT_A), (np.pi, HANGING_A)])
+def test_gymnasiums_pendulum_is_linearised_in_the_state_it_does_not_observe(
+    angle: float, A: Any
+) -> None:
+    model = LinearModel.from_env("Pendulum-v1", [angle, 0.0])
+    np.testing.assert_allclose(model.A, A, atol=1e-9)
+    np.testing.assert_allclose(model.B, UPRIGHT_B, atol=1e-9)
+    assert "The observation is not this state" in model.report()
+
+
+def test_gymnasiums_mountain_car_rests_in_its_valley_in_float32() -> None:
+    model = LinearModel.from_env("MountainCarContinuous-v0", dt=1.0)
+    np.testing.assert_allclose(model.x_ss, [-np.pi / 6, 0], atol=1e-5)  # cos(3 x) = 0
+    # speed+ = speed + .0015 u - .0025 cos(3 x), x+ = x + speed+, by hand; float32 allows no more
+    np.testing.assert_allclose(model.A, [[0.9925, 1], [-0.0075, 1]], atol=1e-4)
+    np.testing.assert_allclose(model.B, [[0.0015], [0.0015]], atol=1e-5)
+
+
+def test_state_is_set_and_read_by_functions_of_the_user() -> None:
+    def put(env: Any, x: Any) -> None:
+        env.unwrapped.state = np.array([x[1], x[0]])
+
+    def get(env: Any) -> Any:
+        return env.unwrapped.state[::-1]
+
+    model = LinearModel.from_env("Pendulum-v1", [0, 0], set_state=put, get_state=get)
+    np.testing.assert_allclose(model.A, np.array(UPRIGHT_A)[::-1, ::-1], atol=1e-9)
+
+
+def test_wrappers_are_part_of_the_plant() -> None:
+    env = gym.wrappers.RescaleAction(gym.make("ClippedPendulum-v0"), np.float32(-1), np.float32(1))
+    model = LinearModel.from_env(env, [0.0, 0.0])
+    np.testing.assert_allclose(model.B, 2 * np.array(UPRIGHT_B), atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "ClippedPendulum-v0"])
+def test_a_time_limit_of_one_step_does_not_matter(name: str) -> None:
+    env = gym.make(name, max_episode_steps=1)
+    np.testing.assert_allclose(LinearModel.from_env(env, [0, 0]).A, UPRIGHT_A, atol=1e-9)
+
+
+def test_the_users_environment_goes_on_as_if_nothing_had_been() -> None:
+    def play(disturb: bool) -> list[Any]:
+        env = gym.make("CSTR-v0")
+        env.reset(seed=0)
+        seen = [env.step([1.0])[0]]
+        if disturb:
+            LinearModel.from_env(env)
+        seen += [env.step([1.0])[0], env.reset()[0]]
+        return [s.tolist() for s in seen]
+
+    assert play(True) == play(False)
+
+
+def test_an_environment_that_cannot_be_copied_is_used_itself_and_said_so() -> None:
+    env = Plant()
+    env.lock = (i for i in ())  # generators are not copied
+    model = LinearModel.from_env(env)
+    np.testing.assert_allclose(model.A, [[0.5]], atol=1e-12)
+    assert "env itself, which cannot be copied: reset it before" in model.report()
+
+
+def test_an_environment_made_by_a_function_is_closed() -> None:
+    closed = []
+
+    class Closing(Plant):
+        def close(self) -> None:
+            closed.append(self)
+
+    LinearModel.from_env(Closing)
+    assert len(closed) == 1
+
+
+def test_curvature_does_not_reach_the_derivative() -> None:
+    plant = Plant(lambda x, u: np.sin(x) + 0.3 * x**2 + np.exp(u) - 1)
+    model = LinearModel.from_env(plant, [0.0], [0.0])
+    np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], 1, atol=1e-9)
+
+
+def test_clipping_close_to_the_operating_point_is_reported_and_avoided() -> None:
+    plant = Plant(lambda x, u: 0.5 * np.clip(x, -0.003, 1) + u)
+    model = LinearModel.from_env(plant, [0.0], [0.0])
+    np.testing.assert_allclose(model.A, [[0.5]], atol=1e-9)
+    assert "not smooth within 0.05 of the operating point along x[0]" in model.report()
+
+
+def test_an_input_without_effect_is_reported() -> None:
+    model = LinearModel.from_env(Plant(lambda x, u: 0.5 * x), [0.0], [0.0])
+    assert "u[0] has no effect on the next state" in model.report()
+
+
+def random_walk(x: Any, u: Any) -> Any:
+    return 0.5 * x + u + NOISE.normal(size=1)
+
+
+NOISE = np.random.default_rng(0)
+CLOCK = iter(range(10**6))
+BAD_PLANTS: list[tuple[Any, dict[str, Any], str]] = [
+    (lambda x, u: np.clip(x + u, 0, 1), {}, r"along x\[0\], .* \(a kink\)\. Clipping"),
+    (lambda x, u: 0.5 * x + np.maximum(u, 0), {}, r"along u\[0\], .* \(a kink\)"),
+    (lambda x, u: 0.5 * x + np.floor(x) + u, {}, r"along x\[0\], .* \(a (kink|jump or noise)\)"),
+    (random_walk, {}, "two steps from the same state.*the plant is random or has states besides"),
+    (lambda x, u: 0.5 * x + u + next(CLOCK), {}, "has states besides these"),
+    (lambda x, u: 0.5 * x + u, {"action": [1.0]}, r"action = \[1\.0\]: entry 0 lies on its bound"),
+    (lambda x, u: 0.5 * x + u + 2, {"state": [0]}, "No steady state was found.*moves in one step"),
+    (lambda x, u: x + u + 2, {"state": [0], "action": [0]}, "no steady state: one step moves it"),
+    (lambda x, u: 0.999 * x, {"state": [1], "action": [0]}, "no steady state: one step moves it"),
+    (lambda x, u: x, {"state": [[0]]}, "must be a vector of finite numbers, or NaN"),
+    (lambda x, u: x, {"state": [0, 0]}, r"a state of shape \(2,\), like the one given, is nowhere"),
+    (lambda x, u: x, {"action": [0, 0]}, r"action has shape \(2,\), expected \(1,\)"),
+    (lambda x, u: x, {"scale": [0]}, r"scale = \[0\.0\] must be above 0"),
+    (lambda x, u: x, {"dt": -1}, "dt = -1 must be a finite number above 0"),
+]
+
+
+@pytest.mark.parametrize(("step", "arguments", "message"), BAD_PLANTS)
+def test_plant_that_cannot_be_linearised_is_refused_with_the_reason(
+    step: Any, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=f"(?s){message}"):
+        LinearModel.from_env(Plant(step), **(arguments or {"state": [0], "action": [0]}))
+
+
+def test_a_reset_that_ignores_the_state_is_noticed() -> None:
+    class Deaf(Plant):
+        def reset(self, *, seed=None, options=None):
+            return super().reset(seed=seed)
+
+    with pytest.raises(ValueError, match=r"(?s)could not be put into a state.*ignored.*set_state="):
+        LinearModel.from_env(Deaf())
+
+
+def test_an_attribute_that_is_not_the_state_is_noticed() -> None:
+    class Deaf(Plant):
+        def reset(self, *, seed=None, options=None):
+            self.state = np.array([0.0])
+            return super().reset(seed=seed)
+
+    with pytest.raises(ValueError, match="no step changes it"):
+        LinearModel.from_env(Deaf())
+
+
+def test_setting_a_state_without_effect_is_noticed() -> None:
+    with pytest.raises(ValueError, match=r"the next state is \[0\.0\] from \[0\.0\] and .* alike"):
+        LinearModel.from_env(Plant(), set_state=lambda env, x: None)
+
+
+def test_hanging_pendulum_whose_angle_wraps_there_is_refused() -> None:
+    with pytest.raises(ValueError, match="an angle that wraps"):
+        LinearModel.from_env("ClippedPendulum-v0", [np.pi, 0])
+
+
+def test_missing_sampling_time_is_asked_for_and_render_fps_is_none() -> None:
+    assert gym.make("MountainCarContinuous-v0").metadata["render_fps"]
+    with pytest.raises(ValueError, match=r"dt is not given, .* Pass dt="):
+        LinearModel.from_env("MountainCarContinuous-v0")
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        ("CartPole-v1", r"Discrete\(2\): a linear model needs a Box"),
+        (3, "env = 3 must be a single gymnasium.Env"),
+        (lambda: 3, "returned 3, expected a single"),
+        (gym.make_vec("CSTR-v0", num_envs=2), "of a vectorised environment, pass one of its parts"),
+    ],
+    ids=["discrete", "number", "function", "vectorised"],
+)
+def test_what_is_no_environment_of_a_plant_is_named(env: Any, message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        LinearModel.from_env(env)
