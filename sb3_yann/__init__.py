@@ -8,12 +8,14 @@ import sb3_yann_envs
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import ExplicitSolutionError, LinearModel, LinearMPC, PiecewiseAffine
 from sb3_yann.guard import Decision, ImprovementGuard, restore_accepted
+from sb3_yann.observations import AffineObservation
 from sb3_yann.policies import YannActor, YannCritic, YannPolicy
 from sb3_yann.problems import register_problem
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AffineObservation",
     "ControlDiagnostics",
     "Decision",
     "ExplicitSolutionError",
