@@ -152,7 +152,8 @@ class AffineObservation(ReadOnlyArrays):
 
         It gives what the env below shows. Where that is not theta yet, compose:
         ``AffineObservation.deviation(x_ss) @ AffineObservation.from_vec_normalize(venv)``.
-        The policy also checks that no clipping (``clip_obs``) acts within the box of the law.
+        The policy also checks that no clipping (``clip_obs``) acts within the box of the law. It
+        takes normalised observations from then on, also where it is loaded without the env.
 
         Raises
         ------

@@ -325,7 +325,7 @@ def test_the_first_episodes_to_start_count_not_the_first_to_end() -> None:
 def test_an_episode_begun_by_a_policy_that_is_then_taken_back_does_not_count() -> None:
     model, guard = still(env=DummyVecEnv([plant] * 2)), guard_alone(trial_episodes=4)
     # After the guard has looked: the next episodes begin with an action of this actor.
-    move = At([STEPS], partial(correct, region=RIGHT, value=1.0))
+    move = At([STEPS], partial(correct, region=RIGHT, value=2.0))
     train(model, 2 * 5 * STEPS, guard, move)
     assert [each.reason for each in guard.decisions] == ["the actor was changed while it rested"]
     np.testing.assert_allclose(guard.state.evidence.accepted.costs, [4.25] * 4)
