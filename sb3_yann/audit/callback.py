@@ -141,7 +141,8 @@ class CostAudit(BaseCallback):
         done, env = column("done"), np.repeat(*self._env_numbers())
         first = np.r_[True, np.diff(env) != 0]
         begins = first | np.r_[False, done[:-1]]
-        problem, observations = self.policy.problem, column("observation")
+        problem = self.policy.problem
+        observations = column("observation").reshape(len(records), -1)
         terminated = done & ~column("truncated")
         model = problem.model
         return Sample(
@@ -154,13 +155,23 @@ class CostAudit(BaseCallback):
             episode=np.cumsum(begins),
             begins=begins,
             first=first,
-            blank=~np.any(observations.reshape(len(records), -1), axis=1),
+            blank=~np.any(observations, axis=1),
+            rounding=self._rounding(observations),
             scale=self.policy.reward_scale,
             offset=self.policy.reward_offset,
             stage_cost=problem.stage_cost,
             step=model.step if model.n_states == problem.n_theta else None,
             gamma=self.model.gamma,
         )
+
+    def _rounding(self, observations: Array) -> Array:
+        """Return by how much theta may err, (steps, n_theta); see AffineObservation."""
+        digits = observations.dtype if observations.dtype.kind == "f" else np.float64
+        size = np.abs(observations).astype(np.float64)
+        if (seen := self.policy.observation) is not None:
+            # What a normalisation hides of its size is in t0.
+            size = size @ np.abs(seen.T).T + np.abs(seen.t0)
+        return np.asarray(size * float(np.finfo(digits).eps))
 
     def _env_numbers(self) -> tuple[Any, list[int]]:
         return np.arange(len(self._records)), [len(each) for each in self._records]

@@ -37,6 +37,8 @@ class Sample:
         Whether the step is the first of its episode, and of its env.
     blank : ndarray of bool, shape (steps,)
         Whether the observation was zero throughout.
+    rounding : ndarray, shape (steps, n)
+        By how much theta may err because observations are float32.
     scale, offset : float
         The reward is taken for ``scale * (-cost) + offset``.
     stage_cost : callable
@@ -57,6 +59,7 @@ class Sample:
     begins: Mask
     first: Mask
     blank: Mask
+    rounding: Array
     scale: float
     offset: float
     stage_cost: Callable[[Array, Array], Array]
@@ -73,6 +76,15 @@ class Sample:
         """The cost of each step that the reward stands for, (steps,)."""
         return (self.offset - self.rewards) / self.scale
 
+    @cached_property
+    def rounded(self) -> Array:
+        """By how much the cost of each step may err because observations are float32, (steps,)."""
+        total: Array = np.zeros(len(self.cost))
+        for i, unit in enumerate(np.eye(self.theta.shape[1])):
+            nearby = self.theta + self.rounding[:, i : i + 1] * unit
+            total = total + np.abs(self.stage_cost(nearby, self.u) - self.cost)
+        return 2 * total
+
     def earlier(self, values: Array, steps: int) -> tuple[Array, Mask]:
         """Return values of so many steps before (later, if below 0), and where there are any."""
         index = np.arange(len(values)) - steps
@@ -87,9 +99,9 @@ class Sample:
     def is_the_problem_s_cost(self, tolerance: float) -> bool:
         """Tell whether every counted reward is what the problem says."""
         cost, error = np.abs(self.cost), np.abs(self.implied - self.cost)
-        size = np.maximum(cost, cost[self.counted].mean())
-        at_rest = 1e-12 + 1e-9 * np.abs(self.rewards).max()  # nothing moves: all are about zero
-        return bool(np.all((error <= tolerance * size + at_rest)[self.counted]))
+        allowed = tolerance * np.maximum(cost, cost[self.counted].mean()) + self.rounded
+        at_rest = 1e-9 * np.abs(self.rewards[self.counted]).max() + 1e-12
+        return bool(np.all((error <= allowed + at_rest)[self.counted]))
 
     def agrees(self, predicted: Array, tolerance: float, defined: Mask | None = None) -> bool:
         """Tell whether nearly all rewards are minus a predicted cost, where it is defined.
@@ -102,7 +114,7 @@ class Sample:
             return False
         known = predicted[used]
         spread = np.abs(known - np.median(known))
-        allowed = tolerance * np.maximum(spread, spread.mean())
+        allowed = tolerance * np.maximum(spread, spread.mean()) + self.rounded[used]
         with np.errstate(invalid="ignore"):
             right = np.abs(self.implied[used] - known) <= allowed
         return bool(right.mean() >= 0.98)

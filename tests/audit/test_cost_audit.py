@@ -323,6 +323,17 @@ def test_a_penalty_without_a_flag_is_a_mismatch() -> None:
     assert audited(Changed(plant(), penalise)).finding.cause == "unknown"
 
 
+@pytest.mark.parametrize("start", [0.0, 1e-3, 0.05, 2.0])
+def test_what_float32_cannot_tell_is_no_mismatch(start) -> None:
+    def absolute(observation):
+        return (env.unwrapped.x + 475).astype(np.float32)
+
+    env = wrappers.TimeLimit(LinearPlant(MPC, start), 20)
+    env = wrappers.TransformObservation(env, absolute, env.observation_space)
+    policy = {"observation": AffineObservation.deviation([475] * 3)}
+    assert audited(env, policy=policy).finding.matches
+
+
 def test_an_env_at_rest_says_nothing_against_the_reward() -> None:
     assert audited(wrappers.TimeLimit(LinearPlant(MPC, 0.0), 20)).finding.matches
 
