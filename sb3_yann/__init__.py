@@ -5,6 +5,7 @@ policy alias ``"YannPolicy"`` with TD3 and DDPG.
 """
 
 import sb3_yann_envs
+from sb3_yann.audit import CostAudit, CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import (
     ExplicitSolutionError,
@@ -15,13 +16,21 @@ from sb3_yann.control import (
     identify,
 )
 from sb3_yann.guard import Decision, ImprovementGuard, restore_accepted
+from sb3_yann.observations import AffineObservation
 from sb3_yann.policies import YannActor, YannCritic, YannPolicy
 from sb3_yann.problems import register_problem
+from sb3_yann_envs import ActionRepeat
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "ActionRepeat",
+    "AffineObservation",
     "ControlDiagnostics",
+    "CostAudit",
+    "CostFinding",
+    "CostMismatchError",
+    "CostMismatchWarning",
     "Decision",
     "ExplicitSolutionError",
     "Identified",

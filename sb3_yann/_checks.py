@@ -10,52 +10,90 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann.control import LinearMPC
+from sb3_yann.observations import AffineObservation, require_frozen
 
 
 def require_plain_td3(algorithm: BaseAlgorithm | None, other: dict[str, Any]) -> None:
-    """Raise unless the algorithm is TD3 or DDPG on an env that does not normalise."""
+    """Raise unless the algorithm is TD3 or DDPG, with keywords that are known."""
     if algorithm is not None and not isinstance(algorithm, TD3):
         raise TypeError(
             f"YannPolicy starts from a deterministic law and works with DDPG and TD3, not with "
             f"{type(algorithm).__name__}. Use e.g. DDPG(YannPolicy, env)."
         )
-    normalize = None if algorithm is None else algorithm.get_vec_normalize_env()
-    if normalize is not None and (normalize.norm_obs or normalize.norm_reward):
-        raise ValueError(
-            "The env is a VecNormalize: normalised observations are not the state that the law "
-            "takes, normalised rewards not the cost that the critic stands for. Train without it."
-        )
     if other:
         raise TypeError(
             f"YannPolicy takes no {', '.join(map(repr, other))}. Its own policy_kwargs are "
             "problem, gamma, net_arch, activation_fn, actor_lr_mult, critic_lr_mult, critic, "
-            "prediction_model, value_scale, critic_warmup, max_correction and pin_equilibrium."
+            "prediction_model, value_scale, critic_warmup, max_correction, pin_equilibrium, "
+            "observation, reward_scale and reward_offset."
         )
 
 
-def require_box(name: str, space: spaces.Space[Any]) -> None:
-    """Raise unless the space is a Box with one dimension."""
+def require_undone_normalisation(
+    problem: LinearMPC, algorithm: BaseAlgorithm | None, observation: AffineObservation | None
+) -> None:
+    """Raise unless ``observation`` can undo what a VecNormalize does to the observations."""
+    normalize = None if algorithm is None else algorithm.get_vec_normalize_env()
+    if normalize is None or algorithm is None:
+        return
+    require_frozen(normalize)
+    if not normalize.norm_obs:
+        return
+    if observation is None:
+        raise ValueError(
+            "The VecNormalize normalises observations, and the law takes the state. Undo it: "
+            "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}."
+        )
+    if normalize.observation_space.shape != algorithm.observation_space.shape:
+        raise ValueError(
+            f"The VecNormalize shows {normalize.observation_space.shape}, but the learner sees "
+            f"{algorithm.observation_space.shape}, and SB3 stores the former. Make VecNormalize "
+            "the last wrapper, outside VecFrameStack."
+        )
+    largest = _largest_observation(problem, observation)
+    if largest > normalize.clip_obs:
+        raise ValueError(
+            f"The VecNormalize clips at clip_obs = {normalize.clip_obs:g}, but in the box of the "
+            f"law normalised observations reach {largest:.4g}: beyond the clipping the state is "
+            "not known. Set venv.clip_obs = numpy.inf."
+        )
+
+
+def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> float:
+    """Return the largest entry that matters to theta over the box of the law, inf if not known."""
+    used = np.any(observation.T != 0, axis=0)
+    T = observation.T[:, used]
+    if np.linalg.matrix_rank(T) < T.shape[1]:  # theta does not tell what was observed
+        return np.inf
+    back = np.linalg.pinv(T)
+    middle = (problem.theta_max + problem.theta_min) / 2 - observation.t0
+    reach = np.abs(back) @ ((problem.theta_max - problem.theta_min) / 2)
+    return float(np.max(np.abs(back @ middle) + reach))
+
+
+def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) -> None:
+    """Raise unless the space is a Box, with one dimension where nothing flattens it."""
     if not isinstance(space, spaces.Box):
         raise TypeError(
             f"{name} is a {type(space).__name__}, YannPolicy needs a Box. "
             "Wrap the env so that observations and actions are vectors of real numbers."
         )
-    if len(space.shape) != 1:
+    if len(space.shape) != 1 and not flattened:
         raise ValueError(
             f"{name} has shape {space.shape}, YannPolicy needs one dimension, (n,). "
-            "Wrap the env in gymnasium.wrappers.FlattenObservation, or observe the plant's state."
+            "Wrap the env in gymnasium.wrappers.FlattenObservation, observe the plant's state, or "
+            "pass policy_kwargs={'observation': AffineObservation(T, t0)}."
         )
 
 
 def require_matching(
-    problem: LinearMPC, observation_space: spaces.Space[Any], action_space: spaces.Box
+    problem: LinearMPC,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Box,
+    observation: AffineObservation | None = None,
 ) -> None:
     """Raise unless the spaces are those of the law: theta in, inputs between its bounds out."""
-    if observation_space.shape != (problem.n_theta,):
-        raise ValueError(
-            f"The observation has shape {observation_space.shape}, but the law of the problem "
-            f"takes theta of shape ({problem.n_theta},). Give the policy the problem of this plant."
-        )
+    _require_theta(problem, observation_space, observation)
     if not np.issubdtype(action_space.dtype, np.floating):
         raise TypeError(
             f"action_space has dtype {action_space.dtype}, but the inputs of an MPC are real: make "
@@ -74,6 +112,51 @@ def require_matching(
             f"{law[0].tolist()} and u_max = {law[1].tolist()}. They must be the same: build the "
             "LinearMPC with the bounds of the env, and leave out wrappers that rescale actions."
         )
+
+
+def _require_theta(
+    problem: LinearMPC,
+    observation_space: spaces.Space[Any],
+    observation: AffineObservation | None,
+) -> None:
+    """Raise unless theta is what is observed, or what ``observation`` makes of it."""
+    shape, takes = observation_space.shape, f"takes theta of shape ({problem.n_theta},)"
+    if observation is None:
+        if shape != (problem.n_theta,):
+            raise ValueError(
+                f"The observation has shape {shape}, but the law of the problem {takes}. Give the "
+                "policy the problem of this plant, or say how theta follows from an observation: "
+                "policy_kwargs={'observation': AffineObservation(T, t0)}."
+            )
+        return
+    if not isinstance(observation, AffineObservation):
+        raise TypeError(f"observation = {observation!r} must be an AffineObservation or None.")
+    if shape is None or observation.n_obs != np.prod(shape):
+        raise ValueError(
+            f"The map to theta has T of shape {observation.T.shape}, but the observation has shape "
+            f"{shape}: T must have as many columns as an observation has entries."
+        )
+    if observation.n_theta != problem.n_theta:
+        raise ValueError(
+            f"The map to theta has T of shape {observation.T.shape}, but the law of the problem "
+            f"{takes}: T must have {problem.n_theta} rows."
+        )
+
+
+def as_reward(scale: float, offset: float, gamma: float) -> tuple[float, float]:
+    """Return what a reward is in terms of the cost: a factor above 0 and a finite offset."""
+    if as_factor("reward_scale", scale) == 0:
+        raise ValueError("reward_scale = 0 would leave nothing to learn from; give e.g. 1.")
+    if isinstance(offset, bool) or not isinstance(offset, (int, float, np.number)):
+        raise TypeError(f"reward_offset = {offset!r} must be a number.")
+    if not np.isfinite(offset):
+        raise ValueError(f"reward_offset = {offset!r} must be a finite number.")
+    if offset != 0 and not gamma < 1:
+        raise ValueError(
+            f"reward_offset = {offset!r} adds up to no finite value with gamma = {gamma!r}: it "
+            "needs a discount below 1."
+        )
+    return float(scale), float(offset)
 
 
 def as_factor(name: str, value: float) -> float:

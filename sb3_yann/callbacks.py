@@ -85,7 +85,7 @@ class ControlDiagnostics(BaseCallback):
         actions = self.locals["buffer_actions"]  # in [-1, 1]
         layer = self.policy.actor.mu
         with th.no_grad():
-            theta = th.as_tensor(observations, dtype=th.float32, device=self.model.device)
+            theta = self.policy.theta(observations)
             law = layer.law(theta).cpu().numpy()
             self._regions.extend(layer.locate(theta)[0].tolist())
         self._distances.extend(np.max(np.abs(actions - law), axis=1) / 2)
@@ -117,9 +117,9 @@ class ControlDiagnostics(BaseCallback):
         observations, actions, rewards = (np.array(part) for part in zip(*episode, strict=True))
         value = 0.0
         if info.get("TimeLimit.truncated", False):
-            last = th.as_tensor(info["terminal_observation"], dtype=th.float32)[None]
-            last = last.to(self.model.device)
-            value = float(self._value(last, self.policy.actor(last).detach())[0])
+            last = np.asarray(info["terminal_observation"])[None]
+            obs = th.as_tensor(last, device=self.model.device)
+            value = float(self._value(last, self.policy.actor(obs).detach())[0])
         returns = np.empty(len(rewards))
         for t in reversed(range(len(rewards))):
             returns[t] = value = rewards[t] + self.model.gamma * value
@@ -127,11 +127,11 @@ class ControlDiagnostics(BaseCallback):
         size = max(float(np.abs(returns).mean()), 1e-30)
         self.logger.record("yann/critic_error", float(error.mean()) / size)
 
-    def _value(self, theta: Any, actions: Any) -> NDArray[np.float32]:
+    def _value(self, observations: Any, actions: Any) -> NDArray[np.float32]:
         """Return the first critic's Q, shape (batch,)."""
         with th.no_grad():
             q = self.policy.critic.q1_forward(
-                th.as_tensor(theta, dtype=th.float32, device=self.model.device),
+                th.as_tensor(observations, device=self.model.device),
                 th.as_tensor(actions, dtype=th.float32, device=self.model.device),
             )
         return np.asarray(q.cpu().numpy()[:, 0])

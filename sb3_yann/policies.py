@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
+from numpy.typing import ArrayLike
 from scipy import linalg
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import ContinuousCritic
@@ -18,16 +20,19 @@ from sb3_yann._checks import (
     as_factor,
     as_max_correction,
     as_net_arch,
+    as_reward,
     require_box,
     require_critic_options,
     require_matching,
     require_plain_td3,
+    require_undone_normalisation,
 )
 from sb3_yann._construction import (
     algorithm_under_construction,
     multiply_learning_rate,
     restore_learning_rate,
 )
+from sb3_yann._features import AffineFeatures, SeesTheta
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import (
     AfterstateValue,
@@ -36,10 +41,11 @@ from sb3_yann.networks import (
     YannLayer,
 )
 from sb3_yann.networks.value import PredictionModel
+from sb3_yann.observations import AffineObservation
 from sb3_yann.problems import resolve_problem
 
 
-class YannActor(Actor):
+class YannActor(SeesTheta, Actor):
     """SB3's actor with a :class:`YannLayer` in place of the multi-layer perceptron.
 
     Parameters are those of SB3's `Actor`; ``problem``, the MPC whose explicit law it starts from;
@@ -88,18 +94,14 @@ class YannActor(Actor):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.options}
 
-    def set_training_mode(self, mode: bool) -> None:
-        """Switch the mode, which SB3 asks for at every step, where it is another one."""
-        if mode != self.training:
-            super().set_training_mode(mode)
 
-
-class YannCritic(ContinuousCritic):
+class YannCritic(SeesTheta, ContinuousCritic):
     """SB3's critic with networks that start as the value of the law on the linear plant.
 
     Parameters are those of SB3's `ContinuousCritic`; ``problem``, the MPC; ``gamma``, the
     discount of the return that it puts out; and ``critic`` (here ``kind``), ``prediction_model``,
-    ``value_scale`` and ``pin_equilibrium`` of :class:`YannPolicy`.
+    ``value_scale``, ``pin_equilibrium``, ``reward_scale`` and ``reward_offset`` of
+    :class:`YannPolicy`.
     """
 
     def __init__(
@@ -119,6 +121,8 @@ class YannCritic(ContinuousCritic):
         prediction_model: PredictionModel | None = None,
         value_scale: float = 30.0,
         pin_equilibrium: bool = True,
+        reward_scale: float = 1.0,
+        reward_offset: float = 0.0,
     ) -> None:
         super().__init__(
             observation_space,
@@ -140,6 +144,8 @@ class YannCritic(ContinuousCritic):
         }
         if prediction_model is None:
             prediction_model = LinearPrediction(problem.model.A, problem.model.B)
+        self.scale = reward_scale
+        self.offset = reward_offset / (1 - gamma) if reward_offset else 0.0
         self.q_networks = []
         for i in range(n_critics):
             q_network: nn.Module
@@ -160,6 +166,15 @@ class YannCritic(ContinuousCritic):
             self.add_module(f"qf{i}", q_network)
             self.q_networks.append(q_network)
 
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """Return Q of each critic, all (batch, 1), in units of the env's reward."""
+        return tuple(self._in_rewards(q) for q in super().forward(obs, actions))
+
+    def _in_rewards(self, q: th.Tensor) -> th.Tensor:
+        if self.scale == 1 and self.offset == 0:
+            return q
+        return self.scale * q + self.offset
+
     def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return the first critic's Q, (batch, 1), with a gradient by the actions alone.
 
@@ -170,15 +185,10 @@ class YannCritic(ContinuousCritic):
         for parameter in trained:
             parameter.requires_grad_(False)
         try:
-            return super().q1_forward(obs, actions)
+            return self._in_rewards(super().q1_forward(obs, actions))
         finally:
             for parameter in trained:
                 parameter.requires_grad_(True)
-
-    def set_training_mode(self, mode: bool) -> None:
-        """Switch the mode, which SB3 asks for at every step, where it is another one."""
-        if mode != self.training:
-            super().set_training_mode(mode)
 
 
 class YannPolicy(TD3Policy):
@@ -192,8 +202,8 @@ class YannPolicy(TD3Policy):
 
     Parameters
     ----------
-    observation_space : gymnasium.spaces.Box, shape (n,)
-        The parameter theta of the law.
+    observation_space : gymnasium.spaces.Box
+        The parameter theta of the law, shape (n,), or what ``observation`` makes theta of.
     action_space : gymnasium.spaces.Box, shape (m,)
         Its bounds must be ``u_min`` and ``u_max`` of the problem.
     lr_schedule : callable
@@ -229,6 +239,12 @@ class YannPolicy(TD3Policy):
     pin_equilibrium : bool, default True
         Whether actor and critic keep their value at ``theta = 0`` for good. Leave it free where the
         steady-state input of the model is not the plant's.
+    observation : AffineObservation, optional
+        The map from an observation to theta. The default is the identity.
+    reward_scale, reward_offset : float, default 1 and 0
+        The env's reward is ``reward_scale * (-c) + reward_offset``, where c is the stage cost of
+        the problem: the critic starts as ``reward_scale * Q + reward_offset / (1 - gamma)``, exact
+        for episodes that end by a time limit only. :class:`CostAudit` finds these numbers.
     n_critics : int, default 2
         TD3's two critics; DDPG sets 1.
     features_extractor_class, features_extractor_kwargs, normalize_images, share_features_extractor
@@ -268,6 +284,9 @@ class YannPolicy(TD3Policy):
         critic_warmup: int = 2000,
         max_correction: float | None = None,
         pin_equilibrium: bool = True,
+        observation: AffineObservation | None = None,
+        reward_scale: float = 1.0,
+        reward_offset: float = 0.0,
         n_critics: int = 2,
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
@@ -284,14 +303,17 @@ class YannPolicy(TD3Policy):
                 f"features_extractor_class = {features_extractor_class.__name__} would change the "
                 "parameter of the law; leave it at FlattenExtractor."
             )
-        require_box("observation_space", observation_space)
+        require_box("observation_space", observation_space, flattened=observation is not None)
         require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
         if algorithm is not None and isinstance(problem, str):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             algorithm.policy_kwargs = {**algorithm.policy_kwargs, "problem": self.problem}
-        require_matching(self.problem, observation_space, action_space)
+        require_matching(self.problem, observation_space, action_space, observation)
+        require_undone_normalisation(self.problem, algorithm, observation)
+        self.observation = observation
         self.gamma = getattr(algorithm, "gamma", 0.99) if gamma is None else gamma
+        self.reward_scale, self.reward_offset = as_reward(reward_scale, reward_offset, self.gamma)
         if isinstance(n_critics, bool) or not isinstance(n_critics, int) or n_critics < 1:
             raise ValueError(f"n_critics = {n_critics!r} must be a whole number of at least 1.")
         if not (isinstance(activation_fn, type) and issubclass(activation_fn, nn.Module)):
@@ -319,6 +341,8 @@ class YannPolicy(TD3Policy):
             "prediction_model": prediction_model,
             "value_scale": value_scale,
             "pin_equilibrium": pin_equilibrium,
+            "reward_scale": self.reward_scale,
+            "reward_offset": self.reward_offset,
         }
         super().__init__(
             observation_space,
@@ -363,6 +387,18 @@ class YannPolicy(TD3Policy):
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._attach_hooks()
 
+    def theta(self, observations: ArrayLike) -> th.Tensor:
+        """Return the parameter of the law, (batch, n_theta), for observations (batch, ...)."""
+        obs = th.as_tensor(np.asarray(observations), device=self.device)
+        with th.no_grad():
+            return self.actor.extract_features(obs, self.actor.features_extractor)
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """Return the map from an observation to theta."""
+        if self.observation is None:
+            return super().make_features_extractor()
+        return AffineFeatures(self.observation_space, self.observation)
+
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
         """Return an actor that equals the explicit law, with networks that are zero."""
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
@@ -386,6 +422,9 @@ class YannPolicy(TD3Policy):
             "prediction_model": self.critic_options["prediction_model"],
             "value_scale": self.critic_options["value_scale"],
             "critic_warmup": self.critic_warmup,
+            "observation": self.observation,
+            "reward_scale": self.reward_scale,
+            "reward_offset": self.reward_offset,
             **self.actor_options,
         }
 

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import gymnasium
 
+from sb3_yann_envs.action_repeat import ActionRepeat
 from sb3_yann_envs.spaces import ProblemBox
 
-__all__ = ["ProblemBox", "register_envs"]
+__all__ = ["ActionRepeat", "ProblemBox", "register_envs"]
 
 _ENTRY_POINTS: dict[str, tuple[str, str, int]] = {
     "CSTR-v0": ("sb3_yann_envs.cstr:CSTREnv", "sb3_yann_envs.vector:CSTRVectorEnv", 400),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -45,9 +45,10 @@ class NotFinite(Exception):
 @dataclass(frozen=True)
 class _FinitePolicy:
     policy: Predictor
+    seen: Callable[[Any], Any]
 
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
-        actions, state = self.policy.predict(observation, deterministic=deterministic)
+        actions, state = self.policy.predict(self.seen(observation), deterministic=deterministic)
         if not np.all(np.isfinite(actions)):
             raise NotFinite
         return actions, state
@@ -55,7 +56,7 @@ class _FinitePolicy:
 
 def play(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Episodes:
     """Return the present policy's episodes; raises NotFinite."""
-    return evaluate(_FinitePolicy(guard.policy), env, seeds)
+    return evaluate(_FinitePolicy(guard.policy, _seen(guard)), env, seeds)
 
 
 def judged(guard: ImprovementGuard, env: Any) -> tuple[Episodes | None, str]:
@@ -82,11 +83,20 @@ def unsafe(played: Episodes) -> NDArray[np.int64]:
     return np.maximum(played.violations, played.terminated)
 
 
+def _seen(guard: ImprovementGuard) -> Callable[[Any], Any]:
+    """Return what turns an observation of the simulator into one that the policy has learnt from.
+
+    The simulator is an env like the one below a VecNormalize.
+    """
+    normalize = guard.model.get_vec_normalize_env()
+    return (lambda observation: observation) if normalize is None else normalize.normalize_obs
+
+
 def visits_of(guard: ImprovementGuard, played: Episodes) -> NDArray[np.bool_]:
     """Return which regions each episode comes through, shape (episodes, regions)."""
-    layer = guard.policy.actor.mu
+    layer, seen = guard.policy.actor.mu, _seen(guard)
     visits = np.zeros((len(played.costs), len(layer.gains)), dtype=bool)
     for visited, states in zip(visits, played.observations, strict=True):
-        theta = th.as_tensor(states[:-1], dtype=th.float32, device=guard.model.device)
+        theta = guard.policy.theta(seen(states[:-1]))
         visited[layer.locate(theta)[0].cpu().numpy()] = True
     return visits

@@ -60,13 +60,11 @@ class PlantTrials:
     def step(self, guard: ImprovementGuard) -> None:
         """Count the step; decide where a block is over."""
         evidence: Evidence = guard.state.evidence
+        self._enrol(guard, evidence)
         if evidence.resting is not None and not same(evidence.resting, guard.policy):
             self._return(guard, evidence, "the actor was changed while it rested")
-        observations = np.asarray(guard.model._last_obs, dtype=np.float64)  # s_t, before the step
         dones, infos = guard.locals["dones"], guard.locals["infos"]
         for i, done in enumerate(dones):
-            if self.lengths[i] == 0:
-                self.starts[i], self.blocks[i] = observations[i].copy(), self.block
             self.costs[i] -= float(guard.locals["rewards"][i])
             self.lengths[i] += 1
             terminated = bool(done and not infos[i].get("TimeLimit.truncated", False))
@@ -84,12 +82,29 @@ class PlantTrials:
                             predicted_cost(guard.policy.problem, self.starts[i], self.lengths[i])
                         )
                 self.costs[i], self.lengths[i], self.violated[i] = 0.0, 0, False
+                self.blocks[i] = -1
         if len(evidence.costs) >= self.trial_episodes:
             self._block_is_over(guard, evidence)
         # Nor does the actor learn while an episode goes on in which a limit was violated: until
         # it is over, it is the accepted policy that leads the plant back.
         rests = evidence.phase != "learning" or self.violated.any()
         guard.policy.actor_step = 0.0 if rests else guard.state.step
+
+    def _enrol(self, guard: ImprovementGuard, evidence: Evidence) -> None:
+        """Count episodes that start now as the block's, before anything ends the block.
+
+        The first to start are the ones that count, not the first to end: of several envs side by
+        side, those would be the short episodes.
+        """
+        starting = np.flatnonzero(self.lengths == 0)
+        if len(starting) == 0:
+            return
+        theta = guard.policy.theta(guard.model._last_obs)  # type: ignore[arg-type]
+        for i in starting:  # s_t, before the step
+            self.starts[i] = theta[i].double().cpu().numpy()
+            counted = len(evidence.costs) + np.count_nonzero(self.blocks == self.block)
+            if counted < self.trial_episodes:
+                self.blocks[i] = self.block
 
     def end(self, guard: ImprovementGuard) -> None:
         """Leave an unfinished block undecided: the accepted policy stays, and learns again."""

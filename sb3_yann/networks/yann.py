@@ -89,9 +89,12 @@ class YannLayer(nn.Module):
         )
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
-        """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
+        """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n).
+
+        Theta of float64 reaches the law as it is, and rounded the network.
+        """
         region, inside = self.locate(theta)
-        correction = self.network(theta / self.theta_half, region)
+        correction = self.network((theta / self.theta_half).to(self.theta_half), region)
         if self.reach is not None:
             correction = clamp_alive(correction, self.reach)
         return clamp_alive(self._law(theta, region, inside) + correction)
@@ -113,7 +116,7 @@ class YannLayer(nn.Module):
         u = (self.gains[region] * theta[:, None]).sum(-1) + self.offsets[region]
         if self.outside == "zero":
             u = th.where(inside[:, None], u, self.resting)
-        return u.clamp(-1, 1).to(theta.dtype)
+        return u.clamp(-1, 1).to(self.theta_half)
 
     def _constant(self, name: str, value: Array, dtype: th.dtype = th.float64) -> None:
         # A buffer, not a parameter: optimizers and SB3's target updates leave it alone.

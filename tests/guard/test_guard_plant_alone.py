@@ -291,3 +291,41 @@ def test_a_plant_alone_draws_no_random_numbers() -> None:
         states.append([random_states(), model.env.envs[0].unwrapped.np_random.bit_generator.state])
         states[-1].append(model.env.envs[0].unwrapped.played)
     assert states[0] == states[1]
+
+
+def test_of_episodes_that_end_at_one_step_no_more_count_than_a_block_has() -> None:
+    model = still(env=DummyVecEnv([plant] * 4))
+    guard = guard_alone(trial_episodes=6)
+    move = At([2 * STEPS + 1], better)  # vectorised steps: two rounds of four episodes a block
+    train(model, 4 * 6 * STEPS, move, guard, phases := Phases(guard))
+    assert phases.phases[2 * STEPS - 1 :: 2 * STEPS] == ["learning", "trial", "learning"]
+    assert verdicts(guard) == ["accepted"]
+    assert guard.decisions[0].episode == 24
+    np.testing.assert_allclose(guard.state.evidence.mpc.costs, [4.25] * 6)
+    np.testing.assert_allclose(guard.state.evidence.accepted.costs, [4.0] * 6)
+
+
+class Slow(gym.Wrapper):
+    """Episodes of ten times the length."""
+
+    def step(self, action):
+        *rest, _, info = self.env.step(action)
+        return *rest, self.env.unwrapped.t >= 10 * STEPS, info
+
+
+def test_the_first_episodes_to_start_count_not_the_first_to_end() -> None:
+    model = still(env=DummyVecEnv([plant, lambda: Slow(plant())]))
+    guard = guard_alone(trial_episodes=3)
+    train(model, 2 * 10 * STEPS, guard)
+    assert len(guard.state.evidence.accepted.costs) == 3
+    lasting = np.sort(guard.state.evidence.accepted.costs)
+    np.testing.assert_allclose(lasting, [4.25, 4.25, 40.25])
+
+
+def test_an_episode_begun_by_a_policy_that_is_then_taken_back_does_not_count() -> None:
+    model, guard = still(env=DummyVecEnv([plant] * 2)), guard_alone(trial_episodes=4)
+    # After the guard has looked: the next episodes begin with an action of this actor.
+    move = At([STEPS], partial(correct, region=RIGHT, value=2.0))
+    train(model, 2 * 5 * STEPS, guard, move)
+    assert [each.reason for each in guard.decisions] == ["the actor was changed while it rested"]
+    np.testing.assert_allclose(guard.state.evidence.accepted.costs, [4.25] * 4)

@@ -1,0 +1,196 @@
+"""The callback that compares the first rewards of training with the problem's stage cost."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_yann._checks import as_factor
+from sb3_yann.audit.causes import Cause, likely_cause
+from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
+from sb3_yann.audit.sample import FEWEST, Array, Sample
+from sb3_yann.policies import YannPolicy
+
+
+class CostAudit(BaseCallback):
+    """Checks that the env's reward and observation mean what the problem says, and names what not.
+
+    Actor and critic are exact only where the reward is minus the stage cost of the problem, of the
+    state before the step and the input that was sent (times ``reward_scale`` plus
+    ``reward_offset``, where the policy has them). The first steps of every `learn` are compared;
+    then the callback rests. Steps with ``info["violation"]`` and those by which the env terminates
+    an episode may cost more. Where they differ, it looks for the reason among scaled, shifted,
+    negated, clipped and normalised rewards, costs of another state or action in time, repeated
+    actions, observations and actions in other units or from another zero, and other weights, and
+    asks the env for its wrappers. The law must leave its steady state for it to see anything.
+
+    Parameters
+    ----------
+    steps : int, default 100
+        Steps to compare, of all envs together. Fewer than ten say nothing.
+    tolerance : float, default 1e-3
+        The largest error of a reward, relative to its own cost or the mean one, whichever is
+        larger, that is not a mismatch.
+    strict : bool, default False
+        Whether a mismatch is a :class:`CostMismatchError` that ends training, not a
+        :class:`CostMismatchWarning`.
+    verbose : int, default 0
+        1 prints that the rewards match.
+
+    Attributes
+    ----------
+    finding : CostFinding or None
+        What was found, once enough steps have been seen.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is out of range; when training starts, if the policy is no YannPolicy.
+    CostMismatchError
+        In training, see ``strict``.
+    """
+
+    model: OffPolicyAlgorithm
+
+    def __init__(
+        self, steps: int = 100, tolerance: float = 1e-3, strict: bool = False, verbose: int = 0
+    ) -> None:
+        super().__init__(verbose)
+        if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < FEWEST:
+            raise ValueError(f"steps = {steps!r} must be a whole number of at least {FEWEST}.")
+        if as_factor("tolerance", tolerance) == 0:
+            raise ValueError("tolerance = 0 would take rounding for a mismatch; give e.g. 1e-3.")
+        if not isinstance(strict, bool):
+            raise TypeError(f"strict = {strict!r} must be True or False.")
+        self.steps, self.tolerance, self.strict = steps, tolerance, strict
+        self.finding: CostFinding | None = None
+
+    def _init_callback(self) -> None:
+        policy = self.model.policy
+        if not isinstance(policy, YannPolicy):
+            raise TypeError(
+                "CostAudit compares the rewards with the problem of a YannPolicy; the policy of "
+                f"this model is {type(policy).__name__}."
+            )
+        self.policy, self.finding = policy, None
+        self._seen = 0
+        self._records: list[list[dict[str, Any]]] = [[] for _ in range(self.training_env.num_envs)]
+
+    def _on_step(self) -> bool:
+        if self._seen < self.steps:
+            self._record()
+            if self._seen >= self.steps:
+                self._judge()
+        return True
+
+    def _on_training_end(self) -> None:
+        if self._seen < self.steps:
+            self._judge()
+
+    def _record(self) -> None:
+        normalize = self.model.get_vec_normalize_env()
+        # The buffer holds what VecNormalize has not touched, and normalises samples of it.
+        rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
+        for i, records in enumerate(self._records):
+            info, done = self.locals["infos"][i], bool(self.locals["dones"][i])
+            following = info["terminal_observation"] if done else self.locals["new_obs"][i]
+            records.append(
+                {
+                    "observation": np.array(self.model._last_obs[i]),  # type: ignore[index]
+                    "following": np.array(following),  # copies: an env may write into its arrays
+                    "action": np.array(self.locals["actions"][i], dtype=np.float64),
+                    "reward": float(rewards[i]),
+                    "violation": bool(info.get("violation", False)),
+                    "truncated": done and bool(info.get("TimeLimit.truncated", False)),
+                    "done": done,
+                }
+            )
+        self._seen += len(self._records)
+
+    def _judge(self) -> None:
+        sample = self._sample()
+        self._records = []
+        if np.count_nonzero(sample.counted) < FEWEST:
+            return
+        cause = self._of_the_vec_normalize()
+        if cause is None and sample.is_the_problem_s_cost(self.tolerance):
+            self.finding = CostFinding.match(sample)
+            if self.verbose:
+                print(f"Cost audit: {self.finding.message}")
+            return
+        if cause is None:
+            cause = likely_cause(sample, self.tolerance)
+        self.finding = CostFinding.mismatch(sample, cause, self.training_env)
+        if self.strict:
+            raise CostMismatchError(self.finding.message)
+        warnings.warn(self.finding.message, CostMismatchWarning, stacklevel=2)
+
+    def _sample(self) -> Sample:
+        records = [each for of_one_env in self._records for each in of_one_env]
+
+        def column(name: str) -> Any:
+            return np.array([each[name] for each in records])
+
+        def theta(name: str) -> Array:
+            return np.asarray(self.policy.theta(column(name)).double().cpu().numpy())
+
+        done, env = column("done"), np.repeat(*self._env_numbers())
+        first = np.r_[True, np.diff(env) != 0]
+        begins = first | np.r_[False, done[:-1]]
+        problem = self.policy.problem
+        observations = column("observation").reshape(len(records), -1)
+        terminated = done & ~column("truncated")
+        model = problem.model
+        return Sample(
+            theta=theta("observation"),
+            following=theta("following"),
+            u=column("action"),
+            rewards=column("reward"),
+            counted=~(column("violation") | terminated),
+            terminated=terminated,
+            episode=np.cumsum(begins),
+            begins=begins,
+            first=first,
+            blank=~np.any(observations, axis=1),
+            rounding=self._rounding(observations),
+            scale=self.policy.reward_scale,
+            offset=self.policy.reward_offset,
+            stage_cost=problem.stage_cost,
+            step=model.step if model.n_states == problem.n_theta else None,
+            gamma=self.model.gamma,
+        )
+
+    def _rounding(self, observations: Array) -> Array:
+        """Return by how much theta may err, (steps, n_theta); see AffineObservation."""
+        digits = observations.dtype if observations.dtype.kind == "f" else np.float64
+        size = np.abs(observations).astype(np.float64)
+        if (seen := self.policy.observation) is not None:
+            # What a normalisation hides of its size is in t0.
+            size = size @ np.abs(seen.T).T + np.abs(seen.t0)
+        return np.asarray(size * float(np.finfo(digits).eps))
+
+    def _env_numbers(self) -> tuple[Any, list[int]]:
+        return np.arange(len(self._records)), [len(each) for each in self._records]
+
+    def _of_the_vec_normalize(self) -> Cause | None:
+        """Return what has been set since the policy was built and let it pass."""
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is None:
+            return None
+        if normalize.norm_reward:
+            return Cause(
+                "normalised reward",
+                "VecNormalize normalises the rewards that the critic learns from. Set "
+                "venv.norm_reward = False; reward_scale is for a constant factor.",
+            )
+        if normalize.norm_obs and normalize.training:
+            return Cause(
+                "normalised observation",
+                "the statistics of VecNormalize move, so that an observation means another state "
+                "at each step. Set venv.training = False.",
+            )
+        return None
