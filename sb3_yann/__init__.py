@@ -6,7 +6,13 @@ policy alias ``"YannPolicy"`` with TD3 and DDPG.
 
 import sb3_yann_envs
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
-from sb3_yann.control import ExplicitSolutionError, LinearModel, LinearMPC, PiecewiseAffine
+from sb3_yann.control import (
+    DisturbanceObserver,
+    ExplicitSolutionError,
+    LinearModel,
+    LinearMPC,
+    PiecewiseAffine,
+)
 from sb3_yann.guard import Decision, ImprovementGuard, restore_accepted
 from sb3_yann.policies import YannActor, YannCritic, YannPolicy
 from sb3_yann.problems import register_problem
@@ -16,6 +22,7 @@ __version__ = "0.1.0"
 __all__ = [
     "ControlDiagnostics",
     "Decision",
+    "DisturbanceObserver",
     "ExplicitSolutionError",
     "ImprovementGuard",
     "LinearMPC",

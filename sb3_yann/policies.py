@@ -6,7 +6,6 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from scipy import linalg
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
@@ -139,7 +138,7 @@ class YannCritic(ContinuousCritic):
             "pinned": pin_equilibrium,
         }
         if prediction_model is None:
-            prediction_model = LinearPrediction(problem.model.A, problem.model.B)
+            prediction_model = LinearPrediction(*problem.prediction)
         self.q_networks = []
         for i in range(n_critics):
             q_network: nn.Module
@@ -149,7 +148,7 @@ class YannCritic(ContinuousCritic):
                 )
             else:
                 q_network = AfterstateValue(
-                    linalg.block_diag(problem.Q, problem.R),
+                    problem.stage_matrix,
                     problem.value_matrix(gamma),
                     prediction_model,
                     gamma,
@@ -192,8 +191,9 @@ class YannPolicy(TD3Policy):
 
     Parameters
     ----------
-    observation_space : gymnasium.spaces.Box, shape (n,)
-        The parameter theta of the law.
+    observation_space : gymnasium.spaces.Box, shape (n_theta,)
+        The parameter theta of the law: the state and, where the problem has them, the reference,
+        the disturbance and the previous input (see :mod:`sb3_yann.wrappers`).
     action_space : gymnasium.spaces.Box, shape (m,)
         Its bounds must be ``u_min`` and ``u_max`` of the problem.
     lr_schedule : callable
@@ -226,9 +226,12 @@ class YannPolicy(TD3Policy):
     max_correction : float, optional
         Bound on the distance from the MPC, as a fraction of the input range, 0 to 1: exact,
         whatever is learnt. The default is none.
-    pin_equilibrium : bool, default True
-        Whether actor and critic keep their value at ``theta = 0`` for good. Leave it free where the
-        steady-state input of the model is not the plant's.
+    pin_equilibrium : bool, optional
+        Whether actor and critic keep their value at ``theta = 0`` for good. The default is
+        False for problems with references or disturbances, and True for others: with those,
+        ``theta = 0`` is one of many steady states, and a correction pinned to zero there could not
+        remove the offset that a wrong steady-state input leaves. Leave it free too where the
+        steady-state input of a regulator's model is not the plant's.
     n_critics : int, default 2
         TD3's two critics; DDPG sets 1.
     features_extractor_class, features_extractor_kwargs, normalize_images, share_features_extractor
@@ -267,7 +270,7 @@ class YannPolicy(TD3Policy):
         value_scale: float = 30.0,
         critic_warmup: int = 2000,
         max_correction: float | None = None,
-        pin_equilibrium: bool = True,
+        pin_equilibrium: bool | None = None,
         n_critics: int = 2,
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
@@ -303,6 +306,8 @@ class YannPolicy(TD3Policy):
             "critic": as_factor("critic_lr_mult", critic_lr_mult),
         }
         require_critic_options(critic, prediction_model, value_scale, critic_warmup)
+        if pin_equilibrium is None:
+            pin_equilibrium = not self.problem.parameters.has_constants
         if not isinstance(pin_equilibrium, bool):
             raise TypeError(f"pin_equilibrium = {pin_equilibrium!r} must be True or False.")
         if optimizer_class is th.optim.Adam and optimizer_kwargs is None:

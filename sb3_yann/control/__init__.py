@@ -3,6 +3,16 @@
 from sb3_yann.control.explicit import ExplicitSolutionError, ParametricQP
 from sb3_yann.control.linear_model import LinearModel
 from sb3_yann.control.mpc import LinearMPC
+from sb3_yann.control.observer import DisturbanceObserver
+from sb3_yann.control.parameters import Parameters
 from sb3_yann.control.piecewise_affine import PiecewiseAffine
 
-__all__ = ["ExplicitSolutionError", "LinearMPC", "LinearModel", "ParametricQP", "PiecewiseAffine"]
+__all__ = [
+    "DisturbanceObserver",
+    "ExplicitSolutionError",
+    "LinearMPC",
+    "LinearModel",
+    "Parameters",
+    "ParametricQP",
+    "PiecewiseAffine",
+]

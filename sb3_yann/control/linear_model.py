@@ -19,10 +19,10 @@ from sb3_yann.control._validation import (
 
 @dataclass(frozen=True, eq=False, init=False)
 class LinearModel(ReadOnlyArrays):
-    """The plant near an operating point: ``x[k+1] = A x[k] + B u[k]``, sampled every ``dt``.
+    """The plant near an operating point: ``x[k+1] = A x[k] + B u[k] + E d[k]``, every ``dt``.
 
-    ``x`` and ``u`` are deviations from the operating point ``(x_ss, u_ss)``. Arrays are stored
-    as read-only float64.
+    ``x`` and ``u`` are deviations from the operating point ``(x_ss, u_ss)``, the disturbance ``d``
+    is one from its value there. Arrays are stored as read-only float64.
 
     Parameters
     ----------
@@ -36,6 +36,8 @@ class LinearModel(ReadOnlyArrays):
         State at the operating point, zeros if left out.
     u_ss : array_like, shape (m,), optional
         Input at the operating point, zeros if left out.
+    E : array_like, shape (n, d), optional
+        Disturbance matrix in discrete time; no disturbance, shape (n, 0), if left out.
 
     Raises
     ------
@@ -48,6 +50,7 @@ class LinearModel(ReadOnlyArrays):
     dt: float
     x_ss: Array
     u_ss: Array
+    E: Array
 
     def __init__(
         self,
@@ -56,6 +59,8 @@ class LinearModel(ReadOnlyArrays):
         dt: float,
         x_ss: ArrayLike | None = None,
         u_ss: ArrayLike | None = None,
+        *,
+        E: ArrayLike | None = None,
     ) -> None:
         state = as_array("A", A, ("n", "n"))
         n = state.shape[0]
@@ -71,6 +76,7 @@ class LinearModel(ReadOnlyArrays):
             "dt": as_positive("dt", dt),
             "x_ss": as_array("x_ss", np.zeros(n) if x_ss is None else x_ss, (n,)),
             "u_ss": as_array("u_ss", np.zeros(m) if u_ss is None else u_ss, (m,)),
+            "E": as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d")),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -156,16 +162,22 @@ class LinearModel(ReadOnlyArrays):
         """Number of inputs m."""
         return int(self.B.shape[1])
 
-    def step(self, x: ArrayLike, u: ArrayLike) -> Array:
-        """Return ``A x + B u``; ``x`` is (n,) or (batch, n), ``u`` is (m,) or (batch, m)."""
-        return np.asarray(x) @ self.A.T + np.asarray(u) @ self.B.T
+    @property
+    def n_disturbances(self) -> int:
+        """Number of disturbances d."""
+        return int(self.E.shape[1])
+
+    def step(self, x: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> Array:
+        """Return ``A x + B u + E d``; each is a vector or a batch of rows, d zeros if left out."""
+        following = np.asarray(x) @ self.A.T + np.asarray(u) @ self.B.T
+        return following if d is None else following + np.asarray(d) @ self.E.T
 
     def __eq__(self, other: object) -> bool:
         """Tell whether all matrices, the sampling time and the operating point are equal."""
         if not isinstance(other, LinearModel):
             return NotImplemented
-        return same_fields(self, other, ("A", "B", "dt", "x_ss", "u_ss"))
+        return same_fields(self, other, ("A", "B", "dt", "x_ss", "u_ss", "E"))
 
     def __hash__(self) -> int:
         """Return a hash that equal models share."""
-        return hash((self.A.tobytes(), self.B.tobytes(), self.dt))
+        return hash((self.A.tobytes(), self.B.tobytes(), self.E.tobytes(), self.dt))
