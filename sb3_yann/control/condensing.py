@@ -99,8 +99,7 @@ def _cost(problem: LinearMPC, prediction: _Prediction) -> tuple[Array, Array]:
     """Return H and F of ``1/2 U'HU + (F theta)'U``, whence the factors 2."""
     N, gamma, errors = problem.horizon, problem.gamma, problem.errors
     T, states = errors.T, errors.T[: problem.model.n_states]
-    discounts: Array = gamma ** np.arange(N)
-    H: Array = 2 * np.kron(np.diag(discounts), problem.R)
+    H: Array = np.asarray(2 * np.kron(np.diag(gamma ** np.arange(N)), problem.R), np.float64)
     F: Array = -H @ np.tile(errors.U, (N, 1))
     for k in range(1, N + 1):
         coordinates = T if k == N else states
