@@ -78,7 +78,16 @@ class OnlineMPC:
         self.size = np.mean(np.diag(cost)[: self.n_moves] * self.unit[: self.n_moves] ** 2)
         self.cost = cost * self.unit[:, None] / self.size  # times the target: a gradient
         self.rate_gradient = self.unit[:, None] * self.changes.T @ rate / self.size
-        self.slack_gradient = slack / 2 / self.size
+        linear = np.zeros(len(cost))
+        q, r = mpc.linear_cost
+        linear[: N * m] = np.kron(discounts, r)
+        linear[N * m : self.n_moves - n] = np.kron(mpc.gamma ** np.arange(1, N), q)
+        if np.any(q) or np.any(r):
+            last, final = slice((N - 1) * m, N * m), slice(self.n_moves - n, self.n_moves)
+            p = mpc.gamma**N * _linear_terminal_cost(mpc)
+            linear[final] += p[:n]
+            linear[last] += p[n:] if len(p) > n else 0
+        self.slack_gradient = (slack + linear * self.unit) / 2 / self.size
         whole = cost + self.changes.T @ rate @ self.changes + np.diag(slack)
         whole = whole * np.outer(self.unit, self.unit) / self.size
         # Zero along the equality constraints, so the optimum is the same; it makes the Hessian
@@ -180,3 +189,20 @@ class OnlineMPC:
             dual_tol=1e-12,
         )
         return np.asarray(z)[:m] * self.u_unit if status == 1 else None
+
+
+def _linear_terminal_cost(mpc: LinearMPC) -> Array:
+    """The gradient at zero of the cost to go, by iteration of the unconstrained plan."""
+    n, m = mpc.model.B.shape
+    (q, r), P, rated = mpc.linear_cost, mpc.terminal_cost, len(mpc.terminal_cost) > n
+    A, B, cross = mpc.model.A, mpc.model.B, np.zeros((n, m))
+    R = mpc.R
+    if rated:
+        A, B = block_diag(A, np.zeros((m, m))), np.vstack([B, np.eye(m)])
+        cross, q, R = np.vstack([cross, -mpc.S]), np.concatenate([q, np.zeros(m)]), mpc.R + mpc.S
+    p = np.zeros(len(q))
+    for _ in range(5000):  # value iteration of the linear part, the quadratic part being stationary
+        curvature = R + mpc.gamma * B.T @ P @ B
+        k = np.linalg.solve(2 * curvature, r + mpc.gamma * B.T @ p)  # the input at zero is -k
+        p = q - 2 * cross @ k + mpc.gamma * A.T @ (p - 2 * P @ B @ k)
+    return p

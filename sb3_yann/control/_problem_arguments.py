@@ -63,6 +63,21 @@ def as_rate_weight(value: ArrayLike | None, n_inputs: int) -> Array:
     return as_symmetric("S", np.zeros((n_inputs, n_inputs)) if value is None else value, n_inputs)
 
 
+def as_linear_cost(
+    value: tuple[ArrayLike, ArrayLike] | None, n_states: int, n_inputs: int
+) -> tuple[Array, Array]:
+    """Return the linear stage cost as (q, r) of shapes (n,) and (m,), zeros for None."""
+    if value is None:
+        value = (np.zeros(n_states), np.zeros(n_inputs))
+    try:
+        q, r = value
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"linear_cost = {value!r} must be a pair (q, r) of arrays for q'x + r'u."
+        ) from None
+    return as_array("linear_cost q", q, (n_states,)), as_array("linear_cost r", r, (n_inputs,))
+
+
 def as_softness(name: str, value: ArrayLike | None, size: int) -> Array:
     """Return the unit of violation (size,) of soft bounds, 0 where they are hard."""
     array = to_float(name, 0.0 if value is None else value)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import linalg
 
+from sb3_yann.control import lqr
 from sb3_yann.control._validation import Array
 from sb3_yann.control.explicit import ParametricQP
 
@@ -79,12 +80,13 @@ def condense(problem: LinearMPC) -> tuple[ParametricQP, tuple[str, ...]]:
         if np.any((softness > 0) & np.isfinite(bounds).any(axis=0))
     ]
     H, F = _cost(problem, prediction)
+    c = _linear_cost(problem, prediction)
     G, w, S, names = _constraints(problem, prediction, slacks)
     penalty = np.full(len(slacks), problem.soft_penalty)
     program = ParametricQP(
         H=linalg.block_diag((H + H.T) / 2, np.diag(2 * penalty)) if slacks else (H + H.T) / 2,
         F=np.vstack([F, np.zeros((len(slacks), problem.n_theta))]),
-        c=np.concatenate([np.zeros(len(F)), penalty]),
+        c=np.concatenate([c, penalty]),
         G=G,
         w=w,
         S=S,
@@ -113,6 +115,28 @@ def _cost(problem: LinearMPC, prediction: _Prediction) -> tuple[Array, Array]:
             H = H + 2 * gamma**k * inputs.T @ problem.S @ inputs
             F = F + 2 * gamma**k * inputs.T @ problem.S @ start
     return H, F
+
+
+def _linear_cost(problem: LinearMPC, prediction: _Prediction) -> Array:
+    """Return c of ``c'U``, from ``q'e_k + r'v_k`` and the terminal cost that goes with it.
+
+    That is ``p'z_N``: with v = -K z - const the optimal cost to go is quadratic and linear, and its
+    linear part satisfies ``p = q - K'r + gamma (A - BK)'p``.
+    """
+    (q, r), N, gamma = problem.linear_cost, problem.horizon, problem.gamma
+    c: Array = np.zeros(N * len(r))
+    if not (np.any(q) or np.any(r)):
+        return c
+    errors, n = problem.errors, len(q)
+    model = errors.model
+    K = lqr.gain(model, errors.R, problem.terminal_cost, gamma, errors.cross)
+    wide = np.concatenate([q, np.zeros(len(errors.T) - n)])
+    closed = np.eye(len(K.T)) - gamma * (model.A - model.B @ K).T
+    p = np.linalg.solve(closed, wide - K.T @ r)
+    c = np.kron(gamma ** np.arange(N), r)
+    for k in range(1, N):
+        c = c + gamma**k * (errors.T[:n] @ prediction.forced[k]).T @ q
+    return np.asarray(c + gamma**N * (errors.T @ prediction.forced[N]).T @ p)
 
 
 def _constraints(

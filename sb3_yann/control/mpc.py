@@ -15,6 +15,7 @@ from sb3_yann.control._problem_arguments import (
     as_box,
     as_half_spaces,
     as_horizon,
+    as_linear_cost,
     as_outputs,
     as_rate_weight,
     as_soft_penalty,
@@ -89,7 +90,7 @@ class LinearMPC(ReadOnlyArrays):
         ``(F, g)`` of shapes (c, n) and (c,) for ``F x_N <= g``, or (c, n_theta) for
         ``F theta_N <= g``, where theta_N ends with ``u_{N-1}``. "invariant" is the set in which the
         gain of the terminal cost keeps all hard constraints for ever: the law then never leaves
-        its domain on the model. See :func:`~sb3_yann.control.invariant.invariant_set`. Stored as
+        its domain on the model, where x_min and x_max bound that. See :func:`~sb3_yann.control.invariant.invariant_set`. Stored as
         (F, g), as the terminal cost is.
     gamma : float, default 1
         Discount in (0, 1]. At 1 this is the usual MPC. With the discount of the learner, the
@@ -117,6 +118,12 @@ class LinearMPC(ReadOnlyArrays):
     soft_penalty : float, optional
         The largest violation s, in units, costs ``soft_penalty (s + s^2)``: an exact penalty, with
         the square that keeps the program strictly convex. It is no part of :meth:`stage_cost`.
+    linear_cost : tuple of array_like, optional
+        ``(q, r)`` of shapes (n,) and (m,): ``q'e_k + r'v_k`` is added to the stage cost, with what
+        goes with it to the terminal cost. The law then rests elsewhere than at the steady state,
+        and there is no :meth:`value_matrix`, hence no policy: for one, take the state and input
+        where the law rests as the operating point, and leave the linear cost out. Without a
+        discount this is the same law wherever no constraint acts at rest.
 
     Raises
     ------
@@ -153,6 +160,7 @@ class LinearMPC(ReadOnlyArrays):
     x_soft: Array
     y_soft: Array
     soft_penalty: float
+    linear_cost: tuple[Array, Array]
 
     def __init__(
         self,
@@ -185,6 +193,7 @@ class LinearMPC(ReadOnlyArrays):
         x_soft: ArrayLike | None = None,
         y_soft: ArrayLike | None = None,
         soft_penalty: float | None = None,
+        linear_cost: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
@@ -196,6 +205,7 @@ class LinearMPC(ReadOnlyArrays):
         self._set(R=as_symmetric("R", R, m, definite=True), S=as_rate_weight(S, m))
         self._set(tracked=as_outputs("tracked", tracked, n))
         self._set(outputs=as_outputs("outputs", outputs, n))
+        self._set(linear_cost=as_linear_cost(linear_cost, n, m))
         for name, low, high, size in (
             ("x", x_min, x_max, n),
             ("u", u_min, u_max, m),
@@ -328,6 +338,9 @@ class LinearMPC(ReadOnlyArrays):
         at, v, errors = np.asarray(theta, np.float64), np.asarray(u, np.float64), self.errors
         z, v = at @ errors.T.T, v - at @ errors.U.T
         cost = np.sum((z @ errors.Q) * z, axis=-1) + np.sum((v @ errors.R) * v, axis=-1)
+        q, r = self.linear_cost
+        if np.any(q) or np.any(r):
+            cost = cost + z[..., : len(q)] @ q + v @ r
         if errors.cross is not None:
             cost = cost + 2 * np.sum((z @ errors.cross) * v, axis=-1)
         return np.asarray(cost)

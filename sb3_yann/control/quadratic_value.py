@@ -40,6 +40,12 @@ def gain_at_rest(problem: LinearMPC) -> Array:
     ValueError
         If the law does not rest at the origin, or, near it, at the steady states of r and d.
     """
+    if any(np.any(part) for part in problem.linear_cost):
+        raise ValueError(
+            "A problem with a linear_cost has no quadratic value about the origin, so no policy "
+            "can start from it. Take the state and input where its law rests as the operating "
+            "point, and leave linear_cost out."
+        )
     law, errors, parts = problem.explicit(), problem.errors, problem.parameters
     origin = np.zeros(problem.n_theta)
     width = problem.u_max - problem.u_min

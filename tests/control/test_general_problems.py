@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from general_problems import PROBLEMS, THERMAL, TWO_TANKS, servo, solved
+from general_problems import PROBLEMS, QUADRATIC, THERMAL, TWO_TANKS, servo, solved
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from online_mpc import OnlineMPC
@@ -140,7 +140,7 @@ def test_bounded_outputs_are_bounded_states_in_other_words() -> None:
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9])
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", QUADRATIC)
 def test_value_is_the_cost_of_the_law_on_the_model(name: str, gamma: float) -> None:
     mpc = solved(name)
     law, P = mpc.explicit(), mpc.value_matrix(gamma)
@@ -155,7 +155,7 @@ def test_value_is_the_cost_of_the_law_on_the_model(name: str, gamma: float) -> N
     np.testing.assert_allclose(cost, value, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", QUADRATIC)
 def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
     mpc, rng = solved(name), np.random.default_rng(0)
     theta, u = box_points(mpc, 50), rng.normal(size=(50, mpc.model.n_inputs))
@@ -229,6 +229,8 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"x_soft": 1}, ValueError, "soft_penalty is missing"),
     ({"soft_penalty": 1}, ValueError, "soft_penalty = 1, but nothing is soft"),
     ({"x_soft": 1, "soft_penalty": -1}, ValueError, "soft_penalty = -1 must be a finite number"),
+    ({"linear_cost": 3}, TypeError, r"linear_cost = 3 must be a pair \(q, r\)"),
+    ({"linear_cost": ([1], [1])}, ValueError, r"linear_cost q has shape \(1,\), expected \(2,\)"),
     ({"terminal_set": "ellipsoid"}, TypeError, "terminal_set must be a pair .* or 'invariant'"),
 ]
 
@@ -255,6 +257,29 @@ def test_references_without_a_box_are_named_when_the_law_is_asked_for() -> None:
 def test_a_law_that_is_held_away_from_rest_has_no_value() -> None:
     mpc = servo(u_min=0.2)
     with pytest.raises(ValueError, match="does not rest at the origin"):
+        mpc.value_matrix(0.9)
+
+
+def test_a_linear_cost_moves_the_rest_to_the_economic_optimum_and_changes_nothing_else() -> None:
+    # Without a discount: by duality the linear cost is a shift of the operating point.
+    q, r = np.array([0.3, 0]), np.array([-0.2])
+    mpc = servo(tracked=None, r_min=None, r_max=None, linear_cost=(q, r), x_min=None, x_max=None,
+                theta_min=-5, theta_max=5, u_min=-2, u_max=2)  # fmt: skip
+    A, B = mpc.model.A, mpc.model.B
+    M = np.hstack([A - np.eye(2), B])
+    kkt = np.block([[np.diag([2, 2, 0.2]), M.T], [M, np.zeros((2, 2))]])
+    rest = np.linalg.solve(kkt, np.concatenate([-q, -r, np.zeros(2)]))[:3]
+    x_e, u_e = rest[:2], rest[2:]
+    assert np.linalg.norm(rest) > 0.1
+    shifted = servo(tracked=None, r_min=None, r_max=None, x_min=None, x_max=None,
+                    theta_min=-6, theta_max=6, u_min=-2 - u_e, u_max=2 - u_e)  # fmt: skip
+    points = box_points(mpc, 500)
+    np.testing.assert_allclose(
+        mpc.explicit()(points), shifted.explicit()(points - x_e) + u_e, atol=1e-9
+    )
+    with pytest.raises(
+        ValueError, match=r"linear_cost has no quadratic value .* leave linear_cost"
+    ):
         mpc.value_matrix(0.9)
 
 

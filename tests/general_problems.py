@@ -55,12 +55,18 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     ),
     "invariant": lambda: servo(terminal_set="invariant"),
     "invariant with all of it": lambda: servo(LOADED, **RATES, terminal_set="invariant"),
+    "linear cost": lambda: servo(LOADED, linear_cost=([0.3, 0], [-0.2]), horizon=3),
+    "linear cost and a weight on the rate": lambda: servo(
+        linear_cost=([0.3, 0], [-0.2]), S=[[2.0]], gamma=0.95
+    ),
     "two tanks": two_tanks,
     "two tanks, all parts": lambda: two_tanks(du_min=-0.8, du_max=0.9),
     "more inputs than outputs": lambda: two_tanks(
         tracked=[[1, 1]], r_min=-0.5, r_max=0.5, R=np.diag([0.1, 1])
     ),
 }
+
+QUADRATIC = [name for name in PROBLEMS if not name.startswith("linear cost")]
 
 
 @cache
