@@ -8,6 +8,7 @@ import sb3_yann_envs
 from sb3_yann.audit import CostAudit, CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import (
+    DisturbanceObserver,
     ExplicitSolutionError,
     Identified,
     LinearModel,
@@ -32,6 +33,7 @@ __all__ = [
     "CostMismatchError",
     "CostMismatchWarning",
     "Decision",
+    "DisturbanceObserver",
     "ExplicitSolutionError",
     "Identified",
     "ImprovementGuard",

@@ -8,7 +8,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import ArrayLike
-from scipy import linalg
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
@@ -143,7 +142,7 @@ class YannCritic(SeesTheta, ContinuousCritic):
             "pinned": pin_equilibrium,
         }
         if prediction_model is None:
-            prediction_model = LinearPrediction(problem.model.A, problem.model.B)
+            prediction_model = LinearPrediction(*problem.prediction)
         self.scale = reward_scale
         self.offset = reward_offset / (1 - gamma) if reward_offset else 0.0
         self.q_networks = []
@@ -155,7 +154,7 @@ class YannCritic(SeesTheta, ContinuousCritic):
                 )
             else:
                 q_network = AfterstateValue(
-                    linalg.block_diag(problem.Q, problem.R),
+                    problem.stage_matrix,
                     problem.value_matrix(gamma),
                     prediction_model,
                     gamma,
@@ -203,7 +202,9 @@ class YannPolicy(TD3Policy):
     Parameters
     ----------
     observation_space : gymnasium.spaces.Box
-        The parameter theta of the law, shape (n,), or what ``observation`` makes theta of.
+        The parameter theta of the law, shape (n_theta,), or what ``observation`` makes theta of:
+        the state and, where the problem has them, the reference, the disturbance and the previous
+        input (see :mod:`sb3_yann.wrappers`).
     action_space : gymnasium.spaces.Box, shape (m,)
         Its bounds must be ``u_min`` and ``u_max`` of the problem.
     lr_schedule : callable
@@ -236,9 +237,12 @@ class YannPolicy(TD3Policy):
     max_correction : float, optional
         Bound on the distance from the MPC, as a fraction of the input range, 0 to 1: exact,
         whatever is learnt. The default is none.
-    pin_equilibrium : bool, default True
-        Whether actor and critic keep their value at ``theta = 0`` for good. Leave it free where the
-        steady-state input of the model is not the plant's.
+    pin_equilibrium : bool, optional
+        Whether actor and critic keep their value at ``theta = 0`` for good. The default is
+        False for problems with references or disturbances, and True for others: with those,
+        ``theta = 0`` is one of many steady states, and a correction pinned to zero there could not
+        remove the offset that a wrong steady-state input leaves. Leave it free too where the
+        steady-state input of a regulator's model is not the plant's.
     observation : AffineObservation, optional
         The map from an observation to theta. The default is the identity.
     reward_scale, reward_offset : float, default 1 and 0
@@ -283,7 +287,7 @@ class YannPolicy(TD3Policy):
         value_scale: float = 30.0,
         critic_warmup: int = 2000,
         max_correction: float | None = None,
-        pin_equilibrium: bool = True,
+        pin_equilibrium: bool | None = None,
         observation: AffineObservation | None = None,
         reward_scale: float = 1.0,
         reward_offset: float = 0.0,
@@ -325,6 +329,8 @@ class YannPolicy(TD3Policy):
             "critic": as_factor("critic_lr_mult", critic_lr_mult),
         }
         require_critic_options(critic, prediction_model, value_scale, critic_warmup)
+        if pin_equilibrium is None:
+            pin_equilibrium = not self.problem.parameters.has_constants
         if not isinstance(pin_equilibrium, bool):
             raise TypeError(f"pin_equilibrium = {pin_equilibrium!r} must be True or False.")
         if optimizer_class is th.optim.Adam and optimizer_kwargs is None:

@@ -32,7 +32,7 @@ class LinearPlant(gym.Env):
     def step(self, action):
         u = np.asarray(action, dtype=np.float64)
         reward = -float(self.mpc.stage_cost(self.x, u))
-        self.x = self.mpc.model.step(self.x, u)
+        self.x = self.mpc.predict(self.x, u)
         return self.x.astype(np.float32), reward, False, False, {}
 
 

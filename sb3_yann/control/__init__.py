@@ -4,13 +4,17 @@ from sb3_yann.control.explicit import ExplicitSolutionError, ParametricQP
 from sb3_yann.control.identification import Identified, identify
 from sb3_yann.control.linear_model import LinearModel
 from sb3_yann.control.mpc import LinearMPC
+from sb3_yann.control.observer import DisturbanceObserver
+from sb3_yann.control.parameters import Parameters
 from sb3_yann.control.piecewise_affine import PiecewiseAffine
 
 __all__ = [
+    "DisturbanceObserver",
     "ExplicitSolutionError",
     "Identified",
     "LinearMPC",
     "LinearModel",
+    "Parameters",
     "ParametricQP",
     "PiecewiseAffine",
     "identify",

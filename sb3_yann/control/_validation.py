@@ -37,7 +37,7 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
     return _frozen(array)
 
 
-def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool) -> Array:
+def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
     """Return ``value`` as a symmetric positive (semi-)definite ``(size, size)`` matrix.
 
     Raises

@@ -31,6 +31,8 @@ class ParametricQP:
     w : ndarray, shape (rows,)
     S : ndarray, shape (rows, n)
     theta_min, theta_max : ndarray, shape (n,)
+    n_slacks : int, default 0
+        How many of the last variables are slacks of soft constraints, and no inputs.
     """
 
     H: Array
@@ -41,12 +43,17 @@ class ParametricQP:
     S: Array
     theta_min: Array
     theta_max: Array
+    n_slacks: int = 0
 
     def solve(self, theta: Array) -> Array | None:
         """Return the optimal U (v,) at one theta (n,) from DAQP, or None where none is feasible."""
         import daqp
 
         upper = self.w + self.S @ theta
+        fixed = ~np.any(self.G, axis=1)
+        if np.any(upper[fixed] < -1e-11):  # a bound of theta alone
+            return None
+        upper = np.where(fixed, 1.0, upper)
         U, _, status, _ = daqp.solve(
             np.ascontiguousarray(self.H),
             self.F @ theta + self.c,
@@ -73,6 +80,7 @@ class ParametricQP:
             S=S / length[:, None],
             theta_min=(self.theta_min - center) / half,
             theta_max=(self.theta_max - center) / half,
+            n_slacks=self.n_slacks,
         )
 
 
@@ -106,7 +114,8 @@ def solve_explicit(
         raise ValueError(
             "The law is computed over a bounded box of parameters, but theta_min = "
             f"{program.theta_min.tolist()} and theta_max = {program.theta_max.tolist()}. Pass "
-            "finite theta_min and theta_max (or x_min and x_max)."
+            "finite theta_min and theta_max (or x_min and x_max), and where theta holds them, "
+            "r_min and r_max, d_min and d_max, u_min and u_max."
         )
     m = len(u_min)
     center = (program.theta_max + program.theta_min) / 2
@@ -114,7 +123,9 @@ def solve_explicit(
     # ppopt's tolerances are absolute: in units of the box and of the input range they mean the
     # same for every plant.
     width = (u_max - u_min) / 2
-    reach = np.tile(np.where(np.isfinite(width), width, 1.0), len(program.c) // m)
+    steps = (len(program.c) - program.n_slacks) // m
+    reach = np.tile(np.where(np.isfinite(width), width, 1.0), steps)
+    reach = np.concatenate([reach, np.ones(program.n_slacks)])
     scaled = program.scaled(center, half, reach)
     _require_feasible(scaled)
     regions = _critical_regions(scaled)
@@ -151,6 +162,8 @@ def _critical_regions(program: ParametricQP) -> list[_Region]:
         A, b = A[length > 0] / length[length > 0, None], b[length > 0] / length[length > 0]
         return [_Region((), law[:, :-1], law[:, -1], A, b)]
 
+    # Rows without U bound theta: with them in the constraints ppopt's active sets degenerate.
+    moving = np.any(program.G, axis=1) | ~np.any(program.S, axis=1)
     from ppopt.mp_solvers import mpqp_combi_graph
     from ppopt.mpqp_program import MPQP_Program
     from ppopt.solver import Solver
@@ -158,14 +171,14 @@ def _critical_regions(program: ParametricQP) -> list[_Region]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # feasibility was checked, with a clearer message
         problem = MPQP_Program(
-            A=program.G,
-            b=program.w[:, None],
+            A=program.G[moving],
+            b=program.w[moving, None],
             c=program.c[:, None],
             H=program.F,
             Q=program.H,
-            A_t=box_A,
-            b_t=box_b[:, None],
-            F=program.S,
+            A_t=np.vstack([box_A, -program.S[~moving]]),
+            b_t=np.concatenate([box_b, program.w[~moving]])[:, None],
+            F=program.S[moving],
             solver=Solver({"lp": "glpk", "qp": "daqp"}),  # the defaults want a Gurobi licence
         )
         found = mpqp_combi_graph.solve(problem).critical_regions
@@ -234,7 +247,7 @@ def _kkt_residual(program: ParametricQP, theta: Array, U: Array) -> float:
     gradient = program.H @ U + program.F @ theta + program.c
     active = program.G[slack < 1e-7]
     stationarity = optimize.nnls(active.T, -gradient)[1] if len(active) else np.abs(gradient).max()
-    size = 1 + np.abs(program.F @ theta).max()
+    size = 1 + np.abs(program.F @ theta + program.c).max()
     return float(max(-slack.min(initial=0.0), stationarity / size))
 
 

@@ -12,7 +12,7 @@ from sb3_yann.control._validation import Array, as_array, as_positive, to_float
 from sb3_yann.control.differences import Jacobian, NotDifferentiableError, jacobian
 from sb3_yann.control.linear_model import LinearModel
 from sb3_yann.control.simulator import Simulator, borrow, connect, sample_time, to_vector
-from sb3_yann.control.steady_state import check_rest, steady_state
+from sb3_yann.control.simulator_rest import check_rest, steady_state
 
 if TYPE_CHECKING:
     from sb3_yann.control.simulator import Maker

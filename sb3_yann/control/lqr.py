@@ -1,7 +1,8 @@
 """Discounted linear-quadratic control: value, gain, and the state-action value matrix.
 
-Costs are ``sum_k gamma^k (x' Q x + u' R u)``. The discount is absorbed by the substitution
-``A -> sqrt(gamma) A``, ``B -> sqrt(gamma) B``, after which the undiscounted equations hold.
+Costs are ``sum_k gamma^k (x' Q x + 2 x' N u + u' R u)``, where N, the argument ``cross``, is zero
+unless given. The discount is absorbed by the substitution ``A -> sqrt(gamma) A``,
+``B -> sqrt(gamma) B``, after which the undiscounted equations hold.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from sb3_yann.control._validation import Array
 from sb3_yann.control.linear_model import LinearModel
 
 
-def riccati(model: LinearModel, Q: Array, R: Array, gamma: float = 1.0) -> Array:
+def riccati(
+    model: LinearModel, Q: Array, R: Array, gamma: float = 1.0, cross: Array | None = None
+) -> Array:
     """Return P (n, n) with ``x' P x`` the smallest discounted cost from x, without constraints.
 
-    It solves ``P = Q + g A'PA - g A'PB (R + g B'PB)^-1 g B'PA`` for ``g = gamma``.
+    It solves ``P = Q + g A'PA - (g A'PB + N) (R + g B'PB)^-1 (g B'PA + N')`` for ``g = gamma``.
 
     Raises
     ------
@@ -26,8 +29,8 @@ def riccati(model: LinearModel, Q: Array, R: Array, gamma: float = 1.0) -> Array
     """
     A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
     try:
-        P = linalg.solve_discrete_are(A, B, Q, R)
-        radius = _spectral_radius(A - B @ gain(model, R, P, gamma))
+        P = linalg.solve_discrete_are(A, B, Q, R, s=cross)
+        radius = spectral_radius(A - B @ gain(model, R, P, gamma, cross))
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
     # SciPy also returns matrices that do not stabilise, where a mode on the unit circle cannot be
@@ -37,19 +40,24 @@ def riccati(model: LinearModel, Q: Array, R: Array, gamma: float = 1.0) -> Array
     return np.asarray((P + P.T) / 2)
 
 
-def gain(model: LinearModel, R: Array, P: Array, gamma: float = 1.0) -> Array:
-    """Return K (m, n) such that ``u = -K x`` minimises ``u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
+def gain(
+    model: LinearModel, R: Array, P: Array, gamma: float = 1.0, cross: Array | None = None
+) -> Array:
+    """Return K (m, n): ``u = -K x`` minimises ``2x'Nu + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
     PB = P @ model.B
     factor = linalg.cho_factor(R + gamma * model.B.T @ PB)
-    return np.asarray(linalg.cho_solve(factor, gamma * PB.T @ model.A))
+    slope = gamma * PB.T @ model.A
+    return np.asarray(linalg.cho_solve(factor, slope if cross is None else slope + cross.T))
 
 
-def policy_value(model: LinearModel, Q: Array, R: Array, K: Array, gamma: float) -> Array:
+def policy_value(
+    model: LinearModel, Q: Array, R: Array, K: Array, gamma: float, cross: Array | None = None
+) -> Array:
     """Return P (n, n) with ``x' P x`` the discounted cost of the law ``u = -K x``, whatever K is.
 
-    It solves the Lyapunov equation ``P = Q + K'RK + gamma (A - BK)' P (A - BK)``. For the
-    optimal K of the same discount this is the Riccati solution; for any other K it is the only P
-    that makes the state-action value of :func:`state_action_matrix` satisfy Bellman's equation
+    It solves ``P = Q - NK - K'N' + K'RK + gamma (A - BK)' P (A - BK)``, a Lyapunov equation. For
+    the optimal K of the same discount this is the Riccati solution; for any other K it is the only
+    P that makes the state-action value of :func:`state_action_matrix` satisfy Bellman's equation
     along the law.
 
     Raises
@@ -58,14 +66,17 @@ def policy_value(model: LinearModel, Q: Array, R: Array, K: Array, gamma: float)
         If the discounted closed loop is not stable, so that the cost is infinite.
     """
     closed = np.sqrt(gamma) * (model.A - model.B @ K)
-    radius = _spectral_radius(closed)
+    radius = spectral_radius(closed)
     if radius >= 1:
         raise ValueError(
             f"The law u = -K x with K = {K.tolist()} has infinite cost: the spectral radius of "
             f"sqrt(gamma) (A - BK) is {radius:.6g}, it must be below 1. Lengthen the horizon, use "
             "the default terminal cost, or a smaller gamma."
         )
-    P = linalg.solve_discrete_lyapunov(closed.T, Q + K.T @ R @ K)
+    stage = Q + K.T @ R @ K
+    if cross is not None:
+        stage = stage - cross @ K - K.T @ cross.T
+    P = linalg.solve_discrete_lyapunov(closed.T, stage)
     return np.asarray((P + P.T) / 2)
 
 
@@ -80,7 +91,8 @@ def state_action_matrix(model: LinearModel, Q: Array, R: Array, P: Array, gamma:
     return np.asarray(linalg.block_diag(Q, R) + gamma * AB.T @ P @ AB)
 
 
-def _spectral_radius(matrix: Array) -> float:
+def spectral_radius(matrix: Array) -> float:
+    """Return the largest modulus of an eigenvalue of a square matrix."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix))))
 
 

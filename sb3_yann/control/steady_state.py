@@ -1,114 +1,90 @@
-"""Where a simulator rests: found, or checked where it is given."""
+"""Steady states that a reference and a disturbance ask for, as a linear map."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy import linalg
 
-from sb3_yann.control._validation import Array
-from sb3_yann.control.simulator import Simulator
-
-MOVED = 1e-3
-"""How far a given steady state may move in one step, in parts of the scale."""
-AWAY = 1e-2
-"""How far from it the plant may really rest, in parts of the scale."""
-SOLVED = 1e-6
-"""How far one that was solved for may move."""
+from sb3_yann.control._validation import Array, ReadOnlyArrays
+from sb3_yann.control.linear_model import LinearModel
 
 
-def steady_state(
-    simulator: Simulator, start: Array, free: NDArray[np.bool_], scale: Array
-) -> Array:
-    """Return the state and action that one step leaves where they are, shape (n+m,).
+@dataclass(frozen=True, eq=False)
+class SteadyStates(ReadOnlyArrays):
+    """``x_s = x [r; d]`` and ``u_s = u [r; d]``.
+
+    Attributes
+    ----------
+    x : ndarray, shape (n, p + d)
+    u : ndarray, shape (m, p + d)
+    """
+
+    x: Array
+    u: Array
+
+
+def steady_states(
+    model: LinearModel, C: Array, Q: Array, R: Array, x_unit: Array, u_unit: Array
+) -> SteadyStates:
+    """Return the map from reference and disturbance to the steady state with ``C x_s = r``.
+
+    It solves ``(A - I) x_s + B u_s = -E d`` and ``C x_s = r`` (Rawlings, Mayne & Diehl, Model
+    Predictive Control, Section 1.5). Where several steady states do, as with more inputs than
+    outputs, it is the one with the smallest ``x_s'Q x_s + u_s'R u_s``; of those that this leaves,
+    the one of minimum norm in the units given.
 
     Parameters
     ----------
-    simulator : Simulator
-        Put in a state, and stepped, many times.
-    start : ndarray, shape (n+m,)
-        What is known of it, and a guess for the rest.
-    free : ndarray of bool, shape (n+m,)
-        Which entries to solve for. The others stay.
-    scale : ndarray, shape (n+m,)
-        How far each moves in use.
+    model : LinearModel
+    C : ndarray, shape (p, n)
+        The tracked outputs; p = 0 for none.
+    Q, R : ndarray, shapes (n, n) and (m, m)
+    x_unit, u_unit : ndarray, shapes (n,) and (m,)
+        Typical sizes, which make ranks and norms independent of the units of the plant.
 
     Raises
     ------
     ValueError
-        If there is none with these entries, or the environment refuses the given one.
+        If some reference or disturbance has no steady state, whatever the bounds.
     """
-    if not np.any(free):
-        return start
-    point = _solve(simulator, start, free, scale)
-    rest = drift(simulator, point, scale)
-    n = rest.size
-    if not np.max(np.abs(rest)) <= SOLVED:
-        reason = simulator.refusal if np.any(np.isnan(rest)) else f"{(rest * scale[:n]).tolist()}"
-        raise ValueError(
-            f"No steady state was found. The best is state = {point[:n].tolist()}, action = "
-            f"{point[n:].tolist()}, which moves in one step by {reason}. Leave more entries free "
-            "(NaN), or start closer to it."
-        )
-    return point
+    n, m = model.B.shape
+    if len(C) + model.n_disturbances == 0:
+        return SteadyStates(np.zeros((n, 0)), np.zeros((m, 0)))
+    unit = np.concatenate([x_unit, u_unit])
+    equations = np.block([[model.A - np.eye(n), model.B], [C, np.zeros((len(C), m))]]) * unit
+    row_unit = np.concatenate([x_unit, np.linalg.norm(equations[n:], axis=1)])
+    row_unit[row_unit == 0] = 1.0
+    equations = equations / row_unit[:, None]
+    right = linalg.block_diag(np.zeros((n, 0)), np.eye(len(C)))
+    right = np.hstack([right, np.vstack([-model.E, np.zeros((len(C), model.n_disturbances))])])
+    right = right / row_unit[:, None]
+
+    solution = np.linalg.pinv(equations, rcond=1e-10) @ right
+    size = np.maximum(np.abs(right).max(axis=0, initial=0.0), np.finfo(float).tiny)
+    missed = np.abs(equations @ solution - right).max(axis=0, initial=0.0) > 1e-8 * size
+    if np.any(missed):
+        raise ValueError(_why_none(model, C, missed, equations))
+
+    free = linalg.null_space(equations, rcond=1e-10)
+    weight = linalg.block_diag(Q, R) * np.outer(unit, unit)
+    curvature = free.T @ weight @ free
+    solution = solution - free @ np.linalg.pinv(curvature, rcond=1e-12, hermitian=True) @ (
+        free.T @ weight @ solution
+    )
+    solution = solution * unit[:, None]
+    return SteadyStates(solution[:n], solution[n:])
 
 
-def check_rest(simulator: Simulator, point: Array, jacobian: Array, scale: Array) -> None:
-    """Refuse a given operating point that moves, or that is far from where the plant rests.
-
-    In a short sample a plant moves little from anywhere. So the way to the nearest steady state
-    counts: that of the linear model, by least squares in state and action.
-
-    Raises
-    ------
-    ValueError
-        If the point is no steady state.
-    """
-    rest = drift(simulator, point, scale)
-    n = rest.size
-    slopes = (jacobian - np.eye(n, point.size)) * scale / scale[:n, None]
-    way = np.linalg.lstsq(slopes, -rest, rcond=1e-9)[0]
-    left = rest + slopes @ way
-    if np.max(np.abs(way)) > AWAY or np.max(np.abs(left)) > MOVED:
-        raise ValueError(
-            f"state = {point[:n].tolist()}, action = {point[n:].tolist()} is no steady state: one "
-            f"step moves it by {(rest * scale[:n]).tolist()}. Leave one of the two out, or set "
-            "entries to NaN, to have them solved for."
-        )
-
-
-def drift(simulator: Simulator, point: Array, scale: Array) -> Array:
-    """Return how far one step moves the state, in parts of the scale, shape (n,)."""
-    n = scale.size - simulator.env.action_space.shape[0]
-    return (simulator.next_state(point[:n], point[n:]) - point[:n]) / scale[:n]
-
-
-def _solve(simulator: Simulator, start: Array, free: NDArray[np.bool_], scale: Array) -> Array:
-    """Return the point that moves least, with only the free entries changed."""
-    from scipy.optimize import least_squares
-
-    place = np.flatnonzero(free)
-    space: Any = simulator.env.action_space
-    n = scale.size - space.shape[0]
-    low = np.concatenate([np.full(n, -np.inf), space.low.astype(np.float64)])[place]
-    high = np.concatenate([np.full(n, np.inf), space.high.astype(np.float64)])[place]
-
-    def at(z: Array) -> Array:
-        point = start.copy()
-        point[place] = z * scale[place]
-        return point
-
-    def residual(z: Array) -> Array:
-        # Where the environment refuses a state, the search turns back.
-        moved = drift(simulator, at(z), scale)
-        return np.asarray(np.nan_to_num(moved, nan=1e3, posinf=1e3, neginf=-1e3))
-
-    def slopes(z: Array) -> Array:
-        # Steps as long as a float32 state needs; SciPy's own would vanish in its rounding.
-        steps = 1e-3 * np.eye(z.size)
-        return np.array([(residual(z + h) - residual(z - h)) / 2e-3 for h in steps]).T
-
-    begin, bounds = start[place] / scale[place], (low / scale[place], high / scale[place])
-    found = least_squares(residual, begin, slopes, bounds, xtol=1e-12, ftol=1e-15, gtol=1e-15)
-    return at(found.x)
+def _why_none(model: LinearModel, C: Array, missed: Array, equations: Array) -> str:
+    p = len(C)
+    which = [f"r[{i}]" if i < p else f"d[{i - p}]" for i in np.flatnonzero(missed)]
+    rank = int(np.linalg.matrix_rank(equations, tol=1e-10))
+    return (
+        f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank {rank}, "
+        f"and the {model.n_states} states and {p} tracked outputs ask for "
+        f"{model.n_states + p}. At most as many outputs as there are inputs "
+        f"({model.n_inputs}) can be tracked, and each must be moved by an input at steady state. "
+        "Track fewer outputs, or other ones."
+    )

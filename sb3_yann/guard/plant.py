@@ -184,5 +184,5 @@ def predicted_cost(problem: LinearMPC, start: Array, steps: int) -> float:
     for _ in range(steps):
         u = law(theta)
         cost += float(problem.stage_cost(theta, u))
-        theta = problem.model.step(theta, u)
+        theta = problem.predict(theta, u)
     return cost

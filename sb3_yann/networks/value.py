@@ -186,7 +186,7 @@ class AfterstateValue(nn.Module):
 
 
 class LinearPrediction(nn.Module):
-    """``(theta, u) -> A theta + B u``."""
+    """``(theta, u) -> A theta + B u``, from :attr:`LinearMPC.prediction`."""
 
     A: th.Tensor
     B: th.Tensor

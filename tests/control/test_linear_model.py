@@ -188,3 +188,21 @@ def test_negative_zero_is_zero_to_equality_and_hash() -> None:
 
 def test_a_model_is_not_equal_to_something_else() -> None:
     assert MODEL != "a model"
+
+
+def test_a_disturbance_enters_by_its_matrix() -> None:
+    model = LinearModel(MODEL.A, MODEL.B, MODEL.dt, E=[[1], [2]])
+    x, u = np.array([1.0, 2.0]), np.array([1.0])
+    np.testing.assert_allclose(model.step(x, u, [0.5]) - model.step(x, u), [0.5, 1.0])
+    assert (model.n_disturbances, MODEL.n_disturbances) == (1, 0)
+
+
+def test_models_with_other_disturbances_are_not_equal() -> None:
+    one, other = (LinearModel(MODEL.A, MODEL.B, MODEL.dt, E=[[1], [k]]) for k in (1, 2))
+    assert one != other
+    assert copy.deepcopy(one) == one
+
+
+def test_a_disturbance_matrix_of_another_shape_is_named() -> None:
+    with pytest.raises(ValueError, match=r"E has shape \(1, 1\), expected \(2, d\)"):
+        LinearModel(MODEL.A, MODEL.B, MODEL.dt, E=[[1]])

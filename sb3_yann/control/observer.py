@@ -1,0 +1,173 @@
+"""Estimates a constant disturbance that nothing measures, from the outputs that are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg
+
+from sb3_yann.control import lqr
+from sb3_yann.control._problem_arguments import as_outputs
+from sb3_yann.control._validation import Array, as_array, to_float
+from sb3_yann.control.linear_model import LinearModel
+
+
+class DisturbanceObserver:
+    """A steady-state Kalman filter for the state and a constant disturbance: offset-free MPC.
+
+    The model is augmented to ``x+ = A x + B u + E d``, ``d+ = d``, ``y = C x``. The estimate
+    ``d_hat`` takes the place of a measured disturbance in the theta of a :class:`LinearMPC` with
+    the same model: its steady-state target then follows the estimate, and tracked outputs that are
+    measured settle without offset (Pannocchia & Rawlings, Disturbance models for offset-free
+    model-predictive control, AIChE J. 49, 2003).
+
+    With as many disturbances as measured outputs the offset goes away for any constant disturbance
+    and any model error that leaves the loop stable; with fewer, only for disturbances that enter
+    as E says. All disturbances of the model are estimated, and the outputs have none of their own.
+
+    Parameters
+    ----------
+    model : LinearModel
+        With a disturbance matrix E (n, d), d >= 1.
+    measured : array_like, shape (q, n), or list of int, optional
+        C, or the indices of the states that are measured. The default is all states.
+    state_noise, disturbance_noise, measurement_noise : array_like or float, default 1
+        Standard deviations, of shapes (n,), (d,) and (q,): how far x and d wander from the model
+        within one sample, and how far y is off. Only their ratios matter: more disturbance noise
+        makes the estimate of d faster and rougher.
+    gain : array_like, shape (n + d, q), optional
+        A Luenberger gain to use instead: ``[x; d]`` is corrected by ``gain (y - C x)``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For arguments of the wrong type or shape, where the measurements do not determine the
+        disturbance, and for a gain that does not make the error decay.
+    """
+
+    def __init__(
+        self,
+        model: LinearModel,
+        measured: ArrayLike | Sequence[int] | None = None,
+        *,
+        state_noise: ArrayLike = 1.0,
+        disturbance_noise: ArrayLike = 1.0,
+        measurement_noise: ArrayLike = 1.0,
+        gain: ArrayLike | None = None,
+    ) -> None:
+        if not isinstance(model, LinearModel):
+            raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
+        n, d = model.n_states, model.n_disturbances
+        self.model = model
+        self.C = as_outputs("measured", np.eye(n) if measured is None else measured, n)
+        _require_observable(model, self.C)
+        q = len(self.C)
+        self.A = np.block([[model.A, model.E], [np.zeros((d, n)), np.eye(d)]])
+        self.B = np.vstack([model.B, np.zeros((d, model.n_inputs))])
+        self.seen = np.hstack([self.C, np.zeros((q, d))])
+        moves = np.concatenate(
+            [
+                _deviations("state_noise", state_noise, n),
+                _deviations("disturbance_noise", disturbance_noise, d),
+            ]
+        )
+        errors = _deviations("measurement_noise", measurement_noise, q)
+        self.gain = (
+            self._kalman_gain(np.diag(moves**2), np.diag(errors**2))
+            if gain is None
+            else as_array("gain", gain, (n + d, q))
+        )
+        radius = lqr.spectral_radius((np.eye(n + d) - self.gain @ self.seen) @ self.A)
+        if not radius < 1:
+            raise ValueError(
+                f"gain = {self.gain.tolist()} does not make the error of the estimate decay: the "
+                f"spectral radius is {radius:.6g}, it must be below 1. Leave the gain out for the "
+                "Kalman filter."
+            )
+        self.estimate: Array = np.zeros(n + d)
+
+    @property
+    def n_measured(self) -> int:
+        """Number of measured outputs q."""
+        return len(self.C)
+
+    @property
+    def x_hat(self) -> Array:
+        """The estimated state (n,)."""
+        return self.estimate[: self.model.n_states].copy()
+
+    @property
+    def d_hat(self) -> Array:
+        """The estimated disturbance (d,)."""
+        return self.estimate[self.model.n_states :].copy()
+
+    def reset(self, y: ArrayLike) -> tuple[Array, Array]:
+        """Start anew from the first measurement y (q,), with no disturbance; return x_hat, d_hat.
+
+        The state is the smallest one that gives y.
+        """
+        start = np.linalg.pinv(self.C) @ as_array("y", y, (self.n_measured,))
+        self.estimate = np.concatenate([start, np.zeros(self.model.n_disturbances)])
+        return self.x_hat, self.d_hat
+
+    def update(self, y: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        """Return x_hat (n,) and d_hat (d,) from y (q,) now and the input u (m,) that led here.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If y or u has another shape, or holds NaN.
+        """
+        now = as_array("y", y, (self.n_measured,))
+        predicted = self.A @ self.estimate + self.B @ as_array("u", u, (self.model.n_inputs,))
+        self.estimate = predicted + self.gain @ (now - self.seen @ predicted)
+        return self.x_hat, self.d_hat
+
+    def _kalman_gain(self, moves: Array, errors: Array) -> Array:
+        """Return the steady-state gain of the filter that corrects after each measurement."""
+        P = linalg.solve_discrete_are(self.A.T, self.seen.T, moves, errors)
+        spread = self.seen @ P @ self.seen.T + errors
+        return np.asarray(np.linalg.solve(spread, self.seen @ P).T)
+
+
+def _require_observable(model: LinearModel, C: Array) -> None:
+    """Raise unless the augmented model is detectable (Pannocchia & Rawlings 2003, Lemma 1)."""
+    n, d, q = model.n_states, model.n_disturbances, len(C)
+    if d == 0:
+        raise ValueError(
+            "The model has no disturbance to estimate: pass its matrix E, e.g. E = B for a load "
+            "at the input."
+        )
+    for pole in np.linalg.eigvals(model.A):
+        hautus = np.vstack([pole * np.eye(n) - model.A, C])
+        if abs(pole) > 1 - 1e-9 and _rank(hautus) < n:
+            raise ValueError(
+                f"The measurements do not see an unstable mode: eigenvalue {pole:.6g} of A is not "
+                "observable through C. Measure another output."
+            )
+    steady = np.block([[model.A - np.eye(n), model.E], [C, np.zeros((q, d))]])
+    rank = _rank(steady)
+    if rank < n + d:
+        raise ValueError(
+            f"The {q} measured outputs do not determine the {d} disturbances at steady state: "
+            f"[[A - I, E], [C, 0]] has rank {rank}, needed is {n + d}. Have at most as many "
+            "disturbances as measured outputs, and none that the outputs cannot tell apart."
+        )
+
+
+def _rank(matrix: Array) -> int:
+    """Return the rank of a matrix with columns and rows brought to unit length."""
+    for axis in (0, 1):
+        length = np.linalg.norm(matrix, axis=axis, keepdims=True)
+        matrix = matrix / np.where(length > 0, length, 1.0)
+    return int(np.linalg.matrix_rank(matrix, tol=1e-9))
+
+
+def _deviations(name: str, value: ArrayLike, size: int) -> Array:
+    array = to_float(name, value)
+    array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
+    if np.any(array <= 0):
+        raise ValueError(f"{name} = {array.tolist()} holds standard deviations, above 0.")
+    return array

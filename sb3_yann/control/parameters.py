@@ -1,0 +1,73 @@
+"""What the parameter theta of a problem holds, and where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The layout of ``theta = [x, r, d, u_prev]``, of which a problem has the parts that it uses.
+
+    Attributes
+    ----------
+    n_states : int
+        The state x.
+    n_references : int
+        The reference r of the tracked outputs.
+    n_disturbances : int
+        The measured, or estimated, disturbance d.
+    n_previous : int
+        The input of the step before, ``u_prev``: all inputs where their rate matters, or none.
+    """
+
+    n_states: int
+    n_references: int = 0
+    n_disturbances: int = 0
+    n_previous: int = 0
+
+    @property
+    def size(self) -> int:
+        """Number of entries of theta."""
+        return int(self.previous.stop)
+
+    @property
+    def has_constants(self) -> bool:
+        """Whether theta holds a reference or a disturbance: it has many steady states then."""
+        return self.n_references + self.n_disturbances > 0
+
+    @property
+    def state(self) -> slice:
+        """The entries of x."""
+        return slice(0, self.n_states)
+
+    @property
+    def reference(self) -> slice:
+        """The entries of r."""
+        return slice(self.n_states, self.n_states + self.n_references)
+
+    @property
+    def disturbance(self) -> slice:
+        """The entries of d."""
+        return slice(self.reference.stop, self.reference.stop + self.n_disturbances)
+
+    @property
+    def constant(self) -> slice:
+        """The entries of r and d, which the prediction holds constant."""
+        return slice(self.n_states, self.disturbance.stop)
+
+    @property
+    def previous(self) -> slice:
+        """The entries of the previous input."""
+        return slice(self.disturbance.stop, self.disturbance.stop + self.n_previous)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A name for each entry, such as ``x[0]``, ``r[0]``, ``d[0]`` or ``u_prev[0]``."""
+        counts = {
+            "x": self.n_states,
+            "r": self.n_references,
+            "d": self.n_disturbances,
+            "u_prev": self.n_previous,
+        }
+        return tuple(f"{name}[{i}]" for name, count in counts.items() for i in range(count))

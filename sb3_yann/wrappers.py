@@ -1,0 +1,321 @@
+"""Wrappers that complete an observation to the parameter theta = [x, r, d, u_prev] of a problem.
+
+Each appends one part. Wrap in the order of theta, the state innermost::
+
+    env = SetPoint(env, r_min, r_max)
+    env = ObserveDisturbance(env, observer, d_min, d_max)  # or MeasuredDisturbance
+    env = PreviousInput(env)
+    env = StageCost(env, problem)
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann.control import DisturbanceObserver, LinearMPC
+
+Vector = NDArray[np.floating[Any]]
+Array = NDArray[np.float64]
+Schedule = Callable[[int], ArrayLike]
+"""The reference after so many steps of an episode."""
+
+
+class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
+    """Appends a vector between ``low`` and ``high`` to the observation.
+
+    The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Vector, Vector],
+        low: ArrayLike,
+        high: ArrayLike,
+        n_replaced: int = 0,
+        n_new: int = 0,
+    ) -> None:
+        super().__init__(env)
+        inner = _require_vector(self, "observation_space")
+        self.inputs = _require_vector(self, "action_space")
+        self.low, self.high = (np.atleast_1d(np.array(side, np.float64)) for side in (low, high))
+        if self.low.ndim != 1 or self.low.shape != self.high.shape:
+            raise ValueError(
+                f"low has shape {self.low.shape} and high {self.high.shape}; give the bounds of "
+                "each appended entry as two vectors of the same length."
+            )
+        if not np.all(self.low <= self.high):
+            raise ValueError(f"low = {self.low.tolist()} exceeds high = {self.high.tolist()}.")
+        free = np.full(n_new, np.inf)
+        self.observation_space = spaces.Box(
+            np.concatenate([-free, inner.low[n_replaced:], self.low]).astype(np.float32),
+            np.concatenate([free, inner.high[n_replaced:], self.high]).astype(np.float32),
+            dtype=np.float32,
+        )
+
+    def executed(self, action: Vector) -> Array:
+        """Return the input (m,) that an action is: clipped to the bounds of the action space."""
+        return np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
+
+    def joined(self, *parts: Vector) -> Vector:
+        """Return the parts as one observation, float32."""
+        return np.concatenate(parts).astype(np.float32)
+
+
+class PreviousInput(_Appending):
+    """Appends the input of the step before, ``u_prev`` (m,), for bounds or weights on its rate.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        With one-dimensional Box spaces.
+    initial : array_like, shape (m,), optional
+        What counts as the previous input at the start of an episode: zeros by default, the
+        operating point.
+    """
+
+    def __init__(self, env: gym.Env[Vector, Vector], initial: ArrayLike | None = None) -> None:
+        bounds = _require_vector(env, "action_space")
+        super().__init__(env, bounds.low, bounds.high)
+        start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
+        if start.shape != bounds.shape:
+            raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
+        self.initial = self.executed(start)
+
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode; the previous input is ``initial``."""
+        observation, info = self.env.reset(**kwargs)
+        return self.joined(observation, self.initial), info
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Step, and show the input that was played."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        joined = self.joined(observation, self.executed(action))
+        return joined, float(reward), terminated, truncated, info
+
+
+class SetPoint(_Appending):
+    """Appends the reference r (p,): drawn uniformly, or of a schedule.
+
+    The observation after a step shows the reference that the next action is to follow.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        With one-dimensional Box spaces.
+    low, high : array_like, shape (p,)
+        The box of references, ``r_min`` and ``r_max`` of the problem.
+    hold : int, optional
+        Steps after which another one is drawn. The default is one reference for each episode.
+    schedule : callable, optional
+        ``schedule(step) -> r`` gives the reference after so many steps of an episode, instead of
+        a random one.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Vector, Vector],
+        low: ArrayLike,
+        high: ArrayLike,
+        *,
+        hold: int | None = None,
+        schedule: Schedule | None = None,
+    ) -> None:
+        super().__init__(env, low, high)
+        if not np.all(np.isfinite([self.low, self.high])):
+            raise ValueError("low and high must be finite: references are drawn between them.")
+        if hold is not None and (isinstance(hold, bool) or hold < 1):
+            raise ValueError(f"hold = {hold!r} must be a number of steps of at least 1, or None.")
+        self.hold, self.schedule = hold, schedule
+        self.steps = 0
+        self.reference: Array = np.zeros(len(self.low))
+
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode, with a reference of its own."""
+        observation, info = self.env.reset(**kwargs)  # seeds the generator that draws
+        self.steps = 0
+        self.reference = self._next()
+        return self.joined(observation, self.reference), info
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Step, and show the reference that holds from now on."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.steps += 1
+        if self.schedule is not None or (self.hold and self.steps % self.hold == 0):
+            self.reference = self._next()
+        joined = self.joined(observation, self.reference)
+        return joined, float(reward), terminated, truncated, info
+
+    def _next(self) -> Array:
+        if self.schedule is None:
+            return np.asarray(self.np_random.uniform(self.low, self.high))
+        r = np.atleast_1d(np.array(self.schedule(self.steps), np.float64))
+        if r.shape != self.low.shape or not np.all((self.low <= r) & (r <= self.high)):
+            raise ValueError(
+                f"schedule({self.steps}) = {r.tolist()} must have shape {self.low.shape} and lie "
+                f"between low = {self.low.tolist()} and high = {self.high.tolist()}."
+            )
+        return r
+
+
+class MeasuredDisturbance(_Appending):
+    """Appends a disturbance d (d,) that the env measures and reports in ``info``.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        With one-dimensional Box spaces.
+    low, high : array_like, shape (d,)
+        The box of disturbances, ``d_min`` and ``d_max`` of the problem.
+    key : str, default "disturbance"
+        The entry of ``info``, after reset and after each step, that holds d.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Vector, Vector],
+        low: ArrayLike,
+        high: ArrayLike,
+        key: str = "disturbance",
+    ) -> None:
+        super().__init__(env, low, high)
+        self.key = key
+
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode."""
+        observation, info = self.env.reset(**kwargs)
+        return self.joined(observation, self._measured(info)), info
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Step, and show what is measured now."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        joined = self.joined(observation, self._measured(info))
+        return joined, float(reward), terminated, truncated, info
+
+    def _measured(self, info: dict[str, Any]) -> Array:
+        if self.key not in info:
+            raise ValueError(
+                f"info has no {self.key!r}, only {sorted(info)}. Name the entry that holds the "
+                "measured disturbance: MeasuredDisturbance(env, low, high, key=...)."
+            )
+        d = np.atleast_1d(np.asarray(info[self.key], np.float64))
+        if d.shape != self.low.shape:
+            raise ValueError(f"info[{self.key!r}] has shape {d.shape}, expected {self.low.shape}.")
+        return d
+
+
+class ObserveDisturbance(_Appending):
+    """Puts the estimated state in place of the measurement, and appends the disturbance d (d,).
+
+    The first entries of the env's observation are the measured outputs y (q,) of the observer; what
+    other wrappers have appended to them, such as a reference, stays where it is.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        With one-dimensional Box spaces.
+    observer : DisturbanceObserver
+        Copied, so that each env has an estimate of its own.
+    low, high : array_like, shape (d,)
+        The box of disturbances, ``d_min`` and ``d_max`` of the problem. The estimate is shown
+        clipped to it, since the law holds inside it; the observer keeps its own.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Vector, Vector],
+        observer: DisturbanceObserver,
+        low: ArrayLike,
+        high: ArrayLike,
+    ) -> None:
+        if not isinstance(observer, DisturbanceObserver):
+            raise TypeError(f"observer = {observer!r} must be a DisturbanceObserver.")
+        super().__init__(env, low, high, observer.n_measured, observer.model.n_states)
+        if len(self.low) != observer.model.n_disturbances:
+            raise ValueError(
+                f"low has shape {self.low.shape}, but the observer estimates "
+                f"{observer.model.n_disturbances} disturbances."
+            )
+        self.observer = copy.deepcopy(observer)
+
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode, and the observer from its first measurement."""
+        observation, info = self.env.reset(**kwargs)
+        measured, rest = np.split(observation, [self.observer.n_measured])
+        return self._shown(*self.observer.reset(measured), rest), info
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Step, and show the estimates that the new measurement gives."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        measured, rest = np.split(observation, [self.observer.n_measured])
+        estimates = self.observer.update(measured, self.executed(action))
+        return self._shown(*estimates, rest), float(reward), terminated, truncated, info
+
+    def _shown(self, x_hat: Array, d_hat: Array, rest: Vector) -> Vector:
+        return self.joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
+
+
+class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
+    """Makes the reward minus the stage cost of the problem, for which the critic is exact.
+
+    An env knows no reference, so its own reward cannot be the cost of following one. The cost is
+    that of the observed theta and of the input played there.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        Its observation is the theta of the problem.
+    problem : LinearMPC
+    violation_cost : float, default 0
+        Added to the cost of a step that reports ``info["violation"]``.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Vector, Vector],
+        problem: LinearMPC,
+        violation_cost: float = 0.0,
+    ) -> None:
+        super().__init__(env)
+        space = _require_vector(env, "observation_space")
+        self.inputs = _require_vector(env, "action_space")
+        if space.shape != (problem.n_theta,):
+            raise ValueError(
+                f"The observation has shape {space.shape}, but theta = "
+                f"[{', '.join(problem.parameters.names)}] has {problem.n_theta} entries. Wrap the "
+                "env so that it shows all of them, in this order."
+            )
+        self.problem, self.violation_cost = problem, violation_cost
+        self.theta: Array = np.zeros(problem.n_theta)
+
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode."""
+        observation, info = self.env.reset(**kwargs)
+        self.theta = np.asarray(observation, np.float64)
+        return observation, info
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Step; the reward is the one of this wrapper."""
+        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
+        cost = float(self.problem.stage_cost(self.theta, u))
+        observation, _, terminated, truncated, info = self.env.step(action)
+        cost += self.violation_cost if info.get("violation") else 0.0
+        self.theta = np.asarray(observation, np.float64)
+        return observation, -cost, terminated, truncated, info
+
+
+def _require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:
+    """Return a space of the env, a Box with one dimension."""
+    space = getattr(env, name)
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise TypeError(
+            f"{name} is {space}, the wrappers need a Box with one dimension. Wrap the env in "
+            "gymnasium.wrappers.FlattenObservation, or observe the plant's state."
+        )
+    return space

@@ -1,0 +1,172 @@
+"""Wrappers that complete an observation to theta: what they append, and when."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import LinearPlant, two_input_mpc
+from gymnasium.utils.env_checker import check_env
+
+from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC
+from sb3_yann.wrappers import (
+    MeasuredDisturbance,
+    ObserveDisturbance,
+    PreviousInput,
+    SetPoint,
+    StageCost,
+)
+
+
+class Counter(gym.Env):
+    """Observes the number of steps, twice; reports a disturbance."""
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(0, 100, (2,), np.float32)
+        self.action_space = gym.spaces.Box(np.float32([-1]), np.float32([2]))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {"disturbance": 0.0}
+
+    def step(self, action):
+        self.steps += 1
+        info = {"disturbance": 0.1 * self.steps, "violation": self.steps == 2}
+        return np.full(2, self.steps, np.float32), -7.0, False, False, info
+
+
+def test_the_previous_input_is_the_one_that_was_played() -> None:
+    env = PreviousInput(Counter(), initial=[0.5])
+    assert env.reset()[0].tolist() == [0, 0, 0.5]
+    assert env.step(np.array([1.5]))[0].tolist() == [1, 1, 1.5]
+    assert env.step(np.array([9.0]))[0].tolist() == [2, 2, 2]  # clipped to the action space
+    assert env.reset()[0].tolist() == [0, 0, 0.5]
+    assert env.observation_space.low.tolist() == [0, 0, -1]
+    assert env.observation_space.high.tolist() == [100, 100, 2]
+
+
+def test_a_reference_is_drawn_for_each_episode_and_follows_the_seed() -> None:
+    env = SetPoint(Counter(), [-1, 0], [1, 5])
+    first, _ = env.reset(seed=3)
+    assert env.step(np.zeros(1))[0][2:].tolist() == first[2:].tolist()
+    second, _ = env.reset()
+    assert second[2:].tolist() != first[2:].tolist()
+    assert env.reset(seed=3)[0].tolist() == first.tolist()
+    for _ in range(50):
+        assert env.observation_space.contains(env.reset()[0])
+
+
+def test_a_reference_may_change_every_few_steps() -> None:
+    env = SetPoint(Counter(), [-1], [1], hold=2)
+    seen = [env.reset(seed=0)[0][2], *(env.step(np.zeros(1))[0][2] for _ in range(5))]
+    assert seen[0] == seen[1]
+    assert seen[2] == seen[3]
+    assert seen[4] == seen[5]
+    assert len(set(seen)) == 3
+
+
+def test_a_schedule_says_which_reference_the_next_action_follows() -> None:
+    env = SetPoint(Counter(), [0], [9], schedule=lambda step: [step])
+    assert env.reset()[0][2] == 0
+    assert [env.step(np.zeros(1))[0][2] for _ in range(3)] == [1, 2, 3]
+
+
+def test_a_measured_disturbance_comes_from_info() -> None:
+    env = MeasuredDisturbance(Counter(), [0], [1])
+    assert env.reset()[0].tolist() == [0, 0, 0]
+    assert env.step(np.zeros(1))[0][2] == np.float32(0.1)
+
+
+def test_the_estimate_takes_the_place_of_the_measurement() -> None:
+    model = LinearModel(np.diag([0.9, 0.8, 0.7]), np.ones((3, 1)), 1.0, E=[[1], [0], [0]])
+    observer = DisturbanceObserver(model, [0, 2])
+    env = ObserveDisturbance(SetPoint(Counter(), [4], [4]), observer, [-0.5], [0.5])
+    assert env.observation_space.shape == (5,)
+    assert env.reset()[0].tolist() == [0, 0, 0, 4, 0]
+    shown = env.step(np.array([0.5]))[0]
+    x_hat, d_hat = observer.update([1, 1], [0.5])  # the wrapper has a copy of its own
+    np.testing.assert_allclose(shown, [*x_hat, 4, *np.clip(d_hat, -0.5, 0.5)], rtol=1e-6)
+    for _ in range(20):
+        shown = env.step(np.array([0.5]))[0]
+    assert shown[-1] == 0.5  # the estimate is shown inside the box of the problem
+    assert env.observer.d_hat[0] > 0.5
+
+
+def test_the_reward_is_minus_the_stage_cost_where_the_action_was_chosen() -> None:
+    mpc = two_input_mpc()
+    env = StageCost(LinearPlant(mpc), mpc)
+    theta, _ = env.reset(seed=0)
+    _, reward, *_ = env.step(np.array([0.3, 5.0]))
+    assert reward == pytest.approx(-float(mpc.stage_cost(theta, [0.3, 0.7])))
+
+
+def test_a_violation_may_cost_extra() -> None:
+    mpc = LinearMPC(LinearModel(np.eye(2) / 2, np.ones((2, 1)), 1), Q=np.eye(2), R=[[1]], horizon=1)
+    env = StageCost(Counter(), mpc, violation_cost=1000)
+    env.reset()
+    assert env.step(np.zeros(1))[1] == 0
+    assert env.step(np.zeros(1))[1] == pytest.approx(-1002)
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        PreviousInput,
+        lambda env: SetPoint(env, [-1], [1]),
+        lambda env: MeasuredDisturbance(env, [0], [5]),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*")  # the checker recommends actions in [-1, 1]
+def test_gymnasium_s_checker_finds_nothing_wrong(wrap) -> None:
+    check_env(wrap(Counter()), skip_render_check=True)
+
+
+DICT = gym.spaces.Dict({"a": gym.spaces.Discrete(2)})
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: SetPoint(Counter(), [1], [0]), ValueError, "low = .* exceeds high"),
+        (lambda: SetPoint(Counter(), [1], [0, 2]), ValueError, r"low has shape \(1,\) and high"),
+        (lambda: SetPoint(Counter(), [0], [np.inf]), ValueError, "must be finite"),
+        (lambda: SetPoint(Counter(), [0], [1], hold=0), ValueError, "hold = 0 must be"),
+        (
+            lambda: SetPoint(Counter(), [0], [1], schedule=lambda step: [2]).reset(),
+            ValueError,
+            r"schedule\(0\) = \[2.0\] must have shape \(1,\) and lie between",
+        ),
+        (
+            lambda: MeasuredDisturbance(Counter(), [0], [1], key="load").reset(),
+            ValueError,
+            "info has no 'load', only",
+        ),
+        (
+            lambda: MeasuredDisturbance(Counter(), [0, 0], [1, 1]).reset(),
+            ValueError,
+            r"info\['disturbance'\] has shape \(1,\), expected \(2,\)",
+        ),
+        (
+            lambda: PreviousInput(Counter(), initial=[1, 2]),
+            ValueError,
+            r"initial has shape \(2,\), expected \(1,\)",
+        ),
+        (lambda: ObserveDisturbance(Counter(), 3, [0], [1]), TypeError, "observer = 3 must be"),
+        (
+            lambda: StageCost(Counter(), two_input_mpc()),
+            ValueError,
+            r"shape \(2,\), but theta = \[x\[0\], x\[1\], x\[2\]\] has 3 entries",
+        ),
+    ],
+)
+def test_bad_arguments_are_named(make, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make()
+
+
+def test_an_env_whose_observation_is_no_vector_is_named() -> None:
+    env = Counter()
+    env.observation_space = DICT
+    with pytest.raises(TypeError, match=r"observation_space is Dict.*Box with one dimension"):
+        SetPoint(env, [0], [1])
