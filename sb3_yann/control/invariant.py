@@ -27,9 +27,11 @@ def invariant_set(problem: LinearMPC) -> tuple[Array, Array]:
     bounds after 0, 1, 2 ... steps are added until those of the next step are all redundant, which
     linear programs tell. In ``x_min`` and ``x_max`` this keeps the law in its domain for ever; a
     box of states given by ``theta_min`` and ``theta_max`` alone is no bound of the predictions, and
-    may still be left. Soft bounds do not count. r and d never decay; as in Section V there, their steady states must lie
-    inside the bounds by a little, here one percent of each bound, which makes the number of steps
-    finite. The box of r and d is taken for granted, and so are the bounds of ``u_prev``.
+    may still be left. Soft bounds do not count.
+
+    r and d never decay; as in Section V there, their steady states must lie inside the bounds by a
+    little, here one percent of each bound, which makes the number of steps finite. The box of r and
+    d is taken for granted, and so are the bounds of ``u_prev``.
 
     Raises
     ------

@@ -83,15 +83,16 @@ class LinearMPC(ReadOnlyArrays):
         box is that of r, d and u, whatever is given.
     terminal_cost : array_like, shape (n_z, n_z), optional
         P, symmetric positive semi-definite; n_z is n, or n + m with an S. The default is the
-        Riccati solution of the same
-        discount, with which the law is the LQR wherever no constraint acts. It is stored, so
-        `dataclasses.replace` keeps it: replace it by None too, to have it solved anew.
+        Riccati solution of the same discount, with which the law is the LQR wherever no constraint
+        acts. It is stored, so `dataclasses.replace` keeps it: replace it by None too, to have it
+        solved anew.
     terminal_set : "invariant" or tuple of array_like, optional
         ``(F, g)`` of shapes (c, n) and (c,) for ``F x_N <= g``, or (c, n_theta) for
-        ``F theta_N <= g``, where theta_N ends with ``u_{N-1}``. "invariant" is the set in which the
+        ``F theta_N <= g`` (its u_prev is ``u_{N-1}``). "invariant" is the set in which the
         gain of the terminal cost keeps all hard constraints for ever: the law then never leaves
-        its domain on the model, where x_min and x_max bound that. See :func:`~sb3_yann.control.invariant.invariant_set`. Stored as
-        (F, g), as the terminal cost is.
+        its domain on the model, where x_min and x_max bound that. See
+        :func:`~sb3_yann.control.invariant.invariant_set`. Stored as (F, g), as the terminal cost
+        is: replace it by "invariant" again where anything else changes.
     gamma : float, default 1
         Discount in (0, 1]. At 1 this is the usual MPC. With the discount of the learner, the
         policy starts as the maximiser of its own critic wherever no constraint acts.

@@ -53,7 +53,7 @@ def gain_at_rest(problem: LinearMPC) -> Array:
     if not law.in_domain(origin) or np.any(np.abs(law(origin)) > 1e-9 * unit):
         raise ValueError(
             "The law does not rest at the origin: theta = 0 must be feasible with u = 0. "
-            "Choose an operating point inside the bounds."
+            "Choose an operating point inside the bounds, and boxes of parameters that hold 0."
         )
     gains = law.gains[law.locate(origin)]
     columns = [gains[:, parts.state]]
