@@ -120,7 +120,8 @@ def _require_theta(
     observation: AffineObservation | None,
 ) -> None:
     """Raise unless theta is what is observed, or what ``observation`` makes of it."""
-    shape, takes = observation_space.shape, f"takes theta of shape ({problem.n_theta},)"
+    shape, names = observation_space.shape, ", ".join(problem.parameters.names)
+    takes = f"takes theta of shape ({problem.n_theta},), that is {names}"
     if observation is None:
         if shape != (problem.n_theta,):
             raise ValueError(

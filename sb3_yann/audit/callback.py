@@ -144,7 +144,6 @@ class CostAudit(BaseCallback):
         problem = self.policy.problem
         observations = column("observation").reshape(len(records), -1)
         terminated = done & ~column("truncated")
-        model = problem.model
         return Sample(
             theta=theta("observation"),
             following=theta("following"),
@@ -160,7 +159,7 @@ class CostAudit(BaseCallback):
             scale=self.policy.reward_scale,
             offset=self.policy.reward_offset,
             stage_cost=problem.stage_cost,
-            step=model.step if model.n_states == problem.n_theta else None,
+            step=problem.predict,
             gamma=self.model.gamma,
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,16 +130,15 @@ def _observations_are_late(sample: Sample) -> bool:
     """
     if sample.blank[sample.begins].all():  # what DelayObservation shows at first
         return True
-    if sample.step is None:
-        return False
     before, known = sample.earlier(sample.u, 1)
     if not known.any():
         return False
 
-    def error(u: Array, step: Callable[[Array, Array], Array]) -> float:
-        return float(np.median(np.linalg.norm(step(sample.theta, u) - sample.following, axis=1)))
+    def error(u: Array) -> float:
+        predicted = sample.step(sample.theta, u)
+        return float(np.median(np.linalg.norm(predicted - sample.following, axis=1)))
 
-    return error(before, sample.step) < error(sample.u, sample.step)
+    return error(before) < error(sample.u)
 
 
 def _sticky_action(sample: Sample, tolerance: float) -> Cause | None:
@@ -218,13 +217,12 @@ def _repeated_action(sample: Sample, tolerance: float) -> Cause | None:
 
 
 def _sums(sample: Sample, k: int) -> Iterator[Array]:
-    if sample.step is not None:
-        total: Array = np.zeros(len(sample.cost))
-        theta = sample.theta
-        for _ in range(k):
-            total = total + sample.stage_cost(theta, sample.u)
-            theta = sample.step(theta, sample.u)
-        yield total
+    total: Array = np.zeros(len(sample.cost))
+    theta = sample.theta
+    for _ in range(k):
+        total = total + sample.stage_cost(theta, sample.u)
+        theta = sample.step(theta, sample.u)
+    yield total
     way = sample.following - sample.theta
     yield np.sum([sample.stage_cost(sample.theta + way * i / k, sample.u) for i in range(k)], 0)
 

@@ -43,8 +43,8 @@ class Sample:
         The reward is taken for ``scale * (-cost) + offset``.
     stage_cost : callable
         (steps, n), (steps, m) to (steps,).
-    step : callable, optional
-        The model: (steps, n), (steps, m) to (steps, n); None where theta is not its state.
+    step : callable
+        The model: (steps, n), (steps, m) to (steps, n).
     gamma : float
         The learner's discount.
     """
@@ -63,7 +63,7 @@ class Sample:
     scale: float
     offset: float
     stage_cost: Callable[[Array, Array], Array]
-    step: Callable[[Array, Array], Array] | None
+    step: Callable[[Array, Array], Array]
     gamma: float
 
     @cached_property
