@@ -194,7 +194,7 @@ def test_a_disturbance_enters_by_its_matrix() -> None:
     model = LinearModel(MODEL.A, MODEL.B, MODEL.dt, E=[[1], [2]])
     x, u = np.array([1.0, 2.0]), np.array([1.0])
     np.testing.assert_allclose(model.step(x, u, [0.5]) - model.step(x, u), [0.5, 1.0])
-    assert (model.n_disturbances, MODEL.n_disturbances) == (1, 0)
+    assert (model.n_disturbances, LinearModel(MODEL.A, MODEL.B, MODEL.dt).n_disturbances) == (1, 0)
 
 
 def test_models_with_other_disturbances_are_not_equal() -> None:
