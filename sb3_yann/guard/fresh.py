@@ -79,8 +79,9 @@ def _hard_starts(guard: ImprovementGuard, trials: SimulatorTrials, n_starts: int
     except NotFinite:
         reason = "an action of the actor is not a finite number on new starts"
         return _Hard(reason, (seeds[0],))
-    excess, more = played.costs - mpc.costs, unsafe(played) > unsafe(mpc)
-    worse = ~(excess <= state.evidence.paired.margin) | more
+    excess = np.nan_to_num(played.costs - mpc.costs, nan=np.inf)
+    more = unsafe(played) > unsafe(mpc)
+    worse = (excess > state.evidence.paired.margin) | more
     if not worse.any():
         return None
     order = np.argsort(np.where(worse, np.where(more, -np.inf, -excess), np.inf), kind="stable")

@@ -27,7 +27,7 @@ class Decision:
         Whether the actor went back to the accepted state.
     candidate_cost, accepted_cost, mpc_cost : float
         Mean cost of an episode of the policy that was tried, of the one that is accepted now, and
-        of the MPC.
+        of the MPC, from all starts that are known at that time: new ones that were lost join them.
     worst_start : float
         Largest excess over the MPC that the accepted policy has on one start, nan if not known.
     regions : tuple of int

@@ -62,6 +62,7 @@ class SimulatorTrials:
                     f"{env.action_space}; the training env has {theirs} and "
                     f"{guard.training_env.action_space}. Give the guard a simulator of this plant."
                 )
+        # Not saved with the model: a resumed run that has to go back goes back to the MPC.
         self.passed: list[Snapshot] = []
         self._final: Snapshot | None = None
         self.last_trial = -self.every  # the first episode that ends is always followed by a trial
