@@ -34,6 +34,30 @@ def comparison_table(title: str, before: Episodes, after: Episodes) -> Table:
     return table
 
 
+def summary_table(title: str, before: Episodes, after: Episodes) -> Table:
+    """Return a `rich` table of mean and worst cost and of violations, for many episodes.
+
+    The episodes must be those of the same seeds. The last rows compare them pair by pair: how
+    many cost less or more by more than rounding (1e-6 of the cost), and the largest increase.
+    """
+    change = after.costs - before.costs
+    same = 1e-6 * np.abs(before.costs)
+    table = Table("", "before", "after", "change", title=title)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, of in (("mean", np.mean), ("worst", np.max)):
+        old, new = float(of(before.costs)), float(of(after.costs))
+        percent = f" ({100 * (new - old) / old:+.1f} %)" if old > 0 else ""
+        table.add_row(name, f"{old:,.2f}", f"{new:,.2f}", _change(new - old) + percent)
+    violations = before.violations.sum(), after.violations.sum()
+    table.add_row("violations", *map(str, violations), f"{violations[1] - violations[0]:+d}")
+    table.add_section()
+    for name, count in (("cheaper", change < -same), ("dearer", change > same)):
+        table.add_row(f"{name} episodes", "", f"{count.sum()} of {len(change)}", "")
+    table.add_row("largest increase", "", "", _change(max(change.max(), 0.0)))
+    return table
+
+
 def save_trajectories(
     path: str | PathLike[str],
     runs: Mapping[str, Episodes],
@@ -42,6 +66,7 @@ def save_trajectories(
     dt: float,
     time_unit: str,
     limits: Mapping[int, tuple[float, str]] | None = None,
+    references: Mapping[int, int] | None = None,
 ) -> Path:
     """Save a PNG of some states and all inputs over time, one colour for each run.
 
@@ -59,6 +84,8 @@ def save_trajectories(
         Sampling time, in ``time_unit``.
     limits : mapping of int to (float, str), optional
         A limit of an entry of the observation, and its label.
+    references : mapping of int to int, optional
+        The entry of the observation that is the set-point of another, drawn as a dashed line.
 
     Returns
     -------
@@ -74,6 +101,9 @@ def save_trajectories(
             style["label"] = label if k == 0 else "_nolegend_"
             for panel, i in zip(panels, states, strict=False):
                 panel.plot(dt * np.arange(len(x)), x[:, i], **style)
+                if references and i in references and color == 0:  # the same in every run
+                    r = x[:, references[i]]
+                    panel.step(dt * np.arange(len(x)), r, "k--", where="post", linewidth=1.0)
             for j, panel in enumerate(panels[len(states) :]):
                 panel.step(dt * np.arange(len(u)), u[:, j], where="post", **style)
     for panel, i in zip(panels, states, strict=False):

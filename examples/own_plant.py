@@ -1,0 +1,79 @@
+"""From the log of an experiment to a guarded policy, on a plant whose pumps have worn since.
+
+python examples/own_plant.py [--episodes 30] [--seed 0]
+"""
+
+import argparse
+from functools import partial
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.wrappers import TimeLimit, TransformAction, TransformObservation
+from rich.console import Console
+from stable_baselines3 import DDPG
+
+from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
+from sb3_yann import CostAudit, ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
+from sb3_yann.evaluation import evaluate
+from sb3_yann.reporting import save_trajectories, summary_table
+from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
+
+STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
+TEST_SEEDS = range(2000, 2050)  # starts, set-points and disturbances that training never sees
+
+
+def make_env(mpc: LinearMPC) -> gymnasium.Env:
+    """Return the plant of today, in deviations, with all that the MPC's theta holds."""
+    x_ss, u_ss, box = mpc.model.x_ss, mpc.model.u_ss, gymnasium.spaces.Box
+    env = QuadrupleTank(noise=0.03, wear=0.1)
+    levels, pumps = box(0 - x_ss, FULL - x_ss, dtype=float), box(mpc.u_min, mpc.u_max, dtype=float)
+    env = TransformObservation(env, lambda level: level - x_ss, levels)
+    env = TransformAction(env, lambda u: u + u_ss, pumps)
+    env = SetPoint(env, mpc.r_min, mpc.r_max, hold=HOLD)
+    env = MeasuredDisturbance(env, mpc.d_min, mpc.d_max)
+    return TimeLimit(StageCost(env, mpc), STEPS)
+
+
+def main() -> None:
+    """Identify, design, check, train, and compare the policy with the MPC that it was."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)  # the networks are too small to share among cores
+    console = Console(highlight=False)
+
+    write_log("out/log.csv")  # you have yours
+    log = np.loadtxt("out/log.csv", delimiter=",", skiprows=1)
+    x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
+    plant = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=[3, 3], d_ss=[0])
+    console.print(plant.report())
+    # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
+    weights = {"Q": np.diag([1, 1, 0, 0]), "R": 0.5 * np.eye(2), "horizon": 2, "gamma": 0.9}
+    wishes = {"tracked": [0, 1], "r_min": -4, "r_max": 4, "d_min": -1, "d_max": 1}
+    limits = {"u_min": 0 - plant.u_ss, "u_max": MAX_VOLTAGE - plant.u_ss}
+    limits |= {"theta_min": 0 - plant.x_ss, "theta_max": FULL - plant.x_ss}
+    mpc = LinearMPC(plant, **weights, **wishes, **limits)
+    console.print(mpc.report())
+    make = partial(make_env, mpc)
+    # Five per cent of the pumps' range is more than the wear takes; V differs by about ten.
+    policy = {"problem": mpc, "max_correction": 0.05, "value_scale": 10.0}
+    settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed}
+    model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
+    before = evaluate(model, make, TEST_SEEDS)
+    guard = ImprovementGuard(make, n_starts=50, fresh=25, record="out/own_plant.csv")
+    callbacks = [NoActionNoise(), CostAudit(verbose=1), guard]
+    model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
+    after = evaluate(model, make, TEST_SEEDS)
+
+    console.print(summary_table("Cost of 50 unseen set-point sequences", before, after))
+    both = {"before (linear MPC)": mpc.explicit(), "after training": model}
+    runs = {name: evaluate(policy, make, TEST_SEEDS[:1]) for name, policy in both.items()}
+    names = {0: "Δh1 [cm]", 1: "Δh2 [cm]", 6: "d [cm³/s]"}, ["Δv1 [V]", "Δv2 [V]"]
+    path = save_trajectories("out/own_plant.png", runs, *names, DT, "s", references={0: 4, 1: 5})
+    console.print(f"Picture: {path}    The guard's decisions: out/own_plant.csv")
+
+
+if __name__ == "__main__":
+    main()
