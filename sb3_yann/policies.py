@@ -37,9 +37,11 @@ from sb3_yann.networks import (
     AfterstateValue,
     LinearPrediction,
     QuadraticStateActionValue,
+    RowAdam,
     YannLayer,
 )
 from sb3_yann.networks.value import PredictionModel
+from sb3_yann.networks.zero_output import FEW
 from sb3_yann.observations import AffineObservation
 from sb3_yann.problems import resolve_problem
 
@@ -180,7 +182,14 @@ class YannCritic(SeesTheta, ContinuousCritic):
         SB3 asks for it to improve the actor, and throws the gradient by the critic's parameters
         away: it is not computed.
         """
-        trained = [each for each in self.q_networks[0].parameters() if each.requires_grad]
+        q_network = self.q_networks[0]
+        if isinstance(q_network, AfterstateValue) and q_network.compiles:
+            q_network.fixed = True
+            try:
+                return self._in_rewards(super().q1_forward(obs, actions))
+            finally:
+                q_network.fixed = False
+        trained = [each for each in q_network.parameters() if each.requires_grad]
         for parameter in trained:
             parameter.requires_grad_(False)
         try:
@@ -367,6 +376,10 @@ class YannPolicy(TD3Policy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
+        if self.problem.explicit().n_regions > FEW and self.optimizer_kwargs == {"fused": True}:
+            # A step, and its gradients, of the regions in use alone.
+            self.actor.optimizer = RowAdam(self.actor.parameters(), lr=lr_schedule(1))
+            self.actor.mu.row_gradients = True
         # A buffer travels with the parameters: a model that is loaded goes on where it was.
         self.register_buffer("critic_updates", th.zeros((), dtype=th.int64))
         self._attach_hooks()

@@ -10,6 +10,7 @@ from torch import nn
 
 from sb3_yann.control._validation import Array
 from sb3_yann.control.piecewise_affine import PiecewiseAffine
+from sb3_yann.networks.compiled_layer import layer_on_processor
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
 
@@ -65,7 +66,7 @@ class YannLayer(nn.Module):
                 f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
                 "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
             )
-        self.outside = law.outside
+        self.outside, self.piecewise_affine, self.row_gradients = law.outside, law, False
         # The input range is 2 here. A little is left for the float32 rounding of what follows.
         self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
         self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
@@ -87,12 +88,19 @@ class YannLayer(nn.Module):
             activation=activation,
             pinned=th.as_tensor(at_origin & pinned),
         )
+        self.scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
+        self.has_its_law = True
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n).
 
-        Theta of float64 reaches the law as it is, and rounded the network.
+        Theta of float64 reaches the law as it is, and rounded the network. On a processor it is
+        compiled code for networks of two hidden layers with tanh, unless theta needs a gradient;
+        the operations of torch do the same elsewhere.
         """
+        fixed = theta.device.type == "cpu" and not theta.requires_grad
+        if fixed and self.has_its_law and self.network.compiles:
+            return layer_on_processor(self, theta)
         region, inside = self.locate(theta)
         correction = self.network((theta / self.theta_half).to(self.theta_half), region)
         if self.reach is not None:
@@ -117,6 +125,13 @@ class YannLayer(nn.Module):
         if self.outside == "zero":
             u = th.where(inside[:, None], u, self.resting)
         return u.clamp(-1, 1).to(self.theta_half)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        before = {name: value.clone() for name, value in self.named_buffers(recurse=False)}
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        # What is compiled goes by the law that was given: with another one it must not be used.
+        same = all(th.equal(value, self.get_buffer(name)) for name, value in before.items())
+        self.has_its_law = self.has_its_law and same
 
     def _constant(self, name: str, value: Array, dtype: th.dtype = th.float64) -> None:
         # A buffer, not a parameter: optimizers and SB3's target updates leave it alone.
