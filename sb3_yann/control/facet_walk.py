@@ -82,47 +82,50 @@ class _Walk:
 
     def explore(self, wave: Iterable[int]) -> None:
         """Add all regions that are connected with those of some active sets."""
-        wave, waiting = sorted(set(wave) - self.seen), []
-        while wave:
-            self.seen.update(wave)
-            new = []
-            for one in self.conditions.regions(wave):
-                self.watch.step(len(self.found) + 1)
-                self.found[one.active] = one
-                new.append(one)
-            facets = [(one, row) for one in new for row in range(len(one.labels))]
+        ahead = sorted(set(wave) - self.seen)
+        facets: list[tuple[_Found, int]] = []
+        while ahead:
+            self.seen.update(ahead)
+            new = [self._add(one) for one in self.conditions.regions(ahead)]
+            facets += [(one, row) for one in new for row in range(len(one.labels))]
             following = {
-                one.active ^ (1 << one.labels[row]) for one, row in facets if one.labels[row] >= 0
+                one.active ^ (1 << label) for one in new for label in one.labels if label >= 0
             }
-            # What lies across a facet is known one wave later.
-            across = {self._across(one, row) for one, row in waiting if self._open(one, row)}
-            waiting = [pair for pair in facets if pair[0].labels[pair[1]] != OUTER]
-            wave = sorted((following | across) - self.seen - {-1})
-            if not wave:
-                across = {self._across(one, row) for one, row in waiting if self._open(one, row)}
-                wave, waiting = sorted(across - self.seen - {-1}), []
+            ahead = sorted(following - self.seen)
+            if not ahead:  # what the flips have left open
+                across = (self._across(one, row) for one, row in facets if self._open(one, row))
+                ahead = sorted({active for active in across if active is not None})
+                facets = []
+
+    def _add(self, one: _Found) -> _Found:
+        self.watch.count()
+        self.found[one.active] = one
+        return one
 
     def _open(self, one: _Found, row: int) -> bool:
+        """Tell whether it is not known what lies across a facet."""
         label = one.labels[row]
-        return label == SHARED or one.active ^ (1 << label) not in self.found
+        if label >= 0:
+            return one.active ^ (1 << label) not in self.found
+        return label == SHARED
 
-    def _across(self, one: _Found, row: int) -> int:
-        """Return the active set across a facet, -1 if none is new or feasible there."""
+    def _across(self, one: _Found, row: int) -> int | None:
+        """Return the active set across a facet, None if none is new or feasible there."""
+        self.watch.tick()
         middle, distance = largest_ball(one.A, one.b, row)
         if distance <= THINNEST:  # the row only touches the region
-            return -1
-        for step in (1e-5, 1e-6, 1e-7, 1e-8):
-            point = middle + min(step, distance) * one.A[row]
-            active = self.conditions.active_at(point)
-            if active is None or active == one.active:
-                return -1
-            other = self.found.get(active)
-            if other is None:
-                if active not in self.seen:
-                    return active
-            elif np.min(other.b - other.A @ middle) >= -1e-9:
-                return -1
-        return -1
+            return None
+        # The shortest step that gives an answer: a longer one may cross a thin region.
+        for step in (1e-8, 1e-7, 1e-6, 1e-5):
+            active = self.conditions.active_at(middle + min(step, distance) * one.A[row])
+            if active is None:
+                return None
+            if active not in self.seen:
+                return active
+            other = self.found.get(active, one)
+            if other is not one and np.min(other.b - other.A @ middle) >= -1e-9:
+                return None
+        return None
 
 
 def _members(active: int) -> list[int]:

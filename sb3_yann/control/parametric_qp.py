@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann.control._validation import Array
 
@@ -45,21 +47,27 @@ class ParametricQP:
         """Return the optimal U (v,), or None, and the multipliers of all rows (rows,)."""
         import daqp
 
+        H, G, fixed, lower, sense = self._arrays
         upper = self.w + self.S @ theta
-        fixed = ~np.any(self.G, axis=1)
         if np.any(upper[fixed] < -1e-11):  # a bound of theta alone
             return None, np.zeros(upper.size)
-        upper = np.where(fixed, 1.0, upper)
+        upper[fixed] = 1.0
         U, _, status, info = daqp.solve(
-            np.ascontiguousarray(self.H),
-            self.F @ theta + self.c,
-            np.ascontiguousarray(self.G),
-            upper,
-            np.full(upper.size, -1e30),
-            np.zeros(upper.size, dtype=np.intc),
-            primal_tol=1e-11,
+            H, self.F @ theta + self.c, G, upper, lower, sense, primal_tol=1e-11
         )
         return (np.asarray(U) if status == 1 else None), np.asarray(info["lam"])
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc]]:
+        """What DAQP asks for at every theta: H, G, the rows without U, no bounds, no options."""
+        rows = len(self.w)
+        return (
+            np.ascontiguousarray(self.H),
+            np.ascontiguousarray(self.G),
+            np.flatnonzero(~np.any(self.G, axis=1)),
+            np.full(rows, -1e30),
+            np.zeros(rows, dtype=np.intc),
+        )
 
     def scaled(self, center: Array, half: Array, reach: Array) -> ParametricQP:
         """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows."""
