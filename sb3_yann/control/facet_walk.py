@@ -6,11 +6,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann.control._validation import Array
 from sb3_yann.control.limits import Watch
 from sb3_yann.control.parametric_qp import ParametricQP
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
+
+Indices = NDArray[np.intp]
 
 # Regions that hold no ball of this radius, in half-widths of the box, are left out.
 THINNEST = 1e-9
@@ -68,6 +71,7 @@ class _Walk:
                 one.law[:, n],
                 one.A,
                 one.b,
+                one.inside,
             )
             for one in self.found.values()
         ]
@@ -153,7 +157,9 @@ class Conditions:
         self.N = program.G[self.kept] @ self.back
         # The slack that each constraint has where none is active.
         self.D = np.column_stack([program.S, program.w])[self.kept] + self.N @ self.Y
-        self._upper = np.full(len(self.kept), -1e30)
+        v, rows = len(self.back), len(self.kept)
+        self._shortest = (np.eye(v), np.zeros(v), self.N)
+        self._options = (np.full(rows, -1e30), np.zeros(rows, dtype=np.intc))
 
     def active_at(self, theta: Array) -> int | None:
         """Return DAQP's working set at theta, None where nothing is feasible."""
@@ -165,20 +171,13 @@ class Conditions:
 
         n = len(theta)
         _, _, status, info = daqp.solve(
-            self._identity(), self._zero(), self.N, self.D[:, :n] @ theta + self.D[:, n],
-            self._upper, None, primal_tol=1e-11,
-        )  # fmt: skip
+            *self._shortest, self.D[:, :n] @ theta + self.D[:, n], *self._options, primal_tol=1e-11
+        )
         if status != 1:
             return None
         multipliers = np.asarray(info["lam"])
         active = np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max()))
         return sum(1 << int(k) for k in active)
-
-    def _identity(self) -> Array:
-        return np.eye(self.N.shape[1])
-
-    def _zero(self) -> Array:
-        return np.zeros(self.N.shape[1])
 
     def regions(self, wave: list[int]) -> Iterator[_Found]:
         """Yield the regions with an interior among those of some active sets."""
@@ -226,7 +225,7 @@ class Conditions:
             if one is not None:
                 yield one
 
-    def _region(self, active: int, law: Array, A: Array, b: Array, label: Array) -> _Found | None:
+    def _region(self, active: int, law: Array, A: Array, b: Array, label: Indices) -> _Found | None:
         A, b = np.concatenate([A, self.outer_A]), np.concatenate([b, self.outer_b])
         inside, radius = largest_ball(A, b)
         if radius <= THINNEST:
@@ -248,7 +247,7 @@ class Conditions:
         return _Found(active, law, A, b, labels, inside)
 
 
-def _irredundant(program: ParametricQP, rows: Array, outer_A: Array, outer_b: Array) -> list[int]:
+def _irredundant(program: ParametricQP, rows: Indices, outer_A: Array, outer_b: Array) -> list[int]:
     """Return which rows bound the pairs (U, theta); of those that say the same, the first."""
     v = program.G.shape[1]
     A = np.vstack([

@@ -13,13 +13,34 @@ from sb3_yann.control._validation import Array
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal."""
+    """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal.
+
+    Attributes
+    ----------
+    active_set : tuple of int
+        The rows of the program that hold with equality, in ascending order.
+    gain : ndarray, shape (v, n)
+    offset : ndarray, shape (v,)
+    A : ndarray, shape (q, n)
+    b : ndarray, shape (q,)
+    inside : ndarray, shape (n,), optional
+        A point well inside, where what found the region knows one.
+    """
 
     active_set: tuple[int, ...]
     gain: Array
     offset: Array
     A: Array
     b: Array
+    inside: Array | None = None
+
+    def ball(self) -> tuple[Array, float]:
+        """Return the centre of a large ball inside, and its radius, negative if there is none."""
+        if self.inside is not None:
+            radius = float(np.min(self.b - self.A @ self.inside))
+            if radius > 0:
+                return self.inside, radius
+        return largest_ball(self.A, self.b)
 
 
 def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
@@ -50,9 +71,7 @@ def _minimise(cost: Array, A: Array, b: Array, equal: int | None) -> Array:
     if equal is not None:
         sense[equal] = 5
     # Proximal steps make it a linear program; DAQP ends them at the exact vertex.
-    point, _, status, _ = daqp.solve(
-        None, cost, A, b, None, sense, primal_tol=1e-12, eps_prox=1e-2
-    )
+    point, _, status, _ = daqp.solve(None, cost, A, b, None, sense, primal_tol=1e-12, eps_prox=1e-2)
     if status == 1:
         return np.asarray(point)
     rest = slice(None) if equal is None else np.arange(len(b)) != equal
