@@ -11,6 +11,10 @@ from scipy import optimize
 from sb3_yann.control._validation import Array
 
 
+# DAQP ends up to 1e-6 from the largest ball: below this it must not end so early.
+THIN = 1e-5
+
+
 @dataclass(frozen=True, eq=False)
 class Region:
     """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal.
@@ -55,6 +59,8 @@ def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, f
     cost = np.zeros(rows.shape[1])
     cost[-1] = -1.0
     point = _minimise(cost, rows, b, facet)
+    if abs(point[-1]) < THIN:
+        point = _minimise(cost, rows, b, facet, eta_prox=1e-14, iter_limit=1000)
     return point[:-1], float(point[-1])
 
 
@@ -63,7 +69,7 @@ def farthest_point(A: Array, b: Array, direction: Array) -> Array:
     return _minimise(-np.asarray(direction, dtype=float), A, b, None)
 
 
-def _minimise(cost: Array, A: Array, b: Array, equal: int | None) -> Array:
+def _minimise(cost: Array, A: Array, b: Array, equal: int | None, **settings: float) -> Array:
     """Return the solution of a small linear program from DAQP, or where that fails from HiGHS."""
     import daqp
 
@@ -71,7 +77,9 @@ def _minimise(cost: Array, A: Array, b: Array, equal: int | None) -> Array:
     if equal is not None:
         sense[equal] = 5
     # Proximal steps make it a linear program; DAQP ends them at the exact vertex.
-    point, _, status, _ = daqp.solve(None, cost, A, b, None, sense, primal_tol=1e-12, eps_prox=1e-2)
+    point, _, status, _ = daqp.solve(
+        None, cost, A, b, None, sense, primal_tol=1e-12, eps_prox=1e-2, **settings
+    )
     if status == 1:
         return np.asarray(point)
     rest = slice(None) if equal is None else np.arange(len(b)) != equal
