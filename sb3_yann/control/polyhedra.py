@@ -13,6 +13,8 @@ from sb3_yann.control._validation import Array
 
 # DAQP ends up to 1e-6 from the largest ball: below this it must not end so early.
 THIN = 1e-5
+# Of polyhedra with a smaller ball DAQP's own search for redundant rows loses facets.
+SLIM = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +103,23 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
 
     Rows that only touch it may be among them. Of rows that say the same there are all.
     """
+    if radius < SLIM:
+        return _facets_one_by_one(A, b - A @ inside, radius)
     import daqp
 
     # DAQP's tolerance is absolute: about the ball, in units of its radius, it means the same for
-    # thin and for wide polyhedra.
+    # small and for large polyhedra.
     redundant = daqp.minrep(np.ascontiguousarray(A), (b - A @ inside) / radius)
     return np.flatnonzero(redundant != 1)
+
+
+def _facets_one_by_one(A: Array, b: Array, radius: float) -> NDArray[np.intp]:
+    """Return the rows beyond which a polyhedron would reach without them."""
+    bounding = []
+    for k in range(len(b)):
+        relaxed = b.copy()
+        relaxed[k] += radius
+        farthest = _minimise(-A[k], A, relaxed, None, eta_prox=1e-14, iter_limit=1000)
+        if A[k] @ farthest > b[k] - max(1e-6 * radius, 1e-13):
+            bounding.append(k)
+    return np.array(bounding, dtype=np.intp)
