@@ -1,6 +1,6 @@
 """The design side: models, LQR, MPC and its explicit law. float64 numpy, no torch."""
 
-from sb3_yann.control.explicit import ExplicitSolutionError, ParametricQP
+from sb3_yann.control.explicit import ExplicitLimitError, ExplicitSolutionError, ParametricQP
 from sb3_yann.control.identification import Identified, identify
 from sb3_yann.control.linear_model import LinearModel
 from sb3_yann.control.mpc import LinearMPC
@@ -10,6 +10,7 @@ from sb3_yann.control.piecewise_affine import PiecewiseAffine
 
 __all__ = [
     "DisturbanceObserver",
+    "ExplicitLimitError",
     "ExplicitSolutionError",
     "Identified",
     "LinearMPC",

@@ -32,7 +32,7 @@ from sb3_yann.control._validation import (
 )
 from sb3_yann.control.condensing import condense
 from sb3_yann.control.error_coordinates import ErrorCoordinates, error_coordinates
-from sb3_yann.control.explicit import ParametricQP, solve_explicit
+from sb3_yann.control.explicit import Limits, ParametricQP, solve_explicit
 from sb3_yann.control.invariant import invariant_set
 from sb3_yann.control.linear_model import LinearModel
 from sb3_yann.control.parameters import Parameters
@@ -370,21 +370,51 @@ class LinearMPC(ReadOnlyArrays):
         """
         return quadratic_value.state_action_matrix(self, gamma)
 
-    def explicit(self) -> PiecewiseAffine:
+    def explicit(
+        self,
+        solver: str = "walk",
+        *,
+        time_limit: float | None = None,
+        region_limit: int | None = None,
+        progress: bool = False,
+    ) -> PiecewiseAffine:
         """Return the explicit law theta -> u_0, solved once, checked, and kept.
+
+        A law that took more than half a second is also kept on disk, in the user's cache folder or
+        the one that the environment variable ``SB3_YANN_CACHE`` names (``off`` for none).
+
+        Parameters
+        ----------
+        solver : {"walk", "ppopt"}, default "walk"
+            What finds the regions: a walk over them from facet to facet, or, as a reference and
+            hundreds of times slower, ppopt. Both give the same law.
+        time_limit : float, optional
+            Seconds after which to give up.
+        region_limit : int, optional
+            Number of regions beyond which to give up.
+        progress : bool, default False
+            Show how many regions were found so far.
 
         Raises
         ------
         ValueError
             If the problem has no feasible parameter, or its box of parameters is not bounded.
+        ExplicitLimitError
+            If a limit is reached; the message says how far the search came and what to change.
         ExplicitSolutionError
             If the solution fails its check; the message says where.
         """
-        return self._law
+        if solver not in self._laws:
+            limits = Limits(time_limit, region_limit, progress)
+            self._laws[solver] = solve_explicit(
+                self.condensed(), self.u_min, self.u_max, self.outside, solver, limits
+            )
+        return self._laws[solver]
 
     @cached_property
-    def _law(self) -> PiecewiseAffine:
-        return solve_explicit(self.condensed(), self.u_min, self.u_max, self.outside)
+    def _laws(self) -> dict[str, PiecewiseAffine]:
+        """The laws solved so far, by solver."""
+        return {}
 
     def condensed(self) -> ParametricQP:
         """Return the quadratic program in the stacked inputs, and slacks if there are any.

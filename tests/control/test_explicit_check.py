@@ -15,6 +15,7 @@ from sample_problems import PROBLEMS, solved
 
 from sb3_yann.control import ExplicitSolutionError
 from sb3_yann.control import explicit as module
+from sb3_yann.control.polyhedra import largest_ball
 
 Regions = list[Any]
 THIN = "a final state held to 1e-4"
@@ -27,7 +28,7 @@ def error_of(
     """Solve with spoilt regions; return the error's message and the theta that it names."""
     with monkeypatch.context() as patch:
         find = module._critical_regions
-        patch.setattr(module, "_critical_regions", lambda program: spoil(find(program)))
+        patch.setattr(module, "_critical_regions", lambda *args: spoil(find(*args)))
         with pytest.raises(ExplicitSolutionError, match="failed its check: ") as error:
             PROBLEMS[name]().explicit()
     theta = re.search(r"theta = (\[.*?\])", str(error.value))
@@ -35,8 +36,12 @@ def error_of(
     return str(error.value), np.array(ast.literal_eval(theta.group(1)))
 
 
+def width(region: Any) -> float:
+    return largest_ball(region.A, region.b)[1]
+
+
 def thinnest(regions: Regions) -> int:
-    return int(np.argmin([module._innermost(region)[1] for region in regions]))
+    return int(np.argmin([width(region) for region in regions]))
 
 
 def with_changed_gain(regions: Regions, index: int, factor: float) -> Regions:
@@ -71,7 +76,7 @@ def test_a_wrong_law_in_a_thin_region_is_found(monkeypatch: pytest.MonkeyPatch) 
     widths: list[float] = []
 
     def spoil(regions: Regions) -> Regions:
-        widths.append(module._innermost(regions[thinnest(regions)])[1])
+        widths.append(width(regions[thinnest(regions)]))
         return with_changed_gain(regions, thinnest(regions), 1.1)
 
     message, theta = error_of(monkeypatch, THIN, spoil)
@@ -98,7 +103,7 @@ def test_finding_no_region_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_failed_check_is_not_kept_as_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
     mpc = PROBLEMS["benchmark"]()
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_critical_regions", lambda program: [])
+        patch.setattr(module, "_critical_regions", lambda *args: [])
         with pytest.raises(ExplicitSolutionError):
             mpc.explicit()
     assert mpc.explicit().n_regions == 9

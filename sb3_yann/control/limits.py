@@ -1,0 +1,125 @@
+"""Limits of the search for the regions of a law, and its progress."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from types import TracebackType
+
+from tqdm import tqdm
+
+
+class ExplicitLimitError(RuntimeError):
+    """The search for the regions of a law ran into ``time_limit`` or ``region_limit``.
+
+    Attributes
+    ----------
+    n_regions : int
+        How many regions were found until then, where the solver tells.
+    """
+
+    def __init__(self, message: str, n_regions: int) -> None:
+        super().__init__(message)
+        self.n_regions = n_regions
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How long a search may take.
+
+    Attributes
+    ----------
+    time_limit : float, optional
+        In seconds.
+    region_limit : int, optional
+        The largest number of regions.
+    progress : bool, default False
+        Show a progress bar, which counts regions.
+
+    Raises
+    ------
+    ValueError
+        If a limit is not above zero, or no number.
+    """
+
+    time_limit: float | None = None
+    region_limit: int | None = None
+    progress: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the limits."""
+        seconds, regions = self.time_limit, self.region_limit
+        if seconds is not None and not (
+            isinstance(seconds, int | float) and math.isfinite(seconds) and seconds > 0
+        ):
+            raise ValueError(
+                f"time_limit = {seconds!r} must be a number of seconds above 0, or None for no "
+                "limit."
+            )
+        if regions is not None and not (
+            isinstance(regions, int) and not isinstance(regions, bool) and regions > 0
+        ):
+            raise ValueError(
+                f"region_limit = {regions!r} must be a whole number above 0, or None for no limit."
+            )
+
+
+class Watch:
+    """Counts the regions of one search, shows them, and ends it at its limits.
+
+    The time counts from when this is made.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits, self.found, self._start = limits, 0, time.monotonic()
+        self._bar = tqdm(
+            desc="Critical regions", unit=" regions", leave=False, disable=not limits.progress
+        )
+
+    def __enter__(self) -> Watch:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Take the progress bar away."""
+        self._bar.close()
+
+    @property
+    def seconds(self) -> float:
+        """How long the search has taken."""
+        return time.monotonic() - self._start
+
+    def count(self, more: int = 1) -> None:
+        """Count regions that were found.
+
+        Raises
+        ------
+        ExplicitLimitError
+            If these are too many, or the time is over.
+        """
+        self.found += more
+        self._bar.update(more)
+        most = self.limits.region_limit
+        if most is not None and self.found > most:
+            self._stop(f"The law has more than region_limit = {most} regions")
+        self.tick()
+
+    def tick(self) -> None:
+        """Raise ExplicitLimitError if the time is over."""
+        most = self.limits.time_limit
+        if most is not None and self.seconds > most:
+            self._stop(f"The law was not solved in time_limit = {most:g} s")
+
+    def _stop(self, what: str) -> None:
+        raise ExplicitLimitError(
+            f"{what}: {self.found} were found in {self.seconds:.1f} s. Their number grows fastest "
+            "with the horizon and with the number of bounds: shorten the horizon, leave out bounds "
+            "that hardly matter, make the box of parameters smaller (theta_min, theta_max), or "
+            "raise the limit.",
+            self.found,
+        )

@@ -1,0 +1,82 @@
+"""Balls, facets and vertices of polyhedra ``A x <= b`` with rows of unit length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from sb3_yann.control._validation import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal."""
+
+    active_set: tuple[int, ...]
+    gain: Array
+    offset: Array
+    A: Array
+    b: Array
+
+
+def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
+    """Return the point farthest from all rows, or, on one facet, from all others, and how far.
+
+    The distance is negative for an empty polyhedron or facet. The polyhedron must be bounded.
+    """
+    rows = np.empty((len(b), A.shape[1] + 1))
+    rows[:, :-1], rows[:, -1] = A, 1.0
+    if facet is not None:
+        rows[facet, -1] = 0.0
+    cost = np.zeros(rows.shape[1])
+    cost[-1] = -1.0
+    point = _minimise(cost, rows, b, facet)
+    return point[:-1], float(point[-1])
+
+
+def farthest_point(A: Array, b: Array, direction: Array) -> Array:
+    """Return the point of a bounded polyhedron that is farthest in one direction."""
+    return _minimise(-np.asarray(direction, dtype=float), A, b, None)
+
+
+def _minimise(cost: Array, A: Array, b: Array, equal: int | None) -> Array:
+    """Return the solution of a small linear program from DAQP, or where that fails from HiGHS."""
+    import daqp
+
+    sense = np.zeros(len(b), dtype=np.intc)
+    if equal is not None:
+        sense[equal] = 5
+    # Proximal steps make it a linear program; DAQP ends them at the exact vertex.
+    point, _, status, _ = daqp.solve(
+        None, cost, A, b, None, sense, primal_tol=1e-12, eps_prox=1e-2
+    )
+    if status == 1:
+        return np.asarray(point)
+    rest = slice(None) if equal is None else np.arange(len(b)) != equal
+    found = optimize.linprog(
+        cost,
+        A_ub=A[rest],
+        b_ub=b[rest],
+        A_eq=None if equal is None else A[[equal]],
+        b_eq=None if equal is None else b[[equal]],
+        bounds=(None, None),
+    )
+    if found.x is None:  # an empty facet
+        return np.append(np.zeros(len(cost) - 1), -np.inf)
+    return np.asarray(found.x)
+
+
+def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]:
+    """Return the rows that bound a polyhedron with a ball of this radius about a point inside.
+
+    Rows that only touch it may be among them. Of rows that say the same there are all.
+    """
+    import daqp
+
+    # DAQP's tolerance is absolute: about the ball, in units of its radius, it means the same for
+    # thin and for wide polyhedra.
+    redundant = daqp.minrep(np.ascontiguousarray(A), (b - A @ inside) / radius)
+    return np.flatnonzero(redundant != 1)

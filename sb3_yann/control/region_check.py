@@ -1,0 +1,218 @@
+"""Checks that critical regions are those of the quadratic program they came from."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+import numpy as np
+
+from sb3_yann.control._validation import Array
+from sb3_yann.control.parametric_qp import ParametricQP
+from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
+
+# All in half-widths of the box, or of the input range: how far a law may be off, and how far a
+# point may be from a region that holds it.
+LAW, INSIDE = 1e-6, 1e-8
+
+
+class ExplicitSolutionError(RuntimeError):
+    """An explicit solution failed its check: it does not solve the program it came from."""
+
+
+def check(program: ParametricQP, regions: list[Region], center: Array, half: Array) -> None:
+    """Check the regions of a scaled program without trusting what found them.
+
+    - An independent QP is solved at the innermost point of every region.
+    - The law of every region solves the Karush-Kuhn-Tucker (KKT) equations of its active set, and
+      its half-spaces imply their inequalities: then it is optimal in all of the region.
+    - Across each facet where constraint k becomes active, or inactive, lies the region of the
+      active set with k added, or removed: their KKT conditions agree on the facet, so it covers
+      all of its other side. Where there is no such region, a QP just across the middle of the facet
+      must be infeasible, or another region there.
+    - QPs at random points of the box agree with the region there, or are infeasible.
+    - No region lies in another one.
+
+    Raises
+    ------
+    ExplicitSolutionError
+        With a theta that shows what is wrong; center and half take it to the units of the problem.
+    """
+    _Check(program, regions, center, half).run()
+
+
+class _Check:
+    def __init__(
+        self, program: ParametricQP, regions: list[Region], center: Array, half: Array
+    ) -> None:
+        self.program, self.regions, self.center, self.half = program, regions, center, half
+        self.by_set = {region.active_set: i for i, region in enumerate(regions)}
+        n = program.F.shape[1]
+        bound = ~np.any(program.G, axis=1) & np.any(program.S, axis=1)
+        self.outer = np.column_stack([
+            np.vstack([np.eye(n), -np.eye(n), -program.S[bound]]),
+            np.concatenate([np.ones(2 * n), program.w[bound]]),
+        ])  # fmt: skip
+
+    def run(self) -> None:
+        if not self.regions:
+            self._fail("no region was found", self.center * 0)
+        self.A, self.b = (
+            np.concatenate([getattr(region, name) for region in self.regions]) for name in "Ab"
+        )
+        self.starts = np.cumsum([0, *(len(region.b) for region in self.regions[:-1])])
+        balls = [largest_ball(region.A, region.b) for region in self.regions]
+        for i, (region, (inside, _)) in enumerate(zip(self.regions, balls, strict=True)):
+            U = self.program.solve(inside)
+            if U is None or np.max(np.abs(U - region.gain @ inside - region.offset)) > LAW:
+                self._fail(f"the law of region {i} is not optimal inside it", inside)
+        for i, law, rows, labels in self._conditions():
+            self._require_law(i, law, balls[i][0])
+            self._require_implied(i, rows, *balls[i])
+            self._require_neighbours(i, rows, labels)
+        self._require_agreement()
+        self._require_no_doubles(balls)
+
+    def _conditions(self) -> list[tuple[int, Array, Array, list[int]]]:
+        """Return the KKT conditions of each region: its law, and rows [A b] with labels."""
+        sizes: dict[int, list[int]] = {}
+        for i, region in enumerate(self.regions):
+            sizes.setdefault(len(region.active_set), []).append(i)
+        found = []
+        for size, members in sorted(sizes.items()):
+            for start in range(0, len(members), 256):
+                found += self._conditions_of(members[start : start + 256], size)
+        return found
+
+    def _conditions_of(
+        self, members: list[int], size: int
+    ) -> list[tuple[int, Array, Array, list[int]]]:
+        program, (v, n) = self.program, self.program.F.shape
+        active = np.array([self.regions[i].active_set for i in members], dtype=int)
+        active = active.reshape(len(members), size)
+        K = np.zeros((len(members), v + size, v + size))
+        K[:, :v, :v] = program.H
+        K[:, v:, :v] = program.G[active]
+        K[:, :v, v:] = np.swapaxes(program.G[active], 1, 2)
+        right = np.empty((len(members), v + size, n + 1))
+        right[:, :v] = -np.column_stack([program.F, program.c])
+        right[:, v:] = np.column_stack([program.S, program.w])[active]
+        try:
+            both = np.linalg.solve(K, right)
+        except np.linalg.LinAlgError:
+            self._fail("the active constraints of a region depend on each other", self.center * 0)
+        laws, multipliers = both[:, :v], both[:, v:]
+        rows = np.column_stack([program.S, program.w]) - program.G @ laws
+        noise = 1 + np.linalg.norm(laws, axis=(1, 2))[:, None] * np.ones(len(program.w))
+        each = np.arange(len(members))[:, None]
+        rows[each, active] = multipliers
+        noise[each, active] = np.abs(multipliers).max(axis=(1, 2), initial=0.0)[:, None]
+        length = np.linalg.norm(rows[:, :, :n], axis=2)
+        fixed = length <= 1e-11 * noise
+        length[fixed] = np.maximum(noise[fixed], 1e-300)
+        rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
+        rows[fixed, :n] = 0.0
+        binding = rows[:, :, n] < np.abs(rows[:, :, :n]).sum(axis=2)
+        return [
+            (i, laws[k], rows[k, binding[k]], [int(label) for label in np.flatnonzero(binding[k])])
+            for k, i in enumerate(members)
+        ]
+
+    def _require_law(self, i: int, law: Array, inside: Array) -> None:
+        region = self.regions[i]
+        error = np.abs(law - np.column_stack([region.gain, region.offset]))
+        if np.max(error) > LAW * (1 + np.abs(law).max()):
+            self._fail(f"the law of region {i} is not optimal inside it", inside)
+
+    def _require_implied(self, i: int, rows: Array, inside: Array, radius: float) -> None:
+        """Raise unless the half-spaces of region i imply all rows."""
+        region, n = self.regions[i], len(inside)
+        A, b = np.concatenate([rows[:, :n], region.A]), np.concatenate([rows[:, n], region.b])
+        b[: len(rows)] += 1e-4 * radius
+        if radius <= 0 or np.any(rows[:, n] < rows[:, :n] @ inside - LAW):
+            self._fail(f"the law of region {i} violates the KKT conditions", inside)
+        for k in facets(A, b, inside, radius):
+            if k >= len(rows):
+                break
+            # Within DAQP's tolerance it may count: the farthest point decides.
+            point = farthest_point(region.A, region.b, rows[k, :n])
+            if rows[k, :n] @ point > rows[k, n] + LAW:
+                self._fail(f"the law of region {i} violates the KKT conditions", point)
+
+    def _require_neighbours(self, i: int, rows: Array, labels: list[int]) -> None:
+        region = self.regions[i]
+        known = np.concatenate([self.outer, rows])
+        own = np.column_stack([region.A, region.b])
+        same = np.abs(own[:, None] - known[None]).max(axis=2) < 1e-9
+        active = set(region.active_set)
+        for row, which in enumerate(same):
+            meant = np.flatnonzero(which) - len(self.outer)
+            if len(meant) and meant[0] < 0:
+                continue  # a bound of theta
+            if not any(tuple(sorted(active ^ {labels[k]})) in self.by_set for k in meant):
+                self._look_across(region, row)
+
+    def _look_across(self, region: Region, row: int) -> None:
+        """Raise if no region touches a facet from the other side where that is feasible."""
+        middle, distance = largest_ball(region.A, region.b, row)
+        for step in (1e-5, 1e-6, 1e-7):
+            point = middle + step * region.A[row]
+            # A half-space that only touches the region has no facet to cross.
+            if distance <= step or np.any(self.outer[:, :-1] @ point > self.outer[:, -1]):
+                continue
+            if self.program.solve(point) is None:
+                return
+            slacks = self._slacks(point)
+            if np.max(slacks) < -INSIDE:
+                self._fail("no region covers a feasible parameter", point)
+            holders = slacks >= -INSIDE
+            if np.any(self._slacks(middle)[holders] >= -INSIDE):
+                return
+
+    def _slacks(self, point: Array) -> Array:
+        return np.asarray(np.minimum.reduceat(self.b - self.A @ point, self.starts))
+
+    def _require_agreement(self) -> None:
+        """Raise unless QPs at random points of the box agree with the regions."""
+        n = self.program.F.shape[1]
+        for point in np.random.default_rng(0).uniform(-1, 1, (200 * n, n)):
+            U, multipliers = self.program.solve_with_multipliers(point)
+            if U is None:
+                continue
+            region = self._held(point, multipliers)
+            if region is None:
+                self._fail("no region covers a feasible parameter", point)
+            if np.max(np.abs(U - region.gain @ point - region.offset)) > LAW:
+                i = self.by_set[region.active_set]
+                self._fail(f"the law of region {i} violates the KKT conditions", point)
+
+    def _held(self, point: Array, multipliers: Array) -> Region | None:
+        """Return a region that holds a point, first that of the constraints with multipliers."""
+        active = tuple(int(k) for k in np.flatnonzero(multipliers > 1e-11))
+        if active in self.by_set:
+            region = self.regions[self.by_set[active]]
+            if np.min(region.b - region.A @ point) >= -INSIDE:
+                return region
+        slacks = self._slacks(point)
+        best = int(np.argmax(slacks))
+        return self.regions[best] if slacks[best] >= -INSIDE else None
+
+    def _require_no_doubles(self, balls: list[tuple[Array, float]]) -> None:
+        """Raise if a region lies in another: both have then the same law, whatever their sets."""
+        laws = np.array([np.append(region.gain.ravel(), region.offset) for region in self.regions])
+        keys = laws @ np.random.default_rng(0).normal(size=laws.shape[1])
+        order = np.argsort(keys)
+        near = np.flatnonzero(np.diff(keys[order]) < LAW * (1 + np.abs(keys[order][:-1])))
+        for i, j in zip(order[near], order[near + 1], strict=True):
+            one, two = self.regions[i], self.regions[j]
+            A, b = np.concatenate([one.A, two.A]), np.concatenate([one.b, two.b])
+            middle, radius = largest_ball(A, b)
+            if radius > 0.99 * min(balls[i][1], balls[j][1]):
+                self._fail(f"region {min(i, j)} and region {max(i, j)} are the same", middle)
+
+    def _fail(self, what: str, theta: Array) -> NoReturn:
+        place = theta * self.half + self.center
+        raise ExplicitSolutionError(
+            f"The explicit solution failed its check: {what}, at theta = {place.tolist()}. The "
+            "problem is likely to be badly conditioned: shorten the horizon, or bring states and "
+            "weights to similar magnitudes."
+        )
