@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cached_property, partial
 from os import PathLike, fspath, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -19,7 +22,14 @@ from sb3_yann.control._validation import (
     to_float,
 )
 
+if TYPE_CHECKING:
+    from sb3_yann.control.search_tree import SearchTree
+
 OUTSIDE = ("nearest", "zero")
+SCAN = 16
+"""Up to this many regions are asked one by one."""
+
+_COMPILED = ("_packed", "_at")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +74,9 @@ class PiecewiseAffine(ReadOnlyArrays):
     theta_min: Array
     theta_max: Array
     outside: str = "nearest"
+
+    # To find a region, more than SCAN of them are held in a tree of hyperplanes, built in a moment
+    # when it is first needed; machine code of numba searches it.
 
     # How far outside every region a point may lie, in half-widths of the box, and still count as
     # inside: facets of neighbours agree to rounding only.
@@ -125,27 +138,38 @@ class PiecewiseAffine(ReadOnlyArrays):
         TypeError, ValueError
             If theta is not numeric, has another shape or holds NaN or infinite entries.
         """
+        try:
+            u = self._at(theta)
+        except TypeError:  # not one point of float64, which is all that this was compiled for
+            u = None
+        if u is not None:
+            return u
+        from sb3_yann.control._location import law_of_batch
+
         points = self._as_theta(theta)
-        region, largest = self._choose(points)
-        u = np.einsum("...mn,...n->...m", self.gains[region], points) + self.offsets[region]
-        if self.outside == "zero":
-            u = np.where((largest >= -self.tolerance)[..., None], u, 0.0)
-        return np.asarray(np.clip(u, self.u_min, self.u_max))
+        inputs: Array = law_of_batch(*self._packed, np.atleast_2d(points))
+        return inputs if points.ndim == 2 else inputs[0]
 
     def locate(self, theta: ArrayLike) -> NDArray[np.int64]:
         """Return the index of the region in use at theta, one for each row of a batch."""
-        return self._choose(self._as_theta(theta))[0]
+        return self._choose(theta)[0]
 
     def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
         """Tell whether the MPC has a solution at theta, for each row of a batch."""
-        return np.asarray(self._choose(self._as_theta(theta))[1] >= -self.tolerance)
+        return np.asarray(self._choose(theta)[1] >= -self.tolerance)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the law to ``path`` as an ``.npz`` file of plain arrays (no pickle)."""
+        """Write the law to ``path`` as an ``.npz`` file of plain arrays (no pickle).
+
+        With it goes the tree that finds a region, if it has one.
+        """
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.tree is not None:
+            arrays.update({f"tree_{name}": each for name, each in vars(self.tree).items()})
         part = f"{fspath(path)}.part"
         try:
             with open(part, "wb") as file:
-                np.savez(file, **{field.name: getattr(self, field.name) for field in fields(self)})
+                np.savez(file, **arrays)
             replace(part, path)  # a reader never sees half a file
         finally:
             Path(part).unlink(missing_ok=True)
@@ -165,7 +189,13 @@ class PiecewiseAffine(ReadOnlyArrays):
                 raise ValueError("it is a single array")
             with data:
                 values = {field.name: data[field.name] for field in fields(cls)}
-            return cls(**{**values, "outside": str(values["outside"])})
+                tree = {name[5:]: data[name] for name in data.files if name.startswith("tree_")}
+            law = cls(**{**values, "outside": str(values["outside"])})
+            if tree:
+                from sb3_yann.control.search_tree import SearchTree
+
+                law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
+            return law
         except (KeyError, TypeError, ValueError, EOFError, BadZipFile) as error:
             raise ValueError(
                 f"{fspath(path)} does not hold a PiecewiseAffine ({error}). "
@@ -189,12 +219,38 @@ class PiecewiseAffine(ReadOnlyArrays):
             f"theta={self.n_theta}, inputs={self.n_inputs}, outside={self.outside!r})"
         )
 
-    def _choose(self, points: Array) -> tuple[NDArray[np.int64], Array]:
+    def _choose(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:
         """Return the region in use and how far inside it each point lies, negative outside."""
-        slack = np.minimum.reduceat(self.b - points @ self.A.T, self.starts, axis=-1)
-        largest = np.max(slack, axis=-1)
-        nearly = largest - self.tie_tolerance * (1 + np.abs(largest))
-        return np.asarray(np.argmax(slack >= nearly[..., None], axis=-1)), largest
+        from sb3_yann.control._location import locate_batch
+
+        points = self._as_theta(theta)
+        region, inside = locate_batch(*self._packed, np.atleast_2d(points))
+        return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
+
+    @cached_property
+    def tree(self) -> SearchTree | None:
+        """The tree that finds a region; None for so few regions that a scan is as fast."""
+        if self.n_regions <= SCAN or not np.all(np.isfinite([self.theta_min, self.theta_max])):
+            return None
+        from sb3_yann.control.search_tree import build_tree
+
+        return build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
+
+    @cached_property
+    def _packed(self) -> tuple[Array, NDArray[np.int64]]:
+        from sb3_yann.control._location import pack
+
+        return pack(self, self.tree)
+
+    @cached_property
+    def _at(self) -> Callable[[Any], Array | None]:
+        from sb3_yann.control._location import law_at
+
+        return partial(law_at, *self._packed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was compiled for this process, but not the tree."""
+        return {name: value for name, value in self.__dict__.items() if name not in _COMPILED}
 
     def _as_theta(self, theta: ArrayLike) -> Array:
         points = to_float("theta", theta)
@@ -205,4 +261,6 @@ class PiecewiseAffine(ReadOnlyArrays):
             )
         if not np.all(np.isfinite(points)):
             raise ValueError("theta holds NaN or infinite entries; the law is defined for numbers.")
-        return points
+        if points.flags.c_contiguous and points.flags.writeable:
+            return points
+        return points.copy(order="C")

@@ -1,0 +1,206 @@
+"""Compiled evaluation of a piecewise affine law: which region holds theta, and its input.
+
+A law goes in as two packed arrays (see :func:`pack`): every array that numba unpacks costs a tenth
+of a microsecond, a good part of what a whole evaluation takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann.control._validation import Array
+
+if TYPE_CHECKING:
+    from sb3_yann.control.piecewise_affine import PiecewiseAffine
+    from sb3_yann.control.search_tree import SearchTree
+
+Integers = NDArray[np.int64]
+F = TypeVar("F", bound=Callable[..., Any])
+
+HEADER = 7
+"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero outside."""
+
+ROWS = 2
+"""Floats before the packed arrays: how far outside counts as inside, and which slacks tie."""
+
+SURELY_INSIDE = 1e-9
+"""With a slack of at least this, no region that the tree left out can be as good."""
+
+
+def compiled(*signatures: str) -> Callable[[F], F]:
+    """Return a decorator that compiles a function for the given types, and keeps the machine code.
+
+    With types that are given nothing is ever compiled for others: those are refused.
+    """
+
+    def compile_it(function: F) -> F:
+        njit: Any = partial(numba.njit, [*signatures] or None, nogil=True, error_model="numpy")
+        try:
+            result: F = njit(cache=True)(function)
+        except RuntimeError:  # no folder to write to: compiled anew in every process
+            result = njit()(function)
+        return result
+
+    return compile_it
+
+
+def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers]:
+    """Return a law as one array of floats and one of whole numbers, for the functions below.
+
+    Without a tree the regions are scanned one by one.
+    """
+    nodes, leaves = (len(tree.levels), len(tree.leaf_starts) - 1) if tree else (0, 0)
+    p, m, n = law.gains.shape
+    header = [n, m, p, law.n_halfspaces, nodes, leaves, law.outside == "zero"]
+    rows = np.column_stack([law.A, law.b])
+    floats: list[Any] = [(law.tolerance, law.tie_tolerance), rows, law.gains, law.offsets]
+    floats += [law.u_min, law.u_max, *((tree.normals, tree.levels) if tree else ())]
+    whole: list[Any] = [header, law.starts, [law.n_halfspaces]]
+    whole += [tree.children, tree.leaf_starts, tree.leaf_regions] if tree else []
+    return (
+        np.concatenate([np.ravel(each) for each in floats]),
+        np.concatenate([np.ravel(each) for each in whole]).astype(np.int64),
+    )
+
+
+@compiled()
+def _slack(floats: Array, n: int, first: int, last: int, theta: Array, low: float) -> float:
+    """Return the smallest slack of rows first to last, or anything below ``low`` if it is lower."""
+    smallest = np.inf
+    for k in range(first, last):
+        row = ROWS + k * (n + 1)
+        slack = floats[row + n]
+        for j in range(n):
+            slack -= floats[row + j] * theta[j]
+        if slack < smallest:
+            smallest = slack
+            if smallest < low:
+                break
+    return smallest
+
+
+@compiled()
+def _scan(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
+    """Return the first region whose smallest slack ties with the largest, and the largest."""
+    n, p = whole[0], whole[2]
+    best, largest, low, tied = 0, -np.inf, -np.inf, False
+    for i in range(p):
+        smallest = np.inf
+        for k in range(whole[HEADER + i], whole[HEADER + i + 1]):
+            row = ROWS + k * (n + 1)
+            slack = floats[row + n]
+            for j in range(n):
+                slack -= floats[row + j] * theta[j]
+            if slack < smallest:
+                smallest = slack
+                if smallest < low:
+                    break
+        if smallest > largest:
+            low = smallest - floats[1] * (1 + abs(smallest))
+            tied = largest >= low
+            best, largest = i, smallest
+        elif smallest >= low:
+            tied = True
+    if not tied:
+        return best, largest
+    nearly = largest - floats[1] * (1 + abs(largest))
+    for i in range(p):
+        first, last = whole[HEADER + i], whole[HEADER + i + 1]
+        if _slack(floats, n, first, last, theta, nearly) >= nearly:
+            return i, largest
+    return best, largest
+
+
+@compiled()
+def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int]:
+    """Return where the regions of the leaf that theta falls into begin and end in ``whole``."""
+    n, m, p, q, nodes, leaves = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
+    normals = ROWS + q * (n + 1) + p * m * n + p * m + 2 * m
+    levels = normals + nodes * n
+    children = HEADER + p + 1
+    node = 0
+    while node >= 0:
+        side = -floats[levels + node]
+        for j in range(n):
+            side += floats[normals + node * n + j] * theta[j]
+        node = whole[children + 2 * node + (1 if side > 0 else 0)]
+    starts = children + 2 * nodes
+    regions = starts + leaves + 1
+    return regions + whole[starts - node - 1], regions + whole[starts - node]
+
+
+@compiled()
+def _choose(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
+    """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite."""
+    n = whole[0]
+    for j in range(n):
+        if not np.isfinite(theta[j]):
+            return -1, np.nan
+    if whole[4] > 0:
+        first, last = _leaf(floats, whole, theta)
+        best, largest = -1, -np.inf
+        for k in range(first, last):
+            i = whole[k]
+            low = largest + floats[1] * (1 + abs(largest)) if best >= 0 else SURELY_INSIDE
+            slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, low)
+            if slack >= low:
+                best, largest = i, slack
+        if best >= 0:
+            return best, largest
+    return _scan(floats, whole, theta)
+
+
+@compiled()
+def _input(floats: Array, whole: Integers, theta: Array, out: Array) -> int:
+    """Write the input at theta to ``out`` and return the region, -1 where theta is not finite."""
+    n, m, p, q = whole[0], whole[1], whole[2], whole[3]
+    region, largest = _choose(floats, whole, theta)
+    if region < 0:
+        return -1
+    gains = ROWS + q * (n + 1)
+    offsets = gains + p * m * n
+    bounds = offsets + p * m
+    zero = whole[6] == 1 and largest < -floats[0]
+    for k in range(m):
+        u = 0.0
+        if not zero:
+            for j in range(n):
+                u += floats[gains + (region * m + k) * n + j] * theta[j]
+            u += floats[offsets + region * m + k]
+        out[k] = min(max(u, floats[bounds + k]), floats[bounds + m + k])
+    return region
+
+
+@compiled("optional(float64[::1])(float64[::1], int64[::1], float64[::1])")
+def law_at(floats: Array, whole: Integers, theta: Array) -> Array | None:
+    """Return the input (m,) at one theta (n,), None where theta is not finite or too long."""
+    if len(theta) != whole[0]:
+        return None
+    out = np.empty(whole[1])
+    if _input(floats, whole, theta, out) < 0:
+        return None
+    return out
+
+
+@compiled("float64[:, ::1](float64[::1], int64[::1], float64[:, ::1])")
+def law_of_batch(floats: Array, whole: Integers, theta: Array) -> Array:
+    """Return the inputs (batch, m) at the rows of theta (batch, n), all finite."""
+    out = np.empty((len(theta), whole[1]))
+    for i in range(len(theta)):
+        _input(floats, whole, theta[i], out[i])
+    return out
+
+
+@compiled("Tuple((int64[::1], float64[::1]))(float64[::1], int64[::1], float64[:, ::1])")
+def locate_batch(floats: Array, whole: Integers, theta: Array) -> tuple[Integers, Array]:
+    """Return the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
+    region, inside = np.empty(len(theta), np.int64), np.empty(len(theta))
+    for i in range(len(theta)):
+        region[i], inside[i] = _choose(floats, whole, theta[i])
+    return region, inside

@@ -1,0 +1,256 @@
+"""A tree of hyperplanes that finds the region of a point without asking every region.
+
+After Tøndel, Johansen & Bemporad (2003), "Evaluation of piecewise affine control via binary search
+tree", with vertices in place of their linear programs, and leaves of a few regions each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+from scipy.spatial import HalfspaceIntersection, QhullError
+
+from sb3_yann.control._location import Integers, compiled
+from sb3_yann.control._validation import Array
+
+LEAF = 4
+"""A node with this many regions is not split further."""
+
+CANDIDATES = 48
+"""Facets tried at a node, drawn from those of its regions."""
+
+OVERLAP = 1e-8
+"""A region that passes a hyperplane by less, in half-widths of the box, is not on its far side."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchTree:
+    """Where ``normals[k] theta <= levels[k]`` go on with ``children[k, 0]``, else with the other.
+
+    A child of -1 - j is leaf j, which lists every region that has an interior there.
+
+    Attributes
+    ----------
+    normals : ndarray, shape (nodes, n)
+    levels : ndarray, shape (nodes,)
+    children : ndarray of int, shape (nodes, 2)
+    leaf_starts : ndarray of int, shape (leaves + 1,)
+        Where each leaf begins in ``leaf_regions``.
+    leaf_regions : ndarray of int
+    """
+
+    normals: Array
+    levels: Array
+    children: Integers
+    leaf_starts: Integers
+    leaf_regions: Integers
+
+    def checked(self, n_theta: int, n_regions: int) -> SearchTree:
+        """Return the tree if a search of it ends in a leaf with regions that there are.
+
+        Raises
+        ------
+        ValueError
+            If it is not a tree for so many parameters and regions: compiled code does not check.
+        """
+        nodes, leaves = len(self.levels), len(self.leaf_starts) - 1
+        numbers = np.arange(nodes)[:, None]
+        sound = (
+            self.normals.shape == (nodes, n_theta)
+            and self.children.shape == (nodes, 2)
+            and nodes > 0
+            and np.all((self.children > numbers) | (self.children < 0))
+            and np.all((self.children < nodes) & (self.children >= -leaves))
+            and self.leaf_starts[0] == 0
+            and np.all(np.diff(self.leaf_starts) >= 0)
+            and self.leaf_starts[-1] == len(self.leaf_regions)
+            and np.all((self.leaf_regions >= 0) & (self.leaf_regions < n_regions))
+        )
+        if not sound:
+            raise ValueError(f"its search tree does not fit {n_regions} regions")
+        return self
+
+    @property
+    def depth(self) -> int:
+        """The largest number of hyperplanes on the way to a leaf."""
+        depth = np.zeros(len(self.children), dtype=int)
+        for node, children in enumerate(self.children):  # children come after their parents
+            depth[children[children > 0]] = depth[node] + 1
+        return int(depth.max(initial=-1)) + 1
+
+    @property
+    def largest_leaf(self) -> int:
+        """The largest number of regions in a leaf."""
+        return int(np.diff(self.leaf_starts).max())
+
+
+@dataclass(frozen=True)
+class _Polytopes:
+    """Regions by their half-spaces, row after row, and by their vertices, in a box of [-1, 1]."""
+
+    A: Array
+    b: Array
+    row_starts: Integers
+    vertices: Array
+    vertex_starts: Integers
+    middles: Array
+    radii: Array
+
+
+def build_tree(
+    A: Array, b: Array, starts: Integers, theta_min: Array, theta_max: Array
+) -> SearchTree:
+    """Return a tree for the regions of a :class:`PiecewiseAffine`, in a bounded box of theta.
+
+    It is balanced as well as a few dozen candidates at every node allow. Whether a region lies on
+    one side is seen by its vertices, of which rounding may move some: the result of a search has
+    to be checked by its slack. The draws are seeded, so that a law always gives the same tree.
+    """
+    center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
+    regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))
+    random = np.random.default_rng(0)
+    normals: list[Array] = []
+    levels: list[float] = []
+    children: list[list[int]] = []
+    leaves: list[Integers] = []
+    everything = np.arange(len(starts), dtype=np.int64)
+    waiting: list[tuple[Integers, int, int]] = [(everything, -1, 0)]  # regions, parent, its side
+    while waiting:
+        inside, parent, side = waiting.pop()
+        split = None if len(inside) <= LEAF else _best_split(regions, inside, random)
+        if parent >= 0:
+            children[parent][side] = -1 - len(leaves) if split is None else len(levels)
+        if split is None:
+            leaves.append(np.sort(inside))
+            continue
+        row, below, above = split
+        waiting += [(above, len(levels), 1), (below, len(levels), 0)]
+        normals.append(regions.A[row])
+        levels.append(regions.b[row])
+        children.append([0, 0])
+    in_box = np.array(normals).reshape(-1, len(half)) / half
+    return SearchTree(
+        normals=in_box,
+        levels=np.array(levels) + in_box @ center,
+        children=np.array(children, dtype=np.int64).reshape(-1, 2),
+        leaf_starts=np.cumsum([0, *map(len, leaves)]),
+        leaf_regions=np.concatenate(leaves),
+    )
+
+
+def _polytopes(A: Array, b: Array, row_starts: Integers) -> _Polytopes:
+    length = np.linalg.norm(A, axis=1)
+    length[length == 0] = 1.0
+    A, b = A / length[:, None], b / length
+    corners = [vertices(A[i:j], b[i:j]) for i, j in pairwise(row_starts)]
+    counts = np.array([len(each) for each in corners])
+    vertex_starts = np.append(0, np.cumsum(counts))
+    points = np.ascontiguousarray(np.concatenate(corners))
+    middles = np.add.reduceat(points, vertex_starts[:-1]) / counts[:, None]
+    distance = np.linalg.norm(points - np.repeat(middles, counts, axis=0), axis=1)
+    radii = np.maximum.reduceat(distance, vertex_starts[:-1])
+    return _Polytopes(A, b, row_starts, points, vertex_starts, middles, radii)
+
+
+def _best_split(
+    regions: _Polytopes, inside: Integers, random: np.random.Generator
+) -> tuple[int, Integers, Integers] | None:
+    """Return a row of A and the regions on either side, None where no row parts them well."""
+    chosen = random.choice(inside, min(CANDIDATES, len(inside)), replace=False)
+    first, last = regions.row_starts[chosen], regions.row_starts[chosen + 1]
+    rows = random.integers(np.tile(first, 2), np.tile(last, 2))
+    sides = _sides(
+        regions.vertices,
+        regions.vertex_starts,
+        regions.middles,
+        regions.radii,
+        inside,
+        regions.A[rows],
+        regions.b[rows],
+    )
+    below, above = (sides & 1).sum(axis=1), (sides >> 1).sum(axis=1)
+    larger = np.maximum(below, above)
+    best = int(np.lexsort((below + above, larger))[0])
+    if larger[best] >= len(inside):
+        return None
+    return int(rows[best]), inside[(sides[best] & 1) > 0], inside[(sides[best] >> 1) > 0]
+
+
+@compiled()
+def _sides(
+    points: Array,
+    vertex_starts: Integers,
+    middles: Array,
+    radii: Array,
+    inside: Integers,
+    normals: Array,
+    levels: Array,
+) -> NDArray[np.uint8]:
+    """Return for each hyperplane and region: 1 below it, 2 above it, 3 on both sides."""
+    n = points.shape[1]
+    sides = np.zeros((len(levels), len(inside)), np.uint8)
+    for c in range(len(levels)):
+        for k in range(len(inside)):
+            i = inside[k]
+            middle = -levels[c]
+            for j in range(n):
+                middle += normals[c, j] * middles[i, j]
+            if abs(middle) >= radii[i]:
+                sides[c, k] = 1 if middle < 0 else 2
+                continue
+            side = 0
+            for vertex in range(vertex_starts[i], vertex_starts[i + 1]):
+                distance = -levels[c]
+                for j in range(n):
+                    distance += normals[c, j] * points[vertex, j]
+                side |= 1 if distance < -OVERLAP else 0
+                side |= 2 if distance > OVERLAP else 0
+            sides[c, k] = side if side else 3
+    return sides
+
+
+def vertices(A: Array, b: Array) -> Array:
+    """Return the vertices (k, n) of ``{A z <= b, -1 <= z <= 1}``, rows of unit length.
+
+    Of a set too thin for that, those of the box: it may lie anywhere.
+    """
+    n = A.shape[1]
+    rows = np.vstack([A, np.eye(n), -np.eye(n)])
+    bounds = np.concatenate([b, np.ones(2 * n)])
+    if n == 1:
+        upper = np.min(bounds[rows[:, 0] > 0] / rows[rows[:, 0] > 0, 0])
+        lower = np.max(bounds[rows[:, 0] < 0] / rows[rows[:, 0] < 0, 0])
+        return np.array([[lower], [upper]])
+    inner = interior_point(rows, bounds)
+    try:
+        found = HalfspaceIntersection(np.column_stack([rows, -bounds]), inner).intersections
+        found = found[np.all(np.isfinite(found), axis=1)]
+    except QhullError:
+        found = np.empty((0, n))
+    if len(found) <= n:
+        return np.stack(np.meshgrid(*[[-1.0, 1.0]] * n), axis=-1).reshape(-1, n)
+    return np.asarray(np.clip(found, -1, 1))
+
+
+def interior_point(A: Array, b: Array, pull: float = 1e-3) -> Array:
+    """Return a point (n,) well inside ``A z <= b``, rows of unit length, if it has an interior.
+
+    The middle of the largest ball, but for a small pull to the origin that makes it a strictly
+    convex program; where that leaves nothing of a thin set, the middle itself.
+    """
+    import daqp
+
+    n = A.shape[1]
+    rows = np.column_stack([A, np.ones(len(b))])
+    cost = np.append(np.zeros(n), -1.0)
+    found, _, status, _ = daqp.solve(
+        pull * np.eye(n + 1), cost, rows, b, np.full(len(b), -1e30), np.zeros(len(b), np.intc)
+    )
+    if status == 1 and np.min(b - A @ found[:n]) > 1e-6:
+        return np.asarray(found[:n])
+    ball = optimize.linprog(cost, A_ub=rows, b_ub=b, bounds=[(None, None)] * (n + 1))
+    return np.asarray(ball.x[:n])
