@@ -6,11 +6,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann.control._validation import Array
 from sb3_yann.control.limits import Watch
 from sb3_yann.control.parametric_qp import ParametricQP
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
+
+Indices = NDArray[np.intp]
 
 # Regions that hold no ball of this radius, in half-widths of the box, are left out.
 THINNEST = 1e-9
@@ -68,6 +71,7 @@ class _Walk:
                 one.law[:, n],
                 one.A,
                 one.b,
+                one.inside,
             )
             for one in self.found.values()
         ]
@@ -76,9 +80,16 @@ class _Walk:
         """Yield the active sets at the centre of the box and at random points of it."""
         n = self.program.F.shape[1]
         for point in [np.zeros(n), *np.random.default_rng(0).uniform(-1, 1, (count, n))]:
-            active = self.conditions.active_at(point)
+            active = self._active_at(point)
             if active is not None:
                 yield active
+
+    def _active_at(self, point: Array) -> int | None:
+        """Return the active set at a point, if there are several one that is not ruled out."""
+        active = self.conditions.active_at(point)
+        if active in self.seen and active not in self.found:
+            return self.conditions.active_at(point, apart=1e-9)
+        return active
 
     def explore(self, wave: Iterable[int]) -> None:
         """Add all regions that are connected with those of some active sets."""
@@ -93,9 +104,9 @@ class _Walk:
             }
             ahead = sorted(following - self.seen)
             if not ahead:  # what the flips have left open
-                across = (self._across(one, row) for one, row in facets if self._open(one, row))
-                ahead = sorted({active for active in across if active is not None})
-                facets = []
+                left = [(pair, self._across(*pair)) for pair in facets if self._open(*pair)]
+                ahead = sorted({active for _, active in left if active is not None})
+                facets = [pair for pair, active in left if active is not None]
 
     def _add(self, one: _Found) -> _Found:
         self.watch.count()
@@ -116,16 +127,21 @@ class _Walk:
         if distance <= THINNEST:  # the row only touches the region
             return None
         # The shortest step that gives an answer: a longer one may cross a thin region.
-        for step in (1e-8, 1e-7, 1e-6, 1e-5):
-            active = self.conditions.active_at(middle + min(step, distance) * one.A[row])
+        for step in (1e-7, 1e-6, 1e-5):
+            point = middle + min(step, distance) * one.A[row]
+            active = self._active_at(point)
             if active is None:
                 return None
             if active not in self.seen:
                 return active
             other = self.found.get(active, one)
-            if other is not one and np.min(other.b - other.A @ middle) >= -1e-9:
+            if other is not one and _holds(other, middle) and _holds(other, point):
                 return None
         return None
+
+
+def _holds(one: _Found, point: Array) -> bool:
+    return float(np.min(one.b - one.A @ point)) >= -1e-9
 
 
 def _members(active: int) -> list[int]:
@@ -153,10 +169,19 @@ class Conditions:
         self.N = program.G[self.kept] @ self.back
         # The slack that each constraint has where none is active.
         self.D = np.column_stack([program.S, program.w])[self.kept] + self.N @ self.Y
-        self._upper = np.full(len(self.kept), -1e30)
+        v, rows = len(self.back), len(self.kept)
+        # Where constraints that depend on each other are all tight, over a whole region, several
+        # active sets have the same law. Of these count those that are right when each constraint
+        # is moved out a little, by a different amount: they share the region among them.
+        self.apart = np.random.default_rng(0).uniform(0.5, 1.5, rows)
+        self._shortest = (np.eye(v), np.zeros(v), self.N)
+        self._options = (np.full(rows, -1e30), np.zeros(rows, dtype=np.intc))
 
-    def active_at(self, theta: Array) -> int | None:
-        """Return DAQP's working set at theta, None where nothing is feasible."""
+    def active_at(self, theta: Array, apart: float = 0.0) -> int | None:
+        """Return DAQP's working set at theta, None where nothing is feasible.
+
+        With the constraints moved apart by so much, see ``__init__``.
+        """
         if np.any(self.outer_A @ theta > self.outer_b + 1e-11):
             return None
         if len(self.kept) == 0:
@@ -164,21 +189,13 @@ class Conditions:
         import daqp
 
         n = len(theta)
-        _, _, status, info = daqp.solve(
-            self._identity(), self._zero(), self.N, self.D[:, :n] @ theta + self.D[:, n],
-            self._upper, None, primal_tol=1e-11,
-        )  # fmt: skip
+        upper = self.D[:, :n] @ theta + self.D[:, n] + apart * self.apart
+        _, _, status, info = daqp.solve(*self._shortest, upper, *self._options, primal_tol=1e-11)
         if status != 1:
             return None
         multipliers = np.asarray(info["lam"])
         active = np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max()))
         return sum(1 << int(k) for k in active)
-
-    def _identity(self) -> Array:
-        return np.eye(self.N.shape[1])
-
-    def _zero(self) -> Array:
-        return np.zeros(self.N.shape[1])
 
     def regions(self, wave: list[int]) -> Iterator[_Found]:
         """Yield the regions with an interior among those of some active sets."""
@@ -199,8 +216,8 @@ class Conditions:
         full = np.all(np.abs(np.diagonal(R, axis1=1, axis2=2)) > 1e-9 * lengths, axis=1)
         Q, R, index = Q[full], R[full], index[full]
         inverse = np.linalg.inv(R)
-        W = np.swapaxes(inverse, 1, 2) @ self.D[index]
-        NQ = self.N @ Q
+        right = np.swapaxes(inverse, 1, 2)
+        W, NQ = right @ self.D[index], self.N @ Q
         rows = self.D - NQ @ W
         width = np.linalg.norm(W, axis=(1, 2))[:, None]
         noise = np.linalg.norm(self.D, axis=1) + np.linalg.norm(NQ, axis=2) * width
@@ -213,6 +230,11 @@ class Conditions:
         ok = ~np.any(constant & (rows[:, :, -1] < -1e-10 * noise), axis=1)
         weak = constant[each, index] & (rows[each, index, -1] <= 1e-10 * noise[each, index])
         ok &= ~np.any(weak, axis=1)
+        tight = constant & (np.abs(rows[:, :, -1]) <= 1e-10 * noise)
+        tight[each, index] = False
+        if np.any(tight):
+            moved = self.apart - np.squeeze(NQ @ (right @ self.apart[index][:, :, None]), axis=2)
+            ok &= ~np.any(tight & (moved < 0), axis=1)
         scale = np.linalg.norm(rows[:, :, :-1], axis=2)
         scale[constant] = 1.0
         A, b = -rows[:, :, :-1] / scale[:, :, None], rows[:, :, -1] / scale
@@ -226,7 +248,7 @@ class Conditions:
             if one is not None:
                 yield one
 
-    def _region(self, active: int, law: Array, A: Array, b: Array, label: Array) -> _Found | None:
+    def _region(self, active: int, law: Array, A: Array, b: Array, label: Indices) -> _Found | None:
         A, b = np.concatenate([A, self.outer_A]), np.concatenate([b, self.outer_b])
         inside, radius = largest_ball(A, b)
         if radius <= THINNEST:
@@ -248,7 +270,7 @@ class Conditions:
         return _Found(active, law, A, b, labels, inside)
 
 
-def _irredundant(program: ParametricQP, rows: Array, outer_A: Array, outer_b: Array) -> list[int]:
+def _irredundant(program: ParametricQP, rows: Indices, outer_A: Array, outer_b: Array) -> list[int]:
     """Return which rows bound the pairs (U, theta); of those that say the same, the first."""
     v = program.G.shape[1]
     A = np.vstack([

@@ -1,7 +1,7 @@
-"""Keeps solved laws on disk, so that a large problem is solved once on a machine.
+r"""Keeps solved laws on disk, so that a large problem is solved once on a machine.
 
 The folder is that of the platform for caches (``~/.cache/sb3-yann``, ``~/Library/Caches/sb3-yann``
-or ``%LOCALAPPDATA%\\sb3-yann``), or the one that the environment variable ``SB3_YANN_CACHE`` names;
+or ``%LOCALAPPDATA%\sb3-yann``), or the one that the environment variable ``SB3_YANN_CACHE`` names;
 ``SB3_YANN_CACHE=off`` (or ``0``) keeps nothing. Any file in it may be deleted at any time.
 """
 
@@ -44,9 +44,7 @@ def cache_folder() -> Path | None:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path(home, ".cache"), "sb3-yann")
 
 
-def cache_key(
-    program: ParametricQP, u_min: Array, u_max: Array, outside: str, solver: str
-) -> str:
+def cache_key(program: ParametricQP, u_min: Array, u_max: Array, outside: str, solver: str) -> str:
     """Return the same name for the same problem only: a hash of all that the law depends on."""
     content = hashlib.sha256(f"{FORMAT} {solver} {outside} {program.n_slacks}".encode())
     arrays = [getattr(program, field.name) for field in fields(program)]

@@ -1,4 +1,4 @@
-"""The multi-parametric quadratic program that a linear MPC is, and its solution at one parameter."""
+"""The multi-parametric quadratic program that a linear MPC is."""
 
 from __future__ import annotations
 

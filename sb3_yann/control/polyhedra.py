@@ -11,15 +11,42 @@ from scipy import optimize
 from sb3_yann.control._validation import Array
 
 
+# DAQP ends up to 1e-6 from the largest ball: below this it must not end so early.
+THIN = 1e-5
+# Of polyhedra with a smaller ball DAQP's own search for redundant rows loses facets.
+SLIM = 1e-3
+
+
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal."""
+    """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal.
+
+    Attributes
+    ----------
+    active_set : tuple of int
+        The rows of the program that hold with equality, in ascending order.
+    gain : ndarray, shape (v, n)
+    offset : ndarray, shape (v,)
+    A : ndarray, shape (q, n)
+    b : ndarray, shape (q,)
+    inside : ndarray, shape (n,), optional
+        A point well inside, where what found the region knows one.
+    """
 
     active_set: tuple[int, ...]
     gain: Array
     offset: Array
     A: Array
     b: Array
+    inside: Array | None = None
+
+    def ball(self) -> tuple[Array, float]:
+        """Return the centre of a large ball inside, and its radius, negative if there is none."""
+        if self.inside is not None:
+            radius = float(np.min(self.b - self.A @ self.inside))
+            if radius > 0:
+                return self.inside, radius
+        return largest_ball(self.A, self.b)
 
 
 def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
@@ -34,6 +61,8 @@ def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, f
     cost = np.zeros(rows.shape[1])
     cost[-1] = -1.0
     point = _minimise(cost, rows, b, facet)
+    if abs(point[-1]) < THIN:
+        point = _minimise(cost, rows, b, facet, eta_prox=1e-14, iter_limit=1000)
     return point[:-1], float(point[-1])
 
 
@@ -42,7 +71,7 @@ def farthest_point(A: Array, b: Array, direction: Array) -> Array:
     return _minimise(-np.asarray(direction, dtype=float), A, b, None)
 
 
-def _minimise(cost: Array, A: Array, b: Array, equal: int | None) -> Array:
+def _minimise(cost: Array, A: Array, b: Array, equal: int | None, **settings: float) -> Array:
     """Return the solution of a small linear program from DAQP, or where that fails from HiGHS."""
     import daqp
 
@@ -51,7 +80,7 @@ def _minimise(cost: Array, A: Array, b: Array, equal: int | None) -> Array:
         sense[equal] = 5
     # Proximal steps make it a linear program; DAQP ends them at the exact vertex.
     point, _, status, _ = daqp.solve(
-        None, cost, A, b, None, sense, primal_tol=1e-12, eps_prox=1e-2
+        None, cost, A, b, None, sense, primal_tol=1e-12, eps_prox=1e-2, **settings
     )
     if status == 1:
         return np.asarray(point)
@@ -74,9 +103,23 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
 
     Rows that only touch it may be among them. Of rows that say the same there are all.
     """
+    if radius < SLIM:
+        return _facets_one_by_one(A, b - A @ inside, radius)
     import daqp
 
     # DAQP's tolerance is absolute: about the ball, in units of its radius, it means the same for
-    # thin and for wide polyhedra.
+    # small and for large polyhedra.
     redundant = daqp.minrep(np.ascontiguousarray(A), (b - A @ inside) / radius)
     return np.flatnonzero(redundant != 1)
+
+
+def _facets_one_by_one(A: Array, b: Array, radius: float) -> NDArray[np.intp]:
+    """Return the rows beyond which a polyhedron would reach without them."""
+    bounding = []
+    for k in range(len(b)):
+        relaxed = b.copy()
+        relaxed[k] += radius
+        farthest = _minimise(-A[k], A, relaxed, None, eta_prox=1e-14, iter_limit=1000)
+        if A[k] @ farthest > b[k] - max(1e-6 * radius, 1e-13):
+            bounding.append(k)
+    return np.array(bounding, dtype=np.intp)

@@ -85,4 +85,5 @@ def _rows_of(program: ParametricQP, problem: Any) -> NDArray[np.intp]:
     ours = np.column_stack([program.G, -program.S, program.w])
     theirs = np.column_stack([problem.A, -problem.F, problem.b])
     distance = np.abs(theirs[:, None] - ours[None]).max(axis=2)
-    return np.argmax(distance < 1e-9 + distance.min(axis=1, keepdims=True), axis=1)
+    first = np.argmax(distance < 1e-9 + distance.min(axis=1, keepdims=True), axis=1)
+    return np.asarray(first)

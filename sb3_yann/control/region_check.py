@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NoReturn
 
 import numpy as np
@@ -40,12 +41,17 @@ def check(program: ParametricQP, regions: list[Region], center: Array, half: Arr
     _Check(program, regions, center, half).run()
 
 
+def _as_bits(active_set: Iterable[int]) -> int:
+    """Return a set of constraints as a whole number, with bit k for constraint k."""
+    return sum(1 << k for k in active_set)
+
+
 class _Check:
     def __init__(
         self, program: ParametricQP, regions: list[Region], center: Array, half: Array
     ) -> None:
         self.program, self.regions, self.center, self.half = program, regions, center, half
-        self.by_set = {region.active_set: i for i, region in enumerate(regions)}
+        self.by_set = {_as_bits(region.active_set): i for i, region in enumerate(regions)}
         n = program.F.shape[1]
         bound = ~np.any(program.G, axis=1) & np.any(program.S, axis=1)
         self.outer = np.column_stack([
@@ -60,7 +66,7 @@ class _Check:
             np.concatenate([getattr(region, name) for region in self.regions]) for name in "Ab"
         )
         self.starts = np.cumsum([0, *(len(region.b) for region in self.regions[:-1])])
-        balls = [largest_ball(region.A, region.b) for region in self.regions]
+        balls = [region.ball() for region in self.regions]
         for i, (region, (inside, _)) in enumerate(zip(self.regions, balls, strict=True)):
             U = self.program.solve(inside)
             if U is None or np.max(np.abs(U - region.gain @ inside - region.offset)) > LAW:
@@ -88,20 +94,20 @@ class _Check:
     ) -> list[tuple[int, Array, Array, list[int]]]:
         program, (v, n) = self.program, self.program.F.shape
         active = np.array([self.regions[i].active_set for i in members], dtype=int)
-        active = active.reshape(len(members), size)
+        active, limit = active.reshape(len(members), size), np.column_stack([program.S, program.w])
         K = np.zeros((len(members), v + size, v + size))
         K[:, :v, :v] = program.H
         K[:, v:, :v] = program.G[active]
         K[:, :v, v:] = np.swapaxes(program.G[active], 1, 2)
         right = np.empty((len(members), v + size, n + 1))
         right[:, :v] = -np.column_stack([program.F, program.c])
-        right[:, v:] = np.column_stack([program.S, program.w])[active]
+        right[:, v:] = limit[active]
         try:
             both = np.linalg.solve(K, right)
         except np.linalg.LinAlgError:
             self._fail("the active constraints of a region depend on each other", self.center * 0)
         laws, multipliers = both[:, :v], both[:, v:]
-        rows = np.column_stack([program.S, program.w]) - program.G @ laws
+        rows = limit - program.G @ laws
         noise = 1 + np.linalg.norm(laws, axis=(1, 2))[:, None] * np.ones(len(program.w))
         each = np.arange(len(members))[:, None]
         rows[each, active] = multipliers
@@ -119,8 +125,8 @@ class _Check:
 
     def _require_law(self, i: int, law: Array, inside: Array) -> None:
         region = self.regions[i]
-        error = np.abs(law - np.column_stack([region.gain, region.offset]))
-        if np.max(error) > LAW * (1 + np.abs(law).max()):
+        off = max(np.abs(law[:, :-1] - region.gain).max(), np.abs(law[:, -1] - region.offset).max())
+        if off > LAW * (1 + np.abs(law).max()):
             self._fail(f"the law of region {i} is not optimal inside it", inside)
 
     def _require_implied(self, i: int, rows: Array, inside: Array, radius: float) -> None:
@@ -143,12 +149,15 @@ class _Check:
         known = np.concatenate([self.outer, rows])
         own = np.column_stack([region.A, region.b])
         same = np.abs(own[:, None] - known[None]).max(axis=2) < 1e-9
-        active = set(region.active_set)
-        for row, which in enumerate(same):
-            meant = np.flatnonzero(which) - len(self.outer)
-            if len(meant) and meant[0] < 0:
+        first = len(self.outer)
+        meant: list[list[int]] = [[] for _ in own]
+        for row, which in zip(*(index.tolist() for index in np.nonzero(same)), strict=True):
+            meant[row].append(which - first)
+        active = _as_bits(region.active_set)
+        for row, which in enumerate(meant):
+            if which and which[0] < 0:
                 continue  # a bound of theta
-            if not any(tuple(sorted(active ^ {labels[k]})) in self.by_set for k in meant):
+            if not any(active ^ (1 << labels[k]) in self.by_set for k in which):
                 self._look_across(region, row)
 
     def _look_across(self, region: Region, row: int) -> None:
@@ -159,7 +168,11 @@ class _Check:
             # A half-space that only touches the region has no facet to cross.
             if distance <= step or np.any(self.outer[:, :-1] @ point > self.outer[:, -1]):
                 continue
-            if self.program.solve(point) is None:
+            U, multipliers = self.program.solve_with_multipliers(point)
+            if U is None:
+                return
+            other = self._of_multipliers(point, multipliers)
+            if other is not None and np.min(other.b - other.A @ middle) >= -INSIDE:
                 return
             slacks = self._slacks(point)
             if np.max(slacks) < -INSIDE:
@@ -182,19 +195,25 @@ class _Check:
             if region is None:
                 self._fail("no region covers a feasible parameter", point)
             if np.max(np.abs(U - region.gain @ point - region.offset)) > LAW:
-                i = self.by_set[region.active_set]
+                i = self.by_set[_as_bits(region.active_set)]
                 self._fail(f"the law of region {i} violates the KKT conditions", point)
 
     def _held(self, point: Array, multipliers: Array) -> Region | None:
         """Return a region that holds a point, first that of the constraints with multipliers."""
-        active = tuple(int(k) for k in np.flatnonzero(multipliers > 1e-11))
-        if active in self.by_set:
-            region = self.regions[self.by_set[active]]
-            if np.min(region.b - region.A @ point) >= -INSIDE:
-                return region
+        region = self._of_multipliers(point, multipliers)
+        if region is not None:
+            return region
         slacks = self._slacks(point)
         best = int(np.argmax(slacks))
         return self.regions[best] if slacks[best] >= -INSIDE else None
+
+    def _of_multipliers(self, point: Array, multipliers: Array) -> Region | None:
+        """Return the region of the constraints with multipliers, if it holds a point."""
+        index = self.by_set.get(_as_bits(np.flatnonzero(multipliers > 1e-11).tolist()))
+        if index is None:
+            return None
+        region = self.regions[index]
+        return region if np.min(region.b - region.A @ point) >= -INSIDE else None
 
     def _require_no_doubles(self, balls: list[tuple[Array, float]]) -> None:
         """Raise if a region lies in another: both have then the same law, whatever their sets."""
