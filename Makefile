@@ -11,7 +11,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --quiet
 CODE := sb3_yann envs examples tests
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper test check format clean
+.PHONY: help demo paper bench test check format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,6 +21,9 @@ demo: $(STAMP)  ## run the example, examples/cstr.py
 
 paper: $(STAMP)  ## run the paper's experiments, hours (make paper ARGS="--quick" for minutes)
 	@PYTHONPATH="$(CURDIR)/examples" OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m paper $(ARGS)
+
+bench: $(STAMP)  ## measure the speed, ten minutes (make bench ARGS="--quick" for one)
+	@PYTHONPATH="$(CURDIR)/examples" OMP_NUM_THREADS=1 $(PY) -m bench $(ARGS)
 
 test: $(STAMP)  ## run the tests (make test ARGS="-k name" passes arguments to pytest)
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \

@@ -150,9 +150,16 @@ class CSTRVectorEnv(_VectorEnv):
     def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
         a, b, s, t = self._state
         cost = cstr.stage_cost(a, b, s, t, u)
+        transfer, rich = cstr.U_SS[0] + u, cstr.is_rich(a, b)
         # Runs that are over may be far beyond the limit, where the rates overflow.
         with np.errstate(all="ignore"):
-            self._state = np.array(cstr.advance((a, b, s, t), cstr.U_SS[0] + u, np.exp))
+            state = np.array(cstr.advance((a, b, s, t), transfer, np.exp))
+            if rich.any():
+                finer = cstr.advance(
+                    (a[rich], b[rich], s[rich], t[rich]), transfer[rich], np.exp, cstr.RICH_SUBSTEPS
+                )
+                state[:, rich] = finer
+        self._state = state
         terminated = cstr.X_SS[3] + self._state[3] > cstr.TEMPERATURE_LIMIT
         return cost + cstr.PENALTY * terminated, terminated
 

@@ -41,14 +41,14 @@ def summary(outcomes: Mapping[Run, Outcome], episodes: int) -> str:
     return "\n\n".join(parts)
 
 
-def quote(text: str, readme: Path) -> bool:
+def quote(text: str, readme: Path, first: str = BEGIN, last: str = END) -> bool:
     """Put the text between the marks of a README; return whether it has them."""
     old = readme.read_text(encoding="utf-8") if readme.exists() else ""
-    before, begin, rest = old.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    before, begin, rest = old.partition(first)
+    _, end, after = rest.partition(last)
     if not (begin and end):
         return False
-    readme.write_text(f"{before}{BEGIN}\n{text}\n\n{END}{after}", encoding="utf-8")
+    readme.write_text(f"{before}{first}\n{text}\n\n{last}{after}", encoding="utf-8")
     return True
 
 

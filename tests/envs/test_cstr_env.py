@@ -111,6 +111,40 @@ def test_an_episode_into_the_limit_agrees_with_an_accurate_integrator() -> None:
     np.testing.assert_allclose(info["state"] + cstr.X_SS, exact.y[:, -1], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_temperature_is_exact_to_1e_6_from_the_farthest_starts_on_the_way_to_the_limit(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    start = np.where(rng.random(4) < 0.5, cstr.STATE_HIGH, [0.1, 0.5, 0.0, 3.0])
+    env = started(start)
+    exact, terminated = cstr.X_SS + start, False
+    while not terminated:
+        *_, terminated, _, info = env.step(act(-55.0))
+        exact = solve_ivp(
+            lambda t, x: cstr.dynamics(x, cstr.U_SS - 55.0),
+            (0.0, cstr.DT),
+            exact,
+            method="LSODA",
+            rtol=1e-12,
+            atol=1e-13,
+        ).y[:, -1]
+        assert abs(info["state"][3] + cstr.X_SS[3] - exact[3]) < 1e-6
+
+
+def test_no_random_start_leads_to_where_a_step_is_divided_more_finely() -> None:
+    env = CSTREnv()
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        _, info = env.reset(seed=seed)
+        u, terminated, steps = -55.0, False, 0
+        while not terminated and steps < 400:
+            u = -u if rng.random() < 0.03 else u
+            assert not cstr.is_rich(*info["state"][:2])
+            *_, terminated, _, info = env.step(act(u))
+            steps += 1
+
+
 # --- the printed model -------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import sb3_yann_envs  # noqa: F401 (registers)
+from sb3_yann_envs import cstr
 
 IDS = {"CSTR-v0": 400, "ClippedPendulum-v0": 200}
 
@@ -41,6 +42,24 @@ def test_each_copy_is_the_single_environment(env_id) -> None:
             assert info[f"_{name}"].all()
         if terminated.any():
             break
+
+
+def test_copies_far_from_the_random_starts_are_integrated_as_the_single_environment_is() -> None:
+    starts = [[0, 0, 0, 0], [2, 2, 2, 0], [0.1, 2, 0, 3], [2, 0, 2, -30]]
+    many = gymnasium.make_vec("CSTR-v0", num_envs=4)
+    many.reset(options={"state": starts})
+    *_, info = many.step(np.zeros((4, 1), np.float32))
+    for start, state in zip(starts, info["state"], strict=True):
+        one = gymnasium.make("CSTR-v0")
+        one.reset(options={"state": start})
+        expected = one.step(np.zeros(1, np.float32))[4]["state"]
+        np.testing.assert_allclose(state, expected, rtol=1e-11, atol=1e-12)
+
+
+def test_to_advance_arrays_leaves_them_as_they_are() -> None:
+    before = np.full((4, 3), 0.01)
+    after = cstr.advance(tuple(before), np.full(3, 50.0), np.exp)
+    assert (before == 0.01).all() and not np.array_equal(after, before)
 
 
 @pytest.mark.parametrize("env_id", IDS)
