@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +61,7 @@ def linearise_dynamics(
     found = _differences(rate, point, steps, rounding, (n, u.size))
     A, B, E = np.split(found.value, [n, inputs], axis=1)
     model = LinearModel.from_continuous(A, B, dt, x, u, E, d)
-    return model.with_notes(*_curvature(found, (n, u.size)))
+    return model.with_notes(*_idle_inputs(model.B), *_curvature(found, (n, u.size)))
 
 
 def linearise_env(
@@ -104,7 +105,9 @@ def _linearise(
     if not np.any(free):
         check_rest(simulator, point, found.value, scales)
     A, B = found.value[:, :n], found.value[:, n:]
+    idle = _idle_inputs(B)
     return LinearModel(A, B, dt, point[:n], point[n:]).with_notes(
+        *idle,
         "Linearised by central differences over one step. The state was set by "
         f"{simulator.setter} and read from {simulator.reader}.",
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
@@ -186,6 +189,20 @@ def _differences(
         ) from None
 
 
+def _idle_inputs(B: Array) -> list[str]:
+    """Return, and warn of, the inputs that no entry of B has an effect of."""
+    idle = np.flatnonzero(~np.any(B, axis=0))
+    if not idle.size:
+        return []
+    note = (
+        f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. If the plant has a "
+        "delay of the input, or an actuator, the inputs on their way belong into the state; an "
+        "input that really does nothing is to be left out."
+    )
+    warnings.warn(note, stacklevel=5)
+    return [note]
+
+
 def _remarks(simulator: Simulator, point: Array) -> list[str]:
     """Return what a user of the model has to know of the environment."""
     n = point.size - simulator.env.action_space.shape[0]
@@ -221,7 +238,7 @@ def _curvature(found: Jacobian, sizes: tuple[int, int]) -> list[str]:
                 f"The plant is not smooth within {found.steps[i]:.3g} of the operating point "
                 f"along {_name(i, sizes)}: {what}."
             )
-        elif not np.any(found.value[:, i]):
+        elif not np.any(found.value[:, i]) and not sizes[0] <= i < sum(sizes):
             notes.append(f"{_name(i, sizes)} has no effect on the next state.")
     return notes
 
