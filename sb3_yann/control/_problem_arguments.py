@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,6 +16,25 @@ from sb3_yann.control._validation import (
     as_symmetric,
     to_float,
 )
+from sb3_yann.control.linear_model import LinearModel
+
+
+DRIFT = 1e-3
+"""How far a model's operating point may move in a sample without a warning, in parts of the box."""
+
+
+def warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:
+    """Warn of an operating point that moves noticeably: the law would rest beside what it is to."""
+    width = (upper - lower) / 2
+    size = np.where(np.isfinite(width), width, np.maximum(np.abs(model.x_ss), 1.0))
+    if np.any(np.abs(model.drift) > DRIFT * size):
+        warnings.warn(
+            f"The operating point of the model, x_ss = {model.x_ss.tolist()} with u_ss = "
+            f"{model.u_ss.tolist()}, is no steady state: there the plant moves by "
+            f"{model.drift.tolist()} in one sample, which the model leaves out, and the law will "
+            "rest beside its references. Identify it with an x_ss and u_ss at which it rests.",
+            stacklevel=3,
+        )
 
 
 def as_horizon(value: int) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
 from sb3_yann.control._validation import Array, ReadOnlyArrays, as_array, to_float
@@ -18,6 +18,9 @@ AHEAD = 10
 """Steps of the longer prediction whose fit is stated."""
 FAR = 5.0
 """Spreads from the mean of the data beyond which a model is extrapolated."""
+SURE = 5.0
+"""Standard errors above which a direction does not integrate: more than in other tests, since those
+of an integrator are not normally distributed (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +121,8 @@ def identify(
         Measured disturbances, which make E.
     x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
         The operating point. Left out, inputs and disturbances take their mean, and the state is
-        where the fitted model rests with them; the mean, if that is far outside the data.
+        where the fitted model rests with them. Along what integrates, as far as the data tell, the
+        state keeps its mean, and the inputs are those that hold it.
     offset : bool, default True
         Fit c too, so that the operating point need not be a steady state exactly. Without it,
         deviations from (x_ss, u_ss, d_ss), zeros where left out, are fitted with c = 0.
@@ -188,17 +192,43 @@ def _operating_point(
         if value is not None:
             start[place] = value
     # The state gives way, or the inputs where the state is given; nothing where both are.
-    ways = slice(0, n) if given[0] is None else slice(n, n + m)
     if given[0] is not None and given[1] is not None:
         return start
     scale = np.where(found.spread > 0, found.spread, 1.0)
     moves = (found.coefficients - np.eye(n, scale.size)) * scale / scale[:n, None]
+    doubt = found.standard_errors * scale / scale[:n, None]
     drift = (found.predict(start[None])[0] - start[:n]) / scale[:n]
-    way = np.linalg.lstsq(moves[:, ways], -drift, rcond=None)[0]
-    # A plant that integrates, or nearly, rests far away if anywhere: the data do not tell of there.
-    if np.max(np.abs(way)) <= FAR:
-        start[ways] += scale[ways] * way
+    states, inputs = slice(0, n), slice(n, n + m)
+    if given[0] is not None:
+        start[inputs] += scale[inputs] * _way(moves[:, inputs], drift, doubt[:, inputs])
+        return start
+    if given[1] is None:  # no state holds what integrates, only the inputs do
+        left, _, _, known = _directions(moves[:, states], doubt[:, states])
+        free = left[:, ~known].T
+        errors = np.sqrt(free**2 @ doubt[:, inputs] ** 2)
+        way = _way(free @ moves[:, inputs], free @ drift, errors)
+        start[inputs] += scale[inputs] * way
+        drift = drift + moves[:, inputs] @ way
+    start[states] += scale[states] * _way(moves[:, states], drift, doubt[:, states])
     return start
+
+
+def _directions(moves: Array, doubt: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return the singular value decomposition, and which directions differ from an integrator."""
+    left, sizes, right = np.linalg.svd(moves, full_matrices=False)
+    errors = np.sqrt(np.sum((left.T**2 @ doubt**2) * right**2, axis=1))
+    return left, sizes, right, (sizes > SURE * errors) & (sizes > 1e-9)
+
+
+def _way(moves: Array, drift: Array, doubt: Array) -> Array:
+    """Return the way that ends the drift, along the directions of which the data are sure.
+
+    Along the others the plant rests far away if anywhere, or wherever it is. Exact equations would
+    go there, and take along those that are known well.
+    """
+    left, sizes, right, known = _directions(moves, doubt)
+    steps = -(left.T @ drift) / np.where(known, sizes, 1.0)
+    return np.asarray(right.T @ np.where(known & (np.abs(steps) <= FAR), steps, 0.0))
 
 
 def _model(
@@ -211,9 +241,11 @@ def _model(
     x, u, d = np.split(point, [n, n + m])
     model = LinearModel(A, B, dt, x, u, E, d)
     drift = found.predict(point[None])[0] - x
-    allowed = 3 * np.sqrt(np.diag(found.covariance) / found.steps) + 1e-9 * (1 + np.abs(x))
+    doubt = np.diag(found.covariance) / found.steps
+    doubt = np.sqrt(doubt + found.standard_errors**2 @ (point - found.centre) ** 2)
+    allowed = 3 * doubt + 1e-9 * (1 + np.abs(x))
     if np.any(np.abs(drift) > allowed):
-        model = model.with_notes(
+        model = model.with_drift(drift).with_notes(
             f"At the operating point the fitted plant moves by {_list(drift)} in one step. The "
             "model leaves that out."
         )

@@ -52,6 +52,9 @@ class LinearModel(ReadOnlyArrays):
     notes : tuple of str
         What is to be known of how the model was made: what was found, dropped, or doubtful. They
         are no part of equality, and `dataclasses.replace` drops them with the old matrices.
+    drift : ndarray, shape (n,)
+        How far the plant was found to move in one sample at the operating point, by more than the
+        doubt about it; the model leaves that out. Kept and dropped as the notes are.
 
     Raises
     ------
@@ -67,6 +70,7 @@ class LinearModel(ReadOnlyArrays):
     E: Array
     d_ss: Array
     notes: tuple[str, ...] = field(init=False, repr=False)
+    drift: Array = field(init=False, repr=False)
 
     def __init__(
         self,
@@ -97,6 +101,7 @@ class LinearModel(ReadOnlyArrays):
             "E": disturbances,
             "d_ss": as_array("d_ss", np.zeros(d) if d_ss is None else d_ss, (d,)),
             "notes": (),
+            "drift": as_array("drift", np.zeros(n), (n,)),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -300,6 +305,12 @@ class LinearModel(ReadOnlyArrays):
         noted = copy.copy(self)
         object.__setattr__(noted, "notes", (*self.notes, *notes))
         return noted
+
+    def with_drift(self, drift: ArrayLike) -> LinearModel:
+        """Return an equal model that is known to leave out this drift (n,)."""
+        known = copy.copy(self)
+        object.__setattr__(known, "drift", as_array("drift", drift, (self.n_states,)))
+        return known
 
     def __eq__(self, other: object) -> bool:
         """Tell whether all matrices, the sampling time and the operating point are equal."""

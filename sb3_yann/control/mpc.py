@@ -21,6 +21,7 @@ from sb3_yann.control._problem_arguments import (
     as_soft_penalty,
     as_softness,
     require_bounded_thing,
+    warn_of_drift,
 )
 from sb3_yann.control._validation import (
     Array,
@@ -223,6 +224,7 @@ class LinearMPC(ReadOnlyArrays):
         self._set(soft_penalty=as_soft_penalty(soft_penalty, self.x_soft, self.y_soft))
         self._set_box(theta_min, theta_max)
         self._set_terminal(terminal_cost, terminal_set)
+        warn_of_drift(model, self.theta_min[:n], self.theta_max[:n])
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_yann import Identified, LinearModel, identify
+from sb3_yann import Identified, LinearModel, LinearMPC, identify
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
@@ -160,6 +160,35 @@ def test_integrator_keeps_an_operating_point_inside_its_data() -> None:
     model = LinearModel.from_data(x, u, dt=1)
     np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], 1, atol=1e-8)
     assert x.min() <= model.x_ss[0] <= x.max()
+
+
+DOUBLE = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
+"""Position and speed."""
+
+
+def drive(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return states and inputs of the double integrator with a little process noise."""
+    rng = np.random.default_rng(seed)
+    u, x = rng.uniform(-1, 1, (200, 1)), np.zeros((201, 2))
+    for k in range(200):
+        x[k + 1] = DOUBLE.step(x[k], u[k]) + rng.normal(0, 0.001, 2)
+    return x, u
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_double_integrator_rests_at_its_operating_point(seed: int) -> None:
+    model = LinearModel.from_data(*drive(seed), dt=0.1)
+    np.testing.assert_allclose(model.x_ss[1], 0, atol=0.01)
+    np.testing.assert_allclose(model.u_ss, 0, atol=0.01)
+    assert not np.any(model.drift)
+
+
+def test_law_of_a_model_whose_operating_point_moves_is_warned_of() -> None:
+    model = LinearModel.from_data(*drive(0), dt=0.1, x_ss=[0, 0.5], u_ss=[0])
+    np.testing.assert_allclose(model.drift, [0.05, 0], atol=1e-3)
+    box = {"theta_min": -5, "theta_max": 5, "u_min": -1, "u_max": 1}
+    with pytest.warns(UserWarning, match=r"moves by \[0\.0.* will rest beside its references"):
+        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracked=[0], r_min=-1, r_max=1, **box)
 
 
 def closed_loop(test_signal: float) -> tuple[np.ndarray, np.ndarray]:
