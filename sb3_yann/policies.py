@@ -88,6 +88,7 @@ class YannActor(SeesTheta, Actor):
             activation_fn(),
             max_correction=max_correction,
             pinned=pin_equilibrium,
+            rate=(problem.du_min, problem.du_max) if problem.has_rate_bounds else None,
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -257,10 +257,15 @@ class LinearMPC(ReadOnlyArrays):
         n = self.model.n_states
         self._set(terminal_set=as_half_spaces(half_spaces, n, self.n_theta))  # type: ignore[arg-type]
 
+    @property
+    def has_rate_bounds(self) -> bool:
+        """Whether the change of an input is bounded."""
+        return bool(np.any(np.isfinite([self.du_min, self.du_max])))
+
     @cached_property
     def parameters(self) -> Parameters:
         """What theta holds, and where."""
-        rated = np.any(self.S) or np.any(np.isfinite([self.du_min, self.du_max]))
+        rated = np.any(self.S) or self.has_rate_bounds
         return Parameters(
             n_states=self.model.n_states,
             n_references=len(self.tracked),
