@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
-from sb3_yann.control._validation import Array, ReadOnlyArrays, as_array, to_float
-from sb3_yann.control.episodes import Episode, as_episodes, split
+from sb3_yann.control._validation import Array, ReadOnlyArrays, as_array, as_positive, to_float
+from sb3_yann.control.episodes import Episode, as_episodes, split, without_gaps
 from sb3_yann.control.linear_model import LinearModel
 from sb3_yann.control.regression import Regression, regress
 
@@ -21,6 +21,10 @@ FAR = 5.0
 SURE = 5.0
 """Standard errors above which a direction does not integrate: more than in other tests, since those
 of an integrator are not normally distributed (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
+
+
+POOR = 50.0
+"""Percent of the longer prediction's fit below which a model is called poor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +100,7 @@ def identify(
     offset: bool = True,
     ridge: float = 0.0,
     held_out: float = 0.2,
+    time: ArrayLike | Sequence[ArrayLike] | None = None,
 ) -> Identified:
     r"""Fit ``x[k+1] = A x[k] + B u[k] + E d[k] + c`` to measured episodes by least squares.
 
@@ -131,8 +136,11 @@ def identify(
         that of one step. It makes data that do not excite the plant usable, at the price of a
         bias towards zero that the standard errors do not contain.
     held_out : float, default 0.2
-        Fraction that is kept out of the model to state its fit: the last episodes as a whole, or
-        the last part of a single one.
+        Fraction of all steps that is kept out of the model to state its fit: the last ones, for
+        which an episode is cut in two.
+    time : array_like, shape (T+1,), or a sequence of such, optional
+        When each row of the states was measured, in the unit of ``dt``. Steps that took another
+        time, by more than 10 %, are left out: a log with missing rows is no record of the plant.
 
     Returns
     -------
@@ -145,7 +153,12 @@ def identify(
         combination of states and inputs does not move: the message names it.
     """
     episodes, sizes = as_episodes(states, actions, disturbances)
+    lost = 0
+    if time is not None:
+        episodes, lost = without_gaps(episodes, time, as_positive("dt", dt))
     n, m, d = sizes
+    if d_ss is not None and disturbances is None:
+        raise ValueError("d_ss is given, but there are no disturbances: pass these as well.")
     given = (
         _given("x_ss", x_ss, n, offset),
         _given("u_ss", u_ss, m, offset),
@@ -160,6 +173,8 @@ def identify(
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
     A, B, E = np.split(found.standard_errors, [n, n + m], axis=1)
     model = _model(found, sizes, given, dt).with_notes(*_quality(found, tested, fits, weight))
+    if lost:
+        model = model.with_notes(f"{lost} steps that took another time than dt were left out.")
     return Identified(
         model=model,
         standard_error_A=A,
@@ -287,10 +302,7 @@ def _quality(
         f"{_list(np.sqrt(np.diag(found.covariance)))} (standard deviation of each state)."
     ]
     if tested:
-        notes.append(
-            f"Fit over {sum(map(len, tested))} steps held out, 100 % is perfect: {_list(fits[0])} "
-            f"% one step ahead, {_list(fits[1])} % {AHEAD} steps ahead."
-        )
+        notes.append(_words_for(fits, sum(map(len, tested))))
     if found.excitation < 0.01:
         notes.append(
             f"Weakly excited: {found.weakest} moved {found.excitation:.1e} times as much as the "
@@ -306,6 +318,23 @@ def _quality(
             "more than the standard errors tell."
         )
     return notes
+
+
+def _words_for(fits: tuple[Array, Array], steps: int) -> str:
+    """Return the fits over data held out in words, a poor one as such."""
+    words = [
+        f"{_list(fit)} % {ahead} ahead"
+        for fit, ahead in zip(fits, ("one step", f"{AHEAD} steps"), strict=True)
+        if not np.all(np.isnan(fit))
+    ]
+    if not words:
+        return f"The {steps} steps held out tell no fit: they are too few, or nothing moves."
+    text = f"Fit over {steps} steps held out, 100 % is perfect: {', '.join(words)}."
+    if len(words) < len(fits):
+        text += f" No episode of them is {AHEAD} steps long."
+    if np.any(fits[1] < POOR):
+        text += f" Poor: {AHEAD} steps ahead the model says little of the plant."
+    return text
 
 
 def _list(values: Array) -> str:

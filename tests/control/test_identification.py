@@ -101,11 +101,30 @@ def test_episodes_are_not_joined_at_their_ends() -> None:
     np.testing.assert_allclose(model.A, A, atol=1e-8)
 
 
-def test_last_episodes_are_held_out_as_a_whole() -> None:
-    x, u, _ = record(0)
-    alone = identify(x, u, dt=1, held_out=0)
-    both = identify([x, 1 + 0 * x], [u, u], dt=1, held_out=0.2)  # the second is nonsense
-    assert both.model == alone.model
+def test_the_last_of_all_steps_are_held_out_however_long_the_episodes() -> None:
+    x, u, _ = record(0, process=0.1)
+    first = identify([x[:21], x[22:321]], [u[:20], u[22:320]], dt=1, held_out=0)
+    both = identify([x[:21], x[22:]], [u[:20], u[22:]], dt=1, held_out=80 / 398)
+    assert both.model == first.model
+    assert "Fit over 80 steps held out" in both.model.report()
+
+
+def test_episodes_too_short_for_ten_steps_state_no_fit_ten_steps_ahead() -> None:
+    x, u, _ = record(0, process=0.1)
+    starts = range(0, 400, 8)
+    notes = identify([x[k : k + 9] for k in starts], [u[k : k + 8] for k in starts], dt=1).model
+    assert "No episode of them is 10 steps long" in notes.report()
+    assert "nan" not in notes.report()
+
+
+def test_rows_that_are_missing_are_noticed_by_their_time() -> None:
+    x, u, _ = record(0, offset=0.0)
+    time = 0.5 * np.arange(401) + 0.02 * np.sin(np.arange(401))  # with some jitter
+    kept = np.setdiff1d(np.arange(401), [7, 100, 101, 250])
+    found = identify(x[kept], u[kept[:-1]], dt=0.5, time=time[kept])
+    np.testing.assert_allclose(found.model.A, A, atol=1e-8)
+    assert "3 steps that took another time than dt were left out" in found.model.report()
+    assert np.abs(identify(x[kept], u[kept[:-1]], dt=0.5).model.A - A).max() > 1e-3
 
 
 def test_last_part_of_a_single_episode_is_held_out() -> None:
@@ -266,6 +285,12 @@ BAD_DATA: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"ridge": -1}, ValueError, "ridge = -1 must be 0 or"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
     ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
+    ({"time": np.arange(400)}, ValueError, r"time of episode 0 has shape \(400,\), expected \(401,"),
+    ({"time": np.arange(401) % 400}, ValueError, "time of episode 0 does not increase after row 39"),
+    ({"time": np.arange(401) / 60}, ValueError, r"dt = 1, but a step of the log takes 0\.0166667"),
+    ({"time": [np.arange(401)] * 2}, ValueError, "time has 2 episodes, states has 1"),
+    ({"d_ss": [0.0]}, ValueError, "d_ss is given, but there are no disturbances"),
+    ({"states": [X[:9, 0], X[:5, 0]]}, ValueError, r"episode 0 has shape \(9,\).*reshape\(-1, 1\)"),
     ({"states": "many"}, TypeError, "states = 'many' is not an array"),
 ]
 
