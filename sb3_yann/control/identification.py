@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from scipy.special import stdtrit
 
 from sb3_yann.control._validation import Array, ReadOnlyArrays, as_array, as_positive, to_float
 from sb3_yann.control.episodes import Episode, as_episodes, split, without_gaps
+from sb3_yann.control.input_effects import input_notes
 from sb3_yann.control.linear_model import LinearModel
 from sb3_yann.control.regression import Regression, regress
 
@@ -173,6 +175,10 @@ def identify(
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
     A, B, E = np.split(found.standard_errors, [n, n + m], axis=1)
     model = _model(found, sizes, given, dt).with_notes(*_quality(found, tested, fits, weight))
+    late = input_notes(found, fitted, sizes)
+    if late:
+        warnings.warn(" ".join(late), stacklevel=2)
+        model = model.with_notes(*late)
     if lost:
         model = model.with_notes(f"{lost} steps that took another time than dt were left out.")
     return Identified(

@@ -210,6 +210,41 @@ def test_law_of_a_model_whose_operating_point_moves_is_warned_of() -> None:
         LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracked=[0], r_min=-1, r_max=1, **box)
 
 
+def delayed(steps: int, hold: int = 1, process: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+    """Return a record in which the input acts so many steps late."""
+    rng = np.random.default_rng(1)
+    u, x = np.repeat(rng.uniform(-1, 1, (400 // hold, 1)), hold, axis=0), np.zeros((401, 2))
+    for k in range(400):
+        acting = u[k - steps] if k >= steps else np.zeros(1)
+        x[k + 1] = A @ x[k] + B @ acting + process * SPREAD * rng.normal(size=2)
+    return x, u
+
+
+@pytest.mark.parametrize("steps", [1, 3, 8])
+@pytest.mark.parametrize("process", [0.0, 0.05])
+def test_delayed_input_is_named_with_its_delay(steps: int, process: float) -> None:
+    with pytest.warns(UserWarning, match=rf"no effect that .* acts {steps} samples late"):
+        found = identify(*delayed(steps, process=process), dt=1)
+    assert "Poor: 10 steps ahead" in found.model.report()
+
+
+def test_delay_of_an_input_that_is_held_is_named() -> None:
+    with pytest.warns(UserWarning, match=r"The residuals follow u\[0\] of \d steps before"):
+        identify(*delayed(3, hold=5), dt=1)
+
+
+def test_input_without_effect_is_warned_of() -> None:
+    x, u, _ = record(0, process=0.1)
+    other = np.random.default_rng(5).normal(size=u.shape)
+    with pytest.warns(UserWarning, match=r"u\[1\] has no effect on the next state that can be told"):
+        identify(x, np.hstack([u, other]), dt=1)
+
+
+def test_sensor_noise_is_taken_for_no_delay() -> None:
+    for seed in range(5):
+        identify(*record(seed, 4000, sensor=0.1)[:2], dt=1)  # a warning would be an error
+
+
 def closed_loop(test_signal: float) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     x, u = np.ones((201, 2)), np.zeros((200, 1))
