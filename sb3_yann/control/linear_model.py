@@ -137,6 +137,7 @@ class LinearModel(ReadOnlyArrays):
         u_ss: ArrayLike,
         dt: float,
         d_ss: ArrayLike | None = None,
+        scale: ArrayLike | None = None,
     ) -> LinearModel:
         """Linearise ``dx/dt = f(x, u)``, or ``f(x, u, d)``, at a steady state; sample it every dt.
 
@@ -154,17 +155,20 @@ class LinearModel(ReadOnlyArrays):
             Sampling time.
         d_ss : array_like, shape (d,), optional
             Measured disturbances at the operating point.
+        scale : array_like, shape (n,) or (n + m + d,), optional
+            How far each state moves in use, or each state, input and disturbance: sets the step
+            sizes (1 % of it) and how far the operating point may move. The default is the size
+            of each, at least 1: for trace concentrations give their own.
 
         Raises
         ------
         ValueError
             If ``f`` returns another shape or NaN at the operating point, has a kink or a jump
-            there, or the operating point moves by more than 0.1 % (of 1, where it is smaller)
-            within one sample.
+            there, or the operating point moves by more than 0.1 % of ``scale`` within one sample.
         """
         from sb3_yann.control.linearise import linearise_dynamics
 
-        return linearise_dynamics(f, x_ss, u_ss, dt, d_ss)
+        return linearise_dynamics(f, x_ss, u_ss, dt, d_ss, scale)
 
     @staticmethod
     def from_env(

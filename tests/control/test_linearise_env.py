@@ -172,7 +172,7 @@ def random_walk(x: Any, u: Any) -> Any:
 NOISE = np.random.default_rng(0)
 CLOCK = iter(range(10**6))
 BAD_PLANTS: list[tuple[Any, dict[str, Any], str]] = [
-    (lambda x, u: np.clip(x + u, 0, 1), {}, r"along x\[0\], .* \(a kink\)\. Clipping"),
+    (lambda x, u: np.clip(x + u, 0, 1), {}, r"along x\[0\], .* \(a kink\), .*Clipping"),
     (lambda x, u: 0.5 * x + np.maximum(u, 0), {}, r"along u\[0\], .* \(a kink\)"),
     (lambda x, u: 0.5 * x + np.floor(x) + u, {}, r"along x\[0\], .* \(a (kink|jump or noise)\)"),
     (random_walk, {}, "two steps from the same state.*the plant is random or has states besides"),
