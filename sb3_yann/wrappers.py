@@ -313,7 +313,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         return observation, -cost, terminated, truncated, info
 
     def _too_fast(self, u: Array) -> bool:
-        """Tell whether u moves from u_prev by more than the rate's bounds and float32's rounding."""
+        """Tell whether u moves from u_prev by more than its bounds, and rounding, allow."""
         mpc = self.problem
         if not mpc.has_rate_bounds:
             return False

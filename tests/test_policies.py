@@ -685,7 +685,7 @@ def heater_mpc(u_min: float, u_max: float) -> LinearMPC:
 
 def test_an_env_with_absolute_inputs_is_told_the_wrapper_that_fits() -> None:
     kwargs = {"problem": heater_mpc(-3, 7)}
-    with pytest.raises(ValueError, match="takes absolute inputs.*RescaleAction") as caught:
+    with pytest.raises(ValueError, match=r"takes absolute inputs.*RescaleAction") as caught:
         DDPG(YannPolicy, Heater(), policy_kwargs=kwargs)
     line = str(caught.value).partition("env = ")[2].removesuffix(".")
     env = eval(line, {"gymnasium": gym, "numpy": np, "env": Heater()})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,25 +15,6 @@ from sb3_yann.control._validation import (
     as_symmetric,
     to_float,
 )
-from sb3_yann.control.linear_model import LinearModel
-
-
-DRIFT = 1e-3
-"""How far a model's operating point may move in a sample without a warning, in parts of the box."""
-
-
-def warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:
-    """Warn of an operating point that moves noticeably: the law would rest beside what it is to."""
-    width = (upper - lower) / 2
-    size = np.where(np.isfinite(width), width, np.maximum(np.abs(model.x_ss), 1.0))
-    if np.any(np.abs(model.drift) > DRIFT * size):
-        warnings.warn(
-            f"The operating point of the model, x_ss = {model.x_ss.tolist()} with u_ss = "
-            f"{model.u_ss.tolist()}, is no steady state: there the plant moves by "
-            f"{model.drift.tolist()} in one sample, which the model leaves out, and the law will "
-            "rest beside its references. Identify it with an x_ss and u_ss at which it rests.",
-            stacklevel=3,
-        )
 
 
 def as_horizon(value: int) -> int:
@@ -57,6 +37,8 @@ def as_outputs(name: str, value: ArrayLike | Sequence[int] | None, n_states: int
     if value is None:
         return as_array(name, np.zeros((0, n_states)), (0, n_states))
     entries = to_float(name, value)
+    if entries.ndim == 0:
+        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value}].")
     if entries.ndim != 1:
         return as_array(name, value, ("q", n_states))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
@@ -98,15 +80,34 @@ def as_linear_cost(
     return as_array("linear_cost q", q, (n_states,)), as_array("linear_cost r", r, (n_inputs,))
 
 
-def as_softness(name: str, value: ArrayLike | None, size: int) -> Array:
-    """Return the unit of violation (size,) of soft bounds, 0 where they are hard."""
-    array = to_float(name, 0.0 if value is None else value)
-    array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
+def as_softness(name: str, value: ArrayLike | None, lower: Array, upper: Array) -> Array:
+    """Return the unit of violation (size,) of soft bounds, 0 where they are hard.
+
+    A single number is for the entries that have a bound.
+
+    Raises
+    ------
+    ValueError
+        If one is negative, or for something without a bound.
+    """
+    array, size = to_float(name, 0.0 if value is None else value), len(lower)
+    bounded = np.isfinite(lower) | np.isfinite(upper)
+    if array.ndim == 0:
+        array = np.where(bounded, array, 0.0) if np.any(bounded) else np.full(size, float(array))
+    array = as_array(name, array, (size,))
     if np.any(array < 0):
         raise ValueError(
             f"{name} = {array.tolist()} holds the violations that count as one unit, 0 where the "
             "bound is hard: no entry may be negative."
         )
+    if value is not None and np.any(to_float(name, value) > 0) and not np.any(array[bounded] > 0):
+        what = name[0]
+        raise ValueError(
+            f"{name} = {value!r}, but there is no bound to soften: pass {what}_min or {what}_max."
+        )
+    if np.any(array[~bounded] > 0):
+        i = int(np.argmax((array > 0) & ~bounded))
+        raise ValueError(f"{name} = {value!r} softens entry {i}, which has no bound: make it 0.")
     return array
 
 
@@ -166,11 +167,12 @@ def as_half_spaces(
     if value is None:
         return np.zeros((0, n_theta)), np.zeros(0)
     try:
-        F, g = value
+        F, g = value if not isinstance(value, str) else ()
     except (TypeError, ValueError):
+        got = repr(value) if isinstance(value, str) else type(value).__name__
         raise TypeError(
             "terminal_set must be a pair (F, g) of arrays for F x_N <= g, or 'invariant', "
-            f"got {type(value).__name__}."
+            f"got {got}."
         ) from None
     rows = to_float("terminal_set F", F)
     if rows.shape[1:] != (n_theta,):

@@ -116,7 +116,9 @@ def to_float(name: str, value: Any) -> Array:
             raise TypeError("it is complex")
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} = {_short(value)} is not an array of real numbers ({error}).") from None
+        raise TypeError(
+            f"{name} = {_short(value)} is not an array of real numbers ({error})."
+        ) from None
 
 
 def _short(value: Any) -> str:

@@ -18,7 +18,9 @@ FOLLOWS = 0.25
 leaves some, as the state is then known better with the inputs that led to it."""
 
 
-def input_notes(found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]) -> list[str]:
+def input_notes(
+    found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]
+) -> list[str]:
     """Return, for inputs and disturbances that have no effect or a late one, what is to be done."""
     n, m, d = sizes
     names = [f"u[{i}]" for i in range(m)] + [f"d[{i}]" for i in range(d)]

@@ -92,6 +92,10 @@ class LinearModel(ReadOnlyArrays):
             raise ValueError(f"B has shape {inputs.shape}: the model needs at least one input.")
         disturbances = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
         d = disturbances.shape[1]
+        if d_ss is not None and np.size(d_ss) and not d:
+            raise ValueError(
+                f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E too."
+            )
         values = {
             "A": state,
             "B": inputs,

@@ -78,14 +78,15 @@ def linearise_dynamics(
 
 def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
     """Return how far each state, input and disturbance moves in use, from what is given of it."""
-    size = np.maximum(np.abs(point), 1.0)
+    size: Array = np.maximum(np.abs(point), 1.0)
     if scale is None:
         return size
     given = to_float("scale", scale)
     given = as_array("scale", given, (point.size if given.shape == point.shape else n,))
     if np.any(given <= 0):
         raise ValueError(f"scale = {given.tolist()} must be above 0 in each entry.")
-    return np.concatenate([given, size[given.size :]])
+    size[: given.size] = given
+    return size
 
 
 def linearise_env(

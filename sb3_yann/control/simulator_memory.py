@@ -1,7 +1,8 @@
-"""Whether a simulator remembers more than the state that it is set to: delays, actuators, clocks."""
+"""Whether a simulator remembers more than the state that it is set to, as a delay does."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,4 +69,4 @@ def _trajectory(
         states.append(simulator.go_on(u) if k else simulator.next_state(x, u))
         if simulator.over or not np.all(np.abs(states[-1] - x) <= farthest):
             break
-    return list(zip(states[1:-1], states[2:], strict=True))
+    return list(pairwise(states[1:]))

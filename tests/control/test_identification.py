@@ -236,7 +236,9 @@ def test_delay_of_an_input_that_is_held_is_named() -> None:
 def test_input_without_effect_is_warned_of() -> None:
     x, u, _ = record(0, process=0.1)
     other = np.random.default_rng(5).normal(size=u.shape)
-    with pytest.warns(UserWarning, match=r"u\[1\] has no effect on the next state that can be told"):
+    with pytest.warns(
+        UserWarning, match=r"u\[1\] has no effect on the next state that can be told"
+    ):
         identify(x, np.hstack([u, other]), dt=1)
 
 
@@ -320,8 +322,16 @@ BAD_DATA: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"ridge": -1}, ValueError, "ridge = -1 must be 0 or"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
     ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
-    ({"time": np.arange(400)}, ValueError, r"time of episode 0 has shape \(400,\), expected \(401,"),
-    ({"time": np.arange(401) % 400}, ValueError, "time of episode 0 does not increase after row 39"),
+    (
+        {"time": np.arange(400)},
+        ValueError,
+        r"time of episode 0 has shape \(400,\), expected \(401,",
+    ),
+    (
+        {"time": np.arange(401) % 400},
+        ValueError,
+        "time of episode 0 does not increase after row 39",
+    ),
     ({"time": np.arange(401) / 60}, ValueError, r"dt = 1, but a step of the log takes 0\.0166667"),
     ({"time": [np.arange(401)] * 2}, ValueError, "time has 2 episodes, states has 1"),
     ({"d_ss": [0.0]}, ValueError, "d_ss is given, but there are no disturbances"),

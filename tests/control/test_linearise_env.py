@@ -179,6 +179,7 @@ BAD_PLANTS: list[tuple[Any, dict[str, Any], str]] = [
     (lambda x, u: 0.5 * x + u + next(CLOCK), {}, "has states besides these"),
     (lambda x, u: 0.5 * x + u, {"action": [1.0]}, r"action = \[1\.0\]: entry 0 lies on its bound"),
     (lambda x, u: 0.5 * x + u + 2, {"state": [0]}, "No steady state was found.*moves in one step"),
+    (lambda x, u: 0.5 * x + u + 2, {"state": [0]}, r"u\[0\] is at its lower bound, -1: the inputs"),
     (lambda x, u: x + u + 2, {"state": [0], "action": [0]}, "no steady state: one step moves it"),
     (lambda x, u: 0.999 * x, {"state": [1], "action": [0]}, "no steady state: one step moves it"),
     (lambda x, u: x, {"state": [[0]]}, "must be a vector of finite numbers, or NaN"),
@@ -256,7 +257,7 @@ def test_an_actuator_that_lags_is_noticed() -> None:
             self.valve += 0.3 * (float(action[0]) - self.valve)
             return super().step(np.array([self.valve]))
 
-    with pytest.raises(ValueError, match="starts anew .a delay of the input, an actuator"):
+    with pytest.raises(ValueError, match=r"starts anew \(a delay of the input, an actuator"):
         LinearModel.from_env(Valve())
 
 
