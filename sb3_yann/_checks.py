@@ -146,7 +146,9 @@ def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None)
     space, u_ss = venv.action_space, problem.model.u_ss
     if not (isinstance(space, spaces.Box) and plain.envs[0].unwrapped.action_space == space):
         return
-    if np.any(u_ss != 0) and np.all((space.low <= u_ss) & (u_ss <= space.high)):
+    if getattr(plain.observation_space, "problem", None) is not None:
+        return  # they are made for each other
+    if np.any(u_ss != 0) and np.all((space.low < u_ss) & (u_ss < space.high)):
         warnings.warn(
             f"u_min and u_max of the MPC are the bounds of the env's own actions, and its model "
             f"has the operating point u_ss = {u_ss.tolist()} between them. The MPC counts from "
