@@ -25,6 +25,7 @@ from sb3_yann._checks import (
     require_matching,
     require_plain_td3,
     require_undone_normalisation,
+    warn_of_absolute_inputs,
 )
 from sb3_yann._construction import (
     algorithm_under_construction,
@@ -90,6 +91,7 @@ class YannActor(SeesTheta, Actor):
             activation_fn(),
             max_correction=max_correction,
             pinned=pin_equilibrium,
+            rate=(problem.du_min, problem.du_max) if problem.has_rate_bounds else None,
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -323,6 +325,7 @@ class YannPolicy(TD3Policy):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             algorithm.policy_kwargs = {**algorithm.policy_kwargs, "problem": self.problem}
         require_matching(self.problem, observation_space, action_space, observation)
+        warn_of_absolute_inputs(self.problem, algorithm)
         require_undone_normalisation(self.problem, algorithm, observation)
         self.observation = observation
         self.gamma = getattr(algorithm, "gamma", 0.99) if gamma is None else gamma

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sb3_yann.networks.yann import YannLayer
 
 _KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
-_KEPT += ", float32[:, ::1], float32[:, ::1]"
+_KEPT += ", float32[:, ::1], float32[:, ::1], float32[:, :, ::1]"
 
 
 @compiled()
@@ -39,15 +39,24 @@ def _locate(
     return u, used[:slots].copy(), slot
 
 
+@compiled()
+def _between(value: Any, low: Any, high: Any) -> Any:
+    """Return a value clamped to bounds; NaN stays what it is."""
+    value = high if value > high else value
+    return low if value < low else value
+
+
 @compiled(
     f"Tuple((float32[:, ::1], {_KEPT}))"
-    f"(float64[::1], int64[::1], float64[:, ::1], float64[::1], float64, {WEIGHTS})"
+    "(float64[::1], int64[::1], float64[:, ::1], float64[::1], float64[:, ::1], float64, "
+    f"{WEIGHTS})"
 )
 def _forward(
     floats: Array,
     whole: Integers,
     theta: Array,
     scaling: Array,
+    change: Array,
     limit: float,
     nodes: Single,
     second: Single,
@@ -64,13 +73,14 @@ def _forward(
     scaling : ndarray, shape (n + 2 m,)
         One over the half-widths of the box of theta; the middles of the input ranges; one over
         their half-widths.
+    change : ndarray, shape (2, m) or (0, m)
+        By how much an action may differ from the previous input, the last m entries of theta.
     limit : float
         The network's output is clamped to [-limit, limit].
     nodes, second, last, pinned
         As in :func:`network`.
     """
     (batch, n), m = theta.shape, last.shape[1]
-    one = np.float32(1)
     u, used, slot = _locate(floats, whole, theta, len(pinned))
     x = np.empty((batch, n), np.float32)
     for row in range(batch):
@@ -78,20 +88,22 @@ def _forward(
             x[row, j] = theta[row, j] * scaling[j]
     out, hidden1, hidden2 = network(x, used, slot, nodes, second, last, pinned)
     actions, total = np.empty((batch, m), np.float32), np.empty((batch, m), np.float32)
+    bounds = np.empty((2, batch, m), np.float32)
+    bounds[0], bounds[1] = -1, 1
     for row in range(batch):
         for k in range(m):
-            law = (u[row, k] - scaling[n + k]) * scaling[n + m + k]
-            law = 1.0 if law > 1 else law
-            law = -1.0 if law < -1 else law
+            for side in range(len(change)):
+                previous = (theta[row, n - m + k] - scaling[n + k]) * scaling[n + m + k]
+                bounds[side, row, k] = min(max(previous + change[side, k], -1.0), 1.0)
+            low, high = bounds[0, row, k], bounds[1, row, k]
+            law = np.float32((u[row, k] - scaling[n + k]) * scaling[n + m + k])
             correction = out[row, k]
             if limit < np.inf:  # which NaN and infinite weights do not pass either
                 correction = np.float32(min(max(correction, -limit), limit))
-                correction = correction if out[row, k] == out[row, k] else one - one
-            action = np.float32(law) + correction
-            total[row, k] = action
-            action = one if action > one else action
-            actions[row, k] = -one if action < -one else action
-    return actions, x, used, slot, hidden1, hidden2, out, total
+                correction = correction if out[row, k] == out[row, k] else np.float32(0)
+            total[row, k] = _between(law, low, high) + correction
+            actions[row, k] = _between(total[row, k], low, high)
+    return actions, x, used, slot, hidden1, hidden2, out, total, bounds
 
 
 @compiled(
@@ -113,6 +125,7 @@ def _backward(
     hidden2: Single,
     out: Single,
     total: Single,
+    bounds: Single,
 ) -> tuple[Single, Single, Single]:
     """Return the gradients of a loss by nodes, second and last, see :func:`network_backward`.
 
@@ -122,10 +135,10 @@ def _backward(
     back = gradient.copy()
     for row in range(len(back)):
         for k in range(back.shape[1]):
-            g = back[row, k]
-            for value, bound in ((total[row, k], 1.0), (out[row, k], limit)):
-                if (value >= bound and g < 0) or (value <= -bound and g > 0):
-                    back[row, k] = 0
+            above = total[row, k] >= bounds[1, row, k] or out[row, k] >= limit
+            below = total[row, k] <= bounds[0, row, k] or out[row, k] <= -limit
+            if (above and back[row, k] < 0) or (below and back[row, k] > 0):
+                back[row, k] = 0
     by_nodes, by_second, by_last, _ = network_backward(
         back, x, used, slot, dense, nodes, second, last, pinned, hidden1, hidden2
     )
@@ -146,7 +159,8 @@ def _given(layer: YannLayer, theta: th.Tensor, weights: tuple[th.Tensor, ...]) -
     arrays = [weight.detach().numpy() for weight in weights]
     law = layer.piecewise_affine.packed
     limit = np.inf if layer.reach is None else layer.reach
-    return [*law, theta.numpy(), layer.scaling, limit, *arrays, layer.network.pinned_array]
+    known = (theta.numpy(), layer.scaling, layer.change_array, limit)
+    return [*law, *known, *arrays, layer.network.pinned_array]
 
 
 class _Layer(th.autograd.Function):
@@ -157,7 +171,7 @@ class _Layer(th.autograd.Function):
         given = _given(layer, theta, weights)
         actions, *kept = _forward(*given)
         ctx.save_for_backward(*weights)  # who changes them before the way back is told so
-        ctx.given, ctx.kept, ctx.by_row = given[4:], kept, layer.row_gradients
+        ctx.given, ctx.kept, ctx.by_row = given[5:], kept, layer.row_gradients
         return th.from_numpy(actions)
 
     @staticmethod

@@ -38,6 +38,10 @@ class YannLayer(nn.Module):
     pinned : bool, default True
         Whether training must leave the equilibrium where it is. A law whose steady-state input is
         wrong has to be free to move it.
+    rate : pair of ndarray, shape (m,), optional
+        ``du_min`` and ``du_max``: the input never moves by more from the previous one, the last m
+        entries of theta, whatever the networks become. The law itself is held to that too, where
+        it has no solution.
 
     Raises
     ------
@@ -51,6 +55,9 @@ class YannLayer(nn.Module):
     half_space_b: th.Tensor
     theta_half: th.Tensor
     resting: th.Tensor
+    middle: th.Tensor
+    half_range: th.Tensor
+    change: th.Tensor
 
     def __init__(
         self,
@@ -59,6 +66,7 @@ class YannLayer(nn.Module):
         activation: Activation = th.tanh,
         max_correction: float | None = None,
         pinned: bool = True,
+        rate: tuple[Array, Array] | None = None,
     ) -> None:
         super().__init__()
         if not np.all(np.isfinite([law.u_min, law.u_max])):
@@ -80,6 +88,13 @@ class YannLayer(nn.Module):
         self._constant("half_space_A", A)
         self._constant("half_space_b", b)
         self._constant("theta_half", (law.theta_max - law.theta_min) / 2, th.float32)
+        self.rated = rate is not None
+        if rate is not None:
+            self._constant("middle", middle)
+            self._constant("half_range", reach)
+            # In both directions a little is left for the rounding of actions and observations.
+            room = np.maximum(np.stack([-rate[0], rate[1]]) / reach - 1e-6, 0.0)
+            self._constant("change", room * [[-1.0], [1.0]])
         at_origin = np.minimum.reduceat(law.b, law.starts) >= -law.tolerance
         self.network = ZeroOutputNetwork(
             law.n_theta,
@@ -90,6 +105,7 @@ class YannLayer(nn.Module):
         )
         self.scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
         self.has_its_law = True
+        self.change_array = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n).
@@ -105,7 +121,10 @@ class YannLayer(nn.Module):
         correction = self.network((theta / self.theta_half).to(self.theta_half), region)
         if self.reach is not None:
             correction = clamp_alive(correction, self.reach)
-        return clamp_alive(self._law(theta, region, inside) + correction)
+        output = self._law(theta, region, inside) + correction
+        if not self.rated:
+            return clamp_alive(output)
+        return clamp_alive_between(output, *self._within_reach(theta))
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
@@ -124,7 +143,15 @@ class YannLayer(nn.Module):
         u = (self.gains[region] * theta[:, None]).sum(-1) + self.offsets[region]
         if self.outside == "zero":
             u = th.where(inside[:, None], u, self.resting)
-        return u.clamp(-1, 1).to(self.theta_half)
+        u = u.clamp(-1, 1).to(self.theta_half)
+        return u.clamp(*self._within_reach(theta)) if self.rated else u
+
+    @th.no_grad()
+    def _within_reach(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the bounds (batch, m) that the rate leaves of [-1, 1]."""
+        previous = (theta[:, -len(self.middle) :] - self.middle) / self.half_range
+        low, high = (previous + self.change[:, None]).clamp(-1, 1).to(self.theta_half)
+        return low, high
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         before = {name: value.clone() for name, value in self.named_buffers(recurse=False)}
@@ -153,21 +180,21 @@ def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
 
 
 class _ClampAlive(th.autograd.Function):
-    """Clamp to [-limit, limit]; backward, stop only what would push further out."""
+    """Clamp to [low, high]; backward, stop only what would push further out."""
 
     @staticmethod
-    def forward(ctx: Any, x: th.Tensor, limit: float) -> th.Tensor:
+    def forward(ctx: Any, x: th.Tensor, low: Any, high: Any) -> th.Tensor:
         ctx.save_for_backward(x)
-        ctx.limit = limit
-        return x.clamp(-limit, limit)
+        ctx.low, ctx.high = low, high
+        return x.clamp(low, high)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, None]:
+    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, None, None]:
         (x,) = ctx.saved_tensors
         (grad,) = grad_outputs
         # Descent moves x against its gradient.
-        outward = ((x >= ctx.limit) & (grad < 0)) | ((x <= -ctx.limit) & (grad > 0))
-        return grad.masked_fill(outward, 0.0), None
+        outward = ((x >= ctx.high) & (grad < 0)) | ((x <= ctx.low) & (grad > 0))
+        return grad.masked_fill(outward, 0.0), None, None
 
 
 def clamp_alive(x: th.Tensor, limit: float = 1.0) -> th.Tensor:
@@ -176,5 +203,11 @@ def clamp_alive(x: th.Tensor, limit: float = 1.0) -> th.Tensor:
     The gradient of `torch.clamp` vanishes beyond the bounds, so a saturated region would never
     learn to leave its bound.
     """
-    clamped: th.Tensor = _ClampAlive.apply(x, limit)  # type: ignore[no-untyped-call]
+    clamped: th.Tensor = _ClampAlive.apply(x, -limit, limit)  # type: ignore[no-untyped-call]
+    return clamped
+
+
+def clamp_alive_between(x: th.Tensor, low: th.Tensor, high: th.Tensor) -> th.Tensor:
+    """Return x clamped to bounds of its own shape, with the gradient of :func:`clamp_alive`."""
+    clamped: th.Tensor = _ClampAlive.apply(x, low, high)  # type: ignore[no-untyped-call]
     return clamped
