@@ -567,7 +567,7 @@ def test_the_linear_model_given_as_prediction_model_changes_no_more_than_roundin
     mine.critic.load_state_dict(default.critic.state_dict(), strict=False)
     found = []
     for model in (mine, default):
-        data = default.replay_buffer.sample(64) if not found else data
+        data = data if found else default.replay_buffer.sample(64)
         (q,) = model.critic(data.observations, data.actions)[:1]
         model.critic.optimizer.zero_grad()
         q.square().sum().backward()

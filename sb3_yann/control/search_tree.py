@@ -7,6 +7,7 @@ tree", with vertices in place of their linear programs, and leaves of a few regi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +21,11 @@ from sb3_yann.control._validation import Array
 LEAF = 4
 """A node with this many regions is not split further."""
 
-CANDIDATES = 48
+NODES = 3
+"""Hyperplanes for each region, at most: where regions are long and thin, every hyperplane cuts some
+of them, and trees down to the last region grow without bound."""
+
+CANDIDATES = 32
 """Facets tried at a node, drawn from those of its regions."""
 
 OVERLAP = 1e-8
@@ -118,17 +123,22 @@ def build_tree(
     children: list[list[int]] = []
     leaves: list[Integers] = []
     everything = np.arange(len(starts), dtype=np.int64)
-    waiting: list[tuple[Integers, int, int]] = [(everything, -1, 0)]  # regions, parent, its side
+    # The fullest node first, and of those the oldest: a number, its parent and side.
+    waiting: list[tuple[int, int, Integers, int, int]] = [(-len(starts), 0, everything, -1, 0)]
+    most, order = NODES * len(starts), 0
     while waiting:
-        inside, parent, side = waiting.pop()
-        split = None if len(inside) <= LEAF else _best_split(regions, inside, random)
+        _, _, inside, parent, side = heappop(waiting)
+        full = len(levels) >= most or len(inside) <= LEAF
+        split = None if full else _best_split(regions, inside, random)
         if parent >= 0:
             children[parent][side] = -1 - len(leaves) if split is None else len(levels)
         if split is None:
             leaves.append(np.sort(inside))
             continue
-        row, below, above = split
-        waiting += [(above, len(levels), 1), (below, len(levels), 0)]
+        row, *parts = split
+        for which, part in enumerate(parts):
+            order += 1
+            heappush(waiting, (-len(part), order, part, len(levels), which))
         normals.append(regions.A[row])
         levels.append(regions.b[row])
         children.append([0, 0])
