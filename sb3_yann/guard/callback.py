@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
@@ -10,16 +11,16 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._checks import as_factor
+from sb3_yann.guard.chance import chance_untouched
+from sb3_yann.guard.checks import check_between, check_not_nested, check_whole
 from sb3_yann.guard.plant import PlantTrials
 from sb3_yann.guard.record import Decision, GuardState, write_csv
 from sb3_yann.guard.simulator import SimulatorTrials
-from sb3_yann.guard.snapshot import Snapshot, same
+from sb3_yann.guard.snapshot import Snapshot
 from sb3_yann.policies import YannPolicy
 
 
@@ -146,8 +147,7 @@ class ImprovementGuard(BaseCallback):
             ("patience", patience, 1),
             ("trial_episodes", trial_episodes, 3),
         ):
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}.")
+            check_whole(name, value, least)
         for name, flag in (("by_region", by_region), ("wander", wander)):
             if not isinstance(flag, bool):
                 raise TypeError(f"{name} = {flag!r} must be True or False.")
@@ -158,8 +158,7 @@ class ImprovementGuard(BaseCallback):
             ("smallest_step", smallest_step, 0.0, 1.0),
             ("significance", significance, 0.0, 0.5),
         ):
-            if not low <= as_factor(name, factor) <= high:
-                raise ValueError(f"{name} = {factor!r} must be between {low:g} and {high:g}.")
+            check_between(name, factor, low, high)
         self.shrink, self.grow, self.smallest_step = shrink, grow, smallest_step
         self.record = None if record is None else Path(record)
         self.trials: SimulatorTrials | PlantTrials
@@ -186,6 +185,7 @@ class ImprovementGuard(BaseCallback):
         return state
 
     def _init_callback(self) -> None:
+        check_not_nested(self)
         policy = self.model.policy
         if not isinstance(policy, YannPolicy):
             raise TypeError(
@@ -197,17 +197,39 @@ class ImprovementGuard(BaseCallback):
         self._mpc = Snapshot.of(policy) if untrained else None
 
     def _on_training_start(self) -> None:
+        check_not_nested(self)
         self.trials.start(self)
         known = getattr(self.model, "guard_state", None)
         if known is None or known.settings != self.trials.settings:
-            state = GuardState(self.trials.settings, Snapshot.of(self.policy), evidence=None)
-            if known is not None:  # other starts or another plant: the policies are tried anew
-                state.decisions, state.episodes = known.decisions, known.episodes
-            self.model.guard_state = state  # type: ignore[attr-defined]
-            self.trials.first_evidence(self)
+            self._start_afresh(known)
+        elif not self.trials.still_holds(self):
+            warnings.warn(
+                f"The guard's env {self.trials.settings['env']} does not play the episodes that "
+                "the guard's evidence is from: it is another simulator of that name. The policies "
+                "are tried anew.",
+                stacklevel=2,
+            )
+            self._start_afresh(known)
         self.policy.actor_step = self.state.step
         if self.record is not None:
             write_csv(self.record, self.decisions)
+
+    def _start_afresh(self, known: GuardState | None) -> None:
+        """Gather first evidence; where that fails, leave everything as it was."""
+        present = Snapshot.of(self.policy)
+        state = GuardState(self.trials.settings, present, evidence=None)
+        if known is not None:  # other starts or another plant: the policies are tried anew
+            state.decisions, state.episodes = [*known.decisions], known.episodes
+        self.model.guard_state = state  # type: ignore[attr-defined]
+        try:
+            self.trials.first_evidence(self, known)
+        except BaseException:
+            present.restore(self.policy)
+            self.model.guard_state = known  # type: ignore[attr-defined]
+            raise
+
+    def _on_rollout_start(self) -> None:
+        self.trials.before_steps(self)
 
     def _on_step(self) -> bool:
         self.state.episodes += int(np.sum(self.locals["dones"]))
@@ -229,7 +251,7 @@ class ImprovementGuard(BaseCallback):
     def mpc(self) -> Snapshot:
         """The MPC itself, with an optimizer as new."""
         if self._mpc is None:
-            with th.random.fork_rng(devices=[]):  # building an actor draws weights
+            with chance_untouched():  # building an actor draws weights
                 actor = self.policy.make_actor()
             optimizer = {**self.policy.actor.optimizer.state_dict(), "state": {}}
             self._mpc = Snapshot.of_parts(actor.state_dict(), optimizer)
@@ -275,6 +297,5 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     state, policy = getattr(model, "guard_state", None), model.policy
     if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
         raise ValueError(f"No ImprovementGuard has been at work on this {type(model).__name__}.")
-    if not same(state.accepted, policy):
-        state.accepted.restore(policy)
+    state.accepted.restore(policy)
     policy.actor_step = 1.0

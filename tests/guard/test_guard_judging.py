@@ -8,14 +8,14 @@ from scipy import stats
 
 from sb3_yann.guard.judging import Paired, PlantEpisodes, probability_of_chance
 
-NONE = np.zeros(3, dtype=np.int64)
+NONE = np.zeros((3, 2), dtype=np.int64)
 NAN, INF = np.nan, np.inf
 
 
 def objection(costs, violations=NONE, accepted=(10.0, 20.0, 30.0), margin=1.0) -> str:
     mpc = np.array([10.0, 20.0, 30.0])
     return Paired(mpc, np.array(accepted), NONE, margin).objection(
-        np.array(costs, float), np.array(violations)
+        np.array(costs, float), violations
     )
 
 
@@ -48,12 +48,24 @@ def test_without_a_margin_no_start_may_cost_more() -> None:
 
 
 def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_costs() -> None:
-    assert "1 starts with violations, the first is number 2" in objection([1, 1, 1], [0, 0, 1])
-    paired = Paired(np.ones(3), np.ones(3), np.array([0, 2, 0]), 1.0)
-    assert paired.objection(np.ones(3), np.array([0, 2, 0])) == ""
-    assert paired.objection(np.ones(3), np.array([0, 1, 0])) == ""
-    assert "violations" in paired.objection(np.zeros(3), np.array([0, 3, 0]))
-    assert "violations" in paired.objection(np.zeros(3), np.array([1, 0, 0]))
+    def violations(*steps: int):
+        return np.column_stack([steps, [0, 0, 0]])
+
+    message = "1 starts with violations, the first is number 2"
+    assert message in objection([1, 1, 1], violations(0, 0, 1))
+    paired = Paired(np.ones(3), np.ones(3), violations(0, 2, 0), 1.0)
+    assert paired.objection(np.ones(3), violations(0, 2, 0)) == ""
+    assert paired.objection(np.ones(3), violations(0, 1, 0)) == ""
+    assert "violations" in paired.objection(np.zeros(3), violations(0, 3, 0))
+    assert "violations" in paired.objection(np.zeros(3), violations(1, 0, 0))
+
+
+def test_an_episode_that_is_terminated_is_refused_though_it_has_fewer_violations() -> None:
+    accepted = np.array([[2, 0], [0, 1]])
+    paired = Paired(np.ones(2), np.ones(2), accepted, 1.0)
+    assert "the env terminates" in paired.objection(np.zeros(2), np.array([[1, 1], [0, 1]]))
+    assert paired.objection(np.zeros(2), accepted) == ""
+    assert "violations" in paired.objection(np.zeros(2), np.array([[2, 0], [1, 0]]))
 
 
 def episodes(costs, predicted=None) -> PlantEpisodes:
