@@ -11,7 +11,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -19,6 +18,7 @@ from sb3_yann.guard.chance import chance_untouched
 from sb3_yann.guard.checks import check_between, check_not_nested, check_whole
 from sb3_yann.guard.plant import PlantTrials
 from sb3_yann.guard.record import Decision, GuardState, write_csv
+from sb3_yann.guard.restoring import restore_accepted
 from sb3_yann.guard.simulator import SimulatorTrials
 from sb3_yann.guard.snapshot import Snapshot
 from sb3_yann.policies import YannPolicy
@@ -32,34 +32,43 @@ class ImprovementGuard(BaseCallback):
     over, actor, target actor and the actor's optimizer return to the accepted state, bit for bit,
     while the critic goes on learning. A return shrinks the actor's steps, an acceptance lets them
     grow again. When `learn` returns, the model *is* the accepted policy. Until then, after an
-    exception and in the zips of a CheckpointCallback, it is a candidate:
+    exception, Ctrl-C, and in the zips of a CheckpointCallback, it is a candidate:
     :func:`restore_accepted` puts the accepted policy in its place.
 
     **With a simulator** (``env`` given) the deterministic policy plays seeded episodes there,
     from the same starts as the accepted policy and the untouched MPC did. It is refused if its
     mean cost is above the accepted policy's, if one start costs more than with the MPC by more than
     the margin, or if an episode has more steps with ``info["violation"]`` than the accepted
-    policy's, or is terminated by the env where the accepted policy's is not. Where the whole
-    is refused, the networks of some regions may still be accepted, under the same conditions. A
-    refused candidate that is better than the MPC on average gets ``patience``.
+    policy's, or is terminated by the env where the accepted policy's is not. Regions that no
+    episode comes through stay as they were. Where the whole is refused, the networks of some
+    regions may still be accepted, under the same conditions. A refused candidate that is better
+    than the MPC on average gets ``patience``. An error of the simulator is a refusal where the MPC
+    meets none from the same starts.
 
     **On a plant alone** (``env=None``) the training episodes decide. The actor learns for
     ``trial_episodes`` episodes, then rests for as many, of which all are played by one and the same
     policy. It is accepted if it costs less than the accepted policy did, by a one-sided test of
     size ``significance`` (:func:`sb3_yann.guard.judging.probability_of_chance`: an analysis of
-    covariance on the cost that the linear model predicts for each start). A violation at any time,
-    or a change of the actor while it rests, brings the accepted policy back at once; after a
-    violation the actor rests until that episode is over. The first policy that is accepted is the
-    one that training starts with, and plays the first block. Each test errs with probability
-    ``significance``, so a policy that is worse *can* pass (one of ten tests that find no
-    difference does with a probability of about 20 %); the simulator's paired episodes have no
-    such chance, but hold for their starts only.
+    covariance on the cost that the linear model predicts for each start), and if none of its
+    episodes costs far more than these explain. A violation at any time, a parameter that is no
+    finite number, or a change of the actor while it rests, brings the accepted policy back at once;
+    after a violation the actor rests until that episode is over. The first policy that is accepted
+    is the one that training starts with, and plays the first block: alone, without the noise and
+    the random actions that NoActionNoise takes away. Each test errs with probability
+    ``significance``, so a policy that is worse *can* pass: of ten candidates that are no different
+    one or more does in a quarter of all cases. Nor does the test see what is rare, or what has
+    changed meanwhile: a policy that loses one start in ten by 200, where an episode costs 60, and
+    gains 12 on the others, passes in a third of the cases (it loses none in its block); and as
+    the accepted block is not played again, a plant that has become 10 % cheaper in between lets an
+    unchanged policy pass in two thirds. The simulator's paired episodes have no such chance, but
+    hold for their starts only.
 
     The guard draws no random numbers and leaves the training env and the buffer alone. Its state
     is an attribute of the model, ``model.guard_state``, and is saved and loaded with it: another
-    guard with the same settings goes on where the last one stopped. Scalars in tensorboard are
-    ``guard/candidate_cost``, ``guard/accepted_cost``, ``guard/mpc_cost``, ``guard/worst_start``,
-    ``guard/step``, ``guard/accepted`` and ``guard/rejected``.
+    guard with the same settings goes on where the last one stopped, if a few episodes show that
+    the simulator is still the same; with other settings what was accepted is tried anew. Scalars in
+    tensorboard are ``guard/candidate_cost``, ``guard/accepted_cost``, ``guard/mpc_cost``,
+    ``guard/worst_start``, ``guard/step``, ``guard/accepted`` and ``guard/rejected``.
 
     Parameters
     ----------
@@ -71,9 +80,10 @@ class ImprovementGuard(BaseCallback):
         Number of seeded starts.
     fresh : int, default 50
         Number of new starts, others each time, on which a policy is tried once more before it is
-        accepted, and ten times as many when training ends. Starts by which it loses against the
-        MPC join the others for good, and what was accepted before is put back: or the MPC, where
-        that loses there as well. 0 is for none.
+        accepted, and ten times as many when training ends. It loses by one start, as above, or by
+        a mean cost above the MPC's. Then the ten hardest of these starts join the others for good,
+        and the last policy accepted before that passes on all of them is put back, or the MPC.
+        0 is for none.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
     every : int, default 1
@@ -105,8 +115,10 @@ class ImprovementGuard(BaseCallback):
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range; when training starts, if the policy is no YannPolicy or the
-        simulator is the training env.
+        If an argument is out of range; when training starts, if the policy is no YannPolicy, the
+        simulator is the training env or gives costs that are no numbers, the guard is within an
+        EveryNTimesteps or the like, or, on a plant alone, if other actions than the policy's are
+        to be played.
     """
 
     model: OffPolicyAlgorithm
@@ -281,21 +293,3 @@ class ImprovementGuard(BaseCallback):
                 + (f" ({decision.reason})" if decision.reason else "")
                 + f"; mean cost {decision.accepted_cost:.6g}, MPC {decision.mpc_cost:.6g}"
             )
-
-
-def restore_accepted(model: BaseAlgorithm) -> None:
-    """Make the policy that a guard accepted last the model's, in training or after a load.
-
-    For what `learn` does at its end and an exception leaves undone, and for a model that was saved
-    in the midst of training.
-
-    Raises
-    ------
-    ValueError
-        If no guard has been at work on the model.
-    """
-    state, policy = getattr(model, "guard_state", None), model.policy
-    if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
-        raise ValueError(f"No ImprovementGuard has been at work on this {type(model).__name__}.")
-    state.accepted.restore(policy)
-    policy.actor_step = 1.0
