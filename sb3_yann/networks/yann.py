@@ -120,6 +120,8 @@ class YannLayer(nn.Module):
         region, inside = self.locate(theta)
         correction = self.network((theta / self.theta_half).to(self.theta_half), region)
         if self.reach is not None:
+            # The bound holds for weights that overflow, or are no numbers, as well.
+            correction = correction.nan_to_num(0.0, self.reach, -self.reach)
             correction = clamp_alive(correction, self.reach)
         output = self._law(theta, region, inside) + correction
         if not self.rated:
