@@ -565,9 +565,8 @@ def test_the_linear_model_given_as_prediction_model_changes_no_more_than_roundin
     default = with_full_buffer(algorithm, two_inputs(), critic_warmup=3)
     updates(default, 10)
     mine.critic.load_state_dict(default.critic.state_dict(), strict=False)
-    found = []
+    found, data = [], default.replay_buffer.sample(64)
     for model in (mine, default):
-        data = data if found else default.replay_buffer.sample(64)
         (q,) = model.critic(data.observations, data.actions)[:1]
         model.critic.optimizer.zero_grad()
         q.square().sum().backward()
