@@ -409,9 +409,9 @@ class LinearMPC(ReadOnlyArrays):
         ----------
         solver : {"walk", "ppopt"}, default "walk"
             What finds the regions: a walk over them from facet to facet, or, as a reference and
-            hundreds of times slower, ppopt. Both give the same law.
+            many times slower, ppopt. Both give the same law.
         time_limit : float, optional
-            Seconds after which to give up.
+            Seconds after which to give up the search.
         region_limit : int, optional
             Number of regions beyond which to give up.
         progress : bool, default False
