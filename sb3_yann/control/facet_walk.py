@@ -48,7 +48,7 @@ def walk(program: ParametricQP, watch: Watch) -> list[Region]:
     found = _Walk(program, watch)
     found.explore(found.seeds(20))
     for _ in range(10):
-        missed = set(found.seeds(50 * program.F.shape[1])) - found.seen
+        missed = set(found.seeds(20 * program.F.shape[1])) - found.seen
         if not missed:
             break
         found.explore(missed)

@@ -15,6 +15,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -61,6 +62,10 @@ def load_law(key: str) -> PiecewiseAffine | None:
     try:
         if path is None or not path.is_file():
             return None
+        with ZipFile(path) as archive:  # first: of a damaged file numpy leaves a handle open
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"{damaged} in it is damaged")
         return PiecewiseAffine.load(path)
     except PermissionError:
         return None

@@ -10,7 +10,6 @@ from scipy import optimize
 
 from sb3_yann.control._validation import Array
 
-
 # DAQP ends up to 1e-6 from the largest ball: below this it must not end so early.
 THIN = 1e-5
 # Of polyhedra with a smaller ball DAQP's own search for redundant rows loses facets.

@@ -53,8 +53,8 @@ def ppopt_regions(program: ParametricQP, watch: Watch) -> list[Region]:
             tuple(sorted(int(rows[k]) for k in one.active_set)),
             one.A,
             one.b.ravel(),
-            one.E,
-            one.f.ravel(),
+            one.E.astype(float),  # with one parameter they are whole numbers
+            one.f.ravel().astype(float),
         )
         for one in found
     ]

@@ -95,6 +95,48 @@ def test_a_region_that_reaches_too_far_is_found(monkeypatch: pytest.MonkeyPatch)
     assert solved("benchmark").explicit().locate(theta) != 0
 
 
+def test_a_region_that_is_there_twice_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    message, theta = error_of(monkeypatch, "benchmark", lambda regions: [*regions, regions[3]])
+    assert "region 3 and region 9 are the same" in message
+    assert solved("benchmark").explicit().locate(theta) == 3
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-5, 1e-6])
+@pytest.mark.parametrize("name", ["benchmark", "reactor"])
+def test_a_thin_gap_between_two_regions_is_found(
+    name: str, gap: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(regions: Regions) -> Regions:
+        inner = np.all(np.abs(regions[0].A) < 0.999, axis=1)  # not a bound of theta
+        b = regions[0].b - gap * inner * (np.cumsum(inner) == 1)
+        return [dataclasses.replace(regions[0], b=b), *regions[1:]]
+
+    message, theta = error_of(monkeypatch, name, spoil)
+    assert "no region covers a feasible parameter" in message
+    assert OnlineMPC(solved(name))(theta) is not None
+
+
+@pytest.mark.parametrize("reach", [1e-2, 1e-4, 1e-5])
+@pytest.mark.parametrize("index", range(5))
+def test_one_half_space_that_reaches_a_little_too_far_is_found(
+    index: int, reach: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(regions: Regions) -> Regions:
+        b = regions[index].b.copy()
+        b[0] += reach
+        return [*regions[:index], dataclasses.replace(regions[index], b=b), *regions[index + 1 :]]
+
+    message, _ = error_of(monkeypatch, "benchmark", spoil)
+    assert f"the law of region {index} violates the KKT conditions" in message
+
+
+def test_the_regions_of_ppopt_are_checked_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = module._critical_regions
+    monkeypatch.setattr(module, "_critical_regions", lambda *args: find(*args)[1:])
+    with pytest.raises(ExplicitSolutionError, match="no region covers a feasible parameter"):
+        PROBLEMS["benchmark"]().explicit("ppopt")
+
+
 def test_finding_no_region_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     message, _ = error_of(monkeypatch, "benchmark", lambda regions: [])
     assert "no region was found" in message
