@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import warnings
 from collections.abc import Callable, Iterator
@@ -10,9 +11,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, sparse
+from scipy import sparse
 
 from sb3_yann.control import ParametricQP, PiecewiseAffine
+from sb3_yann.control.polyhedra import largest_ball
 
 Array = NDArray[np.float64]
 PPOPT = "ppopt evaluate, as shipped"
@@ -85,17 +87,17 @@ def affine_law(program: ParametricQP, theta: Array) -> tuple[Array, Array]:
     return np.ascontiguousarray(free[:, :-1]), free[:, -1]
 
 
+@functools.cache
 def centres(law: PiecewiseAffine) -> Array:
     """Return the point of each region that lies farthest inside, shape (p, n)."""
-    half = (law.theta_max - law.theta_min) / 2
-    cost = np.append(np.zeros(law.n_theta), -1.0)
-    found, ends = [], [*law.starts[1:], law.n_halfspaces]
-    for start, end in zip(law.starts, ends, strict=True):
-        rows = law.A[start:end] * half
-        rows = np.column_stack([rows, np.linalg.norm(rows, axis=1)])
-        ball = optimize.linprog(cost, A_ub=rows, b_ub=law.b[start:end], bounds=(None, None))
-        found.append(ball.x[:-1] * half)
-    return np.array(found)
+    middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
+    A, b = law.A * half, law.b - law.A @ middle  # rows of unit length
+    ends = [*law.starts[1:], law.n_halfspaces]
+    found = [
+        largest_ball(A[start:end], b[start:end])[0]
+        for start, end in zip(law.starts, ends, strict=True)
+    ]
+    return np.asarray(middle + half * np.array(found))
 
 
 def daqp_online(program: ParametricQP, inputs: int) -> Callable[[Array], Array | None]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,21 @@ from sb3_yann_envs import problems
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Problem:
-    """An MPC problem with its law, solved when it is first asked for."""
+    """An MPC problem with its law, solved when it is first asked for.
+
+    Attributes
+    ----------
+    name : str
+    make : callable
+    tree_seconds : float
+        What the first location took, once the law was there: it makes the search tree.
+    """
 
     name: str
     make: Callable[[], LinearMPC]
+    tree_seconds: float = float("nan")
 
     @cached_property
     def mpc(self) -> LinearMPC:
@@ -29,8 +39,13 @@ class Problem:
 
     @cached_property
     def law(self) -> PiecewiseAffine:
-        """Its explicit law."""
-        return self.mpc.explicit()
+        """Its explicit law, with its search tree."""
+        _compile()
+        law = self.mpc.explicit()
+        began = time.perf_counter()
+        law.locate((law.theta_min + law.theta_max) / 2)
+        self.tree_seconds = time.perf_counter() - began
+        return law
 
     @property
     def regions(self) -> int:
@@ -45,6 +60,13 @@ class Problem:
             drawn = rng.uniform(self.law.theta_min, self.law.theta_max, (256, self.law.n_theta))
             found = np.concatenate([found, drawn[self.law.in_domain(drawn)]])
         return found[:count]
+
+
+@cache
+def _compile() -> None:
+    """Have the compiled parts of solution and search ready, whichever problem comes first."""
+    law = double_integrator().explicit()
+    law.locate((law.theta_min + law.theta_max) / 2)
 
 
 def double_integrator() -> LinearMPC:

@@ -39,7 +39,7 @@ class Stopwatch:
 
     clock: Callable[[], float] = time.perf_counter
     repeats: int = 40
-    seconds: float = 10.0
+    seconds: float = 6.0
     spent: list[tuple[float, float]] = field(default_factory=list)
 
     def compare(self, tasks: Mapping[str, Task]) -> dict[str, Array]:
