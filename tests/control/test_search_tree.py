@@ -81,11 +81,10 @@ def test_the_tree_finds_the_region_of_a_scan_inside_and_outside(make, stretch: f
 
 
 def test_the_tree_finds_the_region_of_a_scan_on_facets_and_vertices() -> None:
-    law = many_regions()
+    law, long = many_regions(), two_masses()
     points = np.vstack([facet_points(law), vertices(law)])
     assert np.array_equal(law.locate(points), scanned(law, points)[0])
-    assert np.array_equal(law.locate(facet_points(two_masses())),
-                          scanned(two_masses(), facet_points(two_masses()))[0])  # fmt: skip
+    assert np.array_equal(long.locate(facet_points(long)), scanned(long, facet_points(long))[0])
 
 
 @LAWS
