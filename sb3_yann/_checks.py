@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_yann.control import LinearMPC
 from sb3_yann.observations import AffineObservation, require_frozen
@@ -104,13 +107,56 @@ def require_matching(
     law = (problem.u_min, problem.u_max)
     env = (action_space.low, action_space.high)
     reach = np.where(np.isfinite(law[1] - law[0]), law[1] - law[0], 1.0)
-    if env[0].shape != law[0].shape or any(
-        np.any(np.abs(ours - theirs) > 1e-6 * reach) for ours, theirs in zip(law, env, strict=True)
-    ):
-        raise ValueError(
-            f"The action space is [{env[0].tolist()}, {env[1].tolist()}], but the MPC has u_min = "
-            f"{law[0].tolist()} and u_max = {law[1].tolist()}. They must be the same: build the "
-            "LinearMPC with the bounds of the env, and leave out wrappers that rescale actions."
+    u_ss, given = problem.model.u_ss, action_space.shape == law[0].shape
+
+    def same(shift: NDArray[np.floating[Any]]) -> bool:
+        sides = zip(law, env, strict=True)
+        return all(np.all(np.abs(b + shift - limit) <= 1e-6 * reach) for b, limit in sides)
+
+    if given and same(0 * u_ss):
+        return
+    bounds = f"u_min = {law[0].tolist()} and u_max = {law[1].tolist()}"
+    advice = (
+        "They must be the same: build the LinearMPC with the bounds of the env, as deviations from "
+        "u_ss of its model, and leave out wrappers that rescale actions."
+    )
+    if given and same(u_ss):
+        advice = (
+            f"The env takes absolute inputs, and the MPC deviations from u_ss = {u_ss.tolist()}. "
+            "Before the wrappers that complete the observation, wrap the env: env = "
+            "gymnasium.wrappers.RescaleAction(env, numpy.float32("
+            f"{law[0].tolist()}), numpy.float32({law[1].tolist()}))."
+        )
+    raise ValueError(
+        f"The action space is [{env[0].tolist()}, {env[1].tolist()}], but the MPC has {bounds}. "
+        + advice
+    )
+
+
+def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None) -> None:
+    """Warn where the inputs of the plant itself seem to be absolute and are taken for deviations.
+
+    That is where no wrapper changes the actions, the operating point of the model is not zero, and
+    it lies between the bounds of the env.
+    """
+    venv = None if algorithm is None else algorithm.get_env()
+    plain = None if venv is None else venv.unwrapped
+    if venv is None or not isinstance(plain, DummyVecEnv):
+        return
+    space, u_ss = venv.action_space, problem.model.u_ss
+    if not (isinstance(space, spaces.Box) and plain.envs[0].unwrapped.action_space == space):
+        return
+    if getattr(plain.observation_space, "problem", None) is not None:
+        return  # they are made for each other
+    if np.any(u_ss != 0) and np.all((space.low < u_ss) & (u_ss < space.high)):
+        warnings.warn(
+            f"u_min and u_max of the MPC are the bounds of the env's own actions, and its model "
+            f"has the operating point u_ss = {u_ss.tolist()} between them. The MPC counts from "
+            f"u_ss: if the env takes absolute inputs, give it u_min = "
+            f"{(space.low - u_ss).tolist()} and u_max = {(space.high - u_ss).tolist()}, and wrap "
+            "the env in gymnasium.wrappers.RescaleAction with these. If the env takes deviations, "
+            "leave u_ss out of the model.",
+            stacklevel=2,
         )
 
 

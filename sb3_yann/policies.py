@@ -25,6 +25,7 @@ from sb3_yann._checks import (
     require_matching,
     require_plain_td3,
     require_undone_normalisation,
+    warn_of_absolute_inputs,
 )
 from sb3_yann._construction import (
     algorithm_under_construction,
@@ -37,9 +38,11 @@ from sb3_yann.networks import (
     AfterstateValue,
     LinearPrediction,
     QuadraticStateActionValue,
+    RowAdam,
     YannLayer,
 )
 from sb3_yann.networks.value import PredictionModel
+from sb3_yann.networks.zero_output import FEW
 from sb3_yann.observations import AffineObservation
 from sb3_yann.problems import resolve_problem
 
@@ -88,6 +91,7 @@ class YannActor(SeesTheta, Actor):
             activation_fn(),
             max_correction=max_correction,
             pinned=pin_equilibrium,
+            rate=(problem.du_min, problem.du_max) if problem.has_rate_bounds else None,
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -180,7 +184,14 @@ class YannCritic(SeesTheta, ContinuousCritic):
         SB3 asks for it to improve the actor, and throws the gradient by the critic's parameters
         away: it is not computed.
         """
-        trained = [each for each in self.q_networks[0].parameters() if each.requires_grad]
+        q_network = self.q_networks[0]
+        if isinstance(q_network, AfterstateValue) and q_network.compiles:
+            q_network.fixed = True
+            try:
+                return self._in_rewards(super().q1_forward(obs, actions))
+            finally:
+                q_network.fixed = False
+        trained = [each for each in q_network.parameters() if each.requires_grad]
         for parameter in trained:
             parameter.requires_grad_(False)
         try:
@@ -314,6 +325,7 @@ class YannPolicy(TD3Policy):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             algorithm.policy_kwargs = {**algorithm.policy_kwargs, "problem": self.problem}
         require_matching(self.problem, observation_space, action_space, observation)
+        warn_of_absolute_inputs(self.problem, algorithm)
         require_undone_normalisation(self.problem, algorithm, observation)
         self.observation = observation
         self.gamma = getattr(algorithm, "gamma", 0.99) if gamma is None else gamma
@@ -367,6 +379,10 @@ class YannPolicy(TD3Policy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
+        if self.problem.explicit().n_regions > FEW and self.optimizer_kwargs == {"fused": True}:
+            # A step, and its gradients, of the regions in use alone.
+            self.actor.optimizer = RowAdam(self.actor.parameters(), lr=lr_schedule(1))
+            self.actor.mu.row_gradients = True
         # A buffer travels with the parameters: a model that is loaded goes on where it was.
         self.register_buffer("critic_updates", th.zeros((), dtype=th.int64))
         self._attach_hooks()

@@ -265,7 +265,8 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Makes the reward minus the stage cost of the problem, for which the critic is exact.
 
     An env knows no reference, so its own reward cannot be the cost of following one. The cost is
-    that of the observed theta and of the input played there.
+    that of the observed theta and of the input played there. A step in which the input moves by
+    more than the problem allows reports ``info["violation"]``.
 
     Parameters
     ----------
@@ -305,9 +306,20 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
         cost = float(self.problem.stage_cost(self.theta, u))
         observation, _, terminated, truncated, info = self.env.step(action)
+        if self._too_fast(u):
+            info = {**info, "violation": True}
         cost += self.violation_cost if info.get("violation") else 0.0
         self.theta = np.asarray(observation, np.float64)
         return observation, -cost, terminated, truncated, info
+
+    def _too_fast(self, u: Array) -> bool:
+        """Tell whether u moves from u_prev by more than its bounds, and rounding, allow."""
+        mpc = self.problem
+        if not mpc.has_rate_bounds:
+            return False
+        moved = u - self.theta[mpc.parameters.previous]
+        rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
+        return bool(np.any((moved < mpc.du_min - rounding) | (moved > mpc.du_max + rounding)))
 
 
 def _require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:

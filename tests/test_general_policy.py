@@ -37,6 +37,49 @@ def test_predict_equals_an_independent_online_qp(name: str, algorithm: type[DDPG
     assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
 
 
+RATED = ["servo with rates", "servo with all of it", "two tanks, all parts"]
+
+
+def scrambled(model: DDPG, size: float) -> DDPG:
+    """Give the networks of the actor random weights."""
+    with th.no_grad():
+        for parameter in model.actor.parameters():
+            parameter.copy_(size * th.randn(parameter.shape))
+    return model
+
+
+@pytest.mark.parametrize("max_correction", [None, 0.3])
+@pytest.mark.parametrize("size", [0.5, 50.0])
+@pytest.mark.parametrize("name", RATED)
+def test_rates_are_kept_whatever_the_weights(
+    name: str, size: float, max_correction: float | None
+) -> None:
+    mpc = solved(name)
+    options = {"problem": mpc, "max_correction": max_correction}
+    model = scrambled(DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs=options), size)
+    rng = np.random.default_rng(0)
+    box = mpc.theta_min, mpc.theta_max  # inside the domain and outside
+    theta = rng.uniform(*box, (5000, mpc.n_theta)).astype(np.float32)
+    moved = model.predict(theta)[0] - theta[:, mpc.parameters.previous]
+    assert np.all((mpc.du_min <= moved) & (moved <= mpc.du_max))
+    assert np.max(moved / mpc.du_max) > 0.999  # and they are what holds it
+
+
+def test_an_output_at_the_limit_of_its_rate_learns_to_leave_it() -> None:
+    mpc = solved("servo with rates")
+    model = DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs={"problem": mpc})
+    layer = model.actor.mu
+    theta = th.zeros(1, mpc.n_theta)
+    theta[0, mpc.parameters.reference] = 1.0  # asks for more than the rate allows
+    assert layer(theta).item() == pytest.approx((0.7 - 0.5) / 1.5, abs=1e-5)
+    optimizer = th.optim.Adam(layer.parameters(), 1e-2)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (layer(theta) + 0.4).square().sum().backward()
+        optimizer.step()
+    assert layer(theta).item() < 0
+
+
 def unconstrained_steps(mpc: LinearMPC, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return theta, u and the next theta where both lie in the region at the origin."""
     law, rng = mpc.explicit(), np.random.default_rng(0)

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 from conftest import LinearPlant
 
 from sb3_yann import LinearModel, LinearMPC
@@ -20,6 +21,19 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
     assert shortened != code
     exec(compile(shortened, "README.md", "exec"), {"env": double_integrator()})
     assert (tmp_path / "law.npz").exists()
+
+
+def test_the_plant_of_the_readme_ends_at_its_reference() -> None:
+    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    tracking_block = next(block for block in blocks if "tracked=" in block)
+    names = {"np": np, "LinearModel": LinearModel, "LinearMPC": LinearMPC}
+    names["plant"] = plant = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
+    exec(compile(tracking_block, "README.md", "exec"), names)
+    law, x, u = names["tracking"].explicit(), np.zeros(2), np.zeros(1)
+    for _ in range(300):
+        u = law(np.concatenate([x, [0.5], u]))
+        x = plant.step(x, u)
+    np.testing.assert_allclose(x, [0.5, 0], atol=0.01)
 
 
 def double_integrator() -> gym.Env:

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import LinearPlant, two_input_mpc
+from general_problems import servo
 from gymnasium.utils.env_checker import check_env
 
 from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC
@@ -99,6 +100,15 @@ def test_the_reward_is_minus_the_stage_cost_where_the_action_was_chosen() -> Non
     theta, _ = env.reset(seed=0)
     _, reward, *_ = env.step(np.array([0.3, 5.0]))
     assert reward == pytest.approx(-float(mpc.stage_cost(theta, [0.3, 0.7])))
+
+
+def test_an_input_that_moves_faster_than_its_bounds_is_a_violation() -> None:
+    plain = {"tracked": None, "r_min": None, "r_max": None}
+    mpc = servo(du_min=-0.5, du_max=0.7, **plain)
+    env = StageCost(PreviousInput(LinearPlant(servo(**plain))), mpc)
+    env.reset(seed=0)
+    reported = [env.step(np.float32([u]))[4].get("violation", False) for u in (0.7, 0.2, 1, -1)]
+    assert reported == [False, False, True, True]
 
 
 def test_a_violation_may_cost_extra() -> None:

@@ -33,14 +33,21 @@ SURELY_INSIDE = 1e-9
 """With a slack of at least this, no region that the tree left out can be as good."""
 
 
-def compiled(*signatures: str) -> Callable[[F], F]:
+def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
     """Return a decorator that compiles a function for the given types, and keeps the machine code.
 
-    With types that are given nothing is ever compiled for others: those are refused.
+    With types that are given nothing is ever compiled for others: those are refused. With
+    ``fastmath`` sums may be taken in any order, several terms at a time.
     """
 
     def compile_it(function: F) -> F:
-        njit: Any = partial(numba.njit, [*signatures] or None, nogil=True, error_model="numpy")
+        njit: Any = partial(
+            numba.njit,
+            [*signatures] or None,
+            nogil=True,
+            error_model="numpy",
+            fastmath={"reassoc", "contract", "nsz"} if fastmath else False,
+        )
         try:
             result: F = njit(cache=True)(function)
         except RuntimeError:  # no folder to write to: compiled anew in every process
@@ -86,10 +93,13 @@ def _slack(floats: Array, n: int, first: int, last: int, theta: Array, low: floa
 
 
 @compiled()
-def _scan(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
-    """Return the first region whose smallest slack ties with the largest, and the largest."""
+def _scan(floats: Array, whole: Integers, theta: Array, known: float) -> tuple[int, float]:
+    """Return the first region whose smallest slack ties with the largest, and the largest.
+
+    With the slack of some region that is ``known``, most of the others are soon passed over.
+    """
     n, p = whole[0], whole[2]
-    best, largest, low, tied = 0, -np.inf, -np.inf, False
+    best, largest, low, tied = 0, -np.inf, known - floats[1] * (1 + abs(known)), False
     for i in range(p):
         smallest = np.inf
         for k in range(whole[HEADER + i], whole[HEADER + i + 1]):
@@ -101,12 +111,13 @@ def _scan(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
                 smallest = slack
                 if smallest < low:
                     break
+        if smallest < low:
+            continue
+        tied = True
         if smallest > largest:
-            low = smallest - floats[1] * (1 + abs(smallest))
+            low = max(low, smallest - floats[1] * (1 + abs(smallest)))
             tied = largest >= low
             best, largest = i, smallest
-        elif smallest >= low:
-            tied = True
     if not tied:
         return best, largest
     nearly = largest - floats[1] * (1 + abs(largest))
@@ -142,22 +153,23 @@ def _choose(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
     for j in range(n):
         if not np.isfinite(theta[j]):
             return -1, np.nan
+    known = -np.inf
     if whole[4] > 0:
         first, last = _leaf(floats, whole, theta)
         best, largest = -1, -np.inf
         for k in range(first, last):
             i = whole[k]
-            low = largest + floats[1] * (1 + abs(largest)) if best >= 0 else SURELY_INSIDE
-            slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, low)
-            if slack >= low:
+            slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, largest)
+            if slack > largest + floats[1] * (1 + abs(slack)):
                 best, largest = i, slack
-        if best >= 0:
+        if largest >= SURELY_INSIDE:
             return best, largest
-    return _scan(floats, whole, theta)
+        known = largest
+    return _scan(floats, whole, theta, known)
 
 
 @compiled()
-def _input(floats: Array, whole: Integers, theta: Array, out: Array) -> int:
+def input_at(floats: Array, whole: Integers, theta: Array, out: Array) -> int:
     """Write the input at theta to ``out`` and return the region, -1 where theta is not finite."""
     n, m, p, q = whole[0], whole[1], whole[2], whole[3]
     region, largest = _choose(floats, whole, theta)
@@ -183,7 +195,7 @@ def law_at(floats: Array, whole: Integers, theta: Array) -> Array | None:
     if len(theta) != whole[0]:
         return None
     out = np.empty(whole[1])
-    if _input(floats, whole, theta, out) < 0:
+    if input_at(floats, whole, theta, out) < 0:
         return None
     return out
 
@@ -193,7 +205,7 @@ def law_of_batch(floats: Array, whole: Integers, theta: Array) -> Array:
     """Return the inputs (batch, m) at the rows of theta (batch, n), all finite."""
     out = np.empty((len(theta), whole[1]))
     for i in range(len(theta)):
-        _input(floats, whole, theta[i], out[i])
+        input_at(floats, whole, theta[i], out[i])
     return out
 
 

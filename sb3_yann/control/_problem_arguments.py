@@ -37,6 +37,8 @@ def as_outputs(name: str, value: ArrayLike | Sequence[int] | None, n_states: int
     if value is None:
         return as_array(name, np.zeros((0, n_states)), (0, n_states))
     entries = to_float(name, value)
+    if entries.ndim == 0:
+        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value}].")
     if entries.ndim != 1:
         return as_array(name, value, ("q", n_states))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
@@ -78,15 +80,34 @@ def as_linear_cost(
     return as_array("linear_cost q", q, (n_states,)), as_array("linear_cost r", r, (n_inputs,))
 
 
-def as_softness(name: str, value: ArrayLike | None, size: int) -> Array:
-    """Return the unit of violation (size,) of soft bounds, 0 where they are hard."""
-    array = to_float(name, 0.0 if value is None else value)
-    array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
+def as_softness(name: str, value: ArrayLike | None, lower: Array, upper: Array) -> Array:
+    """Return the unit of violation (size,) of soft bounds, 0 where they are hard.
+
+    A single number is for the entries that have a bound.
+
+    Raises
+    ------
+    ValueError
+        If one is negative, or for something without a bound.
+    """
+    array, size = to_float(name, 0.0 if value is None else value), len(lower)
+    bounded = np.isfinite(lower) | np.isfinite(upper)
+    if array.ndim == 0:
+        array = np.where(bounded, array, 0.0) if np.any(bounded) else np.full(size, float(array))
+    array = as_array(name, array, (size,))
     if np.any(array < 0):
         raise ValueError(
             f"{name} = {array.tolist()} holds the violations that count as one unit, 0 where the "
             "bound is hard: no entry may be negative."
         )
+    if value is not None and np.any(to_float(name, value) > 0) and not np.any(array[bounded] > 0):
+        what = name[0]
+        raise ValueError(
+            f"{name} = {value!r}, but there is no bound to soften: pass {what}_min or {what}_max."
+        )
+    if np.any(array[~bounded] > 0):
+        i = int(np.argmax((array > 0) & ~bounded))
+        raise ValueError(f"{name} = {value!r} softens entry {i}, which has no bound: make it 0.")
     return array
 
 
@@ -146,11 +167,12 @@ def as_half_spaces(
     if value is None:
         return np.zeros((0, n_theta)), np.zeros(0)
     try:
-        F, g = value
+        F, g = value if not isinstance(value, str) else ()
     except (TypeError, ValueError):
+        got = repr(value) if isinstance(value, str) else type(value).__name__
         raise TypeError(
             "terminal_set must be a pair (F, g) of arrays for F x_N <= g, or 'invariant', "
-            f"got {type(value).__name__}."
+            f"got {got}."
         ) from None
     rows = to_float("terminal_set F", F)
     if rows.shape[1:] != (n_theta,):

@@ -116,7 +116,15 @@ def to_float(name: str, value: Any) -> Array:
             raise TypeError("it is complex")
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} = {value!r} is not an array of real numbers ({error}).") from None
+        raise TypeError(
+            f"{name} = {_short(value)} is not an array of real numbers ({error})."
+        ) from None
+
+
+def _short(value: Any) -> str:
+    """Return the representation of a value, without the middle of a long one."""
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:120]} ... {text[-40:]}"
 
 
 class ReadOnlyArrays:

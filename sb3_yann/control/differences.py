@@ -43,9 +43,9 @@ class Jacobian:
 class NotDifferentiableError(ValueError):
     """The function has a kink, a jump or no value next to the point, in coordinate `column`."""
 
-    def __init__(self, column: int, reason: str) -> None:
+    def __init__(self, column: int, reason: str, no_value: bool = False) -> None:
         super().__init__(reason)
-        self.column = column
+        self.column, self.no_value = column, no_value
 
 
 def jacobian(
@@ -117,7 +117,7 @@ def _column(
     one, other, span = np.array(ahead), np.array(behind), np.array(spans)[:, None]
     valid = np.all(np.isfinite(one) & np.isfinite(other), axis=1) if spans else np.zeros(0, bool)
     if np.count_nonzero(valid) < 3:
-        raise NotDifferentiableError(i, "it has no finite value on one of its sides")
+        raise NotDifferentiableError(i, "it has no finite value on one of its sides", True)
     far = bool(valid[0])
     one, other, span = one[valid], other[valid], span[valid]
     slope = (one + other) / 2

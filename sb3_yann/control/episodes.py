@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike
 
 from sb3_yann.control._validation import Array, to_float
 
+UNEVEN = 0.1
+"""How far a step may take longer or shorter than dt, in parts of it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Episode:
@@ -64,7 +67,7 @@ def as_episodes(
 
 
 def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list[Episode]]:
-    """Return the episodes to fit and those to test: whole ones, or the last part of a single one.
+    """Return what to fit and what to test: the last of all steps, cutting an episode if need be.
 
     Raises
     ------
@@ -73,19 +76,75 @@ def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list
     """
     if not 0 <= held_out < 1:
         raise ValueError(f"held_out = {held_out!r} must be a fraction in [0, 1).")
-    if held_out == 0:
-        return episodes, []
-    if len(episodes) > 1:
-        count = min(max(1, round(held_out * len(episodes))), len(episodes) - 1)
-        return episodes[:-count], episodes[-count:]
-    (episode,) = episodes
-    border = len(episode) - max(1, round(held_out * len(episode)))
-    return [episode.part(0, border)], [episode.part(border, len(episode))]
+    total = sum(map(len, episodes))
+    left = total - max(1, round(held_out * total)) if held_out else total
+    fitted, tested = [], []
+    for episode in episodes:
+        border = min(left, len(episode))
+        left -= border
+        fitted += [episode.part(0, border)] if border else []
+        tested += [episode.part(border, len(episode))] if border < len(episode) else []
+    return fitted, tested
+
+
+def without_gaps(
+    episodes: list[Episode], time: ArrayLike | Sequence[ArrayLike], dt: float
+) -> tuple[list[Episode], int]:
+    """Return the episodes cut wherever a step took another time than dt, and the steps left out.
+
+    Raises
+    ------
+    ValueError
+        If the times do not fit the episodes or do not increase, or most steps take another time.
+    """
+    times = _times(time)
+    if len(times) != len(episodes):
+        raise ValueError(f"time has {len(times)} episodes, states has {len(episodes)}.")
+    parts, lost, spans = [], 0, []
+    for i, (episode, instants) in enumerate(zip(episodes, times, strict=True)):
+        if instants.shape != (len(episode) + 1,):
+            raise ValueError(
+                f"time of episode {i} has shape {instants.shape}, expected ({len(episode) + 1},): "
+                "one for each row of states."
+            )
+        span = np.diff(instants)
+        if not np.all(span > 0):
+            raise ValueError(
+                f"time of episode {i} does not increase after row {int(np.argmax(~(span > 0)))}. "
+                "Sort the log, and leave out rows that stand there twice."
+            )
+        gaps = np.flatnonzero(np.abs(span - dt) > UNEVEN * dt)
+        edges = zip([-1, *gaps], [*gaps, len(episode)], strict=True)
+        parts += [episode.part(a + 1, b) for a, b in edges if b > a + 1]
+        lost += gaps.size
+        spans.append(span)
+    if 2 * lost > sum(map(len, episodes)):
+        raise ValueError(
+            f"dt = {dt:g}, but a step of the log takes {np.median(np.concatenate(spans)):g} (the "
+            "median). Give time and dt in the same unit."
+        )
+    return parts, lost
+
+
+def _times(value: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
+    """Return one vector of times for each episode."""
+    several = isinstance(value, (list, tuple)) and len(value) > 0 and np.ndim(value[0]) == 1
+    if several:
+        return [to_float(f"time of episode {i}", part) for i, part in enumerate(value)]  # type: ignore[arg-type]
+    array = to_float("time", value)
+    return list(array) if array.ndim == 2 else [array]
 
 
 def _matrices(name: str, value: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
     """Return one float64 matrix for each episode, all with the same columns."""
-    several = isinstance(value, (list, tuple)) and len(value) > 0 and np.ndim(value[0]) == 2
+    parts_given = list(value) if isinstance(value, (list, tuple)) else []
+    flat = [i for i, part in enumerate(parts_given) if np.shape(part) != () and np.ndim(part) == 1]
+    if flat and len({np.size(part) for part in parts_given}) > 1:
+        raise ValueError(
+            f"{name} of episode {flat[0]} has shape {np.shape(parts_given[flat[0]])}, expected "
+            "(rows, columns). Of a single column write values.reshape(-1, 1)."
+        )
+    several = len(parts_given) > 0 and np.ndim(parts_given[0]) == 2
     array = None if several else to_float(name, value)
     if array is not None and array.ndim != 3:
         parts = [array]

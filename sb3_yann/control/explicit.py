@@ -53,7 +53,7 @@ def solve_explicit(
         See :class:`PiecewiseAffine`.
     solver : {"walk", "ppopt"}
         Our walk from facet to facet (:mod:`sb3_yann.control.facet_walk`), or ppopt's combinatorial
-        graph search, which takes hundreds of times longer.
+        graph search, which takes tens of times longer above a hundred regions.
     limits : Limits
         When to give up.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,15 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from sb3_yann.control._validation import Array, ReadOnlyArrays, as_array, to_float
-from sb3_yann.control.episodes import Episode, as_episodes, split
+from sb3_yann.control._validation import Array, ReadOnlyArrays, as_array, as_positive, to_float
+from sb3_yann.control.episodes import Episode, as_episodes, split, without_gaps
+from sb3_yann.control.input_effects import input_notes
 from sb3_yann.control.linear_model import LinearModel
+from sb3_yann.control.operating_point import FAR, operating_point
 from sb3_yann.control.regression import Regression, regress
 
 AHEAD = 10
 """Steps of the longer prediction whose fit is stated."""
-FAR = 5.0
-"""Spreads from the mean of the data beyond which a model is extrapolated."""
+POOR = 50.0
+"""Percent of the longer prediction's fit below which a model is called poor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +96,7 @@ def identify(
     offset: bool = True,
     ridge: float = 0.0,
     held_out: float = 0.2,
+    time: ArrayLike | Sequence[ArrayLike] | None = None,
 ) -> Identified:
     r"""Fit ``x[k+1] = A x[k] + B u[k] + E d[k] + c`` to measured episodes by least squares.
 
@@ -118,7 +122,8 @@ def identify(
         Measured disturbances, which make E.
     x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
         The operating point. Left out, inputs and disturbances take their mean, and the state is
-        where the fitted model rests with them; the mean, if that is far outside the data.
+        where the fitted model rests with them. Along what integrates, as far as the data tell, the
+        state keeps its mean, and the inputs are those that hold it.
     offset : bool, default True
         Fit c too, so that the operating point need not be a steady state exactly. Without it,
         deviations from (x_ss, u_ss, d_ss), zeros where left out, are fitted with c = 0.
@@ -127,8 +132,11 @@ def identify(
         that of one step. It makes data that do not excite the plant usable, at the price of a
         bias towards zero that the standard errors do not contain.
     held_out : float, default 0.2
-        Fraction that is kept out of the model to state its fit: the last episodes as a whole, or
-        the last part of a single one.
+        Fraction of all steps that is kept out of the model to state its fit: the last ones, for
+        which an episode is cut in two.
+    time : array_like, shape (T+1,), or a sequence of such, optional
+        When each row of the states was measured, in the unit of ``dt``. Steps that took another
+        time, by more than 10 %, are left out: a log with missing rows is no record of the plant.
 
     Returns
     -------
@@ -141,7 +149,12 @@ def identify(
         combination of states and inputs does not move: the message names it.
     """
     episodes, sizes = as_episodes(states, actions, disturbances)
+    lost = 0
+    if time is not None:
+        episodes, lost = without_gaps(episodes, time, as_positive("dt", dt))
     n, m, d = sizes
+    if d_ss is not None and disturbances is None:
+        raise ValueError("d_ss is given, but there are no disturbances: pass these as well.")
     given = (
         _given("x_ss", x_ss, n, offset),
         _given("u_ss", u_ss, m, offset),
@@ -156,6 +169,12 @@ def identify(
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
     A, B, E = np.split(found.standard_errors, [n, n + m], axis=1)
     model = _model(found, sizes, given, dt).with_notes(*_quality(found, tested, fits, weight))
+    late = input_notes(found, fitted, sizes)
+    if late:
+        warnings.warn(" ".join(late), stacklevel=2)
+        model = model.with_notes(*late)
+    if lost:
+        model = model.with_notes(f"{lost} steps that took another time than dt were left out.")
     return Identified(
         model=model,
         standard_error_A=A,
@@ -177,43 +196,21 @@ def _given(name: str, value: ArrayLike | None, size: int, offset: bool) -> Array
     return as_array(name, value, (size,))
 
 
-def _operating_point(
-    found: Regression, sizes: tuple[int, int, int], given: Sequence[Array | None]
-) -> Array:
-    """Return the state, inputs and disturbances (n+m+d,) where the fitted plant rests."""
-    n, m, _ = sizes
-    x, u, d = np.split(found.centre, [n, n + m])
-    start = np.concatenate([x if given[0] is None else given[0], u, d])
-    for place, value in ((slice(n, n + m), given[1]), (slice(n + m, None), given[2])):
-        if value is not None:
-            start[place] = value
-    # The state gives way, or the inputs where the state is given; nothing where both are.
-    ways = slice(0, n) if given[0] is None else slice(n, n + m)
-    if given[0] is not None and given[1] is not None:
-        return start
-    scale = np.where(found.spread > 0, found.spread, 1.0)
-    moves = (found.coefficients - np.eye(n, scale.size)) * scale / scale[:n, None]
-    drift = (found.predict(start[None])[0] - start[:n]) / scale[:n]
-    way = np.linalg.lstsq(moves[:, ways], -drift, rcond=None)[0]
-    # A plant that integrates, or nearly, rests far away if anywhere: the data do not tell of there.
-    if np.max(np.abs(way)) <= FAR:
-        start[ways] += scale[ways] * way
-    return start
-
-
 def _model(
     found: Regression, sizes: tuple[int, int, int], given: Sequence[Array | None], dt: float
 ) -> LinearModel:
     """Return the model about its operating point, with a note if the plant moves there."""
     n, m, _ = sizes
-    point = _operating_point(found, sizes, given)
+    point = operating_point(found, sizes, given)
     A, B, E = np.split(found.coefficients, [n, n + m], axis=1)
     x, u, d = np.split(point, [n, n + m])
     model = LinearModel(A, B, dt, x, u, E, d)
     drift = found.predict(point[None])[0] - x
-    allowed = 3 * np.sqrt(np.diag(found.covariance) / found.steps) + 1e-9 * (1 + np.abs(x))
+    doubt = np.diag(found.covariance) / found.steps
+    doubt = np.sqrt(doubt + found.standard_errors**2 @ (point - found.centre) ** 2)
+    allowed = 3 * doubt + 1e-9 * (1 + np.abs(x))
     if np.any(np.abs(drift) > allowed):
-        model = model.with_notes(
+        model = model.with_drift(drift).with_notes(
             f"At the operating point the fitted plant moves by {_list(drift)} in one step. The "
             "model leaves that out."
         )
@@ -255,10 +252,7 @@ def _quality(
         f"{_list(np.sqrt(np.diag(found.covariance)))} (standard deviation of each state)."
     ]
     if tested:
-        notes.append(
-            f"Fit over {sum(map(len, tested))} steps held out, 100 % is perfect: {_list(fits[0])} "
-            f"% one step ahead, {_list(fits[1])} % {AHEAD} steps ahead."
-        )
+        notes.append(_words_for(fits, sum(map(len, tested))))
     if found.excitation < 0.01:
         notes.append(
             f"Weakly excited: {found.weakest} moved {found.excitation:.1e} times as much as the "
@@ -274,6 +268,23 @@ def _quality(
             "more than the standard errors tell."
         )
     return notes
+
+
+def _words_for(fits: tuple[Array, Array], steps: int) -> str:
+    """Return the fits over data held out in words, a poor one as such."""
+    words = [
+        f"{_list(fit)} % {ahead} ahead"
+        for fit, ahead in zip(fits, ("one step", f"{AHEAD} steps"), strict=True)
+        if not np.all(np.isnan(fit))
+    ]
+    if not words:
+        return f"The {steps} steps held out tell no fit: they are too few, or nothing moves."
+    text = f"Fit over {steps} steps held out, 100 % is perfect: {', '.join(words)}."
+    if len(words) < len(fits):
+        text += f" No episode of them is {AHEAD} steps long."
+    if np.any(fits[1] < POOR):
+        text += f" Poor: {AHEAD} steps ahead the model says little of the plant."
+    return text
 
 
 def _list(values: Array) -> str:

@@ -52,6 +52,9 @@ class LinearModel(ReadOnlyArrays):
     notes : tuple of str
         What is to be known of how the model was made: what was found, dropped, or doubtful. They
         are no part of equality, and `dataclasses.replace` drops them with the old matrices.
+    drift : ndarray, shape (n,)
+        How far the plant was found to move in one sample at the operating point, by more than the
+        doubt about it; the model leaves that out. Kept and dropped as the notes are.
 
     Raises
     ------
@@ -67,6 +70,7 @@ class LinearModel(ReadOnlyArrays):
     E: Array
     d_ss: Array
     notes: tuple[str, ...] = field(init=False, repr=False)
+    drift: Array = field(init=False, repr=False)
 
     def __init__(
         self,
@@ -88,6 +92,10 @@ class LinearModel(ReadOnlyArrays):
             raise ValueError(f"B has shape {inputs.shape}: the model needs at least one input.")
         disturbances = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
         d = disturbances.shape[1]
+        if d_ss is not None and np.size(d_ss) and not d:
+            raise ValueError(
+                f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E too."
+            )
         values = {
             "A": state,
             "B": inputs,
@@ -97,6 +105,7 @@ class LinearModel(ReadOnlyArrays):
             "E": disturbances,
             "d_ss": as_array("d_ss", np.zeros(d) if d_ss is None else d_ss, (d,)),
             "notes": (),
+            "drift": as_array("drift", np.zeros(n), (n,)),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -132,6 +141,7 @@ class LinearModel(ReadOnlyArrays):
         u_ss: ArrayLike,
         dt: float,
         d_ss: ArrayLike | None = None,
+        scale: ArrayLike | None = None,
     ) -> LinearModel:
         """Linearise ``dx/dt = f(x, u)``, or ``f(x, u, d)``, at a steady state; sample it every dt.
 
@@ -149,17 +159,20 @@ class LinearModel(ReadOnlyArrays):
             Sampling time.
         d_ss : array_like, shape (d,), optional
             Measured disturbances at the operating point.
+        scale : array_like, shape (n,) or (n + m + d,), optional
+            How far each state moves in use, or each state, input and disturbance: sets the step
+            sizes (1 % of it) and how far the operating point may move. The default is the size
+            of each, at least 1: for trace concentrations give their own.
 
         Raises
         ------
         ValueError
             If ``f`` returns another shape or NaN at the operating point, has a kink or a jump
-            there, or the operating point moves by more than 0.1 % (of 1, where it is smaller)
-            within one sample.
+            there, or the operating point moves by more than 0.1 % of ``scale`` within one sample.
         """
         from sb3_yann.control.linearise import linearise_dynamics
 
-        return linearise_dynamics(f, x_ss, u_ss, dt, d_ss)
+        return linearise_dynamics(f, x_ss, u_ss, dt, d_ss, scale)
 
     @staticmethod
     def from_env(
@@ -300,6 +313,12 @@ class LinearModel(ReadOnlyArrays):
         noted = copy.copy(self)
         object.__setattr__(noted, "notes", (*self.notes, *notes))
         return noted
+
+    def with_drift(self, drift: ArrayLike) -> LinearModel:
+        """Return an equal model that is known to leave out this drift (n,)."""
+        known = copy.copy(self)
+        object.__setattr__(known, "drift", as_array("drift", drift, (self.n_states,)))
+        return known
 
     def __eq__(self, other: object) -> bool:
         """Tell whether all matrices, the sampling time and the operating point are equal."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,11 @@ LONGEST = 0.01
 LONGEST_SINGLE = 0.05
 """The same where states are read in float32."""
 STEADY = 1e-3
-"""How far a steady state may move in one sample, in parts of its size (of 1 if smaller)."""
+"""How far a steady state may move in one sample, in parts of its scale."""
+MOVES = 0.01
+"""The same in parts of its own size, from which on a state smaller than 1 is warned of."""
+SHORTER = 64.0
+"""How much shorter steps become where a function has no value next to the point."""
 
 
 def linearise_dynamics(
@@ -31,6 +36,7 @@ def linearise_dynamics(
     u_ss: ArrayLike,
     dt: float,
     d_ss: ArrayLike | None,
+    scale: ArrayLike | None = None,
 ) -> LinearModel:
     """See `LinearModel.from_dynamics`."""
     x, u = as_array("x_ss", x_ss, ("n",)), as_array("u_ss", u_ss, ("m",))
@@ -47,20 +53,40 @@ def linearise_dynamics(
 
     arguments = (x, u) if d_ss is None else (x, u, d)
     called = "f(x_ss, u_ss)" if d_ss is None else "f(x_ss, u_ss, d_ss)"
+    point = np.concatenate([x, u, d])
+    size = _dynamics_scale(point, n, scale)
     drift = dt * np.abs(as_array(called, f(*arguments), (n,)))
-    if np.any(drift > STEADY * np.maximum(np.abs(x), 1)):
+    if np.any(drift > STEADY * size[:n]):
         raise ValueError(
             f"x_ss = {x.tolist()}, u_ss = {u.tolist()}{extra} is no steady state: within one "
-            f"sample of {dt:g} the state would move by {drift.tolist()}. Solve f{names} = 0 "
-            "first, e.g. with scipy.optimize.root."
+            f"sample of {dt:g} the state would move by {drift.tolist()}, with a scale of "
+            f"{size[:n].tolist()}. Solve f{names} = 0 first, e.g. with scipy.optimize.root."
         )
-    point = np.concatenate([x, u, d])
-    rounding = np.finfo(float).eps * np.maximum(np.abs(x), 1) / dt
-    steps = LONGEST * np.maximum(np.abs(point), 1)
-    found = _differences(rate, point, steps, rounding, (n, u.size))
+    if scale is None and np.any((drift > MOVES * np.abs(x)) & (x != 0) & (drift > 1e-8)):
+        warnings.warn(
+            f"Within one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
+            f"{drift.tolist()}: little beside 1, and much beside itself. Pass scale=..., how far "
+            "each state moves in use, to have it checked.",
+            stacklevel=3,
+        )
+    rounding = np.finfo(float).eps * np.maximum(np.abs(x), size[:n]) / dt
+    found = _differences(rate, point, LONGEST * size, rounding, (n, u.size))
     A, B, E = np.split(found.value, [n, inputs], axis=1)
     model = LinearModel.from_continuous(A, B, dt, x, u, E, d)
-    return model.with_notes(*_curvature(found, (n, u.size)))
+    return model.with_notes(*_idle_inputs(model.B), *_curvature(found, (n, u.size)))
+
+
+def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
+    """Return how far each state, input and disturbance moves in use, from what is given of it."""
+    size: Array = np.maximum(np.abs(point), 1.0)
+    if scale is None:
+        return size
+    given = to_float("scale", scale)
+    given = as_array("scale", given, (point.size if given.shape == point.shape else n,))
+    if np.any(given <= 0):
+        raise ValueError(f"scale = {given.tolist()} must be above 0 in each entry.")
+    size[: given.size] = given
+    return size
 
 
 def linearise_env(
@@ -104,7 +130,9 @@ def _linearise(
     if not np.any(free):
         check_rest(simulator, point, found.value, scales)
     A, B = found.value[:, :n], found.value[:, n:]
+    idle = _idle_inputs(B)
     return LinearModel(A, B, dt, point[:n], point[n:]).with_notes(
+        *idle,
         "Linearised by central differences over one step. The state was set by "
         f"{simulator.setter} and read from {simulator.reader}.",
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
@@ -175,15 +203,35 @@ def _differences(
     actual: Callable[[Array], Array] = lambda z: z,
 ) -> Jacobian:
     """Return the Jacobian; name the coordinate where there is none."""
-    try:
-        return jacobian(f, point, steps, rounding, actual)
-    except NotDifferentiableError as error:
-        i = error.column
-        raise ValueError(
-            f"The plant cannot be linearised at {point.tolist()}: along {_name(i, sizes)}, {error}."
-            " Clipping, dry friction and angles that wrap do this. Move the operating point off "
-            "it, or fit data that reach across it: LinearModel.from_data."
-        ) from None
+    shortest, steps = steps / SHORTER**2, steps.copy()
+    while True:
+        try:
+            return jacobian(f, point, steps, rounding, actual)
+        except NotDifferentiableError as error:
+            i, reason = error.column, str(error)
+            if not error.no_value or steps[i] <= shortest[i]:
+                break
+            steps[i] /= SHORTER
+    raise ValueError(
+        f"The plant cannot be linearised at {point.tolist()}: along {_name(i, sizes)}, {reason}, "
+        f"with steps up to {steps[i]:.3g}. Clipping, dry friction and angles that wrap do this, "
+        "and steps that are too long: pass scale=..., how far each state moves in use. Or move "
+        "the operating point off it, or fit data that reach across it: LinearModel.from_data."
+    )
+
+
+def _idle_inputs(B: Array) -> list[str]:
+    """Return, and warn of, the inputs that no entry of B has an effect of."""
+    idle = np.flatnonzero(~np.any(B, axis=0))
+    if not idle.size:
+        return []
+    note = (
+        f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. If the plant has a "
+        "delay of the input, or an actuator, the inputs on their way belong into the state; an "
+        "input that really does nothing is to be left out."
+    )
+    warnings.warn(note, stacklevel=5)
+    return [note]
 
 
 def _remarks(simulator: Simulator, point: Array) -> list[str]:
@@ -221,7 +269,7 @@ def _curvature(found: Jacobian, sizes: tuple[int, int]) -> list[str]:
                 f"The plant is not smooth within {found.steps[i]:.3g} of the operating point "
                 f"along {_name(i, sizes)}: {what}."
             )
-        elif not np.any(found.value[:, i]):
+        elif not np.any(found.value[:, i]) and not sizes[0] <= i < sum(sizes):
             notes.append(f"{_name(i, sizes)} has no effect on the next state.")
     return notes
 

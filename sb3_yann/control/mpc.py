@@ -22,6 +22,13 @@ from sb3_yann.control._problem_arguments import (
     as_softness,
     require_bounded_thing,
 )
+from sb3_yann.control._problem_checks import (
+    require_room_to_rest,
+    require_same_rest,
+    softened_box,
+    warn_of_drift,
+    warn_of_unused_softness,
+)
 from sb3_yann.control._validation import (
     Array,
     ReadOnlyArrays,
@@ -78,9 +85,10 @@ class LinearMPC(ReadOnlyArrays):
         Bounds of the inputs. A policy needs them finite.
     theta_min, theta_max : array_like, shape (n,), or float, optional
         The box of states for which the problem is solved; the default is ``x_min``,
-        ``x_max``. Given alone, without ``x_min`` and ``x_max``, they bound the parameters only
-        and leave the predicted states free. They are stored with shape (n_theta,): the rest of the
-        box is that of r, d and u, whatever is given.
+        ``x_max``, and where these are soft, half their distance beyond each. Given alone, without
+        ``x_min`` and ``x_max``, they bound the parameters only and leave the predicted states
+        free. They are stored with shape (n_theta,): the rest of the box is that of r, d and u,
+        from which one given for all of theta must not differ.
     terminal_cost : array_like, shape (n_z, n_z), optional
         P, symmetric positive semi-definite; n_z is n, or n + m with an S. The default is the
         Riccati solution of the same discount, with which the law is the LQR wherever no constraint
@@ -105,7 +113,7 @@ class LinearMPC(ReadOnlyArrays):
     d_min, d_max : array_like, shape (d,), or float, optional
         The box of disturbances.
     du_min, du_max : array_like, shape (m,), or float, optional
-        Bounds of the change of the inputs from one sample to the next.
+        Bounds of the change of the inputs from one sample to the next: 0 lies between them.
     S : array_like, shape (m, m), optional
         Weight of that change, symmetric positive semi-definite.
     outputs : array_like, shape (q, n), or list of int, optional
@@ -113,9 +121,10 @@ class LinearMPC(ReadOnlyArrays):
     y_min, y_max : array_like, shape (q,), or float, optional
         Their bounds.
     x_soft, y_soft : array_like, shapes (n,) and (q,), or float, optional
-        The violation of each bound that counts as one unit; 0, the default, keeps the bound hard.
-        Soft bounds of the states share one slack over the horizon, those of the outputs another.
-        Pass theta_min and theta_max beyond x_min and x_max, or the law ends where these do.
+        The violation of each bound that counts as one unit; 0, the default, keeps the bound hard;
+        a single number is for all that have a bound. Soft bounds of the states share one slack
+        over the horizon, those of the outputs another. The law ends at theta_min and theta_max,
+        which are to reach beyond soft bounds, as they do by default.
     soft_penalty : float, optional
         The largest violation s, in units, costs ``soft_penalty (s + s^2)``: an exact penalty, with
         the square that keeps the program strictly convex. It is no part of :meth:`stage_cost`.
@@ -218,11 +227,16 @@ class LinearMPC(ReadOnlyArrays):
             require_bounded_thing(name, low, high, size)
             lower, upper = as_bounds(name, low, high, size)
             self._set(**{f"{name}_min": lower, f"{name}_max": upper})
-        self._set(x_soft=as_softness("x_soft", x_soft, n))
-        self._set(y_soft=as_softness("y_soft", y_soft, len(self.outputs)))
+        self._set(x_soft=as_softness("x_soft", x_soft, self.x_min, self.x_max))
+        self._set(y_soft=as_softness("y_soft", y_soft, self.y_min, self.y_max))
         self._set(soft_penalty=as_soft_penalty(soft_penalty, self.x_soft, self.y_soft))
+        inputs, free = (self.u_min, self.u_max), self.parameters.has_constants
+        require_room_to_rest(*inputs, self.du_min, self.du_max, free)
         self._set_box(theta_min, theta_max)
+        box = self.theta_min[:n], self.theta_max[:n]
+        warn_of_unused_softness(self.x_soft, (self.x_min, self.x_max), box)
         self._set_terminal(terminal_cost, terminal_set)
+        warn_of_drift(model, *box)
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
@@ -231,11 +245,14 @@ class LinearMPC(ReadOnlyArrays):
     def _set_box(self, theta_min: ArrayLike | None, theta_max: ArrayLike | None) -> None:
         """Store the box of theta: that of the states, then of r, d and the previous input."""
         size = self.n_theta
-        parts = [as_box("theta", (theta_min, theta_max), (self.x_min, self.x_max), size)]
+        default = softened_box(self.x_min, self.x_max, self.x_soft)
+        parts = [as_box("theta", (theta_min, theta_max), default, size)]
         parts += [(self.r_min, self.r_max), (self.d_min, self.d_max)]
         parts += [(self.u_min, self.u_max)] if self.parameters.n_previous else []
         low, high = (np.concatenate(bounds) for bounds in zip(*parts, strict=True))
         low, high = as_bounds("theta", low, high, size)
+        for name, given, stored in (("theta_min", theta_min, low), ("theta_max", theta_max, high)):
+            require_same_rest(name, given, stored, self.parameters.names, self.model.n_states)
         self._set(theta_min=low, theta_max=high)
 
     def _set_terminal(
@@ -255,10 +272,15 @@ class LinearMPC(ReadOnlyArrays):
         n = self.model.n_states
         self._set(terminal_set=as_half_spaces(half_spaces, n, self.n_theta))  # type: ignore[arg-type]
 
+    @property
+    def has_rate_bounds(self) -> bool:
+        """Whether the change of an input is bounded."""
+        return bool(np.any(np.isfinite([self.du_min, self.du_max])))
+
     @cached_property
     def parameters(self) -> Parameters:
         """What theta holds, and where."""
-        rated = np.any(self.S) or np.any(np.isfinite([self.du_min, self.du_max]))
+        rated = np.any(self.S) or self.has_rate_bounds
         return Parameters(
             n_states=self.model.n_states,
             n_references=len(self.tracked),
@@ -387,9 +409,9 @@ class LinearMPC(ReadOnlyArrays):
         ----------
         solver : {"walk", "ppopt"}, default "walk"
             What finds the regions: a walk over them from facet to facet, or, as a reference and
-            hundreds of times slower, ppopt. Both give the same law.
+            many times slower, ppopt. Both give the same law.
         time_limit : float, optional
-            Seconds after which to give up.
+            Seconds after which to give up the search.
         region_limit : int, optional
             Number of regions beyond which to give up.
         progress : bool, default False

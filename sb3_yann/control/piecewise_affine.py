@@ -29,7 +29,7 @@ OUTSIDE = ("nearest", "zero")
 SCAN = 16
 """Up to this many regions are asked one by one."""
 
-_COMPILED = ("_packed", "_at")
+_COMPILED = ("packed", "_at")
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ class PiecewiseAffine(ReadOnlyArrays):
         from sb3_yann.control._location import law_of_batch
 
         points = self._as_theta(theta)
-        inputs: Array = law_of_batch(*self._packed, np.atleast_2d(points))
+        inputs: Array = law_of_batch(*self.packed, np.atleast_2d(points))
         return inputs if points.ndim == 2 else inputs[0]
 
     def locate(self, theta: ArrayLike) -> NDArray[np.int64]:
@@ -224,7 +224,7 @@ class PiecewiseAffine(ReadOnlyArrays):
         from sb3_yann.control._location import locate_batch
 
         points = self._as_theta(theta)
-        region, inside = locate_batch(*self._packed, np.atleast_2d(points))
+        region, inside = locate_batch(*self.packed, np.atleast_2d(points))
         return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
 
     @cached_property
@@ -237,7 +237,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         return build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
 
     @cached_property
-    def _packed(self) -> tuple[Array, NDArray[np.int64]]:
+    def packed(self) -> tuple[Array, NDArray[np.int64]]:
+        """The law as two arrays for compiled code, see :func:`sb3_yann.control._location.pack`."""
         from sb3_yann.control._location import pack
 
         return pack(self, self.tree)
@@ -246,7 +247,11 @@ class PiecewiseAffine(ReadOnlyArrays):
     def _at(self) -> Callable[[Any], Array | None]:
         from sb3_yann.control._location import law_at
 
-        return partial(law_at, *self._packed)
+        return partial(law_at, *self.packed)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> PiecewiseAffine:
+        """Return the law itself, of which nothing can change."""
+        return self
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what was compiled for this process, but not the tree."""

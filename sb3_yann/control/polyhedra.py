@@ -13,7 +13,7 @@ from sb3_yann.control._validation import Array
 # DAQP ends up to 1e-6 from the largest ball: below this it must not end so early.
 THIN = 1e-5
 # Of polyhedra with a smaller ball DAQP's own search for redundant rows loses facets.
-SLIM = 1e-3
+SLIM = 1e-4
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,8 @@ class Regression:
     reached : ndarray, shape (n,)
     spread : ndarray, shape (n+m+d,)
         Root mean square of each regressor about the centre.
+    factors : ndarray, shape (n+m+d,)
+        Standard errors of each column in units of the residuals' standard deviation.
     covariance : ndarray, shape (n, n)
         Of the residuals.
     autocorrelation : ndarray, shape (n,)
@@ -41,6 +43,7 @@ class Regression:
     centre: Array
     reached: Array
     spread: Array
+    factors: Array
     covariance: Array
     autocorrelation: Array
     degrees_of_freedom: int
@@ -106,6 +109,7 @@ def regress(
         centre=centre,
         reached=reached,
         spread=spread,
+        factors=factors,
         covariance=covariance,
         autocorrelation=_autocorrelation(residuals, episodes, targets),
         degrees_of_freedom=freedom,

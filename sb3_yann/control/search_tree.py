@@ -7,20 +7,25 @@ tree", with vertices in place of their linear programs, and leaves of a few regi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 from scipy.spatial import HalfspaceIntersection, QhullError
 
 from sb3_yann.control._location import Integers, compiled
 from sb3_yann.control._validation import Array
+from sb3_yann.control.polyhedra import largest_ball
 
 LEAF = 4
 """A node with this many regions is not split further."""
 
-CANDIDATES = 48
+NODES = 3
+"""Hyperplanes for each region, at most: where regions are long and thin, every hyperplane cuts some
+of them, and trees down to the last region grow without bound."""
+
+CANDIDATES = 32
 """Facets tried at a node, drawn from those of its regions."""
 
 OVERLAP = 1e-8
@@ -118,17 +123,22 @@ def build_tree(
     children: list[list[int]] = []
     leaves: list[Integers] = []
     everything = np.arange(len(starts), dtype=np.int64)
-    waiting: list[tuple[Integers, int, int]] = [(everything, -1, 0)]  # regions, parent, its side
+    # The fullest node first, and of those the oldest: a number, its parent and side.
+    waiting: list[tuple[int, int, Integers, int, int]] = [(-len(starts), 0, everything, -1, 0)]
+    most, order = NODES * len(starts), 0
     while waiting:
-        inside, parent, side = waiting.pop()
-        split = None if len(inside) <= LEAF else _best_split(regions, inside, random)
+        _, _, inside, parent, side = heappop(waiting)
+        full = len(levels) >= most or len(inside) <= LEAF
+        split = None if full else _best_split(regions, inside, random)
         if parent >= 0:
             children[parent][side] = -1 - len(leaves) if split is None else len(levels)
         if split is None:
             leaves.append(np.sort(inside))
             continue
-        row, below, above = split
-        waiting += [(above, len(levels), 1), (below, len(levels), 0)]
+        row, *parts = split
+        for which, part in enumerate(parts):
+            order += 1
+            heappush(waiting, (-len(part), order, part, len(levels), which))
         normals.append(regions.A[row])
         levels.append(regions.b[row])
         children.append([0, 0])
@@ -225,7 +235,7 @@ def vertices(A: Array, b: Array) -> Array:
         upper = np.min(bounds[rows[:, 0] > 0] / rows[rows[:, 0] > 0, 0])
         lower = np.max(bounds[rows[:, 0] < 0] / rows[rows[:, 0] < 0, 0])
         return np.array([[lower], [upper]])
-    inner = interior_point(rows, bounds)
+    inner, _ = largest_ball(rows, bounds)
     try:
         found = HalfspaceIntersection(np.column_stack([rows, -bounds]), inner).intersections
         found = found[np.all(np.isfinite(found), axis=1)]
@@ -234,23 +244,3 @@ def vertices(A: Array, b: Array) -> Array:
     if len(found) <= n:
         return np.stack(np.meshgrid(*[[-1.0, 1.0]] * n), axis=-1).reshape(-1, n)
     return np.asarray(np.clip(found, -1, 1))
-
-
-def interior_point(A: Array, b: Array, pull: float = 1e-3) -> Array:
-    """Return a point (n,) well inside ``A z <= b``, rows of unit length, if it has an interior.
-
-    The middle of the largest ball, but for a small pull to the origin that makes it a strictly
-    convex program; where that leaves nothing of a thin set, the middle itself.
-    """
-    import daqp
-
-    n = A.shape[1]
-    rows = np.column_stack([A, np.ones(len(b))])
-    cost = np.append(np.zeros(n), -1.0)
-    found, _, status, _ = daqp.solve(
-        pull * np.eye(n + 1), cost, rows, b, np.full(len(b), -1e30), np.zeros(len(b), np.intc)
-    )
-    if status == 1 and np.min(b - A @ found[:n]) > 1e-6:
-        return np.asarray(found[:n])
-    ball = optimize.linprog(cost, A_ub=rows, b_ub=b, bounds=[(None, None)] * (n + 1))
-    return np.asarray(ball.x[:n])

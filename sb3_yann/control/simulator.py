@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann.control._validation import Array, as_array, as_positive, to_float
+from sb3_yann.control.simulator_memory import memory
 
 if TYPE_CHECKING:
     import gymnasium
@@ -127,7 +128,7 @@ class Simulator:
         self.refusal = ""
         self.ended = False
         self.observation, self.info = self.env.reset(seed=0 if borrowed.private else None)
-        self._over = False
+        self.over = False
         self.readers = dict(READERS)
         if get_state is not None:
             self.readers = {"get_state": lambda env, observation, info: get_state(env)}
@@ -158,9 +159,9 @@ class Simulator:
         ValueError, AssertionError, TypeError
             Whatever the environment raises for a state that it does not take.
         """
-        if self._over and not self.resets:
+        if self.over and not self.resets:
             self.observation, self.info = self.env.reset()
-            self._over = False
+            self.over = False
         self.setters[self.setter](x)
         return self.resets or self.reader in ("get_state", ATTRIBUTE)
 
@@ -176,13 +177,20 @@ class Simulator:
         except (ValueError, AssertionError) as error:
             self.refusal = str(error)
             return np.full(x.size, np.nan)
+        reached = self.go_on(u)
+        if reached.shape != x.shape:
+            raise ValueError(f"{self.reader} holds no state of shape {x.shape} after a step.")
+        return reached
+
+    def go_on(self, u: Array) -> Array:
+        """Return the state one step later, from wherever the environment is."""
         action = self.actual(u).astype(self.env.action_space.dtype)
         self.observation, _, terminated, truncated, self.info = self.env.step(action)
-        self._over = bool(terminated or truncated)
+        self.over = bool(terminated or truncated)
         self.ended = bool(terminated)
         reached = self.read()
-        if reached is None or reached.shape != x.shape:
-            raise ValueError(f"{self.reader} holds no state of shape {x.shape} after a step.")
+        if reached is None:
+            raise ValueError(f"{self.reader} holds no state after a step.")
         return reached
 
     def _reset_to(self, x: Array) -> None:
@@ -288,7 +296,7 @@ def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | No
         return f"no step changes it from {other.tolist()}, whatever the action"
     if not simulator.resets and np.array_equal(first, moved):
         return f"the next state is {first.tolist()} from {x.tolist()} and {other.tolist()} alike"
-    return None
+    return memory(simulator, x, u, u + 0.5 * _room(simulator, u), scale)
 
 
 def _room(simulator: Simulator, u: Array) -> Array:

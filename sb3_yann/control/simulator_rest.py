@@ -48,10 +48,22 @@ def steady_state(
         reason = simulator.refusal if np.any(np.isnan(rest)) else f"{(rest * scale[:n]).tolist()}"
         raise ValueError(
             f"No steady state was found. The best is state = {point[:n].tolist()}, action = "
-            f"{point[n:].tolist()}, which moves in one step by {reason}. Leave more entries free "
-            "(NaN), or start closer to it."
+            f"{point[n:].tolist()}, which moves in one step by {reason}."
+            f"{_at_bounds(simulator, point[n:], scale[n:])} Leave more entries free (NaN), or "
+            "start closer to it."
         )
     return point
+
+
+def _at_bounds(simulator: Simulator, u: Array, scale: Array) -> str:
+    """Return which inputs would have to go beyond their bounds, in words."""
+    space: Any = simulator.env.action_space
+    stuck = [
+        f"u[{i}] is at its {side} bound, {bound[i]:g}"
+        for side, bound in (("lower", space.low), ("upper", space.high))
+        for i in np.flatnonzero(np.abs(u - bound) <= 1e-6 * scale)
+    ]
+    return f" {', '.join(stuck)}: the inputs do not hold it." if stuck else ""
 
 
 def check_rest(simulator: Simulator, point: Array, jacobian: Array, scale: Array) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
@@ -10,16 +11,16 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._checks import as_factor
+from sb3_yann.guard.chance import chance_untouched
+from sb3_yann.guard.checks import check_between, check_not_nested, check_whole
 from sb3_yann.guard.plant import PlantTrials
 from sb3_yann.guard.record import Decision, GuardState, write_csv
+from sb3_yann.guard.restoring import restore_accepted
 from sb3_yann.guard.simulator import SimulatorTrials
-from sb3_yann.guard.snapshot import Snapshot, same
+from sb3_yann.guard.snapshot import Snapshot
 from sb3_yann.policies import YannPolicy
 
 
@@ -31,34 +32,43 @@ class ImprovementGuard(BaseCallback):
     over, actor, target actor and the actor's optimizer return to the accepted state, bit for bit,
     while the critic goes on learning. A return shrinks the actor's steps, an acceptance lets them
     grow again. When `learn` returns, the model *is* the accepted policy. Until then, after an
-    exception and in the zips of a CheckpointCallback, it is a candidate:
+    exception, Ctrl-C, and in the zips of a CheckpointCallback, it is a candidate:
     :func:`restore_accepted` puts the accepted policy in its place.
 
     **With a simulator** (``env`` given) the deterministic policy plays seeded episodes there,
     from the same starts as the accepted policy and the untouched MPC did. It is refused if its
     mean cost is above the accepted policy's, if one start costs more than with the MPC by more than
     the margin, or if an episode has more steps with ``info["violation"]`` than the accepted
-    policy's, or is terminated by the env where the accepted policy's is not. Where the whole
-    is refused, the networks of some regions may still be accepted, under the same conditions. A
-    refused candidate that is better than the MPC on average gets ``patience``.
+    policy's, or is terminated by the env where the accepted policy's is not. Regions that no
+    episode comes through stay as they were. Where the whole is refused, the networks of some
+    regions may still be accepted, under the same conditions. A refused candidate that is better
+    than the MPC on average gets ``patience``. An error of the simulator is a refusal where the MPC
+    meets none from the same starts.
 
     **On a plant alone** (``env=None``) the training episodes decide. The actor learns for
     ``trial_episodes`` episodes, then rests for as many, of which all are played by one and the same
     policy. It is accepted if it costs less than the accepted policy did, by a one-sided test of
     size ``significance`` (:func:`sb3_yann.guard.judging.probability_of_chance`: an analysis of
-    covariance on the cost that the linear model predicts for each start). A violation at any time,
-    or a change of the actor while it rests, brings the accepted policy back at once; after a
-    violation the actor rests until that episode is over. The first policy that is accepted is the
-    one that training starts with, and plays the first block. Each test errs with probability
-    ``significance``, so a policy that is worse *can* pass (one of ten tests that find no
-    difference does with a probability of about 20 %); the simulator's paired episodes have no
-    such chance, but hold for their starts only.
+    covariance on the cost that the linear model predicts for each start), and if none of its
+    episodes costs far more than these explain. A violation at any time, a parameter that is no
+    finite number, or a change of the actor while it rests, brings the accepted policy back at once;
+    after a violation the actor rests until that episode is over. The first policy that is accepted
+    is the one that training starts with, and plays the first block: alone, without the noise and
+    the random actions that NoActionNoise takes away. Each test errs with probability
+    ``significance``, so a policy that is worse *can* pass: of ten candidates that are no different
+    one or more does in a quarter of all cases. Nor does the test see what is rare, or what has
+    changed meanwhile: a policy that loses one start in ten by 200, where an episode costs 60, and
+    gains 12 on the others, passes in a third of the cases (it loses none in its block); and as
+    the accepted block is not played again, a plant that has become 10 % cheaper in between lets an
+    unchanged policy pass in two thirds. The simulator's paired episodes have no such chance, but
+    hold for their starts only.
 
     The guard draws no random numbers and leaves the training env and the buffer alone. Its state
     is an attribute of the model, ``model.guard_state``, and is saved and loaded with it: another
-    guard with the same settings goes on where the last one stopped. Scalars in tensorboard are
-    ``guard/candidate_cost``, ``guard/accepted_cost``, ``guard/mpc_cost``, ``guard/worst_start``,
-    ``guard/step``, ``guard/accepted`` and ``guard/rejected``.
+    guard with the same settings goes on where the last one stopped, if a few episodes show that
+    the simulator is still the same; with other settings what was accepted is tried anew. Scalars in
+    tensorboard are ``guard/candidate_cost``, ``guard/accepted_cost``, ``guard/mpc_cost``,
+    ``guard/worst_start``, ``guard/step``, ``guard/accepted`` and ``guard/rejected``.
 
     Parameters
     ----------
@@ -70,9 +80,10 @@ class ImprovementGuard(BaseCallback):
         Number of seeded starts.
     fresh : int, default 50
         Number of new starts, others each time, on which a policy is tried once more before it is
-        accepted, and ten times as many when training ends. Starts by which it loses against the
-        MPC join the others for good, and what was accepted before is put back: or the MPC, where
-        that loses there as well. 0 is for none.
+        accepted, and ten times as many when training ends. It loses by one start, as above, or by
+        a mean cost above the MPC's. Then the ten hardest of these starts join the others for good,
+        and the last policy accepted before that passes on all of them is put back, or the MPC.
+        0 is for none.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
     every : int, default 1
@@ -104,8 +115,10 @@ class ImprovementGuard(BaseCallback):
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range; when training starts, if the policy is no YannPolicy or the
-        simulator is the training env.
+        If an argument is out of range; when training starts, if the policy is no YannPolicy, the
+        simulator is the training env or gives costs that are no numbers, the guard is within an
+        EveryNTimesteps or the like, or, on a plant alone, if other actions than the policy's are
+        to be played.
     """
 
     model: OffPolicyAlgorithm
@@ -146,8 +159,7 @@ class ImprovementGuard(BaseCallback):
             ("patience", patience, 1),
             ("trial_episodes", trial_episodes, 3),
         ):
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}.")
+            check_whole(name, value, least)
         for name, flag in (("by_region", by_region), ("wander", wander)):
             if not isinstance(flag, bool):
                 raise TypeError(f"{name} = {flag!r} must be True or False.")
@@ -158,8 +170,7 @@ class ImprovementGuard(BaseCallback):
             ("smallest_step", smallest_step, 0.0, 1.0),
             ("significance", significance, 0.0, 0.5),
         ):
-            if not low <= as_factor(name, factor) <= high:
-                raise ValueError(f"{name} = {factor!r} must be between {low:g} and {high:g}.")
+            check_between(name, factor, low, high)
         self.shrink, self.grow, self.smallest_step = shrink, grow, smallest_step
         self.record = None if record is None else Path(record)
         self.trials: SimulatorTrials | PlantTrials
@@ -186,6 +197,7 @@ class ImprovementGuard(BaseCallback):
         return state
 
     def _init_callback(self) -> None:
+        check_not_nested(self)
         policy = self.model.policy
         if not isinstance(policy, YannPolicy):
             raise TypeError(
@@ -197,17 +209,39 @@ class ImprovementGuard(BaseCallback):
         self._mpc = Snapshot.of(policy) if untrained else None
 
     def _on_training_start(self) -> None:
+        check_not_nested(self)
         self.trials.start(self)
         known = getattr(self.model, "guard_state", None)
         if known is None or known.settings != self.trials.settings:
-            state = GuardState(self.trials.settings, Snapshot.of(self.policy), evidence=None)
-            if known is not None:  # other starts or another plant: the policies are tried anew
-                state.decisions, state.episodes = known.decisions, known.episodes
-            self.model.guard_state = state  # type: ignore[attr-defined]
-            self.trials.first_evidence(self)
+            self._start_afresh(known)
+        elif not self.trials.still_holds(self):
+            warnings.warn(
+                f"The guard's env {self.trials.settings['env']} does not play the episodes that "
+                "the guard's evidence is from: it is another simulator of that name. The policies "
+                "are tried anew.",
+                stacklevel=2,
+            )
+            self._start_afresh(known)
         self.policy.actor_step = self.state.step
         if self.record is not None:
             write_csv(self.record, self.decisions)
+
+    def _start_afresh(self, known: GuardState | None) -> None:
+        """Gather first evidence; where that fails, leave everything as it was."""
+        present = Snapshot.of(self.policy)
+        state = GuardState(self.trials.settings, present, evidence=None)
+        if known is not None:  # other starts or another plant: the policies are tried anew
+            state.decisions, state.episodes = [*known.decisions], known.episodes
+        self.model.guard_state = state  # type: ignore[attr-defined]
+        try:
+            self.trials.first_evidence(self, known)
+        except BaseException:
+            present.restore(self.policy)
+            self.model.guard_state = known  # type: ignore[attr-defined]
+            raise
+
+    def _on_rollout_start(self) -> None:
+        self.trials.before_steps(self)
 
     def _on_step(self) -> bool:
         self.state.episodes += int(np.sum(self.locals["dones"]))
@@ -229,7 +263,7 @@ class ImprovementGuard(BaseCallback):
     def mpc(self) -> Snapshot:
         """The MPC itself, with an optimizer as new."""
         if self._mpc is None:
-            with th.random.fork_rng(devices=[]):  # building an actor draws weights
+            with chance_untouched():  # building an actor draws weights
                 actor = self.policy.make_actor()
             optimizer = {**self.policy.actor.optimizer.state_dict(), "state": {}}
             self._mpc = Snapshot.of_parts(actor.state_dict(), optimizer)
@@ -259,22 +293,3 @@ class ImprovementGuard(BaseCallback):
                 + (f" ({decision.reason})" if decision.reason else "")
                 + f"; mean cost {decision.accepted_cost:.6g}, MPC {decision.mpc_cost:.6g}"
             )
-
-
-def restore_accepted(model: BaseAlgorithm) -> None:
-    """Make the policy that a guard accepted last the model's, in training or after a load.
-
-    For what `learn` does at its end and an exception leaves undone, and for a model that was saved
-    in the midst of training.
-
-    Raises
-    ------
-    ValueError
-        If no guard has been at work on the model.
-    """
-    state, policy = getattr(model, "guard_state", None), model.policy
-    if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
-        raise ValueError(f"No ImprovementGuard has been at work on this {type(model).__name__}.")
-    if not same(state.accepted, policy):
-        state.accepted.restore(policy)
-    policy.actor_step = 1.0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,35 +12,80 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann.evaluation import Episodes, Predictor, evaluate
+from sb3_yann.guard.chance import chance_untouched
 from sb3_yann.guard.judging import Paired
+from sb3_yann.guard.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
-class Evidence:
-    """The accepted policy's episodes: what a candidate is compared with.
+class Outcome:
+    """What came of a policy's episodes, in the order of their seeds.
 
-    ``visits[i, r]`` says whether the episode from start i comes through region r: the others go on
-    as they are, whatever the network of r becomes.
+    Attributes
+    ----------
+    costs : ndarray, shape (episodes,)
+    unsafe : ndarray of int, shape (episodes, 2)
+        Steps with a violation, and whether the env terminated the episode.
+    visits : ndarray of bool, shape (episodes, regions)
+        Through which regions it comes: whatever the networks of the others become, the episode
+        stays as it is.
     """
 
-    seeds: tuple[int, ...]
-    paired: Paired
+    costs: Array
+    unsafe: NDArray[np.int64]
     visits: NDArray[np.bool_]
 
-    def and_also(self, other: Evidence) -> Evidence:
-        """Return the evidence from the starts of both."""
-        return Evidence(
-            (*self.seeds, *other.seeds),
-            self.paired.and_also(other.paired),
+    def at(self, index: Any) -> Outcome:
+        """Return some of the episodes."""
+        return Outcome(self.costs[index], self.unsafe[index], self.visits[index])
+
+    def and_also(self, other: Outcome) -> Outcome:
+        """Return the episodes of both."""
+        return Outcome(
+            np.concatenate([self.costs, other.costs]),
+            np.concatenate([self.unsafe, other.unsafe]),
             np.concatenate([self.visits, other.visits]),
         )
 
+    def replaced(self, index: Any, other: Outcome) -> Outcome:
+        """Return a copy with other episodes in some places."""
+        copy = Outcome(self.costs.copy(), self.unsafe.copy(), self.visits.copy())
+        copy.costs[index], copy.unsafe[index] = other.costs, other.unsafe
+        copy.visits[index] = other.visits
+        return copy
 
-class NotFinite(Exception):
-    """An action of the policy is not a finite number; envs need not put up with one."""
+
+@dataclass(frozen=True)
+class Evidence:
+    """The MPC's episodes and the accepted policy's: what a candidate is compared with."""
+
+    seeds: tuple[int, ...]
+    mpc: Outcome
+    accepted: Outcome
+    margin: float
+
+    @property
+    def paired(self) -> Paired:
+        """What judges the costs of a candidate from these starts."""
+        return Paired(self.mpc.costs, self.accepted.costs, self.accepted.unsafe, self.margin)
+
+    @property
+    def visits(self) -> NDArray[np.bool_]:
+        """Through which regions the accepted policy's episodes come."""
+        return self.accepted.visits
+
+    def of(self, accepted: Outcome) -> Evidence:
+        """Return what stands for another policy from the same starts."""
+        return Evidence(self.seeds, self.mpc, accepted, self.margin)
+
+
+class Unplayable(Exception):
+    """The policy's episodes cannot be played to their end; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -49,38 +95,78 @@ class _FinitePolicy:
 
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
         actions, state = self.policy.predict(self.seen(observation), deterministic=deterministic)
-        if not np.all(np.isfinite(actions)):
-            raise NotFinite
+        if not np.all(np.isfinite(actions)):  # envs need not put up with it
+            raise Unplayable("an action of the actor is not a finite number")
         return actions, state
 
 
-def play(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Episodes:
-    """Return the present policy's episodes; raises NotFinite."""
-    return evaluate(_FinitePolicy(guard.policy, _seen(guard)), env, seeds)
+def played(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Episodes:
+    """Return the present policy's episodes; raises Unplayable, or what the env raises."""
+    with chance_untouched():
+        return evaluate(_FinitePolicy(guard.policy, _seen(guard)), env, seeds)
 
 
-def judged(guard: ImprovementGuard, env: Any) -> tuple[Episodes | None, str]:
+def play(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Outcome:
+    """Return what comes of the present policy.
+
+    Raises
+    ------
+    Unplayable
+        If an action is not finite, or if the env raises an error under this policy, but not under
+        the MPC from the same starts. An error that the MPC meets as well is the env's own.
+    """
+    try:
+        return outcome_of(guard, played(guard, env, seeds))
+    except Unplayable:
+        raise
+    except Exception as error:
+        present = Snapshot.of(guard.policy)
+        guard.mpc.restore(guard.policy)
+        try:
+            played(guard, env, seeds)
+        finally:
+            present.restore(guard.policy)
+        reason = f"the simulator failed: {type(error).__name__}: {error}"
+        raise Unplayable(reason) from error
+
+
+def outcome_of(guard: ImprovementGuard, episodes: Episodes) -> Outcome:
+    """Return what matters of the episodes."""
+    unsafe = np.column_stack([episodes.violations, episodes.terminated]).astype(np.int64)
+    return Outcome(episodes.costs, unsafe, _visits(guard, episodes))
+
+
+def judged(guard: ImprovementGuard, env: Any) -> tuple[Outcome | None, str]:
     """Return the episodes of the present policy and what speaks against it, if anything."""
-    if not all(bool(th.isfinite(each).all()) for each in guard.policy.actor.parameters()):
+    if not finite(guard):
         return None, "a parameter of the actor is not a finite number"
     evidence: Evidence = guard.state.evidence
     try:
-        played = play(guard, env, evidence.seeds)
-    except NotFinite:
-        return None, "an action of the actor is not a finite number"
-    return played, evidence.paired.objection(played.costs, unsafe(played))
+        outcome = play(guard, env, evidence.seeds)
+    except Unplayable as error:
+        return None, str(error)
+    return outcome, evidence.paired.objection(outcome.costs, outcome.unsafe)
 
 
-def evidence_of(guard: ImprovementGuard, played: Episodes) -> Evidence:
-    """Return what stands for the policy of these episodes, from the starts of the accepted one."""
-    evidence: Evidence = guard.state.evidence
-    paired = replace(evidence.paired, costs=played.costs, violations=unsafe(played))
-    return Evidence(evidence.seeds, paired, visits_of(guard, played))
+def finite(guard: ImprovementGuard) -> bool:
+    """Return whether all parameters of the actor are finite numbers."""
+    return all(bool(th.isfinite(each).all()) for each in guard.policy.actor.parameters())
 
 
-def unsafe(played: Episodes) -> NDArray[np.int64]:
-    """Return the violations of each episode; to be terminated counts as one."""
-    return np.maximum(played.violations, played.terminated)
+@contextmanager
+def all_or_nothing(guard: ImprovementGuard) -> Iterator[Snapshot]:
+    """Yield the candidate; bring it back, and what was accepted, if it is cut off by an error.
+
+    Or by Ctrl-C: what is under trial stands in the place of what is accepted until it is over.
+    """
+    state, candidate = guard.state, Snapshot.of(guard.policy)
+    before = state.accepted, state.evidence, [*state.passed]
+    try:
+        yield candidate
+    except BaseException:
+        state.accepted, state.evidence, state.passed = before
+        candidate.restore(guard.policy)
+        raise
 
 
 def _seen(guard: ImprovementGuard) -> Callable[[Any], Any]:
@@ -92,11 +178,10 @@ def _seen(guard: ImprovementGuard) -> Callable[[Any], Any]:
     return (lambda observation: observation) if normalize is None else normalize.normalize_obs
 
 
-def visits_of(guard: ImprovementGuard, played: Episodes) -> NDArray[np.bool_]:
-    """Return which regions each episode comes through, shape (episodes, regions)."""
+def _visits(guard: ImprovementGuard, episodes: Episodes) -> NDArray[np.bool_]:
     layer, seen = guard.policy.actor.mu, _seen(guard)
-    visits = np.zeros((len(played.costs), len(layer.gains)), dtype=bool)
-    for visited, states in zip(visits, played.observations, strict=True):
+    visits = np.zeros((len(episodes.costs), len(layer.gains)), dtype=bool)
+    for visited, states in zip(visits, episodes.observations, strict=True):
         theta = guard.policy.theta(seen(states[:-1]))
         visited[layer.locate(theta)[0].cpu().numpy()] = True
     return visits

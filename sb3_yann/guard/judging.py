@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 Array = NDArray[np.float64]
+OUTLIER = 1e-3
+"""Probability that one episode of a policy like the accepted one is taken for far outside."""
 
 
 @dataclass(frozen=True)
@@ -19,25 +21,17 @@ class Paired:
     ----------
     mpc_costs, costs : ndarray, shape (starts,)
         Of the MPC and of the accepted policy.
-    violations : ndarray of int, shape (starts,)
-        Of the accepted policy.
+    unsafe : ndarray of int, shape (starts, 2)
+        Of the accepted policy: steps with a violation, and whether the env terminated the episode.
+        They are compared one by one: an episode that is cut short has fewer steps to violate in.
     margin : float
         By how much one start may cost more than with the MPC, in units of the cost.
     """
 
     mpc_costs: Array
     costs: Array
-    violations: NDArray[np.int64]
+    unsafe: NDArray[np.int64]
     margin: float
-
-    def and_also(self, other: Paired) -> Paired:
-        """Return the episodes of both, with the margin of this one."""
-        return Paired(
-            np.concatenate([self.mpc_costs, other.mpc_costs]),
-            np.concatenate([self.costs, other.costs]),
-            np.concatenate([self.violations, other.violations]),
-            self.margin,
-        )
 
     def lost(self, costs: Array) -> NDArray[np.bool_]:
         """Return which starts cost more than with the MPC by more than the margin."""
@@ -47,14 +41,15 @@ class Paired:
         """Return whether the mean cost is above the MPC's."""
         return not costs.mean() <= self.mpc_costs.mean()
 
-    def objection(self, costs: Array, violations: NDArray[np.int64]) -> str:
+    def objection(self, costs: Array, unsafe: NDArray[np.int64]) -> str:
         """Return why a policy with these episodes is refused, empty where it is not.
 
         Comparisons are written so that a cost that is not a number is refused.
         """
-        more = np.flatnonzero(violations > self.violations)
-        if len(more):
-            return f"{len(more)} starts with violations, the first is number {more[0]}"
+        for column, what in enumerate(("violations", "an episode that the env terminates")):
+            more = np.flatnonzero(unsafe[:, column] > self.unsafe[:, column])
+            if len(more):
+                return f"{len(more)} starts with {what}, the first is number {more[0]}"
         excess = costs - self.mpc_costs
         worst = int(np.argmax(np.where(np.isnan(excess), np.inf, excess)))
         if not excess[worst] <= self.margin:
@@ -80,6 +75,34 @@ class PlantEpisodes:
     predicted: Array
 
 
+def excess_of_an_outlier(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
+    """Return by how much one of the candidate's episodes costs more than the accepted policy's.
+
+    0 where none is far outside: beyond the upper prediction limit, of size ``OUTLIER`` for all of
+    them together, of the least-squares line of the accepted policy's costs on the predicted ones
+    (e.g. Montgomery, chapter 10). The mean would not show it: a heavy loss raises the
+    scatter as well.
+    """
+    covariate = _varies(accepted.predicted) and bool(np.all(np.isfinite(candidate.predicted)))
+    X, new = (
+        np.column_stack([np.ones(len(each.costs)), each.predicted][: 1 + covariate])
+        for each in (accepted, candidate)
+    )
+    freedom = len(X) - X.shape[1]
+    coefficients, *_ = np.linalg.lstsq(X, accepted.costs, rcond=None)
+    scatter = np.sqrt(np.sum((accepted.costs - X @ coefficients) ** 2) / freedom)
+    leverage = np.einsum("ij,jk,ik->i", new, np.linalg.pinv(X.T @ X), new)
+    excess = candidate.costs - new @ coefficients
+    limit = stats.t.isf(OUTLIER / len(new), freedom) * scatter * np.sqrt(1 + leverage)
+    beyond = excess > limit + 1e-9 * np.abs(accepted.costs).max()
+    return float(np.max(excess, where=beyond, initial=0.0))
+
+
+def _varies(predicted: Array) -> bool:
+    finite = bool(np.all(np.isfinite(predicted)))
+    return finite and bool(np.ptp(predicted) > 1e-9 * np.abs(predicted).max())
+
+
 def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
     """Return the one-sided p-value of "the candidate costs less" against "it does not"."""
     return compared(candidate, accepted)[1]
@@ -100,7 +123,7 @@ def compared(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, 
     is_candidate = np.arange(len(costs)) < len(candidate.costs)
     predicted = np.concatenate([candidate.predicted, accepted.predicted])
     columns = [np.ones(len(costs)), is_candidate.astype(float)]
-    if np.all(np.isfinite(predicted)) and np.ptp(predicted) > 1e-9 * np.abs(predicted).max():
+    if _varies(predicted):
         columns.append((predicted - predicted.mean()) / predicted.std())
     X = np.column_stack(columns)
     freedom = len(costs) - X.shape[1]

@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann.control import LinearMPC
-from sb3_yann.guard.judging import PlantEpisodes, compared
-from sb3_yann.guard.record import Decision
+from sb3_yann.guard.checks import check_acts_alone
+from sb3_yann.guard.judging import PlantEpisodes, compared, excess_of_an_outlier
+from sb3_yann.guard.record import Decision, GuardState
 from sb3_yann.guard.snapshot import Snapshot, same
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
 
 Array = NDArray[np.float64]
+LARGEST = 1e9
+"""Parameters beyond this are taken for diverged: the actor's sums could overflow."""
 
 
 @dataclass
@@ -46,21 +49,46 @@ class PlantTrials:
     def start(self, guard: ImprovementGuard) -> None:
         """Begin with the episodes that start now; one that is under way is not counted."""
         n_envs = guard.training_env.num_envs
+        check_acts_alone(guard)
         # SB3 goes on in the midst of an episode where its steps are not counted from 0 again.
         self.costs, self.lengths = np.zeros(n_envs), np.full(n_envs, int(guard.num_timesteps > 0))
         self.violated = np.zeros(n_envs, dtype=bool)
+        # Whether the accepted policy has played all of the episode that is under way.
+        self.accepted_led = np.zeros(n_envs, dtype=bool)
         self.starts: list[Array] = [np.empty(0)] * n_envs
         self.blocks = np.full(n_envs, -1)
         self.block = 0
 
-    def first_evidence(self, guard: ImprovementGuard) -> None:
-        """Begin with a block of episodes that the present policy plays."""
-        guard.accept(Evidence(resting=Snapshot.of(guard.policy)))
+    def still_holds(self, guard: ImprovementGuard) -> bool:
+        """Return whether the evidence is there; a plant cannot be played again."""
+        return guard.state.evidence is not None
+
+    def first_evidence(self, guard: ImprovementGuard, known: GuardState | None) -> None:
+        """Begin with a block of episodes of the present policy, or of what is accepted already."""
+        other = False
+        if known is not None:  # what the present one is, if it is another, nobody has found out
+            other = not same(known.accepted, guard.policy)
+            known.accepted.restore(guard.policy)
+        guard.accept(evidence := Evidence(resting=Snapshot.of(guard.policy)))
+        if other:
+            self._report(guard, evidence, "rejected", "before training, it is not accepted", np.nan)
+
+    def before_steps(self, guard: ImprovementGuard) -> None:
+        """Bring the accepted policy back before a diverged one acts on the plant.
+
+        SB3 calls this after each training of the networks, before the next action.
+        """
+        largest = [each.detach().abs().max() for each in guard.policy.actor.parameters()]
+        if not all(bool(each <= LARGEST) for each in largest):  # nor does nan pass
+            reason = "a parameter of the actor is not a finite number, or too large"
+            self._return(guard, guard.state.evidence, reason)
 
     def step(self, guard: ImprovementGuard) -> None:
         """Count the step; decide where a block is over."""
         evidence: Evidence = guard.state.evidence
         self._enrol(guard, evidence)
+        if self.accepted_led.any() and not same(guard.state.accepted, guard.policy):
+            self.accepted_led[:] = False
         if evidence.resting is not None and not same(evidence.resting, guard.policy):
             self._return(guard, evidence, "the actor was changed while it rested")
         dones, infos = guard.locals["dones"], guard.locals["infos"]
@@ -72,7 +100,7 @@ class PlantTrials:
                 self.violated[i] = True
                 if not same(guard.state.accepted, guard.policy):
                     self._return(guard, evidence, "a limit was violated")
-                elif terminated:
+                elif terminated and self.accepted_led[i]:
                     evidence.terminates = True
             if done:
                 if self.blocks[i] == self.block:
@@ -99,6 +127,7 @@ class PlantTrials:
         starting = np.flatnonzero(self.lengths == 0)
         if len(starting) == 0:
             return
+        self.accepted_led[starting] = True
         theta = guard.policy.theta(guard.model._last_obs)  # type: ignore[arg-type]
         for i in starting:  # s_t, before the step
             self.starts[i] = theta[i].double().cpu().numpy()
@@ -135,6 +164,11 @@ class PlantTrials:
             return
         played = PlantEpisodes(np.array(evidence.costs), np.array(evidence.predicted))
         if evidence.phase == "first":
+            if not np.all(np.isfinite(played.costs)):
+                raise ValueError(
+                    f"The episodes of the guard's first block cost {played.costs.tolist()}: "
+                    "no policy can be compared with that. Rewards must be finite numbers."
+                )
             evidence.accepted = played
             if guard.policy.actor.mu.network.is_zero():
                 evidence.mpc = played
@@ -142,7 +176,10 @@ class PlantTrials:
             assert evidence.accepted is not None
             difference, chance = compared(played, evidence.accepted)
             reason = f"{difference:+.4g} from the same starts by the linear model, p = {chance:.3g}"
-            if chance < self.significance:
+            beyond = excess_of_an_outlier(played, evidence.accepted)
+            if beyond > 0:
+                reason += f", but one start costs {beyond:.4g} more than it should"
+            if chance < self.significance and not beyond > 0:
                 evidence.accepted = played
                 guard.accept(evidence)
                 self._report(guard, evidence, "accepted", reason, played.costs.mean())

@@ -51,7 +51,12 @@ class Decision:
 
 @dataclass
 class GuardState:
-    """All that a stopped run needs to go on; it travels in the model's zip."""
+    """All that a stopped run needs to go on; it travels in the model's zip.
+
+    ``passed`` are policies that were accepted, the latest last, with their outcomes on the first of
+    the known starts: what may be gone back to. ``fresh`` counts the new starts that were tried,
+    ``next_start`` is the seed of the next.
+    """
 
     settings: dict[str, Any]
     accepted: Snapshot
@@ -60,6 +65,8 @@ class GuardState:
     episodes: int = 0
     rejections: int = 0
     fresh: int = 0
+    next_start: int = 0
+    passed: list[tuple[Snapshot, Any]] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
 
 

@@ -9,21 +9,29 @@ from typing import TYPE_CHECKING, Any, Final
 import gymnasium as gym
 import numpy as np
 
-from sb3_yann.evaluation import Episodes, one_env
-from sb3_yann.guard.episodes import Evidence, evidence_of, judged, play, unsafe, visits_of
-from sb3_yann.guard.fresh import VIOLATES, settle
-from sb3_yann.guard.judging import Paired
-from sb3_yann.guard.record import Decision
-from sb3_yann.guard.regions import accept_parts, taken_over
-from sb3_yann.guard.snapshot import Snapshot, same, same_networks
+from sb3_yann.guard.checks import check_simulator, first_episodes
+from sb3_yann.guard.episodes import (
+    Evidence,
+    Outcome,
+    Unplayable,
+    all_or_nothing,
+    finite,
+    judged,
+    outcome_of,
+    played,
+)
+from sb3_yann.guard.fresh import VIOLATES, remember, settle
+from sb3_yann.guard.record import Decision, GuardState
+from sb3_yann.guard.regions import accept_parts, accept_visited, taken_over
+from sb3_yann.guard.snapshot import Snapshot, changed, same, same_networks
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
 
 
 PART: Final = "accepted in part"
-MEMORY = 50_000_000
-"""Bytes of earlier accepted policies that are kept to go back to."""
+REPLAYED = 5
+"""Starts from which the accepted policy is played again when a run goes on."""
 
 
 class SimulatorTrials:
@@ -44,56 +52,72 @@ class SimulatorTrials:
         self.env, self.every, self.margin, self.by_region = env, every, margin, by_region
         self.patience, self.wander, self.fresh = patience, wander, fresh
         self.seeds = range(seed, seed + n_starts)
-        self.settings = {"env": _name(env), "seeds": self.seeds, "margin": margin}
+        self.settings: dict[str, Any] = {"env": _name(env), "seeds": self.seeds, "margin": margin}
 
     def start(self, guard: ImprovementGuard) -> None:
         """Check that the simulator is another env than the training env, and a like one."""
-        training = [env.unwrapped for env in getattr(guard.training_env, "envs", [])]
-        with one_env(self.env) as env:
-            if any(env.unwrapped is each for each in training):
-                raise ValueError(
-                    "The guard's env is the training env, whose episodes its own would interrupt. "
-                    "Give it another one, e.g. its id."
-                )
-            ours, theirs = env.observation_space.shape, guard.training_env.observation_space.shape
-            if ours != theirs or env.action_space != guard.training_env.action_space:
-                raise ValueError(
-                    f"The guard's env {_name(self.env)} has observations of shape {ours} and "
-                    f"{env.action_space}; the training env has {theirs} and "
-                    f"{guard.training_env.action_space}. Give the guard a simulator of this plant."
-                )
-        # Not saved with the model: a resumed run that has to go back goes back to the MPC.
-        self.passed: list[Snapshot] = []
+        check_simulator(self.env, self.settings["env"], guard.training_env)
         self._final: Snapshot | None = None
         self.last_trial = -self.every  # the first episode that ends is always followed by a trial
 
-    def first_evidence(self, guard: ImprovementGuard) -> None:
-        """Play the MPC's episodes, and accept the policy if it is no worse at the start."""
-        present = Snapshot.of(guard.policy)
+    def still_holds(self, guard: ImprovementGuard) -> bool:
+        """Return whether the accepted policy's episodes are still what the evidence says.
+
+        The settings name the simulator; another one may have the same name.
+        """
+        evidence: Evidence | None = guard.state.evidence
+        if evidence is None:
+            return False
+        last = len(evidence.seeds) - 1
+        some = np.unique(np.linspace(0, last, REPLAYED).astype(int))
+        present, expected = Snapshot.of(guard.policy), evidence.accepted.at(some)
+        try:
+            guard.state.accepted.restore(guard.policy)
+            again = outcome_of(
+                guard, played(guard, self.env, [evidence.seeds[int(i)] for i in some])
+            )
+        except Unplayable:
+            return False
+        finally:
+            present.restore(guard.policy)
+        close = np.allclose(again.costs, expected.costs, rtol=1e-5, atol=1e-3 * evidence.margin)
+        return close and np.array_equal(again.unsafe, expected.unsafe)
+
+    def first_evidence(self, guard: ImprovementGuard, known: GuardState | None) -> None:
+        """Play the MPC's episodes, and accept what is no worse at the start.
+
+        That may be the policy that is accepted by a run with other settings, whose hard starts
+        stay, and the present one.
+        """
+        state, present = guard.state, Snapshot.of(guard.policy)
+        candidates, seeds = [present], (*self.seeds,)
+        state.next_start = self.seeds.stop
+        if known is not None:
+            candidates = [known.accepted, present]
+            state.fresh, state.next_start = known.fresh, max(known.next_start, self.seeds.stop)
+            hard = set(getattr(known.evidence, "seeds", ())) - {*known.settings.get("seeds", ())}
+            seeds = (*seeds, *sorted(hard - {*seeds}))
         if not guard.policy.actor.mu.network.is_zero():
             guard.mpc.restore(guard.policy)
-        # By the actor, not the law in float64: the MPC itself is to be no worse to the last bit.
-        mpc = play(guard, self.env, self.seeds)
-        again = play(guard, self.env, self.seeds)
-        for seed, first, second in zip(self.seeds, mpc.costs, again.costs, strict=True):
-            if not np.isclose(first, second, rtol=1e-6, atol=0, equal_nan=True):
-                raise ValueError(
-                    f"The MPC played two episodes of the guard's env {_name(self.env)} from the "
-                    f"seed {seed}, at costs of {first:g} and {second:g}. Episodes are compared in "
-                    "pairs: all that is random in the env must come from self.np_random."
-                )
-        margin = self.margin * float(np.median(np.abs(mpc.costs)))
-        paired = Paired(mpc.costs, mpc.costs, unsafe(mpc), margin)
-        guard.accept(Evidence((*self.seeds,), paired, visits_of(guard, mpc)))
-        if same(present, guard.policy):
-            return
-        present.restore(guard.policy)
-        played, reason = judged(guard, self.env)
-        if played is not None and not reason:
-            guard.accept(evidence_of(guard, played))
-        else:
-            guard.state.accepted.restore(guard.policy)
-            self._report(guard, played, f"before training, {reason}", [], returned=True)
+        mpc = first_episodes(guard, self.env, self.settings["env"], seeds)
+        margin = self.margin * float(np.median(np.abs(mpc.costs[: len(self.seeds)])))
+        guard.accept(Evidence(seeds, mpc, mpc, margin))
+        for candidate in candidates:
+            if same(candidate, guard.policy):
+                continue
+            candidate.restore(guard.policy)
+            outcome, reason = judged(guard, self.env)
+            if outcome is not None and not reason:
+                accept_visited(guard, candidate, outcome)
+            else:
+                state.accepted.restore(guard.policy)
+                self._report(guard, outcome, f"before training, {reason}", [], returned=True)
+        for snapshot, _ in [] if known is None else known.passed:
+            remember(guard, snapshot, None)
+        remember(guard, state.accepted, state.evidence.accepted)
+
+    def before_steps(self, guard: ImprovementGuard) -> None:
+        """Do nothing: the training env may meet any candidate."""
 
     def step(self, guard: ImprovementGuard) -> None:
         """Try the present policy where an episode has ended and it is time."""
@@ -103,63 +127,71 @@ class SimulatorTrials:
 
     def end(self, guard: ImprovementGuard) -> None:
         """Try the last candidate, and what is accepted then on ten times as many new starts."""
+        state = guard.state
         # There is no later: what is refused now returns.
-        guard.state.rejections = self.patience - 1
-        self._try(guard)
-        last = guard.state.accepted
+        state.rejections = self.patience - 1
+        try:
+            self._try(guard)
+        finally:
+            state.rejections = 0
+        last = state.accepted
         if last is self._final:  # the Zoo ends its first callback a second time
             return
-        reason = settle(guard, self, 10 * self.fresh)
-        self._final = accepted = guard.state.accepted
+        with all_or_nothing(guard):
+            reason = settle(guard, self, 10 * self.fresh)
+        self._final = accepted = state.accepted
         accepted.restore(guard.policy)
         if reason:
             regions = taken_over(guard.mpc, last, accepted)
             self._report(guard, None, f"at the end, {reason}", regions, returned=True)
 
-    def remember(self, snapshot: Snapshot) -> None:
-        """Keep what passed on new starts, as far as memory allows."""
-        self.forget(snapshot)
-        self.passed.append(snapshot)
-        most = max(1, min(len(self.passed), MEMORY // snapshot.size))
-        del self.passed[:-most]
-
-    def forget(self, snapshot: Snapshot) -> None:
-        """Remove what lost on new starts after all."""
-        self.passed = [each for each in self.passed if not same_networks(each, snapshot)]
-
     def _try(self, guard: ImprovementGuard) -> None:
         if same(guard.state.accepted, guard.policy):
             return
-        before = guard.state.accepted, guard.state.evidence
-        candidate = Snapshot.of(guard.policy)
-        played, reason = judged(guard, self.env)
-        hopeless = played is None or bool(np.any(unsafe(played) > before[1].paired.violations))
-        if played is not None and not reason:
-            guard.accept(evidence_of(guard, played), candidate)
-        elif played is not None and not hopeless:
-            hopeless = not self.wander and before[1].paired.loses_to_the_mpc(played.costs)
-            if self.by_region:
-                accept_parts(guard, self.env, candidate, played)
-        moved = not same_networks(before[0], guard.state.accepted)
-        lost = settle(guard, self, self.fresh) if moved else ""
-        if not reason and not lost:
-            guard.state.rejections = 0
-            self._report(guard, played, "", [], returned=False)
-            return
-        guard.state.rejections += 1
-        hopeless = hopeless or VIOLATES in lost
-        returned = hopeless or guard.state.rejections >= self.patience
-        if returned:
-            guard.state.rejections = 0
+        before = guard.state.accepted
+        with all_or_nothing(guard) as candidate:
+            if self._plays_alike(guard, candidate):
+                return
+            outcome, reason, returned = self._judge(guard, candidate)
         accepted = guard.state.accepted
-        (accepted if returned else candidate).restore(guard.policy)
-        regions = taken_over(before[0], candidate, accepted)
-        self._report(guard, played, reason or lost, regions, returned)
+        regions = taken_over(before, candidate, accepted) if reason else []
+        self._report(guard, outcome, reason, regions, returned)
+
+    def _plays_alike(self, guard: ImprovementGuard, candidate: Snapshot) -> bool:
+        """Return whether it differs only where none of the accepted policy's episodes comes."""
+        visited = guard.state.evidence.visits.any(0)
+        return finite(guard) and not np.any(changed(guard.state.accepted, candidate) & visited)
+
+    def _judge(
+        self, guard: ImprovementGuard, candidate: Snapshot
+    ) -> tuple[Outcome | None, str, bool]:
+        """Return the candidate's episodes, why it is refused, and whether the actor returns."""
+        state = guard.state
+        before: tuple[Snapshot, Evidence] = state.accepted, state.evidence
+        outcome, reason = judged(guard, self.env)
+        hopeless = outcome is None or bool(np.any(outcome.unsafe > before[1].accepted.unsafe))
+        if outcome is not None and not reason:
+            accept_visited(guard, candidate, outcome)
+        elif outcome is not None and not hopeless:
+            hopeless = not self.wander and before[1].paired.loses_to_the_mpc(outcome.costs)
+            if self.by_region:
+                accept_parts(guard, self.env, candidate, outcome)
+        moved = not same_networks(before[0], state.accepted)
+        lost = settle(guard, self, self.fresh) if moved else ""
+        returned = False
+        if reason or lost:
+            state.rejections += 1
+            hopeless = hopeless or VIOLATES in lost
+            returned = hopeless or state.rejections >= self.patience
+        if returned or not (reason or lost):
+            state.rejections = 0
+        (state.accepted if returned else candidate).restore(guard.policy)
+        return outcome, reason or lost, returned
 
     def _report(
         self,
         guard: ImprovementGuard,
-        played: Episodes | None,
+        outcome: Outcome | None,
         reason: str,
         regions: list[int],
         returned: bool,
@@ -172,7 +204,7 @@ class SimulatorTrials:
                 verdict="accepted" if not reason else PART if regions else "rejected",
                 reason=reason,
                 returned=returned,
-                candidate_cost=np.nan if played is None else float(played.costs.mean()),
+                candidate_cost=np.nan if outcome is None else float(outcome.costs.mean()),
                 accepted_cost=float(paired.costs.mean()),
                 mpc_cost=float(paired.mpc_costs.mean()),
                 worst_start=float(np.max(paired.costs - paired.mpc_costs)),

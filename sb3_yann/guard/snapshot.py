@@ -7,7 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch as th
+from numpy.typing import NDArray
 
 from sb3_yann.policies import YannPolicy
 
@@ -101,3 +103,12 @@ def same_networks(one: Snapshot, other: Snapshot) -> bool:
     """Return whether both hold the same actor, whatever its optimizer remembers."""
     networks = other.networks()
     return all(th.equal(value, networks[name]) for name, value in one.networks().items())
+
+
+def changed(before: Snapshot, after: Snapshot) -> NDArray[np.bool_]:
+    """Return in which regions the network is another one, shape (regions,)."""
+    networks = after.networks()
+    different = [
+        (value != networks[name]).flatten(1).any(1) for name, value in before.networks().items()
+    ]
+    return np.asarray(th.stack(different).any(0).numpy())

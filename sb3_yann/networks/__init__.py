@@ -1,6 +1,7 @@
 """Networks that start as something known, exactly, and are trainable. torch, no SB3."""
 
 from sb3_yann.networks.literal import LiteralYann
+from sb3_yann.networks.row_adam import RowAdam
 from sb3_yann.networks.value import (
     AfterstateValue,
     LinearPrediction,
@@ -14,6 +15,7 @@ __all__ = [
     "LinearPrediction",
     "LiteralYann",
     "QuadraticStateActionValue",
+    "RowAdam",
     "YannLayer",
     "ZeroOutputNetwork",
 ]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
+from sb3_yann.networks.compiled_value import value_on_processor
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
 Array = NDArray[np.float64]
@@ -169,9 +171,38 @@ class AfterstateValue(nn.Module):
         self.network = ZeroOutputNetwork(
             n, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
+        self.fixed = False
+        """Whether gradients go to the action alone, not to the weights."""
+        self._constants: tuple[Array, Array, Array, Array] | None = None
+
+    @property
+    def compiles(self) -> bool:
+        """Whether there is compiled code for such a value where it is now."""
+        return isinstance(self.model, LinearPrediction) and self.network.compiles
+
+    @property
+    def constants(self) -> tuple[Array, Array, Array, Array]:
+        """W, the model's [A B], the scale of the quadratic form, and others, for compiled code."""
+        if self._constants is None:
+            A, B = (self.model.get_buffer(name).numpy() for name in "AB")  # type: ignore[union-attr]
+            root = self.quadratic.root.numpy()
+            scaling = (self.network_scale, self.to_input, self.middle)
+            self._constants = (
+                self.W.numpy(),
+                np.ascontiguousarray(np.vstack([A, B]).T),
+                np.outer(root, root) * self.gamma,
+                np.concatenate([each.numpy() for each in scaling]),
+            )
+        return self._constants
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._constants = None
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
+        if self.compiles and theta_and_action.device.type == "cpu":
+            return value_on_processor(self, theta_and_action)
         theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
         u = action * self.to_input + self.middle
         z = th.cat([theta, u], 1)

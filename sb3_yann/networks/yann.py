@@ -10,6 +10,7 @@ from torch import nn
 
 from sb3_yann.control._validation import Array
 from sb3_yann.control.piecewise_affine import PiecewiseAffine
+from sb3_yann.networks.compiled_layer import layer_on_processor
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
 
@@ -37,6 +38,10 @@ class YannLayer(nn.Module):
     pinned : bool, default True
         Whether training must leave the equilibrium where it is. A law whose steady-state input is
         wrong has to be free to move it.
+    rate : pair of ndarray, shape (m,), optional
+        ``du_min`` and ``du_max``: the input never moves by more from the previous one, the last m
+        entries of theta, whatever the networks become. The law itself is held to that too, where
+        it has no solution.
 
     Raises
     ------
@@ -50,6 +55,9 @@ class YannLayer(nn.Module):
     half_space_b: th.Tensor
     theta_half: th.Tensor
     resting: th.Tensor
+    middle: th.Tensor
+    half_range: th.Tensor
+    change: th.Tensor
 
     def __init__(
         self,
@@ -58,6 +66,7 @@ class YannLayer(nn.Module):
         activation: Activation = th.tanh,
         max_correction: float | None = None,
         pinned: bool = True,
+        rate: tuple[Array, Array] | None = None,
     ) -> None:
         super().__init__()
         if not np.all(np.isfinite([law.u_min, law.u_max])):
@@ -65,7 +74,7 @@ class YannLayer(nn.Module):
                 f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
                 "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
             )
-        self.outside = law.outside
+        self.outside, self.piecewise_affine, self.row_gradients = law.outside, law, False
         # The input range is 2 here. A little is left for the float32 rounding of what follows.
         self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
         self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
@@ -79,6 +88,13 @@ class YannLayer(nn.Module):
         self._constant("half_space_A", A)
         self._constant("half_space_b", b)
         self._constant("theta_half", (law.theta_max - law.theta_min) / 2, th.float32)
+        self.rated = rate is not None
+        if rate is not None:
+            self._constant("middle", middle)
+            self._constant("half_range", reach)
+            # In both directions a little is left for the rounding of actions and observations.
+            room = np.maximum(np.stack([-rate[0], rate[1]]) / reach - 1e-6, 0.0)
+            self._constant("change", room * [[-1.0], [1.0]])
         at_origin = np.minimum.reduceat(law.b, law.starts) >= -law.tolerance
         self.network = ZeroOutputNetwork(
             law.n_theta,
@@ -87,17 +103,30 @@ class YannLayer(nn.Module):
             activation=activation,
             pinned=th.as_tensor(at_origin & pinned),
         )
+        self.scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
+        self.has_its_law = True
+        self.change_array = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n).
 
-        Theta of float64 reaches the law as it is, and rounded the network.
+        Theta of float64 reaches the law as it is, and rounded the network. On a processor it is
+        compiled code for networks of two hidden layers with tanh, unless theta needs a gradient;
+        the operations of torch do the same elsewhere.
         """
+        fixed = theta.device.type == "cpu" and not theta.requires_grad
+        if fixed and self.has_its_law and self.network.compiles:
+            return layer_on_processor(self, theta)
         region, inside = self.locate(theta)
         correction = self.network((theta / self.theta_half).to(self.theta_half), region)
         if self.reach is not None:
+            # The bound holds for weights that overflow, or are no numbers, as well.
+            correction = correction.nan_to_num(0.0, self.reach, -self.reach)
             correction = clamp_alive(correction, self.reach)
-        return clamp_alive(self._law(theta, region, inside) + correction)
+        output = self._law(theta, region, inside) + correction
+        if not self.rated:
+            return clamp_alive(output)
+        return clamp_alive_between(output, *self._within_reach(theta))
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
@@ -116,7 +145,22 @@ class YannLayer(nn.Module):
         u = (self.gains[region] * theta[:, None]).sum(-1) + self.offsets[region]
         if self.outside == "zero":
             u = th.where(inside[:, None], u, self.resting)
-        return u.clamp(-1, 1).to(self.theta_half)
+        u = u.clamp(-1, 1).to(self.theta_half)
+        return u.clamp(*self._within_reach(theta)) if self.rated else u
+
+    @th.no_grad()
+    def _within_reach(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the bounds (batch, m) that the rate leaves of [-1, 1]."""
+        previous = (theta[:, -len(self.middle) :] - self.middle) / self.half_range
+        low, high = (previous + self.change[:, None]).clamp(-1, 1).to(self.theta_half)
+        return low, high
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        before = {name: value.clone() for name, value in self.named_buffers(recurse=False)}
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        # What is compiled goes by the law that was given: with another one it must not be used.
+        same = all(th.equal(value, self.get_buffer(name)) for name, value in before.items())
+        self.has_its_law = self.has_its_law and same
 
     def _constant(self, name: str, value: Array, dtype: th.dtype = th.float64) -> None:
         # A buffer, not a parameter: optimizers and SB3's target updates leave it alone.
@@ -138,21 +182,21 @@ def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
 
 
 class _ClampAlive(th.autograd.Function):
-    """Clamp to [-limit, limit]; backward, stop only what would push further out."""
+    """Clamp to [low, high]; backward, stop only what would push further out."""
 
     @staticmethod
-    def forward(ctx: Any, x: th.Tensor, limit: float) -> th.Tensor:
+    def forward(ctx: Any, x: th.Tensor, low: Any, high: Any) -> th.Tensor:
         ctx.save_for_backward(x)
-        ctx.limit = limit
-        return x.clamp(-limit, limit)
+        ctx.low, ctx.high = low, high
+        return x.clamp(low, high)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, None]:
+    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, None, None]:
         (x,) = ctx.saved_tensors
         (grad,) = grad_outputs
         # Descent moves x against its gradient.
-        outward = ((x >= ctx.limit) & (grad < 0)) | ((x <= -ctx.limit) & (grad > 0))
-        return grad.masked_fill(outward, 0.0), None
+        outward = ((x >= ctx.high) & (grad < 0)) | ((x <= ctx.low) & (grad > 0))
+        return grad.masked_fill(outward, 0.0), None, None
 
 
 def clamp_alive(x: th.Tensor, limit: float = 1.0) -> th.Tensor:
@@ -161,5 +205,11 @@ def clamp_alive(x: th.Tensor, limit: float = 1.0) -> th.Tensor:
     The gradient of `torch.clamp` vanishes beyond the bounds, so a saturated region would never
     learn to leave its bound.
     """
-    clamped: th.Tensor = _ClampAlive.apply(x, limit)  # type: ignore[no-untyped-call]
+    clamped: th.Tensor = _ClampAlive.apply(x, -limit, limit)  # type: ignore[no-untyped-call]
+    return clamped
+
+
+def clamp_alive_between(x: th.Tensor, low: th.Tensor, high: th.Tensor) -> th.Tensor:
+    """Return x clamped to bounds of its own shape, with the gradient of :func:`clamp_alive`."""
+    clamped: th.Tensor = _ClampAlive.apply(x, low, high)  # type: ignore[no-untyped-call]
     return clamped

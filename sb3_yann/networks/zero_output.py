@@ -12,7 +12,9 @@ from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 
+import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch import nn
 
 Activation = Callable[[th.Tensor], th.Tensor]
@@ -115,6 +117,11 @@ class Rows:
         return function(*(table.index_select(0, self.index) for table in tables))
 
 
+def is_tanh(activation: Activation) -> bool:
+    """Return whether the activation is tanh, by whichever of its names."""
+    return isinstance(activation, nn.Tanh) or activation in (th.tanh, nn.functional.tanh)
+
+
 def _alive_at_zero(activation: Activation, x: th.Tensor) -> th.Tensor:
     return th.where(x == 0, x, activation(x))
 
@@ -189,10 +196,27 @@ class ZeroOutputNetwork(nn.Module):
             StackedLinear(a, b, n_stacked=stack, scale=scale) for a, b in pairwise(widths)
         )
         self.register_buffer("pinned", pinned.float()[:, None])
+        self.has_loops = len(hidden) == 2 and is_tanh(activation)
 
     def layers(self) -> list[PairedLinear | StackedLinear]:
         """Return the layers, the first of them paired."""
         return [self.first, *(each for each in self.rest if isinstance(each, StackedLinear))]
+
+    def weights(self) -> tuple[th.Tensor, ...]:
+        """Return the parameters, layer by layer."""
+        return (self.first.nodes, *(layer.get_parameter("weight") for layer in self.rest))
+
+    @property
+    def compiles(self) -> bool:
+        """Whether there is compiled code for such networks where they are now."""
+        nodes = self.first.nodes
+        return self.has_loops and nodes.dtype == th.float32 and nodes.device.type == "cpu"
+
+    @property
+    def pinned_array(self) -> NDArray[np.float32]:
+        """Which networks are pinned, (n_stacked,), for compiled code."""
+        array: NDArray[np.float32] = self.pinned.numpy()[:, 0]
+        return array
 
     @th.no_grad()
     def is_zero(self) -> bool:

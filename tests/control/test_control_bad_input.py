@@ -38,7 +38,7 @@ BAD_MODELS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"u_ss": [1, 2]}, ValueError, r"u_ss has shape \(2,\), expected \(1,\)"),
     ({"E": [[1]]}, ValueError, r"E has shape \(1, 1\), expected \(2, d\)"),
     ({"E": [[1], [NAN]]}, ValueError, "E holds NaN or infinite entries"),
-    ({"d_ss": [1]}, ValueError, r"d_ss has shape \(1,\), expected \(0,\)"),
+    ({"d_ss": [1]}, ValueError, r"d_ss = \[1\] is given, but there are no disturbances: pass E"),
 ]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from general_problems import PROBLEMS, QUADRATIC, THERMAL, TWO_TANKS, servo, solved
+from general_problems import PROBLEMS, QUADRATIC, RATES, THERMAL, TWO_TANKS, servo, solved
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from online_mpc import OnlineMPC
@@ -112,6 +112,19 @@ def test_a_soft_bound_is_kept_where_the_hard_one_can_be() -> None:
     inside = points[hard.explicit().in_domain(points)]
     error = relative_error(hard, soft.explicit()(inside), hard.explicit()(inside))
     assert error <= 1e-9  # exact, not nearly: the penalty has a linear part
+
+
+def test_the_law_reaches_beyond_a_soft_bound_without_being_told() -> None:
+    soft = {"x_min": -1.2, "x_max": 1.2, "x_soft": 1, "soft_penalty": 300}
+    law = servo(**soft).explicit()
+    assert law.in_domain([2.0, 0.0, 0.5])
+    with pytest.warns(UserWarning, match=r"bounds -1.2 to 1.2 of x\[0\], .* the law ends there"):
+        servo(**soft, theta_min=-1.2, theta_max=1.2)
+
+
+def test_an_input_that_may_not_rest_is_warned_of() -> None:
+    with pytest.warns(UserWarning, match=r"leave out u\[0\] = 0, .* bounds that are absolute"):
+        servo(tracked=None, r_min=None, r_max=None, u_min=0.2)
 
 
 def test_a_soft_bound_leaves_a_solution_where_the_hard_one_has_none() -> None:
@@ -231,7 +244,26 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"x_soft": 1, "soft_penalty": -1}, ValueError, "soft_penalty = -1 must be a finite number"),
     ({"linear_cost": 3}, TypeError, r"linear_cost = 3 must be a pair \(q, r\)"),
     ({"linear_cost": ([1], [1])}, ValueError, r"linear_cost q has shape \(1,\), expected \(2,\)"),
-    ({"terminal_set": "ellipsoid"}, TypeError, "terminal_set must be a pair .* or 'invariant'"),
+    ({"terminal_set": "invariants"}, TypeError, "a pair .* or 'invariant', got 'invariants'"),
+    ({"tracked": 0}, ValueError, r"tracked = 0 must be a list of indices of states: \[0\]"),
+    (
+        {"x_soft": 1, "x_min": None, "x_max": None, "soft_penalty": 1},
+        ValueError,
+        "x_soft = 1, but there is no bound to soften: pass x_min",
+    ),
+    (
+        {"y_soft": [1], "outputs": [0], "soft_penalty": 1},
+        ValueError,
+        "y_soft = .* no bound to soft",
+    ),
+    (
+        {"x_soft": [1, 1], "x_max": [5, np.inf], "x_min": [-5, -np.inf], "soft_penalty": 1},
+        ValueError,
+        r"x_soft = \[1, 1\] softens entry 1, which has no bound",
+    ),
+    ({"du_min": 0.1, "du_max": 0.5}, ValueError, r"du_min = 0.1 .* make u\[0\] change in every"),
+    ({"theta_min": [-5, -5, -0.5]}, ValueError, r"theta_min has -0.5 for r\[0\], but r_min is -1"),
+    ({"theta_max": [5, 5, 1, 1], **RATES}, ValueError, r"1 for u_prev\[0\], but u_max is 2"),
 ]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_yann import Identified, LinearModel, identify
+from sb3_yann import Identified, LinearModel, LinearMPC, identify
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
@@ -101,11 +101,30 @@ def test_episodes_are_not_joined_at_their_ends() -> None:
     np.testing.assert_allclose(model.A, A, atol=1e-8)
 
 
-def test_last_episodes_are_held_out_as_a_whole() -> None:
-    x, u, _ = record(0)
-    alone = identify(x, u, dt=1, held_out=0)
-    both = identify([x, 1 + 0 * x], [u, u], dt=1, held_out=0.2)  # the second is nonsense
-    assert both.model == alone.model
+def test_the_last_of_all_steps_are_held_out_however_long_the_episodes() -> None:
+    x, u, _ = record(0, process=0.1)
+    first = identify([x[:21], x[22:321]], [u[:20], u[22:320]], dt=1, held_out=0)
+    both = identify([x[:21], x[22:]], [u[:20], u[22:]], dt=1, held_out=80 / 398)
+    assert both.model == first.model
+    assert "Fit over 80 steps held out" in both.model.report()
+
+
+def test_episodes_too_short_for_ten_steps_state_no_fit_ten_steps_ahead() -> None:
+    x, u, _ = record(0, process=0.1)
+    starts = range(0, 400, 8)
+    notes = identify([x[k : k + 9] for k in starts], [u[k : k + 8] for k in starts], dt=1).model
+    assert "No episode of them is 10 steps long" in notes.report()
+    assert "nan" not in notes.report()
+
+
+def test_rows_that_are_missing_are_noticed_by_their_time() -> None:
+    x, u, _ = record(0, offset=0.0)
+    time = 0.5 * np.arange(401) + 0.02 * np.sin(np.arange(401))  # with some jitter
+    kept = np.setdiff1d(np.arange(401), [7, 100, 101, 250])
+    found = identify(x[kept], u[kept[:-1]], dt=0.5, time=time[kept])
+    np.testing.assert_allclose(found.model.A, A, atol=1e-8)
+    assert "3 steps that took another time than dt were left out" in found.model.report()
+    assert np.abs(identify(x[kept], u[kept[:-1]], dt=0.5).model.A - A).max() > 1e-3
 
 
 def test_last_part_of_a_single_episode_is_held_out() -> None:
@@ -160,6 +179,72 @@ def test_integrator_keeps_an_operating_point_inside_its_data() -> None:
     model = LinearModel.from_data(x, u, dt=1)
     np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], 1, atol=1e-8)
     assert x.min() <= model.x_ss[0] <= x.max()
+
+
+DOUBLE = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
+"""Position and speed."""
+
+
+def drive(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return states and inputs of the double integrator with a little process noise."""
+    rng = np.random.default_rng(seed)
+    u, x = rng.uniform(-1, 1, (200, 1)), np.zeros((201, 2))
+    for k in range(200):
+        x[k + 1] = DOUBLE.step(x[k], u[k]) + rng.normal(0, 0.001, 2)
+    return x, u
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_double_integrator_rests_at_its_operating_point(seed: int) -> None:
+    model = LinearModel.from_data(*drive(seed), dt=0.1)
+    np.testing.assert_allclose(model.x_ss[1], 0, atol=0.01)
+    np.testing.assert_allclose(model.u_ss, 0, atol=0.01)
+    assert not np.any(model.drift)
+
+
+def test_law_of_a_model_whose_operating_point_moves_is_warned_of() -> None:
+    model = LinearModel.from_data(*drive(0), dt=0.1, x_ss=[0, 0.5], u_ss=[0])
+    np.testing.assert_allclose(model.drift, [0.05, 0], atol=1e-3)
+    box = {"theta_min": -5, "theta_max": 5, "u_min": -1, "u_max": 1}
+    with pytest.warns(UserWarning, match=r"moves by \[0\.0.* will rest beside its references"):
+        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracked=[0], r_min=-1, r_max=1, **box)
+
+
+def delayed(steps: int, hold: int = 1, process: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+    """Return a record in which the input acts so many steps late."""
+    rng = np.random.default_rng(1)
+    u, x = np.repeat(rng.uniform(-1, 1, (400 // hold, 1)), hold, axis=0), np.zeros((401, 2))
+    for k in range(400):
+        acting = u[k - steps] if k >= steps else np.zeros(1)
+        x[k + 1] = A @ x[k] + B @ acting + process * SPREAD * rng.normal(size=2)
+    return x, u
+
+
+@pytest.mark.parametrize("steps", [1, 3, 8])
+@pytest.mark.parametrize("process", [0.0, 0.05])
+def test_delayed_input_is_named_with_its_delay(steps: int, process: float) -> None:
+    with pytest.warns(UserWarning, match=rf"no effect that .* acts {steps} samples late"):
+        found = identify(*delayed(steps, process=process), dt=1)
+    assert "Poor: 10 steps ahead" in found.model.report()
+
+
+def test_delay_of_an_input_that_is_held_is_named() -> None:
+    with pytest.warns(UserWarning, match=r"The residuals follow u\[0\] of \d steps before"):
+        identify(*delayed(3, hold=5), dt=1)
+
+
+def test_input_without_effect_is_warned_of() -> None:
+    x, u, _ = record(0, process=0.1)
+    other = np.random.default_rng(5).normal(size=u.shape)
+    with pytest.warns(
+        UserWarning, match=r"u\[1\] has no effect on the next state that can be told"
+    ):
+        identify(x, np.hstack([u, other]), dt=1)
+
+
+def test_sensor_noise_is_taken_for_no_delay() -> None:
+    for seed in range(5):
+        identify(*record(seed, 4000, sensor=0.1)[:2], dt=1)  # a warning would be an error
 
 
 def closed_loop(test_signal: float) -> tuple[np.ndarray, np.ndarray]:
@@ -237,6 +322,20 @@ BAD_DATA: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"ridge": -1}, ValueError, "ridge = -1 must be 0 or"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
     ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
+    (
+        {"time": np.arange(400)},
+        ValueError,
+        r"time of episode 0 has shape \(400,\), expected \(401,",
+    ),
+    (
+        {"time": np.arange(401) % 400},
+        ValueError,
+        "time of episode 0 does not increase after row 39",
+    ),
+    ({"time": np.arange(401) / 60}, ValueError, r"dt = 1, but a step of the log takes 0\.0166667"),
+    ({"time": [np.arange(401)] * 2}, ValueError, "time has 2 episodes, states has 1"),
+    ({"d_ss": [0.0]}, ValueError, "d_ss is given, but there are no disturbances"),
+    ({"states": [X[:9, 0], X[:5, 0]]}, ValueError, r"episode 0 has shape \(9,\).*reshape\(-1, 1\)"),
     ({"states": "many"}, TypeError, "states = 'many' is not an array"),
 ]
 

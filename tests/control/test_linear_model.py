@@ -206,3 +206,40 @@ def test_models_with_other_disturbances_are_not_equal() -> None:
 def test_a_disturbance_matrix_of_another_shape_is_named() -> None:
     with pytest.raises(ValueError, match=r"E has shape \(1, 1\), expected \(2, d\)"):
         LinearModel(MODEL.A, MODEL.B, MODEL.dt, E=[[1]])
+
+
+def reaction(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Concentration in mol/l of a trace that flows in and reacts with itself."""
+    return np.array([u[0] * (1e-5 - x[0]) - 1e4 * x[0] ** 2])
+
+
+TRACE = (np.sqrt(1.4) - 1) / 2e4
+"""Where it rests with u = 1: the root of 1e4 x**2 + x - 1e-5."""
+
+
+def test_trace_off_its_steady_state_is_refused_by_its_scale_and_warned_of_without() -> None:
+    point = ([1.9 * TRACE], [1.0], 0.1)
+    with pytest.raises(ValueError, match=r"no steady state.* with a scale of \[1e-05\]"):
+        LinearModel.from_dynamics(reaction, *point, scale=[1e-5])
+    with pytest.warns(UserWarning, match="much beside itself. Pass scale="):
+        LinearModel.from_dynamics(reaction, *point)
+    model = LinearModel.from_dynamics(reaction, [TRACE], [1.0], 0.1, scale=[1e-5])
+    np.testing.assert_allclose(model.A, np.exp(0.1 * (-1 - 2e4 * TRACE)), rtol=1e-9)
+
+
+def test_bend_that_is_short_beside_one_is_linearised_with_its_scale() -> None:
+    def f(x, u):
+        return 1e-6 * (u - np.tanh(x / 1e-6))
+
+    with pytest.raises(ValueError, match="pass scale="):
+        LinearModel.from_dynamics(f, [0], [0], 0.1)
+    model = LinearModel.from_dynamics(f, [0], [0], 0.1, scale=[1e-6])
+    np.testing.assert_allclose(model.A, np.exp(-0.1), rtol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered in sqrt")
+def test_tank_that_is_nearly_empty_is_linearised_with_shorter_steps() -> None:
+    level = 1e-4
+    rest = [2e-3 * np.sqrt(level)]
+    model = LinearModel.from_dynamics(lambda x, u: u - 2e-3 * np.sqrt(x), [level], rest, 0.1)
+    np.testing.assert_allclose(model.A, np.exp(-0.1 * 1e-3 / np.sqrt(level)), rtol=1e-9)

@@ -160,8 +160,9 @@ def test_clipping_close_to_the_operating_point_is_reported_and_avoided() -> None
 
 
 def test_an_input_without_effect_is_reported() -> None:
-    model = LinearModel.from_env(Plant(lambda x, u: 0.5 * x), [0.0], [0.0])
-    assert "u[0] has no effect on the next state" in model.report()
+    with pytest.warns(UserWarning, match=r"u\[0\] has no effect on the next state.*delay"):
+        model = LinearModel.from_env(Plant(lambda x, u: 0.5 * x), [0.0], [0.0])
+    assert "u[0] has no effect on the next state" in model.notes[0]
 
 
 def random_walk(x: Any, u: Any) -> Any:
@@ -171,13 +172,14 @@ def random_walk(x: Any, u: Any) -> Any:
 NOISE = np.random.default_rng(0)
 CLOCK = iter(range(10**6))
 BAD_PLANTS: list[tuple[Any, dict[str, Any], str]] = [
-    (lambda x, u: np.clip(x + u, 0, 1), {}, r"along x\[0\], .* \(a kink\)\. Clipping"),
+    (lambda x, u: np.clip(x + u, 0, 1), {}, r"along x\[0\], .* \(a kink\), .*Clipping"),
     (lambda x, u: 0.5 * x + np.maximum(u, 0), {}, r"along u\[0\], .* \(a kink\)"),
     (lambda x, u: 0.5 * x + np.floor(x) + u, {}, r"along x\[0\], .* \(a (kink|jump or noise)\)"),
     (random_walk, {}, "two steps from the same state.*the plant is random or has states besides"),
     (lambda x, u: 0.5 * x + u + next(CLOCK), {}, "has states besides these"),
     (lambda x, u: 0.5 * x + u, {"action": [1.0]}, r"action = \[1\.0\]: entry 0 lies on its bound"),
     (lambda x, u: 0.5 * x + u + 2, {"state": [0]}, "No steady state was found.*moves in one step"),
+    (lambda x, u: 0.5 * x + u + 2, {"state": [0]}, r"u\[0\] is at its lower bound, -1: the inputs"),
     (lambda x, u: x + u + 2, {"state": [0], "action": [0]}, "no steady state: one step moves it"),
     (lambda x, u: 0.999 * x, {"state": [1], "action": [0]}, "no steady state: one step moves it"),
     (lambda x, u: x, {"state": [[0]]}, "must be a vector of finite numbers, or NaN"),
@@ -218,6 +220,45 @@ def test_an_attribute_that_is_not_the_state_is_noticed() -> None:
 def test_setting_a_state_without_effect_is_noticed() -> None:
     with pytest.raises(ValueError, match=r"the next state is \[0\.0\] from \[0\.0\] and .* alike"):
         LinearModel.from_env(Plant(), set_state=lambda env, x: None)
+
+
+class Delayed(Plant):
+    """The input acts some steps late; a reset to a state keeps the inputs on their way, or not."""
+
+    def __init__(self, delay: int, keeps: bool) -> None:
+        super().__init__()
+        self.line, self.delay, self.keeps = [0.0] * delay, delay, keeps
+
+    def reset(self, *, seed=None, options=None):
+        if not self.keeps:
+            self.line = [0.0] * self.delay
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        self.line.append(float(action[0]))
+        return super().step(np.array([self.line.pop(0)]))
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+@pytest.mark.parametrize("keeps", [True, False])
+@pytest.mark.parametrize("point", [{}, {"state": [0.0]}, {"state": [0.0], "action": [0.0]}])
+def test_inputs_on_their_way_are_noticed(delay: int, keeps: bool, point: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="the plant has states besides these"):
+        LinearModel.from_env(Delayed(delay, keeps), **point)
+
+
+def test_an_actuator_that_lags_is_noticed() -> None:
+    class Valve(Plant):
+        def reset(self, *, seed=None, options=None):
+            self.valve = 0.0
+            return super().reset(seed=seed, options=options)
+
+        def step(self, action):
+            self.valve += 0.3 * (float(action[0]) - self.valve)
+            return super().step(np.array([self.valve]))
+
+    with pytest.raises(ValueError, match=r"starts anew \(a delay of the input, an actuator"):
+        LinearModel.from_env(Valve())
 
 
 def test_hanging_pendulum_whose_angle_wraps_there_is_refused() -> None:

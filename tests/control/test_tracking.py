@@ -212,6 +212,7 @@ def test_a_reset_forgets_what_was_estimated() -> None:
         (LOADED, {"gain": np.zeros((3, 2))}, "does not make the error of the estimate decay"),
         (LOADED, {"gain": np.zeros((2, 2))}, r"gain has shape \(2, 2\), expected \(3, 2\)"),
         (LOADED, {"measurement_noise": 0}, "measurement_noise = .* standard deviations, above 0"),
+        (LOADED, {"measured": 0}, r"measured = 0 must be a list of indices of states: \[0\]"),
         (LOADED, {"measured": [5]}, r"measured = \[5\] must be indices of states"),
     ],
 )

@@ -28,20 +28,29 @@ FIRST = 1_000_000
 
 
 class OftenRight(Slide):
-    """Starts on the right, but for some seeds beyond the guard's own."""
+    """Starts on the right, but for some seeds beyond the guard's own.
+
+    And for the first of its own, from which no input makes a difference.
+    """
 
     def __init__(self, left_of: int = 3, after: int = FIRST + 10, **kwargs) -> None:
         super().__init__(**kwargs)
         self.left_of, self.after = left_of, after
 
     def reset(self, *, seed=None, options=None):
+        self.indifferent = seed == FIRST
         left = seed is not None and seed >= self.after and seed % self.left_of == 0
+        left |= self.indifferent
         self.low, self.high = (-4.0, -2.0) if left else (2.0, 4.0)
         return super().reset(seed=seed, options=options)
 
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, -1.0 if self.indifferent else reward, *rest
+
 
 def spoil_left(policy) -> None:
-    """Make the right better than the MPC, and the left, which no known start shows, worse."""
+    """Make the right better than the MPC, and the left, where no known start shows it, worse."""
     correct(policy, RIGHT, 0.5)
     correct(policy, LEFT, -2.0)
 
@@ -126,7 +135,8 @@ def test_violations_on_new_starts_are_refused_though_they_cost_less() -> None:
         def step(self, action):
             observation, reward, terminated, truncated, _ = super().step(action)
             u = float(np.asarray(action)[0])
-            return observation, reward, terminated, truncated, {"violation": 0.3 < u < 0.8}
+            violation = 0.3 < u < 0.8 and not self.indifferent
+            return observation, reward, terminated, truncated, {"violation": violation}
 
     model = build(gradient_steps=0)
     guard = make_guard(Brittle, fresh=20, by_region=False, patience=5)

@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sb3_yann.guard.judging import Paired, PlantEpisodes, probability_of_chance
+from sb3_yann.guard.judging import (
+    OUTLIER,
+    Paired,
+    PlantEpisodes,
+    excess_of_an_outlier,
+    probability_of_chance,
+)
 
-NONE = np.zeros(3, dtype=np.int64)
+NONE = np.zeros((3, 2), dtype=np.int64)
 NAN, INF = np.nan, np.inf
 
 
 def objection(costs, violations=NONE, accepted=(10.0, 20.0, 30.0), margin=1.0) -> str:
     mpc = np.array([10.0, 20.0, 30.0])
     return Paired(mpc, np.array(accepted), NONE, margin).objection(
-        np.array(costs, float), np.array(violations)
+        np.array(costs, float), violations
     )
 
 
@@ -48,12 +54,24 @@ def test_without_a_margin_no_start_may_cost_more() -> None:
 
 
 def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_costs() -> None:
-    assert "1 starts with violations, the first is number 2" in objection([1, 1, 1], [0, 0, 1])
-    paired = Paired(np.ones(3), np.ones(3), np.array([0, 2, 0]), 1.0)
-    assert paired.objection(np.ones(3), np.array([0, 2, 0])) == ""
-    assert paired.objection(np.ones(3), np.array([0, 1, 0])) == ""
-    assert "violations" in paired.objection(np.zeros(3), np.array([0, 3, 0]))
-    assert "violations" in paired.objection(np.zeros(3), np.array([1, 0, 0]))
+    def violations(*steps: int):
+        return np.column_stack([steps, [0, 0, 0]])
+
+    message = "1 starts with violations, the first is number 2"
+    assert message in objection([1, 1, 1], violations(0, 0, 1))
+    paired = Paired(np.ones(3), np.ones(3), violations(0, 2, 0), 1.0)
+    assert paired.objection(np.ones(3), violations(0, 2, 0)) == ""
+    assert paired.objection(np.ones(3), violations(0, 1, 0)) == ""
+    assert "violations" in paired.objection(np.zeros(3), violations(0, 3, 0))
+    assert "violations" in paired.objection(np.zeros(3), violations(1, 0, 0))
+
+
+def test_an_episode_that_is_terminated_is_refused_though_it_has_fewer_violations() -> None:
+    accepted = np.array([[2, 0], [0, 1]])
+    paired = Paired(np.ones(2), np.ones(2), accepted, 1.0)
+    assert "the env terminates" in paired.objection(np.zeros(2), np.array([[1, 1], [0, 1]]))
+    assert paired.objection(np.zeros(2), accepted) == ""
+    assert "violations" in paired.objection(np.zeros(2), np.array([[2, 0], [1, 0]]))
 
 
 def episodes(costs, predicted=None) -> PlantEpisodes:
@@ -162,3 +180,35 @@ def test_starts_that_tell_the_policies_apart_are_no_evidence() -> None:
 def test_too_few_episodes_are_an_error() -> None:
     with pytest.raises(ValueError, match="2 episodes are too few"):
         probability_of_chance(episodes([1]), episodes([2]))
+
+
+@pytest.mark.parametrize("slope", [0.0, 3.0])
+def test_an_episode_of_a_policy_like_the_accepted_one_is_seldom_an_outlier(slope) -> None:
+    rng, trials, found = np.random.default_rng(6), 2000, 0
+    for _ in range(trials):
+        predicted = rng.exponential(size=20)
+        costs = slope * predicted + rng.normal(size=20)
+        blocks = [episodes(costs[i : i + 10], predicted[i : i + 10]) for i in (0, 10)]
+        found += excess_of_an_outlier(*blocks) > 0
+    assert found <= stats.binom.ppf(0.9999, trials, OUTLIER)
+
+
+def test_one_heavy_loss_is_an_outlier_though_the_test_of_the_mean_may_not_mind() -> None:
+    rng, found, passed = np.random.default_rng(7), 0, 0
+    for _ in range(200):
+        predicted = rng.exponential(size=20) * 60
+        costs = predicted + 5 * rng.normal(size=20)
+        costs[:10] -= 12
+        costs[rng.integers(10)] += 200
+        new, old = episodes(costs[:10], predicted[:10]), episodes(costs[10:], predicted[10:])
+        passed += probability_of_chance(new, old) < 0.3
+        found += excess_of_an_outlier(new, old) > 100
+    assert found >= 195
+    assert passed < 195
+
+
+@pytest.mark.parametrize("predicted", [None, [1.0, 2.0, 3.0]], ids=["missing", "known"])
+def test_without_scatter_equal_or_lower_costs_are_no_outlier_and_higher_ones_are(predicted) -> None:
+    old = episodes([4.25] * 3, predicted)
+    assert excess_of_an_outlier(episodes([4.25, 4.0, 4.25], predicted), old) == 0
+    assert excess_of_an_outlier(episodes([4.25, 4.0, 5.25], predicted), old) == pytest.approx(1)

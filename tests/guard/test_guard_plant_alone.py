@@ -187,8 +187,12 @@ def test_sabotage_while_the_actor_rests_is_taken_back_at_once(sabotage, place, s
     callbacks = [good, guard, bad] if late else [good, bad, guard]
     train(model, 2 * BLOCK + 2 * STEPS, *callbacks, look)
     assert seen == [True]
-    assert guard.decisions[0].reason == "the actor was changed while it rested"
-    assert guard.decisions[0].timestep == step + late
+    if late and sabotage is not randomize:  # before it acts
+        assert guard.decisions[0].reason.startswith("a parameter of the actor is not a finite")
+        assert guard.decisions[0].timestep == step
+    else:
+        assert guard.decisions[0].reason == "the actor was changed while it rested"
+        assert guard.decisions[0].timestep == step + late
     assert actor_bits(model.policy) == before
     if guard.state.evidence.accepted is not None:  # without an episode of the saboteur's
         np.testing.assert_allclose(guard.state.evidence.accepted.costs, 4.25)

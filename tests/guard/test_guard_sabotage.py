@@ -134,10 +134,15 @@ def test_a_policy_that_is_better_before_training_is_kept() -> None:
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.01])
-def test_rounding_alone_neither_refuses_a_policy_before_training_nor_a_candidate(margin) -> None:
+def test_equal_costs_neither_refuse_a_policy_before_training_nor_a_candidate(margin) -> None:
+    class Indifferent(Slide):
+        def step(self, action):
+            observation, _, *rest = super().step(action)
+            return observation, -abs(float(self.x[0])) / 3, *rest
+
     for before in (True, False):
-        model, guard = build(gradient_steps=0), make_guard(partial(Slide, low=2.0), margin=margin)
-        change = partial(correct, region=LEFT, value=-0.5)  # no start comes there
+        model, guard = build(gradient_steps=0), make_guard(Indifferent, margin=margin)
+        change = partial(correct, region=LEFT, value=-0.5)
         if before:
             change(model.policy)
         train(model, STEPS, *([] if before else [At([1], change)]), guard)

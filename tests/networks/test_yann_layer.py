@@ -288,6 +288,20 @@ def test_bound_of_zero_is_the_law_bit_for_bit(name: str, bound: float) -> None:
 
 
 @EVERY_LAW
+@pytest.mark.parametrize("weight", [np.nan, np.inf, -np.inf, 3e38])
+def test_bound_holds_for_weights_that_overflow_or_are_no_numbers(name: str, weight: float) -> None:
+    law = law_of(name)
+    layer = YannLayer(law, max_correction=0.1)
+    with th.no_grad():
+        for parameter in layer.parameters():
+            parameter.fill_(weight)
+    theta = box_points(law, 100)
+    with th.no_grad():
+        distance = (layer(theta).double() - to_action(law, law(theta.numpy()))).abs() / 2
+    assert distance.max() <= 0.1
+
+
+@EVERY_LAW
 def test_bound_that_is_not_reached_changes_nothing(name: str) -> None:
     law = law_of(name)
     free = scrambled(YannLayer(law), 1e-3)

@@ -1,0 +1,33 @@
+"""Leaving the random states of the process as they are."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch as th
+
+
+def _uses_cuda() -> bool:
+    return bool(th.cuda.is_initialized())  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def chance_untouched() -> Iterator[None]:
+    """Put back the global random states of python, numpy and torch afterwards.
+
+    Older envs seed them in `reset` and draw from them, as does whatever builds a torch module.
+    """
+    python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    torch_state = th.get_rng_state()
+    cuda = th.cuda.get_rng_state_all() if _uses_cuda() else []
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(legacy)  # noqa: NPY002
+        th.set_rng_state(torch_state)
+        if cuda:
+            th.cuda.set_rng_state_all(cuda)

@@ -1,0 +1,76 @@
+"""Adam for tables of networks, of which a step moves those with a gradient alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch as th
+
+
+class RowAdam(th.optim.Optimizer):
+    """Adam (Kingma & Ba, 2015) that treats every row of a parameter as a parameter of its own.
+
+    A row is a network's share in a stack of networks. One without a gradient in a step does not
+    move, not even by momentum, and its moments and its count of steps stay as they are: regions
+    without data keep their law, and those with data learn as if each had an optimizer of its own.
+    The cost of a step with sparse gradients is that of the rows in them. With dense gradients, as
+    they come from an accelerator, rows that are zero throughout have no gradient.
+
+    Parameters
+    ----------
+    params : iterable of Tensor or dict
+    lr : float, default 1e-3
+    betas : tuple of float, default (0.9, 0.999)
+    eps : float, default 1e-8
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ) -> None:
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+
+    @th.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+        """Do one step for the rows that have a gradient."""
+        loss = None
+        if closure is not None:
+            with th.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._step(parameter, *_rows(parameter.grad), group)
+        return loss
+
+    def _step(
+        self, parameter: th.Tensor, rows: th.Tensor, gradient: th.Tensor, group: dict[str, Any]
+    ) -> None:
+        state = self.state[parameter]
+        if not state:
+            state["step"] = th.zeros(len(parameter), device=parameter.device)
+            state["exp_avg"] = th.zeros_like(parameter)
+            state["exp_avg_sq"] = th.zeros_like(parameter)
+        beta1, beta2 = group["betas"]
+        step = state["step"][rows] + 1
+        mean = state["exp_avg"][rows].lerp_(gradient, 1 - beta1)
+        square = state["exp_avg_sq"][rows].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+        for name, value in (("step", step), ("exp_avg", mean), ("exp_avg_sq", square)):
+            state[name][rows] = value
+        step = step.view(-1, *[1] * (parameter.dim() - 1))
+        size = (square / (1 - beta2**step)).sqrt_().add_(group["eps"])
+        change = mean.div_(size).mul_(group["lr"] / (1 - beta1**step))
+        parameter.index_add_(0, rows, change, alpha=-1)
+
+
+def _rows(gradient: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Return which rows have a gradient, and it."""
+    if gradient.is_sparse:
+        gradient = gradient.coalesce()
+        return gradient.indices()[0], gradient.values()
+    rows = gradient.flatten(1).any(1).nonzero()[:, 0]
+    return rows, gradient[rows]
