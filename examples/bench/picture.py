@@ -42,7 +42,11 @@ def save_picture(figures: Figures, folder: Path) -> Path | None:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     canvas.legend(
-        handles.values(), handles.keys(), loc="outside lower center", ncols=5, frameon=False
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=len(panels),
+        frameon=False,
     )
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / NAME

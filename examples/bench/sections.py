@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -42,7 +43,7 @@ def run(bench: Bench, names: Sequence[str]) -> None:
     """Run some of the sections, and print the tables as they come."""
     problems = [SMALLEST] if bench.quick else PROBLEMS
     for name in names:
-        before = set(bench.figures.sections())
+        before, began = set(bench.figures.sections()), time.perf_counter()
         if name == ENVS:
             simulators.simulators(bench)
         elif name == GPU:
@@ -53,6 +54,7 @@ def run(bench: Bench, names: Sequence[str]) -> None:
         for section in bench.figures.sections():
             if section not in before:
                 show(bench.figures, section, TITLES[section], bench.console)
+        bench.console.print(f"{name}: {time.perf_counter() - began:.0f} s\n")
 
 
 def _devices(bench: Bench, problems: Sequence[Problem]) -> None:

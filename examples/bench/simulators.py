@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from bench.problems import Array
+from bench.problems import SMALLEST, Array
 from bench.records import Bench, Figure, timed
 from bench.timing import Task
+from sb3_yann.evaluation import evaluate
 from sb3_yann_envs import cstr
 from sb3_yann_envs.clipped_pendulum import ClippedPendulumEnv
 from sb3_yann_envs.cstr import CSTREnv
@@ -19,6 +20,7 @@ from sb3_yann_envs.cstr import CSTREnv
 SECTION = "environments"
 CSTR = "reactor, env.step"
 TIME, ERROR = "time of a step", "largest error of T in K"
+WHOLE = "400 steps of each, under the law"
 EPISODES = "reactor, make_vec, one step of each episode"
 
 
@@ -39,6 +41,9 @@ def simulators(bench: Bench) -> None:
     calls = {"vector": Task(vector.step, [np.full((many, 1), 3.0, np.float32)])}
     found[f"{EPISODES} of {many:,}"] = bench.watch.compare(calls)["vector"] / many
     bench.figures.add(timed(SECTION, TIME, found))
+    evaluate(SMALLEST.law, "CSTR-v0", range(2))
+    seconds = bench.watch.once(lambda: evaluate(SMALLEST.law, "CSTR-v0", range(many)))
+    bench.figures.add(timed(SECTION, WHOLE, {f"reactor, {many:,} episodes side by side": seconds}))
     random, farthest = errors(1 if bench.quick else 5)
     bench.figures.add(
         [
@@ -63,7 +68,7 @@ def errors(episodes: int) -> tuple[float, float]:
     low, high = np.array([-0.08, -0.5, -2.0, -10.0]), cstr.STATE_HIGH
     drawn = [rng.uniform(cstr.START_LOW, cstr.START_HIGH) for _ in range(episodes)]
     drawn[0] = np.array(cstr.START_HIGH)  # the shortest way to the limit
-    corners = [high, np.append(high[:3], 0.0)]
+    corners = [high, np.append(high[:3], 0.0), np.array([0.15, 2.0, 0.0, 3.3])]
     corners += [np.where(rng.random(4) < 0.5, high, low) for _ in range(4 * episodes)]
     return max(map(_error, drawn)), max(map(_error, corners))
 
