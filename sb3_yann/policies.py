@@ -265,7 +265,8 @@ class YannPolicy(TD3Policy):
     features_extractor_class, features_extractor_kwargs, normalize_images, share_features_extractor
         As SB3 passes them; only its defaults are taken, since theta must reach the law as it is.
     optimizer_class, optimizer_kwargs
-        As in SB3's `TD3Policy`.
+        As in SB3's `TD3Policy`. By default the actor of more than 32 regions has
+        :class:`RowAdam`, which steps the networks of the regions in use alone.
 
     Raises
     ------
