@@ -32,6 +32,9 @@ ROWS = 2
 SURELY_INSIDE = 1e-9
 """With a slack of at least this, no region that the tree left out can be as good."""
 
+CLEAR = 1e-6
+"""So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
+
 
 def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
     """Return a decorator that compiles a function for the given types, and keeps the machine code.
@@ -129,21 +132,25 @@ def _scan(floats: Array, whole: Integers, theta: Array, known: float) -> tuple[i
 
 
 @compiled()
-def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int]:
-    """Return where the regions of the leaf that theta falls into begin and end in ``whole``."""
+def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int, float]:
+    """Return where the regions of the leaf that theta falls into begin and end in ``whole``.
+
+    With them comes the smallest distance from the hyperplanes on the way.
+    """
     n, m, p, q, nodes, leaves = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
     normals = ROWS + q * (n + 1) + p * m * n + p * m + 2 * m
     levels = normals + nodes * n
     children = HEADER + p + 1
-    node = 0
+    node, room = 0, np.inf
     while node >= 0:
         side = -floats[levels + node]
         for j in range(n):
             side += floats[normals + node * n + j] * theta[j]
+        room = min(room, abs(side))
         node = whole[children + 2 * node + (1 if side > 0 else 0)]
     starts = children + 2 * nodes
     regions = starts + leaves + 1
-    return regions + whole[starts - node - 1], regions + whole[starts - node]
+    return regions + whole[starts - node - 1], regions + whole[starts - node], room
 
 
 @compiled()
@@ -155,14 +162,14 @@ def _choose(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
             return -1, np.nan
     known = -np.inf
     if whole[4] > 0:
-        first, last = _leaf(floats, whole, theta)
+        first, last, room = _leaf(floats, whole, theta)
         best, largest = -1, -np.inf
         for k in range(first, last):
             i = whole[k]
             slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, largest)
             if slack > largest + floats[1] * (1 + abs(slack)):
                 best, largest = i, slack
-        if largest >= SURELY_INSIDE:
+        if largest >= SURELY_INSIDE or (largest >= -floats[1] and room > CLEAR):
             return best, largest
         known = largest
     return _scan(floats, whole, theta, known)
