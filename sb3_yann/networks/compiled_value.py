@@ -191,6 +191,9 @@ def _forms_backward(
 
 def value_on_processor(value: AfterstateValue, points: th.Tensor) -> th.Tensor:
     """Return what ``value(points)`` is, (batch, 1), for points of shape (batch, n + m)."""
+    size = len(value.W)
+    if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
+        raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
     weights = (value.quadratic.entries, *value.network.weights())
     if value.fixed:
         weights = tuple(weight.detach() for weight in weights)

@@ -211,3 +211,10 @@ def test_a_value_that_is_loaded_is_that_of_its_file() -> None:
     other.load_state_dict(state)
     assert th.equal(ours(points), other(points))
     assert_close(ours(points), by_torch(ours)(points))
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (3, 6), (4,), (2, 3, 4)])
+def test_shapes_that_do_not_fit_are_refused_before_compiled_code_reads_them(shape) -> None:
+    for module in (YannLayer(law_of("reactor")), value(True)):
+        with pytest.raises(ValueError, match=r"shape \(\d.*expected \(batch, [45]\)"):
+            module(th.zeros(shape))
