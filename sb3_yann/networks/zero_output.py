@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -204,7 +205,8 @@ class ZeroOutputNetwork(nn.Module):
 
     def weights(self) -> tuple[th.Tensor, ...]:
         """Return the parameters, layer by layer."""
-        return (self.first.nodes, *(layer.get_parameter("weight") for layer in self.rest))
+        rest: Any = self.rest
+        return (self.first.nodes, *[layer.weight for layer in rest])
 
     @property
     def compiles(self) -> bool:
