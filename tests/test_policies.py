@@ -400,7 +400,7 @@ def test_the_actor_stays_the_mpc_bit_for_bit_until_the_critic_is_warm(policy_del
     updates(model, 1)  # the sixth of the critic, and then the actor's first
     assert changed(model.actor, first.actor)
     assert not th.equal(model.actor(theta), law)
-    assert {int(state["step"].max()) for state in model.actor.optimizer.state.values()} == {1}
+    assert {int(state["steps"].max()) for state in model.actor.optimizer.state.values()} == {1}
     updates(model, 2)  # the first step moves one layer of zeros only
     assert not th.equal(model.actor_target(theta), law)
 

@@ -6,8 +6,9 @@ of a microsecond, a good part of what a whole evaluation takes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numba
@@ -36,28 +37,50 @@ CLEAR = 1e-6
 """So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
 
 
+def _sources() -> str:
+    """Return a hash of all files with compiled functions, which call each other."""
+    package = Path(__file__).parents[1]
+    files = [*package.glob("control/_location.py"), *package.glob("control/search_tree.py")]
+    files += sorted(package.glob("networks/compiled*.py"))
+    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
+
+
+SOURCES = _sources()
+
+
 def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
     """Return a decorator that compiles a function for the given types, and keeps the machine code.
 
-    With types that are given nothing is ever compiled for others: those are refused. With
-    ``fastmath`` sums may be taken in any order, several terms at a time.
+    With types that are given nothing is ever compiled for others: those are refused. Without any
+    the function is a part of those that call it. With ``fastmath`` sums may be taken in any order,
+    several terms at a time.
     """
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
 
     def compile_it(function: F) -> F:
-        njit: Any = partial(
-            numba.njit,
-            [*signatures] or None,
-            nogil=True,
-            error_model="numpy",
-            fastmath={"reassoc", "contract", "nsz"} if fastmath else False,
-        )
+        if not signatures:
+            part: F = numba.njit(**options)(function)
+            return part
+        result: F
         try:
-            result: F = njit(cache=True)(function)
-        except RuntimeError:  # no folder to write to: compiled anew in every process
-            result = njit()(function)
+            result = _compile(numba.njit(**options)(function), signatures, keep=True)
+        except Exception:  # no folder to write to, a full disk, a damaged file
+            result = _compile(numba.njit(**options)(function), signatures, keep=False)
         return result
 
     return compile_it
+
+
+def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
+    if keep:
+        dispatcher.enable_caching()
+        # numba looks at the function's own file; what it calls may have changed in another.
+        dispatcher._cache._cache_file._source_stamp = SOURCES
+    for signature in signatures:
+        dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    return dispatcher
 
 
 def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers]:
@@ -192,6 +215,7 @@ def input_at(floats: Array, whole: Integers, theta: Array, out: Array) -> int:
             for j in range(n):
                 u += floats[gains + (region * m + k) * n + j] * theta[j]
             u += floats[offsets + region * m + k]
+        u = u if u == u else 0.0  # inf - inf, far from everything
         out[k] = min(max(u, floats[bounds + k]), floats[bounds + m + k])
     return region
 

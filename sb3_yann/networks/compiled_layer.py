@@ -159,7 +159,7 @@ def layer_on_processor(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
 
 
 def _given(layer: YannLayer, theta: th.Tensor, weights: tuple[th.Tensor, ...]) -> list[Any]:
-    arrays = [weight.detach().numpy() for weight in weights]
+    arrays = [weight.detach().contiguous().numpy() for weight in weights]
     law = layer.piecewise_affine.packed
     limit = np.inf if layer.reach is None else layer.reach
     known = (theta.numpy(), layer.scaling, layer.change_array, limit)

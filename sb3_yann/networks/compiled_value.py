@@ -213,7 +213,7 @@ class _Pass:
         self, value: AfterstateValue, points: th.Tensor, weights: tuple[th.Tensor, ...]
     ) -> None:
         self.weights = weights
-        entries, nodes, second, last = (weight.detach().numpy() for weight in weights)
+        entries, nodes, second, last = (weight.detach().contiguous().numpy() for weight in weights)
         W, AB, self.roots, scaling = value.constants
         pinned = value.network.pinned_array
         self.first: tuple[Any, ...] = (W, AB, entries * self.roots, scaling, nodes, pinned)

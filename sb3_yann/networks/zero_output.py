@@ -210,7 +210,14 @@ class ZeroOutputNetwork(nn.Module):
 
     @property
     def compiles(self) -> bool:
-        """Whether there is compiled code for such networks where they are now."""
+        """Whether there is compiled code for such networks where they are now.
+
+        What is traced, exported or compiled by torch needs torch's own operations: it would take
+        the result of compiled code for a constant.
+        """
+        tracing = th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+        if tracing or th.compiler.is_compiling():
+            return False
         nodes = self.first.nodes
         return self.has_loops and nodes.dtype == th.float32 and nodes.device.type == "cpu"
 

@@ -135,6 +135,8 @@ def test_a_state_of_another_law_is_used_as_it_is() -> None:
     layer.load_state_dict(state)
     assert not layer.has_its_law
     assert not th.allclose(layer(theta), YannLayer(law)(theta))
+    layer.load_state_dict(YannLayer(law).state_dict())
+    assert layer.has_its_law
 
 
 @pytest.mark.parametrize("x", [0.0, -0.0])
@@ -218,3 +220,38 @@ def test_shapes_that_do_not_fit_are_refused_before_compiled_code_reads_them(shap
     for module in (YannLayer(law_of("reactor")), value(True)):
         with pytest.raises(ValueError, match=r"shape \(\d.*expected \(batch, [45]\)"):
             module(th.zeros(shape))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_torch_traces_still_depends_on_the_state() -> None:
+    for module, n in ((YannLayer(law_of("reactor")), 4), (value(True), 5)):
+        shaken(module.network, 0.1)
+        one, other = th.rand(2, 6, n)
+        with th.no_grad():
+            traced = th.jit.trace(module, one)
+            assert_close(traced(other), module(other))
+
+
+def test_a_value_notices_a_change_of_its_model() -> None:
+    ours, points = value(True), th.rand(20, 5)
+    ours(points)
+    ours.model.A.mul_(1.1)
+    ours.gamma = 0.5
+    assert_close(ours(points), by_torch(ours)(points))
+
+
+def test_matrices_may_come_in_any_order_of_memory() -> None:
+    mpc = problems.cstr()
+    given = mpc.stage_matrix, mpc.value_matrix(0.99)
+    rest = LinearPrediction(*mpc.prediction), 0.99, mpc.theta_max, mpc.u_min, mpc.u_max
+    found = [
+        AfterstateValue(*map(order, given), *rest)(th.ones(2, 5))
+        for order in (np.ascontiguousarray, np.asfortranarray)
+    ]
+    assert th.equal(*found)
+
+
+@pytest.mark.parametrize("rate", [(np.ones(1), np.ones(1)), (np.ones(3), np.ones(3))])
+def test_a_rate_that_does_not_fit_is_refused(rate) -> None:
+    with pytest.raises(ValueError, match=r"rate has shape \(2, \d\), expected \(2, 2\)"):
+        YannLayer(law_of("two inputs"), rate=rate)
