@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,13 @@ class YannActor(SeesTheta, Actor):
             rate=(problem.du_min, problem.du_max) if problem.has_rate_bounds else None,
         )
 
+    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
+        """Yield the weights, without the search of all modules for them.
+
+        SB3's update of the targets asks for them at every step.
+        """
+        return iter(self.mu.network.weights()) if recurse else super().parameters(recurse)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.options}
 
@@ -172,6 +180,13 @@ class YannCritic(SeesTheta, ContinuousCritic):
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """Return Q of each critic, all (batch, 1), in units of the env's reward."""
         return tuple(self._in_rewards(q) for q in super().forward(obs, actions))
+
+    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
+        """Yield the weights, without the search of all modules for them."""
+        if not recurse:
+            return super().parameters(recurse)
+        networks: list[Any] = self.q_networks
+        return (each for q in networks for each in (q.quadratic.entries, *q.network.weights()))
 
     def _in_rewards(self, q: th.Tensor) -> th.Tensor:
         if self.scale == 1 and self.offset == 0:

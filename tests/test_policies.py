@@ -843,3 +843,16 @@ def test_an_optimizer_of_ones_own_gets_dense_gradients() -> None:
     model = with_full_buffer(DDPG, two_inputs(), **kwargs)
     updates(model, 2)
     assert not any(each.grad.is_sparse for each in model.actor.parameters())
+
+
+@POLICIES
+@CRITICS
+def test_actor_and_critic_yield_all_their_parameters_in_the_order_of_their_names(
+    algorithm, critic
+) -> None:
+    model = build(algorithm, policy_kwargs={"critic": critic})
+    for module in (model.actor, model.actor_target, model.critic, model.critic_target):
+        named = [each for _, each in module.named_parameters()]
+        found = [*module.parameters()]
+        assert len(found) == len(named) > 2
+        assert all(one is other for one, other in zip(found, named, strict=True))

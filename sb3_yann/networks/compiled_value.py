@@ -194,7 +194,7 @@ def value_on_processor(value: AfterstateValue, points: th.Tensor) -> th.Tensor:
     size = len(value.W)
     if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
         raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
-    weights = (value.quadratic.entries, *value.network.weights())
+    weights: tuple[th.Tensor, ...] = (value.quadratic.entries, *value.network.weights())
     if value.fixed:
         weights = tuple(weight.detach() for weight in weights)
     if th.is_grad_enabled():

@@ -203,7 +203,7 @@ class ZeroOutputNetwork(nn.Module):
         """Return the layers, the first of them paired."""
         return [self.first, *(each for each in self.rest if isinstance(each, StackedLinear))]
 
-    def weights(self) -> tuple[th.Tensor, ...]:
+    def weights(self) -> tuple[nn.Parameter, ...]:
         """Return the parameters, layer by layer."""
         rest: Any = self.rest
         return (self.first.nodes, *[layer.weight for layer in rest])
