@@ -21,7 +21,7 @@ from sb3_yann.control.polyhedra import largest_ball
 LEAF = 4
 """A node with this many regions is not split further."""
 
-NODES = 3
+NODES = 8
 """Hyperplanes for each region, at most: where regions are long and thin, every hyperplane cuts some
 of them, and trees down to the last region grow without bound."""
 
