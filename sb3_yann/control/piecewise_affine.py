@@ -141,12 +141,13 @@ class PiecewiseAffine(ReadOnlyArrays):
         TypeError, ValueError
             If theta is not numeric, has another shape or holds NaN or infinite entries.
         """
-        try:
-            u = self._at(theta)
-        except TypeError:  # not one point of float64, which is all that this was compiled for
-            u = None
-        if u is not None:
-            return u
+        if getattr(theta, "ndim", 0) == 1:
+            try:
+                u = self._at(theta)
+            except TypeError:  # not float64, which is all that this was compiled for
+                u = None
+            if u is not None:
+                return u
         from sb3_yann.control._location import law_of_batch
 
         points = self._as_theta(theta)
