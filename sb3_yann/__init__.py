@@ -9,6 +9,7 @@ from sb3_yann.audit import CostAudit, CostFinding, CostMismatchError, CostMismat
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import (
     DisturbanceObserver,
+    ExplicitLimitError,
     ExplicitSolutionError,
     Identified,
     LinearModel,
@@ -34,6 +35,7 @@ __all__ = [
     "CostMismatchWarning",
     "Decision",
     "DisturbanceObserver",
+    "ExplicitLimitError",
     "ExplicitSolutionError",
     "Identified",
     "ImprovementGuard",

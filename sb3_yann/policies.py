@@ -265,7 +265,10 @@ class YannPolicy(TD3Policy):
     features_extractor_class, features_extractor_kwargs, normalize_images, share_features_extractor
         As SB3 passes them; only its defaults are taken, since theta must reach the law as it is.
     optimizer_class, optimizer_kwargs
-        As in SB3's `TD3Policy`.
+        As in SB3's `TD3Policy`. In place of Adam the actor of more than 32 regions has
+        :class:`RowAdam`, which steps the networks of the regions in use alone; its gradients are
+        sparse then, until ``actor.mu.row_gradients`` is set to False. Other optimizers, and
+        arguments other than ``eps`` and ``betas``, get dense ones.
 
     Raises
     ------
@@ -379,9 +382,11 @@ class YannPolicy(TD3Policy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        if self.problem.explicit().n_regions > FEW and self.optimizer_kwargs == {"fused": True}:
+        chosen = {name: each for name, each in self.optimizer_kwargs.items() if name != "fused"}
+        adam = self.optimizer_class is th.optim.Adam and chosen.keys() <= {"betas", "eps"}
+        if adam and self.problem.explicit().n_regions > FEW:
             # A step, and its gradients, of the regions in use alone.
-            self.actor.optimizer = RowAdam(self.actor.parameters(), lr=lr_schedule(1))
+            self.actor.optimizer = RowAdam(self.actor.parameters(), lr=lr_schedule(1), **chosen)
             self.actor.mu.row_gradients = True
         # A buffer travels with the parameters: a model that is loaded goes on where it was.
         self.register_buffer("critic_updates", th.zeros((), dtype=th.int64))

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 import sb3_yann
 from sb3_yann import LinearModel, LinearMPC, NoActionNoise, YannActor, YannCritic, YannPolicy
-from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue
+from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, RowAdam
 from sb3_yann_envs import problems
 
 ENVS = ("CSTR-v0", "ClippedPendulum-v0")
@@ -400,7 +400,7 @@ def test_the_actor_stays_the_mpc_bit_for_bit_until_the_critic_is_warm(policy_del
     updates(model, 1)  # the sixth of the critic, and then the actor's first
     assert changed(model.actor, first.actor)
     assert not th.equal(model.actor(theta), law)
-    assert {int(state["step"].max()) for state in model.actor.optimizer.state.values()} == {1}
+    assert {int(state["steps"].max()) for state in model.actor.optimizer.state.values()} == {1}
     updates(model, 2)  # the first step moves one layer of zeros only
     assert not th.equal(model.actor_target(theta), law)
 
@@ -821,3 +821,25 @@ def test_only_problems_can_be_registered() -> None:
 def test_a_name_for_a_problem_must_be_a_name() -> None:
     with pytest.raises(ValueError, match="'a:b'"):
         sb3_yann.register_problem("a:b", problems.cstr)
+
+
+def test_beyond_32_regions_those_without_data_do_not_move_not_even_by_momentum() -> None:
+    model = with_full_buffer(DDPG, two_inputs(), critic_warmup=0)
+    assert isinstance(model.actor.optimizer, RowAdam)
+    assert two_inputs().explicit().n_regions > 32
+    updates(model, 5)
+    before = copy.deepcopy(model.actor.mu.network)
+    data = model.replay_buffer.sample(3)
+    model.replay_buffer.sample = lambda *_, **__: data
+    updates(model, 1)
+    seen = set(two_inputs().explicit().locate(data.observations.double().numpy()).tolist())
+    for old, new in zip(before.parameters(), model.actor.mu.network.parameters(), strict=True):
+        moved = (old != new).flatten(1).any(1).nonzero()[:, 0].tolist()
+        assert moved and set(moved) <= seen
+
+
+def test_an_optimizer_of_ones_own_gets_dense_gradients() -> None:
+    kwargs = {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {}, "critic_warmup": 0}
+    model = with_full_buffer(DDPG, two_inputs(), **kwargs)
+    updates(model, 2)
+    assert not any(each.grad.is_sparse for each in model.actor.parameters())

@@ -6,8 +6,9 @@ of a microsecond, a good part of what a whole evaluation takes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numba
@@ -32,29 +33,54 @@ ROWS = 2
 SURELY_INSIDE = 1e-9
 """With a slack of at least this, no region that the tree left out can be as good."""
 
+CLEAR = 1e-6
+"""So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
+
+
+def _sources() -> str:
+    """Return a hash of all files with compiled functions, which call each other."""
+    package = Path(__file__).parents[1]
+    files = [*package.glob("control/_location.py"), *package.glob("control/search_tree.py")]
+    files += sorted(package.glob("networks/compiled*.py"))
+    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
+
+
+SOURCES = _sources()
+
 
 def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
     """Return a decorator that compiles a function for the given types, and keeps the machine code.
 
-    With types that are given nothing is ever compiled for others: those are refused. With
-    ``fastmath`` sums may be taken in any order, several terms at a time.
+    With types that are given nothing is ever compiled for others: those are refused. Without any
+    the function is a part of those that call it. With ``fastmath`` sums may be taken in any order,
+    several terms at a time.
     """
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
 
     def compile_it(function: F) -> F:
-        njit: Any = partial(
-            numba.njit,
-            [*signatures] or None,
-            nogil=True,
-            error_model="numpy",
-            fastmath={"reassoc", "contract", "nsz"} if fastmath else False,
-        )
+        if not signatures:
+            part: F = numba.njit(**options)(function)
+            return part
+        result: F
         try:
-            result: F = njit(cache=True)(function)
-        except RuntimeError:  # no folder to write to: compiled anew in every process
-            result = njit()(function)
+            result = _compile(numba.njit(**options)(function), signatures, keep=True)
+        except Exception:  # no folder to write to, a full disk, a damaged file
+            result = _compile(numba.njit(**options)(function), signatures, keep=False)
         return result
 
     return compile_it
+
+
+def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
+    if keep:
+        dispatcher.enable_caching()
+        # numba looks at the function's own file; what it calls may have changed in another.
+        dispatcher._cache._cache_file._source_stamp = SOURCES
+    for signature in signatures:
+        dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    return dispatcher
 
 
 def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers]:
@@ -129,21 +155,25 @@ def _scan(floats: Array, whole: Integers, theta: Array, known: float) -> tuple[i
 
 
 @compiled()
-def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int]:
-    """Return where the regions of the leaf that theta falls into begin and end in ``whole``."""
+def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int, float]:
+    """Return where the regions of the leaf that theta falls into begin and end in ``whole``.
+
+    With them comes the smallest distance from the hyperplanes on the way.
+    """
     n, m, p, q, nodes, leaves = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
     normals = ROWS + q * (n + 1) + p * m * n + p * m + 2 * m
     levels = normals + nodes * n
     children = HEADER + p + 1
-    node = 0
+    node, room = 0, np.inf
     while node >= 0:
         side = -floats[levels + node]
         for j in range(n):
             side += floats[normals + node * n + j] * theta[j]
+        room = min(room, abs(side))
         node = whole[children + 2 * node + (1 if side > 0 else 0)]
     starts = children + 2 * nodes
     regions = starts + leaves + 1
-    return regions + whole[starts - node - 1], regions + whole[starts - node]
+    return regions + whole[starts - node - 1], regions + whole[starts - node], room
 
 
 @compiled()
@@ -155,14 +185,14 @@ def _choose(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
             return -1, np.nan
     known = -np.inf
     if whole[4] > 0:
-        first, last = _leaf(floats, whole, theta)
+        first, last, room = _leaf(floats, whole, theta)
         best, largest = -1, -np.inf
         for k in range(first, last):
             i = whole[k]
             slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, largest)
             if slack > largest + floats[1] * (1 + abs(slack)):
                 best, largest = i, slack
-        if largest >= SURELY_INSIDE:
+        if largest >= SURELY_INSIDE or (largest >= -floats[1] and room > CLEAR):
             return best, largest
         known = largest
     return _scan(floats, whole, theta, known)
@@ -185,6 +215,7 @@ def input_at(floats: Array, whole: Integers, theta: Array, out: Array) -> int:
             for j in range(n):
                 u += floats[gains + (region * m + k) * n + j] * theta[j]
             u += floats[offsets + region * m + k]
+        u = u if u == u else 0.0  # inf - inf, far from everything
         out[k] = min(max(u, floats[bounds + k]), floats[bounds + m + k])
     return region
 

@@ -34,7 +34,7 @@ def cache_folder() -> Path | None:
     if chosen.lower() in ("off", "0"):
         return None
     if chosen:
-        return Path(chosen)
+        return Path(chosen).expanduser()
     home = os.path.expanduser("~")
     if home == "~":  # no home folder is known
         return None
@@ -96,9 +96,11 @@ def store_law(key: str, law: PiecewiseAffine) -> None:
         os.close(handle)
         law.save(part)
         os.replace(part, path)
-    except OSError:
+    except (OSError, MemoryError):
+        pass  # the law itself is there
+    finally:
         with suppress(OSError):
-            os.unlink(part)
+            os.unlink(part)  # nothing, once it has been renamed
 
 
 def _path(key: str) -> Path | None:

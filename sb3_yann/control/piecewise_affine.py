@@ -29,6 +29,9 @@ OUTSIDE = ("nearest", "zero")
 SCAN = 16
 """Up to this many regions are asked one by one."""
 
+MOST_PARAMETERS = 10
+"""Of more, the regions have too many vertices for a tree."""
+
 _COMPILED = ("packed", "_at")
 
 
@@ -196,7 +199,7 @@ class PiecewiseAffine(ReadOnlyArrays):
 
                 law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
             return law
-        except (KeyError, TypeError, ValueError, EOFError, BadZipFile) as error:
+        except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
             raise ValueError(
                 f"{fspath(path)} does not hold a PiecewiseAffine ({error}). "
                 "Write it with law.save(path)."
@@ -230,11 +233,13 @@ class PiecewiseAffine(ReadOnlyArrays):
     @cached_property
     def tree(self) -> SearchTree | None:
         """The tree that finds a region; None for so few regions that a scan is as fast."""
-        if self.n_regions <= SCAN or not np.all(np.isfinite([self.theta_min, self.theta_max])):
+        bounded = np.all(np.isfinite([self.theta_min, self.theta_max]))
+        if self.n_regions <= SCAN or self.n_theta > MOST_PARAMETERS or not bounded:
             return None
         from sb3_yann.control.search_tree import build_tree
 
-        return build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
+        tree = build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
+        return tree if len(tree.levels) else None  # regions that no hyperplane parts
 
     @cached_property
     def packed(self) -> tuple[Array, NDArray[np.int64]]:

@@ -62,10 +62,15 @@ class SearchTree:
         ValueError
             If it is not a tree for so many parameters and regions: compiled code does not check.
         """
-        nodes, leaves = len(self.levels), len(self.leaf_starts) - 1
+        nodes, leaves = self.levels.size, self.leaf_starts.size - 1
         numbers = np.arange(nodes)[:, None]
+        whole = (self.children, self.leaf_starts, self.leaf_regions)
         sound = (
-            self.normals.shape == (nodes, n_theta)
+            all(each.dtype.kind == "i" for each in whole)
+            and self.leaf_starts.ndim == self.leaf_regions.ndim == 1
+            and leaves > 0
+            and self.levels.shape == (nodes,)
+            and self.normals.shape == (nodes, n_theta)
             and self.children.shape == (nodes, 2)
             and nodes > 0
             and np.all((self.children > numbers) | (self.children < 0))
@@ -190,7 +195,10 @@ def _best_split(
     return int(rows[best]), inside[(sides[best] & 1) > 0], inside[(sides[best] >> 1) > 0]
 
 
-@compiled()
+@compiled(
+    "uint8[:, ::1](float64[:, ::1], int64[::1], float64[:, ::1], float64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1])"
+)
 def _sides(
     points: Array,
     vertex_starts: Integers,

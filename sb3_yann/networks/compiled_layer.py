@@ -147,6 +147,9 @@ def _backward(
 
 def layer_on_processor(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
     """Return what the layer does, (batch, m), for theta (batch, n) without a gradient."""
+    n = layer.piecewise_affine.n_theta
+    if theta.dim() != 2 or theta.shape[1] != n:  # compiled code does not look
+        raise ValueError(f"theta has shape {tuple(theta.shape)}, expected (batch, {n}).")
     points = theta.detach().double().contiguous()
     weights = layer.network.weights()
     if th.is_grad_enabled():
@@ -156,7 +159,7 @@ def layer_on_processor(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
 
 
 def _given(layer: YannLayer, theta: th.Tensor, weights: tuple[th.Tensor, ...]) -> list[Any]:
-    arrays = [weight.detach().numpy() for weight in weights]
+    arrays = [weight.detach().contiguous().numpy() for weight in weights]
     law = layer.piecewise_affine.packed
     limit = np.inf if layer.reach is None else layer.reach
     known = (theta.numpy(), layer.scaling, layer.change_array, limit)

@@ -191,6 +191,9 @@ def _forms_backward(
 
 def value_on_processor(value: AfterstateValue, points: th.Tensor) -> th.Tensor:
     """Return what ``value(points)`` is, (batch, 1), for points of shape (batch, n + m)."""
+    size = len(value.W)
+    if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
+        raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
     weights = (value.quadratic.entries, *value.network.weights())
     if value.fixed:
         weights = tuple(weight.detach() for weight in weights)
@@ -210,7 +213,7 @@ class _Pass:
         self, value: AfterstateValue, points: th.Tensor, weights: tuple[th.Tensor, ...]
     ) -> None:
         self.weights = weights
-        entries, nodes, second, last = (weight.detach().numpy() for weight in weights)
+        entries, nodes, second, last = (weight.detach().contiguous().numpy() for weight in weights)
         W, AB, self.roots, scaling = value.constants
         pinned = value.network.pinned_array
         self.first: tuple[Any, ...] = (W, AB, entries * self.roots, scaling, nodes, pinned)

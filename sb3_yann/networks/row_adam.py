@@ -51,15 +51,16 @@ class RowAdam(th.optim.Optimizer):
         self, parameter: th.Tensor, rows: th.Tensor, gradient: th.Tensor, group: dict[str, Any]
     ) -> None:
         state = self.state[parameter]
-        if not state:
-            state["step"] = th.zeros(len(parameter), device=parameter.device)
-            state["exp_avg"] = th.zeros_like(parameter)
-            state["exp_avg_sq"] = th.zeros_like(parameter)
+        if "steps" not in state:  # nothing yet, or what an Adam left
+            taken = float(state.pop("step", 0.0))
+            state["steps"] = th.full((len(parameter),), taken, device=parameter.device)
+            for name in ("exp_avg", "exp_avg_sq"):
+                state.setdefault(name, th.zeros_like(parameter))
         beta1, beta2 = group["betas"]
-        step = state["step"][rows] + 1
+        step = state["steps"][rows] + 1
         mean = state["exp_avg"][rows].lerp_(gradient, 1 - beta1)
         square = state["exp_avg_sq"][rows].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
-        for name, value in (("step", step), ("exp_avg", mean), ("exp_avg_sq", square)):
+        for name, value in (("steps", step), ("exp_avg", mean), ("exp_avg_sq", square)):
             state[name][rows] = value
         step = step.view(-1, *[1] * (parameter.dim() - 1))
         size = (square / (1 - beta2**step)).sqrt_().add_(group["eps"])

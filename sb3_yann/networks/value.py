@@ -38,7 +38,8 @@ class QuadraticForm(nn.Module):
         diagonal = np.abs(np.diag(M))
         root = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         # Float64: along the law the terms of the form cancel, by a factor of up to some hundreds.
-        self.entries = nn.Parameter(th.as_tensor(M / np.outer(root, root), dtype=th.float64))
+        entries = np.array(M / np.outer(root, root), order="C")
+        self.entries = nn.Parameter(th.as_tensor(entries, dtype=th.float64))
         self.register_buffer("root", th.as_tensor(root))
 
     def forward(self, z: th.Tensor) -> th.Tensor:
@@ -96,7 +97,7 @@ class QuadraticStateActionValue(nn.Module):
             "network_scale": 1 / np.concatenate([theta_half, reach]),
         }
         for name, value in constants.items():
-            self.register_buffer(name, th.as_tensor(value, dtype=th.float64))
+            self.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=th.float64))
         self.network = ZeroOutputNetwork(
             n + m, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
@@ -165,7 +166,7 @@ class AfterstateValue(nn.Module):
             "network_scale": 1 / theta_half,
         }
         for name, value in constants.items():
-            self.register_buffer(name, th.as_tensor(value, dtype=th.float64))
+            self.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=th.float64))
         n, m = len(theta_half), len(u_min)
         _check_prediction(self.model, n, m)
         self.network = ZeroOutputNetwork(
@@ -173,31 +174,34 @@ class AfterstateValue(nn.Module):
         )
         self.fixed = False
         """Whether gradients go to the action alone, not to the weights."""
-        self._constants: tuple[Array, Array, Array, Array] | None = None
+        self._constants: tuple[Array, Array, Array, Array]
+        self._constants_of: tuple[Any, ...] = ()
 
     @property
     def compiles(self) -> bool:
         """Whether there is compiled code for such a value where it is now."""
-        return isinstance(self.model, LinearPrediction) and self.network.compiles
+        double = self.W.dtype == self.quadratic.entries.dtype == th.float64
+        return double and isinstance(self.model, LinearPrediction) and self.network.compiles
 
     @property
     def constants(self) -> tuple[Array, Array, Array, Array]:
         """W, the model's [A B], the scale of the quadratic form, and others, for compiled code."""
-        if self._constants is None:
-            A, B = (self.model.get_buffer(name).numpy() for name in "AB")  # type: ignore[union-attr]
-            root = self.quadratic.root.numpy()
-            scaling = (self.network_scale, self.to_input, self.middle)
+        model: Any = self.model
+        used = (
+            self.W, model.A, model.B, self.quadratic.root,
+            self.network_scale, self.to_input, self.middle,
+        )  # fmt: skip
+        now = (self.gamma, *((id(each), each._version) for each in used))
+        if self._constants_of != now:
+            W, A, B, root, *scaling = (each.numpy() for each in used)
             self._constants = (
-                self.W.numpy(),
+                W.copy(),
                 np.ascontiguousarray(np.vstack([A, B]).T),
                 np.outer(root, root) * self.gamma,
-                np.concatenate([each.numpy() for each in scaling]),
+                np.concatenate(scaling),
             )
+            self._constants_of = now
         return self._constants
-
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
-        self._constants = None
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""

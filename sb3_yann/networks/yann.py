@@ -79,17 +79,18 @@ class YannLayer(nn.Module):
         self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
         self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
         middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
-        A, b = _padded_half_spaces(law)
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
         # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
-        self._constant("gains", law.gains / reach[:, None])
-        self._constant("offsets", (law.offsets - middle) / reach)
-        self._constant("resting", np.clip(-middle / reach, -1, 1))
-        self._constant("half_space_A", A)
-        self._constant("half_space_b", b)
+        for name, value in _constants(law).items():
+            self._constant(name, value)
         self._constant("theta_half", (law.theta_max - law.theta_min) / 2, th.float32)
         self.rated = rate is not None
         if rate is not None:
+            if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
+                raise ValueError(
+                    f"rate has shape {np.shape(rate)}, expected (2, {law.n_inputs}) and a theta "
+                    f"that ends with the {law.n_inputs} previous inputs; it has {law.n_theta}."
+                )
             self._constant("middle", middle)
             self._constant("half_range", reach)
             # In both directions a little is left for the rounding of actions and observations.
@@ -156,15 +157,29 @@ class YannLayer(nn.Module):
         return low, high
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        before = {name: value.clone() for name, value in self.named_buffers(recurse=False)}
         super()._load_from_state_dict(state_dict, prefix, *args)
         # What is compiled goes by the law that was given: with another one it must not be used.
-        same = all(th.equal(value, self.get_buffer(name)) for name, value in before.items())
-        self.has_its_law = self.has_its_law and same
+        self.has_its_law = all(
+            np.array_equal(value, self.get_buffer(name).cpu())
+            for name, value in _constants(self.piecewise_affine).items()
+        )
 
     def _constant(self, name: str, value: Array, dtype: th.dtype = th.float64) -> None:
         # A buffer, not a parameter: optimizers and SB3's target updates leave it alone.
         self.register_buffer(name, th.as_tensor(np.array(value), dtype=dtype))
+
+
+def _constants(law: PiecewiseAffine) -> dict[str, Array]:
+    """Return the law for actions in [-1, 1], as the layer keeps it."""
+    middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
+    A, b = _padded_half_spaces(law)
+    return {
+        "gains": law.gains / reach[:, None],
+        "offsets": (law.offsets - middle) / reach,
+        "resting": np.clip(-middle / reach, -1, 1),
+        "half_space_A": A,
+        "half_space_b": b,
+    }
 
 
 def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -204,11 +205,19 @@ class ZeroOutputNetwork(nn.Module):
 
     def weights(self) -> tuple[th.Tensor, ...]:
         """Return the parameters, layer by layer."""
-        return (self.first.nodes, *(layer.get_parameter("weight") for layer in self.rest))
+        rest: Any = self.rest
+        return (self.first.nodes, *[layer.weight for layer in rest])
 
     @property
     def compiles(self) -> bool:
-        """Whether there is compiled code for such networks where they are now."""
+        """Whether there is compiled code for such networks where they are now.
+
+        What is traced, exported or compiled by torch needs torch's own operations: it would take
+        the result of compiled code for a constant.
+        """
+        tracing = th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+        if tracing or th.compiler.is_compiling():
+            return False
         nodes = self.first.nodes
         return self.has_loops and nodes.dtype == th.float32 and nodes.device.type == "cpu"
 

@@ -146,6 +146,7 @@ def test_with_equal_discounts_the_critic_is_that_of_the_riccati_solution(
     np.testing.assert_array_equal(mpc.terminal_cost, P)
 
 
+@pytest.mark.filterwarnings("ignore:u_min")  # it says so
 def test_state_action_matrix_needs_a_law_that_rests_at_the_origin() -> None:
     mpc = input_bounds_only(LinearModel([[0.9]], [[1]], 1.0), u_min=0.2)
     with pytest.raises(ValueError, match=r"does not rest at the origin: theta = 0 must be feas"):

@@ -157,6 +157,24 @@ def test_a_tree_with_a_loop_is_refused() -> None:
         tree.checked(1, 1)
 
 
+def test_a_law_that_no_hyperplane_parts_has_no_tree_and_is_saved_all_the_same(tmp_path) -> None:
+    box = np.vstack([np.eye(2), -np.eye(2)])
+    law = PiecewiseAffine(
+        np.zeros((17, 1, 2)), np.zeros((17, 1)), np.tile(box, (17, 1)), np.ones(68),
+        np.arange(17) * 4, [-1], [1], [-1, -1], [1, 1],
+    )  # fmt: skip
+    assert law.tree is None
+    law.save(tmp_path / "law.npz")
+    assert PiecewiseAffine.load(tmp_path / "law.npz") == law
+
+
+def test_an_input_stays_within_its_bounds_where_numbers_overflow() -> None:
+    law = PiecewiseAffine(
+        [[[1e10, -1e10]]], [[0.0]], [[1.0, 0.0]], [1.0], [0], [-1], [1], [-1, -1], [1, 1]
+    )
+    assert law([1e300, 1e300]).tolist() == [0.0]
+
+
 def test_overlapping_regions_tie_alike_in_a_tree_and_in_a_scan() -> None:
     law = many_regions()
     ends = np.append(law.starts, law.n_halfspaces)
