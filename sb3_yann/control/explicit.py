@@ -76,12 +76,9 @@ def solve_explicit(
         if units.agree(law, u_min, u_max, outside):
             return law
         law_cache.warn_of(key, "it holds the law of another problem.")
-    if solver != "walk":
-        _require_feasible(units.scaled)
+    _require_feasible(units.scaled)
     with Watch(limits) as watch:
         regions = _critical_regions(units.scaled, solver, watch)
-        if not regions:
-            _require_feasible(units.scaled)  # the reason, most likely
         check(units.scaled, regions, units.center, units.half)
         law = units.law(regions, u_min, u_max, outside)
     if watch.seconds > WORTH_KEEPING:
