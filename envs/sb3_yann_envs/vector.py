@@ -97,7 +97,7 @@ class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any
             for generator, each in zip(self._generators, seeds, strict=True)
         ]
         states = [self._start(i, start) for i, start in enumerate(starts)]
-        self._state = np.array(states).T
+        self._state = np.ascontiguousarray(np.array(states).T)
         self._over[:] = False
         self._steps[:] = 0
         observed = self._observed()
@@ -150,16 +150,7 @@ class CSTRVectorEnv(_VectorEnv):
     def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
         a, b, s, t = self._state
         cost = cstr.stage_cost(a, b, s, t, u)
-        transfer, rich = cstr.U_SS[0] + u, cstr.is_rich(a, b)
-        # Runs that are over may be far beyond the limit, where the rates overflow.
-        with np.errstate(all="ignore"):
-            state = np.array(cstr.advance((a, b, s, t), transfer, np.exp))
-            if rich.any():
-                finer = cstr.advance(
-                    (a[rich], b[rich], s[rich], t[rich]), transfer[rich], np.exp, cstr.RICH_SUBSTEPS
-                )
-                state[:, rich] = finer
-        self._state = state
+        self._state = cstr.advance_all(self._state, cstr.U_SS[0] + u)
         terminated = cstr.X_SS[3] + self._state[3] > cstr.TEMPERATURE_LIMIT
         return cost + cstr.PENALTY * terminated, terminated
 

@@ -58,7 +58,7 @@ def test_copies_far_from_the_random_starts_are_integrated_as_the_single_environm
 
 def test_to_advance_arrays_leaves_them_as_they_are() -> None:
     before = np.full((4, 3), 0.01)
-    after = cstr.advance(tuple(before), np.full(3, 50.0), np.exp)
+    after = cstr.advance_all(before, np.full(3, 50.0))
     assert (before == 0.01).all() and not np.array_equal(after, before)
 
 
