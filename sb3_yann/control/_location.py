@@ -24,14 +24,15 @@ if TYPE_CHECKING:
 Integers = NDArray[np.int64]
 F = TypeVar("F", bound=Callable[..., Any])
 
-HEADER = 7
-"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero outside."""
+HEADER = 8
+"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero outside, disjoint."""
 
 ROWS = 2
 """Floats before the packed arrays: how far outside counts as inside, and which slacks tie."""
 
 SURELY_INSIDE = 1e-9
-"""With a slack of at least this, no region that the tree left out can be as good."""
+"""With a slack of at least this, no region that the tree left out, or no other one at all if they
+are disjoint, can be as good."""
 
 CLEAR = 1e-6
 """So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
@@ -90,7 +91,8 @@ def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers
     """
     nodes, leaves = (len(tree.levels), len(tree.leaf_starts) - 1) if tree else (0, 0)
     p, m, n = law.gains.shape
-    header = [n, m, p, law.n_halfspaces, nodes, leaves, law.outside == "zero"]
+    header = [n, m, p, law.n_halfspaces, nodes, leaves]
+    header += [law.outside == "zero", law.disjoint]
     rows = np.column_stack([law.A, law.b])
     floats: list[Any] = [(law.tolerance, law.tie_tolerance), rows, law.gains, law.offsets]
     floats += [law.u_min, law.u_max, *((tree.normals, tree.levels) if tree else ())]
@@ -177,6 +179,40 @@ def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int, float
 
 
 @compiled()
+def _best_of_leaf(
+    floats: Array, whole: Integers, theta: Array, first: int, last: int
+) -> tuple[int, float]:
+    """Return what `_scan` does, of the regions of a leaf.
+
+    Where regions are disjoint, the first one that surely holds theta ends the search. The leaf
+    begins with those that most often do.
+    """
+    n, disjoint = whole[0], whole[7] == 1
+    best, largest, low, tied = -1, -np.inf, -np.inf, False
+    for k in range(first, last):
+        i = whole[k]
+        slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, low)
+        if slack < low:
+            continue
+        if disjoint and slack >= SURELY_INSIDE:
+            return i, slack
+        tied = True
+        if slack > largest:
+            low = max(low, slack - floats[1] * (1 + abs(slack)))
+            tied = largest >= low
+            best, largest = i, slack
+    if not tied:
+        return best, largest
+    nearly = largest - floats[1] * (1 + abs(largest))
+    for k in range(first, last):
+        i = whole[k]
+        rows = whole[HEADER + i], whole[HEADER + i + 1]
+        if i < best and _slack(floats, n, rows[0], rows[1], theta, nearly) >= nearly:
+            best = i
+    return best, largest
+
+
+@compiled()
 def _choose(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
     """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite."""
     n = whole[0]
@@ -186,15 +222,9 @@ def _choose(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
     known = -np.inf
     if whole[4] > 0:
         first, last, room = _leaf(floats, whole, theta)
-        best, largest = -1, -np.inf
-        for k in range(first, last):
-            i = whole[k]
-            slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, largest)
-            if slack > largest + floats[1] * (1 + abs(slack)):
-                best, largest = i, slack
-        if largest >= SURELY_INSIDE or (largest >= -floats[1] and room > CLEAR):
-            return best, largest
-        known = largest
+        best, known = _best_of_leaf(floats, whole, theta, first, last)
+        if known >= SURELY_INSIDE or (known >= -floats[1] and room > CLEAR):
+            return best, known
     return _scan(floats, whole, theta, known)
 
 

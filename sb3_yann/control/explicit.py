@@ -127,6 +127,7 @@ class _Units:
             theta_min=self.program.theta_min,
             theta_max=self.program.theta_max,
             outside=outside,
+            disjoint=True,
         )
 
     def agree(self, law: PiecewiseAffine, u_min: Array, u_max: Array, outside: str) -> bool:

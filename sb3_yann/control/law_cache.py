@@ -25,7 +25,7 @@ from sb3_yann.control.piecewise_affine import PiecewiseAffine
 
 VARIABLE = "SB3_YANN_CACHE"
 # Raise it when the same problem would give another law, or the file another format.
-FORMAT = 1
+FORMAT = 2
 
 
 def cache_folder() -> Path | None:

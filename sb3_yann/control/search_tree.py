@@ -6,7 +6,7 @@ tree", with vertices in place of their linear programs, and leaves of a few regi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import pairwise
 
@@ -21,11 +21,14 @@ from sb3_yann.control.polyhedra import largest_ball
 LEAF = 4
 """A node with this many regions is not split further."""
 
-NODES = 8
+NODES = 2
 """Hyperplanes for each region, at most: where regions are long and thin, every hyperplane cuts some
 of them, and trees down to the last region grow without bound."""
 
-CANDIDATES = 32
+DRAWS = 64
+"""Random points for each region that tell which regions of a leaf are met most often."""
+
+CANDIDATES = 16
 """Facets tried at a node, drawn from those of its regions."""
 
 OVERLAP = 1e-8
@@ -46,6 +49,7 @@ class SearchTree:
     leaf_starts : ndarray of int, shape (leaves + 1,)
         Where each leaf begins in ``leaf_regions``.
     leaf_regions : ndarray of int
+        Those first in which most points of the leaf lie.
     """
 
     normals: Array
@@ -147,14 +151,88 @@ def build_tree(
         normals.append(regions.A[row])
         levels.append(regions.b[row])
         children.append([0, 0])
-    in_box = np.array(normals).reshape(-1, len(half)) / half
-    return SearchTree(
-        normals=in_box,
-        levels=np.array(levels) + in_box @ center,
+    tree = SearchTree(
+        normals=np.array(normals).reshape(-1, len(half)),
+        levels=np.array(levels),
         children=np.array(children, dtype=np.int64).reshape(-1, 2),
         leaf_starts=np.cumsum([0, *map(len, leaves)]),
         leaf_regions=np.concatenate(leaves),
     )
+    if not levels:  # regions that no hyperplane parts
+        return tree
+    in_box = tree.normals / half
+    return replace(
+        tree,
+        normals=in_box,
+        levels=tree.levels + in_box @ center,
+        leaf_regions=_often_first(tree, regions, random),
+    )
+
+
+def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Generator) -> Integers:
+    """Return the regions of all leaves, in each of them those first that hold most of its points.
+
+    First by points drawn all over the box, then by as many drawn in each region: in a large box a
+    small region may have none of the former.
+    """
+    p, n = regions.middles.shape
+    everywhere = random.uniform(-1, 1, (DRAWS * p, n))
+    which = np.repeat(np.arange(p), DRAWS // 8)
+    first, last = regions.vertex_starts[which], regions.vertex_starts[which + 1]
+    corners = regions.vertices[random.integers(first, last, (n + 1, len(which)))]
+    within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
+    all_over, in_each = (
+        _hits(
+            tree.normals,
+            tree.levels,
+            tree.children,
+            tree.leaf_starts,
+            tree.leaf_regions,
+            regions.A,
+            regions.b,
+            regions.row_starts,
+            points,
+        )
+        for points in (everywhere, within)
+    )
+    leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
+    order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
+    return np.ascontiguousarray(tree.leaf_regions[order])
+
+
+@compiled(
+    "int64[::1](float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1])"
+)
+def _hits(
+    normals: Array,
+    levels: Array,
+    children: Integers,
+    leaf_starts: Integers,
+    leaf_regions: Integers,
+    A: Array,
+    b: Array,
+    row_starts: Integers,
+    points: Array,
+) -> Integers:
+    """Return for each entry of ``leaf_regions`` how many points it is the first one to hold."""
+    hits = np.zeros(len(leaf_regions), np.int64)
+    for each in range(len(points)):
+        point, node = points[each], 0
+        while node >= 0:
+            above = np.dot(normals[node], point) > levels[node]
+            node = children[node, 1 if above else 0]
+        for k in range(leaf_starts[-1 - node], leaf_starts[-node]):
+            i = leaf_regions[k]
+            inside = True
+            for row in range(row_starts[i], row_starts[i + 1]):
+                inside = np.dot(A[row], point) <= b[row]
+                if not inside:
+                    break
+            if inside:
+                hits[k] += 1
+                break
+    return hits
 
 
 def _polytopes(A: Array, b: Array, row_starts: Integers) -> _Polytopes:
