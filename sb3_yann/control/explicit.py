@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import optimize
 
@@ -165,6 +167,9 @@ def _require_feasible(program: ParametricQP) -> None:
     v, n = program.F.shape
     rows = np.hstack([program.G, -program.S])
     rows = np.hstack([rows, np.linalg.norm(rows, axis=1, keepdims=True)])
+    with_room = replace(program, w=program.w - 1e-6 * rows[:, -1])
+    if with_room.solve(np.zeros(n)) is not None:  # mostly: it takes a hundredth of the time
+        return
     bounds = [(None, None)] * v + [(-1, 1)] * n + [(None, 1)]
     cost = np.zeros(v + n + 1)
     cost[-1] = -1

@@ -77,12 +77,20 @@ class _Walk:
         ]
 
     def seeds(self, count: int) -> Iterator[int]:
-        """Yield the active sets at the centre of the box and at random points of it."""
+        """Yield the active sets where no region is known: at the centre and at random points."""
         n = self.program.F.shape[1]
-        for point in [np.zeros(n), *np.random.default_rng(0).uniform(-1, 1, (count, n))]:
+        points = np.vstack([np.zeros(n), np.random.default_rng(0).uniform(-1, 1, (count, n))])
+        for point in points[~self._known(points)]:
             active = self._active_at(point)
             if active is not None:
                 yield active
+
+    def _known(self, points: Array) -> NDArray[np.bool_]:
+        """Tell which points a region holds that was found."""
+        known = np.zeros(len(points), dtype=bool)
+        for one in self.found.values():
+            known |= np.all(points @ one.A.T <= one.b, axis=1)
+        return known
 
     def _active_at(self, point: Array) -> int | None:
         """Return the active set at a point, if there are several one that is not ruled out."""

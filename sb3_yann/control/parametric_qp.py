@@ -49,9 +49,10 @@ class ParametricQP:
 
         H, G, fixed, lower, sense = self._arrays
         upper = self.w + self.S @ theta
-        if np.any(upper[fixed] < -1e-11):  # a bound of theta alone
-            return None, np.zeros(upper.size)
-        upper[fixed] = 1.0
+        if fixed.size:  # bounds of theta alone
+            if upper[fixed].min() < -1e-11:
+                return None, np.zeros(upper.size)
+            upper[fixed] = 1.0
         U, _, status, info = daqp.solve(
             H, self.F @ theta + self.c, G, upper, lower, sense, primal_tol=1e-11
         )

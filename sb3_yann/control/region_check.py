@@ -46,6 +46,12 @@ def _as_bits(active_set: Iterable[int]) -> int:
     return sum(1 << k for k in active_set)
 
 
+def _sets(multipliers: Array) -> list[int]:
+    """Return the sets of constraints with multipliers, one for each row, as whole numbers."""
+    bits = np.packbits(multipliers > 1e-11, axis=1, bitorder="little")
+    return [int.from_bytes(row.tobytes(), "little") for row in bits]
+
+
 class _Check:
     def __init__(
         self, program: ParametricQP, regions: list[Region], center: Array, half: Array
@@ -187,33 +193,37 @@ class _Check:
     def _require_agreement(self) -> None:
         """Raise unless QPs at random points of the box agree with the regions."""
         n = self.program.F.shape[1]
-        for point in np.random.default_rng(1).uniform(-1, 1, (50 * n, n)):
-            U, multipliers = self.program.solve_with_multipliers(point)
-            if U is None:
-                continue
-            region = self._held(point, multipliers)
-            if region is None:
-                self._fail("no region covers a feasible parameter", point)
-            if np.max(np.abs(U - region.gain @ point - region.offset)) > LAW:
-                i = self.by_set[_as_bits(region.active_set)]
-                self._fail(f"the law of region {i} violates the KKT conditions", point)
+        drawn = np.random.default_rng(1).uniform(-1, 1, (50 * n, n))
+        solved = [(point, *self.program.solve_with_multipliers(point)) for point in drawn]
+        feasible = [each for each in solved if each[1] is not None]
+        if not feasible:
+            return
+        points, inputs, multipliers = (np.array(each) for each in zip(*feasible, strict=True))
+        meant = np.array([self.by_set.get(each, -1) for each in _sets(multipliers)])
+        for i in np.unique(meant):
+            region, at = self.regions[i], meant == i
+            held = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE
+            off = np.abs(points[at] @ region.gain.T + region.offset - inputs[at]).max(axis=1)
+            for k in np.flatnonzero(at)[(i < 0) | ~held | (off > LAW)]:
+                self._require_held(points[k], inputs[k])
 
-    def _held(self, point: Array, multipliers: Array) -> Region | None:
-        """Return a region that holds a point, first that of the constraints with multipliers."""
-        region = self._of_multipliers(point, multipliers)
-        if region is not None:
-            return region
+    def _require_held(self, point: Array, U: Array) -> None:
+        """Raise unless the region that is nearest to a point holds it, and has the right law."""
         slacks = self._slacks(point)
-        best = int(np.argmax(slacks))
-        return self.regions[best] if slacks[best] >= -INSIDE else None
+        nearest = int(np.argmax(slacks))
+        region = self.regions[nearest]
+        if slacks[nearest] < -INSIDE:
+            self._fail("no region covers a feasible parameter", point)
+        if np.max(np.abs(U - region.gain @ point - region.offset)) > LAW:
+            self._fail(f"the law of region {nearest} violates the KKT conditions", point)
 
     def _of_multipliers(self, point: Array, multipliers: Array) -> Region | None:
         """Return the region of the constraints with multipliers, if it holds a point."""
-        index = self.by_set.get(_as_bits(np.flatnonzero(multipliers > 1e-11).tolist()))
+        index = self.by_set.get(_sets(multipliers[None])[0])
         if index is None:
             return None
         region = self.regions[index]
-        return region if np.min(region.b - region.A @ point) >= -INSIDE else None
+        return region if (region.b - region.A @ point).min() >= -INSIDE else None
 
     def _require_no_doubles(self, balls: list[tuple[Array, float]]) -> None:
         """Raise if a region lies in another: both have then the same law, whatever their sets."""
