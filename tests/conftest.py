@@ -8,6 +8,7 @@ import os
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from online_mpc import OnlineMPC
 
 from sb3_yann import LinearModel, LinearMPC
@@ -15,6 +16,12 @@ from sb3_yann_envs import problems
 
 # No test reads or leaves laws in the cache of who runs it.
 os.environ["SB3_YANN_CACHE"] = "off"
+
+
+@pytest.fixture(autouse=True)
+def same_initial_weights() -> None:
+    """Seed torch: a test must not depend on which tests ran before it."""
+    th.manual_seed(0)
 
 
 class LinearPlant(gym.Env):

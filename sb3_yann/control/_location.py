@@ -124,9 +124,10 @@ def _slack(floats: Array, n: int, first: int, last: int, theta: Array, low: floa
 def _scan(floats: Array, whole: Integers, theta: Array, known: float) -> tuple[int, float]:
     """Return the first region whose smallest slack ties with the largest, and the largest.
 
-    With the slack of some region that is ``known``, most of the others are soon passed over.
+    With the slack of some region that is ``known``, most of the others are soon passed over. Where
+    regions are disjoint, the first one that surely holds theta ends the search.
     """
-    n, p = whole[0], whole[2]
+    n, p, disjoint = whole[0], whole[2], whole[7] == 1
     best, largest, low, tied = 0, -np.inf, known - floats[1] * (1 + abs(known)), False
     for i in range(p):
         smallest = np.inf
@@ -141,6 +142,8 @@ def _scan(floats: Array, whole: Integers, theta: Array, known: float) -> tuple[i
                     break
         if smallest < low:
             continue
+        if disjoint and smallest >= SURELY_INSIDE:
+            return i, smallest
         tied = True
         if smallest > largest:
             low = max(low, smallest - floats[1] * (1 + abs(smallest)))
@@ -182,11 +185,7 @@ def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int, float
 def _best_of_leaf(
     floats: Array, whole: Integers, theta: Array, first: int, last: int
 ) -> tuple[int, float]:
-    """Return what `_scan` does, of the regions of a leaf.
-
-    Where regions are disjoint, the first one that surely holds theta ends the search. The leaf
-    begins with those that most often do.
-    """
+    """Return what `_scan` does, of the regions of a leaf: those met most often come first."""
     n, disjoint = whole[0], whole[7] == 1
     best, largest, low, tied = -1, -np.inf, -np.inf, False
     for k in range(first, last):

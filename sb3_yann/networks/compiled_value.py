@@ -131,12 +131,14 @@ def _output_backward(
 
 @compiled(
     "Tuple((float32[:, :, :, ::1], float64[:, ::1], float64[:, ::1]))"
-    f"(float32[:, ::1], float32[:, ::1], {_QUADRATICS}, {_LINEAR}, {_NODES})",
+    f"(float32[:, ::1], float32[:, ::1], boolean, boolean, {_QUADRATICS}, {_LINEAR}, {_NODES})",
     fastmath=True,
 )
 def _forms_backward(
     gradient: Single,
     back: Single,
+    of_points: bool,
+    of_weights: bool,
     y: Array,
     z: Array,
     x: Single,
@@ -150,35 +152,40 @@ def _forms_backward(
 ) -> tuple[Single, Array, Array]:
     """Return the gradients by nodes, points (batch, n + m) and M (n, n).
 
-    ``back`` (batch, h1) is the gradient by the first hidden layer.
+    ``back`` (batch, h1) is the gradient by the first hidden layer. Those by points, or by nodes
+    and M, are zeros unless they are asked for.
     """
     batch, n, m = len(y), len(M), len(W) - len(M)
     k, h = nodes.shape[1], nodes.shape[2]
     one = np.float32(1)
     matrix, zero = _matrix(first_layers(nodes, np.zeros(1, np.int64)), pinned)
     by_points, by_M = np.zeros((batch, n + m)), np.zeros((n, n))
-    by_matrix, by_x = np.zeros((n + 1, h), np.float32), np.empty(n, np.float32)
+    by_matrix = np.zeros((n + 1, h), np.float32)
     through = np.empty(h, np.float32)
     for row in range(batch):
         for a in range(h):
             out = hidden[row, a] + zero[a]
             through[a] = back[row, a] * (one - out * out)
             by_matrix[n, a] += through[a] - pinned[0] * back[row, a] * (one - zero[a] * zero[a])
-        for j in range(n):
-            total = np.float32(0)
-            for a in range(h):
-                total += through[a] * matrix[j, a]
-                by_matrix[j, a] += through[a] * x[row, j]
-            by_x[j] = total
         g = -float(gradient[row, 0])
+        if of_weights:
+            for j in range(n):
+                for a in range(h):
+                    by_matrix[j, a] += through[a] * x[row, j]
+                for i in range(n):
+                    by_M[i, j] += g * z[row, i] * z[row, j]
+        if not of_points:
+            continue
         for i in range(n + m):
             for j in range(n + m):
                 by_points[row, i] += g * (W[i, j] + W[j, i]) * y[row, j]
         for i in range(n):
-            by_z = by_x[i] * scaling[i]
+            by_x = np.float32(0)
+            for a in range(h):
+                by_x += through[a] * matrix[i, a]
+            by_z = by_x * scaling[i]
             for j in range(n):
                 by_z += g * (M[i, j] + M[j, i]) * z[row, j]
-                by_M[i, j] += g * z[row, i] * z[row, j]
             for j in range(n + m):
                 by_points[row, j] += by_z * AB[i, j]
         for j in range(n, n + m):
@@ -225,23 +232,26 @@ class _Pass:
         self.factor = value.gamma * value.scale
         self.q: Single = _output(total, self.hidden, *self.layers, self.factor)
 
-    def backward(self, gradient: Single, by_weights: bool) -> tuple[Array, list[th.Tensor | None]]:
-        """Return the gradients by the points and, if they are asked for, the weights."""
+    def backward(
+        self, gradient: Single, of_points: bool, of_weights: bool
+    ) -> tuple[th.Tensor | None, ...]:
+        """Return the gradients by the points and the weights, as far as they are asked for."""
         through, by_bias, by_last = _output_backward(
             gradient, self.factor, self.hidden, *self.layers
         )
         product, second = th.from_numpy(through), self.weights[2].detach()
         back = th.mm(product, second[0, :, :-1])
-        by_nodes, by_points, by_M = _forms_backward(
-            gradient, back.numpy(), *self.forms, *self.first
+        by_nodes, found, by_M = _forms_backward(
+            gradient, back.numpy(), of_points, of_weights, *self.forms, *self.first
         )
-        if not by_weights:
-            return by_points, [None] * 4
+        by_points = th.from_numpy(found) if of_points else None
+        if not of_weights:
+            return by_points, None, None, None, None
         by_second = th.empty_like(second)
         th.mm(product.T, th.from_numpy(self.forms[-1]), out=by_second[0, :, :-1])
         by_second[0, :, -1] = th.from_numpy(by_bias)
         by_entries = th.from_numpy(by_M * self.roots)
-        return by_points, [by_entries, th.from_numpy(by_nodes), by_second, th.from_numpy(by_last)]
+        return by_points, by_entries, th.from_numpy(by_nodes), by_second, th.from_numpy(by_last)
 
 
 class _Value(th.autograd.Function):
@@ -260,5 +270,6 @@ class _Value(th.autograd.Function):
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
         _ = ctx.saved_tensors
         gradient = gradients[0].contiguous().numpy()
-        by_points, by_weights = ctx.done.backward(gradient, any(ctx.needs_input_grad[2:]))
-        return None, th.from_numpy(by_points).to(ctx.dtype), *by_weights
+        _, of_points, *of_weights = ctx.needs_input_grad
+        by_points, *by_weights = ctx.done.backward(gradient, of_points, any(of_weights))
+        return None, by_points if by_points is None else by_points.to(ctx.dtype), *by_weights

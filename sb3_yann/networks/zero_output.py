@@ -178,7 +178,10 @@ class ZeroOutputNetwork(nn.Module):
         super().__init__()
         if len(hidden) not in (1, 2) or min(hidden) < 1:
             raise ValueError(f"hidden = {hidden} must name one or two widths of at least 1.")
-        slope, at_zero = th.func.grad_and_value(activation)(th.zeros(()))
+        with th.enable_grad():
+            zero = th.zeros((), requires_grad=True)
+            at_zero = activation(zero)
+            (slope,) = th.autograd.grad(at_zero, zero)
         if at_zero != 0:
             raise ValueError(
                 f"activation(0) = {at_zero:g}, but a zero output needs activation(0) = 0. "
