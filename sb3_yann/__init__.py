@@ -5,6 +5,7 @@ policy alias ``"YannPolicy"`` with TD3 and DDPG.
 """
 
 import sb3_yann_envs
+from sb3_yann.actor_critic import YannActor, YannCritic
 from sb3_yann.audit import CostAudit, CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import (
@@ -19,7 +20,7 @@ from sb3_yann.control import (
 )
 from sb3_yann.guard import Decision, ImprovementGuard, restore_accepted
 from sb3_yann.observations import AffineObservation
-from sb3_yann.policies import YannActor, YannCritic, YannPolicy
+from sb3_yann.policies import YannPolicy
 from sb3_yann.problems import register_problem
 from sb3_yann_envs import ActionRepeat
 
