@@ -216,10 +216,10 @@ class ZeroOutputNetwork(nn.Module):
         """Whether there is compiled code for such networks where they are now.
 
         What is traced, exported or compiled by torch needs torch's own operations: it would take
-        the result of compiled code for a constant.
+        the result of compiled code for a constant. So does what is cast to other types on the way.
         """
         tracing = th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-        if tracing or th.compiler.is_compiling():
+        if tracing or th.compiler.is_compiling() or th.is_autocast_enabled("cpu"):
             return False
         nodes = self.first.nodes
         return self.has_loops and nodes.dtype == th.float32 and nodes.device.type == "cpu"

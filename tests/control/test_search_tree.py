@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -244,3 +247,18 @@ def test_theta_may_come_in_any_array_or_list(given) -> None:
 def test_theta_that_is_none_is_refused_also_where_compiled_code_sees_it_first(given) -> None:
     with pytest.raises(ValueError, match="theta"):
         many_regions()(np.array(given))
+
+
+def test_without_a_compiler_the_law_is_the_same() -> None:
+    program = (
+        "from test_search_tree import *; law = many_regions(); points = in_box(law, 200, 1.5)\n"
+        "print(law(points).tobytes().hex(), law(points[0]).tobytes().hex())"
+    )
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", program], env={**os.environ, "NUMBA_DISABLE_JIT": off},
+            capture_output=True, text=True, check=True, cwd=Path(__file__).parent,
+        ).stdout
+        for off in "01"
+    ]  # fmt: skip
+    assert outputs[0] == outputs[1]

@@ -255,3 +255,13 @@ def test_matrices_may_come_in_any_order_of_memory() -> None:
 def test_a_rate_that_does_not_fit_is_refused(rate) -> None:
     with pytest.raises(ValueError, match=r"rate has shape \(2, \d\), expected \(2, 2\)"):
         YannLayer(law_of("two inputs"), rate=rate)
+
+
+def test_autocast_runs_the_operations_of_torch() -> None:
+    layer = YannLayer(law_of("reactor"))
+    shaken(layer, 0.1)
+    theta = box_points(law_of("reactor"), 20)
+    exact = layer(theta)
+    with th.autocast("cpu"):
+        assert not layer.network.compiles
+        assert th.allclose(layer(theta), exact, atol=0.05)
