@@ -87,7 +87,7 @@ class ControlDiagnostics(BaseCallback):
         with th.no_grad():
             theta = self.policy.theta(observations)
             law = layer.law(theta).cpu().numpy()
-            self._regions.extend(layer.locate(theta)[0].tolist())
+            self._regions.extend(layer.regions(theta).tolist())
         self._distances.extend(np.max(np.abs(actions - law), axis=1) / 2)
         dones, infos = self.locals["dones"], self.locals["infos"]
         self.violations += sum(bool(info.get("violation", False)) for info in infos)

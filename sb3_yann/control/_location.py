@@ -60,7 +60,7 @@ def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
     options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
 
     def compile_it(function: F) -> F:
-        if not signatures or numba.config.DISABLE_JIT:
+        if not signatures or numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
             part: F = numba.njit(**options)(function)
             return part
         result: F

@@ -183,5 +183,5 @@ def _visits(guard: ImprovementGuard, episodes: Episodes) -> NDArray[np.bool_]:
     visits = np.zeros((len(episodes.costs), len(layer.gains)), dtype=bool)
     for visited, states in zip(visits, episodes.observations, strict=True):
         theta = guard.policy.theta(seen(states[:-1]))
-        visited[layer.locate(theta)[0].cpu().numpy()] = True
+        visited[layer.regions(theta)] = True
     return visits

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch import nn
 
 from sb3_yann.control._validation import Array
@@ -132,6 +133,20 @@ class YannLayer(nn.Module):
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
         return self._law(theta, *self.locate(theta))
+
+    def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
+        """Return the region whose law and network are in use for each row of theta (batch, n).
+
+        The first one for rows that are not finite.
+        """
+        if not self.has_its_law:
+            by_torch: NDArray[np.int64] = self.locate(theta)[0].cpu().numpy()
+            return by_torch
+        points = theta.detach().double().cpu().numpy()
+        finite = np.isfinite(points).all(axis=1)
+        found = np.zeros(len(points), dtype=np.int64)
+        found[finite] = self.piecewise_affine.locate(points[finite])
+        return found
 
     @th.no_grad()
     def locate(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

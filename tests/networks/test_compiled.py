@@ -265,3 +265,16 @@ def test_autocast_runs_the_operations_of_torch() -> None:
     with th.autocast("cpu"):
         assert not layer.network.compiles
         assert th.allclose(layer(theta), exact, atol=0.05)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_regions_are_those_whose_networks_are_used(name: str) -> None:
+    layer = YannLayer(law_of(name, "nearest"))
+    shaken(layer, 0.1)
+    theta = box_points(law_of(name, "nearest"), 60, stretch=1.5)
+    layer.row_gradients = True
+    for row, region in zip(theta, layer.regions(theta), strict=True):
+        for gradient in gradients(layer(row[None]), layer):
+            assert gradient.coalesce().indices()[0].tolist() == [region]
+    theta[1, 0] = th.nan
+    assert layer.regions(theta)[1] == 0 and len(layer.regions(theta)) == 60
