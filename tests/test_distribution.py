@@ -182,3 +182,9 @@ def test_importing_prints_nothing_and_writes_no_file(package: str, tmp_path: Pat
     )
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
     assert list(folder.rglob("*")) == []
+
+
+def test_an_import_compiles_nothing() -> None:
+    program = "import sb3_yann, sys; print([name for name in sys.modules if 'compiled_' in name])"
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ran.stdout.strip() == "[]" and ran.returncode == 0

@@ -77,8 +77,8 @@ class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any
         """
         if seed is None:
             seeds: list[int | None] = [None] * self.num_envs
-        elif isinstance(seed, int):
-            seeds = [seed + i for i in range(self.num_envs)]
+        elif isinstance(seed, int | np.integer):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
         else:
             seeds = [*seed]
         starts = [None] * self.num_envs

@@ -81,7 +81,12 @@ def solve_explicit(
     _require_feasible(units.scaled)
     with Watch(limits) as watch:
         regions = _critical_regions(units.scaled, solver, watch)
-        check(units.scaled, regions, units.center, units.half)
+        try:
+            check(units.scaled, regions, units.center, units.half)
+        except ExplicitSolutionError as error:
+            if solver == "walk":
+                raise
+            raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
         law = units.law(regions, u_min, u_max, outside)
     if watch.seconds > WORTH_KEEPING:
         law_cache.store_law(key, law)

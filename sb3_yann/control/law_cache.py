@@ -34,7 +34,8 @@ def cache_folder() -> Path | None:
     if chosen.lower() in ("off", "0"):
         return None
     if chosen:
-        return Path(chosen).expanduser()
+        folder = os.path.expanduser(chosen)
+        return None if folder.startswith("~") else Path(folder)  # of a user who is not there
     home = os.path.expanduser("~")
     if home == "~":  # no home folder is known
         return None

@@ -9,6 +9,12 @@ from types import TracebackType
 
 from tqdm import tqdm  # type: ignore[import-untyped]
 
+_ADVICE = (
+    "Their number grows fastest with the horizon and with the number of bounds: shorten the "
+    "horizon, leave out bounds that hardly matter, make the box of parameters smaller (theta_min, "
+    "theta_max), or raise the limit."
+)
+
 
 class ExplicitLimitError(RuntimeError):
     """The search for the regions of a law ran into ``time_limit`` or ``region_limit``.
@@ -64,6 +70,15 @@ class Limits:
                 f"region_limit = {regions!r} must be a whole number above 0, or None for no limit."
             )
 
+    def require(self, n_regions: int) -> None:
+        """Raise ExplicitLimitError if a law that is there has too many regions."""
+        if self.region_limit is not None and n_regions > self.region_limit:
+            raise ExplicitLimitError(
+                f"The law has {n_regions} regions, more than region_limit = {self.region_limit}. "
+                f"{_ADVICE}",
+                n_regions,
+            )
+
 
 class Watch:
     """Counts the regions of one search, shows them, and ends it at its limits.
@@ -117,9 +132,6 @@ class Watch:
 
     def _stop(self, what: str) -> None:
         raise ExplicitLimitError(
-            f"{what}: {self.found} were found in {self.seconds:.1f} s. Their number grows fastest "
-            "with the horizon and with the number of bounds: shorten the horizon, leave out bounds "
-            "that hardly matter, make the box of parameters smaller (theta_min, theta_max), or "
-            "raise the limit.",
+            f"{what}: {self.found} were found in {self.seconds:.1f} s. {_ADVICE}",
             self.found,
         )

@@ -409,11 +409,12 @@ class LinearMPC(ReadOnlyArrays):
         ----------
         solver : {"walk", "ppopt"}, default "walk"
             What finds the regions: a walk over them from facet to facet, or, as a reference and
-            many times slower, ppopt. Both give the same law.
+            many times slower, ppopt. Where ppopt's regions pass the check, both give the same law.
         time_limit : float, optional
-            Seconds after which to give up the search.
+            Seconds after which to give up the search. A law that was kept takes none.
         region_limit : int, optional
-            Number of regions beyond which to give up.
+            The most regions that the law may have. The walk gives up beyond; ppopt tells their
+            number only at its end.
         progress : bool, default False
             Show how many regions were found so far.
 
@@ -426,11 +427,12 @@ class LinearMPC(ReadOnlyArrays):
         ExplicitSolutionError
             If the solution fails its check; the message says where.
         """
+        limits = Limits(time_limit, region_limit, progress)
         if solver not in self._laws:
-            limits = Limits(time_limit, region_limit, progress)
             self._laws[solver] = solve_explicit(
                 self.condensed(), self.u_min, self.u_max, self.outside, solver, limits
             )
+        limits.require(self._laws[solver].n_regions)
         return self._laws[solver]
 
     @cached_property

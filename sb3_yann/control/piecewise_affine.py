@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from os import PathLike, fspath, replace
+from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
@@ -66,8 +67,9 @@ class PiecewiseAffine(ReadOnlyArrays):
         The box for which the law was solved; a network scales its inputs by it.
     outside : {"nearest", "zero"}
     disjoint : bool, default False
-        Whether no two regions share an interior, as `LinearMPC.explicit` checks of its laws: the
-        search then ends at the first region that holds theta, several times as fast.
+        That no two regions share an interior, as `LinearMPC.explicit` checks of its laws: the
+        search then ends at the first region found to hold theta, several times as fast. It is not
+        checked here; where it is wrong, any of the regions that hold theta may be chosen.
     """
 
     gains: Array
@@ -106,6 +108,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         )
         if self.outside not in OUTSIDE:
             raise ValueError(f"outside = {self.outside!r} must be one of {OUTSIDE}.")
+        if not isinstance(self.disjoint, bool):
+            raise TypeError(f"disjoint = {self.disjoint!r} must be True or False.")
         rows = as_array("starts", self.starts, (p,))
         if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):
             raise ValueError(
@@ -174,11 +178,11 @@ class PiecewiseAffine(ReadOnlyArrays):
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.tree is not None:
             arrays.update({f"tree_{name}": each for name, each in vars(self.tree).items()})
-        part = f"{fspath(path)}.part"
+        part = f"{fspath(path)}.{os.getpid()}.part"  # another process may be writing the same
         try:
             with open(part, "wb") as file:
                 np.savez(file, **arrays)
-            replace(part, path)  # a reader never sees half a file
+            os.replace(part, path)  # a reader never sees half a file
         finally:
             Path(part).unlink(missing_ok=True)
 
@@ -197,7 +201,7 @@ class PiecewiseAffine(ReadOnlyArrays):
                 raise ValueError("it is a single array")
             with data:
                 values = {field.name: data[field.name] for field in fields(cls)}
-                values |= {"outside": str(values["outside"]), "disjoint": bool(values["disjoint"])}
+                values |= {"outside": str(data["outside"]), "disjoint": bool(data["disjoint"])}
                 tree = {name[5:]: data[name] for name in data.files if name.startswith("tree_")}
             law = cls(**values)
             if tree:

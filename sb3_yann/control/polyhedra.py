@@ -102,14 +102,30 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
 
     Rows that only touch it may be among them. Of rows that say the same there are all.
     """
+    slack = b - A @ inside
     if radius < SLIM:
-        return _facets_one_by_one(A, b - A @ inside, radius)
+        if np.min(slack) < 0.5 * radius:
+            return _facets_one_by_one(A, slack, radius)
+        A, slack, radius = _rounded(A, slack)
     import daqp
 
     # DAQP's tolerance is absolute: about the ball, in units of its radius, it means the same for
     # small and for large polyhedra.
-    redundant = daqp.minrep(np.ascontiguousarray(A), (b - A @ inside) / radius)
+    redundant = daqp.minrep(np.ascontiguousarray(A), slack / radius)
     return np.flatnonzero(redundant != 1)
+
+
+def _rounded(A: Array, slack: Array) -> tuple[Array, Array, float]:
+    """Return a thin polyhedron ``A z <= slack`` in coordinates in which it is round, and a radius.
+
+    They are those of Dikin's ellipsoid about z = 0: it lies in the polyhedron, and becomes the unit
+    ball.
+    """
+    scaled = A / slack[:, None]
+    L = np.linalg.cholesky(scaled.T @ scaled)
+    rows = np.linalg.solve(L, A.T).T
+    length = np.linalg.norm(rows, axis=1)
+    return rows / length[:, None], slack / length, 1.0
 
 
 def _facets_one_by_one(A: Array, b: Array, radius: float) -> NDArray[np.intp]:

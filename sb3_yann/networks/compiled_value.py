@@ -192,7 +192,9 @@ def _forms_backward(
             by_points[row, j] *= scaling[j]
     by_nodes = np.empty((1, k, h, n + 1), np.float32)
     for node in range(k):  # they enter the same sum
-        by_nodes[0, node] = by_matrix.T
+        for a in range(h):
+            for j in range(n + 1):
+                by_nodes[0, node, a, j] = by_matrix[j, a]
     return by_nodes, by_points, by_M
 
 

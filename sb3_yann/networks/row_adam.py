@@ -32,6 +32,11 @@ class RowAdam(th.optim.Optimizer):
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
     ) -> None:
+        if not (lr >= 0 and eps >= 0 and all(0 <= beta < 1 for beta in betas)):
+            raise ValueError(
+                f"lr = {lr!r} and eps = {eps!r} must be at least 0, and betas = {betas!r} from 0 "
+                "to below 1."
+            )
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
     @th.no_grad()

@@ -11,7 +11,6 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_yann.networks.compiled_value import value_on_processor
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
 Array = NDArray[np.float64]
@@ -206,6 +205,8 @@ class AfterstateValue(nn.Module):
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
         if self.compiles and theta_and_action.device.type == "cpu":
+            from sb3_yann.networks.compiled_value import value_on_processor  # compiled once
+
             return value_on_processor(self, theta_and_action)
         theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
         u = action * self.to_input + self.middle

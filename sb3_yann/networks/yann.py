@@ -11,7 +11,6 @@ from torch import nn
 
 from sb3_yann.control._validation import Array
 from sb3_yann.control.piecewise_affine import PiecewiseAffine
-from sb3_yann.networks.compiled_layer import layer_on_processor
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
 
@@ -118,6 +117,8 @@ class YannLayer(nn.Module):
         """
         fixed = theta.device.type == "cpu" and not theta.requires_grad
         if fixed and self.has_its_law and self.network.compiles:
+            from sb3_yann.networks.compiled_layer import layer_on_processor  # compiled once
+
             return layer_on_processor(self, theta)
         region, inside = self.locate(theta)
         correction = self.network((theta / self.theta_half).to(self.theta_half), region)

@@ -80,3 +80,11 @@ def test_progress_goes_to_the_error_stream_and_only_if_asked_for(capfd: Any) -> 
     out, err = capfd.readouterr()
     assert out == ""
     assert "Critical regions" in err
+
+
+def test_a_law_that_is_there_keeps_to_the_limit_of_regions() -> None:
+    mpc = benchmark()
+    assert mpc.explicit().n_regions == 9
+    with pytest.raises(ExplicitLimitError, match="9 regions, more than region_limit = 8") as error:
+        mpc.explicit(region_limit=8)
+    assert error.value.n_regions == 9

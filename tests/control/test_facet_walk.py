@@ -16,7 +16,7 @@ from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.control import explicit as module
 from sb3_yann.control.limits import Limits, Watch
-from sb3_yann.control.polyhedra import Region, farthest_point, largest_ball
+from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
 
 # Those that ppopt solves in about a second.
 NAMES = [
@@ -165,3 +165,16 @@ def test_regions_that_no_first_point_leads_to_are_found_from_others(
 
     monkeypatch.setattr(facet_walk._Walk, "explore", late)
     assert problem("two inputs").explicit().n_regions == 27
+
+
+@pytest.mark.parametrize("width", [1e-5, 1e-7])
+def test_facets_of_a_thin_polyhedron_are_those_of_the_same_one_made_round(width: float) -> None:
+    random = np.random.default_rng(0)
+    A = random.normal(size=(40, 3))
+    A /= np.linalg.norm(A, axis=1)[:, None]
+    b = random.uniform(0.5, 1.5, 40)
+    round_one = facets(A, b, np.zeros(3), 0.5)
+    thin = A @ np.linalg.inv(np.linalg.qr(random.normal(size=(3, 3)))[0] * [1, 1, width])
+    length = np.linalg.norm(thin, axis=1)
+    found = facets(thin / length[:, None], b / length, np.zeros(3), float(np.min(b / length)))
+    assert found.tolist() == round_one.tolist() and len(found) < 40

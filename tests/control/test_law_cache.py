@@ -153,6 +153,16 @@ def test_a_place_that_cannot_be_written_to_does_no_harm(
     assert benchmark().explicit() == solved("benchmark").explicit()
 
 
+def test_the_home_of_a_user_who_is_not_there_does_no_harm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SB3_YANN_CACHE", "~no-such-user/laws")
+    monkeypatch.setattr(module, "WORTH_KEEPING", 0.0)
+    assert benchmark().explicit() == solved("benchmark").explicit()
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_full_disk_does_no_harm_and_leaves_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

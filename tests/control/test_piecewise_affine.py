@@ -305,3 +305,8 @@ def test_theta_that_is_no_point_or_batch_is_named(
 ) -> None:
     with pytest.raises(error, match=message):
         getattr(law_of("pendulum"), call)(theta)
+
+
+def test_disjoint_is_true_or_false() -> None:
+    with pytest.raises(TypeError, match="disjoint = 'no' must be True or False"):
+        dataclasses.replace(law_of("pendulum"), disjoint="no")

@@ -56,6 +56,11 @@ def test_copies_far_from_the_random_starts_are_integrated_as_the_single_environm
         np.testing.assert_allclose(state, expected, rtol=1e-11, atol=1e-12)
 
 
+def test_a_seed_of_numpy_is_a_seed() -> None:
+    env = gymnasium.make_vec("CSTR-v0", num_envs=2)
+    np.testing.assert_array_equal(env.reset(seed=np.int64(7))[0], env.reset(seed=7)[0])
+
+
 def test_to_advance_arrays_leaves_them_as_they_are() -> None:
     before = np.full((4, 3), 0.01)
     after = cstr.advance_all(before, np.full(3, 50.0))

@@ -98,3 +98,9 @@ def test_it_goes_on_from_what_an_adam_left() -> None:
     other.step()
     assert th.allclose(again, expected, atol=1e-6)
     assert other.state[again]["steps"].tolist() == [2.0] * ROWS
+
+
+@pytest.mark.parametrize("options", [{"lr": -1.0}, {"eps": -1e-8}, {"betas": (0.9, 1.0)}])
+def test_options_out_of_range_are_refused(options) -> None:
+    with pytest.raises(ValueError, match="must be at least 0, and betas"):
+        RowAdam([th.zeros(2, requires_grad=True)], **options)
