@@ -154,7 +154,9 @@ class YannCritic(SeesTheta, ContinuousCritic):
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """Return Q of each critic, all (batch, 1), in units of the env's reward."""
-        return tuple(self._in_rewards(q) for q in super().forward(obs, actions))
+        theta = self.extract_features(obs, self.features_extractor)  # never trained
+        points = th.cat([theta, actions], dim=1)
+        return tuple(self._in_rewards(q_network(points)) for q_network in self.q_networks)
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
         """Yield the weights, without the search of all modules for them."""
@@ -176,11 +178,10 @@ class YannCritic(SeesTheta, ContinuousCritic):
         """
         q_network = self.q_networks[0]
         if isinstance(q_network, AfterstateValue) and q_network.compiles:
-            q_network.fixed = True
-            try:
-                return self._in_rewards(super().q1_forward(obs, actions))
-            finally:
-                q_network.fixed = False
+            with th.no_grad():
+                theta = self.extract_features(obs, self.features_extractor)
+            points = th.cat([theta, actions], dim=1)
+            return self._in_rewards(q_network.compiled_with_fixed_weights(points))
         trained = [each for each in q_network.parameters() if each.requires_grad]
         for parameter in trained:
             parameter.requires_grad_(False)

@@ -248,7 +248,7 @@ class YannPolicy(TD3Policy):
         multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
 
     def _before_critic_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
-        self.critic_updates += 1
+        self.critic_updates.add_(1)
         multiply_learning_rate(optimizer, self.lr_mult["critic"])
 
     def __setstate__(self, state: dict[str, Any]) -> None:

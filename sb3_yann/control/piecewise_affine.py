@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sb3_yann.control.search_tree import SearchTree
 
 OUTSIDE = ("nearest", "zero")
-SCAN = 16
+SCAN = 4
 """Up to this many regions are asked one by one."""
 
 MOST_PARAMETERS = 10

@@ -198,13 +198,16 @@ def _forms_backward(
     return by_nodes, by_points, by_M
 
 
-def value_on_processor(value: AfterstateValue, points: th.Tensor) -> th.Tensor:
-    """Return what ``value(points)`` is, (batch, 1), for points of shape (batch, n + m)."""
+def value_on_processor(value: AfterstateValue, points: th.Tensor, fixed: bool = False) -> th.Tensor:
+    """Return what ``value(points)`` is, (batch, 1), for points of shape (batch, n + m).
+
+    With ``fixed`` weights there is a gradient by the points alone.
+    """
     size = len(value.W)
     if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
         raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
     weights: tuple[th.Tensor, ...] = (value.quadratic.entries, *value.network.weights())
-    if value.fixed:
+    if fixed:
         weights = tuple(weight.detach() for weight in weights)
     if th.is_grad_enabled():
         q: th.Tensor = _Value.apply(value, points, *weights)  # type: ignore[no-untyped-call]

@@ -171,8 +171,6 @@ class AfterstateValue(nn.Module):
         self.network = ZeroOutputNetwork(
             n, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
-        self.fixed = False
-        """Whether gradients go to the action alone, not to the weights."""
         self._constants: tuple[Array, Array, Array, Array]
         self._constants_of: tuple[Any, ...] = ()
 
@@ -213,6 +211,12 @@ class AfterstateValue(nn.Module):
         z = th.cat([theta, u], 1)
         stage = ((z @ self.W) * z).sum(-1, keepdim=True)
         return -(stage + self.gamma * self.value(self.model(theta, u))).float()
+
+    def compiled_with_fixed_weights(self, theta_and_action: th.Tensor) -> th.Tensor:
+        """Return Q where :attr:`compiles`, with a gradient by the rows, but not by the weights."""
+        from sb3_yann.networks.compiled_value import value_on_processor
+
+        return value_on_processor(self, theta_and_action, fixed=True)
 
     def value(self, theta: th.Tensor) -> th.Tensor:
         """Return V, the discounted cost to go in float64, shape (batch, 1), for (batch, n)."""
