@@ -7,7 +7,7 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_yann.observations import AffineObservation
@@ -41,8 +41,9 @@ class SeesTheta(BaseModel):
         if isinstance(features_extractor, AffineFeatures):
             theta: th.Tensor = features_extractor(obs)
             return theta
-        if isinstance(obs, th.Tensor) and obs.ndim == 2 and obs.dtype == th.float32:
-            return obs  # what SB3 returns as well, after two dozen lines of Python
+        if isinstance(obs, th.Tensor) and isinstance(features_extractor, FlattenExtractor):
+            if obs.ndim == 2 and obs.dtype == th.float32:
+                return obs  # what SB3 returns as well, after two dozen lines of Python
         return super().extract_features(obs, features_extractor)
 
     def set_training_mode(self, mode: bool) -> None:

@@ -200,12 +200,16 @@ class _Check:
             return
         points, inputs, multipliers = (np.array(each) for each in zip(*feasible, strict=True))
         meant = np.array([self.by_set.get(each, -1) for each in _sets(multipliers)])
-        for i in np.unique(meant):
-            region, at = self.regions[i], meant == i
-            held = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE
+        held = meant >= 0
+        for i in np.unique(meant[held]):
+            region, at = self.regions[i], np.flatnonzero(meant == i)
+            held[at] = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE
             off = np.abs(points[at] @ region.gain.T + region.offset - inputs[at]).max(axis=1)
-            for k in np.flatnonzero(at)[(i < 0) | ~held | (off > LAW)]:
-                self._require_held(points[k], inputs[k])
+            wrong = at[held[at] & (off > LAW)]
+            if len(wrong):
+                self._fail(f"the law of region {i} violates the KKT conditions", points[wrong[0]])
+        for k in np.flatnonzero(~held):
+            self._require_held(points[k], inputs[k])
 
     def _require_held(self, point: Array, U: Array) -> None:
         """Raise unless the region that is nearest to a point holds it, and has the right law."""

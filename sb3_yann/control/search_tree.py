@@ -26,7 +26,7 @@ NODES = 2
 of them, and trees down to the last region grow without bound."""
 
 DRAWS = 64
-"""Random points for each region that tell which regions of a leaf are met most often."""
+"""Random points in the box for each region that tell which regions of a leaf are met most often."""
 
 CANDIDATES = 16
 """Facets tried at a node, drawn from those of its regions."""
@@ -172,7 +172,7 @@ def build_tree(
 def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Generator) -> Integers:
     """Return the regions of all leaves, in each of them those first that hold most of its points.
 
-    First by points drawn all over the box, then by as many drawn in each region: in a large box a
+    First by points drawn all over the box, then by some drawn in each region: in a large box a
     small region may have none of the former.
     """
     p, n = regions.middles.shape
