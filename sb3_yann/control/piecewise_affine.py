@@ -269,7 +269,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was compiled for this process, but not the tree."""
+        """Leave out what was compiled for this process; the tree goes along, as in :meth:`save`."""
+        _ = self.tree
         return {name: value for name, value in self.__dict__.items() if name not in _COMPILED}
 
     def _as_theta(self, theta: ArrayLike) -> Array:
