@@ -105,14 +105,16 @@ def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers
 
 
 @compiled()
-def _slack(floats: Array, n: int, first: int, last: int, theta: Array, low: float) -> float:
+def _slack(
+    floats: Array, n: int, first: int, last: int, theta: Array, at: int, low: float
+) -> float:
     """Return the smallest slack of rows first to last, or anything below ``low`` if it is lower."""
     smallest = np.inf
     for k in range(first, last):
         row = ROWS + k * (n + 1)
         slack = floats[row + n]
         for j in range(n):
-            slack -= floats[row + j] * theta[j]
+            slack -= floats[row + j] * theta[at, j]
         if slack < smallest:
             smallest = slack
             if smallest < low:
@@ -121,7 +123,7 @@ def _slack(floats: Array, n: int, first: int, last: int, theta: Array, low: floa
 
 
 @compiled()
-def _scan(floats: Array, whole: Integers, theta: Array, known: float) -> tuple[int, float]:
+def _scan(floats: Array, whole: Integers, theta: Array, at: int, known: float) -> tuple[int, float]:
     """Return the first region whose smallest slack ties with the largest, and the largest.
 
     With the slack of some region that is ``known``, most of the others are soon passed over. Where
@@ -135,7 +137,7 @@ def _scan(floats: Array, whole: Integers, theta: Array, known: float) -> tuple[i
             row = ROWS + k * (n + 1)
             slack = floats[row + n]
             for j in range(n):
-                slack -= floats[row + j] * theta[j]
+                slack -= floats[row + j] * theta[at, j]
             if slack < smallest:
                 smallest = slack
                 if smallest < low:
@@ -154,13 +156,13 @@ def _scan(floats: Array, whole: Integers, theta: Array, known: float) -> tuple[i
     nearly = largest - floats[1] * (1 + abs(largest))
     for i in range(p):
         first, last = whole[HEADER + i], whole[HEADER + i + 1]
-        if _slack(floats, n, first, last, theta, nearly) >= nearly:
+        if _slack(floats, n, first, last, theta, at, nearly) >= nearly:
             return i, largest
     return best, largest
 
 
 @compiled()
-def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int, float]:
+def _leaf(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, int, float]:
     """Return where the regions of the leaf that theta falls into begin and end in ``whole``.
 
     With them comes the smallest distance from the hyperplanes on the way.
@@ -173,7 +175,7 @@ def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int, float
     while node >= 0:
         side = -floats[levels + node]
         for j in range(n):
-            side += floats[normals + node * n + j] * theta[j]
+            side += floats[normals + node * n + j] * theta[at, j]
         room = min(room, abs(side))
         node = whole[children + 2 * node + (1 if side > 0 else 0)]
     starts = children + 2 * nodes
@@ -183,14 +185,14 @@ def _leaf(floats: Array, whole: Integers, theta: Array) -> tuple[int, int, float
 
 @compiled()
 def _best_of_leaf(
-    floats: Array, whole: Integers, theta: Array, first: int, last: int
+    floats: Array, whole: Integers, theta: Array, at: int, first: int, last: int
 ) -> tuple[int, float]:
     """Return what `_scan` does, of the regions of a leaf: those met most often come first."""
     n, disjoint = whole[0], whole[7] == 1
     best, largest, low, tied = -1, -np.inf, -np.inf, False
     for k in range(first, last):
         i = whole[k]
-        slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, low)
+        slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, at, low)
         if slack < low:
             continue
         if disjoint and slack >= SURELY_INSIDE:
@@ -206,32 +208,36 @@ def _best_of_leaf(
     for k in range(first, last):
         i = whole[k]
         rows = whole[HEADER + i], whole[HEADER + i + 1]
-        if i < best and _slack(floats, n, rows[0], rows[1], theta, nearly) >= nearly:
+        if i < best and _slack(floats, n, rows[0], rows[1], theta, at, nearly) >= nearly:
             best = i
     return best, largest
 
 
 @compiled()
-def _choose(floats: Array, whole: Integers, theta: Array) -> tuple[int, float]:
+def _choose(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, float]:
     """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite."""
     n = whole[0]
     for j in range(n):
-        if not np.isfinite(theta[j]):
+        if not np.isfinite(theta[at, j]):
             return -1, np.nan
     known = -np.inf
     if whole[4] > 0:
-        first, last, room = _leaf(floats, whole, theta)
-        best, known = _best_of_leaf(floats, whole, theta, first, last)
+        first, last, room = _leaf(floats, whole, theta, at)
+        best, known = _best_of_leaf(floats, whole, theta, at, first, last)
         if known >= SURELY_INSIDE or (known >= -floats[1] and room > CLEAR):
             return best, known
-    return _scan(floats, whole, theta, known)
+    return _scan(floats, whole, theta, at, known)
 
 
 @compiled()
-def input_at(floats: Array, whole: Integers, theta: Array, out: Array) -> int:
-    """Write the input at theta to ``out`` and return the region, -1 where theta is not finite."""
+def input_at(floats: Array, whole: Integers, theta: Array, out: Array, at: int) -> int:
+    """Write the input at one row of theta to that of ``out``, and return the region, -1 for none.
+
+    Functions take the whole array and the row: a row on its own is an array, of which numba counts
+    who refers to it, and that costs as much as the rest.
+    """
     n, m, p, q = whole[0], whole[1], whole[2], whole[3]
-    region, largest = _choose(floats, whole, theta)
+    region, largest = _choose(floats, whole, theta, at)
     if region < 0:
         return -1
     gains = ROWS + q * (n + 1)
@@ -242,10 +248,10 @@ def input_at(floats: Array, whole: Integers, theta: Array, out: Array) -> int:
         u = 0.0
         if not zero:
             for j in range(n):
-                u += floats[gains + (region * m + k) * n + j] * theta[j]
+                u += floats[gains + (region * m + k) * n + j] * theta[at, j]
             u += floats[offsets + region * m + k]
         u = u if u == u else 0.0  # inf - inf, far from everything
-        out[k] = min(max(u, floats[bounds + k]), floats[bounds + m + k])
+        out[at, k] = min(max(u, floats[bounds + k]), floats[bounds + m + k])
     return region
 
 
@@ -254,10 +260,10 @@ def law_at(floats: Array, whole: Integers, theta: Array) -> Array | None:
     """Return the input (m,) at one theta (n,), None where theta is not finite or too long."""
     if len(theta) != whole[0]:
         return None
-    out = np.empty(whole[1])
-    if input_at(floats, whole, theta, out) < 0:
+    out = np.empty((1, whole[1]))
+    if input_at(floats, whole, theta.reshape(1, -1), out, 0) < 0:
         return None
-    return out
+    return out[0]
 
 
 @compiled("float64[:, ::1](float64[::1], int64[::1], float64[:, ::1])")
@@ -265,7 +271,7 @@ def law_of_batch(floats: Array, whole: Integers, theta: Array) -> Array:
     """Return the inputs (batch, m) at the rows of theta (batch, n), all finite."""
     out = np.empty((len(theta), whole[1]))
     for i in range(len(theta)):
-        input_at(floats, whole, theta[i], out[i])
+        input_at(floats, whole, theta, out, i)
     return out
 
 
@@ -274,5 +280,5 @@ def locate_batch(floats: Array, whole: Integers, theta: Array) -> tuple[Integers
     """Return the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
     region, inside = np.empty(len(theta), np.int64), np.empty(len(theta))
     for i in range(len(theta)):
-        region[i], inside[i] = _choose(floats, whole, theta[i])
+        region[i], inside[i] = _choose(floats, whole, theta, i)
     return region, inside

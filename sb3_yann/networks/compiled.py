@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann.control._location import Integers, compiled
@@ -19,6 +20,11 @@ Single = NDArray[np.float32]
 
 WEIGHTS = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1]"
 """Types of nodes, second, last and pinned, see :func:`network`."""
+
+
+def as_array(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
+    """Return what compiled code takes for a tensor, without its gradient: the same memory if so."""
+    return np.ascontiguousarray(tensor.numpy(force=True), dtype)
 
 
 @compiled()  # not a fast one: s(b) - s(b) must be zero wherever the two are computed
@@ -87,16 +93,20 @@ def at_zero(matrices: Single, used: Integers, pinned: Single) -> Single:
 
 
 @compiled(fastmath=True)
-def hidden_layer(x: Single, matrix: Single, zero: Single, out: Single) -> None:
-    """Write ``s(W x + b) - s(b)`` to out, for a matrix (inputs + 1, outputs)."""
-    inputs, outputs = matrix.shape[0] - 1, matrix.shape[1]
+def hidden_layer(x: Single, row: int, matrices: Single, s: int, zero: Single, out: Single) -> None:
+    """Write ``s(W x + b) - s(b)`` to a row of out, for that of x.
+
+    The matrix, (inputs + 1, outputs), and s(b) are number s of several. (Slices would be passed
+    more plainly, and take as long as all that is done with them: numba counts who refers to each.)
+    """
+    inputs, outputs = matrices.shape[1] - 1, matrices.shape[2]
     for a in range(outputs):
-        out[a] = matrix[inputs, a]
+        out[row, a] = matrices[s, inputs, a]
     for j in range(inputs):
         for a in range(outputs):
-            out[a] += matrix[j, a] * x[j]
+            out[row, a] += matrices[s, j, a] * x[row, j]
     for a in range(outputs):
-        out[a] = tanh(out[a]) - zero[a]
+        out[row, a] = tanh(out[row, a]) - zero[s, a]
 
 
 @compiled(fastmath=True)
@@ -134,8 +144,8 @@ def network(
     for row in range(batch):
         s = slot[row]
         i = used[s]
-        hidden_layer(x[row], matrices1[s], zero1[s], hidden1[row])
-        hidden_layer(hidden1[row], matrices2[s], zero2[s], hidden2[row])
+        hidden_layer(x, row, matrices1, s, zero1, hidden1)
+        hidden_layer(hidden1, row, matrices2, s, zero2, hidden2)
         for k in range(m):
             total = (np.float32(1) - pinned[i]) * last[i, k, h2]
             for j in range(h2):
@@ -149,25 +159,32 @@ def _hidden_backward(
     back: Single,
     x: Single,
     out: Single,
+    row: int,
     zero: Single,
     pinned: float,
-    matrix: Single,
-    by_matrix: Single,
+    s: int,
+    matrices: Single,
+    i: int,
+    by_matrices: Single,
+    at: int,
     by_x: Single,
 ) -> None:
-    """Add the gradient by a matrix (outputs, inputs + 1), and write that by x.
+    """Add the gradient by a matrix (outputs, inputs + 1), and write that by a row of x.
 
-    ``back`` is the gradient by what :func:`hidden_layer` wrote to ``out``.
+    ``back`` (batch, outputs) is the gradient by what :func:`hidden_layer` wrote to ``out``; the
+    matrix is number i of ``matrices``, its gradient number ``at`` of ``by_matrices``.
     """
     one = np.float32(1)
-    inputs = len(x)
-    by_x[:] = 0
-    for a in range(len(out)):  # of tanh(z + b) - tanh(b): by z, and less that of tanh(b), by b
-        through = back[a] * (one - (out[a] + zero[a]) * (out[a] + zero[a]))
+    inputs = x.shape[1]
+    for j in range(inputs):
+        by_x[row, j] = 0
+    for a in range(out.shape[1]):  # of tanh(z + b) - tanh(b): by z, and less that of tanh(b), by b
+        b = zero[s, a]
+        through = back[row, a] * (one - (out[row, a] + b) * (out[row, a] + b))
         for j in range(inputs):
-            by_x[j] += through * matrix[a, j]
-            by_matrix[a, j] += through * x[j]
-        by_matrix[a, inputs] += through - pinned * back[a] * (one - zero[a] * zero[a])
+            by_x[row, j] += through * matrices[i, a, j]
+            by_matrices[at, a, j] += through * x[row, j]
+        by_matrices[at, a, inputs] += through - pinned * back[row, a] * (one - b * b)
 
 
 @compiled(fastmath=True)
@@ -195,11 +212,8 @@ def network_backward(
     by_first = np.zeros((rows, h1, n + 1), np.float32)
     by_second = np.zeros((rows, h2, h1 + 1), np.float32)
     by_last = np.zeros((rows, m, h2 + 1), np.float32)
-    by_x, by_1, by_2 = (
-        np.empty((batch, n), np.float32),
-        np.empty(h1, np.float32),
-        np.empty(h2, np.float32),
-    )
+    by_x, by_1 = np.empty((batch, n), np.float32), np.empty((batch, h1), np.float32)
+    by_2 = np.zeros((batch, h2), np.float32)
     first = first_layers(nodes, used)
     matrices1 = transposed(first, np.arange(len(used)))
     zero1 = at_zero(matrices1, used, pinned)
@@ -208,26 +222,15 @@ def network_backward(
         s = slot[row]
         i = used[s]
         at = i if dense else s
-        by_2[:] = 0
         for c in range(m):
             g = back[row, c]
             for j in range(h2):
-                by_2[j] += g * last[i, c, j]
+                by_2[row, j] += g * last[i, c, j]
                 by_last[at, c, j] += g * hidden2[row, j]
             by_last[at, c, h2] += g * (np.float32(1) - pinned[i])
-        _hidden_backward(
-            by_2,
-            hidden1[row],
-            hidden2[row],
-            zero2[s],
-            pinned[i],
-            second[i],
-            by_second[at],
-            by_1,
-        )
-        _hidden_backward(
-            by_1, x[row], hidden1[row], zero1[s], pinned[i], first[s], by_first[at], by_x[row]
-        )
+        own = pinned[i]
+        _hidden_backward(by_2, hidden1, hidden2, row, zero2, own, s, second, i, by_second, at, by_1)
+        _hidden_backward(by_1, x, hidden1, row, zero1, own, s, first, s, by_first, at, by_x)
     by_nodes = np.empty((rows, k, h1, n + 1), np.float32)
     for node in range(k):  # they enter the same sum
         for s in range(by_first.shape[0]):

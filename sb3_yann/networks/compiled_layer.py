@@ -9,7 +9,7 @@ import torch as th
 
 from sb3_yann.control._location import Integers, compiled, input_at
 from sb3_yann.control._validation import Array
-from sb3_yann.networks.compiled import WEIGHTS, Single, network, network_backward
+from sb3_yann.networks.compiled import WEIGHTS, Single, as_array, network, network_backward
 
 if TYPE_CHECKING:
     from sb3_yann.networks.yann import YannLayer
@@ -29,7 +29,7 @@ def _locate(
     slot = np.empty(batch, np.int64)
     slots = 0
     for row in range(batch):
-        region = input_at(floats, whole, theta[row], u[row])
+        region = input_at(floats, whole, theta, u, row)
         if region < 0:
             u[row], region = np.nan, 0
         if slot_of[region] < 0:
@@ -150,27 +150,29 @@ def layer_on_processor(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
     n = layer.piecewise_affine.n_theta
     if theta.dim() != 2 or theta.shape[1] != n:  # compiled code does not look
         raise ValueError(f"theta has shape {tuple(theta.shape)}, expected (batch, {n}).")
-    points = theta.detach().double().contiguous()
-    weights = layer.network.weights()
+    points = as_array(theta, np.float64)
+    network: Any = layer._modules["network"]
+    weights = network.weights()
     if th.is_grad_enabled():
         actions: th.Tensor = _Layer.apply(layer, points, *weights)  # type: ignore[no-untyped-call]
         return actions
     return th.from_numpy(_forward(*_given(layer, points, weights))[0])
 
 
-def _given(layer: YannLayer, theta: th.Tensor, weights: tuple[th.Tensor, ...]) -> list[Any]:
-    arrays = [weight.detach().contiguous().numpy() for weight in weights]
+def _given(layer: YannLayer, theta: Array, weights: tuple[th.Tensor, ...]) -> list[Any]:
+    network: Any = layer._modules["network"]
+    arrays = [as_array(weight) for weight in weights]
     law = layer.piecewise_affine.packed
     limit = np.inf if layer.reach is None else layer.reach
-    known = (theta.numpy(), layer.scaling, layer.change_array, limit)
-    return [*law, *known, *arrays, layer.network.pinned_array]
+    known = (theta, layer.scaling, layer.change_array, limit)
+    return [*law, *known, *arrays, network.pinned_array]
 
 
 class _Layer(th.autograd.Function):
     """Differentiable by the weights of the networks, once."""
 
     @staticmethod
-    def forward(ctx: Any, layer: YannLayer, theta: th.Tensor, *weights: th.Tensor) -> th.Tensor:
+    def forward(ctx: Any, layer: YannLayer, theta: Array, *weights: th.Tensor) -> th.Tensor:
         given = _given(layer, theta, weights)
         actions, *kept = _forward(*given)
         ctx.save_for_backward(*weights)  # who changes them before the way back is told so
@@ -181,7 +183,7 @@ class _Layer(th.autograd.Function):
     @th.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
         weights, (_, used, *_) = ctx.saved_tensors, ctx.kept
-        gradient = gradients[0].contiguous().numpy()
+        gradient = as_array(gradients[0])
         arrays = _backward(gradient, not ctx.by_row, *ctx.given, *ctx.kept)
         found = [th.from_numpy(each) for each in arrays]
         if ctx.by_row:

@@ -9,7 +9,15 @@ import torch as th
 
 from sb3_yann.control._location import compiled
 from sb3_yann.control._validation import Array
-from sb3_yann.networks.compiled import Single, at_zero, first_layers, hidden_layer, tanh, transposed
+from sb3_yann.networks.compiled import (
+    Single,
+    as_array,
+    at_zero,
+    first_layers,
+    hidden_layer,
+    tanh,
+    transposed,
+)
 
 if TYPE_CHECKING:
     from sb3_yann.networks.value import AfterstateValue
@@ -20,11 +28,11 @@ _QUADRATICS = "float64[:, ::1], float64[:, ::1], float32[:, ::1], float32[:, ::1
 
 
 @compiled()
-def _matrix(weights: Single, pinned: Single) -> tuple[Single, Single]:
-    """Return the only layer of a stack, inputs before outputs, and what it puts out at zero."""
+def _matrices(weights: Single, pinned: Single) -> tuple[Single, Single]:
+    """Return the layers of a stack of one, inputs before outputs, and what they put out at zero."""
     used = np.zeros(1, np.int64)
     matrices = transposed(weights, used)
-    return matrices[0], at_zero(matrices, used, pinned)[0]
+    return matrices, at_zero(matrices, used, pinned)
 
 
 @compiled(
@@ -48,7 +56,7 @@ def _forms(
     batch, n, m = len(points), len(M), len(W) - len(M)
     y, z, total = np.empty((batch, n + m)), np.zeros((batch, n)), np.zeros(batch)
     x, hidden = np.empty((batch, n), np.float32), np.empty((batch, nodes.shape[2]), np.float32)
-    matrix, zero = _matrix(first_layers(nodes, np.zeros(1, np.int64)), pinned)
+    matrices, zero = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
     for row in range(batch):
         for j in range(n):
             y[row, j] = points[row, j]
@@ -68,7 +76,7 @@ def _forms(
             for j in range(n):
                 product += M[i, j] * z[row, j]
             total[row] += z[row, i] * product
-        hidden_layer(x[row], matrix, zero, hidden[row])
+        hidden_layer(x, row, matrices, 0, zero, hidden)
     return total, y, z, x, hidden
 
 
@@ -87,10 +95,11 @@ def _output(
     """
     batch, h = hidden.shape
     q = np.empty((batch, 1), np.float32)
-    matrix, zero = _matrix(second, pinned)
+    matrices, zeros = _matrices(second, pinned)
+    bias, zero = matrices[0, -1], zeros[0]
     for row in range(batch):
         for a in range(h):
-            hidden[row, a] = tanh(hidden[row, a] + matrix[-1, a]) - zero[a]
+            hidden[row, a] = tanh(hidden[row, a] + bias[a]) - zero[a]
         learnt = (np.float32(1) - pinned[0]) * last[0, 0, h]
         for a in range(h):
             learnt += last[0, 0, a] * hidden[row, a]
@@ -115,7 +124,7 @@ def _output_backward(
     one = np.float32(1)
     through, by_bias = np.empty((batch, h), np.float32), np.zeros(h, np.float32)
     by_last, all_back = np.zeros((1, 1, h + 1), np.float32), np.float32(0)
-    _, zero = _matrix(second, pinned)
+    zero = _matrices(second, pinned)[1][0]
     for row in range(batch):
         back = np.float32(-factor * gradient[row, 0])
         all_back += back
@@ -158,7 +167,8 @@ def _forms_backward(
     batch, n, m = len(y), len(M), len(W) - len(M)
     k, h = nodes.shape[1], nodes.shape[2]
     one = np.float32(1)
-    matrix, zero = _matrix(first_layers(nodes, np.zeros(1, np.int64)), pinned)
+    matrices, zeros = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
+    matrix, zero = matrices[0], zeros[0]
     by_points, by_M = np.zeros((batch, n + m)), np.zeros((n, n))
     by_matrix = np.zeros((n + 1, h), np.float32)
     through = np.empty(h, np.float32)
@@ -203,10 +213,13 @@ def value_on_processor(value: AfterstateValue, points: th.Tensor, fixed: bool = 
 
     With ``fixed`` weights there is a gradient by the points alone.
     """
-    size = len(value.W)
+    buffers: Any = value._buffers  # a module's tables: its attributes take a microsecond to find
+    modules: Any = value._modules
+    size = len(buffers["W"])
     if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
         raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
-    weights: tuple[th.Tensor, ...] = (value.quadratic.entries, *value.network.weights())
+    entries = modules["quadratic"]._parameters["entries"]
+    weights: tuple[th.Tensor, ...] = (entries, *modules["network"].weights())
     if fixed:
         weights = tuple(weight.detach() for weight in weights)
     if th.is_grad_enabled():
@@ -225,14 +238,16 @@ class _Pass:
         self, value: AfterstateValue, points: th.Tensor, weights: tuple[th.Tensor, ...]
     ) -> None:
         self.weights = weights
-        entries, nodes, second, last = (weight.detach().contiguous().numpy() for weight in weights)
+        entries, nodes, second, last = as_array(weights[0], np.float64), *map(as_array, weights[1:])
         W, AB, self.roots, scaling = value.constants
-        pinned = value.network.pinned_array
+        network: Any = value._modules["network"]
+        pinned = network.pinned_array
         self.first: tuple[Any, ...] = (W, AB, entries * self.roots, scaling, nodes, pinned)
-        array = points.detach().double().contiguous().numpy()
+        array = as_array(points, np.float64)
         total, *forms = _forms(array, *self.first)
         self.forms: tuple[Any, ...] = tuple(forms)
-        product = th.mm(th.from_numpy(self.forms[-1]), weights[2].detach()[0, :, :-1].T)
+        self.matrix = th.from_numpy(second)[0, :, :-1]
+        product = th.mm(th.from_numpy(self.forms[-1]), self.matrix.T)
         self.hidden, self.layers = product.numpy(), (second, last, pinned)
         self.factor = value.gamma * value.scale
         self.q: Single = _output(total, self.hidden, *self.layers, self.factor)
@@ -244,15 +259,15 @@ class _Pass:
         through, by_bias, by_last = _output_backward(
             gradient, self.factor, self.hidden, *self.layers
         )
-        product, second = th.from_numpy(through), self.weights[2].detach()
-        back = th.mm(product, second[0, :, :-1])
+        product = th.from_numpy(through)
+        back = th.mm(product, self.matrix)
         by_nodes, found, by_M = _forms_backward(
             gradient, back.numpy(), of_points, of_weights, *self.forms, *self.first
         )
         by_points = th.from_numpy(found) if of_points else None
         if not of_weights:
             return by_points, None, None, None, None
-        by_second = th.empty_like(second)
+        by_second = th.empty_like(self.weights[2])
         th.mm(product.T, th.from_numpy(self.forms[-1]), out=by_second[0, :, :-1])
         by_second[0, :, -1] = th.from_numpy(by_bias)
         by_entries = th.from_numpy(by_M * self.roots)
@@ -274,7 +289,7 @@ class _Value(th.autograd.Function):
     @th.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
         _ = ctx.saved_tensors
-        gradient = gradients[0].contiguous().numpy()
+        gradient = as_array(gradients[0])
         _, of_points, *of_weights = ctx.needs_input_grad
         by_points, *by_weights = ctx.done.backward(gradient, of_points, any(of_weights))
         return None, by_points if by_points is None else by_points.to(ctx.dtype), *by_weights

@@ -172,32 +172,35 @@ class AfterstateValue(nn.Module):
             n, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
         self._constants: tuple[Array, Array, Array, Array]
-        self._constants_of: tuple[Any, ...] = ()
+        self._constants_of: tuple[Any, ...] = ((), ())
 
     @property
     def compiles(self) -> bool:
         """Whether there is compiled code for such a value where it is now."""
-        double = self.W.dtype == self.quadratic.entries.dtype == th.float64
-        return double and isinstance(self.model, LinearPrediction) and self.network.compiles
+        modules: Any = self._modules
+        linear = isinstance(modules.get("model"), LinearPrediction)
+        if not linear or self._buffers["W"].dtype != th.float64:  # type: ignore[union-attr]
+            return False
+        double: bool = modules["quadratic"]._parameters["entries"].dtype == th.float64
+        return double and modules["network"].compiles
 
     @property
     def constants(self) -> tuple[Array, Array, Array, Array]:
         """W, the model's [A B], the scale of the quadratic form, and others, for compiled code."""
-        model: Any = self.model
-        used = (
-            self.W, model.A, model.B, self.quadratic.root,
-            self.network_scale, self.to_input, self.middle,
-        )  # fmt: skip
-        now = (self.gamma, *((id(each), each._version) for each in used))
-        if self._constants_of != now:
-            W, A, B, root, *scaling = (each.numpy() for each in used)
+        modules: Any = self._modules
+        tables: Any = self._buffers, modules["model"]._buffers, modules["quadratic"]._buffers
+        used = [each for table in tables for each in table.values()]
+        now = [self.gamma, *[(id(each), each._version) for each in used]]
+        if self._constants_of[0] != now:
+            own, model, quadratic = ({k: v.numpy() for k, v in each.items()} for each in tables)
+            root = quadratic["root"]
             self._constants = (
-                W.copy(),
-                np.ascontiguousarray(np.vstack([A, B]).T),
+                own["W"].copy(),
+                np.ascontiguousarray(np.vstack([model["A"], model["B"]]).T),
                 np.outer(root, root) * self.gamma,
-                np.concatenate(scaling),
+                np.concatenate([own["network_scale"], own["to_input"], own["middle"]]),
             )
-            self._constants_of = now
+            self._constants_of = now, used  # kept, so that no other can have their addresses
         return self._constants
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:

@@ -208,8 +208,13 @@ class ZeroOutputNetwork(nn.Module):
 
     def weights(self) -> tuple[nn.Parameter, ...]:
         """Return the parameters, layer by layer."""
-        rest: Any = self.rest
-        return (self.first.nodes, *[layer.weight for layer in rest])
+        # From the modules' own tables: an attribute of a module takes a microsecond to find.
+        modules: Any = self._modules
+        rest = modules["rest"]._modules.values()
+        return (
+            modules["first"]._parameters["nodes"],
+            *[layer._parameters["weight"] for layer in rest],
+        )
 
     @property
     def compiles(self) -> bool:
@@ -221,13 +226,14 @@ class ZeroOutputNetwork(nn.Module):
         tracing = th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         if tracing or th.compiler.is_compiling() or th.is_autocast_enabled("cpu"):
             return False
-        nodes = self.first.nodes
-        return self.has_loops and nodes.dtype == th.float32 and nodes.device.type == "cpu"
+        nodes = self.weights()[0]
+        return self.has_loops and nodes.dtype == th.float32 and nodes.is_cpu
 
     @property
     def pinned_array(self) -> NDArray[np.float32]:
         """Which networks are pinned, (n_stacked,), for compiled code."""
-        array: NDArray[np.float32] = self.pinned.numpy()[:, 0]
+        pinned: Any = self._buffers["pinned"]
+        array: NDArray[np.float32] = pinned.numpy()[:, 0]
         return array
 
     @th.no_grad()
