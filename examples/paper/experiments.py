@@ -46,7 +46,7 @@ class Plant:
     steps: int  # of one episode
     problem: Callable[[], LinearMPC]
     optimum: Callable[..., Any]
-    gradient_steps: int = 1
+    gradient_steps: int = 2
     critic_warmup: int = 2000
     guard: dict[str, Any] = field(default_factory=dict)
 
@@ -75,7 +75,6 @@ _PENDULUM = Plant(
     200,
     problems.clipped_pendulum,
     optimum.clipped_pendulum_optimum,
-    gradient_steps=2,
     critic_warmup=4000,
     guard={"fresh": 100, "patience": 10, "wander": True},
 )
@@ -103,9 +102,10 @@ def yann(
     gamma: float = 0.99,
     outside: str | None = None,
     plant_alone: bool = False,
+    gradient_steps: int | None = None,
     **policy_kwargs: Any,
 ) -> Learner:
-    """Return a YANN learner; None as guard trains without one."""
+    """Return a YANN learner, with the plant's gradient steps; None as guard trains without one."""
     problem = plant.problem()
     if outside is not None:
         problem = replace(problem, outside=outside)
@@ -114,7 +114,7 @@ def yann(
         YannPolicy,
         env,
         gamma=gamma,
-        gradient_steps=plant.gradient_steps,
+        gradient_steps=gradient_steps or plant.gradient_steps,
         seed=seed,
         device="cpu",
         buffer_size=200_000,
@@ -141,19 +141,28 @@ def _yardstick(build: Callable[..., Learner], **options: Any) -> Callable[..., L
     return lambda make_env, seed, plant: build(make_env, seed, **options)
 
 
+CHANGES: dict[str, dict[str, Any]] = {
+    "guard off": {"guard": None},
+    "guard off, noise 0.1": {"guard": None, "noise": 0.1},
+    "guard: plant alone": {"plant_alone": True},
+    "paper's critic": {"critic": "state_action"},
+    "paper's critic, TD3, guard off": {"critic": "state_action", "guard": None, "algorithm": TD3},
+    "at most 5 % from the MPC": {"max_correction": 0.05},
+    "free equilibrium": {"pin_equilibrium": False},
+    "discount 0.95": {"gamma": 0.95},
+    "nearest outside": {"outside": "nearest"},
+}
+"""What is changed of YANN-RL, one thing at a time."""
+ONE_STEP = "YANN-RL, one step"
+"""With one gradient step for each step of the plant, as SB3 has it, and its rivals here."""
 LEARNERS: dict[str, Callable[..., Learner]] = {
     "YANN-RL": yann,
-    "YANN-RL, guard off": partial(yann, guard=None),
-    "YANN-RL, guard off, noise 0.1": partial(yann, guard=None, noise=0.1),
-    "YANN-RL, guard: plant alone": partial(yann, plant_alone=True),
-    "YANN-RL, paper's critic": partial(yann, critic="state_action"),
-    "YANN-RL, paper's critic, TD3, guard off": partial(
-        yann, critic="state_action", guard=None, algorithm=TD3
-    ),
-    "YANN-RL, at most 5 % from the MPC": partial(yann, max_correction=0.05),
-    "YANN-RL, free equilibrium": partial(yann, pin_equilibrium=False),
-    "YANN-RL, discount 0.95": partial(yann, gamma=0.95),
-    "YANN-RL, nearest outside": partial(yann, outside="nearest"),
+    ONE_STEP: partial(yann, gradient_steps=1),
+    **{f"YANN-RL, {name}": partial(yann, **change) for name, change in CHANGES.items()},
+    **{
+        f"{ONE_STEP}, {name}": partial(yann, gradient_steps=1, **change)
+        for name, change in CHANGES.items()
+    },
     "DDPG": _yardstick(yardsticks.sb3_ddpg),
     "DDPG, best kept": _yardstick(yardsticks.best_of_ddpg, seeds=GUARD_SEEDS),
     "TD3": _yardstick(yardsticks.sb3_td3),
@@ -163,21 +172,27 @@ LEARNERS: dict[str, Callable[..., Learner]] = {
 }
 VARIANTS = {
     "CSTR": [
-        "guard off",
-        "guard off, noise 0.1",
-        "guard: plant alone",
-        "paper's critic",
-        "at most 5 % from the MPC",
-        "discount 0.95",
+        f"{ONE_STEP}, {name}"
+        for name in (
+            "guard off",
+            "guard off, noise 0.1",
+            "guard: plant alone",
+            "paper's critic",
+            "at most 5 % from the MPC",
+            "discount 0.95",
+        )
     ],
     "pendulum, Q = diag(1, 0.1)": [
-        "guard off",
-        "paper's critic, TD3, guard off",
-        "free equilibrium",
-        "nearest outside",
+        f"YANN-RL, {name}"
+        for name in (
+            "guard off",
+            "paper's critic, TD3, guard off",
+            "free equilibrium",
+            "nearest outside",
+        )
     ],
 }
-"""What is changed on which plant, one thing at a time."""
+"""What is changed on which plant; on the reactor, of the learner with one gradient step."""
 FIXED = ("MPC", "LQR", "optimum")
 
 
@@ -195,9 +210,9 @@ def _runs() -> list[Run]:
     def add(plant: str, learners: Iterable[str], seeds: range, episodes: int = 50) -> None:
         runs.extend(Run(plant, name, seed, episodes) for name in learners for seed in seeds)
 
-    add(reactor, ["YANN-RL", "residual RL"], ten)
+    add(reactor, ["YANN-RL", ONE_STEP, "residual RL"], ten)
     add(reactor, ["DDPG"], five)
-    add(reactor, ["YANN-RL"], long, episodes=200)
+    add(reactor, ["YANN-RL", ONE_STEP], long, episodes=200)
     add(reactor, ["DDPG"], range(50, 55), episodes=200)
     add(pendulum, ["YANN-RL"], ten)
     add(printed, ["YANN-RL"], ten)
@@ -206,7 +221,7 @@ def _runs() -> list[Run]:
     add(pendulum, ["DDPG", "TD3", "residual RL", "cloned MPC, then DDPG"], five)
     for plant, variants in VARIANTS.items():
         for name in variants:
-            add(plant, [f"YANN-RL, {name}"], five if "guard" in name else three)
+            add(plant, [name], five if "guard" in name else three)
     return runs
 
 

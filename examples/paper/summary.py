@@ -14,6 +14,8 @@ SHOWN = (
     MPC,
     OURS,
     f"{OURS}, guard off",
+    f"{OURS}, one step",
+    f"{OURS}, one step, guard off",
     "residual RL",
     "cloned MPC, then DDPG",
     "DDPG",
