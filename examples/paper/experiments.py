@@ -76,7 +76,7 @@ _PENDULUM = Plant(
     problems.clipped_pendulum,
     optimum.clipped_pendulum_optimum,
     critic_warmup=4000,
-    guard={"fresh": 100, "patience": 10, "wander": True},
+    guard={"fresh": 100, "final": 10_000, "patience": 10, "wander": True},
 )
 PLANTS = {
     "CSTR": _REACTOR,
@@ -212,7 +212,7 @@ def _runs() -> list[Run]:
 
     add(reactor, ["YANN-RL", ONE_STEP, "residual RL"], ten)
     add(reactor, ["DDPG"], five)
-    add(reactor, ["YANN-RL", ONE_STEP], long, episodes=200)
+    add(reactor, [ONE_STEP], long, episodes=200)
     add(reactor, ["DDPG"], range(50, 55), episodes=200)
     add(pendulum, ["YANN-RL"], ten)
     add(printed, ["YANN-RL"], ten)

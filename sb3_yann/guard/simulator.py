@@ -42,6 +42,7 @@ class SimulatorTrials:
         env: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]],
         n_starts: int,
         fresh: int,
+        final: int,
         seed: int,
         every: int,
         margin: float,
@@ -50,7 +51,8 @@ class SimulatorTrials:
         wander: bool,
     ) -> None:
         self.env, self.every, self.margin, self.by_region = env, every, margin, by_region
-        self.patience, self.wander, self.fresh = patience, wander, fresh
+        self.patience, self.wander = patience, wander
+        self.fresh, self.final = fresh, final
         self.seeds = range(seed, seed + n_starts)
         self.settings: dict[str, Any] = {"env": _name(env), "seeds": self.seeds, "margin": margin}
 
@@ -126,7 +128,7 @@ class SimulatorTrials:
             self._try(guard)
 
     def end(self, guard: ImprovementGuard) -> None:
-        """Try the last candidate, and what is accepted then on ten times as many new starts."""
+        """Try the last candidate, and what is accepted then on ``final`` new starts."""
         state = guard.state
         # There is no later: what is refused now returns.
         state.rejections = self.patience - 1
@@ -138,7 +140,7 @@ class SimulatorTrials:
         if last is self._final:  # the Zoo ends its first callback a second time
             return
         with all_or_nothing(guard):
-            reason = settle(guard, self, 10 * self.fresh)
+            reason = settle(guard, self, self.final)
         self._final = accepted = state.accepted
         accepted.restore(guard.policy)
         if reason:

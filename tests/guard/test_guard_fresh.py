@@ -76,6 +76,17 @@ def test_without_new_starts_it_passes() -> None:
     assert guard.state.evidence.seeds == tuple(range(FIRST, FIRST + 10))
 
 
+@pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
+def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, seeds) -> None:
+    model = build(gradient_steps=0)
+    guard = make_guard(OftenRight, fresh=0, final=final, by_region=False)
+    train(model, STEPS, At([STEPS], spoil_left), guard)
+    assert guard.state.fresh == seeds
+    assert model.policy.actor.mu.network.is_zero() == (final is not None)
+    if final is not None:
+        assert guard.decisions[-1].reason.startswith("at the end, 10 of 30 new starts lose")
+
+
 def test_without_by_region_the_whole_of_it_is_put_back() -> None:
     model, guard = build(gradient_steps=0), make_guard(OftenRight, fresh=20, by_region=False)
     before = actor_bits(model.policy)
