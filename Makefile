@@ -25,9 +25,9 @@ paper: $(STAMP)  ## run the paper's experiments, hours (make paper ARGS="--quick
 bench: $(STAMP)  ## measure the speed, ten minutes (make bench ARGS="--quick" for one)
 	@PYTHONPATH="$(CURDIR)/examples" OMP_NUM_THREADS=1 $(PY) -m bench $(ARGS)
 
-test: $(STAMP)  ## run the tests (make test ARGS="-k name" passes arguments to pytest)
+test: $(STAMP)  ## run the tests, side by side (make test ARGS="-n 0 -k name" for pytest alone)
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
-		$(PY) -m pytest $(ARGS)
+		$(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 check: $(STAMP)  ## lint, check the formatting and the types
 	$(PY) -m ruff check $(CODE)

@@ -87,7 +87,7 @@ PLANTS = {
         _PENDULUM,
         problem=printed_pendulum,
         gradient_steps=4,
-        guard={**_PENDULUM.guard, "margin": 0.03},
+        guard={**_PENDULUM.guard, "final": 1000, "margin": 0.03},
     ),
 }
 

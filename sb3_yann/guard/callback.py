@@ -85,9 +85,9 @@ class ImprovementGuard(BaseCallback):
         passes on all of them is put back, or the MPC. 0 is for none.
     final : int, optional
         Number of new starts on which what is accepted is tried in the same way when training ends.
-        The default is ten times ``fresh``. What passes on n starts loses fewer than one in n / 3 of
-        such starts with 95 % confidence (the rule of three): where the simulator is fast, thousands
-        cost little.
+        The default is ten times ``fresh``. A policy that loses one of n / 3 starts or more passes
+        on n with a probability below 5 % (the rule of three), one of k that are tried in turn with
+        at most k times that: where the simulator is fast, thousands cost little.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
     every : int, default 1

@@ -218,8 +218,10 @@ def value_on_processor(value: AfterstateValue, points: th.Tensor, fixed: bool = 
     size = len(buffers["W"])
     if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
         raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
-    entries = modules["quadratic"]._parameters["entries"]
-    weights: tuple[th.Tensor, ...] = (entries, *modules["network"].weights())
+    weights: tuple[th.Tensor, ...] = (
+        modules["quadratic"].entries,
+        *modules["network"].weights(),
+    )
     if fixed:
         weights = tuple(weight.detach() for weight in weights)
     if th.is_grad_enabled():

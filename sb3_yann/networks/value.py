@@ -181,7 +181,7 @@ class AfterstateValue(nn.Module):
         linear = isinstance(modules.get("model"), LinearPrediction)
         if not linear or self._buffers["W"].dtype != th.float64:  # type: ignore[union-attr]
             return False
-        double: bool = modules["quadratic"]._parameters["entries"].dtype == th.float64
+        double: bool = modules["quadratic"].entries.dtype == th.float64
         return double and modules["network"].compiles
 
     @property

@@ -208,13 +208,12 @@ class ZeroOutputNetwork(nn.Module):
 
     def weights(self) -> tuple[nn.Parameter, ...]:
         """Return the parameters, layer by layer."""
-        # From the modules' own tables: an attribute of a module takes a microsecond to find.
         modules: Any = self._modules
-        rest = modules["rest"]._modules.values()
-        return (
-            modules["first"]._parameters["nodes"],
-            *[layer._parameters["weight"] for layer in rest],
-        )
+        first, rest = modules["first"], modules["rest"]._modules.values()
+        try:  # from the modules' own tables: an attribute of a module takes a microsecond to find
+            return (first._parameters["nodes"], *[each._parameters["weight"] for each in rest])
+        except KeyError:  # made of others, by torch.nn.utils.parametrize or prune
+            return (first.nodes, *[each.weight for each in rest])
 
     @property
     def compiles(self) -> bool:

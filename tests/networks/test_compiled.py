@@ -241,6 +241,44 @@ def test_a_value_notices_a_change_of_its_model() -> None:
     assert_close(ours(points), by_torch(ours)(points))
 
 
+def test_a_value_notices_a_buffer_in_the_place_of_another() -> None:
+    ours, points = value(True), th.rand(20, 5)
+    for factor in (2, 3, 4):  # memory that is freed is given to the next one
+        before = ours(points)
+        ours.W = factor * ours.W.clone()
+        assert_close(ours(points), by_torch(ours)(points))
+        assert not th.allclose(ours(points), before)
+
+
+class Double(th.nn.Module):
+    def forward(self, weight: th.Tensor) -> th.Tensor:
+        return 2 * weight
+
+
+@pytest.mark.parametrize("name", ["layer", "value"])
+def test_weights_that_are_made_of_others_are_used_and_trained(name: str) -> None:
+    module, n = {"layer": (YannLayer(law_of("reactor")), 4), "value": (value(True), 5)}[name]
+    shaken(module, 0.1)
+    th.nn.utils.parametrize.register_parametrization(module.network.rest[-1], "weight", Double())
+    theta = box_points(law_of("reactor"), 50)
+    points = th.cat([theta, th.linspace(-1, 1, 50)[:, None]], 1)[:, :n]
+    ours, theirs = module(points), (plain := by_torch(module))(points)
+    assert_close(ours, theirs)
+    for one, other in zip(gradients(ours, module), gradients(theirs, plain), strict=True):
+        assert_close(one, other, 1e-4)
+
+
+@pytest.mark.parametrize("name", ["layer", "value"])
+def test_weights_that_are_lent_for_a_call_are_used(name: str) -> None:
+    module, n = {"layer": (YannLayer(law_of("reactor")), 4), "value": (value(True), 5)}[name]
+    other = copy.deepcopy(module)
+    shaken(other, 0.1)
+    points = 0.1 * th.rand(20, n)  # where the law is not saturated
+    lent = dict(other.named_parameters())
+    assert th.equal(th.func.functional_call(module, lent, points), other(points))
+    assert not th.equal(module(points), other(points))
+
+
 def test_matrices_may_come_in_any_order_of_memory() -> None:
     mpc = problems.cstr()
     given = mpc.stage_matrix, mpc.value_matrix(0.99)
