@@ -27,7 +27,7 @@ bench: $(STAMP)  ## measure the speed, ten minutes (make bench ARGS="--quick" fo
 
 test: $(STAMP)  ## run the tests, side by side (make test ARGS="-n 0 -k name" for pytest alone)
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
-		$(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
+		$(PY) -m pytest -n logical --maxprocesses 4 --dist loadfile $(ARGS)
 
 check: $(STAMP)  ## lint, check the formatting and the types
 	$(PY) -m ruff check $(CODE)
