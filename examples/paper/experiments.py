@@ -22,6 +22,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 import sb3_yann
 from paper import optimum, yardsticks
+from paper.measures import ONE_STEP, OURS
 from paper.runner import Outcome, Run
 from paper.yardsticks import Learner
 from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
@@ -34,7 +35,7 @@ GUARD_SEEDS = range(1_000_000, 1_000_200)
 """Starts on which a rival may choose its best policy: as many as the guard's, and new ones."""
 CHECKPOINTS = (0, 10, 20, 30, 40, 50, 75, 100, 150, 200)
 """Training episodes after which the policy is tested."""
-FINGERPRINT = f"{sb3_yann.__version__}-2"
+FINGERPRINT = f"{sb3_yann.__version__}-3"
 """Results of another version are not taken for those of this one."""
 
 
@@ -153,12 +154,10 @@ CHANGES: dict[str, dict[str, Any]] = {
     "nearest outside": {"outside": "nearest"},
 }
 """What is changed of YANN-RL, one thing at a time."""
-ONE_STEP = "YANN-RL, one step"
-"""With one gradient step for each step of the plant, as SB3 has it, and its rivals here."""
 LEARNERS: dict[str, Callable[..., Learner]] = {
-    "YANN-RL": yann,
+    OURS: yann,
     ONE_STEP: partial(yann, gradient_steps=1),
-    **{f"YANN-RL, {name}": partial(yann, **change) for name, change in CHANGES.items()},
+    **{f"{OURS}, {name}": partial(yann, **change) for name, change in CHANGES.items()},
     **{
         f"{ONE_STEP}, {name}": partial(yann, gradient_steps=1, **change)
         for name, change in CHANGES.items()
@@ -183,7 +182,7 @@ VARIANTS = {
         )
     ],
     "pendulum, Q = diag(1, 0.1)": [
-        f"YANN-RL, {name}"
+        f"{OURS}, {name}"
         for name in (
             "guard off",
             "paper's critic, TD3, guard off",
@@ -210,13 +209,13 @@ def _runs() -> list[Run]:
     def add(plant: str, learners: Iterable[str], seeds: range, episodes: int = 50) -> None:
         runs.extend(Run(plant, name, seed, episodes) for name in learners for seed in seeds)
 
-    add(reactor, ["YANN-RL", ONE_STEP, "residual RL"], ten)
+    add(reactor, [OURS, ONE_STEP, "residual RL"], ten)
     add(reactor, ["DDPG"], five)
     add(reactor, [ONE_STEP], long, episodes=200)
     add(reactor, ["DDPG"], range(50, 55), episodes=200)
-    add(pendulum, ["YANN-RL"], ten)
-    add(printed, ["YANN-RL"], ten)
-    add(true_model, ["YANN-RL"], ten)
+    add(pendulum, [OURS], ten)
+    add(printed, [OURS], ten)
+    add(true_model, [OURS], ten)
     add(reactor, ["DDPG, best kept", "TD3", "residual RL, no noise", "cloned MPC, then DDPG"], five)
     add(pendulum, ["DDPG", "TD3", "residual RL", "cloned MPC, then DDPG"], five)
     for plant, variants in VARIANTS.items():
@@ -228,9 +227,9 @@ def _runs() -> list[Run]:
 RUNS = _runs()
 QUICK = [
     *(Run(plant, name, 0, 0) for plant in ("CSTR", "pendulum, Q = I") for name in FIXED),
-    Run("CSTR", "YANN-RL", 20, 8),
+    Run("CSTR", OURS, 20, 8),
     Run("CSTR", "DDPG", 20, 8),
-    Run("pendulum, Q = I", "YANN-RL", 20, 8),
+    Run("pendulum, Q = I", OURS, 20, 8),
 ]
 
 

@@ -263,7 +263,8 @@ def law_at(floats: Array, whole: Integers, theta: Array) -> Array | None:
     out = np.empty((1, whole[1]))
     if input_at(floats, whole, theta.reshape(1, -1), out, 0) < 0:
         return None
-    return out[0]
+    u: Array = out[0]
+    return u
 
 
 @compiled("float64[:, ::1](float64[::1], int64[::1], float64[:, ::1])")

@@ -268,6 +268,10 @@ class PiecewiseAffine(ReadOnlyArrays):
         """Return the law itself, of which nothing can change."""
         return self
 
+    def __copy__(self) -> PiecewiseAffine:
+        """Return the law itself."""
+        return self
+
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what was compiled for this process; the tree goes along, as in :meth:`save`."""
         _ = self.tree

@@ -85,9 +85,10 @@ class ImprovementGuard(BaseCallback):
         passes on all of them is put back, or the MPC. 0 is for none.
     final : int, optional
         Number of new starts on which what is accepted is tried in the same way when training ends.
-        The default is ten times ``fresh``. A policy that loses one of n / 3 starts or more passes
-        on n with a probability below 5 % (the rule of three), one of k that are tried in turn with
-        at most k times that: where the simulator is fast, thousands cost little.
+        The default is ten times ``fresh``; 0 is for none. A policy that loses at least one start
+        in n / 3 passes on n with a probability below 5 % (the rule of three), one of k that are
+        tried in turn with at most k times that. Ten thousand take some seconds where the env is
+        named and steps as arrays; a function that makes one is called for each start.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
     every : int, default 1

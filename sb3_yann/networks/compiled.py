@@ -24,7 +24,11 @@ WEIGHTS = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float3
 
 def as_array(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
     """Return what compiled code takes for a tensor, without its gradient: the same memory if so."""
-    return np.ascontiguousarray(tensor.numpy(force=True), dtype)
+    try:
+        array = tensor.numpy(force=True)
+    except TypeError:  # bfloat16, which numpy does not have
+        array = tensor.double().numpy(force=True)
+    return np.ascontiguousarray(array, dtype)
 
 
 @compiled()  # not a fast one: s(b) - s(b) must be zero wherever the two are computed

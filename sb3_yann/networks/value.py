@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -172,7 +173,7 @@ class AfterstateValue(nn.Module):
             n, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
         self._constants: tuple[Array, Array, Array, Array]
-        self._constants_of: tuple[Any, ...] = ((), ())
+        self._constants_of: tuple[list[Any], tuple[th.Tensor, ...]] = ([], ())
 
     @property
     def compiles(self) -> bool:
@@ -188,19 +189,23 @@ class AfterstateValue(nn.Module):
     def constants(self) -> tuple[Array, Array, Array, Array]:
         """W, the model's [A B], the scale of the quadratic form, and others, for compiled code."""
         modules: Any = self._modules
-        tables: Any = self._buffers, modules["model"]._buffers, modules["quadratic"]._buffers
-        used = [each for table in tables for each in table.values()]
-        now = [self.gamma, *[(id(each), each._version) for each in used]]
-        if self._constants_of[0] != now:
-            own, model, quadratic = ({k: v.numpy() for k, v in each.items()} for each in tables)
-            root = quadratic["root"]
+        own: Any = self._buffers
+        model, quadratic = modules["model"]._buffers, modules["quadratic"]._buffers
+        used = (
+            own["W"], model["A"], model["B"], quadratic["root"],
+            own["network_scale"], own["to_input"], own["middle"],
+        )  # fmt: skip
+        now = [self.gamma, *[each._version for each in used]]
+        then, known = self._constants_of
+        if then != now or not all(map(operator.is_, used, known)):
+            W, A, B, root, *scaling = (each.numpy() for each in used)
             self._constants = (
-                own["W"].copy(),
-                np.ascontiguousarray(np.vstack([model["A"], model["B"]]).T),
+                W.copy(),
+                np.ascontiguousarray(np.vstack([A, B]).T),
                 np.outer(root, root) * self.gamma,
-                np.concatenate([own["network_scale"], own["to_input"], own["middle"]]),
+                np.concatenate(scaling),
             )
-            self._constants_of = now, used  # kept, so that no other can have their addresses
+            self._constants_of = now, used
         return self._constants
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:

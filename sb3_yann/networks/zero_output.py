@@ -212,7 +212,7 @@ class ZeroOutputNetwork(nn.Module):
         first, rest = modules["first"], modules["rest"]._modules.values()
         try:  # from the modules' own tables: an attribute of a module takes a microsecond to find
             return (first._parameters["nodes"], *[each._parameters["weight"] for each in rest])
-        except KeyError:  # made of others, by torch.nn.utils.parametrize or prune
+        except KeyError:  # made of others, by torch.nn.utils.parametrize
             return (first.nodes, *[each.weight for each in rest])
 
     @property
@@ -225,8 +225,8 @@ class ZeroOutputNetwork(nn.Module):
         tracing = th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         if tracing or th.compiler.is_compiling() or th.is_autocast_enabled("cpu"):
             return False
-        nodes = self.weights()[0]
-        return self.has_loops and nodes.dtype == th.float32 and nodes.is_cpu
+        single = th.float32
+        return self.has_loops and all(w.dtype == single and w.is_cpu for w in self.weights())
 
     @property
     def pinned_array(self) -> NDArray[np.float32]:

@@ -199,6 +199,17 @@ def test_the_report_is_whole(tmp_path) -> None:
     assert "![CSTR](results-cstr.png)" in text
 
 
+def test_every_learner_that_is_run_for_longer_has_a_row_of_its_own_after_that_time() -> None:
+    from paper.experiments import RUNS
+
+    long = [run for run in RUNS if run.episodes == 200]
+    assert len(long) > 4
+    outcomes = {run: learned(OPTIMUM, episodes=200) for run in long}
+    rows, _ = standing({**reactor(seeds=0), **outcomes}, "CSTR", 200).tables()
+    assert {row.learner for row in rows} - {"MPC", "optimum"} == {run.learner for run in long}
+    assert any(run.learner.startswith("YANN-RL") for run in long)
+
+
 @pytest.mark.parametrize("missing", ["MPC", "optimum", "YANN-RL", "DDPG", "MPC optimum YANN-RL"])
 def test_the_report_does_without(missing, tmp_path) -> None:
     everything = {**reactor(seeds=2), **pendulum()}
