@@ -15,8 +15,6 @@ from paper.runner import Outcome, Run
 Array = NDArray[np.float64]
 
 OURS, MPC, OPTIMUM = "YANN-RL", "MPC", "optimum"
-ONE_STEP = f"{OURS}, one step"
-"""With one gradient step for each step of the plant, as SB3 has it, and the rivals here."""
 FIRST = (OPTIMUM, MPC, "LQR", OURS)
 HELD = 50.0
 """A pendulum that costs less than this was held upright."""
@@ -54,8 +52,7 @@ class Standing:
     def tables(self) -> tuple[list[Row], list[Row]]:
         """Return the rows of the learners, and those of ours and its variants."""
         variants = [name for name in self.learners if name.startswith(OURS)]
-        both = (OURS, ONE_STEP)
-        others = [name for name in self.learners if name in both or name not in variants]
+        others = [name for name in self.learners if name == OURS or name not in variants]
         return [self.row(name) for name in others], [self.row(name) for name in variants]
 
 

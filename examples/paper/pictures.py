@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
-from paper.measures import MPC, ONE_STEP, OURS
+from paper.measures import MPC, OURS
 from paper.runner import Outcome, Run
 
 Array = NDArray[np.float64]
@@ -44,8 +44,7 @@ def _learners(outcomes: Mapping[Run, Outcome]) -> dict[str, list[Outcome]]:
     """Return the runs of each learner, ours first; its variants have a table and no curve."""
     found: dict[str, list[Outcome]] = {}
     for run in sorted(outcomes, key=lambda run: run.learner != OURS):
-        shown = run.learner in (OURS, ONE_STEP) or not run.learner.startswith(OURS)
-        if run.episodes and shown:
+        if run.episodes and (run.learner == OURS or not run.learner.startswith(OURS)):
             found.setdefault(run.learner, []).append(outcomes[run])
     return found
 

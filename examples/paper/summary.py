@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from paper.markdown import number, table
-from paper.measures import MPC, ONE_STEP, OPTIMUM, OURS, Row, plants_of, standing
+from paper.measures import MPC, OPTIMUM, OURS, Row, plants_of, standing
 from paper.runner import Outcome, Run
 
 SHOWN = (
@@ -14,8 +14,6 @@ SHOWN = (
     MPC,
     OURS,
     f"{OURS}, guard off",
-    ONE_STEP,
-    f"{ONE_STEP}, guard off",
     "residual RL",
     "cloned MPC, then DDPG",
     "DDPG",
