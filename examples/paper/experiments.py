@@ -105,6 +105,7 @@ def yann(
     outside: str | None = None,
     plant_alone: bool = False,
     gradient_steps: int | None = None,
+    tau: float = 0.005,
     **policy_kwargs: Any,
 ) -> Learner:
     """Return a YANN learner, with the plant's gradient steps; None as guard trains without one."""
@@ -116,6 +117,7 @@ def yann(
         YannPolicy,
         env,
         gamma=gamma,
+        tau=tau,
         gradient_steps=gradient_steps or plant.gradient_steps,
         seed=seed,
         device="cpu",
@@ -153,6 +155,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "free equilibrium": {"pin_equilibrium": False},
     "discount 0.95": {"gamma": 0.95},
     "two gradient steps": {"gradient_steps": 2},
+    "target rate 0.02": {"tau": 0.02},
     "nearest outside": {"outside": "nearest"},
 }
 """What is changed of YANN-RL, one thing at a time."""
@@ -200,7 +203,8 @@ def _runs() -> list[Run]:
     def add(plant: str, learners: Iterable[str], seeds: range, episodes: int = 50) -> None:
         runs.extend(Run(plant, name, seed, episodes) for name in learners for seed in seeds)
 
-    add(reactor, [OURS, f"{OURS}, two gradient steps", "residual RL"], ten)
+    add(reactor, [OURS, "residual RL"], ten)
+    add(reactor, [f"{OURS}, two gradient steps", f"{OURS}, target rate 0.02"], ten)
     add(reactor, ["DDPG"], five)
     add(reactor, [OURS], long, episodes=200)
     add(reactor, ["DDPG"], range(50, 55), episodes=200)
