@@ -98,13 +98,10 @@ def _actor(figures: Figures) -> Iterator[Criterion]:
     sizes = _sizes(figures, section)
     for each in sizes:
         yield from _at_most(figures, section, each, 1.5)
-    # In units of the perceptron beside it, which knows no regions: between two laws the clock of a
-    # shared machine may change by more than is asked.
-    both = [[figures.get(section, name, each) for name in ("ours", peers.MLP)] for each in sizes]
-    units = [np.median(ratios(a.samples, b.samples)) for a, b in both if a and b]
-    if len(units) > 1:
-        more = max(units) / min(units) - 1
-        found = f"{100 * more:.0f} % ({times(min(units))} to {times(max(units))} {peers.MLP})"
+    middles = [figure.middle for each in sizes if (figure := figures.get(section, "ours", each))]
+    if len(middles) > 1:
+        more = max(middles) / min(middles) - 1
+        found = f"{100 * more:.0f} % ({seconds(min(middles))} to {seconds(max(middles))})"
         what = f"{section}, {sizes[0]:,} to {sizes[-1]:,} regions"
         yield Criterion(what, "within 20 %", found, more <= 0.2)
 
