@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 # python -m, not the scripts in .venv/bin: their first line breaks on a path with spaces.
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
-CODE := sb3_yann envs examples tests
+CODE := sb3_yann envs benchmarks experiments examples tests
 
 .DEFAULT_GOAL := help
 .PHONY: help demo paper bench test check format clean
@@ -20,10 +20,10 @@ demo: $(STAMP)  ## run the example, examples/cstr.py
 	@$(PY) examples/cstr.py
 
 paper: $(STAMP)  ## run the paper's experiments, hours (make paper ARGS="--quick" for minutes)
-	@PYTHONPATH="$(CURDIR)/examples" OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m paper $(ARGS)
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m experiments $(ARGS)
 
 bench: $(STAMP)  ## measure the speed, ten minutes (make bench ARGS="--quick" for one)
-	@PYTHONPATH="$(CURDIR)/examples" OMP_NUM_THREADS=1 $(PY) -m bench $(ARGS)
+	@OMP_NUM_THREADS=1 $(PY) -m benchmarks $(ARGS)
 
 test: $(STAMP)  ## run the tests, side by side (make test ARGS="-n 0 -k name" for pytest alone)
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \

@@ -5,7 +5,6 @@ policy alias ``"YannPolicy"`` with TD3 and DDPG.
 """
 
 import sb3_yann_envs
-from sb3_yann.actor_critic import YannActor, YannCritic
 from sb3_yann.audit import CostAudit, CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import (
@@ -19,9 +18,10 @@ from sb3_yann.control import (
     identify,
 )
 from sb3_yann.guard import Decision, ImprovementGuard, restore_accepted
-from sb3_yann.observations import AffineObservation
-from sb3_yann.policies import YannPolicy
-from sb3_yann.problems import register_problem
+from sb3_yann.policy.actor_critic import YannActor, YannCritic
+from sb3_yann.policy.observations import AffineObservation
+from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.problem_registry import register_problem
 from sb3_yann_envs import ActionRepeat
 
 __version__ = "0.1.0"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.policies import YannPolicy
+from sb3_yann.policy.policies import YannPolicy
 
 
 class NoActionNoise(BaseCallback):

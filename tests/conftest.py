@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from online_mpc import OnlineMPC
 
+from online_mpc import OnlineMPC
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann_envs import problems
 

@@ -6,9 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import LinearPlant, two_input_mpc
-from general_problems import servo
 from gymnasium.utils.env_checker import check_env
 
+from general_problems import servo
 from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC
 from sb3_yann.wrappers import (
     MeasuredDisturbance,

@@ -141,7 +141,7 @@ def run(request, tmp_path_factory) -> Run:
 
 
 def test_a_trained_model_loads_without_solving_its_problem_again(run, monkeypatch) -> None:
-    monkeypatch.delattr("sb3_yann.control.mpc.solve_explicit")
+    monkeypatch.delattr("sb3_yann.control.mpc.linear_mpc.solve_explicit")
     model = run.model()
     mpc = model.policy.problem
     assert model.num_timesteps == EPISODE[run.env_id]

@@ -9,11 +9,11 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._checks import as_factor
 from sb3_yann.audit.causes import Cause, likely_cause
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.audit.sample import FEWEST, Array, Sample
-from sb3_yann.policies import YannPolicy
+from sb3_yann.policy._checks import as_factor
+from sb3_yann.policy.policies import YannPolicy
 
 
 class CostAudit(BaseCallback):

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg
 
-from sb3_yann.control._validation import Array
-from sb3_yann.control.linear_model import LinearModel
+from sb3_yann._validation import Array
+from sb3_yann.control.model.linear_model import LinearModel
 
 
 def riccati(

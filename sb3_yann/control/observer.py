@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
+from sb3_yann._validation import Array, as_array, to_float
 from sb3_yann.control import lqr
-from sb3_yann.control._problem_arguments import as_outputs
-from sb3_yann.control._validation import Array, as_array, to_float
-from sb3_yann.control.linear_model import LinearModel
+from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.mpc._arguments import as_outputs
 
 
 class DisturbanceObserver:

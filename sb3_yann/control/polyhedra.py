@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from sb3_yann.control._validation import Array
+from sb3_yann._validation import Array
 
 # DAQP ends up to 1e-6 from the largest ball: below this it must not end so early.
 THIN = 1e-5

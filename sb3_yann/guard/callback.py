@@ -14,14 +14,14 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.guard.chance import chance_untouched
-from sb3_yann.guard.checks import check_between, check_not_nested, check_whole
-from sb3_yann.guard.plant import PlantTrials
-from sb3_yann.guard.record import Decision, GuardState, write_csv
+from sb3_yann.guard.actor_checkpoint import Snapshot
+from sb3_yann.guard.plant_acceptance import PlantTrials
+from sb3_yann.guard.preconditions import check_between, check_not_nested, check_whole
 from sb3_yann.guard.restoring import restore_accepted
-from sb3_yann.guard.simulator import SimulatorTrials
-from sb3_yann.guard.snapshot import Snapshot
-from sb3_yann.policies import YannPolicy
+from sb3_yann.guard.rng import chance_untouched
+from sb3_yann.guard.simulator_acceptance import SimulatorTrials
+from sb3_yann.guard.state import Decision, GuardState, write_csv
+from sb3_yann.policy.policies import YannPolicy
 
 
 class ImprovementGuard(BaseCallback):
@@ -48,7 +48,7 @@ class ImprovementGuard(BaseCallback):
     **On a plant alone** (``env=None``) the training episodes decide. The actor learns for
     ``trial_episodes`` episodes, then rests for as many, of which all are played by one and the same
     policy. It is accepted if it costs less than the accepted policy did, by a one-sided test of
-    size ``significance`` (:func:`sb3_yann.guard.judging.probability_of_chance`: an analysis of
+    size ``significance`` (:func:`sb3_yann.guard.statistics.probability_of_chance`: an analysis of
     covariance on the cost that the linear model predicts for each start), and if none of its
     episodes costs far more than these explain. A violation at any time, a parameter that is no
     finite number, or a change of the actor while it rests, brings the accepted policy back at once;

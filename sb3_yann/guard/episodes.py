@@ -11,10 +11,10 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann.evaluation import Episodes, Predictor, evaluate
-from sb3_yann.guard.chance import chance_untouched
-from sb3_yann.guard.judging import Paired
-from sb3_yann.guard.snapshot import Snapshot
+from sb3_yann.evaluation.episodes import Episodes, Predictor, evaluate
+from sb3_yann.guard.actor_checkpoint import Snapshot
+from sb3_yann.guard.rng import chance_untouched
+from sb3_yann.guard.statistics import Paired
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_yann.guard.record import GuardState
-from sb3_yann.policies import YannPolicy
+from sb3_yann.guard.state import GuardState
+from sb3_yann.policy.policies import YannPolicy
 
 
 def restore_accepted(model: BaseAlgorithm) -> None:

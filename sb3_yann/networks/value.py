@@ -211,7 +211,9 @@ class AfterstateValue(nn.Module):
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
         if self.compiles and theta_and_action.device.type == "cpu":
-            from sb3_yann.networks.compiled_value import value_on_processor  # compiled once
+            from sb3_yann.networks._kernels.afterstate_value import (
+                value_on_processor,  # compiled once
+            )
 
             return value_on_processor(self, theta_and_action)
         theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
@@ -222,7 +224,7 @@ class AfterstateValue(nn.Module):
 
     def compiled_with_fixed_weights(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q where :attr:`compiles`, with a gradient by the rows, but not by the weights."""
-        from sb3_yann.networks.compiled_value import value_on_processor
+        from sb3_yann.networks._kernels.afterstate_value import value_on_processor
 
         return value_on_processor(self, theta_and_action, fixed=True)
 

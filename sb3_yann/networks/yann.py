@@ -9,8 +9,8 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_yann.control._validation import Array
-from sb3_yann.control.piecewise_affine import PiecewiseAffine
+from sb3_yann._validation import Array
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
 
@@ -117,7 +117,7 @@ class YannLayer(nn.Module):
         """
         fixed = theta.device.type == "cpu" and not theta.requires_grad
         if fixed and self.has_its_law and self.network.compiles:
-            from sb3_yann.networks.compiled_layer import layer_on_processor  # compiled once
+            from sb3_yann.networks._kernels.yann_layer import layer_on_processor  # compiled once
 
             return layer_on_processor(self, theta)
         region, inside = self.locate(theta)

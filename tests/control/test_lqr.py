@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sample_problems import DOUBLE_INTEGRATOR, input_bounds_only
 from scipy import optimize
 
+from sample_problems import DOUBLE_INTEGRATOR, input_bounds_only
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.control import lqr
 from sb3_yann_envs import problems

@@ -8,10 +8,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from guard_samples import STEPS, Slide, build, make_guard, train
 from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import DDPG
 
+from guard_samples import STEPS, Slide, build, make_guard, train
 from sb3_yann import ImprovementGuard
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [

@@ -7,6 +7,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
+
 from guard_samples import (
     REGION,
     RIGHT,
@@ -22,7 +24,6 @@ from guard_samples import (
     train,
     verdicts,
 )
-from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
 
 FIRST = 1_000_000
 

@@ -6,6 +6,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG
+
 from guard_samples import (
     LAW,
     LEFT,
@@ -23,10 +25,8 @@ from guard_samples import (
     train,
     verdicts,
 )
-from stable_baselines3 import DDPG
-
 from sb3_yann import restore_accepted
-from sb3_yann.evaluation import evaluate
+from sb3_yann.evaluation.episodes import evaluate
 
 FIRST = 1_000_000
 """The first of the guard's own seeds."""

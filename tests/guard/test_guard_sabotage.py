@@ -6,6 +6,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG, TD3
+
 from guard_samples import (
     LEFT,
     MPC,
@@ -28,10 +30,8 @@ from guard_samples import (
     verdicts,
     worse,
 )
-from stable_baselines3 import DDPG, TD3
-
 from sb3_yann import ImprovementGuard
-from sb3_yann.evaluation import evaluate
+from sb3_yann.evaluation.episodes import evaluate
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
 SABOTAGE = {

@@ -7,6 +7,9 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.vec_env import DummyVecEnv
+
 from guard_samples import (
     RIGHT,
     STEPS,
@@ -26,11 +29,8 @@ from guard_samples import (
     train,
     verdicts,
 )
-from stable_baselines3 import DDPG, TD3
-from stable_baselines3.common.vec_env import DummyVecEnv
-
 from sb3_yann import ImprovementGuard
-from sb3_yann.guard.judging import Paired
+from sb3_yann.guard.statistics import Paired
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
 

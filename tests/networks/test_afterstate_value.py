@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch as th
 from numpy.typing import NDArray
-from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
 from scipy import linalg
 
+from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
 from sb3_yann.networks import AfterstateValue, LinearPrediction, QuadraticStateActionValue
 from sb3_yann.networks.value import PredictionModel
 

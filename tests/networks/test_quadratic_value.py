@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch as th
 from numpy.typing import NDArray
-from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
 
+from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
 from sb3_yann.networks import QuadraticStateActionValue, YannLayer
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])

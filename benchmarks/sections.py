@@ -1,0 +1,76 @@
+"""The sections of the benchmark, in order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch as th
+
+from benchmarks import evaluation, exactness, gpu, memory, networks, offline, simulators
+from benchmarks.problems import PROBLEMS, SMALLEST, Problem
+from benchmarks.records import Bench, Figure, show, timed
+from benchmarks.timing import Array
+
+TITLES = {
+    evaluation.ONE: "The law in numpy, one point",
+    evaluation.MANY: "The law in numpy, 256 points",
+    networks.FORWARD_ONE: "Actor in torch, batch of 1, without gradient",
+    networks.FORWARD_MANY: "Actor in torch, batch of 256, without gradient",
+    networks.PREDICT: "model.predict of one observation",
+    networks.TRAIN: "One training step of DDPG, batch of 256",
+    offline.SECTION: "Offline solution",
+    exactness.SECTION: "Exactness",
+    simulators.SECTION: "Environments",
+    memory.SECTION: "Memory",
+    gpu.SECTION: "Processor and CUDA device",
+}
+PerProblem = Callable[[Bench, Problem], None]
+EACH: dict[str, PerProblem] = {
+    "law": evaluation.law,
+    "actor": networks.actor,
+    "train": networks.training,
+    "solve": offline.offline,
+    "exact": exactness.exactness,
+    "memory": memory.memory,
+}
+ENVS, GPU = "env", "gpu"
+NAMES = (*EACH, ENVS, GPU)
+
+
+def run(bench: Bench, names: Sequence[str]) -> None:
+    """Run some of the sections, and print the tables as they come."""
+    problems = [SMALLEST] if bench.quick else PROBLEMS
+    for name in names:
+        before, began = set(bench.figures.sections()), time.perf_counter()
+        if name == ENVS:
+            simulators.simulators(bench)
+        elif name == GPU:
+            _devices(bench, problems)
+        else:
+            for problem in problems:
+                EACH[name](bench, problem)
+        for section in bench.figures.sections():
+            if section not in before:
+                show(bench.figures, section, TITLES[section], bench.console)
+        bench.console.print(f"{name}: {time.perf_counter() - began:.0f} s\n")
+
+
+def _devices(bench: Bench, problems: Sequence[Problem]) -> None:
+    """Measure on a CUDA device too, where there is one."""
+    if not th.cuda.is_available():
+        bench.console.print("No CUDA device: the section gpu is skipped.")
+        return
+    for problem in (problems[0], problems[-1]):
+        found: dict[tuple[str, int], Array] = {}
+        for what, device, batch, seconds in gpu.measure(problem.law, bench.watch):
+            row = f"{problem.regions:,} regions, {what}, {device}"
+            bench.figures.add(timed(gpu.SECTION, f"batch of {batch:,}", {row: seconds}))
+            if what == gpu.BACKWARD:
+                found[device, batch] = seconds
+        first = gpu.pays_from(found)
+        text = "never" if first is None else f"from a batch of {first:,}"
+        row = f"{problem.regions:,} regions: where cuda is faster"
+        column = f"batch of {gpu.BATCHES[0]:,}"
+        bench.figures.add([Figure(gpu.SECTION, row, column, np.zeros(1), "text", text)])

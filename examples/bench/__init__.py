@@ -1,1 +1,0 @@
-"""How fast it is, beside what there is to compare with: ``python -m bench``."""

@@ -1,1 +1,0 @@
-"""The paper's experiments, with more seeds and more to compare with: ``python -m paper``."""

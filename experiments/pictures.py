@@ -1,0 +1,124 @@
+"""Learning curves, and what the learning cost, as one PNG for each plant."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+from numpy.typing import NDArray
+
+from experiments.measures import MPC, OURS
+from experiments.runner import Outcome, Run
+
+Array = NDArray[np.float64]
+
+# Okabe and Ito's colours, told apart with any colour vision; ours is always the first.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+STYLES = ("-", "--", "-.", ":")
+MARKERS = "osD^vPX"
+
+
+def save_pictures(outcomes: Mapping[Run, Outcome], folder: Path) -> dict[str, Path]:
+    """Save ``results-<plant>.png`` for each plant with an MPC and a learner, and return them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    saved: dict[str, Path] = {}
+    for plant in dict.fromkeys(run.plant for run in outcomes):
+        of_plant = {run: outcome for run, outcome in outcomes.items() if run.plant == plant}
+        fixed = {run.learner: out for run, out in of_plant.items() if run.episodes == 0}
+        learners = _learners(of_plant)
+        if MPC in fixed and learners:
+            words = re.sub(r"[^\w]+", "-", plant).strip("-").lower()
+            saved[plant] = folder / f"results-{words}.png"
+            _picture(plant, learners, fixed).savefig(saved[plant], dpi=120)
+    return saved
+
+
+def _learners(outcomes: Mapping[Run, Outcome]) -> dict[str, list[Outcome]]:
+    """Return the runs of each learner, ours first; its variants have a table and no curve."""
+    found: dict[str, list[Outcome]] = {}
+    for run in sorted(outcomes, key=lambda run: run.learner != OURS):
+        if run.episodes and (run.learner == OURS or not run.learner.startswith(OURS)):
+            found.setdefault(run.learner, []).append(outcomes[run])
+    return found
+
+
+def _picture(
+    plant: str, learners: Mapping[str, list[Outcome]], fixed: Mapping[str, Outcome]
+) -> Figure:
+    figure = Figure(figsize=(14, 4.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    curves, closer, costs = figure.subplots(1, 3)
+    base = float(fixed[MPC].test_costs[-1].mean())
+    tested = {name: _tests(runs, base) for name, runs in learners.items()}
+    excess = {name: _excess(runs, base) for name, runs in learners.items()}
+    for k, name in enumerate(learners):
+        label = f"{name} ({len(learners[name])} seeds)"
+        _band(curves, *tested[name], k, label)
+        _band(closer, *tested[name], k, label)
+        _band(costs, *excess[name], k, label)
+    for k, (name, outcome) in enumerate(fixed.items()):
+        level = float(outcome.test_costs[-1].mean()) / base
+        style = {"color": "black", "linestyle": STYLES[1 + k % 3], "linewidth": 1}
+        for axes in (curves, closer):
+            axes.axhline(level, label=name, zorder=1, **style)
+    costs.axhline(0, color="black", linewidth=1, label="as the MPC", zorder=1)
+    gap = 1 - min(1.0, *(float(fixed[name].test_costs[-1].mean()) / base for name in fixed))
+    closer.set_ylim(1 - 1.3 * (gap or 0.1), 1 + 0.7 * (gap or 0.1))
+    _scales(curves, costs, tested, excess)
+    curves.set(title=f"{plant}: test cost", ylabel="mean test cost / that of the MPC")
+    closer.set(title="the same, around the MPC", ylabel="mean test cost / that of the MPC")
+    costs.set(title="what the learning cost", ylabel="excess cost so far / one episode of the MPC")
+    for axes in (curves, closer, costs):
+        axes.set_xlabel("training episodes")
+        axes.grid(alpha=0.3)
+    handles, labels = curves.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _tests(runs: list[Outcome], base: float) -> tuple[Array, Array]:
+    """Return the checkpoints that all seeds share, and their relative costs (seeds, k)."""
+    shared = reduce(np.intersect1d, [run.checkpoints for run in runs])
+    means = [run.test_costs[np.isin(run.checkpoints, shared)].mean(axis=1) for run in runs]
+    return shared.astype(float), np.array(means) / base
+
+
+def _excess(runs: list[Outcome], base: float) -> tuple[Array, Array]:
+    length = min(len(run.training_costs) for run in runs)
+    more = [(run.training_costs - run.training_mpc_costs)[:length] for run in runs]
+    sums = np.cumsum(np.reshape(more, (len(runs), length)), axis=1) / base
+    return np.arange(length + 1.0), np.hstack([np.zeros((len(runs), 1)), sums])
+
+
+def _band(axes: Axes, x: Array, y: Array, k: int, label: str) -> None:
+    """Draw the median over the seeds, and the band from the first to the third quartile."""
+    low, middle, high = np.quantile(y, [0.25, 0.5, 0.75], axis=0)
+    color, style = COLORS[k % len(COLORS)], STYLES[k % len(STYLES)]
+    marker = {"marker": MARKERS[k % len(MARKERS)], "markersize": 4, "markevery": 0.12}
+    axes.plot(x, middle, label=label, color=color, linestyle=style, zorder=9 - k, **marker)
+    axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+
+
+def _scales(
+    curves: Axes,
+    costs: Axes,
+    tested: Mapping[str, tuple[Array, Array]],
+    excess: Mapping[str, tuple[Array, Array]],
+) -> None:
+    """Use logarithmic axes where one learner would flatten the others."""
+    medians = np.concatenate([np.median(y, axis=0) for _, y in tested.values()])
+    if np.all(medians > 0) and medians.max() > 5 * medians.min():
+        curves.set_yscale("log")
+        curves.yaxis.set_major_formatter("{x:g}")
+        curves.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.2, 0.6)))
+    ends = [abs(float(np.median(y[:, -1]))) for _, y in excess.values()]
+    if max(ends) > 5:
+        costs.set_yscale("symlog", linthresh=1)
+        costs.yaxis.set_major_formatter("{x:g}")

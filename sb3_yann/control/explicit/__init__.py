@@ -1,0 +1,1 @@
+"""The multi-parametric QP solved off line, with a certificate."""

@@ -1,0 +1,89 @@
+"""The multi-parametric quadratic program that a linear MPC is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+
+
+@dataclass(frozen=True, eq=False)
+class ParametricQP:
+    """``min_U 1/2 U'HU + (F theta + c)'U`` with ``G U <= w + S theta``, for theta in a box.
+
+    Attributes
+    ----------
+    H : ndarray, shape (v, v)
+        Positive definite.
+    F : ndarray, shape (v, n)
+    c : ndarray, shape (v,)
+    G : ndarray, shape (rows, v)
+    w : ndarray, shape (rows,)
+    S : ndarray, shape (rows, n)
+    theta_min, theta_max : ndarray, shape (n,)
+    n_slacks : int, default 0
+        How many of the last variables are slacks of soft constraints, and no inputs.
+    """
+
+    H: Array
+    F: Array
+    c: Array
+    G: Array
+    w: Array
+    S: Array
+    theta_min: Array
+    theta_max: Array
+    n_slacks: int = 0
+
+    def solve(self, theta: Array) -> Array | None:
+        """Return the optimal U (v,) at one theta (n,) from DAQP, or None where none is feasible."""
+        return self.solve_with_multipliers(theta)[0]
+
+    def solve_with_multipliers(self, theta: Array) -> tuple[Array | None, Array]:
+        """Return the optimal U (v,), or None, and the multipliers of all rows (rows,)."""
+        import daqp
+
+        H, G, fixed, lower, sense = self._arrays
+        upper = self.w + self.S @ theta
+        if fixed.size:  # bounds of theta alone
+            if upper[fixed].min() < -1e-11:
+                return None, np.zeros(upper.size)
+            upper[fixed] = 1.0
+        U, _, status, info = daqp.solve(
+            H, self.F @ theta + self.c, G, upper, lower, sense, primal_tol=1e-11
+        )
+        return (np.asarray(U) if status == 1 else None), np.asarray(info["lam"])
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc]]:
+        """What DAQP asks for at every theta: H, G, the rows without U, no bounds, no options."""
+        rows = len(self.w)
+        return (
+            np.ascontiguousarray(self.H),
+            np.ascontiguousarray(self.G),
+            np.flatnonzero(~np.any(self.G, axis=1)),
+            np.full(rows, -1e30),
+            np.zeros(rows, dtype=np.intc),
+        )
+
+    def scaled(self, center: Array, half: Array, reach: Array) -> ParametricQP:
+        """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows."""
+        size = np.mean(np.diag(self.H) * reach**2)
+        G, S = self.G * reach, self.S * half
+        length = np.linalg.norm(np.hstack([G, S]), axis=1)
+        length[length == 0] = 1.0
+        return ParametricQP(
+            H=self.H * np.outer(reach, reach) / size,
+            F=self.F * np.outer(reach, half) / size,
+            c=(self.c + self.F @ center) * reach / size,
+            G=G / length[:, None],
+            w=(self.w + self.S @ center) / length,
+            S=S / length[:, None],
+            theta_min=(self.theta_min - center) / half,
+            theta_max=(self.theta_max - center) / half,
+            n_slacks=self.n_slacks,
+        )

@@ -1,0 +1,89 @@
+"""The critical regions of a quadratic program from ppopt, the reference for our own search."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.control.explicit.budget import Watch
+from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.polyhedra import Region
+
+
+def ppopt_regions(program: ParametricQP, watch: Watch) -> list[Region]:
+    """Return the critical regions of a program with unit rows whose box is the unit box.
+
+    They come from ppopt's combinatorial graph search (Arnström et al.,
+    https://arxiv.org/abs/2404.05511) with GLPK and DAQP. ppopt tells its regions only at the end,
+    so the number of regions is looked at only then.
+    """
+    n = program.F.shape[1]
+    box_A, box_b = np.vstack([np.eye(n), -np.eye(n)]), np.ones(2 * n)
+    if not np.any(program.G):  # nothing binds U, which ppopt does not take
+        watch.count()
+        return [_unconstrained(program, box_A, box_b)]
+
+    # Rows without U bound theta: with them in the constraints ppopt's active sets degenerate.
+    moving = np.any(program.G, axis=1) | ~np.any(program.S, axis=1)
+    from ppopt.mp_solvers import mpqp_combi_graph
+    from ppopt.mpqp_program import MPQP_Program
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # feasibility was checked, with a clearer message
+        problem = MPQP_Program(
+            A=program.G[moving],
+            b=program.w[moving, None],
+            c=program.c[:, None],
+            H=program.F,
+            Q=program.H,
+            A_t=np.vstack([box_A, -program.S[~moving]]),
+            b_t=np.concatenate([box_b, program.w[~moving]])[:, None],
+            F=program.S[moving],
+            solver=_watched_solver(watch),
+        )
+        found = mpqp_combi_graph.solve(problem).critical_regions
+    watch.count(len(found))
+    rows = _rows_of(program, problem)
+    return [
+        Region(
+            tuple(sorted(int(rows[k]) for k in one.active_set)),
+            one.A,
+            one.b.ravel(),
+            one.E.astype(float),  # with one parameter they are whole numbers
+            one.f.ravel().astype(float),
+        )
+        for one in found
+    ]
+
+
+def _unconstrained(program: ParametricQP, box_A: Array, box_b: Array) -> Region:
+    law: Array = -np.linalg.solve(program.H, np.column_stack([program.F, program.c])).astype(float)
+    A, b = np.vstack([box_A, -program.S]), np.concatenate([box_b, program.w])
+    length = np.linalg.norm(A, axis=1)
+    A, b = A[length > 0] / length[length > 0, None], b[length > 0] / length[length > 0]
+    return Region((), law[:, :-1], law[:, -1], A, b)
+
+
+def _watched_solver(watch: Watch) -> Any:
+    """Return ppopt's solvers without Gurobi, which its defaults want, ended at the time limit."""
+    from ppopt.solver import Solver
+
+    class Watched(Solver):  # type: ignore[misc]
+        def solve_lp(self, *args: Any, **kwargs: Any) -> Any:
+            watch.tick()
+            return super().solve_lp(*args, **kwargs)
+
+    return Watched({"lp": "glpk", "qp": "daqp"})
+
+
+def _rows_of(program: ParametricQP, problem: Any) -> NDArray[np.intp]:
+    """Return which row of the program each row is that ppopt has kept."""
+    ours = np.column_stack([program.G, -program.S, program.w])
+    theirs = np.column_stack([problem.A, -problem.F, problem.b])
+    distance = np.abs(theirs[:, None] - ours[None]).max(axis=2)
+    first = np.argmax(distance < 1e-9 + distance.min(axis=1, keepdims=True), axis=1)
+    return np.asarray(first)

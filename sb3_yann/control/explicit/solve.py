@@ -1,0 +1,187 @@
+"""Solves a multi-parametric quadratic program off line, and checks the answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import optimize
+
+from sb3_yann._validation import Array
+from sb3_yann.control.explicit import law_cache
+from sb3_yann.control.explicit.budget import ExplicitLimitError, Limits, Watch
+from sb3_yann.control.explicit.certificate import ExplicitSolutionError, check
+from sb3_yann.control.explicit.facet_walk import walk
+from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.polyhedra import Region
+
+__all__ = [
+    "SOLVERS",
+    "ExplicitLimitError",
+    "ExplicitSolutionError",
+    "Limits",
+    "ParametricQP",
+    "solve_explicit",
+]
+
+SOLVERS = {"walk": walk, "ppopt": ppopt_regions}
+
+# A law that took less, in seconds, is not worth a file in the cache.
+WORTH_KEEPING = 0.5
+
+
+def solve_explicit(
+    program: ParametricQP,
+    u_min: Array,
+    u_max: Array,
+    outside: str,
+    solver: str = "walk",
+    limits: Limits = Limits(),  # noqa: B008 (it is frozen)
+) -> PiecewiseAffine:
+    """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
+
+    The regions are in the order of their active sets, fewest constraints first, so that a problem
+    always gives the same law. A law that took long is kept on disk
+    (:mod:`sb3_yann.control.explicit.law_cache`) and read from there the next time.
+
+    Parameters
+    ----------
+    program : ParametricQP
+    u_min, u_max : ndarray, shape (m,)
+        The input range, in which the tolerances are measured; infinite where there is none.
+    outside : {"nearest", "zero"}
+        See :class:`PiecewiseAffine`.
+    solver : {"walk", "ppopt"}
+        Our walk from facet to facet (:mod:`sb3_yann.control.explicit.facet_walk`), or ppopt's
+        combinatorial graph search, which takes tens of times longer above a hundred regions.
+    limits : Limits
+        When to give up.
+
+    Raises
+    ------
+    ValueError
+        If the box of parameters is not bounded, or hardly any parameter in it is feasible.
+    ExplicitLimitError
+        If a limit is reached.
+    ExplicitSolutionError
+        If the solution fails its check.
+    """
+    if solver not in SOLVERS:
+        raise ValueError(f"solver = {solver!r} must be one of {tuple(SOLVERS)}.")
+    _require_box(program)
+    units = _Units(program, u_min, u_max)
+    key = law_cache.cache_key(program, u_min, u_max, outside, solver)
+    law = law_cache.load_law(key)
+    if law is not None:
+        if units.agree(law, u_min, u_max, outside):
+            return law
+        law_cache.warn_of(key, "it holds the law of another problem.")
+    _require_feasible(units.scaled)
+    with Watch(limits) as watch:
+        regions = _critical_regions(units.scaled, solver, watch)
+        try:
+            check(units.scaled, regions, units.center, units.half)
+        except ExplicitSolutionError as error:
+            if solver == "walk":
+                raise
+            raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
+        law = units.law(regions, u_min, u_max, outside)
+    if watch.seconds > WORTH_KEEPING:
+        law_cache.store_law(key, law)
+    return law
+
+
+def _critical_regions(program: ParametricQP, solver: str, watch: Watch) -> list[Region]:
+    """Return the critical regions of a program whose box is the unit box, sorted."""
+    found = SOLVERS[solver](program, watch)
+    return sorted(found, key=lambda region: (len(region.active_set), region.active_set))
+
+
+class _Units:
+    """A program in units of its box and its input range.
+
+    Tolerances of solvers are absolute: in these units they mean the same for every plant.
+    """
+
+    def __init__(self, program: ParametricQP, u_min: Array, u_max: Array) -> None:
+        self.center = (program.theta_max + program.theta_min) / 2
+        self.half = (program.theta_max - program.theta_min) / 2
+        width = (u_max - u_min) / 2
+        steps = (len(program.c) - program.n_slacks) // len(u_min)
+        reach = np.tile(np.where(np.isfinite(width), width, 1.0), steps)
+        self.reach = np.concatenate([reach, np.ones(program.n_slacks)])
+        self.program = program
+        self.scaled = program.scaled(self.center, self.half, self.reach)
+
+    def law(
+        self, regions: list[Region], u_min: Array, u_max: Array, outside: str
+    ) -> PiecewiseAffine:
+        """Return the law of the first inputs in the units of the problem."""
+        m, reach, half = len(u_min), self.reach, self.half
+        gains = np.stack([reach[:m, None] * region.gain[:m] / half for region in regions])
+        offsets = np.stack([reach[:m] * region.offset[:m] for region in regions])
+        A = np.concatenate([region.A / half for region in regions])
+        return PiecewiseAffine(
+            gains=gains,
+            offsets=offsets - gains @ self.center,
+            A=A,
+            b=np.concatenate([region.b for region in regions]) + A @ self.center,
+            starts=np.cumsum([0, *(len(region.b) for region in regions[:-1])]),
+            u_min=u_min,
+            u_max=u_max,
+            theta_min=self.program.theta_min,
+            theta_max=self.program.theta_max,
+            outside=outside,
+            disjoint=True,
+        )
+
+    def agree(self, law: PiecewiseAffine, u_min: Array, u_max: Array, outside: str) -> bool:
+        """Tell whether a law that was read is that of QPs at random points of the same box."""
+        m, n = len(u_min), len(self.center)
+        ours = (u_min, u_max, self.program.theta_min, self.program.theta_max)
+        theirs = (law.u_min, law.u_max, law.theta_min, law.theta_max)
+        if law.gains.shape[1:] != (m, n) or law.outside != outside:
+            return False
+        if not all(np.array_equal(one, other) for one, other in zip(ours, theirs, strict=True)):
+            return False
+        points = np.random.default_rng(0).uniform(-1, 1, (30, n))
+        theta = points * self.half + self.center
+        for point, u, inside in zip(points, law(theta), law.in_domain(theta), strict=True):
+            U = self.scaled.solve(point)
+            if (U is not None) != inside:
+                return False
+            if U is not None and np.max(np.abs(U[:m] - u / self.reach[:m])) > 1e-6:
+                return False
+        return True
+
+
+def _require_box(program: ParametricQP) -> None:
+    if not np.all(np.isfinite([program.theta_min, program.theta_max])):
+        raise ValueError(
+            "The law is computed over a bounded box of parameters, but theta_min = "
+            f"{program.theta_min.tolist()} and theta_max = {program.theta_max.tolist()}. Pass "
+            "finite theta_min and theta_max (or x_min and x_max), and where theta holds them, "
+            "r_min and r_max, d_min and d_max, u_min and u_max."
+        )
+
+
+def _require_feasible(program: ParametricQP) -> None:
+    """Raise unless the feasible pairs (U, theta) have an interior (largest ball, HiGHS)."""
+    v, n = program.F.shape
+    rows = np.hstack([program.G, -program.S])
+    rows = np.hstack([rows, np.linalg.norm(rows, axis=1, keepdims=True)])
+    with_room = replace(program, w=program.w - 1e-6 * rows[:, -1])
+    if with_room.solve(np.zeros(n)) is not None:  # mostly: it takes a hundredth of the time
+        return
+    bounds = [(None, None)] * v + [(-1, 1)] * n + [(None, 1)]
+    cost = np.zeros(v + n + 1)
+    cost[-1] = -1
+    ball = optimize.linprog(cost, A_ub=rows, b_ub=program.w, bounds=bounds)
+    if ball.status != 0 or ball.x[-1] < 1e-9:
+        raise ValueError(
+            "The MPC problem is infeasible: no theta in its box (theta_min, theta_max) has inputs "
+            "that keep every bound with room to spare. Widen x_min/x_max, u_min/u_max or the "
+            "terminal set."
+        )

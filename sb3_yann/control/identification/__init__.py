@@ -1,0 +1,1 @@
+"""Linear models from a plant's log."""

@@ -1,0 +1,96 @@
+"""Whether the inputs of identified data act on the next state, or later."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import fdtrc
+
+from sb3_yann._validation import Array
+from sb3_yann.control.identification.least_squares import Regression
+from sb3_yann.control.identification.logs import Episode
+
+LONGEST = 10
+"""Samples after which an input is no longer looked for in the residuals."""
+CHANCE = 0.01
+"""Probability with which an input without effect passes for one that has an effect."""
+FOLLOWS = 0.25
+"""Correlation of residuals with an earlier input from which on a delay is named. Sensor noise, too,
+leaves some, as the state is then known better with the inputs that led to it."""
+
+
+def input_notes(
+    found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]
+) -> list[str]:
+    """Return, for inputs and disturbances that have no effect or a late one, what is to be done."""
+    n, m, d = sizes
+    names = [f"u[{i}]" for i in range(m)] + [f"d[{i}]" for i in range(d)]
+    delays, notes = _delays(found, episodes, sizes), []
+    for j, (name, (lag, correlation)) in enumerate(zip(names, delays, strict=True)):
+        idle = _chance(found, n, n + j) > CHANCE
+        late = (
+            f"the residuals follow {name} of {lag} steps before (correlation {correlation:.2f}): "
+            f"it acts {lag} samples late. Append its last {lag} values to the state of each row."
+        )
+        if idle and lag:
+            notes.append(f"{name} has no effect that can be told from 0, and {late}")
+        elif lag:
+            notes.append(late[0].upper() + late[1:])
+        elif idle:
+            notes.append(
+                f"{name} has no effect on the next state that can be told from 0. Is it delayed by "
+                "more than the log shows, too small beside the noise, or not what the plant got?"
+            )
+    return notes
+
+
+def _chance(found: Regression, n: int, column: int) -> float:
+    """Return the probability of a column as large as this one where all its entries are zero.
+
+    Hotelling's T-squared test of the whole column: the residuals of the states are correlated.
+    """
+    floor = np.diag((1e-10 * np.maximum(found.spread[:n], np.finfo(float).tiny)) ** 2)
+    effect = found.coefficients[:, column] / max(found.factors[column], np.finfo(float).tiny)
+    square = float(effect @ np.linalg.solve(found.covariance + floor, effect))
+    freedom = found.degrees_of_freedom - n + 1
+    if freedom < 1:
+        return 0.0  # too little is known for a verdict
+    return float(fdtrc(n, freedom, square * freedom / (n * found.degrees_of_freedom)))
+
+
+def _delays(
+    found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]
+) -> list[tuple[int, float]]:
+    """Return the lag that the residuals follow most, and how much, 0 where they follow none.
+
+    Each earlier input counts as far as the regressors of the step do not tell it.
+    """
+    best = [(0, 0.0)] * (sizes[1] + sizes[2])
+    for lag in range(1, LONGEST + 1):
+        longer = [episode for episode in episodes if len(episode) > lag]
+        steps = sum(len(episode) - lag for episode in longer)
+        if steps <= 4 * found.centre.size:
+            break
+        now = np.concatenate([episode.regressors[lag:] for episode in longer])
+        residuals = np.concatenate([episode.states[1 + lag :] for episode in longer])
+        residuals = residuals - found.predict(now)
+        if np.all(np.std(residuals, axis=0) <= 1e-9 * found.spread[: sizes[0]]):
+            break  # nothing but rounding
+        past = np.concatenate([episode.driven[:-lag] for episode in longer])
+        for j, size in enumerate(_correlations(now - found.centre, residuals, past)):
+            if size > max(best[j][1], FOLLOWS, 5 / np.sqrt(steps)):
+                best[j] = (lag, float(size))
+    return best
+
+
+def _correlations(known: Array, residuals: Array, past: Array) -> Array:
+    """Return the largest correlation of each past input with a residual, without what is known."""
+    spread = np.std(known, axis=0)
+    basis = np.column_stack([np.ones(len(known)), known / np.where(spread > 0, spread, 1.0)])
+    orthonormal = np.linalg.qr(basis)[0]
+
+    def rest(values: Array) -> Array:
+        left = values - orthonormal @ (orthonormal.T @ values)
+        size, before = np.linalg.norm(left, axis=0), np.linalg.norm(values, axis=0)
+        return np.asarray(np.where(size > 1e-6 * before, left / np.where(size > 0, size, 1), 0.0))
+
+    return np.asarray(np.max(np.abs(rest(residuals).T @ rest(past)), axis=0))

@@ -1,0 +1,67 @@
+"""Where an identified plant rests, as far as the data tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.control.identification.least_squares import Regression
+
+FAR = 5.0
+"""Spreads from the mean of the data beyond which a model is extrapolated."""
+SURE = 5.0
+"""Standard errors above which a direction does not integrate: more than in other tests, since those
+of an integrator are not normally distributed (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
+
+
+def operating_point(
+    found: Regression, sizes: tuple[int, int, int], given: Sequence[Array | None]
+) -> Array:
+    """Return the state, inputs and disturbances (n+m+d,) where the fitted plant rests."""
+    n, m, _ = sizes
+    x, u, d = np.split(found.centre, [n, n + m])
+    start = np.concatenate([x if given[0] is None else given[0], u, d])
+    for place, value in ((slice(n, n + m), given[1]), (slice(n + m, None), given[2])):
+        if value is not None:
+            start[place] = value
+    # The state gives way, or the inputs where the state is given; nothing where both are.
+    if given[0] is not None and given[1] is not None:
+        return start
+    scale = np.where(found.spread > 0, found.spread, 1.0)
+    moves = (found.coefficients - np.eye(n, scale.size)) * scale / scale[:n, None]
+    doubt = found.standard_errors * scale / scale[:n, None]
+    drift = (found.predict(start[None])[0] - start[:n]) / scale[:n]
+    states, inputs = slice(0, n), slice(n, n + m)
+    if given[0] is not None:
+        start[inputs] += scale[inputs] * _way(moves[:, inputs], drift, doubt[:, inputs])
+        return start
+    if given[1] is None:  # no state holds what integrates, only the inputs do
+        left, _, _, known = _directions(moves[:, states], doubt[:, states])
+        free = left[:, ~known].T
+        errors = np.sqrt(free**2 @ doubt[:, inputs] ** 2)
+        way = _way(free @ moves[:, inputs], free @ drift, errors)
+        start[inputs] += scale[inputs] * way
+        drift = drift + moves[:, inputs] @ way
+    start[states] += scale[states] * _way(moves[:, states], drift, doubt[:, states])
+    return start
+
+
+def _directions(moves: Array, doubt: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return the singular value decomposition, and which directions differ from an integrator."""
+    left, sizes, right = np.linalg.svd(moves, full_matrices=False)
+    errors = np.sqrt(np.sum((left.T**2 @ doubt**2) * right**2, axis=1))
+    return left, sizes, right, (sizes > SURE * errors) & (sizes > 1e-9)
+
+
+def _way(moves: Array, drift: Array, doubt: Array) -> Array:
+    """Return the way that ends the drift, along the directions of which the data are sure.
+
+    Along the others the plant rests far away if anywhere, or wherever it is. Exact equations would
+    go there, and take along those that are known well.
+    """
+    left, sizes, right, known = _directions(moves, doubt)
+    steps = -(left.T @ drift) / np.where(known, sizes, 1.0)
+    return np.asarray(right.T @ np.where(known & (np.abs(steps) <= FAR), steps, 0.0))

@@ -1,0 +1,1 @@
+"""Piecewise affine laws and the search for a region."""

@@ -1,0 +1,285 @@
+"""Compiled evaluation of a piecewise affine law: which region holds theta, and its input.
+
+A law goes in as two packed arrays (see :func:`pack`): every array that numba unpacks costs a tenth
+of a microsecond, a good part of what a whole evaluation takes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+
+if TYPE_CHECKING:
+    from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+    from sb3_yann.control.law.search_tree import SearchTree
+
+Integers = NDArray[np.int64]
+F = TypeVar("F", bound=Callable[..., Any])
+
+HEADER = 8
+"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero outside, disjoint."""
+
+ROWS = 2
+"""Floats before the packed arrays: how far outside counts as inside, and which slacks tie."""
+
+SURELY_INSIDE = 1e-9
+"""With a slack of at least this, no region that the tree left out, or no other one at all if they
+are disjoint, can be as good."""
+
+CLEAR = 1e-6
+"""So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
+
+
+def _sources() -> str:
+    """Return a hash of all files with compiled functions, which call each other."""
+    package = Path(__file__).parents[2]
+    files = [*package.glob("control/law/_kernels.py"), *package.glob("control/law/search_tree.py")]
+    files += sorted(package.glob("networks/_kernels/*.py"))
+    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
+
+
+SOURCES = _sources()
+
+
+def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
+    """Return a decorator that compiles a function for the given types, and keeps the machine code.
+
+    With types that are given nothing is ever compiled for others: those are refused. Without any
+    the function is a part of those that call it. With ``fastmath`` sums may be taken in any order,
+    several terms at a time.
+    """
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
+
+    def compile_it(function: F) -> F:
+        if not signatures or numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+            part: F = numba.njit(**options)(function)
+            return part
+        result: F
+        try:
+            result = _compile(numba.njit(**options)(function), signatures, keep=True)
+        except Exception:  # no folder to write to, a full disk, a damaged file
+            result = _compile(numba.njit(**options)(function), signatures, keep=False)
+        return result
+
+    return compile_it
+
+
+def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
+    if keep:
+        dispatcher.enable_caching()
+        # numba looks at the function's own file; what it calls may have changed in another.
+        dispatcher._cache._cache_file._source_stamp = SOURCES
+    for signature in signatures:
+        dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    return dispatcher
+
+
+def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers]:
+    """Return a law as one array of floats and one of whole numbers, for the functions below.
+
+    Without a tree the regions are scanned one by one.
+    """
+    nodes, leaves = (len(tree.levels), len(tree.leaf_starts) - 1) if tree else (0, 0)
+    p, m, n = law.gains.shape
+    header = [n, m, p, law.n_halfspaces, nodes, leaves]
+    header += [law.outside == "zero", law.disjoint]
+    rows = np.column_stack([law.A, law.b])
+    floats: list[Any] = [(law.tolerance, law.tie_tolerance), rows, law.gains, law.offsets]
+    floats += [law.u_min, law.u_max, *((tree.normals, tree.levels) if tree else ())]
+    whole: list[Any] = [header, law.starts, [law.n_halfspaces]]
+    whole += [tree.children, tree.leaf_starts, tree.leaf_regions] if tree else []
+    return (
+        np.concatenate([np.ravel(each) for each in floats]),
+        np.concatenate([np.ravel(each) for each in whole]).astype(np.int64),
+    )
+
+
+@compiled()
+def _slack(
+    floats: Array, n: int, first: int, last: int, theta: Array, at: int, low: float
+) -> float:
+    """Return the smallest slack of rows first to last, or anything below ``low`` if it is lower."""
+    smallest = np.inf
+    for k in range(first, last):
+        row = ROWS + k * (n + 1)
+        slack = floats[row + n]
+        for j in range(n):
+            slack -= floats[row + j] * theta[at, j]
+        if slack < smallest:
+            smallest = slack
+            if smallest < low:
+                break
+    return smallest
+
+
+@compiled()
+def _scan(floats: Array, whole: Integers, theta: Array, at: int, known: float) -> tuple[int, float]:
+    """Return the first region whose smallest slack ties with the largest, and the largest.
+
+    With the slack of some region that is ``known``, most of the others are soon passed over. Where
+    regions are disjoint, the first one that surely holds theta ends the search.
+    """
+    n, p, disjoint = whole[0], whole[2], whole[7] == 1
+    best, largest, low, tied = 0, -np.inf, known - floats[1] * (1 + abs(known)), False
+    for i in range(p):
+        smallest = np.inf
+        for k in range(whole[HEADER + i], whole[HEADER + i + 1]):
+            row = ROWS + k * (n + 1)
+            slack = floats[row + n]
+            for j in range(n):
+                slack -= floats[row + j] * theta[at, j]
+            if slack < smallest:
+                smallest = slack
+                if smallest < low:
+                    break
+        if smallest < low:
+            continue
+        if disjoint and smallest >= SURELY_INSIDE:
+            return i, smallest
+        tied = True
+        if smallest > largest:
+            low = max(low, smallest - floats[1] * (1 + abs(smallest)))
+            tied = largest >= low
+            best, largest = i, smallest
+    if not tied:
+        return best, largest
+    nearly = largest - floats[1] * (1 + abs(largest))
+    for i in range(p):
+        first, last = whole[HEADER + i], whole[HEADER + i + 1]
+        if _slack(floats, n, first, last, theta, at, nearly) >= nearly:
+            return i, largest
+    return best, largest
+
+
+@compiled()
+def _leaf(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, int, float]:
+    """Return where the regions of the leaf that theta falls into begin and end in ``whole``.
+
+    With them comes the smallest distance from the hyperplanes on the way.
+    """
+    n, m, p, q, nodes, leaves = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
+    normals = ROWS + q * (n + 1) + p * m * n + p * m + 2 * m
+    levels = normals + nodes * n
+    children = HEADER + p + 1
+    node, room = 0, np.inf
+    while node >= 0:
+        side = -floats[levels + node]
+        for j in range(n):
+            side += floats[normals + node * n + j] * theta[at, j]
+        room = min(room, abs(side))
+        node = whole[children + 2 * node + (1 if side > 0 else 0)]
+    starts = children + 2 * nodes
+    regions = starts + leaves + 1
+    return regions + whole[starts - node - 1], regions + whole[starts - node], room
+
+
+@compiled()
+def _best_of_leaf(
+    floats: Array, whole: Integers, theta: Array, at: int, first: int, last: int
+) -> tuple[int, float]:
+    """Return what `_scan` does, of the regions of a leaf: those met most often come first."""
+    n, disjoint = whole[0], whole[7] == 1
+    best, largest, low, tied = -1, -np.inf, -np.inf, False
+    for k in range(first, last):
+        i = whole[k]
+        slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, at, low)
+        if slack < low:
+            continue
+        if disjoint and slack >= SURELY_INSIDE:
+            return i, slack
+        tied = True
+        if slack > largest:
+            low = max(low, slack - floats[1] * (1 + abs(slack)))
+            tied = largest >= low
+            best, largest = i, slack
+    if not tied:
+        return best, largest
+    nearly = largest - floats[1] * (1 + abs(largest))
+    for k in range(first, last):
+        i = whole[k]
+        rows = whole[HEADER + i], whole[HEADER + i + 1]
+        if i < best and _slack(floats, n, rows[0], rows[1], theta, at, nearly) >= nearly:
+            best = i
+    return best, largest
+
+
+@compiled()
+def _choose(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, float]:
+    """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite."""
+    n = whole[0]
+    for j in range(n):
+        if not np.isfinite(theta[at, j]):
+            return -1, np.nan
+    known = -np.inf
+    if whole[4] > 0:
+        first, last, room = _leaf(floats, whole, theta, at)
+        best, known = _best_of_leaf(floats, whole, theta, at, first, last)
+        if known >= SURELY_INSIDE or (known >= -floats[1] and room > CLEAR):
+            return best, known
+    return _scan(floats, whole, theta, at, known)
+
+
+@compiled()
+def input_at(floats: Array, whole: Integers, theta: Array, out: Array, at: int) -> int:
+    """Write the input at one row of theta to that of ``out``, and return the region, -1 for none.
+
+    Functions take the whole array and the row: a row on its own is an array, of which numba counts
+    who refers to it, and that costs as much as the rest.
+    """
+    n, m, p, q = whole[0], whole[1], whole[2], whole[3]
+    region, largest = _choose(floats, whole, theta, at)
+    if region < 0:
+        return -1
+    gains = ROWS + q * (n + 1)
+    offsets = gains + p * m * n
+    bounds = offsets + p * m
+    zero = whole[6] == 1 and largest < -floats[0]
+    for k in range(m):
+        u = 0.0
+        if not zero:
+            for j in range(n):
+                u += floats[gains + (region * m + k) * n + j] * theta[at, j]
+            u += floats[offsets + region * m + k]
+        u = u if u == u else 0.0  # inf - inf, far from everything
+        out[at, k] = min(max(u, floats[bounds + k]), floats[bounds + m + k])
+    return region
+
+
+@compiled("optional(float64[::1])(float64[::1], int64[::1], float64[::1])")
+def law_at(floats: Array, whole: Integers, theta: Array) -> Array | None:
+    """Return the input (m,) at one theta (n,), None where theta is not finite or too long."""
+    if len(theta) != whole[0]:
+        return None
+    out = np.empty((1, whole[1]))
+    if input_at(floats, whole, theta.reshape(1, -1), out, 0) < 0:
+        return None
+    u: Array = out[0]
+    return u
+
+
+@compiled("float64[:, ::1](float64[::1], int64[::1], float64[:, ::1])")
+def law_of_batch(floats: Array, whole: Integers, theta: Array) -> Array:
+    """Return the inputs (batch, m) at the rows of theta (batch, n), all finite."""
+    out = np.empty((len(theta), whole[1]))
+    for i in range(len(theta)):
+        input_at(floats, whole, theta, out, i)
+    return out
+
+
+@compiled("Tuple((int64[::1], float64[::1]))(float64[::1], int64[::1], float64[:, ::1])")
+def locate_batch(floats: Array, whole: Integers, theta: Array) -> tuple[Integers, Array]:
+    """Return the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
+    region, inside = np.empty(len(theta), np.int64), np.empty(len(theta))
+    for i in range(len(theta)):
+        region[i], inside[i] = _choose(floats, whole, theta, i)
+    return region, inside

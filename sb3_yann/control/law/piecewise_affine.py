@@ -1,0 +1,291 @@
+"""Piecewise affine laws on polyhedral regions: locate, evaluate, save, load."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
+from os import PathLike, fspath
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann._validation import (
+    Array,
+    ReadOnlyArrays,
+    as_array,
+    as_bounds,
+    same_fields,
+    to_float,
+)
+
+if TYPE_CHECKING:
+    from sb3_yann.control.law.search_tree import SearchTree
+
+OUTSIDE = ("nearest", "zero")
+SCAN = 4
+"""Up to this many regions are asked one by one."""
+
+MOST_PARAMETERS = 10
+"""Of more, the regions have too many vertices for a tree."""
+
+_COMPILED = ("packed", "_at")
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewiseAffine(ReadOnlyArrays):
+    """The law ``u = gains[i] theta + offsets[i]`` for theta in region i, total and bounded.
+
+    One region is chosen at every theta: the one whose smallest slack ``b - A theta`` over its own
+    half-spaces is largest, the first of them on a tie. Inside the feasible set that is a region
+    which holds theta (on a facet, one of its neighbours, where both laws agree); outside it is the
+    region that theta violates least.
+
+    Outside the feasible set, where the MPC has no solution, ``outside`` decides:
+
+    - ``"nearest"``: the affine law of the chosen region, clipped to the input bounds.
+    - ``"zero"``: no deviation of the input (clipped to the bounds), as in Braniff & Tian, where
+      no indicator of a region is active. It jumps at the border of the feasible set.
+
+    Attributes
+    ----------
+    gains : ndarray, shape (p, m, n)
+    offsets : ndarray, shape (p, m)
+    A : ndarray, shape (q, n)
+        Half-spaces ``A theta <= b`` of all regions, region after region. A slack ``b - A theta``
+        is a distance in half-widths of the box: whatever the units of theta, the law is the same.
+    b : ndarray, shape (q,)
+    starts : ndarray of int, shape (p,)
+        The first row of each region in ``A``.
+    u_min, u_max : ndarray, shape (m,)
+        Bounds of the input, infinite where there is none.
+    theta_min, theta_max : ndarray, shape (n,)
+        The box for which the law was solved; a network scales its inputs by it.
+    outside : {"nearest", "zero"}
+    disjoint : bool, default False
+        That no two regions share an interior, as `LinearMPC.explicit` checks of its laws: the
+        search then ends at the first region found to hold theta, several times as fast. It is not
+        checked here; where it is wrong, any of the regions that hold theta may be chosen.
+    """
+
+    gains: Array
+    offsets: Array
+    A: Array
+    b: Array
+    starts: NDArray[np.int64]
+    u_min: Array
+    u_max: Array
+    theta_min: Array
+    theta_max: Array
+    outside: str = "nearest"
+    disjoint: bool = False
+
+    # To find a region, more than SCAN of them are held in a tree of hyperplanes, built in a moment
+    # when it is first needed; machine code of numba searches it.
+
+    # How far outside every region a point may lie, in half-widths of the box, and still count as
+    # inside: facets of neighbours agree to rounding only.
+    tolerance = 1e-8
+
+    # Slacks that differ by less, relative to 1 + their size, tie. Outside the feasible set whole
+    # areas violate two regions alike, at a border that these share: rounding must not choose.
+    tie_tolerance = 1e-12
+
+    def __post_init__(self) -> None:
+        """Check the arrays against each other and store them as read-only float64."""
+        gains = as_array("gains", self.gains, ("p", "m", "n"))
+        p, m, n = gains.shape
+        A = as_array("A", self.A, ("q", n))
+        values = {"gains": gains, "A": A, "b": as_array("b", self.b, (len(A),))}
+        values["offsets"] = as_array("offsets", self.offsets, (p, m))
+        values["u_min"], values["u_max"] = as_bounds("u", self.u_min, self.u_max, m)
+        values["theta_min"], values["theta_max"] = as_bounds(
+            "theta", self.theta_min, self.theta_max, n
+        )
+        if self.outside not in OUTSIDE:
+            raise ValueError(f"outside = {self.outside!r} must be one of {OUTSIDE}.")
+        if not isinstance(self.disjoint, bool):
+            raise TypeError(f"disjoint = {self.disjoint!r} must be True or False.")
+        rows = as_array("starts", self.starts, (p,))
+        if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):
+            raise ValueError(
+                f"starts = {rows.tolist()} must be the first row of each region in A, which has "
+                f"{len(A)} rows: whole numbers that increase from 0 on."
+            )
+        starts = rows.astype(np.int64)
+        starts.setflags(write=False)
+        for name, value in {**values, "starts": starts}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def n_regions(self) -> int:
+        """Number of regions p."""
+        return len(self.starts)
+
+    @property
+    def n_halfspaces(self) -> int:
+        """Number of half-spaces q of all regions together."""
+        return len(self.b)
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters n."""
+        return int(self.gains.shape[2])
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs m."""
+        return int(self.gains.shape[1])
+
+    def __call__(self, theta: ArrayLike) -> Array:
+        """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n).
+
+        Raises
+        ------
+        TypeError, ValueError
+            If theta is not numeric, has another shape or holds NaN or infinite entries.
+        """
+        if getattr(theta, "ndim", 0) == 1:
+            try:
+                u = self._at(theta)
+            except TypeError:  # not float64, which is all that this was compiled for
+                u = None
+            if u is not None:
+                return u
+        from sb3_yann.control.law._kernels import law_of_batch
+
+        points = self._as_theta(theta)
+        inputs: Array = law_of_batch(*self.packed, np.atleast_2d(points))
+        return inputs if points.ndim == 2 else inputs[0]
+
+    def locate(self, theta: ArrayLike) -> NDArray[np.int64]:
+        """Return the index of the region in use at theta, one for each row of a batch."""
+        return self._choose(theta)[0]
+
+    def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
+        """Tell whether the MPC has a solution at theta, for each row of a batch."""
+        return np.asarray(self._choose(theta)[1] >= -self.tolerance)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the law to ``path`` as an ``.npz`` file of plain arrays (no pickle).
+
+        With it goes the tree that finds a region, if it has one.
+        """
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.tree is not None:
+            arrays.update({f"tree_{name}": each for name, each in vars(self.tree).items()})
+        part = f"{fspath(path)}.{os.getpid()}.part"  # another process may be writing the same
+        try:
+            with open(part, "wb") as file:
+                np.savez(file, **arrays)
+            os.replace(part, path)  # a reader never sees half a file
+        finally:
+            Path(part).unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> PiecewiseAffine:
+        """Read a law that :meth:`save` wrote.
+
+        Raises
+        ------
+        ValueError
+            If the file is not such a law.
+        """
+        try:
+            data = np.load(path, allow_pickle=False)
+            if isinstance(data, np.ndarray):
+                raise ValueError("it is a single array")
+            with data:
+                values = {field.name: data[field.name] for field in fields(cls)}
+                values |= {"outside": str(data["outside"]), "disjoint": bool(data["disjoint"])}
+                tree = {name[5:]: data[name] for name in data.files if name.startswith("tree_")}
+            law = cls(**values)
+            if tree:
+                from sb3_yann.control.law.search_tree import SearchTree
+
+                law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
+            return law
+        except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
+            raise ValueError(
+                f"{fspath(path)} does not hold a PiecewiseAffine ({error}). "
+                "Write it with law.save(path)."
+            ) from None
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether both laws have the same regions, gains and options."""
+        if not isinstance(other, PiecewiseAffine):
+            return NotImplemented
+        return same_fields(self, other, [field.name for field in fields(self)])
+
+    def __hash__(self) -> int:
+        """Return a hash that equal laws share."""
+        return hash((self.gains.tobytes(), self.b.tobytes(), self.outside))
+
+    def __repr__(self) -> str:
+        """Name the sizes."""
+        return (
+            f"PiecewiseAffine(regions={self.n_regions}, halfspaces={self.n_halfspaces}, "
+            f"theta={self.n_theta}, inputs={self.n_inputs}, outside={self.outside!r})"
+        )
+
+    def _choose(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:
+        """Return the region in use and how far inside it each point lies, negative outside."""
+        from sb3_yann.control.law._kernels import locate_batch
+
+        points = self._as_theta(theta)
+        region, inside = locate_batch(*self.packed, np.atleast_2d(points))
+        return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
+
+    @cached_property
+    def tree(self) -> SearchTree | None:
+        """The tree that finds a region; None for so few regions that a scan is as fast."""
+        bounded = np.all(np.isfinite([self.theta_min, self.theta_max]))
+        if self.n_regions <= SCAN or self.n_theta > MOST_PARAMETERS or not bounded:
+            return None
+        from sb3_yann.control.law.search_tree import build_tree
+
+        tree = build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
+        return tree if len(tree.levels) else None  # regions that no hyperplane parts
+
+    @cached_property
+    def packed(self) -> tuple[Array, NDArray[np.int64]]:
+        """The law as two arrays for compiled code, see `_kernels.pack`."""
+        from sb3_yann.control.law._kernels import pack
+
+        return pack(self, self.tree)
+
+    @cached_property
+    def _at(self) -> Callable[[Any], Array | None]:
+        from sb3_yann.control.law._kernels import law_at
+
+        return partial(law_at, *self.packed)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> PiecewiseAffine:
+        """Return the law itself, of which nothing can change."""
+        return self
+
+    def __copy__(self) -> PiecewiseAffine:
+        """Return the law itself."""
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was compiled for this process; the tree goes along, as in :meth:`save`."""
+        _ = self.tree
+        return {name: value for name, value in self.__dict__.items() if name not in _COMPILED}
+
+    def _as_theta(self, theta: ArrayLike) -> Array:
+        points = to_float("theta", theta)
+        if points.ndim not in (1, 2) or points.shape[-1] != self.n_theta:
+            raise ValueError(
+                f"theta has shape {points.shape}, expected ({self.n_theta},) "
+                f"or (batch, {self.n_theta})."
+            )
+        if not np.all(np.isfinite(points)):
+            raise ValueError("theta holds NaN or infinite entries; the law is defined for numbers.")
+        if points.flags.c_contiguous and points.flags.writeable:
+            return points
+        return points.copy(order="C")

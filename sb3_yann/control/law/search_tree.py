@@ -1,0 +1,332 @@
+"""A tree of hyperplanes that finds the region of a point without asking every region.
+
+After Tøndel, Johansen & Bemporad (2003), "Evaluation of piecewise affine control via binary search
+tree", with vertices in place of their linear programs, and leaves of a few regions each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import HalfspaceIntersection, QhullError
+
+from sb3_yann._validation import Array
+from sb3_yann.control.law._kernels import Integers, compiled
+from sb3_yann.control.polyhedra import largest_ball
+
+LEAF = 4
+"""A node with this many regions is not split further."""
+
+NODES = 2
+"""Hyperplanes for each region, at most: where regions are long and thin, every hyperplane cuts some
+of them, and trees down to the last region grow without bound."""
+
+DRAWS = 64
+"""Random points in the box for each region that tell which regions of a leaf are met most often."""
+
+CANDIDATES = 16
+"""Facets tried at a node, drawn from those of its regions."""
+
+OVERLAP = 1e-8
+"""A region that passes a hyperplane by less, in half-widths of the box, is not on its far side."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchTree:
+    """Where ``normals[k] theta <= levels[k]`` go on with ``children[k, 0]``, else with the other.
+
+    A child of -1 - j is leaf j, which lists every region that has an interior there.
+
+    Attributes
+    ----------
+    normals : ndarray, shape (nodes, n)
+    levels : ndarray, shape (nodes,)
+    children : ndarray of int, shape (nodes, 2)
+    leaf_starts : ndarray of int, shape (leaves + 1,)
+        Where each leaf begins in ``leaf_regions``.
+    leaf_regions : ndarray of int
+        Those first in which most points of the leaf lie.
+    """
+
+    normals: Array
+    levels: Array
+    children: Integers
+    leaf_starts: Integers
+    leaf_regions: Integers
+
+    def checked(self, n_theta: int, n_regions: int) -> SearchTree:
+        """Return the tree if a search of it ends in a leaf with regions that there are.
+
+        Raises
+        ------
+        ValueError
+            If it is not a tree for so many parameters and regions: compiled code does not check.
+        """
+        nodes, leaves = self.levels.size, self.leaf_starts.size - 1
+        numbers = np.arange(nodes)[:, None]
+        whole = (self.children, self.leaf_starts, self.leaf_regions)
+        sound = (
+            all(each.dtype.kind == "i" for each in whole)
+            and self.leaf_starts.ndim == self.leaf_regions.ndim == 1
+            and leaves > 0
+            and self.levels.shape == (nodes,)
+            and self.normals.shape == (nodes, n_theta)
+            and self.children.shape == (nodes, 2)
+            and nodes > 0
+            and np.all((self.children > numbers) | (self.children < 0))
+            and np.all((self.children < nodes) & (self.children >= -leaves))
+            and self.leaf_starts[0] == 0
+            and np.all(np.diff(self.leaf_starts) >= 0)
+            and self.leaf_starts[-1] == len(self.leaf_regions)
+            and np.all((self.leaf_regions >= 0) & (self.leaf_regions < n_regions))
+        )
+        if not sound:
+            raise ValueError(f"its search tree does not fit {n_regions} regions")
+        return self
+
+    @property
+    def depth(self) -> int:
+        """The largest number of hyperplanes on the way to a leaf."""
+        depth = np.zeros(len(self.children), dtype=int)
+        for node, children in enumerate(self.children):  # children come after their parents
+            depth[children[children > 0]] = depth[node] + 1
+        return int(depth.max(initial=-1)) + 1
+
+    @property
+    def largest_leaf(self) -> int:
+        """The largest number of regions in a leaf."""
+        return int(np.diff(self.leaf_starts).max())
+
+
+@dataclass(frozen=True)
+class _Polytopes:
+    """Regions by their half-spaces, row after row, and by their vertices, in a box of [-1, 1]."""
+
+    A: Array
+    b: Array
+    row_starts: Integers
+    vertices: Array
+    vertex_starts: Integers
+    middles: Array
+    radii: Array
+
+
+def build_tree(
+    A: Array, b: Array, starts: Integers, theta_min: Array, theta_max: Array
+) -> SearchTree:
+    """Return a tree for the regions of a :class:`PiecewiseAffine`, in a bounded box of theta.
+
+    It is balanced as well as a few dozen candidates at every node allow. Whether a region lies on
+    one side is seen by its vertices, of which rounding may move some: the result of a search has
+    to be checked by its slack. The draws are seeded, so that a law always gives the same tree.
+    """
+    center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
+    regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))
+    random = np.random.default_rng(0)
+    normals: list[Array] = []
+    levels: list[float] = []
+    children: list[list[int]] = []
+    leaves: list[Integers] = []
+    everything = np.arange(len(starts), dtype=np.int64)
+    # The fullest node first, and of those the oldest: a number, its parent and side.
+    waiting: list[tuple[int, int, Integers, int, int]] = [(-len(starts), 0, everything, -1, 0)]
+    most, order = NODES * len(starts), 0
+    while waiting:
+        _, _, inside, parent, side = heappop(waiting)
+        full = len(levels) >= most or len(inside) <= LEAF
+        split = None if full else _best_split(regions, inside, random)
+        if parent >= 0:
+            children[parent][side] = -1 - len(leaves) if split is None else len(levels)
+        if split is None:
+            leaves.append(np.sort(inside))
+            continue
+        row, *parts = split
+        for which, part in enumerate(parts):
+            order += 1
+            heappush(waiting, (-len(part), order, part, len(levels), which))
+        normals.append(regions.A[row])
+        levels.append(regions.b[row])
+        children.append([0, 0])
+    tree = SearchTree(
+        normals=np.array(normals).reshape(-1, len(half)),
+        levels=np.array(levels),
+        children=np.array(children, dtype=np.int64).reshape(-1, 2),
+        leaf_starts=np.cumsum([0, *map(len, leaves)]),
+        leaf_regions=np.concatenate(leaves),
+    )
+    if not levels:  # regions that no hyperplane parts
+        return tree
+    in_box = tree.normals / half
+    return replace(
+        tree,
+        normals=in_box,
+        levels=tree.levels + in_box @ center,
+        leaf_regions=_often_first(tree, regions, random),
+    )
+
+
+def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Generator) -> Integers:
+    """Return the regions of all leaves, in each of them those first that hold most of its points.
+
+    First by points drawn all over the box, then by some drawn in each region: in a large box a
+    small region may have none of the former.
+    """
+    p, n = regions.middles.shape
+    everywhere = random.uniform(-1, 1, (DRAWS * p, n))
+    which = np.repeat(np.arange(p), DRAWS // 8)
+    first, last = regions.vertex_starts[which], regions.vertex_starts[which + 1]
+    corners = regions.vertices[random.integers(first, last, (n + 1, len(which)))]
+    within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
+    all_over, in_each = (
+        _hits(
+            tree.normals,
+            tree.levels,
+            tree.children,
+            tree.leaf_starts,
+            tree.leaf_regions,
+            regions.A,
+            regions.b,
+            regions.row_starts,
+            points,
+        )
+        for points in (everywhere, within)
+    )
+    leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
+    order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
+    return np.ascontiguousarray(tree.leaf_regions[order])
+
+
+@compiled(
+    "int64[::1](float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1])"
+)
+def _hits(
+    normals: Array,
+    levels: Array,
+    children: Integers,
+    leaf_starts: Integers,
+    leaf_regions: Integers,
+    A: Array,
+    b: Array,
+    row_starts: Integers,
+    points: Array,
+) -> Integers:
+    """Return for each entry of ``leaf_regions`` how many points it is the first one to hold."""
+    hits = np.zeros(len(leaf_regions), np.int64)
+    for each in range(len(points)):
+        point, node = points[each], 0
+        while node >= 0:
+            above = np.dot(normals[node], point) > levels[node]
+            node = children[node, 1 if above else 0]
+        for k in range(leaf_starts[-1 - node], leaf_starts[-node]):
+            i = leaf_regions[k]
+            inside = True
+            for row in range(row_starts[i], row_starts[i + 1]):
+                inside = np.dot(A[row], point) <= b[row]
+                if not inside:
+                    break
+            if inside:
+                hits[k] += 1
+                break
+    return hits
+
+
+def _polytopes(A: Array, b: Array, row_starts: Integers) -> _Polytopes:
+    length = np.linalg.norm(A, axis=1)
+    length[length == 0] = 1.0
+    A, b = A / length[:, None], b / length
+    corners = [vertices(A[i:j], b[i:j]) for i, j in pairwise(row_starts)]
+    counts = np.array([len(each) for each in corners])
+    vertex_starts = np.append(0, np.cumsum(counts))
+    points = np.ascontiguousarray(np.concatenate(corners))
+    middles = np.add.reduceat(points, vertex_starts[:-1]) / counts[:, None]
+    distance = np.linalg.norm(points - np.repeat(middles, counts, axis=0), axis=1)
+    radii = np.maximum.reduceat(distance, vertex_starts[:-1])
+    return _Polytopes(A, b, row_starts, points, vertex_starts, middles, radii)
+
+
+def _best_split(
+    regions: _Polytopes, inside: Integers, random: np.random.Generator
+) -> tuple[int, Integers, Integers] | None:
+    """Return a row of A and the regions on either side, None where no row parts them well."""
+    chosen = random.choice(inside, min(CANDIDATES, len(inside)), replace=False)
+    first, last = regions.row_starts[chosen], regions.row_starts[chosen + 1]
+    rows = random.integers(np.tile(first, 2), np.tile(last, 2))
+    sides = _sides(
+        regions.vertices,
+        regions.vertex_starts,
+        regions.middles,
+        regions.radii,
+        inside,
+        regions.A[rows],
+        regions.b[rows],
+    )
+    below, above = (sides & 1).sum(axis=1), (sides >> 1).sum(axis=1)
+    larger = np.maximum(below, above)
+    best = int(np.lexsort((below + above, larger))[0])
+    if larger[best] >= len(inside):
+        return None
+    return int(rows[best]), inside[(sides[best] & 1) > 0], inside[(sides[best] >> 1) > 0]
+
+
+@compiled(
+    "uint8[:, ::1](float64[:, ::1], int64[::1], float64[:, ::1], float64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1])"
+)
+def _sides(
+    points: Array,
+    vertex_starts: Integers,
+    middles: Array,
+    radii: Array,
+    inside: Integers,
+    normals: Array,
+    levels: Array,
+) -> NDArray[np.uint8]:
+    """Return for each hyperplane and region: 1 below it, 2 above it, 3 on both sides."""
+    n = points.shape[1]
+    sides = np.zeros((len(levels), len(inside)), np.uint8)
+    for c in range(len(levels)):
+        for k in range(len(inside)):
+            i = inside[k]
+            middle = -levels[c]
+            for j in range(n):
+                middle += normals[c, j] * middles[i, j]
+            if abs(middle) >= radii[i]:
+                sides[c, k] = 1 if middle < 0 else 2
+                continue
+            side = 0
+            for vertex in range(vertex_starts[i], vertex_starts[i + 1]):
+                distance = -levels[c]
+                for j in range(n):
+                    distance += normals[c, j] * points[vertex, j]
+                side |= 1 if distance < -OVERLAP else 0
+                side |= 2 if distance > OVERLAP else 0
+            sides[c, k] = side if side else 3
+    return sides
+
+
+def vertices(A: Array, b: Array) -> Array:
+    """Return the vertices (k, n) of ``{A z <= b, -1 <= z <= 1}``, rows of unit length.
+
+    Of a set too thin for that, those of the box: it may lie anywhere.
+    """
+    n = A.shape[1]
+    rows = np.vstack([A, np.eye(n), -np.eye(n)])
+    bounds = np.concatenate([b, np.ones(2 * n)])
+    if n == 1:
+        upper = np.min(bounds[rows[:, 0] > 0] / rows[rows[:, 0] > 0, 0])
+        lower = np.max(bounds[rows[:, 0] < 0] / rows[rows[:, 0] < 0, 0])
+        return np.array([[lower], [upper]])
+    inner, _ = largest_ball(rows, bounds)
+    try:
+        found = HalfspaceIntersection(np.column_stack([rows, -bounds]), inner).intersections
+        found = found[np.all(np.isfinite(found), axis=1)]
+    except QhullError:
+        found = np.empty((0, n))
+    if len(found) <= n:
+        return np.stack(np.meshgrid(*[[-1.0, 1.0]] * n), axis=-1).reshape(-1, n)
+    return np.asarray(np.clip(found, -1, 1))

@@ -1,0 +1,1 @@
+"""Linear models from equations and simulators, by finite differences."""

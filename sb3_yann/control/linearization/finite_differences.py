@@ -1,0 +1,148 @@
+"""Jacobians by central differences that notice kinks, jumps and rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_yann._validation import Array
+
+LEVELS = 6
+RATIO = 4.0
+"""Each point is approached with `LEVELS` steps, each this much shorter than the one before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Jacobian:
+    """A Jacobian and what its differences showed.
+
+    Attributes
+    ----------
+    value : ndarray, shape (r, c)
+        The derivatives; those that are not above their own error are exactly zero.
+    error : ndarray, shape (r, c)
+        Estimated error of each.
+    dropped : float
+        The largest entry that was set to zero for being below its error.
+    steps : ndarray, shape (c,)
+        The longest step in each coordinate.
+    change : ndarray, shape (c,)
+        How much the difference over the longest step is off, as a fraction of the largest entry
+        of the column: how nonlinear the function is within that step. NaN if it has no value there.
+    """
+
+    value: Array
+    error: Array
+    dropped: float
+    steps: Array
+    change: Array
+
+
+class NotDifferentiableError(ValueError):
+    """The function has a kink, a jump or no value next to the point, in coordinate `column`."""
+
+    def __init__(self, column: int, reason: str, no_value: bool = False) -> None:
+        super().__init__(reason)
+        self.column, self.no_value = column, no_value
+
+
+def jacobian(
+    f: Callable[[Array], Array],
+    point: Array,
+    steps: Array,
+    noise: Array,
+    actual: Callable[[Array], Array] = lambda z: z,
+) -> Jacobian:
+    """Return the derivatives of f at a point, with Richardson's extrapolation and its error.
+
+    The difference over h and the one over h/4 give an extrapolation that is exact up to fourth
+    order in h. Of the extrapolations over ever shorter steps, each entry takes the one that agrees
+    best with its neighbour: Ridders (1982), *Advances in Engineering Software* 4, 75-76. SciPy
+    has such a method too (`scipy.differentiate`, from 1.15 on) but for smooth functions only: a
+    simulator clips and wraps, which has to be noticed rather than averaged.
+
+    Parameters
+    ----------
+    f : callable
+        Takes an array of shape (c,), returns one of shape (r,); NaN where it has no value.
+    point, steps : ndarray, shape (c,)
+        Where, and the longest step in each coordinate.
+    noise : ndarray, shape (r,)
+        The error of each value of f (rounding).
+    actual : callable, optional
+        The point that f really takes for one it is given, e.g. that in float32.
+
+    Raises
+    ------
+    NotDifferentiableError
+        If f has a kink or a jump at the point, or no value next to it.
+    """
+    centre = f(actual(point))
+    columns = [
+        _column(f, centre, actual(point), i, steps[i], noise, actual) for i in range(point.size)
+    ]
+    value, error, change = (np.array(part) for part in zip(*columns, strict=True))
+    lost = np.abs(value) <= error
+    return Jacobian(
+        value=np.where(lost, 0.0, value).T,
+        error=error.T,
+        dropped=float(np.max(np.abs(value[lost]), initial=0.0)),
+        steps=steps,
+        change=change,
+    )
+
+
+def _column(
+    f: Callable[[Array], Array],
+    centre: Array,
+    point: Array,
+    i: int,
+    longest: float,
+    noise: Array,
+    actual: Callable[[Array], Array],
+) -> tuple[Array, Array, float]:
+    """Return the derivatives with respect to coordinate i, their errors, and the change."""
+    ahead, behind, spans = [], [], []
+    for level in range(LEVELS):
+        offset = np.zeros(point.size)
+        offset[i] = longest / RATIO**level
+        above, below = actual(point + offset), actual(point - offset)
+        if above[i] <= point[i] or below[i] >= point[i]:
+            break  # the step is lost in the rounding of the point
+        ahead.append((f(above) - centre) / (above[i] - point[i]))
+        behind.append((centre - f(below)) / (point[i] - below[i]))
+        spans.append(above[i] - below[i])
+    one, other, span = np.array(ahead), np.array(behind), np.array(spans)[:, None]
+    valid = np.all(np.isfinite(one) & np.isfinite(other), axis=1) if spans else np.zeros(0, bool)
+    if np.count_nonzero(valid) < 3:
+        raise NotDifferentiableError(i, "it has no finite value on one of its sides", True)
+    far = bool(valid[0])
+    one, other, span = one[valid], other[valid], span[valid]
+    slope = (one + other) / 2
+    # Unequal sides (a point that is rounded) would leave a first-order error in the mean.
+    value, error = _extrapolated(slope, RATIO**2, 2 * noise / span)
+    kink, doubt = _extrapolated(one - other, RATIO, 4 * noise / span)
+    steepest = np.max(np.abs(value) + np.abs(kink) / 2)
+    floor = np.max(2 * noise / span[0])
+    if np.any((np.abs(kink) > 5 * doubt) & (np.abs(kink) > 0.01 * steepest)):
+        raise NotDifferentiableError(i, "its slopes to the two sides differ (a kink)")
+    if np.max(error) > max(0.2 * np.max(np.abs(value)), 20 * floor):
+        raise NotDifferentiableError(i, "its slope has no limit for short steps (a jump or noise)")
+    scale = np.max(np.abs(value))
+    change = np.max(np.abs(slope[0] - value)) / scale if scale > 0 else 0.0
+    return value, error, float(change) if far else np.nan
+
+
+def _extrapolated(levels: Array, power: float, rounding: Array) -> tuple[Array, Array]:
+    """Return the limits for short steps, entry by entry, and their errors.
+
+    `levels` has shape (k, r), its error falls by the factor `power` from each to the next;
+    `rounding`, of the same shape, is what rounding does to it.
+    """
+    limits = (power * levels[1:] - levels[:-1]) / (power - 1)
+    errors = np.abs(np.diff(limits, axis=0)) + 2 * rounding[1:-1]
+    best = np.argmin(errors, axis=0)
+    rows = np.arange(levels.shape[1])
+    return limits[best, rows], errors[best, rows]

@@ -1,0 +1,290 @@
+"""Linear models from equations and from simulators."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import Array, as_array, as_positive, to_float
+from sb3_yann.control.linearization.finite_differences import (
+    Jacobian,
+    NotDifferentiableError,
+    jacobian,
+)
+from sb3_yann.control.linearization.simulator import (
+    Simulator,
+    borrow,
+    connect,
+    sample_time,
+    to_vector,
+)
+from sb3_yann.control.linearization.steady_state import check_rest, steady_state
+from sb3_yann.control.model.linear_model import LinearModel
+
+if TYPE_CHECKING:
+    from sb3_yann.control.linearization.simulator import Maker
+
+LONGEST = 0.01
+"""The longest step of a difference, in parts of the scale of its coordinate."""
+LONGEST_SINGLE = 0.05
+"""The same where states are read in float32."""
+STEADY = 1e-3
+"""How far a steady state may move in one sample, in parts of its scale."""
+MOVES = 0.01
+"""The same in parts of its own size, from which on a state smaller than 1 is warned of."""
+SHORTER = 64.0
+"""How much shorter steps become where a function has no value next to the point."""
+
+
+def linearise_dynamics(
+    f: Callable[..., ArrayLike],
+    x_ss: ArrayLike,
+    u_ss: ArrayLike,
+    dt: float,
+    d_ss: ArrayLike | None,
+    scale: ArrayLike | None = None,
+) -> LinearModel:
+    """See `LinearModel.from_dynamics`."""
+    x, u = as_array("x_ss", x_ss, ("n",)), as_array("u_ss", u_ss, ("m",))
+    d = as_array("d_ss", [] if d_ss is None else d_ss, ("d",))
+    dt = as_positive("dt", dt)
+    n, inputs = x.size, x.size + u.size
+    names, extra = ("(x, u)", "") if d_ss is None else ("(x, u, d)", f", d_ss = {d.tolist()}")
+    if not callable(f):
+        raise TypeError(f"f = {f!r} must be a function {names} -> dx/dt.")
+
+    def rate(point: Array) -> Array:
+        parts = (point[:n], point[n:inputs], *([] if d_ss is None else [point[inputs:]]))
+        return np.asarray(f(*parts), dtype=np.float64)
+
+    arguments = (x, u) if d_ss is None else (x, u, d)
+    called = "f(x_ss, u_ss)" if d_ss is None else "f(x_ss, u_ss, d_ss)"
+    point = np.concatenate([x, u, d])
+    size = _dynamics_scale(point, n, scale)
+    drift = dt * np.abs(as_array(called, f(*arguments), (n,)))
+    if np.any(drift > STEADY * size[:n]):
+        raise ValueError(
+            f"x_ss = {x.tolist()}, u_ss = {u.tolist()}{extra} is no steady state: within one "
+            f"sample of {dt:g} the state would move by {drift.tolist()}, with a scale of "
+            f"{size[:n].tolist()}. Solve f{names} = 0 first, e.g. with scipy.optimize.root."
+        )
+    if scale is None and np.any((drift > MOVES * np.abs(x)) & (x != 0) & (drift > 1e-8)):
+        warnings.warn(
+            f"Within one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
+            f"{drift.tolist()}: little beside 1, and much beside itself. Pass scale=..., how far "
+            "each state moves in use, to have it checked.",
+            stacklevel=3,
+        )
+    rounding = np.finfo(float).eps * np.maximum(np.abs(x), size[:n]) / dt
+    found = _differences(rate, point, LONGEST * size, rounding, (n, u.size))
+    A, B, E = np.split(found.value, [n, inputs], axis=1)
+    model = LinearModel.from_continuous(A, B, dt, x, u, E, d)
+    return model.with_notes(*_idle_inputs(model.B), *_curvature(found, (n, u.size)))
+
+
+def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
+    """Return how far each state, input and disturbance moves in use, from what is given of it."""
+    size: Array = np.maximum(np.abs(point), 1.0)
+    if scale is None:
+        return size
+    given = to_float("scale", scale)
+    given = as_array("scale", given, (point.size if given.shape == point.shape else n,))
+    if np.any(given <= 0):
+        raise ValueError(f"scale = {given.tolist()} must be above 0 in each entry.")
+    size[: given.size] = given
+    return size
+
+
+def linearise_env(
+    env: Maker,
+    state: ArrayLike | None,
+    action: ArrayLike | None,
+    dt: float | None,
+    set_state: Callable[[Any, Array], object] | None,
+    get_state: Callable[[Any], ArrayLike] | None,
+    scale: ArrayLike | None,
+) -> LinearModel:
+    """See `LinearModel.from_env`."""
+    borrowed = borrow(env)
+    try:
+        step_time = sample_time(borrowed.env, dt)
+        simulator = Simulator(borrowed, set_state, get_state)
+        x, u = _partly_known("state", state), _partly_known("action", action)
+        model = _linearise(simulator, x, u, step_time, scale)
+        return model.with_notes(f"What was stepped: {borrowed.note}.")
+    finally:
+        borrowed.close()
+
+
+def _linearise(
+    simulator: Simulator, x: Array | None, u: Array | None, dt: float, scale: ArrayLike | None
+) -> LinearModel:
+    """Connect to the simulator, find where it rests, and take the differences there."""
+    middle, width = _actions(simulator.env.action_space)
+    if u is None:
+        # With a state to hold, the action is what holds it; with none, that at mid range.
+        u = middle if x is None else np.full(middle.size, np.nan)
+    elif u.shape != middle.shape:
+        raise ValueError(f"action has shape {u.shape}, expected {middle.shape}.")
+    u_start = np.where(np.isnan(u), middle, u)
+    x_start, size = connect(simulator, x, u_start, scale)
+    scales = np.concatenate([size, width])
+    n = size.size
+    free = np.isnan(np.concatenate([np.full(n, np.nan) if x is None else x, u]))
+    point = steady_state(simulator, np.concatenate([x_start, u_start]), free, scales)
+    found = _differentiate(simulator, point, scales)
+    if not np.any(free):
+        check_rest(simulator, point, found.value, scales)
+    A, B = found.value[:, :n], found.value[:, n:]
+    idle = _idle_inputs(B)
+    return LinearModel(A, B, dt, point[:n], point[n:]).with_notes(
+        *idle,
+        "Linearised by central differences over one step. The state was set by "
+        f"{simulator.setter} and read from {simulator.reader}.",
+        f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
+        "for and the others given or taken from the middle of the action space.",
+        *_remarks(simulator, point),
+        *_curvature(found, (n, u.size)),
+    )
+
+
+def _actions(space: Any) -> tuple[Array, Array]:
+    """Return the middle of a Box of actions and half its width; 0 and 1 where it is unbounded."""
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    bounded = (low > -1e6) & (high < 1e6)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    return (low + high) / 2, (high - low) / 2
+
+
+def _partly_known(name: str, value: ArrayLike | None) -> Array | None:
+    """Return ``value`` as an array of shape (n,) in which NaN stands for unknown entries."""
+    if value is None:
+        return None
+    array = to_float(name, value)
+    if array.ndim != 1 or np.any(np.isinf(array)):
+        raise ValueError(f"{name} = {value!r} must be a vector of finite numbers, or NaN to solve.")
+    return array
+
+
+def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian:
+    """Return the Jacobian (n, n+m) of the next state with respect to state and action.
+
+    Raises
+    ------
+    ValueError
+        If an action lies on its bound, or the plant has a kink or a jump at the point.
+    """
+    space = simulator.env.action_space
+    n = scale.size - space.shape[0]
+    room = np.minimum(point[n:] - space.low, space.high - point[n:]).astype(np.float64)
+    if np.any(room <= 1e-6 * scale[n:]):
+        i = int(np.argmin(room / scale[n:]))
+        raise ValueError(
+            f"action = {point[n:].tolist()}: entry {i} lies on its bound in {space}, where the "
+            "plant cannot be linearised. Choose an operating point with room to both sides."
+        )
+
+    def step(point: Array) -> Array:
+        return simulator.next_state(point[:n], point[n:])
+
+    def actual(point: Array) -> Array:
+        return np.concatenate([point[:n], simulator.actual(point[n:])])
+
+    # What is read may be float32: then every number read is one, and steps have to be longer.
+    readings = [step(point), step(point + LONGEST / 3 * scale * (np.arange(scale.size) < n))]
+    single = all(np.array_equal(r, r.astype(np.float32), equal_nan=True) for r in readings)
+    longest = (LONGEST_SINGLE if single else LONGEST) * scale
+    spacing = np.finfo(np.float32 if single else np.float64).eps
+    rounding = spacing * np.maximum(np.abs(readings[0]), longest[:n])
+    longest[n:] = np.minimum(longest[n:], room)
+    return _differences(step, point, longest, rounding, (n, room.size), actual)
+
+
+def _differences(
+    f: Callable[[Array], Array],
+    point: Array,
+    steps: Array,
+    rounding: Array,
+    sizes: tuple[int, int],
+    actual: Callable[[Array], Array] = lambda z: z,
+) -> Jacobian:
+    """Return the Jacobian; name the coordinate where there is none."""
+    shortest, steps = steps / SHORTER**2, steps.copy()
+    while True:
+        try:
+            return jacobian(f, point, steps, rounding, actual)
+        except NotDifferentiableError as error:
+            i, reason = error.column, str(error)
+            if not error.no_value or steps[i] <= shortest[i]:
+                break
+            steps[i] /= SHORTER
+    raise ValueError(
+        f"The plant cannot be linearised at {point.tolist()}: along {_name(i, sizes)}, {reason}, "
+        f"with steps up to {steps[i]:.3g}. Clipping, dry friction and angles that wrap do this, "
+        "and steps that are too long: pass scale=..., how far each state moves in use. Or move "
+        "the operating point off it, or fit data that reach across it: LinearModel.from_data."
+    )
+
+
+def _idle_inputs(B: Array) -> list[str]:
+    """Return, and warn of, the inputs that no entry of B has an effect of."""
+    idle = np.flatnonzero(~np.any(B, axis=0))
+    if not idle.size:
+        return []
+    note = (
+        f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. If the plant has a "
+        "delay of the input, or an actuator, the inputs on their way belong into the state; an "
+        "input that really does nothing is to be left out."
+    )
+    warnings.warn(note, stacklevel=5)
+    return [note]
+
+
+def _remarks(simulator: Simulator, point: Array) -> list[str]:
+    """Return what a user of the model has to know of the environment."""
+    n = point.size - simulator.env.action_space.shape[0]
+    simulator.next_state(point[:n], point[n:])
+    remarks = []
+    if simulator.ended:
+        remarks.append("The environment terminates the episode at the operating point.")
+    seen, state = to_vector(simulator.observation), simulator.read()
+    if seen is None or state is None or not _same(seen, state):
+        remarks.append(
+            "The observation is not this state. A policy needs a wrapper that makes it so."
+        )
+    return remarks
+
+
+def _same(one: Array, other: Array) -> bool:
+    """Tell whether two states agree in float32."""
+    return one.shape == other.shape and np.allclose(one, other, rtol=1e-5, atol=1e-5)
+
+
+def _curvature(found: Jacobian, sizes: tuple[int, int]) -> list[str]:
+    """Return notes on entries that were dropped, and where the plant bends soon."""
+    notes = []
+    if found.dropped > 0:
+        notes.append(
+            f"Derivatives that are not above their rounding error (at most {found.dropped:.1e}) "
+            "were set to zero."
+        )
+    for i, change in enumerate(found.change):
+        if not change <= 0.1:
+            what = "it has no value there" if np.isnan(change) else f"slopes differ by {change:.0%}"
+            notes.append(
+                f"The plant is not smooth within {found.steps[i]:.3g} of the operating point "
+                f"along {_name(i, sizes)}: {what}."
+            )
+        elif not np.any(found.value[:, i]) and not sizes[0] <= i < sum(sizes):
+            notes.append(f"{_name(i, sizes)} has no effect on the next state.")
+    return notes
+
+
+def _name(i: int, sizes: tuple[int, int]) -> str:
+    """Return ``x[i]``, ``u[i]`` or ``d[i]`` for a coordinate of the stacked point."""
+    n, m = sizes
+    return f"x[{i}]" if i < n else f"u[{i - n}]" if i < n + m else f"d[{i - n - m}]"

@@ -1,0 +1,1 @@
+"""Linear models about an operating point."""

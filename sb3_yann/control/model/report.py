@@ -1,0 +1,217 @@
+"""What a linear model says of its plant, in words and numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from sb3_yann._validation import Array
+from sb3_yann.control.model.linear_model import LinearModel
+
+ON_CIRCLE = 1e-6
+"""Poles this close to a magnitude of 1 neither grow nor die out."""
+UNREACHED = 1e-6
+HARDLY_REACHED = 1e-3
+"""Directions that the inputs move this much less than the others."""
+DOUBLINGS = 16
+"""Of the horizon over which the reach of the inputs is summed: 65,536 samples."""
+GONE = 0.1
+"""Time constants, in samples, below which a mode counts as a delay: gone within one sample."""
+SLOW_SAMPLING, FAST_SAMPLING = 1.0, 50.0
+"""Time constants, in samples, below which a mode is sampled too slowly, and above too fast.
+
+Åström and Wittenmark (*Computer-Controlled Systems*, on the choice of the sampling period) advise 4
+to 10 samples in the rise time of the closed loop."""
+
+
+def describe(model: LinearModel) -> str:
+    """Return the report of `LinearModel.report`."""
+    blocks = (
+        _head(model),
+        ["Poles:", *(f"  {line}" for line in _modes(model))],
+        [_stability(model)],
+        _reach(model),
+        _scaling(model),
+        _sampling(model),
+        [f"Note: {note}" for note in model.notes],
+    )
+    return "\n".join(line for block in blocks for line in block)
+
+
+def _head(model: LinearModel) -> list[str]:
+    sizes = ", ".join(
+        f"{count} {word}{'s' * (count != 1)}"
+        for count, word in (
+            (model.n_states, "state"),
+            (model.n_inputs, "input"),
+            (model.n_disturbances, "measured disturbance"),
+        )
+    )
+    point = f"x_ss = {_vector(model.x_ss)}, u_ss = {_vector(model.u_ss)}"
+    if model.n_disturbances:
+        point += f", d_ss = {_vector(model.d_ss)}"
+    return [f"Linear model: {sizes}, sampled every {model.dt:.4g}.", f"Operating point: {point}."]
+
+
+def poles(model: LinearModel) -> Array:
+    """Return the eigenvalues of A, the largest first, one of each complex pair."""
+    values = np.linalg.eigvals(model.A)
+    values = values[values.imag >= 0]
+    return np.asarray(values[np.argsort(-np.abs(values), kind="stable")])
+
+
+def time_constant(pole: complex) -> float:
+    """Return the samples in which a mode changes by the factor e, negative where it grows."""
+    size = abs(pole)
+    if abs(size - 1) <= ON_CIRCLE:
+        return np.inf
+    return float(-1 / np.log(size)) if size > 0 else 0.0
+
+
+def _modes(model: LinearModel) -> list[str]:
+    return [f"{_number(pole)}: {_mode(pole, model.dt)}" for pole in poles(model)]
+
+
+def _mode(pole: complex, dt: float) -> str:
+    """Return how the mode of a pole moves."""
+    constant = time_constant(pole)
+    lasting = f"{abs(constant) * dt:.4g} ({abs(constant):.3g} samples)"
+    if np.isinf(constant):
+        words = "integrates" if abs(pole - 1) <= ON_CIRCLE else "neither grows nor decays"
+    elif abs(constant) < GONE:
+        words = "gone within one sample"
+    else:
+        words = f"{'decays' if constant > 0 else 'grows'}, time constant {lasting}"
+    angle = abs(np.angle(pole))
+    if angle > 1e-9 and abs(pole) > 1e-9:
+        period = 2 * np.pi / angle
+        words += f", oscillates with period {period * dt:.4g} ({period:.3g} samples)"
+    return words
+
+
+def _stability(model: LinearModel) -> str:
+    sizes = np.abs(np.linalg.eigvals(model.A))
+    growing = int(np.sum(sizes > 1 + ON_CIRCLE))
+    largest = f"the largest magnitude of a pole is {np.max(sizes):.6g}"
+    if growing:
+        return f"Unstable: {growing} of {sizes.size} poles grow, {largest}."
+    if np.max(sizes) >= 1 - ON_CIRCLE:
+        return f"On the border of stability: some modes do not decay, {largest}."
+    return f"Stable: {largest}."
+
+
+def reach(model: LinearModel) -> tuple[Array, Array]:
+    """Return how far the inputs move the state along independent directions, and these (n, n).
+
+    They are the principal axes of the controllability Gramian, each state in units of how far it
+    is moved itself, so that units do not count; the largest first, relative to it. The rows of
+    the second are the directions. The rank of ``control.ctrb`` would mislead: with short samples
+    A is near the identity and ``B, AB, ...`` are nearly parallel for any plant. `control.gram`
+    needs slycot and a stable A; here A is scaled down, which changes no reachable subspace.
+    """
+    A, B = model.A, model.B / np.maximum(np.linalg.norm(model.B, axis=0), np.finfo(float).tiny)
+    radius = np.max(np.abs(np.linalg.eigvals(A)))
+    if radius > 0.999:
+        A = A * (0.999 / radius)
+    gramian, power = B @ B.T, A
+    # Smith's doubling: a sum of positive terms, which units cannot spoil as they do an equation.
+    for _ in range(DOUBLINGS):
+        gramian, power = gramian + power @ gramian @ power.T, power @ power
+    moved = np.sqrt(np.maximum(np.diag(gramian), 0))
+    # What rounding leaves of a state that no input moves is not to be blown up.
+    still = moved <= 1e-12 * np.max(moved, initial=0)
+    unit = np.where(still, 1.0, moved)
+    gramian[still, :] = gramian[:, still] = 0.0
+    sizes, axes = np.linalg.eigh(gramian / np.outer(unit, unit))
+    sizes = np.sqrt(np.maximum(sizes[::-1], 0))
+    return sizes / (sizes[0] or 1.0), axes[:, ::-1].T / unit
+
+
+def _reach(model: LinearModel) -> list[str]:
+    """Return how well the inputs reach the states."""
+    sizes, axes = reach(model)
+    rank = int(np.sum(sizes > UNREACHED))
+    lines = [f"Controllability: the inputs reach {rank} of {sizes.size} directions of the state."]
+    if rank < sizes.size:
+        lines += [f"  Nothing moves {_direction(axis)}." for axis in axes[rank:]]
+    elif sizes[-1] < HARDLY_REACHED:
+        lines.append(f"  {_direction(axes[-1])} is moved {sizes[-1]:.1e} times as far as the most.")
+    idle = np.flatnonzero(~np.any(model.B, axis=0))
+    return lines + [f"  u[{i}] has no effect." for i in idle]
+
+
+def _scaling(model: LinearModel) -> list[str]:
+    """Return how the units fit each other."""
+    _, (factors, _) = linalg.matrix_balance(model.A, permute=False, separate=True)
+    spread = np.max(factors) / np.min(factors)
+    effects = np.abs(model.B[model.B != 0])
+    lines = []
+    if effects.size:
+        lines.append(
+            f"Scaling: entries of B from {np.min(effects):.2g} to {np.max(effects):.2g}; balancing "
+            f"A would rescale its states by up to {spread:.3g} against each other"
+            + (". Consider other units." if spread > 1e3 else ".")
+        )
+    n = model.n_states
+    if np.min(np.abs(np.linalg.eigvals(model.A) - 1)) > ON_CIRCLE:
+        gain = np.linalg.solve(np.eye(n) - model.A, model.B)
+        gain[np.abs(gain) < 1e-9 * np.max(np.abs(gain))] = 0.0
+        # Where the plant is not stable, the state rests there but does not go there.
+        stable = np.all(np.abs(poles(model)) < 1 - ON_CIRCLE)
+        verb = "moves the state to" if stable else "would balance the state at"
+        lines += [f"  Held at 1, u[{j}] {verb} {_vector(g)}." for j, g in enumerate(gain.T)]
+    return lines
+
+
+def _sampling(model: LinearModel) -> list[str]:
+    """Return how the sampling time fits the plant."""
+    found = poles(model)
+    constants = [abs(time_constant(pole)) for pole in found]
+    moving = [constant for constant in constants if GONE <= constant < np.inf]
+    angles = [abs(np.angle(pole)) for pole in found if abs(pole) > 1e-9]
+    period = 2 * np.pi / max(angles) if angles and max(angles) > 1e-9 else np.inf
+    if not moving and np.isinf(period):
+        return ["Sampling: the plant only integrates or delays: no time scale to compare dt with."]
+    lines = []
+    if moving:
+        lines.append(
+            f"Sampling: the fastest time constant is {min(moving):.3g} samples, the slowest "
+            f"{max(moving):.3g}. A horizon of as many steps sees such a mode change e-fold."
+        )
+    else:
+        lines.append(f"Sampling: the shortest oscillation takes {period:.3g} samples.")
+    if min(moving, default=np.inf) < SLOW_SAMPLING or period < 6:
+        lines.append(
+            "  Slow: a mode dies out or swings round within a few samples, where no input can act "
+            "on it. Sample faster, or leave it out of the model."
+        )
+    elif min(moving, default=0.0) > FAST_SAMPLING and period > 2 * np.pi * FAST_SAMPLING:
+        lines.append(
+            "  Fast: even the fastest mode hardly moves in one sample, and a short horizon sees "
+            "little of the plant. Sample slower, or lengthen the horizon."
+        )
+    return lines
+
+
+def _direction(axis: Array) -> str:
+    """Return a combination of states in words."""
+    largest = axis[np.argmax(np.abs(axis))]
+    terms = [
+        f"{value / largest:+.3g} x[{i}]"
+        for i, value in enumerate(axis)
+        if abs(value) > 1e-3 * abs(largest)
+    ]
+    return terms[0].split()[1] if len(terms) == 1 else " ".join(terms).removeprefix("+")
+
+
+def _number(value: complex) -> str:
+    if value.imag == 0:
+        return f"{value.real:.4f}"
+    return f"{value.real:.4f} ± {abs(value.imag):.4f}i"
+
+
+def _vector(values: NDArray[np.floating[Any]]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

@@ -1,0 +1,96 @@
+"""Models of python-control as the models of this package."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import as_positive
+from sb3_yann.control.model.linear_model import LinearModel
+
+
+def take_statespace(
+    system: Any,
+    dt: float | None,
+    x_ss: ArrayLike | None,
+    u_ss: ArrayLike | None,
+    disturbances: Sequence[int | str],
+    d_ss: ArrayLike | None,
+) -> LinearModel:
+    """See `LinearModel.from_statespace`."""
+    import control
+
+    if not isinstance(system, control.StateSpace):
+        raise TypeError(
+            f"system = {system!r} must be a control.StateSpace. Convert a transfer function with "
+            "control.ss(...), but mind that its states then are no measured quantities."
+        )
+    step, continuous = _sample_time(system.dt, dt)
+    chosen = [_input(system, each) for each in disturbances]
+    inputs = [i for i in range(system.ninputs) if i not in chosen]
+    make = LinearModel.from_continuous if continuous else LinearModel
+    B = np.asarray(system.B)
+    model = make(system.A, B[:, inputs], step, x_ss, u_ss, B[:, chosen], d_ss)
+    sampled = "sampled with a zero-order hold" if continuous else "taken as it is, discrete"
+    return model.with_notes(f"From a control.StateSpace, {sampled}.", *_dropped(system, model))
+
+
+def _sample_time(own: float | bool | None, dt: float | None) -> tuple[float, bool]:
+    """Return the sampling time, and whether the system is continuous.
+
+    python-control's time bases: 0 is continuous, True discrete without a sampling time, None not
+    stated.
+    """
+    if own is None:
+        raise ValueError(
+            "system.dt is None: it does not say whether it is continuous or discrete. Make it with "
+            "control.ss(A, B, C, D, 0) or control.ss(A, B, C, D, dt)."
+        )
+    given = None if dt is None else as_positive("dt", dt)
+    if own is not True and own > 0:
+        if given is not None and not np.isclose(given, own, rtol=1e-9, atol=0):
+            raise ValueError(
+                f"dt = {given:g}, but the system is discrete with dt = {own:g}, and is not sampled "
+                "anew. Leave dt out, or pass the continuous system."
+            )
+        return float(own), False
+    if given is None:
+        kind = "discrete, without a sampling time" if own is True else "continuous"
+        raise ValueError(f"dt is not given, and the system is {kind}. Pass dt=...")
+    return given, own is not True
+
+
+def _input(system: Any, name: int | str) -> int:
+    """Return the number of an input."""
+    labels = list(system.input_labels)
+    if isinstance(name, str) and name in labels:
+        return int(labels.index(name))
+    if isinstance(name, (int, np.integer)) and 0 <= name < len(labels):
+        return int(name)
+    raise ValueError(f"disturbances: {name!r} is no input, neither number nor label, of {labels}.")
+
+
+def _dropped(system: Any, model: LinearModel) -> list[str]:
+    """Return notes on what of the outputs is lost."""
+    import control
+
+    C, n = np.asarray(system.C), model.n_states
+    notes = []
+    if np.any(system.D):
+        notes.append("D is not zero and was dropped: the outputs it feeds are not used.")
+    if np.array_equal(C, np.eye(n)):
+        return notes
+    rank = int(np.linalg.matrix_rank(control.obsv(model.A, C)))
+    notes.append(
+        "C is not the identity and was dropped: the law depends on the states, not on the outputs "
+        "y = C x. Measure the states, or estimate them by an observer"
+        + (
+            "."
+            if rank == n
+            else f", which is not possible: the outputs show {rank} of {n} directions of the state."
+        )
+    )
+    return notes

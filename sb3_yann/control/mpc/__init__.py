@@ -1,0 +1,1 @@
+"""The linear MPC problem, its cost and its value."""

@@ -1,0 +1,169 @@
+"""The invariant terminal set: where the terminal gain keeps every hard constraint for ever."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import optimize
+
+from sb3_yann._validation import Array
+from sb3_yann.control import lqr
+
+if TYPE_CHECKING:
+    from sb3_yann.control.mpc.linear_mpc import LinearMPC
+
+MARGIN = 0.01
+"""How far inside the bounds steady states must lie, relative to the bounds."""
+MAX_ROWS, MAX_STEPS = 200, 500
+
+
+def invariant_set(problem: LinearMPC) -> tuple[Array, Array]:
+    """Return F (rows, n_theta) and g (rows,): the maximal output admissible set F theta <= g.
+
+    From a theta in it the law ``v = -K z``, with K the gain of the terminal cost, keeps all hard
+    bounds of x, u, y and the rate for ever on the model, with r and d constant. Gilbert & Tan,
+    Linear systems with state and control constraints, IEEE Trans. Autom. Control 36 (1991): the
+    bounds after 0, 1, 2 ... steps are added until those of the next step are all redundant, which
+    linear programs tell. In ``x_min`` and ``x_max`` this keeps the law in its domain for ever; a
+    box of states given by ``theta_min`` and ``theta_max`` alone is no bound of the predictions, and
+    may still be left. Soft bounds do not count.
+
+    r and d never decay; as in Section V there, their steady states must lie inside the bounds by a
+    little, here one percent of each bound, which makes the number of steps finite. The box of r and
+    d is taken for granted, and so are the bounds of ``u_prev``.
+
+    Raises
+    ------
+    ValueError
+        If the gain does not stabilise the model, the origin is not inside all bounds, the number
+        of steps is not finite within 500, or there are more than 200 rows.
+    """
+    errors, parts = problem.errors, problem.parameters
+    K = lqr.gain(errors.model, errors.R, problem.terminal_cost, problem.gamma, errors.cross)
+    radius = lqr.spectral_radius(errors.model.A - errors.model.B @ K)
+    if radius >= 1:
+        raise ValueError(
+            "terminal_set='invariant' needs a terminal gain that stabilises the model, but the "
+            f"spectral radius of A - BK is {radius:.6g}. Use gamma=1, or the default terminal cost."
+        )
+    gain = errors.U - K @ errors.T
+    half = _unit(problem)
+    rows, bounds = _bounds(problem, gain)
+    A, B = problem.prediction
+    rows, closed = rows * half, (A + B @ gain) * half / half[:, None]
+    steady = rows @ _steady_projection(problem, half)
+    if np.any(bounds <= 0):
+        raise ValueError(
+            "terminal_set='invariant' needs an operating point with room to every bound, but "
+            "theta = 0 lies on or beyond a hard one. Move the bounds or the operating point."
+        )
+    granted = _granted(problem, half)
+    found = _remove_redundant(rows, bounds, *granted)
+    if parts.has_constants:
+        moving = np.any(np.abs(steady) > 1e-12, axis=1)
+        inside = (steady[moving], (1 - MARGIN) * bounds[moving])
+        found = np.vstack([found[0], inside[0]]), np.concatenate([found[1], inside[1]])
+    found = _until_nothing_new(rows, bounds, closed, found, granted)
+    F, g = _remove_redundant(*found, *granted)
+    return F / half, g
+
+
+def _until_nothing_new(
+    rows: Array,
+    bounds: Array,
+    closed: Array,
+    found: tuple[Array, Array],
+    granted: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """Add the bounds of later steps until those of one step say nothing new."""
+    F, g = found
+    later = rows
+    for _ in range(MAX_STEPS):
+        later = later @ closed
+        A, b = np.vstack([F, granted[0]]), np.concatenate([g, granted[1]])
+        new = [i for i, row in enumerate(later) if not _is_redundant(row, float(bounds[i]), A, b)]
+        if not new:
+            return F, g
+        F, g = np.vstack([F, later[new]]), np.concatenate([g, bounds[new]])
+        if len(g) > MAX_ROWS:
+            raise ValueError(
+                f"The invariant terminal set has more than {MAX_ROWS} half-spaces. Give the "
+                "state more weight, sample more slowly, or pass a terminal set of your own."
+            )
+    raise ValueError(
+        f"The invariant terminal set is not determined after {MAX_STEPS} steps: the closed loop "
+        "of the terminal gain is too slow. Give the state more weight, or sample more slowly."
+    )
+
+
+def _bounds(problem: LinearMPC, gain: Array) -> tuple[Array, Array]:
+    """Return the hard bounds of x, u, y and the rate under ``u = gain theta``: rows and bounds."""
+    parts, size = problem.parameters, problem.n_theta
+    state = np.eye(size)[parts.state]
+    values = [(gain, problem.u_min, problem.u_max)]
+    for seen, low, high, soft in (
+        (state, problem.x_min, problem.x_max, problem.x_soft),
+        (problem.outputs @ state, problem.y_min, problem.y_max, problem.y_soft),
+    ):
+        hard = soft == 0
+        values.append((seen[hard], low[hard], high[hard]))
+    if parts.n_previous:
+        change = gain - np.eye(size)[parts.previous]
+        values.append((change, problem.du_min, problem.du_max))
+    rows = np.concatenate([sign * each for each, _, _ in values for sign in (1, -1)])
+    bounds = np.concatenate([side for _, low, high in values for side in (high, -low)])
+    bounded = np.isfinite(bounds)
+    return rows[bounded], bounds[bounded]
+
+
+def _steady_projection(problem: LinearMPC, half: Array) -> Array:
+    """Return the map from theta to the theta at rest under the same r and d, in units of half."""
+    parts, steady = problem.parameters, problem.steady_states
+    at_rest = np.zeros((problem.n_theta, problem.n_theta))
+    at_rest[parts.state, parts.constant] = steady.x
+    at_rest[parts.constant, parts.constant] = np.eye(parts.constant.stop - parts.constant.start)
+    at_rest[parts.previous, parts.constant] = steady.u[: parts.n_previous]
+    return np.asarray(at_rest / half[:, None] * half)
+
+
+def _granted(problem: LinearMPC, half: Array) -> tuple[Array, Array]:
+    """Return the half-spaces that every predicted theta satisfies anyway."""
+    first = problem.parameters.constant.start
+    eye = np.eye(problem.n_theta)[first:]
+    rows = np.vstack([eye, -eye])
+    bounds = np.concatenate([problem.theta_max[first:], -problem.theta_min[first:]])
+    bounds = bounds / np.tile(half[first:], 2)
+    bounded = np.isfinite(bounds)
+    return rows[bounded], bounds[bounded]
+
+
+def _remove_redundant(
+    rows: Array, bounds: Array, granted_rows: Array, granted_bounds: Array
+) -> tuple[Array, Array]:
+    """Return the half-spaces that the others and the granted ones do not imply."""
+    kept = list(range(len(bounds)))
+    for i in range(len(bounds)):
+        others = [j for j in kept if j != i]
+        A = np.vstack([rows[others], granted_rows])
+        b = np.concatenate([bounds[others], granted_bounds])
+        if _is_redundant(rows[i], float(bounds[i]), A, b):
+            kept = others
+    return rows[kept], bounds[kept]
+
+
+def _is_redundant(row: Array, bound: float, A: Array, b: Array) -> bool:
+    """Tell whether ``row theta <= bound`` follows from ``A theta <= b`` (a linear program)."""
+    length = float(np.linalg.norm(row))
+    if length < 1e-12:
+        return True
+    row, bound = row / length, bound / length
+    # The row itself, one further out, keeps the program bounded.
+    A, b = np.vstack([A, row]), np.append(b, bound + 1)
+    best = optimize.linprog(-row, A_ub=A, b_ub=b, bounds=[(None, None)] * len(row))
+    return bool(best.status == 0 and -best.fun <= bound + 1e-9)
+
+
+def _unit(problem: LinearMPC) -> Array:
+    half = (problem.theta_max - problem.theta_min) / 2
+    return np.asarray(np.where(np.isfinite(half), half, 1.0))

@@ -1,0 +1,1 @@
+"""Seeded episodes, tables and pictures."""

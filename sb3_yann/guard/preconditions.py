@@ -1,0 +1,142 @@
+"""What must hold before a guard can compare policies."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_yann.evaluation.episodes import Episodes, one_env
+from sb3_yann.guard.episodes import Outcome, outcome_of, played
+from sb3_yann.guard.rng import chance_untouched
+from sb3_yann.policy._checks import as_factor
+
+if TYPE_CHECKING:
+    from sb3_yann.guard.callback import ImprovementGuard
+
+
+def check_simulator(
+    simulator: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]],
+    name: str,
+    training_env: VecEnv,
+) -> None:
+    """Raise ValueError if the simulator is the training env, or an env of another shape."""
+    training = [env.unwrapped for env in getattr(training_env, "envs", [])]
+    with chance_untouched(), one_env(simulator) as env:
+        if any(env.unwrapped is each for each in training):
+            raise ValueError(
+                "The guard's env is the training env, whose episodes its own would interrupt. "
+                "Give it another one, e.g. its id."
+            )
+        ours, theirs = env.observation_space.shape, training_env.observation_space.shape
+        if ours != theirs or env.action_space != training_env.action_space:
+            raise ValueError(
+                f"The guard's env {name} has observations of shape {ours} and "
+                f"{env.action_space}; the training env has {theirs} and "
+                f"{training_env.action_space}. Give the guard a simulator of this plant."
+            )
+
+
+def check_acts_alone(guard: ImprovementGuard) -> None:
+    """Raise ValueError if anything but the policy would act on the training env.
+
+    Without a simulator the training episodes are the evidence: those of random actions would be
+    taken for the MPC's.
+    """
+    model = guard.model
+    if guard.num_timesteps < model.learning_starts:
+        raise ValueError(
+            f"learning_starts = {model.learning_starts}: SB3 plays so many actions at random, and "
+            "ImprovementGuard(None) takes the training episodes for the policy's own. Pass the "
+            "callback NoActionNoise() as well, or learning_starts=0."
+        )
+    if model.action_noise is not None:
+        raise ValueError(
+            f"action_noise = {model.action_noise}: ImprovementGuard(None) takes the training "
+            "episodes for the policy's own. Pass the callback NoActionNoise() as well, or none."
+        )
+
+
+def check_not_nested(guard: ImprovementGuard) -> None:
+    """Raise ValueError if the guard is within a callback that does not tell it of the end."""
+    event = guard.parent if isinstance(guard.parent, EventCallback) else None
+    event = event or _event_above(guard, guard.locals.get("callback"))
+    if event is not None:
+        raise ValueError(
+            f"The guard is within a callback of the class {type(event).__name__}, which passes on "
+            "neither each step nor the end of training: the final model might not be an accepted "
+            "one. Pass the guard to learn itself, with every=... for trials less often."
+        )
+
+
+def _event_above(
+    guard: ImprovementGuard, callback: BaseCallback | None, above: EventCallback | None = None
+) -> EventCallback | None:
+    """Return the EventCallback that the guard is under, among what was passed to learn."""
+    if callback is guard:
+        return above
+    children: list[BaseCallback | None] = [*getattr(callback, "callbacks", [])]
+    if isinstance(callback, EventCallback):
+        above = callback
+        children += [callback.callback, getattr(callback, "callback_on_new_best", None)]
+    found = (_event_above(guard, each, above) for each in children if each is not None)
+    return next((each for each in found if each is not None), None)
+
+
+def check_whole(name: str, value: Any, least: int) -> None:
+    """Raise ValueError if an argument is no whole number, or less than what is the least."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}.")
+
+
+def check_between(name: str, value: Any, low: float, high: float) -> None:
+    """Raise ValueError or TypeError if an argument is no number within the limits."""
+    if not low <= as_factor(name, value) <= high:
+        raise ValueError(f"{name} = {value!r} must be between {low:g} and {high:g}.")
+
+
+def first_episodes(
+    guard: ImprovementGuard, simulator: Any, name: str, seeds: Sequence[int]
+) -> Outcome:
+    """Return what comes of the present policy, the MPC, if the simulator can compare policies.
+
+    By the actor, not the law in float64: the MPC itself is to be no worse to the last bit.
+
+    Raises
+    ------
+    ValueError
+        If a second episode from the same seed costs something else, or a cost is not finite.
+    """
+    mpc = played(guard, simulator, seeds)
+    for seed, cost in zip(seeds, mpc.costs, strict=True):
+        if not np.isfinite(cost):
+            raise ValueError(
+                f"The MPC's episode of the guard's env {name} from the seed {seed} costs {cost:g}. "
+                "Policies are compared by their costs: rewards must be finite numbers."
+            )
+    again = played(guard, simulator, seeds)
+    for seed, first, second in zip(seeds, mpc.costs, again.costs, strict=True):
+        if not np.isclose(first, second, rtol=1e-6, atol=0):
+            raise ValueError(
+                f"The MPC played two episodes of the guard's env {name} from the "
+                f"seed {seed}, at costs of {first:g} and {second:g}. Episodes are compared in "
+                "pairs: all that is random in the env must come from self.np_random."
+            )
+    if len(seeds) > 1 and _all_alike(mpc):
+        warnings.warn(
+            f"All {len(seeds)} starts of the guard's env {name} are one and the same: its reset "
+            "ignores its seed. What the guard accepts is compared from this start only.",
+            stacklevel=2,
+        )
+    return outcome_of(guard, mpc)
+
+
+def _all_alike(episodes: Episodes) -> bool:
+    first = episodes.observations[0][0]
+    starts = all(np.array_equal(each[0], first) for each in episodes.observations)
+    return starts and bool(np.allclose(episodes.costs, episodes.costs[0], rtol=1e-6, atol=0))

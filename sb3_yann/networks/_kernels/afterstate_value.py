@@ -1,0 +1,297 @@
+"""The afterstate value on a processor: compiled, and one operation of torch with its gradient."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+
+from sb3_yann._validation import Array
+from sb3_yann.control.law._kernels import compiled
+from sb3_yann.networks._kernels.mlp import (
+    Single,
+    as_array,
+    at_zero,
+    first_layers,
+    hidden_layer,
+    tanh,
+    transposed,
+)
+
+if TYPE_CHECKING:
+    from sb3_yann.networks.value import AfterstateValue
+
+_LINEAR = "float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1]"
+_NODES = "float32[:, :, :, ::1], float32[::1]"
+_QUADRATICS = "float64[:, ::1], float64[:, ::1], float32[:, ::1], float32[:, ::1]"
+
+
+@compiled()
+def _matrices(weights: Single, pinned: Single) -> tuple[Single, Single]:
+    """Return the layers of a stack of one, inputs before outputs, and what they put out at zero."""
+    used = np.zeros(1, np.int64)
+    matrices = transposed(weights, used)
+    return matrices, at_zero(matrices, used, pinned)
+
+
+@compiled(
+    f"Tuple((float64[::1], {_QUADRATICS}))(float64[:, ::1], {_LINEAR}, {_NODES})", fastmath=True
+)
+def _forms(
+    points: Array, W: Array, AB: Array, M: Array, scaling: Array, nodes: Single, pinned: Single
+) -> tuple[Array, Array, Array, Single, Single]:
+    """Return ``y'W y + z'M z`` (batch,), y, z, the network's input, and its first hidden layer.
+
+    Parameters
+    ----------
+    points : ndarray, shape (batch, n + m)
+        Rows ``[theta, a]``; y is the same with inputs for actions, and ``z = AB y``.
+    W, AB, M : ndarray, shapes (n + m, n + m), (n, n + m) and (n, n)
+    scaling : ndarray, shape (n + 2 m,)
+        Factors of z for the network; half the ranges of the inputs; their middles.
+    nodes : ndarray, shape (1, k, h1, n + 1)
+    pinned : ndarray, shape (1,)
+    """
+    batch, n, m = len(points), len(M), len(W) - len(M)
+    y, z, total = np.empty((batch, n + m)), np.zeros((batch, n)), np.zeros(batch)
+    x, hidden = np.empty((batch, n), np.float32), np.empty((batch, nodes.shape[2]), np.float32)
+    matrices, zero = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
+    for row in range(batch):
+        for j in range(n):
+            y[row, j] = points[row, j]
+        for j in range(n, n + m):
+            y[row, j] = points[row, j] * scaling[j] + scaling[j + m]
+        for i in range(n + m):
+            product = 0.0
+            for j in range(n + m):
+                product += W[i, j] * y[row, j]
+            total[row] += y[row, i] * product
+        for i in range(n):
+            for j in range(n + m):
+                z[row, i] += AB[i, j] * y[row, j]
+            x[row, i] = z[row, i] * scaling[i]
+        for i in range(n):
+            product = 0.0
+            for j in range(n):
+                product += M[i, j] * z[row, j]
+            total[row] += z[row, i] * product
+        hidden_layer(x, row, matrices, 0, zero, hidden)
+    return total, y, z, x, hidden
+
+
+@compiled(
+    "float32[:, ::1](float64[::1], float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], "
+    "float32[::1], float64)",
+    fastmath=True,
+)
+def _output(
+    total: Array, hidden: Single, second: Single, last: Single, pinned: Single, factor: float
+) -> Single:
+    """Return ``-(total + factor network)`` (batch, 1).
+
+    ``hidden`` (batch, h2) comes as the product of the second layer's weights and becomes what that
+    layer puts out. second and last are (1, h2, h1 + 1) and (1, 1, h2 + 1).
+    """
+    batch, h = hidden.shape
+    q = np.empty((batch, 1), np.float32)
+    matrices, zeros = _matrices(second, pinned)
+    bias, zero = matrices[0, -1], zeros[0]
+    for row in range(batch):
+        for a in range(h):
+            hidden[row, a] = tanh(hidden[row, a] + bias[a]) - zero[a]
+        learnt = (np.float32(1) - pinned[0]) * last[0, 0, h]
+        for a in range(h):
+            learnt += last[0, 0, a] * hidden[row, a]
+        q[row, 0] = -(total[row] + factor * learnt)
+    return q
+
+
+@compiled(
+    "Tuple((float32[:, ::1], float32[::1], float32[:, :, ::1]))"
+    "(float32[:, ::1], float64, float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], "
+    "float32[::1])",
+    fastmath=True,
+)
+def _output_backward(
+    gradient: Single, factor: float, hidden: Single, second: Single, last: Single, pinned: Single
+) -> tuple[Single, Single, Single]:
+    """Return the gradients by the second layer's products (batch, h2), its bias, and last.
+
+    ``gradient`` (batch, 1) is that of a loss by what :func:`_output` returned.
+    """
+    batch, h = hidden.shape
+    one = np.float32(1)
+    through, by_bias = np.empty((batch, h), np.float32), np.zeros(h, np.float32)
+    by_last, all_back = np.zeros((1, 1, h + 1), np.float32), np.float32(0)
+    zero = _matrices(second, pinned)[1][0]
+    for row in range(batch):
+        back = np.float32(-factor * gradient[row, 0])
+        all_back += back
+        for a in range(h):
+            by_last[0, 0, a] += back * hidden[row, a]
+            out = hidden[row, a] + zero[a]
+            back_a = back * last[0, 0, a]
+            through[row, a] = back_a * (one - out * out)
+            by_bias[a] += through[row, a] - pinned[0] * back_a * (one - zero[a] * zero[a])
+    by_last[0, 0, h] = (one - pinned[0]) * all_back
+    return through, by_bias, by_last
+
+
+@compiled(
+    "Tuple((float32[:, :, :, ::1], float64[:, ::1], float64[:, ::1]))"
+    f"(float32[:, ::1], float32[:, ::1], boolean, boolean, {_QUADRATICS}, {_LINEAR}, {_NODES})",
+    fastmath=True,
+)
+def _forms_backward(
+    gradient: Single,
+    back: Single,
+    of_points: bool,
+    of_weights: bool,
+    y: Array,
+    z: Array,
+    x: Single,
+    hidden: Single,
+    W: Array,
+    AB: Array,
+    M: Array,
+    scaling: Array,
+    nodes: Single,
+    pinned: Single,
+) -> tuple[Single, Array, Array]:
+    """Return the gradients by nodes, points (batch, n + m) and M (n, n).
+
+    ``back`` (batch, h1) is the gradient by the first hidden layer. Those by points, or by nodes
+    and M, are zeros unless they are asked for.
+    """
+    batch, n, m = len(y), len(M), len(W) - len(M)
+    k, h = nodes.shape[1], nodes.shape[2]
+    one = np.float32(1)
+    matrices, zeros = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
+    matrix, zero = matrices[0], zeros[0]
+    by_points, by_M = np.zeros((batch, n + m)), np.zeros((n, n))
+    by_matrix = np.zeros((n + 1, h), np.float32)
+    through = np.empty(h, np.float32)
+    for row in range(batch):
+        for a in range(h):
+            out = hidden[row, a] + zero[a]
+            through[a] = back[row, a] * (one - out * out)
+            by_matrix[n, a] += through[a] - pinned[0] * back[row, a] * (one - zero[a] * zero[a])
+        g = -float(gradient[row, 0])
+        if of_weights:
+            for j in range(n):
+                for a in range(h):
+                    by_matrix[j, a] += through[a] * x[row, j]
+                for i in range(n):
+                    by_M[i, j] += g * z[row, i] * z[row, j]
+        if not of_points:
+            continue
+        for i in range(n + m):
+            for j in range(n + m):
+                by_points[row, i] += g * (W[i, j] + W[j, i]) * y[row, j]
+        for i in range(n):
+            by_x = np.float32(0)
+            for a in range(h):
+                by_x += through[a] * matrix[i, a]
+            by_z = by_x * scaling[i]
+            for j in range(n):
+                by_z += g * (M[i, j] + M[j, i]) * z[row, j]
+            for j in range(n + m):
+                by_points[row, j] += by_z * AB[i, j]
+        for j in range(n, n + m):
+            by_points[row, j] *= scaling[j]
+    by_nodes = np.empty((1, k, h, n + 1), np.float32)
+    for node in range(k):  # they enter the same sum
+        for a in range(h):
+            for j in range(n + 1):
+                by_nodes[0, node, a, j] = by_matrix[j, a]
+    return by_nodes, by_points, by_M
+
+
+def value_on_processor(value: AfterstateValue, points: th.Tensor, fixed: bool = False) -> th.Tensor:
+    """Return what ``value(points)`` is, (batch, 1), for points of shape (batch, n + m).
+
+    With ``fixed`` weights there is a gradient by the points alone.
+    """
+    buffers: Any = value._buffers  # a module's tables: its attributes take a microsecond to find
+    modules: Any = value._modules
+    size = len(buffers["W"])
+    if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
+        raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
+    weights: tuple[th.Tensor, ...] = (
+        modules["quadratic"].entries,
+        *modules["network"].weights(),
+    )
+    if fixed:
+        weights = tuple(weight.detach() for weight in weights)
+    if th.is_grad_enabled():
+        q: th.Tensor = _Value.apply(value, points, *weights)  # type: ignore[no-untyped-call]
+        return q
+    return th.from_numpy(_Pass(value, points, weights).q)
+
+
+class _Pass:
+    """One way forward, and what the way back needs of it.
+
+    The second layer, nearly all of the arithmetic, is left to torch's products of matrices.
+    """
+
+    def __init__(
+        self, value: AfterstateValue, points: th.Tensor, weights: tuple[th.Tensor, ...]
+    ) -> None:
+        self.weights = weights
+        entries, nodes, second, last = as_array(weights[0], np.float64), *map(as_array, weights[1:])
+        W, AB, self.roots, scaling = value.constants
+        network: Any = value._modules["network"]
+        pinned = network.pinned_array
+        self.first: tuple[Any, ...] = (W, AB, entries * self.roots, scaling, nodes, pinned)
+        array = as_array(points, np.float64)
+        total, *forms = _forms(array, *self.first)
+        self.forms: tuple[Any, ...] = tuple(forms)
+        self.matrix = th.from_numpy(second)[0, :, :-1]
+        product = th.mm(th.from_numpy(self.forms[-1]), self.matrix.T)
+        self.hidden, self.layers = product.numpy(), (second, last, pinned)
+        self.factor = value.gamma * value.scale
+        self.q: Single = _output(total, self.hidden, *self.layers, self.factor)
+
+    def backward(
+        self, gradient: Single, of_points: bool, of_weights: bool
+    ) -> tuple[th.Tensor | None, ...]:
+        """Return the gradients by the points and the weights, as far as they are asked for."""
+        through, by_bias, by_last = _output_backward(
+            gradient, self.factor, self.hidden, *self.layers
+        )
+        product = th.from_numpy(through)
+        back = th.mm(product, self.matrix)
+        by_nodes, found, by_M = _forms_backward(
+            gradient, back.numpy(), of_points, of_weights, *self.forms, *self.first
+        )
+        by_points = th.from_numpy(found) if of_points else None
+        if not of_weights:
+            return by_points, None, None, None, None
+        by_second = th.empty_like(self.weights[2])
+        th.mm(product.T, th.from_numpy(self.forms[-1]), out=by_second[0, :, :-1])
+        by_second[0, :, -1] = th.from_numpy(by_bias)
+        by_entries = th.from_numpy(by_M * self.roots)
+        return by_points, by_entries, th.from_numpy(by_nodes), by_second, th.from_numpy(by_last)
+
+
+class _Value(th.autograd.Function):
+    """Differentiable by points and weights, once."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, value: AfterstateValue, points: th.Tensor, *weights: th.Tensor
+    ) -> th.Tensor:
+        ctx.save_for_backward(*weights)  # who changes them before the way back is told so
+        ctx.done, ctx.dtype = _Pass(value, points, weights), points.dtype
+        return th.from_numpy(ctx.done.q)
+
+    @staticmethod
+    @th.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        _ = ctx.saved_tensors
+        gradient = as_array(gradients[0])
+        _, of_points, *of_weights = ctx.needs_input_grad
+        by_points, *by_weights = ctx.done.backward(gradient, of_points, any(of_weights))
+        return None, by_points if by_points is None else by_points.to(ctx.dtype), *by_weights

@@ -1,0 +1,244 @@
+"""Stacks of zero-output networks on a processor, forward and backward, as compiled loops.
+
+A batch of some hundred states goes through networks of a few hundred to a few thousand weights: in
+torch's own operations most of the time is their overhead, some fifty times over. Here it is one
+call each way, and only the networks in use are ever read or written, so that the cost does not
+grow with their number.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+
+from sb3_yann.control.law._kernels import Integers, compiled
+
+Single = NDArray[np.float32]
+
+WEIGHTS = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1]"
+"""Types of nodes, second, last and pinned, see :func:`network`."""
+
+
+def as_array(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
+    """Return what compiled code takes for a tensor, without its gradient: the same memory if so."""
+    try:
+        array = tensor.numpy(force=True)
+    except TypeError:  # bfloat16, which numpy does not have
+        array = tensor.double().numpy(force=True)
+    return np.ascontiguousarray(array, dtype)
+
+
+@compiled()  # not a fast one: s(b) - s(b) must be zero wherever the two are computed
+def tanh(x: Any) -> Any:
+    """Return tanh in float32 to two units in the last place: exact at 0, odd, 1 beyond 10.
+
+    With t = tanh(x / 2) from the eighth convergent of Lambert's continued fraction
+    ``t = h / (1 + h^2 / (3 + h^2 / (5 + ...)))`` at h = x / 2, it is ``2 t / (1 + t^2)``. That is
+    arithmetic alone, of which a processor does several at a time; the library's tanh costs more
+    than all the rest.
+    """
+    one, five = np.float32(1), np.float32(5)
+    h = np.float32(0.5) * x
+    h = five if h > five else h  # NaN stays what it is
+    h = -five if h < -five else h
+    y = h * h
+    above = ((np.float32(36) * y + np.float32(6930)) * y + np.float32(270270)) * y
+    below = ((y + np.float32(630)) * y + np.float32(51975)) * y + np.float32(945945)
+    t = h * (above + np.float32(2027025)) / (below * y + np.float32(2027025))
+    return (t + t) / (one + t * t)
+
+
+@compiled()
+def first_layers(nodes: Single, used: Integers) -> Single:
+    """Return the sums over the nodes, (slots, h1, n + 1); opposite nodes are added first."""
+    k, rows, columns = nodes.shape[1:]
+    sums = np.zeros((len(used), rows, columns), np.float32)
+    # Entry by entry: arrays that are added as a whole take numba five times as long to compile.
+    for s in range(len(used)):
+        own = nodes[used[s]]
+        for pair in range(k // 2):
+            for a in range(rows):
+                for j in range(columns):
+                    sums[s, a, j] += own[pair, a, j] + own[k // 2 + pair, a, j]
+        if k % 2:
+            for a in range(rows):
+                for j in range(columns):
+                    sums[s, a, j] += own[k - 1, a, j]
+    return sums
+
+
+@compiled()
+def transposed(matrices: Single, used: Integers) -> Single:
+    """Return the matrices in use with inputs before outputs, (slots, inputs, outputs)."""
+    _, rows, columns = matrices.shape
+    out = np.empty((len(used), columns, rows), np.float32)
+    for s in range(len(used)):
+        for a in range(rows):
+            for j in range(columns):
+                out[s, j, a] = matrices[used[s], a, j]
+    return out
+
+
+@compiled()
+def at_zero(matrices: Single, used: Integers, pinned: Single) -> Single:
+    """Return what a hidden layer puts out at zero where it is pinned, else 0: (slots, outputs).
+
+    ``matrices`` (slots, inputs + 1, outputs) hold the biases in their last rows.
+    """
+    out = np.zeros((len(used), matrices.shape[2]), np.float32)
+    for s in range(len(used)):
+        if pinned[used[s]] > 0:
+            for a in range(matrices.shape[2]):
+                out[s, a] = tanh(matrices[s, -1, a])
+    return out
+
+
+@compiled(fastmath=True)
+def hidden_layer(x: Single, row: int, matrices: Single, s: int, zero: Single, out: Single) -> None:
+    """Write ``s(W x + b) - s(b)`` to a row of out, for that of x.
+
+    The matrix, (inputs + 1, outputs), and s(b) are number s of several. (Slices would be passed
+    more plainly, and take as long as all that is done with them: numba counts who refers to each.)
+    """
+    inputs, outputs = matrices.shape[1] - 1, matrices.shape[2]
+    for a in range(outputs):
+        out[row, a] = matrices[s, inputs, a]
+    for j in range(inputs):
+        for a in range(outputs):
+            out[row, a] += matrices[s, j, a] * x[row, j]
+    for a in range(outputs):
+        out[row, a] = tanh(out[row, a]) - zero[s, a]
+
+
+@compiled(fastmath=True)
+def network(
+    x: Single,
+    used: Integers,
+    slot: Integers,
+    nodes: Single,
+    second: Single,
+    last: Single,
+    pinned: Single,
+) -> tuple[Single, Single, Single]:
+    """Return the networks' output (batch, m), and their hidden layers, (batch, h1) and (batch, h2).
+
+    Parameters
+    ----------
+    x : ndarray, shape (batch, n)
+    used : ndarray of int, shape (slots,)
+        The networks in use.
+    slot : ndarray of int, shape (batch,)
+        Where in ``used`` each row's network is.
+    nodes : ndarray, shape (p, k, h1, n + 1)
+        First layers, whose k nodes are summed.
+    second : ndarray, shape (p, h2, h1 + 1)
+    last : ndarray, shape (p, m, h2 + 1)
+    pinned : ndarray, shape (p,)
+        1 where the network stays zero at the origin, else 0.
+    """
+    batch, m, h1, h2 = len(x), last.shape[1], second.shape[2] - 1, last.shape[2] - 1
+    matrices1 = transposed(first_layers(nodes, used), np.arange(len(used)))
+    matrices2 = transposed(second, used)
+    zero1, zero2 = at_zero(matrices1, used, pinned), at_zero(matrices2, used, pinned)
+    hidden1, hidden2 = np.empty((batch, h1), np.float32), np.empty((batch, h2), np.float32)
+    out = np.empty((batch, m), np.float32)
+    for row in range(batch):
+        s = slot[row]
+        i = used[s]
+        hidden_layer(x, row, matrices1, s, zero1, hidden1)
+        hidden_layer(hidden1, row, matrices2, s, zero2, hidden2)
+        for k in range(m):
+            total = (np.float32(1) - pinned[i]) * last[i, k, h2]
+            for j in range(h2):
+                total += last[i, k, j] * hidden2[row, j]
+            out[row, k] = total
+    return out, hidden1, hidden2
+
+
+@compiled(fastmath=True)
+def _hidden_backward(
+    back: Single,
+    x: Single,
+    out: Single,
+    row: int,
+    zero: Single,
+    pinned: float,
+    s: int,
+    matrices: Single,
+    i: int,
+    by_matrices: Single,
+    at: int,
+    by_x: Single,
+) -> None:
+    """Add the gradient by a matrix (outputs, inputs + 1), and write that by a row of x.
+
+    ``back`` (batch, outputs) is the gradient by what :func:`hidden_layer` wrote to ``out``; the
+    matrix is number i of ``matrices``, its gradient number ``at`` of ``by_matrices``.
+    """
+    one = np.float32(1)
+    inputs = x.shape[1]
+    for j in range(inputs):
+        by_x[row, j] = 0
+    for a in range(out.shape[1]):  # of tanh(z + b) - tanh(b): by z, and less that of tanh(b), by b
+        b = zero[s, a]
+        through = back[row, a] * (one - (out[row, a] + b) * (out[row, a] + b))
+        for j in range(inputs):
+            by_x[row, j] += through * matrices[i, a, j]
+            by_matrices[at, a, j] += through * x[row, j]
+        by_matrices[at, a, inputs] += through - pinned * back[row, a] * (one - b * b)
+
+
+@compiled(fastmath=True)
+def network_backward(
+    back: Single,
+    x: Single,
+    used: Integers,
+    slot: Integers,
+    dense: bool,
+    nodes: Single,
+    second: Single,
+    last: Single,
+    pinned: Single,
+    hidden1: Single,
+    hidden2: Single,
+) -> tuple[Single, Single, Single, Single]:
+    """Return the gradients by nodes, second, last, and by x (batch, n).
+
+    Of all networks if ``dense``, else of those in use alone, in the order of ``used``. ``back``
+    (batch, m) is the gradient by the output; the others are as in :func:`network`.
+    """
+    batch, n = x.shape
+    k, m, h1, h2 = nodes.shape[1], last.shape[1], second.shape[2] - 1, last.shape[2] - 1
+    rows = len(pinned) if dense else len(used)
+    by_first = np.zeros((rows, h1, n + 1), np.float32)
+    by_second = np.zeros((rows, h2, h1 + 1), np.float32)
+    by_last = np.zeros((rows, m, h2 + 1), np.float32)
+    by_x, by_1 = np.empty((batch, n), np.float32), np.empty((batch, h1), np.float32)
+    by_2 = np.zeros((batch, h2), np.float32)
+    first = first_layers(nodes, used)
+    matrices1 = transposed(first, np.arange(len(used)))
+    zero1 = at_zero(matrices1, used, pinned)
+    zero2 = at_zero(transposed(second, used), used, pinned)
+    for row in range(batch):
+        s = slot[row]
+        i = used[s]
+        at = i if dense else s
+        for c in range(m):
+            g = back[row, c]
+            for j in range(h2):
+                by_2[row, j] += g * last[i, c, j]
+                by_last[at, c, j] += g * hidden2[row, j]
+            by_last[at, c, h2] += g * (np.float32(1) - pinned[i])
+        own = pinned[i]
+        _hidden_backward(by_2, hidden1, hidden2, row, zero2, own, s, second, i, by_second, at, by_1)
+        _hidden_backward(by_1, x, hidden1, row, zero1, own, s, first, s, by_first, at, by_x)
+    by_nodes = np.empty((rows, k, h1, n + 1), np.float32)
+    for node in range(k):  # they enter the same sum
+        for s in range(by_first.shape[0]):
+            for a in range(by_first.shape[1]):
+                for j in range(by_first.shape[2]):
+                    by_nodes[s, node, a, j] = by_first[s, a, j]
+    return by_nodes, by_second, by_last, by_x

@@ -1,0 +1,196 @@
+"""The YANN layer on a processor: compiled, and one operation of torch with its gradient."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+
+from sb3_yann._validation import Array
+from sb3_yann.control.law._kernels import Integers, compiled, input_at
+from sb3_yann.networks._kernels.mlp import WEIGHTS, Single, as_array, network, network_backward
+
+if TYPE_CHECKING:
+    from sb3_yann.networks.yann import YannLayer
+
+_KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
+_KEPT += ", float32[:, ::1], float32[:, ::1], float32[:, :, ::1]"
+
+
+@compiled()
+def _locate(
+    floats: Array, whole: Integers, theta: Array, p: int
+) -> tuple[Array, Integers, Integers]:
+    """Return inputs (batch, m), NaN for theta that is not finite, the regions in use and slots."""
+    batch = len(theta)
+    u = np.empty((batch, whole[1]))
+    slot_of, used = np.full(p, -1), np.empty(min(batch, p), np.int64)
+    slot = np.empty(batch, np.int64)
+    slots = 0
+    for row in range(batch):
+        region = input_at(floats, whole, theta, u, row)
+        if region < 0:
+            u[row], region = np.nan, 0
+        if slot_of[region] < 0:
+            used[slots], slot_of[region] = region, slots
+            slots += 1
+        slot[row] = slot_of[region]
+    return u, used[:slots].copy(), slot
+
+
+@compiled()
+def _between(value: Any, low: Any, high: Any) -> Any:
+    """Return a value clamped to bounds; NaN stays what it is."""
+    value = high if value > high else value
+    return low if value < low else value
+
+
+@compiled(
+    f"Tuple((float32[:, ::1], {_KEPT}))"
+    "(float64[::1], int64[::1], float64[:, ::1], float64[::1], float64[:, ::1], float64, "
+    f"{WEIGHTS})"
+)
+def _forward(
+    floats: Array,
+    whole: Integers,
+    theta: Array,
+    scaling: Array,
+    change: Array,
+    limit: float,
+    nodes: Single,
+    second: Single,
+    last: Single,
+    pinned: Single,
+) -> tuple[Any, ...]:
+    """Return the actions (batch, m), and what :func:`_backward` needs.
+
+    Parameters
+    ----------
+    floats, whole : ndarray
+        The law, packed.
+    theta : ndarray, shape (batch, n)
+    scaling : ndarray, shape (n + 2 m,)
+        One over the half-widths of the box of theta; the middles of the input ranges; one over
+        their half-widths.
+    change : ndarray, shape (2, m) or (0, m)
+        By how much an action may differ from the previous input, the last m entries of theta.
+    limit : float
+        The network's output is clamped to [-limit, limit].
+    nodes, second, last, pinned
+        As in :func:`network`.
+    """
+    (batch, n), m = theta.shape, last.shape[1]
+    u, used, slot = _locate(floats, whole, theta, len(pinned))
+    x = np.empty((batch, n), np.float32)
+    for row in range(batch):
+        for j in range(n):
+            x[row, j] = theta[row, j] * scaling[j]
+    out, hidden1, hidden2 = network(x, used, slot, nodes, second, last, pinned)
+    actions, total = np.empty((batch, m), np.float32), np.empty((batch, m), np.float32)
+    bounds = np.empty((2, batch, m), np.float32)
+    bounds[0], bounds[1] = -1, 1
+    for row in range(batch):
+        for k in range(m):
+            for side in range(len(change)):
+                previous = (theta[row, n - m + k] - scaling[n + k]) * scaling[n + m + k]
+                bounds[side, row, k] = min(max(previous + change[side, k], -1.0), 1.0)
+            low, high = bounds[0, row, k], bounds[1, row, k]
+            law = np.float32((u[row, k] - scaling[n + k]) * scaling[n + m + k])
+            correction = out[row, k]
+            if limit < np.inf:  # which NaN and infinite weights do not pass either
+                correction = np.float32(min(max(correction, -limit), limit))
+                correction = correction if out[row, k] == out[row, k] else np.float32(0)
+            total[row, k] = _between(law, low, high) + correction
+            actions[row, k] = _between(total[row, k], low, high)
+    return actions, x, used, slot, hidden1, hidden2, out, total, bounds
+
+
+@compiled(
+    "Tuple((float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1]))"
+    f"(float32[:, ::1], boolean, float64, {WEIGHTS}, {_KEPT})"
+)
+def _backward(
+    gradient: Single,
+    dense: bool,
+    limit: float,
+    nodes: Single,
+    second: Single,
+    last: Single,
+    pinned: Single,
+    x: Single,
+    used: Integers,
+    slot: Integers,
+    hidden1: Single,
+    hidden2: Single,
+    out: Single,
+    total: Single,
+    bounds: Single,
+) -> tuple[Single, Single, Single]:
+    """Return the gradients of a loss by nodes, second and last, see :func:`network_backward`.
+
+    ``gradient`` (batch, m) is that of the loss by the actions. What would push an action, or a
+    correction, further beyond its bound is stopped: descent moves against the gradient.
+    """
+    back = gradient.copy()
+    for row in range(len(back)):
+        for k in range(back.shape[1]):
+            above = total[row, k] >= bounds[1, row, k] or out[row, k] >= limit
+            below = total[row, k] <= bounds[0, row, k] or out[row, k] <= -limit
+            if (above and back[row, k] < 0) or (below and back[row, k] > 0):
+                back[row, k] = 0
+    by_nodes, by_second, by_last, _ = network_backward(
+        back, x, used, slot, dense, nodes, second, last, pinned, hidden1, hidden2
+    )
+    return by_nodes, by_second, by_last
+
+
+def layer_on_processor(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
+    """Return what the layer does, (batch, m), for theta (batch, n) without a gradient."""
+    n = layer.piecewise_affine.n_theta
+    if theta.dim() != 2 or theta.shape[1] != n:  # compiled code does not look
+        raise ValueError(f"theta has shape {tuple(theta.shape)}, expected (batch, {n}).")
+    points = as_array(theta, np.float64)
+    network: Any = layer._modules["network"]
+    weights = network.weights()
+    if th.is_grad_enabled():
+        actions: th.Tensor = _Layer.apply(layer, points, *weights)  # type: ignore[no-untyped-call]
+        return actions
+    return th.from_numpy(_forward(*_given(layer, points, weights))[0])
+
+
+def _given(layer: YannLayer, theta: Array, weights: tuple[th.Tensor, ...]) -> list[Any]:
+    network: Any = layer._modules["network"]
+    arrays = [as_array(weight) for weight in weights]
+    law = layer.piecewise_affine.packed
+    limit = np.inf if layer.reach is None else layer.reach
+    known = (theta, layer.scaling, layer.change_array, limit)
+    return [*law, *known, *arrays, network.pinned_array]
+
+
+class _Layer(th.autograd.Function):
+    """Differentiable by the weights of the networks, once."""
+
+    @staticmethod
+    def forward(ctx: Any, layer: YannLayer, theta: Array, *weights: th.Tensor) -> th.Tensor:
+        given = _given(layer, theta, weights)
+        actions, *kept = _forward(*given)
+        ctx.save_for_backward(*weights)  # who changes them before the way back is told so
+        ctx.given, ctx.kept, ctx.by_row = given[5:], kept, layer.row_gradients
+        return th.from_numpy(actions)
+
+    @staticmethod
+    @th.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        weights, (_, used, *_) = ctx.saved_tensors, ctx.kept
+        gradient = as_array(gradients[0])
+        arrays = _backward(gradient, not ctx.by_row, *ctx.given, *ctx.kept)
+        found = [th.from_numpy(each) for each in arrays]
+        if ctx.by_row:
+            rows = th.from_numpy(used)[None]
+            sizes = [weight.shape for weight in weights]
+            found = [
+                th.sparse_coo_tensor(rows, by_weight, size, check_invariants=False)
+                for by_weight, size in zip(found, sizes, strict=True)
+            ]
+        return None, None, *found

@@ -1,0 +1,107 @@
+"""The YANN actor layer by layer as Braniff & Tian draw it: a reference, not the working path.
+
+It is slower than :class:`YannLayer`, doubles the output on facets (where two regions are active)
+and loses digits to the suppression constant. Its count of parameters is that of the paper.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_yann._validation import Array
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+
+
+class LiteralYann(nn.Module):
+    """theta -> u in physical units, (batch, n) -> (batch, m), zero outside every region.
+
+    Subdomain identification (three layers), all affine laws with both signs, and a two-layer
+    network of ``p h`` nodes run side by side; a layer of ReLUs suppresses what belongs to inactive
+    regions, the last layer adds up the rest. The second layer of the trainable network is dense
+    across regions, as the paper's count demands: its updates are not exclusive to a region.
+
+    Parameters
+    ----------
+    law : PiecewiseAffine
+        p regions, q half-spaces.
+    width : int
+        Nodes h for each region and layer.
+    scale : float, default 0.01
+        Initial weights are uniform in [-scale, scale].
+    """
+
+    def __init__(self, law: PiecewiseAffine, width: int, scale: float = 0.01) -> None:
+        super().__init__()
+        p, m, n, q = law.n_regions, law.n_inputs, law.n_theta, law.n_halfspaces
+        counts = np.diff([*law.starts, q])
+        owner = np.repeat(np.eye(p), counts, axis=1)  # (p, q): which region a half-space bounds
+        sign = np.array([1.0, -1.0])
+        gains = np.concatenate([s * law.gains.reshape(p * m, n) for s in sign])
+        offsets = np.concatenate([s * law.offsets.reshape(p * m) for s in sign])
+
+        # Rows of the suppression layer: (sign, region, output). It takes the indicators, the
+        # signed laws and the nodes of the network; node j of a region serves output j mod m.
+        suppression = _largest(law) + width  # the nodes of a region add up to at most width
+        active = np.tile(np.kron(np.eye(p), np.ones((m, 1))), (2, 1))
+        share = np.array([[float(j % m == i) for j in range(width)] for i in range(m)])
+        nodes = np.concatenate([s * np.kron(np.eye(p), share) for s in sign])
+        suppress = np.hstack([suppression * active, np.eye(2 * p * m), nodes])
+
+        self.fixed = nn.ParameterDict(
+            {
+                "half_spaces": _fixed(-law.A),
+                "half_spaces_bias": _fixed(law.b),
+                "all_hold": _fixed(owner),
+                "all_hold_bias": _fixed(0.5 - counts),
+                "indicator": _fixed(np.eye(p)),
+                "laws": _fixed(gains),
+                "laws_bias": _fixed(offsets),
+                "suppress": _fixed(suppress),
+                "suppress_bias": _fixed(np.full(2 * p * m, -suppression)),
+                "add": _fixed(np.kron(sign[None], np.tile(np.eye(m), p))),
+            }
+        )
+        half = width // 2
+        order = np.arange(width)
+        order[: 2 * half] = np.roll(order[: 2 * half], half)  # an odd node is left to itself
+        partner = (np.arange(p)[:, None] * width + order).ravel()
+        self.register_buffer("partner", th.as_tensor(partner), persistent=False)
+        first = th.empty(p, width, n + 1).uniform_(-scale, scale)
+        first[:, half : 2 * half] = -first[:, :half]
+        first[:, 2 * half :] = 0
+        first = first.reshape(p * width, n + 1)
+        self.first_weight = nn.Parameter(first[:, :-1].clone())
+        self.first_bias = nn.Parameter(first[:, -1].clone())
+        self.second_weight = nn.Parameter(th.empty(p * width, p * width).uniform_(-scale, scale))
+
+    partner: th.Tensor
+
+    def forward(self, theta: th.Tensor) -> th.Tensor:
+        """Return u, shape (batch, m), for theta of shape (batch, n)."""
+        w = self.fixed
+        holds = _step(theta @ w["half_spaces"].T + w["half_spaces_bias"])
+        active = _step(holds @ w["all_hold"].T + w["all_hold_bias"]) @ w["indicator"].T
+        laws = theta @ w["laws"].T + w["laws_bias"]
+        weight = self.first_weight + self.first_weight[self.partner]
+        bias = self.first_bias + self.first_bias[self.partner]
+        nodes = th.tanh(th.tanh(theta @ weight.T + bias) @ self.second_weight.T)
+        joined = th.cat([active, laws, nodes], dim=1)
+        u: th.Tensor = th.relu(joined @ w["suppress"].T + w["suppress_bias"]) @ w["add"].T
+        return u
+
+
+def _largest(law: PiecewiseAffine) -> float:
+    """Return a bound on |K theta + r| of every region over the whole box."""
+    middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
+    at_middle = np.abs(law.gains @ middle + law.offsets)
+    return float(np.max(at_middle + np.abs(law.gains) @ half))
+
+
+def _fixed(value: Array) -> nn.Parameter:
+    return nn.Parameter(th.tensor(value, dtype=th.get_default_dtype()), requires_grad=False)
+
+
+def _step(x: th.Tensor) -> th.Tensor:
+    return (x >= 0).to(x.dtype)

@@ -1,0 +1,1 @@
+"""The Stable-Baselines3 policy that starts as a linear MPC."""

@@ -1,0 +1,269 @@
+"""Checks of what a policy is given: spaces, algorithm and keywords."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3 import TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_yann.control import LinearMPC
+from sb3_yann.policy.observations import AffineObservation, require_frozen
+
+
+def require_plain_td3(algorithm: BaseAlgorithm | None, other: dict[str, Any]) -> None:
+    """Raise unless the algorithm is TD3 or DDPG, with keywords that are known."""
+    if algorithm is not None and not isinstance(algorithm, TD3):
+        raise TypeError(
+            f"YannPolicy starts from a deterministic law and works with DDPG and TD3, not with "
+            f"{type(algorithm).__name__}. Use e.g. DDPG(YannPolicy, env)."
+        )
+    if other:
+        raise TypeError(
+            f"YannPolicy takes no {', '.join(map(repr, other))}. Its own policy_kwargs are "
+            "problem, gamma, net_arch, activation_fn, actor_lr_mult, critic_lr_mult, critic, "
+            "prediction_model, value_scale, critic_warmup, max_correction, pin_equilibrium, "
+            "observation, reward_scale and reward_offset."
+        )
+
+
+def require_undone_normalisation(
+    problem: LinearMPC, algorithm: BaseAlgorithm | None, observation: AffineObservation | None
+) -> None:
+    """Raise unless ``observation`` can undo what a VecNormalize does to the observations."""
+    normalize = None if algorithm is None else algorithm.get_vec_normalize_env()
+    if normalize is None or algorithm is None:
+        return
+    require_frozen(normalize)
+    if not normalize.norm_obs:
+        return
+    if observation is None:
+        raise ValueError(
+            "The VecNormalize normalises observations, and the law takes the state. Undo it: "
+            "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}."
+        )
+    if normalize.observation_space.shape != algorithm.observation_space.shape:
+        raise ValueError(
+            f"The VecNormalize shows {normalize.observation_space.shape}, but the learner sees "
+            f"{algorithm.observation_space.shape}, and SB3 stores the former. Make VecNormalize "
+            "the last wrapper, outside VecFrameStack."
+        )
+    largest = _largest_observation(problem, observation)
+    if largest > normalize.clip_obs:
+        raise ValueError(
+            f"The VecNormalize clips at clip_obs = {normalize.clip_obs:g}, but in the box of the "
+            f"law normalised observations reach {largest:.4g}: beyond the clipping the state is "
+            "not known. Set venv.clip_obs = numpy.inf."
+        )
+
+
+def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> float:
+    """Return the largest entry that matters to theta over the box of the law, inf if not known."""
+    used = np.any(observation.T != 0, axis=0)
+    T = observation.T[:, used]
+    if np.linalg.matrix_rank(T) < T.shape[1]:  # theta does not tell what was observed
+        return np.inf
+    back = np.linalg.pinv(T)
+    middle = (problem.theta_max + problem.theta_min) / 2 - observation.t0
+    reach = np.abs(back) @ ((problem.theta_max - problem.theta_min) / 2)
+    return float(np.max(np.abs(back @ middle) + reach))
+
+
+def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) -> None:
+    """Raise unless the space is a Box, with one dimension where nothing flattens it."""
+    if not isinstance(space, spaces.Box):
+        raise TypeError(
+            f"{name} is a {type(space).__name__}, YannPolicy needs a Box. "
+            "Wrap the env so that observations and actions are vectors of real numbers."
+        )
+    if len(space.shape) != 1 and not flattened:
+        raise ValueError(
+            f"{name} has shape {space.shape}, YannPolicy needs one dimension, (n,). "
+            "Wrap the env in gymnasium.wrappers.FlattenObservation, observe the plant's state, or "
+            "pass policy_kwargs={'observation': AffineObservation(T, t0)}."
+        )
+
+
+def require_matching(
+    problem: LinearMPC,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Box,
+    observation: AffineObservation | None = None,
+) -> None:
+    """Raise unless the spaces are those of the law: theta in, inputs between its bounds out."""
+    _require_theta(problem, observation_space, observation)
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise TypeError(
+            f"action_space has dtype {action_space.dtype}, but the inputs of an MPC are real: make "
+            "it a Box of numpy.float32."
+        )
+    if not action_space.is_bounded():
+        raise ValueError(f"action_space = {action_space} must have finite bounds.")
+    law = (problem.u_min, problem.u_max)
+    env = (action_space.low, action_space.high)
+    reach = np.where(np.isfinite(law[1] - law[0]), law[1] - law[0], 1.0)
+    u_ss, given = problem.model.u_ss, action_space.shape == law[0].shape
+
+    def same(shift: NDArray[np.floating[Any]]) -> bool:
+        sides = zip(law, env, strict=True)
+        return all(np.all(np.abs(b + shift - limit) <= 1e-6 * reach) for b, limit in sides)
+
+    if given and same(0 * u_ss):
+        return
+    bounds = f"u_min = {law[0].tolist()} and u_max = {law[1].tolist()}"
+    advice = (
+        "They must be the same: build the LinearMPC with the bounds of the env, as deviations from "
+        "u_ss of its model, and leave out wrappers that rescale actions."
+    )
+    if given and same(u_ss):
+        advice = (
+            f"The env takes absolute inputs, and the MPC deviations from u_ss = {u_ss.tolist()}. "
+            "Before the wrappers that complete the observation, wrap the env: env = "
+            "gymnasium.wrappers.RescaleAction(env, numpy.float32("
+            f"{law[0].tolist()}), numpy.float32({law[1].tolist()}))."
+        )
+    raise ValueError(
+        f"The action space is [{env[0].tolist()}, {env[1].tolist()}], but the MPC has {bounds}. "
+        + advice
+    )
+
+
+def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None) -> None:
+    """Warn where the inputs of the plant itself seem to be absolute and are taken for deviations.
+
+    That is where no wrapper changes the actions, the operating point of the model is not zero, and
+    it lies between the bounds of the env.
+    """
+    venv = None if algorithm is None else algorithm.get_env()
+    plain = None if venv is None else venv.unwrapped
+    if venv is None or not isinstance(plain, DummyVecEnv):
+        return
+    space, u_ss = venv.action_space, problem.model.u_ss
+    if not (isinstance(space, spaces.Box) and plain.envs[0].unwrapped.action_space == space):
+        return
+    if getattr(plain.observation_space, "problem", None) is not None:
+        return  # they are made for each other
+    if np.any(u_ss != 0) and np.all((space.low < u_ss) & (u_ss < space.high)):
+        warnings.warn(
+            f"u_min and u_max of the MPC are the bounds of the env's own actions, and its model "
+            f"has the operating point u_ss = {u_ss.tolist()} between them. The MPC counts from "
+            f"u_ss: if the env takes absolute inputs, give it u_min = "
+            f"{(space.low - u_ss).tolist()} and u_max = {(space.high - u_ss).tolist()}, and wrap "
+            "the env in gymnasium.wrappers.RescaleAction with these. If the env takes deviations, "
+            "leave u_ss out of the model.",
+            stacklevel=2,
+        )
+
+
+def _require_theta(
+    problem: LinearMPC,
+    observation_space: spaces.Space[Any],
+    observation: AffineObservation | None,
+) -> None:
+    """Raise unless theta is what is observed, or what ``observation`` makes of it."""
+    shape, names = observation_space.shape, ", ".join(problem.parameters.names)
+    takes = f"takes theta of shape ({problem.n_theta},), that is {names}"
+    if observation is None:
+        if shape != (problem.n_theta,):
+            raise ValueError(
+                f"The observation has shape {shape}, but the law of the problem {takes}. Give the "
+                "policy the problem of this plant, or say how theta follows from an observation: "
+                "policy_kwargs={'observation': AffineObservation(T, t0)}."
+            )
+        return
+    if not isinstance(observation, AffineObservation):
+        raise TypeError(f"observation = {observation!r} must be an AffineObservation or None.")
+    if shape is None or observation.n_obs != np.prod(shape):
+        raise ValueError(
+            f"The map to theta has T of shape {observation.T.shape}, but the observation has shape "
+            f"{shape}: T must have as many columns as an observation has entries."
+        )
+    if observation.n_theta != problem.n_theta:
+        raise ValueError(
+            f"The map to theta has T of shape {observation.T.shape}, but the law of the problem "
+            f"{takes}: T must have {problem.n_theta} rows."
+        )
+
+
+def as_reward(scale: float, offset: float, gamma: float) -> tuple[float, float]:
+    """Return what a reward is in terms of the cost: a factor above 0 and a finite offset."""
+    if as_factor("reward_scale", scale) == 0:
+        raise ValueError("reward_scale = 0 would leave nothing to learn from; give e.g. 1.")
+    if isinstance(offset, bool) or not isinstance(offset, (int, float, np.number)):
+        raise TypeError(f"reward_offset = {offset!r} must be a number.")
+    if not np.isfinite(offset):
+        raise ValueError(f"reward_offset = {offset!r} must be a finite number.")
+    if offset != 0 and not gamma < 1:
+        raise ValueError(
+            f"reward_offset = {offset!r} adds up to no finite value with gamma = {gamma!r}: it "
+            "needs a discount below 1."
+        )
+    return float(scale), float(offset)
+
+
+def as_factor(name: str, value: float) -> float:
+    """Return a factor, a finite float of at least 0."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+        raise TypeError(f"{name} = {value!r} must be a number.")
+    if not (np.isfinite(value) and value >= 0):
+        raise ValueError(f"{name} = {value!r} must be a finite number of at least 0.")
+    return float(value)
+
+
+def require_critic_options(
+    critic: str, prediction_model: object, value_scale: float, critic_warmup: int
+) -> None:
+    """Raise unless these are options of a critic."""
+    if critic not in ("afterstate", "state_action"):
+        raise ValueError(f"critic = {critic!r} must be 'afterstate' or 'state_action'.")
+    if prediction_model is not None and not callable(prediction_model):
+        raise TypeError(
+            f"prediction_model = {prediction_model!r} must be a function of tensors (theta, u) "
+            "that returns the next theta, or None for the linear model."
+        )
+    if prediction_model is not None and critic == "state_action":
+        raise ValueError(
+            "prediction_model is for critic='afterstate'; critic='state_action' predicts nothing."
+        )
+    if as_factor("value_scale", value_scale) == 0:
+        raise ValueError("value_scale = 0 would leave the network without effect; give e.g. 30.")
+    whole = isinstance(critic_warmup, (int, np.integer)) and not isinstance(critic_warmup, bool)
+    if not whole or critic_warmup < 0:
+        raise ValueError(
+            f"critic_warmup = {critic_warmup!r} must be a whole number of updates, 0 for none."
+        )
+
+
+def as_max_correction(value: float | None) -> float | None:
+    """Return the bound on the distance from the MPC, a fraction of the input range."""
+    if value is None:
+        return None
+    if as_factor("max_correction", value) > 1:
+        raise ValueError(
+            f"max_correction = {value!r} is a fraction of the input range, 0 to 1, or None."
+        )
+    return float(value)
+
+
+def as_net_arch(value: dict[str, list[int]] | list[int] | None) -> dict[str, list[int]]:
+    """Return the hidden widths of actor (pi) and critic (qf), with defaults for what is missing."""
+    known = {"pi": [16, 16], "qf": [64, 64]}
+    if value is None:
+        return known
+    if isinstance(value, list):  # SB3's short form
+        value = dict.fromkeys(known, value)
+    if not isinstance(value, dict) or not set(value) <= set(known):
+        raise ValueError(f"net_arch = {value!r} must be a dict such as {known}.")
+    for name, widths in value.items():
+        sizes = list(widths) if isinstance(widths, (list, tuple)) else []
+        if len(sizes) not in (1, 2) or not all(isinstance(n, int) and n > 0 for n in sizes):
+            raise ValueError(
+                f"net_arch[{name!r}] = {widths!r} must name the widths of one or two hidden "
+                f"layers, such as {known[name]}."
+            )
+    return {**known, **value}

@@ -1,0 +1,52 @@
+"""How a map from observations to theta gets into SB3's actor and critic."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_yann.policy.observations import AffineObservation
+
+
+class AffineFeatures(BaseFeaturesExtractor):
+    """Observations (batch, ...) of any float type to theta (batch, n_theta) in float64."""
+
+    T: th.Tensor
+    t0: th.Tensor
+
+    def __init__(
+        self, observation_space: spaces.Space[Any], observation: AffineObservation
+    ) -> None:
+        super().__init__(observation_space, features_dim=observation.n_theta)
+        self.register_buffer("T", th.as_tensor(observation.T.T.copy()))
+        self.register_buffer("t0", th.as_tensor(observation.t0.copy()))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Return theta."""
+        return th.addmm(self.t0, observations.flatten(1).double(), self.T)
+
+
+class SeesTheta(BaseModel):
+    """An actor or critic of SB3 whose features are theta, not rounded on the way."""
+
+    def extract_features(
+        self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor
+    ) -> th.Tensor:
+        """Return theta; SB3's preprocessing would round observations of float64 to float32."""
+        if isinstance(features_extractor, AffineFeatures):
+            theta: th.Tensor = features_extractor(obs)
+            return theta
+        if isinstance(obs, th.Tensor) and isinstance(features_extractor, FlattenExtractor):
+            if obs.ndim == 2 and obs.dtype == th.float32:
+                return obs  # what SB3 returns as well, after two dozen lines of Python
+        return super().extract_features(obs, features_extractor)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch the mode, which SB3 asks for at every step, where it is another one."""
+        if mode != self.training:
+            super().set_training_mode(mode)

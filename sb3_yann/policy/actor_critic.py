@@ -1,0 +1,192 @@
+"""The YANN actor and critic, in the places of those of Stable-Baselines3's TD3 and DDPG."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.td3.policies import Actor
+from torch import nn
+
+from sb3_yann.control import LinearMPC
+from sb3_yann.networks import (
+    AfterstateValue,
+    LinearPrediction,
+    QuadraticStateActionValue,
+    YannLayer,
+)
+from sb3_yann.networks.value import PredictionModel
+from sb3_yann.policy._features import SeesTheta
+
+
+class YannActor(SeesTheta, Actor):
+    """SB3's actor with a :class:`YannLayer` in place of the multi-layer perceptron.
+
+    Parameters are those of SB3's `Actor`; ``problem``, the MPC whose explicit law it starts from;
+    and ``max_correction`` and ``pin_equilibrium`` of :class:`YannPolicy`. ``net_arch`` is the width
+    of each region's network.
+    """
+
+    mu: YannLayer  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: nn.Module,
+        features_dim: int,
+        problem: LinearMPC,
+        activation_fn: type[nn.Module] = nn.Tanh,
+        normalize_images: bool = True,
+        max_correction: float | None = None,
+        pin_equilibrium: bool = True,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            [],  # no perceptron is built that would be thrown away
+            features_extractor,
+            features_dim,
+            activation_fn,
+            normalize_images,
+        )
+        self.net_arch = net_arch
+        self.options = {
+            "problem": problem,
+            "max_correction": max_correction,
+            "pin_equilibrium": pin_equilibrium,
+        }
+        self.mu = YannLayer(
+            problem.explicit(),
+            tuple(net_arch),
+            activation_fn(),
+            max_correction=max_correction,
+            pinned=pin_equilibrium,
+            rate=(problem.du_min, problem.du_max) if problem.has_rate_bounds else None,
+        )
+
+    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
+        """Yield the weights, without the search of all modules for them.
+
+        SB3's update of the targets asks for them at every step.
+        """
+        return iter(self.mu.network.weights()) if recurse else super().parameters(recurse)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self.options}
+
+
+class YannCritic(SeesTheta, ContinuousCritic):
+    """SB3's critic with networks that start as the value of the law on the linear plant.
+
+    Parameters are those of SB3's `ContinuousCritic`; ``problem``, the MPC; ``gamma``, the
+    discount of the return that it puts out; and ``critic`` (here ``kind``), ``prediction_model``,
+    ``value_scale``, ``pin_equilibrium``, ``reward_scale`` and ``reward_offset`` of
+    :class:`YannPolicy`.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        problem: LinearMPC,
+        gamma: float,
+        activation_fn: type[nn.Module] = nn.Tanh,
+        normalize_images: bool = True,
+        n_critics: int = 2,
+        share_features_extractor: bool = False,
+        kind: str = "afterstate",
+        prediction_model: PredictionModel | None = None,
+        value_scale: float = 30.0,
+        pin_equilibrium: bool = True,
+        reward_scale: float = 1.0,
+        reward_offset: float = 0.0,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            [],
+            features_extractor,
+            features_dim,
+            activation_fn,
+            normalize_images,
+            n_critics,
+            share_features_extractor,
+        )
+        common: dict[str, Any] = {
+            "theta_half": (problem.theta_max - problem.theta_min) / 2,
+            "u_min": problem.u_min,
+            "u_max": problem.u_max,
+            "hidden": tuple(net_arch),
+            "pinned": pin_equilibrium,
+        }
+        if prediction_model is None:
+            prediction_model = LinearPrediction(*problem.prediction)
+        self.scale = reward_scale
+        self.offset = reward_offset / (1 - gamma) if reward_offset else 0.0
+        self.q_networks = []
+        for i in range(n_critics):
+            q_network: nn.Module
+            if kind == "state_action":
+                q_network = QuadraticStateActionValue(
+                    problem.state_action_matrix(gamma), activation=activation_fn(), **common
+                )
+            else:
+                q_network = AfterstateValue(
+                    problem.stage_matrix,
+                    problem.value_matrix(gamma),
+                    prediction_model,
+                    gamma,
+                    activation=activation_fn(),
+                    scale=value_scale,
+                    **common,
+                )
+            self.add_module(f"qf{i}", q_network)
+            self.q_networks.append(q_network)
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """Return Q of each critic, all (batch, 1), in units of the env's reward."""
+        theta = self.extract_features(obs, self.features_extractor)  # never trained
+        points = th.cat([theta, actions], dim=1)
+        return tuple(self._in_rewards(q_network(points)) for q_network in self.q_networks)
+
+    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
+        """Yield the weights, without the search of all modules for them."""
+        if not recurse:
+            return super().parameters(recurse)
+        networks: list[Any] = self.q_networks
+        return (each for q in networks for each in (q.quadratic.entries, *q.network.weights()))
+
+    def _in_rewards(self, q: th.Tensor) -> th.Tensor:
+        if self.scale == 1 and self.offset == 0:
+            return q
+        return self.scale * q + self.offset
+
+    def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return the first critic's Q, (batch, 1), with a gradient by the actions alone.
+
+        SB3 asks for it to improve the actor, and throws the gradient by the critic's parameters
+        away: it is not computed.
+        """
+        q_network = self.q_networks[0]
+        if isinstance(q_network, AfterstateValue) and q_network.compiles:
+            with th.no_grad():
+                theta = self.extract_features(obs, self.features_extractor)
+            points = th.cat([theta, actions], dim=1)
+            return self._in_rewards(q_network.compiled_with_fixed_weights(points))
+        trained = [each for each in q_network.parameters() if each.requires_grad]
+        for parameter in trained:
+            parameter.requires_grad_(False)
+        try:
+            return self._in_rewards(super().q1_forward(obs, actions))
+        finally:
+            for parameter in trained:
+                parameter.requires_grad_(True)

@@ -1,0 +1,237 @@
+"""What an env's observation says of the parameter of the law: ``theta = T obs + t0``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array, same_fields
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class AffineObservation(ReadOnlyArrays):
+    """The map ``theta = T obs + t0`` from an observation to the parameter of the law.
+
+    ``policy_kwargs={"observation": ...}``. An observation of several dimensions is flattened first,
+    in C order. Maps compose like matrices: ``outer @ inner`` applies ``inner`` first, so that an
+    env that shows ``(T - 400) / 20`` as its only entry, for a law about 410, is undone by
+    ``AffineObservation.deviation([410]) @ AffineObservation.normalised([400], [20])``.
+
+    The map is computed in float64, and an observation of dtype float64 keeps all its digits on the
+    way to the law. One of float32, as most are, has been rounded by ``2^-24`` (6e-8) of its own
+    size before: theta then errs by up to ``6e-8 |T| |obs|``. A temperature of 475 K is known to
+    1.5e-5 K, where its deviation would be known to 1e-7 K or better. At the steady state itself,
+    theta is such an error instead of an exact zero.
+
+    Parameters
+    ----------
+    T : array_like, shape (n_theta, n_obs)
+    t0 : array_like, shape (n_theta,), optional
+        Zeros if left out.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an array has another shape or holds NaN or infinite entries.
+    """
+
+    T: Array
+    t0: Array
+
+    def __init__(self, T: ArrayLike, t0: ArrayLike | None = None) -> None:
+        matrix = as_array("T", T, ("n_theta", "n_obs"))
+        offset = np.zeros(len(matrix)) if t0 is None else t0
+        object.__setattr__(self, "T", matrix)
+        object.__setattr__(self, "t0", as_array("t0", offset, (len(matrix),)))
+
+    @classmethod
+    def identity(cls, size: int) -> AffineObservation:
+        """Return ``theta = obs``."""
+        return cls(np.eye(size))
+
+    @classmethod
+    def deviation(cls, x_ss: ArrayLike) -> AffineObservation:
+        """Return ``theta = obs - x_ss``: the env shows absolute values, the law takes deviations.
+
+        Parameters
+        ----------
+        x_ss : array_like, shape (n,)
+            The operating point, `LinearModel.x_ss`.
+        """
+        steady = as_array("x_ss", x_ss, ("n",))
+        return cls(np.eye(len(steady)), -steady)
+
+    @classmethod
+    def normalised(cls, mean: ArrayLike, std: ArrayLike) -> AffineObservation:
+        """Return ``theta = std * obs + mean``: the env shows ``(theta - mean) / std``.
+
+        Parameters
+        ----------
+        mean, std : array_like, shape (n,)
+            In units of theta; ``std`` is not zero.
+        """
+        middle = as_array("mean", mean, ("n",))
+        spread = as_array("std", std, (len(middle),))
+        if np.any(spread == 0):
+            raise ValueError(f"std = {spread.tolist()} must not be zero: nothing would be seen.")
+        return cls(np.diag(spread), middle)
+
+    @classmethod
+    def rescaled(
+        cls, low: ArrayLike, high: ArrayLike, to: tuple[float, float] = (-1.0, 1.0)
+    ) -> AffineObservation:
+        """Return the map of an env that shows [low, high] as the interval ``to``.
+
+        Parameters
+        ----------
+        low, high : array_like, shape (n,)
+            In units of theta.
+        to : pair of float, default (-1, 1)
+            As ``min_obs`` and ``max_obs`` of `gymnasium.wrappers.RescaleObservation`.
+        """
+        bottom = as_array("low", low, ("n",))
+        top = as_array("high", high, (len(bottom),))
+        width = float(to[1]) - float(to[0])
+        if np.any(top <= bottom) or not width > 0:
+            raise ValueError(
+                f"low = {bottom.tolist()} must lie below high = {top.tolist()}, and to[0] below "
+                f"to[1] in to = {to}."
+            )
+        slope = (top - bottom) / width
+        return cls(np.diag(slope), bottom - slope * float(to[0]))
+
+    @classmethod
+    def pick(cls, entries: Sequence[int], size: int) -> AffineObservation:
+        """Return ``theta[i] = obs[entries[i]]``, of an observation with ``size`` entries.
+
+        This reorders, and leaves out what the law does not take. A law that takes a set-point as
+        part of theta gets it in this way as well.
+        """
+        return cls(np.eye(size)[_as_entries("entries", entries, size)])
+
+    @classmethod
+    def minus_set_point(
+        cls, entries: Sequence[int], set_points: Sequence[int | None], size: int
+    ) -> AffineObservation:
+        """Return ``theta[i] = obs[entries[i]] - obs[set_points[i]]``, None for no set-point.
+
+        For a law in deviations from a set-point that is part of the observation.
+        """
+        if len(set_points) != len(entries):
+            raise ValueError(
+                f"set_points = {set_points} has {len(set_points)} items for {len(entries)} "
+                "entries; write None for an entry without a set-point."
+            )
+        T = np.eye(size)[_as_entries("entries", entries, size)]
+        for row, set_point in zip(T, set_points, strict=True):
+            if set_point is not None:
+                row -= np.eye(size)[_as_entries("set_points", [set_point], size)[0]]
+        return cls(T)
+
+    @classmethod
+    def newest_frame(cls, size: int, frames: int) -> AffineObservation:
+        """Return ``theta = `` the newest of the last ``frames`` observations of ``size`` entries.
+
+        It comes last both in SB3's `VecFrameStack`, which joins vectors to one of shape
+        ``(frames * size,)``, and in gymnasium's `FrameStackObservation`, of shape (frames, size).
+        (With ``channels_order="first"``, VecFrameStack joins vectors in the same order.)
+        """
+        if frames < 1:
+            raise ValueError(f"frames = {frames} must be at least 1.")
+        return cls.pick(range((frames - 1) * size, frames * size), frames * size)
+
+    @classmethod
+    def from_vec_normalize(cls, venv: VecEnv) -> AffineObservation:
+        """Return the map that undoes the frozen statistics of a `VecNormalize`.
+
+        It gives what the env below shows. Where that is not theta yet, compose:
+        ``AffineObservation.deviation(x_ss) @ AffineObservation.from_vec_normalize(venv)``.
+        The policy also checks that no clipping (``clip_obs``) acts within the box of the law. It
+        takes normalised observations from then on, also where it is loaded without the env.
+
+        Raises
+        ------
+        ValueError
+            If there is no VecNormalize, its statistics still move, it normalises rewards, or it is
+            not what the learner sees.
+        """
+        normalize = unwrap_vec_normalize(venv)
+        if normalize is None:
+            raise ValueError(f"venv = {venv} holds no VecNormalize; wrap it in one, or leave it.")
+        require_frozen(normalize)
+        shape = normalize.observation_space.shape
+        if shape is None or shape != venv.observation_space.shape:
+            raise ValueError(
+                f"The VecNormalize shows {shape}, but venv {venv.observation_space.shape}. Make "
+                "VecNormalize the last wrapper, outside VecFrameStack."
+            )
+        if not normalize.norm_obs:
+            return cls.identity(int(np.prod(shape)))
+        statistics = cast(RunningMeanStd, normalize.obs_rms)  # a dict only for a space of dicts
+        std = np.sqrt(statistics.var + normalize.epsilon)
+        return cls.normalised(np.ravel(statistics.mean), np.ravel(std))
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters of the law."""
+        return int(self.T.shape[0])
+
+    @property
+    def n_obs(self) -> int:
+        """Number of entries of an observation."""
+        return int(self.T.shape[1])
+
+    def __call__(self, observation: ArrayLike) -> Array:
+        """Return theta, (n_theta,) or (batch, n_theta), for (n_obs,) or (batch, n_obs)."""
+        return np.asarray(np.asarray(observation, dtype=np.float64) @ self.T.T + self.t0)
+
+    def __matmul__(self, inner: AffineObservation) -> AffineObservation:
+        """Return the map that applies ``inner`` first and this one to what comes out."""
+        if not isinstance(inner, AffineObservation):
+            return NotImplemented
+        if inner.n_theta != self.n_obs:
+            raise ValueError(
+                f"The inner map puts out {inner.n_theta} entries, the outer one takes {self.n_obs}."
+            )
+        return AffineObservation(self.T @ inner.T, self.T @ inner.t0 + self.t0)
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether both maps are the same."""
+        if not isinstance(other, AffineObservation):
+            return NotImplemented
+        return same_fields(self, other, ("T", "t0"))
+
+    def __hash__(self) -> int:
+        """Return a hash that equal maps share."""
+        return hash((self.T.tobytes(), self.t0.tobytes()))
+
+    def __repr__(self) -> str:
+        """Name the matrix and the offset, so that it can be pasted."""
+        return f"AffineObservation(T={self.T.tolist()}, t0={self.t0.tolist()})"
+
+
+def require_frozen(normalize: VecNormalize) -> None:
+    """Raise if a VecNormalize changes what it has said, or changes the rewards."""
+    if normalize.norm_reward:
+        raise ValueError(
+            "The VecNormalize normalises rewards: they are not the cost that the critic stands "
+            "for. Pass norm_reward=False; policy_kwargs={'reward_scale': ...} takes care of sizes."
+        )
+    if normalize.norm_obs and normalize.training:
+        raise ValueError(
+            "The VecNormalize still moves its statistics (training=True), so that one observation "
+            "means another state at each step. Collect them first, then set venv.training = False."
+        )
+
+
+def _as_entries(name: str, entries: Sequence[int], size: int) -> list[int]:
+    found = [int(entry) for entry in entries]
+    if not all(0 <= entry < size for entry in found):
+        raise ValueError(f"{name} = {found} must be indices from 0 to {size - 1}.")
+    return found

@@ -1,0 +1,90 @@
+"""The choice of a solver, limits and progress of `LinearMPC.explicit`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sample_problems import PROBLEMS, benchmark, box_points, solved
+from sb3_yann.control import ExplicitLimitError
+
+
+@pytest.mark.parametrize("name", ["pendulum", "reactor", "benchmark", "one state", "discounted"])
+def test_both_solvers_give_the_same_law(name: str) -> None:
+    mpc = PROBLEMS[name]()
+    walk, ppopt = mpc.explicit(), mpc.explicit("ppopt")
+    assert (walk.n_regions, walk.n_halfspaces) == (ppopt.n_regions, ppopt.n_halfspaces)
+    np.testing.assert_allclose(walk.gains, ppopt.gains, rtol=1e-9, atol=1e-9)
+    points = box_points(mpc, 1000)
+    np.testing.assert_allclose(walk(points), ppopt(points), rtol=1e-9, atol=1e-9)
+
+
+def test_the_law_of_each_solver_is_kept() -> None:
+    mpc = benchmark()
+    assert mpc.explicit(solver="ppopt") is mpc.explicit("ppopt")
+    assert mpc.explicit() is mpc.explicit("walk")
+
+
+def test_another_solver_is_named() -> None:
+    with pytest.raises(ValueError, match=r"solver = 'gurobi' must be one of \('walk', 'ppopt'\)"):
+        benchmark().explicit("gurobi")
+
+
+@pytest.mark.parametrize("solver", ["walk", "ppopt"])
+def test_too_many_regions_are_an_error_that_says_what_to_change(solver: str) -> None:
+    message = "more than region_limit = 4 regions: .* were found in .* shorten the horizon"
+    with pytest.raises(ExplicitLimitError, match=message) as error:
+        benchmark().explicit(solver, region_limit=4)
+    assert error.value.n_regions == (5 if solver == "walk" else 9)
+
+
+@pytest.mark.parametrize("solver", ["walk", "ppopt"])
+def test_too_long_a_search_is_an_error_that_says_what_to_change(solver: str) -> None:
+    with pytest.raises(ExplicitLimitError, match=r"not solved in time_limit = 1e-06 s: .* horizon"):
+        benchmark().explicit(solver, time_limit=1e-6)
+
+
+def test_a_limit_that_is_not_reached_changes_nothing() -> None:
+    law = benchmark().explicit(time_limit=1000, region_limit=9)
+    assert law == solved("benchmark").explicit()
+
+
+def test_after_a_limit_the_law_can_still_be_had() -> None:
+    mpc = benchmark()
+    with pytest.raises(ExplicitLimitError):
+        mpc.explicit(region_limit=1)
+    assert mpc.explicit().n_regions == 9
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"time_limit": 0}, "time_limit = 0 must be a number of seconds above 0"),
+        ({"time_limit": float("nan")}, "time_limit = nan must be a number of seconds above 0"),
+        ({"time_limit": "1 h"}, "time_limit = '1 h' must be a number of seconds above 0"),
+        ({"region_limit": 0}, "region_limit = 0 must be a whole number above 0"),
+        ({"region_limit": 1.5}, "region_limit = 1.5 must be a whole number above 0"),
+    ],
+)
+def test_bad_limit_is_named(limits: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        benchmark().explicit(**limits)
+
+
+def test_progress_goes_to_the_error_stream_and_only_if_asked_for(capfd: Any) -> None:
+    benchmark().explicit()
+    assert capfd.readouterr() == ("", "")
+    benchmark().explicit(progress=True)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "Critical regions" in err
+
+
+def test_a_law_that_is_there_keeps_to_the_limit_of_regions() -> None:
+    mpc = benchmark()
+    assert mpc.explicit().n_regions == 9
+    with pytest.raises(ExplicitLimitError, match="9 regions, more than region_limit = 8") as error:
+        mpc.explicit(region_limit=8)
+    assert error.value.n_regions == 9

@@ -1,0 +1,180 @@
+"""The walk from facet to facet finds the regions that ppopt finds, and that QPs say are there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+import general_problems
+import sample_problems
+from reference_answers import online_answers, random_problems, relative_error
+from sample_problems import box_points, half_spaces, input_bounds_only, small_mpc
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann.control import PiecewiseAffine
+from sb3_yann.control.explicit import solve as module
+from sb3_yann.control.explicit.budget import Limits, Watch
+from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
+
+# Those that ppopt solves in about a second.
+NAMES = [
+    *("pendulum", "reactor", "reactor, predicted states bounded", "benchmark", "terminal set"),
+    *("asymmetric input bounds", "discounted", "one step", "only one state bounded"),
+    *("a final state held to 1e-4", "every state bound twice", "a constraint that only touches"),
+    *("a constraint without a state", "inputs that do the same", "an input without effect"),
+    *("coupled inputs", "unstable, part of the box infeasible", "only predicted states bounded"),
+    *("nothing bounded", "zero input not allowed", "origin outside the box"),
+    *("states without weight", "cheap inputs", "expensive inputs", "one state"),
+    *("states of 1e-9 and 1e7, inputs of 1e6", "four states, two inputs"),
+]
+GENERAL_NAMES = [
+    *("servo", "servo with rates", "servo with a weight on the rate", "soft states"),
+    *("invariant with all of it", "linear cost", "two tanks", "two tanks, all parts"),
+]
+
+
+def problem(name: str) -> LinearMPC:
+    return {**sample_problems.PROBLEMS, **general_problems.PROBLEMS}[name]()
+
+
+def regions_of(mpc: LinearMPC, solver: str) -> list[Region]:
+    units = module._Units(mpc.condensed(), mpc.u_min, mpc.u_max)
+    return module._critical_regions(units.scaled, solver, Watch(Limits()))
+
+
+def reaches_beyond(one: Region, other: Region) -> float:
+    """How far the half-spaces of one region let a point get beyond those of another."""
+    beyond = (normal @ farthest_point(one.A, one.b, normal) for normal in other.A)
+    return max(point - bound for point, bound in zip(beyond, other.b, strict=True))
+
+
+def assert_same_regions(mpc: LinearMPC) -> None:
+    ours, theirs = regions_of(mpc, "walk"), regions_of(mpc, "ppopt")
+    assert [one.active_set for one in ours] == [one.active_set for one in theirs]
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(one.gain, other.gain, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(one.offset, other.offset, rtol=1e-9, atol=1e-9)
+        assert max(reaches_beyond(one, other), reaches_beyond(other, one)) < 1e-8
+        assert len(one.b) <= len(other.b)
+
+
+@pytest.mark.parametrize("name", [*NAMES, *GENERAL_NAMES])
+def test_regions_are_those_of_ppopt(name: str) -> None:
+    assert_same_regions(problem(name))
+
+
+@settings(
+    derandomize=True,
+    max_examples=10,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+@given(random_problems())
+def test_regions_of_random_problems_are_those_of_ppopt(mpc: LinearMPC) -> None:
+    units = module._Units(mpc.condensed(), mpc.u_min, mpc.u_max)
+    try:
+        module._require_feasible(units.scaled)
+    except ValueError:
+        return
+    assert_same_regions(mpc)
+
+
+@pytest.mark.parametrize("name", ["two inputs", "servo with all of it", "two tanks, all parts"])
+def test_every_half_space_of_a_region_bounds_it(name: str) -> None:
+    for region in regions_of(problem(name), "walk"):
+        np.testing.assert_allclose(np.linalg.norm(region.A, axis=1), 1)
+        for row in range(len(region.b)):
+            assert largest_ball(region.A, region.b, row)[1] > 1e-9
+
+
+def carts(**changes: Any) -> LinearMPC:
+    """Two coupled carts, each with a force of its own; hundreds of regions."""
+    A = [[1, 0.5, 0.05, 0], [-0.1, 1, 0.1, 0], [0.05, 0, 1, 0.5], [0.1, 0, -0.1, 1]]
+    B = [[0.125, 0], [0.5, 0.1], [0, 0.125], [0.1, 0.5]]
+    values = {"Q": np.eye(4), "R": 0.1 * np.eye(2), "horizon": 3, "u_min": -1, "u_max": 1}
+    return LinearMPC(LinearModel(A, B, 0.5), **{**values, **changes})
+
+
+def staircase(**changes: Any) -> LinearMPC:
+    """From the lowest input to the highest in three steps, all of the largest size.
+
+    The last of the five constraints on the four inputs holds with equality whenever the others do.
+    """
+    limits = {"u_min": -1, "u_max": 0.5, "du_min": -0.5, "du_max": 0.5, "horizon": 4}
+    return input_bounds_only(
+        LinearModel([[0.9, 0.4], [0, 0.8]], [[0], [1]], 1.0), **{**limits, **changes}
+    )
+
+
+def holders(law: PiecewiseAffine, points: np.ndarray, depth: float) -> np.ndarray:
+    """How many regions hold each point deeper than a distance in half-widths of the box."""
+    count = np.zeros(len(points), dtype=int)
+    for region in range(law.n_regions):
+        A, b = half_spaces(law, region)
+        count += np.all(points @ A.T <= b - depth, axis=1)
+    return count
+
+
+@pytest.mark.parametrize(
+    "mpc",
+    [carts(x_min=-10, x_max=10), carts(theta_min=-10, theta_max=10), staircase()],
+    ids=["carts, states bounded", "carts", "staircase"],
+)
+def test_law_of_many_regions_is_the_online_qp_and_no_point_is_in_two(mpc: LinearMPC) -> None:
+    law, points = mpc.explicit(), box_points(mpc, 2000)
+    inputs, feasible = online_answers(mpc, points)
+    np.testing.assert_array_equal(law.in_domain(points), feasible)
+    assert relative_error(mpc, law(points[feasible]), inputs) <= 1e-9
+    assert holders(law, points, depth=1e-9).max() == 1
+    np.testing.assert_array_equal(holders(law, points, depth=-1e-9) > 0, feasible)
+
+
+def test_constraints_that_depend_on_each_other_share_a_region_without_overlap() -> None:
+    # Where all five constraints of the staircase are tight, any four of them give the same law.
+    mpc = staircase(theta_min=-20, theta_max=20)
+    law = mpc.explicit()
+    same = law.gains[:, :, :].reshape(law.n_regions, -1)
+    assert len(np.unique(np.round(np.column_stack([same, law.offsets]), 9), axis=0)) > 1
+    assert holders(law, box_points(mpc, 20000), depth=1e-9).max() == 1
+
+
+def test_a_region_thinner_than_a_millionth_of_the_box_is_found() -> None:
+    slim = small_mpc(terminal_set=([[1, 0], [-1, 0]], [1e-6, 1e-6]), horizon=3)
+    law = slim.explicit()
+    radii = [region.ball()[1] for region in regions_of(slim, "walk")]
+    assert min(radii) < 1e-6
+    points = np.array([region.ball()[0] for region in regions_of(slim, "walk")]) * 5
+    inputs, feasible = online_answers(slim, points)
+    assert feasible.all()
+    assert relative_error(slim, law(points), inputs) <= 1e-9
+
+
+def test_regions_that_no_first_point_leads_to_are_found_from_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from sb3_yann.control import facet_walk
+
+    explore, calls = facet_walk._Walk.explore, []
+
+    def late(self: Any, wave: Any) -> None:
+        calls.append(wave)
+        if len(calls) > 1:
+            explore(self, wave)
+
+    monkeypatch.setattr(facet_walk._Walk, "explore", late)
+    assert problem("two inputs").explicit().n_regions == 27
+
+
+@pytest.mark.parametrize("width", [1e-5, 1e-7])
+def test_facets_of_a_thin_polyhedron_are_those_of_the_same_one_made_round(width: float) -> None:
+    random = np.random.default_rng(0)
+    A = random.normal(size=(40, 3))
+    A /= np.linalg.norm(A, axis=1)[:, None]
+    b = random.uniform(0.5, 1.5, 40)
+    round_one = facets(A, b, np.zeros(3), 0.5)
+    thin = A @ np.linalg.inv(np.linalg.qr(random.normal(size=(3, 3)))[0] * [1, 1, width])
+    length = np.linalg.norm(thin, axis=1)
+    found = facets(thin / length[:, None], b / length, np.zeros(3), float(np.min(b / length)))
+    assert found.tolist() == round_one.tolist() and len(found) < 40

@@ -1,0 +1,274 @@
+"""The explicit law is the MPC: the same input as an online QP, everywhere, every time."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from scipy import optimize
+
+from fresh_process import run_python
+from online_mpc import OnlineMPC
+from reference_answers import online_answers, random_problems, relative_error
+from sample_problems import (
+    DOUBLE_INTEGRATOR,
+    EYE_ROWS,
+    PROBLEMS,
+    benchmark,
+    box_points,
+    in_units,
+    input_bounds_only,
+    small_mpc,
+    solved,
+)
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann.control import lqr
+from sb3_yann_envs import problems
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "pendulum",
+        "reactor",
+        "asymmetric input bounds",
+        "two inputs",
+        "terminal set",
+        "discounted",
+        "one state",
+    ],
+)
+def test_law_equals_an_online_qp_at_ten_thousand_feasible_states(name: str) -> None:
+    mpc, count = solved(name), 10_000
+    points = box_points(mpc, 6 * count)
+    inside = points[mpc.explicit().in_domain(points)][:count]
+    assert len(inside) == count
+    inputs, feasible = online_answers(mpc, inside)
+    assert feasible.all()
+    assert relative_error(mpc, mpc.explicit()(inside), inputs) <= 1e-9
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_law_and_domain_are_those_of_an_online_qp(name: str) -> None:
+    mpc = solved(name)
+    points = box_points(mpc, 500, seed=1)
+    inputs, feasible = online_answers(mpc, points)
+    assert feasible.any()
+    np.testing.assert_array_equal(mpc.explicit().in_domain(points), feasible)
+    assert relative_error(mpc, mpc.explicit()(points[feasible]), inputs) <= 1e-9
+
+
+@settings(
+    derandomize=True,
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+@given(random_problems())
+def test_law_and_domain_of_random_problems_are_those_of_an_online_qp(mpc: LinearMPC) -> None:
+    law, points = mpc.explicit(), box_points(mpc, 200)
+    inputs, feasible = online_answers(mpc, points)
+    assume(feasible.any())
+    np.testing.assert_array_equal(law.in_domain(points), feasible)
+    assert relative_error(mpc, law(points[feasible]), inputs) <= 1e-9
+
+
+def test_online_qp_itself_agrees_with_a_general_purpose_solver() -> None:
+    mpc, theta = benchmark(), np.array([3.0, -0.4])
+
+    def cost(u: np.ndarray) -> float:
+        x, total = theta, 0.0
+        for k in range(2):
+            total += float(x @ mpc.Q @ x) + 0.1 * float(u[k] ** 2)
+            x = mpc.model.step(x, u[k : k + 1])
+        return total + float(x @ mpc.terminal_cost @ x)
+
+    best = optimize.minimize(cost, np.zeros(2), bounds=[(-1, 1)] * 2, tol=1e-14)
+    assert OnlineMPC(mpc)(theta)[0] == pytest.approx(best.x[0], abs=1e-6)
+
+
+def test_one_step_without_state_bounds_is_the_clipped_lqr() -> None:
+    mpc = input_bounds_only(horizon=1)
+    gain = lqr.gain(mpc.model, mpc.R, mpc.terminal_cost)
+    points = box_points(mpc, 2000)
+    np.testing.assert_allclose(
+        mpc.explicit()(points), np.clip(-points @ gain.T, -1, 1), rtol=0, atol=1e-13
+    )
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.95, 0.8])
+def test_unconstrained_region_has_the_lqr_gain_of_the_same_discount(gamma: float) -> None:
+    mpc = input_bounds_only(gamma=gamma)
+    law, K = mpc.explicit(), lqr.gain(mpc.model, mpc.R, mpc.terminal_cost, gamma)
+    np.testing.assert_allclose(law.gains[law.locate([0, 0])], -K, rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("name", "n_regions", "n_halfspaces"),
+    [
+        # Braniff & Tian's parameter counts decode to these numbers only: p regions and q half-
+        # spaces in q(n+1) + p(q+1) + p^2 + ... = 15,188 (pendulum) and 5,320 (reactor).
+        ("pendulum", 7, 32),
+        ("reactor", 7, 56),
+        # what the paper's text says literally; measured here
+        ("reactor, predicted states bounded", 7, 79),
+    ],
+)
+def test_partition_has_the_known_size(name: str, n_regions: int, n_halfspaces: int) -> None:
+    law = solved(name).explicit()
+    assert (law.n_regions, law.n_halfspaces) == (n_regions, n_halfspaces)
+
+
+def test_pendulum_with_the_printed_weights_has_another_partition() -> None:
+    mpc = problems.clipped_pendulum()
+    other = LinearMPC(
+        mpc.model,
+        Q=np.eye(2),  # as printed; diag(1, 0.1) gives the 7 regions that the paper counts
+        R=mpc.R,
+        horizon=2,
+        x_min=mpc.x_min,
+        x_max=mpc.x_max,
+        u_min=mpc.u_min,
+        u_max=mpc.u_max,
+    )
+    assert (other.explicit().n_regions, other.explicit().n_halfspaces) == (9, 40)
+
+
+def test_published_benchmark_has_nine_regions_and_the_published_gains() -> None:
+    # The double integrator of Bemporad, Morari, Dua & Pistikopoulos, The explicit linear quadratic
+    # regulator for constrained systems, Automatica 38 (2002). The numbers are quoted second-hand,
+    # to 4 decimals; the next test and the Riccati gain derive them without any explicit solver.
+    law = benchmark().explicit()
+    assert law.n_regions == 9
+    table = {tuple(np.round([*g[0], o[0]], 4)) for g, o in zip(law.gains, law.offsets, strict=True)}
+    published = {(-0.8166, -1.7499, 0), (-0.5528, -1.5364, 0.4308), (-0.5528, -1.5364, -0.4308)}
+    assert table == {*published, (0, 0, 1), (0, 0, -1)}
+
+
+def test_benchmark_region_with_a_saturated_second_input_is_the_minimiser_by_hand() -> None:
+    # With u_1 fixed the cost is a parabola in u_0: independent of any solver.
+    mpc = benchmark()
+    A, B, P = mpc.model.A, mpc.model.B, mpc.terminal_cost
+    curvature = mpc.R + B.T @ (mpc.Q + A.T @ P @ A) @ B
+    gain = -np.linalg.solve(curvature, B.T @ (mpc.Q + A.T @ P @ A) @ A)
+    offset = -np.linalg.solve(curvature, B.T @ A.T @ P @ B @ [-1.0])
+    law = mpc.explicit()
+    found = np.isclose(law.gains, gain).all((1, 2)) & np.isclose(law.offsets, offset).all(1)
+    assert np.sum(found) == 1
+
+
+@pytest.mark.parametrize("name", ["pendulum", "reactor", "two inputs"])
+def test_solving_twice_gives_the_same_law_bit_for_bit(name: str) -> None:
+    assert PROBLEMS[name]().explicit() == solved(name).explicit()
+
+
+def test_a_fresh_process_gives_the_same_law_bit_for_bit(tmp_path: Any) -> None:
+    path = tmp_path / "law.npz"
+    code = (
+        "import sys; from sb3_yann_envs import problems; "
+        "problems.clipped_pendulum().explicit().save(sys.argv[1])"
+    )
+    assert run_python(code, str(path)).returncode == 0
+    law = solved("pendulum").explicit()
+    assert type(law).load(path) == law
+
+
+@pytest.mark.parametrize("units", [[1e-9, 1e7], [1e-4, 1e4], [1e9, 1e9]])
+def test_units_of_states_and_input_change_nothing(units: list[float]) -> None:
+    plain = in_units(np.ones(2), 1.0)
+    other = in_units(np.array(units), 1e6)
+    wide = 2 * box_points(plain, 2000)  # outside the feasible set too
+    one, two = plain.explicit(), other.explicit()
+    np.testing.assert_array_equal(two.in_domain(wide * units), one.in_domain(wide))
+    np.testing.assert_allclose(two(wide * units) / 1e6, one(wide), rtol=0, atol=1e-9)
+
+
+def test_constraints_that_say_the_same_give_no_more_regions() -> None:
+    twice = small_mpc(terminal_set=(2 * EYE_ROWS, [10] * 4))
+    assert twice.explicit().n_regions == small_mpc().explicit().n_regions
+
+
+def test_law_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_yann.control import mpc as module
+
+    calls, solve = [], module.solve_explicit
+    monkeypatch.setattr(module, "solve_explicit", lambda *args: calls.append(args) or solve(*args))
+    mpc = small_mpc()
+    assert mpc.explicit() is mpc.explicit()
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
+def test_copies_of_a_problem_bring_the_solved_law(
+    copied: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    twin = copied(solved("benchmark"))
+    # Nothing is left to solve with.
+    monkeypatch.setattr("sb3_yann.control.mpc.linear_mpc.solve_explicit", None)
+    assert twin.explicit() == solved("benchmark").explicit()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
+def test_copies_of_a_problem_are_equal_and_share_a_hash(copied: Any) -> None:
+    mpc = small_mpc()
+    assert copied(mpc) == mpc
+    assert hash(copied(mpc)) == hash(mpc)
+
+
+def test_solving_does_not_change_equality() -> None:
+    assert solved("pendulum") == problems.clipped_pendulum()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"model": LinearModel(DOUBLE_INTEGRATOR.A, DOUBLE_INTEGRATOR.B, 2.0)},
+        {"Q": np.diag([1, 2])},
+        {"R": [[2]]},
+        {"horizon": 3},
+        {"x_min": -4},
+        {"x_max": 4},
+        {"u_min": -2},
+        {"u_max": 2},
+        {"theta_min": -4},
+        {"theta_max": 4},
+        {"terminal_cost": np.eye(2)},
+        {"terminal_set": ([[1, 1]], [3])},
+        {"gamma": 0.9},
+        {"outside": "zero"},
+    ],
+)
+def test_problems_that_differ_in_one_argument_are_not_equal(changes: dict[str, Any]) -> None:
+    assert small_mpc(**changes) != small_mpc()
+
+
+def test_a_problem_is_not_equal_to_something_else() -> None:
+    assert small_mpc() != "a problem"
+
+
+def test_negative_zero_is_zero_to_the_hash_of_a_problem() -> None:
+    one, other = (small_mpc(Q=[[1, zero], [zero, 1]]) for zero in (0.0, -0.0))
+    assert one == other
+    assert hash(one) == hash(other)
+
+
+def test_arrays_of_a_problem_stay_read_only_in_a_copy() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        copy.deepcopy(small_mpc()).Q[0, 0] = 2
+
+
+@pytest.mark.parametrize("entry", [0, 1])
+def test_a_terminal_set_stays_read_only_in_a_copy(entry: int) -> None:
+    twin = copy.deepcopy(small_mpc(terminal_set=([[1, 1]], [3])))
+    with pytest.raises(ValueError, match="read-only"):
+        twin.terminal_set[entry][0] = 2
+
+
+def test_a_problem_with_one_thing_replaced_is_that_problem() -> None:
+    changed = dataclasses.replace(small_mpc(), Q=np.diag([1, 2]), terminal_cost=None)
+    assert changed == small_mpc(Q=np.diag([1, 2]))

@@ -1,0 +1,89 @@
+"""Solving needs no licence, prints nothing, and leaves the process as it was."""
+
+from __future__ import annotations
+
+import pickle
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fresh_process import run_python
+from sample_problems import benchmark
+
+NO_GUROBI = """
+import sys
+try:
+    import gurobipy
+except ImportError:
+    pass
+else:
+    def no_licence(*args, **kwargs):
+        raise RuntimeError("gurobi was asked")
+    for name in ("Model", "MModel", "Env", "read"):
+        if hasattr(gurobipy, name):
+            setattr(gurobipy, name, no_licence)
+from sb3_yann_envs import problems
+sys.exit(problems.clipped_pendulum().explicit().n_regions)
+"""
+
+NOT_INSTALLED = """
+import sys
+for name in ("gurobipy", "quadprog"):
+    sys.modules[name] = None
+from sb3_yann_envs import problems
+sys.exit(problems.cstr().explicit().n_regions)
+"""
+
+FROZEN_LAW = """
+import sys, pickle
+for name in ("ppopt", "daqp", "cvxopt", "gurobipy"):
+    sys.modules[name] = None
+mpc = pickle.load(sys.stdin.buffer)
+mpc.explicit()([0.0, 0.0])
+sys.exit(mpc.explicit().n_regions)
+"""
+
+
+@pytest.mark.parametrize(
+    "code", [NO_GUROBI, NOT_INSTALLED], ids=["gurobi has no licence", "gurobi is not installed"]
+)
+def test_solving_needs_no_gurobi_and_prints_nothing(code: str) -> None:
+    done = run_python(code)
+    assert (done.returncode, done.stdout, done.stderr) == (7, b"", b"")
+
+
+def test_a_solved_problem_needs_no_solver() -> None:
+    mpc = benchmark()
+    mpc.explicit()
+    done = run_python(FROZEN_LAW, stdin=pickle.dumps(mpc))
+    assert (done.returncode, done.stdout, done.stderr) == (9, b"", b"")
+
+
+def test_global_random_state_is_untouched() -> None:
+    python, legacy = random.getstate(), np.random.get_state(legacy=False)  # noqa: NPY002
+    benchmark().explicit()
+    assert random.getstate() == python
+    np.testing.assert_equal(np.random.get_state(legacy=False), legacy)  # noqa: NPY002
+
+
+def test_random_state_does_not_change_the_law() -> None:
+    laws = []
+    for seed in (1, 2):
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        laws.append(benchmark().explicit())
+    assert laws[0] == laws[1]
+
+
+def test_solving_writes_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    benchmark().explicit()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numpy_error_handling_and_print_options_are_untouched() -> None:
+    before = (np.geterr(), np.get_printoptions())
+    benchmark().explicit()
+    assert (np.geterr(), np.get_printoptions()) == before

@@ -1,0 +1,313 @@
+"""A PiecewiseAffine law is defined everywhere, bounded, and survives files and copies."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import pickle
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sample_problems import (
+    PROBLEMS,
+    box_points,
+    facet_points,
+    half_spaces,
+    solved,
+    vertices,
+)
+from sb3_yann.control import PiecewiseAffine
+
+PLANAR = ["pendulum", "benchmark", "asymmetric input bounds", "two inputs", "terminal set"]
+
+
+@cache
+def law_of(name: str, outside: str = "nearest") -> PiecewiseAffine:
+    return dataclasses.replace(solved(name).explicit(), outside=outside)
+
+
+def far_points(law: PiecewiseAffine, seed: int = 0) -> np.ndarray:
+    """Points (count, n) of every size from 1e-6 to 1e6 boxes, and on the axes."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(2000, law.n_theta)) * 10 ** rng.uniform(-6, 6, (2000, 1))
+    axes = np.kron([1e6, -1e6, 0.0], np.eye(law.n_theta)).T
+    return np.vstack([points, axes]) * (law.theta_max - law.theta_min)
+
+
+@cache
+def special_points(name: str) -> np.ndarray:
+    law = law_of(name)
+    corners = [vertices(law)] if law.n_theta == 2 else []
+    return np.vstack([facet_points(law), *corners])
+
+
+@pytest.mark.parametrize("name", [*PLANAR, "reactor", "states of 1e-9 and 1e7, inputs of 1e6"])
+def test_facets_and_vertices_belong_to_the_domain(name: str) -> None:
+    points = special_points(name)
+    assert len(points) > 10
+    assert law_of(name).in_domain(points).all()
+
+
+@pytest.mark.parametrize("name", [*PLANAR, "reactor"])
+def test_law_is_continuous_on_facets_and_at_vertices(name: str) -> None:
+    law, points = law_of(name), special_points(name)
+    half = (law.theta_max - law.theta_min) / 2
+    jumps, neighbours = [], 0
+    for point in points:
+        holding = [
+            i
+            for i in range(law.n_regions)
+            if np.all(half_spaces(law, i)[0] @ point <= half_spaces(law, i)[1] + 1e-10)
+        ]
+        values = law.gains[holding] @ point + law.offsets[holding]
+        jumps.append(np.max(np.abs(values - law(point)) / (law.u_max - law.u_min)))
+        neighbours += len(holding) > 1
+    assert np.all(half > 0)
+    assert neighbours > 5  # the points do lie between regions
+    assert max(jumps) <= 1e-9
+
+
+@pytest.mark.parametrize("outside", ["nearest", "zero"])
+@pytest.mark.parametrize("name", [*PLANAR, "reactor"])
+def test_every_facet_and_vertex_has_exactly_the_input_of_its_one_region(
+    name: str, outside: str
+) -> None:
+    law, points = law_of(name, outside), special_points(name)
+    region = law.locate(points)
+    for point, i, u in zip(points, region, law(points), strict=True):
+        one = np.clip(law.gains[i] @ point + law.offsets[i], law.u_min, law.u_max)
+        np.testing.assert_allclose(u, one, rtol=0, atol=1e-14 * np.max(law.u_max))
+
+
+@pytest.mark.parametrize("outside", ["nearest", "zero"])
+@pytest.mark.parametrize("name", [*PLANAR, "reactor", "four states, two inputs"])
+def test_one_point_and_a_batch_agree(name: str, outside: str) -> None:
+    law = law_of(name, outside)
+    points = np.vstack([special_points(name), far_points(law)])
+    np.testing.assert_allclose(
+        np.stack([law(point) for point in points]),
+        law(points),
+        rtol=0,
+        atol=1e-13 * np.max(law.u_max),
+    )
+    np.testing.assert_array_equal([law.in_domain(p) for p in points], law.in_domain(points))
+
+
+def test_chosen_region_has_the_largest_smallest_slack_and_is_the_first_on_a_tie() -> None:
+    law = law_of("benchmark")
+    for point in box_points(solved("benchmark"), 200):
+        slacks = [np.min(b - A @ point) for A, b in map(lambda i: half_spaces(law, i), range(9))]
+        assert law.locate(point) == int(np.argmax(slacks))
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (0,)])
+def test_shapes_follow_those_of_theta(batch: tuple[int, ...]) -> None:
+    law, theta = law_of("two inputs"), np.zeros((*batch, 2))
+    assert law(theta).shape == (*batch, 2)
+    assert np.shape(law.locate(theta)) == np.shape(law.in_domain(theta)) == batch
+
+
+@pytest.mark.parametrize("outside", ["nearest", "zero"])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_input_is_finite_and_within_bounds_a_million_boxes_away(name: str, outside: str) -> None:
+    law = law_of(name, outside)
+    u = law(far_points(law))
+    assert np.all(np.isfinite(u))
+    assert np.all((law.u_min <= u) & (u <= law.u_max))
+
+
+def test_nearest_is_the_clipped_law_of_the_region_violated_least() -> None:
+    law = law_of("benchmark")
+    points = far_points(law)
+    outside = points[~law.in_domain(points)]
+    assert len(outside) > 100
+    i = law.locate(outside)
+    affine = np.einsum("bmn,bn->bm", law.gains[i], outside) + law.offsets[i]
+    np.testing.assert_array_equal(law(outside), np.clip(affine, -1, 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("asymmetric input bounds", 0.0), ("zero input not allowed", 0.2)]
+)
+def test_zero_is_no_input_outside_or_the_bound_nearest_to_it(name: str, value: float) -> None:
+    law = law_of(name, "zero")
+    points = far_points(law)
+    outside = points[~law.in_domain(points)]
+    assert len(outside) > 100
+    np.testing.assert_array_equal(law(outside), value)
+
+
+@pytest.mark.parametrize("name", [*PLANAR, "reactor"])
+def test_both_options_are_the_same_law_inside(name: str) -> None:
+    points = box_points(solved(name), 1000)
+    inside = points[law_of(name).in_domain(points)]
+    np.testing.assert_array_equal(law_of(name, "zero")(inside), law_of(name)(inside))
+
+
+@pytest.mark.parametrize("outside", ["nearest", "zero"])
+def test_law_read_from_a_file_is_equal_to_the_one_saved(tmp_path: Path, outside: str) -> None:
+    law, path = law_of("reactor", outside), tmp_path / "law"
+    law.save(path)
+    assert PiecewiseAffine.load(path) == law
+    assert hash(PiecewiseAffine.load(str(path))) == hash(law)
+
+
+def test_saved_file_holds_plain_arrays(tmp_path: Path) -> None:
+    law = law_of("pendulum")
+    law.save(tmp_path / "law.npz")
+    with np.load(tmp_path / "law.npz", allow_pickle=False) as data:
+        names = {name for name in data if not name.startswith("tree_")}
+        assert names == {field.name for field in dataclasses.fields(law)}
+        assert all(data[name].dtype != object for name in data)
+
+
+def test_saving_leaves_one_file(tmp_path: Path) -> None:
+    law_of("pendulum").save(tmp_path / "law.npz")
+    assert [path.name for path in tmp_path.iterdir()] == ["law.npz"]
+
+
+def test_failed_save_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    law, path = law_of("pendulum"), tmp_path / "law.npz"
+    law.save(path)
+
+    def full_disk(file: Any, **arrays: Any) -> None:
+        file.write(b"half of it")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(np, "savez", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        law_of("reactor").save(path)
+    assert PiecewiseAffine.load(path) == law
+    assert [entry.name for entry in tmp_path.iterdir()] == ["law.npz"]
+
+
+def arrays_with(**changes: Any) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        law = law_of("pendulum")
+        values = {field.name: getattr(law, field.name) for field in dataclasses.fields(law)}
+        with open(path, "wb") as file:
+            np.savez(file, **{**values, **changes})
+
+    return write
+
+
+def first_half(path: Path) -> None:
+    law_of("pendulum").save(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def one_flipped_byte(path: Path) -> None:
+    law_of("pendulum").save(path)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+
+
+def one_array(path: Path) -> None:
+    with open(path, "wb") as file:
+        np.save(file, np.eye(2))
+
+
+GARBAGE: dict[str, Callable[[Path], Any]] = {
+    "text": lambda path: path.write_text("garbage"),
+    "nothing": lambda path: path.touch(),
+    "a pickle": lambda path: path.write_bytes(pickle.dumps(law_of("pendulum"))),
+    "one array": one_array,
+    "another archive": lambda path: np.savez(path.open("wb"), gains=np.eye(2)),
+    "half a file": first_half,
+    "a flipped byte": one_flipped_byte,
+    "objects": arrays_with(gains=np.array([{}], dtype=object)),
+    "NaN": arrays_with(offsets=np.full((7, 1), np.nan)),
+    "words": arrays_with(b=np.full(32, "one")),
+    "gains of another shape": arrays_with(gains=np.zeros((7, 2))),
+    "offsets of another shape": arrays_with(offsets=np.zeros((6, 1))),
+    "rows that do not exist": arrays_with(starts=np.arange(7) + 100),
+    "rows out of order": arrays_with(starts=np.array([0, 4, 2, 8, 12, 16, 20])),
+    "half rows": arrays_with(starts=np.arange(7) / 2),
+    "no region": arrays_with(gains=np.zeros((0, 1, 2)), offsets=np.zeros((0, 1)), starts=[]),
+    "crossed bounds": arrays_with(u_min=np.array([3.0])),
+    "an unknown option": arrays_with(outside="mean"),
+}
+
+
+@pytest.mark.parametrize("content", GARBAGE)
+@pytest.mark.filterwarnings("ignore:unclosed file")  # the writer of "another archive"
+def test_file_that_holds_no_law_is_a_value_error(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "law.npz"
+    GARBAGE[content](path)
+    with pytest.raises(
+        ValueError, match=r"(?s)law\.npz does not hold a PiecewiseAffine .*law\.save"
+    ):
+        PiecewiseAffine.load(path)
+
+
+def test_missing_file_stays_a_file_not_found_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        PiecewiseAffine.load(tmp_path / "nowhere.npz")
+
+
+COPIES = [copy.copy, copy.deepcopy, lambda law: pickle.loads(pickle.dumps(law))]
+
+
+@pytest.mark.parametrize("copied", COPIES)
+def test_copies_are_equal_and_share_a_hash(copied: Any) -> None:
+    law = law_of("pendulum")
+    assert copied(law) == law
+    assert hash(copied(law)) == hash(law)
+
+
+@pytest.mark.parametrize("copied", [lambda law: law, *COPIES])
+@pytest.mark.parametrize("name", ["gains", "offsets", "A", "b", "starts", "u_min", "theta_max"])
+def test_arrays_are_read_only_in_every_copy(name: str, copied: Any) -> None:
+    array = getattr(copied(law_of("pendulum")), name)
+    with pytest.raises(ValueError, match="read-only"):
+        array[...] = 0
+
+
+@pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(PiecewiseAffine)])
+def test_laws_that_differ_in_one_field_are_not_equal(name: str) -> None:
+    law = law_of("pendulum")
+    value = {"outside": "zero", "disjoint": False}.get(name)
+    if value is None:
+        value = getattr(law, name) + 0
+        value.flat[-1] += 1 if name == "starts" else 1e-3
+    assert dataclasses.replace(law, **{name: value}) != law
+
+
+def test_a_law_is_not_equal_to_something_else() -> None:
+    assert law_of("pendulum") != "a law"
+
+
+BAD_THETA: list[tuple[Any, type[Exception], str]] = [
+    ([1.0], ValueError, r"theta has shape \(1,\), expected \(2,\) or \(batch, 2\)"),
+    (1.0, ValueError, r"theta has shape \(\), expected \(2,\)"),
+    (np.zeros((4, 3)), ValueError, r"theta has shape \(4, 3\), expected \(2,\)"),
+    (np.zeros((2, 2, 2)), ValueError, r"theta has shape \(2, 2, 2\), expected"),
+    ([np.nan, 0], ValueError, "theta holds NaN or infinite"),
+    ([[0, 0], [np.inf, 0]], ValueError, "theta holds NaN or infinite"),
+    (["a", "b"], TypeError, "theta = .* is not an array of real numbers"),
+    ([1j, 0], TypeError, "theta = .* is not an array of real numbers"),
+    (np.array([1j, 0]), TypeError, "theta = .* is not an array of real numbers"),
+    (object(), TypeError, "theta = .* is not an array of real numbers"),
+]
+
+
+@pytest.mark.parametrize("call", ["__call__", "locate", "in_domain"])
+@pytest.mark.parametrize(("theta", "error", "message"), BAD_THETA)
+def test_theta_that_is_no_point_or_batch_is_named(
+    call: str, theta: Any, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        getattr(law_of("pendulum"), call)(theta)
+
+
+def test_disjoint_is_true_or_false() -> None:
+    with pytest.raises(TypeError, match="disjoint = 'no' must be True or False"):
+        dataclasses.replace(law_of("pendulum"), disjoint="no")

@@ -1,0 +1,220 @@
+"""Bad input is an error that names the argument, what it was and what is expected."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sample_problems import DOUBLE_INTEGRATOR, input_bounds_only, small_mpc
+from sb3_yann import LinearModel, LinearMPC
+
+NAN, INF = np.nan, np.inf
+TURN = [[np.cos(1), np.sin(1), 0], [-np.sin(1), np.cos(1), 0], [0, 0, 0.5]]
+
+BAD_MODELS: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"A": [[1, 2, 3], [4, 5, 6]]}, ValueError, r"A has shape \(2, 3\), expected a square matrix"),
+    ({"A": [1, 2]}, ValueError, r"A has shape \(2,\), expected \(n, n\)"),
+    ({"A": np.zeros((0, 0))}, ValueError, r"A has shape \(0, 0\), expected a square matrix"),
+    ({"A": None}, ValueError, r"A has shape \(\), expected \(n, n\)"),
+    ({"A": [[1, NAN], [0, 1]]}, ValueError, "A holds NaN or infinite entries"),
+    ({"A": [[1, INF], [0, 1]]}, ValueError, "A holds NaN or infinite entries"),
+    ({"A": [["a", 1], [0, 1]]}, TypeError, "A = .* is not an array of real numbers"),
+    ({"A": [[1, 2], [3]]}, TypeError, "A = .* is not an array of real numbers"),
+    ({"A": np.array([[1j, 0], [0, 1]])}, TypeError, "(?s)A = .* is not an array of real numbers"),
+    ({"B": [[1], [2], [3]]}, ValueError, r"B has shape \(3, 1\), expected \(2, m\)"),
+    ({"B": [1, 2]}, ValueError, r"B has shape \(2,\), expected \(2, m\)"),
+    ({"B": np.zeros((2, 0))}, ValueError, r"B has shape \(2, 0\): the model needs at least one"),
+    ({"B": [[NAN], [1]]}, ValueError, "B holds NaN or infinite entries"),
+    ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
+    ({"dt": -0.1}, ValueError, "dt = -0.1 must be a finite number above 0"),
+    ({"dt": NAN}, ValueError, "dt = nan must be a finite number above 0"),
+    ({"dt": INF}, ValueError, "dt = inf must be a finite number above 0"),
+    ({"dt": "soon"}, TypeError, "dt = 'soon' is not an array of real numbers"),
+    ({"dt": [1, 2]}, ValueError, r"dt = \[1, 2\] must be a single number"),
+    ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
+    ({"x_ss": [NAN, 0]}, ValueError, "x_ss holds NaN or infinite entries"),
+    ({"u_ss": [1, 2]}, ValueError, r"u_ss has shape \(2,\), expected \(1,\)"),
+    ({"E": [[1]]}, ValueError, r"E has shape \(1, 1\), expected \(2, d\)"),
+    ({"E": [[1], [NAN]]}, ValueError, "E holds NaN or infinite entries"),
+    ({"d_ss": [1]}, ValueError, r"d_ss = \[1\] is given, but there are no disturbances: pass E"),
+]
+
+
+@pytest.mark.parametrize("make", [LinearModel, LinearModel.from_continuous])
+@pytest.mark.parametrize(("changes", "error", "message"), BAD_MODELS)
+def test_bad_argument_of_a_model_is_named(
+    make: Any, changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    values = {"A": [[1, 1], [0, 1]], "B": [[0], [1]], "dt": 1.0}
+    with pytest.raises(error, match=message):
+        make(**{**values, **changes})
+
+
+BAD_DYNAMICS: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"f": lambda x, u: [1, 2, 3]}, ValueError, r"f\(x_ss, u_ss\) has shape \(3,\), expected \(2,"),
+    ({"f": lambda x, u: x * NAN}, ValueError, r"f\(x_ss, u_ss\) holds NaN"),
+    ({"f": lambda x, u: x + 1j}, TypeError, r"f\(x_ss, u_ss\) = .* is not an array of real"),
+    ({"x_ss": [NAN, 0]}, ValueError, "x_ss holds NaN"),
+    ({"u_ss": 0.0}, ValueError, r"u_ss has shape \(\), expected \(m,\)"),
+    ({"f": lambda x, u: [1, 0]}, ValueError, "is no steady state.*Solve f"),
+    ({"f": 3}, TypeError, "f = 3 must be a function"),
+    ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
+]
+
+
+@pytest.mark.parametrize(("changes", "error", "message"), BAD_DYNAMICS)
+def test_bad_dynamics_are_named(
+    changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    values = {"f": lambda x, u: -x + u, "x_ss": [0, 0], "u_ss": [0], "dt": 0.1}
+    with pytest.raises(error, match=message):
+        LinearModel.from_dynamics(**{**values, **changes})
+
+
+BAD_PROBLEMS: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"model": "pendulum"}, TypeError, "model = 'pendulum' must be a LinearModel"),
+    ({"Q": np.eye(3)}, ValueError, r"Q has shape \(3, 3\), expected \(2, 2\)"),
+    ({"Q": 1}, ValueError, r"Q has shape \(\), expected \(2, 2\)"),
+    ({"Q": [[1, NAN], [0, 1]]}, ValueError, "Q holds NaN"),
+    ({"Q": [["a", 0], [0, 1]]}, TypeError, "Q = .* is not an array of real numbers"),
+    ({"Q": [[1, 2], [0, 1]]}, ValueError, r"Q is not symmetric: .* Pass \(Q \+ Q.T\) / 2"),
+    ({"Q": [[1, 2], [2, 1]]}, ValueError, "Q must be positive semi-definite, .* is -1"),
+    ({"R": [[0]]}, ValueError, "R must be positive definite, .* is 0. Give every input a positive"),
+    ({"R": [[-1]]}, ValueError, "R must be positive definite, its smallest eigenvalue is -1"),
+    ({"R": np.eye(2)}, ValueError, r"R has shape \(2, 2\), expected \(1, 1\)"),
+    ({"R": [[INF]]}, ValueError, "R holds NaN or infinite entries"),
+    ({"horizon": 0}, ValueError, "horizon = 0 must be at least 1"),
+    ({"horizon": -1}, ValueError, "horizon = -1 must be at least 1"),
+    ({"horizon": 2.5}, TypeError, "horizon = 2.5 must be a whole number of steps"),
+    ({"horizon": True}, TypeError, "horizon = True must be a whole number of steps"),
+    ({"horizon": "2"}, TypeError, "horizon = '2' must be a whole number of steps"),
+    ({"gamma": 0}, ValueError, r"gamma = 0 must lie in \(0, 1\]"),
+    ({"gamma": 1.5}, ValueError, r"gamma = 1.5 must lie in \(0, 1\]"),
+    ({"gamma": NAN}, ValueError, r"gamma = nan must lie in \(0, 1\]"),
+    ({"gamma": "high"}, TypeError, "gamma = 'high' is not an array of real numbers"),
+    ({"gamma": [0.9, 0.9]}, ValueError, r"gamma = \[0.9, 0.9\] must be a single number"),
+    ({"u_min": 2}, ValueError, "u_min must lie below u_max, but entry 0 has u_min = 2 and u_max ="),
+    ({"u_min": 1}, ValueError, "u_min must lie below u_max, but entry 0 has u_min = 1 and u_max ="),
+    ({"u_min": [-1, -1]}, ValueError, r"u_min has shape \(2,\), expected \(1,\) or a single"),
+    ({"u_max": NAN}, ValueError, "u_max holds NaN: .* Use inf for 'no bound'"),
+    ({"u_max": "high"}, TypeError, "u_max = 'high' is not an array of real numbers"),
+    ({"u_max": -INF}, ValueError, "u_min must lie below u_max"),
+    ({"x_min": [0, 5]}, ValueError, "x_min must lie below x_max, but entry 1 has x_min = 5"),
+    ({"x_max": [1, 2, 3]}, ValueError, r"x_max has shape \(3,\), expected \(2,\) or a single"),
+    ({"x_max": [NAN, 1]}, ValueError, "x_max holds NaN"),
+    ({"theta_min": 6}, ValueError, "theta_min must lie below theta_max, but entry 0"),
+    ({"theta_max": [[1, 1]]}, ValueError, r"theta_max has shape \(1, 2\), expected \(2,\)"),
+    ({"outside": "mean"}, ValueError, r"outside = 'mean' must be one of \('nearest', 'zero'\)"),
+    ({"outside": None}, ValueError, "outside = None must be one of"),
+    ({"outside": np.array(["zero", "zero"])}, ValueError, "outside = .* must be one of"),
+    ({"terminal_cost": np.eye(3)}, ValueError, r"terminal_cost has shape \(3, 3\), expected \(2,"),
+    ({"terminal_cost": -np.eye(2)}, ValueError, "terminal_cost must be positive semi-definite"),
+    ({"terminal_set": 5}, TypeError, r"terminal_set must be a pair \(F, g\) of arrays .* got int"),
+    ({"terminal_set": (np.eye(2),)}, TypeError, r"terminal_set must be a pair .* got tuple"),
+    ({"terminal_set": (np.eye(3), [1] * 3)}, ValueError, r"terminal_set F has shape \(3, 3\)"),
+    ({"terminal_set": (np.eye(2), [1] * 3)}, ValueError, r"terminal_set g has shape \(3,\), exp"),
+    ({"terminal_set": (np.eye(2), [1, INF])}, ValueError, "terminal_set g holds NaN or infinite"),
+    ({"terminal_set": ("F", "g")}, TypeError, "terminal_set F = 'F' is not an array of real"),
+]
+
+
+@pytest.mark.parametrize(("changes", "error", "message"), BAD_PROBLEMS)
+def test_bad_argument_of_a_problem_is_named(
+    changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    values = {"model": DOUBLE_INTEGRATOR, "Q": np.eye(2), "R": [[1]], "horizon": 2}
+    values |= {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 1}
+    with pytest.raises(error, match=message):
+        LinearMPC(**{**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ("A", "B"),
+    [
+        ([[1.2, 0], [0, 0.5]], [[0], [1]]),
+        (np.eye(2), [[1], [0]]),
+        (TURN, [[0], [0], [1]]),
+        ([[3]], [[0]]),
+    ],
+    ids=["unstable", "two integrators, one input", "on the unit circle", "no input at all"],
+)
+def test_an_unstable_mode_out_of_reach_is_named(A: Any, B: Any) -> None:
+    model = LinearModel(A, B, 1.0)
+    with pytest.raises(ValueError, match=r"no input reaches: eigenvalue .* Remove the mode from"):
+        LinearMPC(model, Q=np.eye(len(A)), R=[[1]], horizon=2)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_mode_out_of_reach_is_named_in_any_coordinates(seed: int) -> None:
+    change = np.random.default_rng(seed).normal(size=(3, 3))
+    A = change @ np.diag([1.0, 0.5, 0.3]) @ np.linalg.inv(change)
+    model = LinearModel(A, change @ [[0], [1], [1]], 1.0)
+    with pytest.raises(ValueError, match="no input reaches: eigenvalue"):
+        LinearMPC(model, Q=np.eye(3), R=[[1]], horizon=2)
+
+
+@pytest.mark.parametrize(
+    ("A", "Q", "gamma"),
+    [
+        (np.diag([1, 0.5]), [0, 1], 1.0),
+        (np.diag([-1, 0.5]), [0, 1], 1.0),
+        (TURN, [0, 0, 1], 1.0),
+        (np.diag([1, 0.5]) / np.sqrt(0.9), [0, 1], 0.9),
+        ([[1, 1], [0, 1]], [0, 0], 1.0),
+    ],
+    ids=["integrator", "alternating", "oscillator", "after the discount", "no weight at all"],
+)
+def test_a_mode_on_the_unit_circle_without_weight_is_an_error(
+    A: Any, Q: list[float], gamma: float
+) -> None:
+    model = LinearModel(A, np.ones((len(A), 1)), 1.0)
+    with pytest.raises(ValueError, match=r"on the unit circle carries no weight in Q. Give it a"):
+        LinearMPC(model, Q=np.diag(Q), R=[[1]], horizon=2, gamma=gamma)
+
+
+def test_a_terminal_cost_stands_in_for_the_riccati_solution() -> None:
+    mpc = small_mpc(LinearModel(np.eye(2), [[1], [0]], 1.0), terminal_cost=np.eye(2))
+    np.testing.assert_array_equal(mpc.terminal_cost, np.eye(2))
+
+
+def test_a_smaller_discount_stands_in_for_an_input_that_does_not_reach() -> None:
+    model = LinearModel([[1.02, 0], [0, 0.5]], [[0], [1]], 1.0)
+    assert input_bounds_only(model, gamma=0.9).explicit().in_domain([1, 1])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"terminal_set": ([[1, 0], [-1, 0]], [-1, -1])},  # x <= -1 and x >= 1
+        {"terminal_set": ([[1, 0], [-1, 0]], [0, 0])},  # x = 0: feasible, but without an interior
+        {"theta_min": [50, 50], "theta_max": [60, 60]},  # out of the inputs' reach
+    ],
+)
+def test_an_infeasible_problem_is_a_value_error(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"infeasible: no theta in its box .* Widen x_min/x_max"):
+        small_mpc(**changes).explicit()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"x_min": None, "x_max": None}, {"x_min": [-1, -INF]}, {"theta_max": INF}]
+)
+def test_an_unbounded_box_is_a_value_error(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"bounded box .* Pass finite theta_min and theta_max"):
+        small_mpc(**changes).explicit()
+
+
+@pytest.mark.parametrize(
+    ("gamma", "error", "message"),
+    [
+        (0, ValueError, r"gamma = 0 must lie in \(0, 1\]"),
+        (1.5, ValueError, r"gamma = 1.5 must lie in \(0, 1\]"),
+        ("high", TypeError, "gamma = 'high' is not an array of real numbers"),
+    ],
+)
+def test_bad_discount_of_the_critic_is_named(
+    gamma: Any, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        small_mpc().state_action_matrix(gamma)

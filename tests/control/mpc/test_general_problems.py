@@ -1,0 +1,328 @@
+"""Laws of problems with references, disturbances, rates and soft bounds, against an online QP."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from general_problems import PROBLEMS, QUADRATIC, RATES, THERMAL, TWO_TANKS, servo, solved
+from online_mpc import OnlineMPC
+from reference_answers import online_answers, relative_error
+from sample_problems import box_points
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann.control import lqr
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_law_and_domain_are_those_of_an_online_qp(name: str) -> None:
+    mpc = solved(name)
+    points = box_points(mpc, 1000, seed=1)
+    inputs, feasible = online_answers(mpc, points)
+    assert feasible.sum() > 50
+    np.testing.assert_array_equal(mpc.explicit().in_domain(points), feasible)
+    assert relative_error(mpc, mpc.explicit()(points[feasible]), inputs) <= 1e-9
+
+
+SIZES = [(1, 1, 4), (1, 2, 2), (2, 1, 2), (2, 1, 3), (2, 2, 1), (3, 1, 2), (3, 3, 1), (4, 1, 2)]
+SIZES += [(4, 2, 1), (4, 3, 1)]
+
+
+@st.composite
+def random_problems(draw: st.DrawFn) -> LinearMPC:
+    """Problems with parts in and out; few enough decisions to stay below some 100 regions."""
+    n, m, N = draw(st.sampled_from(SIZES))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    A *= draw(st.sampled_from([0.5, 0.9])) / np.max(np.abs(np.linalg.eigvals(A)))
+    n_d = draw(st.integers(0, 1))
+    box = rng.uniform(1, 5, n)
+    values: dict[str, Any] = {
+        "Q": np.diag(rng.choice([0.1, 1.0, 10.0], n)),
+        "R": np.diag(10 ** rng.uniform(-2, 1, m)),
+        "horizon": N,
+        "u_min": -rng.uniform(0.3, 2, m),
+        "u_max": rng.uniform(0.3, 2, m),
+        "gamma": draw(st.sampled_from([1.0, 0.9])),
+        "theta_min": -box,
+        "theta_max": box,
+        "d_min": np.full(n_d, -0.2),
+        "d_max": np.full(n_d, 0.3),
+    }
+    if draw(st.booleans()):
+        values |= {"tracked": rng.normal(size=(1, n)), "r_min": -0.5, "r_max": 0.8}
+    if draw(st.booleans()) and N * m <= 3:
+        values |= {"du_min": -rng.uniform(0.2, 1, m), "du_max": rng.uniform(0.2, 1, m)}
+        values["S"] = draw(st.sampled_from([0.0, 1.0])) * np.eye(m)
+    if draw(st.booleans()) and N * m <= 2:
+        values |= {"outputs": rng.normal(size=(1, n)), "y_max": 2.0}
+        values |= draw(st.sampled_from([{}, {"y_soft": 1.0, "soft_penalty": 300.0}]))
+    return LinearMPC(LinearModel(A, B, 1.0, E=rng.normal(size=(n, n_d))), **values)
+
+
+@settings(
+    derandomize=True,
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
+@given(random_problems())
+def test_law_and_domain_of_random_problems_are_those_of_an_online_qp(mpc: LinearMPC) -> None:
+    law, points = mpc.explicit(), box_points(mpc, 200)
+    inputs, feasible = online_answers(mpc, points)
+    assume(feasible.any())
+    np.testing.assert_array_equal(law.in_domain(points), feasible)
+    assert relative_error(mpc, law(points[feasible]), inputs) <= 1e-9
+
+
+def test_eight_parameters_and_two_inputs() -> None:
+    mpc = solved("two tanks, all parts")
+    assert (mpc.n_theta, mpc.model.n_inputs) == (8, 2)
+    assert mpc.parameters.names == (
+        *("x[0]", "x[1]", "r[0]", "r[1]", "d[0]", "d[1]", "u_prev[0]", "u_prev[1]"),
+    )
+
+
+def test_rates_are_kept_on_every_step_of_a_closed_loop() -> None:
+    mpc = servo(du_min=-0.1, du_max=0.2)
+    theta = np.array([0.0, 0.0, 0.9, 0.0])
+    for _ in range(40):
+        u = mpc.explicit()(theta)
+        assert -0.1 - 1e-9 <= u[0] - theta[-1] <= 0.2 + 1e-9
+        theta = mpc.predict(theta, u)
+    np.testing.assert_allclose(theta[0], 0.9, atol=1e-3)
+
+
+def test_a_weight_on_the_rate_makes_the_input_move_less() -> None:
+    start = [0.0, 0.0, 0.9]
+    first = [servo(S=weight * np.eye(1)).explicit()([*start, 0.0])[0] for weight in (0.1, 10.0)]
+    assert 0 < first[1] < first[0] / 2
+
+
+def test_a_soft_bound_is_kept_where_the_hard_one_can_be() -> None:
+    hard = servo(x_max=[1.5, 0.3], x_min=[-1.5, -0.3], theta_min=-3, theta_max=3)
+    soft = dataclasses.replace(hard, x_soft=[0.0, 1.0], soft_penalty=1e3)
+    points = box_points(hard, 2000)
+    inside = points[hard.explicit().in_domain(points)]
+    error = relative_error(hard, soft.explicit()(inside), hard.explicit()(inside))
+    assert error <= 1e-9  # exact, not nearly: the penalty has a linear part
+
+
+def test_the_law_reaches_beyond_a_soft_bound_without_being_told() -> None:
+    soft = {"x_min": -1.2, "x_max": 1.2, "x_soft": 1, "soft_penalty": 300}
+    law = servo(**soft).explicit()
+    assert law.in_domain([2.0, 0.0, 0.5])
+    with pytest.warns(UserWarning, match=r"bounds -1.2 to 1.2 of x\[0\], .* the law ends there"):
+        servo(**soft, theta_min=-1.2, theta_max=1.2)
+
+
+def test_an_input_that_may_not_rest_is_warned_of() -> None:
+    with pytest.warns(UserWarning, match=r"leave out u\[0\] = 0, .* bounds that are absolute"):
+        servo(tracked=None, r_min=None, r_max=None, u_min=0.2)
+
+
+def test_a_soft_bound_leaves_a_solution_where_the_hard_one_has_none() -> None:
+    hard = servo(x_max=[9.0, 0.3], x_min=[-9.0, -0.3], theta_min=-3, theta_max=3)
+    soft = dataclasses.replace(hard, x_soft=[0.0, 1.0], soft_penalty=1e3)
+    points = box_points(hard, 1000)
+    assert soft.explicit().in_domain(points).mean() > hard.explicit().in_domain(points).mean() + 0.1
+
+
+def test_bounded_outputs_are_bounded_states_in_other_words() -> None:
+    as_states = servo(x_max=[9.0, 0.3], x_min=[-9.0, -0.3], theta_min=-3, theta_max=3)
+    as_outputs = servo(
+        x_min=[-9.0, -np.inf],
+        x_max=[9.0, np.inf],
+        outputs=[1],
+        y_min=-0.3,
+        y_max=0.3,
+        theta_min=-3,
+        theta_max=3,
+    )
+    points = box_points(as_states, 1000)
+    one, other = as_states.explicit(), as_outputs.explicit()
+    np.testing.assert_array_equal(one.in_domain(points), other.in_domain(points))
+    inside = points[one.in_domain(points)]
+    assert relative_error(as_states, one(inside), other(inside)) <= 1e-9
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.9])
+@pytest.mark.parametrize("name", QUADRATIC)
+def test_value_is_the_cost_of_the_law_on_the_model(name: str, gamma: float) -> None:
+    mpc = solved(name)
+    law, P = mpc.explicit(), mpc.value_matrix(gamma)
+    theta = 1e-3 * box_points(mpc, 5, seed=2)
+    at_rest = law.locate(np.zeros(mpc.n_theta))
+    value, cost = np.einsum("bi,ij,bj->b", theta, P, theta), np.zeros(5)
+    for k in range(400):
+        assert np.all(law.locate(theta) == at_rest)
+        u = law(theta)
+        cost += gamma**k * mpc.stage_cost(theta, u)
+        theta = mpc.predict(theta, u)
+    np.testing.assert_allclose(cost, value, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", QUADRATIC)
+def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
+    mpc, rng = solved(name), np.random.default_rng(0)
+    theta, u = box_points(mpc, 50), rng.normal(size=(50, mpc.model.n_inputs))
+    z = np.hstack([theta, u])
+    form = np.einsum("bi,ij,bj->b", z, mpc.stage_matrix, z)
+    np.testing.assert_allclose(mpc.stage_cost(theta, u), form, rtol=1e-9, atol=1e-9)
+    M = mpc.state_action_matrix(0.9)
+    following = mpc.predict(theta, u)
+    value = np.einsum("bi,ij,bj->b", following, mpc.value_matrix(0.9), following)
+    np.testing.assert_allclose(
+        np.einsum("bi,ij,bj->b", z, M, z), form + 0.9 * value, rtol=1e-9, atol=1e-9
+    )
+
+
+def test_stage_cost_is_the_formula() -> None:
+    mpc = servo(S=[[2.0]])
+    theta, u = np.array([0.3, -0.1, 0.5, 0.2]), np.array([0.4])
+    x_s, u_s = mpc.steady_state([0.5])
+    e = theta[:2] - x_s
+    expected = e @ mpc.Q @ e + 0.1 * (u - u_s) ** 2 + 2.0 * (0.4 - 0.2) ** 2
+    assert mpc.stage_cost(theta, u) == pytest.approx(float(expected[0]))
+
+
+def test_a_weight_on_the_rate_has_the_gain_of_the_augmented_lqr() -> None:
+    mpc = servo(S=[[2.0]], x_min=None, x_max=None, theta_min=-9, theta_max=9, u_min=-90, u_max=90)
+    A, B = THERMAL.A, THERMAL.B
+    bigger = LinearModel(
+        np.block([[A, np.zeros((2, 1))], [np.zeros((1, 3))]]), np.vstack([B, [[1.0]]]), 1.0
+    )
+    Q, R = np.diag([1, 1, 2.0]), np.array([[0.1 + 2.0]])
+    N = np.array([[0], [0], [-2.0]])
+    P = lqr.riccati(bigger, Q, R, cross=N)
+    K = lqr.gain(bigger, R, P, cross=N)
+    law = mpc.explicit()
+    gain = law.gains[law.locate(np.zeros(4))]
+    np.testing.assert_allclose(gain[:, [0, 1, 3]], -K, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda mpc: pickle.loads(pickle.dumps(mpc))])
+def test_copies_are_equal_and_bring_the_law(copied: Any) -> None:
+    mpc = solved("two tanks, all parts")
+    twin = copied(mpc)
+    assert twin == mpc
+    assert hash(twin) == hash(mpc)
+    assert twin.explicit() == mpc.explicit()
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_a_problem_with_one_thing_replaced_is_that_problem(name: str) -> None:
+    mpc = solved(name)
+    assert dataclasses.replace(mpc) == mpc
+    changed = dataclasses.replace(mpc, r_max=mpc.r_max / 2)
+    assert (changed == mpc) == (mpc.r_max.size == 0)
+    assert changed.theta_max[changed.parameters.reference].tolist() == (mpc.r_max / 2).tolist()
+
+
+BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"tracked": [0, 1]}, ValueError, r"no steady state for r\[0\], r\[1\]: .* rank 3.* \(1\) can"),
+    ({"tracked": [2]}, ValueError, r"tracked = \[2\] must be indices of states, .* 0 to 1"),
+    ({"tracked": [0.5]}, ValueError, r"tracked = \[0.5\] must be indices of states"),
+    ({"tracked": [True]}, ValueError, r"tracked = \[True\] must be indices of states"),
+    ({"tracked": [[1, 2, 3]]}, ValueError, r"tracked has shape \(1, 3\), expected \(q, 2\)"),
+    ({"r_min": 2}, ValueError, "r_min must lie below r_max"),
+    ({"r_max": [1, 2]}, ValueError, r"r_max has shape \(2,\), expected \(1,\)"),
+    ({"d_max": 2}, ValueError, "d_min or d_max is given, but there is no E of the model"),
+    ({"y_max": 2}, ValueError, "y_min or y_max is given, but there is no outputs"),
+    ({"du_min": 0, "du_max": 0}, ValueError, "du_min must lie below du_max"),
+    ({"S": [[-1]]}, ValueError, "S must be positive semi-definite"),
+    ({"S": np.eye(2)}, ValueError, r"S has shape \(2, 2\), expected \(1, 1\)"),
+    ({"x_soft": -1, "soft_penalty": 1}, ValueError, "x_soft = .* no entry may be negative"),
+    ({"x_soft": 1}, ValueError, "soft_penalty is missing"),
+    ({"soft_penalty": 1}, ValueError, "soft_penalty = 1, but nothing is soft"),
+    ({"x_soft": 1, "soft_penalty": -1}, ValueError, "soft_penalty = -1 must be a finite number"),
+    ({"linear_cost": 3}, TypeError, r"linear_cost = 3 must be a pair \(q, r\)"),
+    ({"linear_cost": ([1], [1])}, ValueError, r"linear_cost q has shape \(1,\), expected \(2,\)"),
+    ({"terminal_set": "invariants"}, TypeError, "a pair .* or 'invariant', got 'invariants'"),
+    ({"tracked": 0}, ValueError, r"tracked = 0 must be a list of indices of states: \[0\]"),
+    (
+        {"x_soft": 1, "x_min": None, "x_max": None, "soft_penalty": 1},
+        ValueError,
+        "x_soft = 1, but there is no bound to soften: pass x_min",
+    ),
+    (
+        {"y_soft": [1], "outputs": [0], "soft_penalty": 1},
+        ValueError,
+        "y_soft = .* no bound to soft",
+    ),
+    (
+        {"x_soft": [1, 1], "x_max": [5, np.inf], "x_min": [-5, -np.inf], "soft_penalty": 1},
+        ValueError,
+        r"x_soft = \[1, 1\] softens entry 1, which has no bound",
+    ),
+    ({"du_min": 0.1, "du_max": 0.5}, ValueError, r"du_min = 0.1 .* make u\[0\] change in every"),
+    ({"theta_min": [-5, -5, -0.5]}, ValueError, r"theta_min has -0.5 for r\[0\], but r_min is -1"),
+    ({"theta_max": [5, 5, 1, 1], **RATES}, ValueError, r"1 for u_prev\[0\], but u_max is 2"),
+]
+
+
+@pytest.mark.parametrize(("changes", "error", "message"), BAD)
+def test_bad_argument_is_named(
+    changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        servo(**changes)
+
+
+def test_a_disturbance_that_no_input_can_hold_is_named() -> None:
+    model = LinearModel([[1, 0], [0, 0.5]], [[0], [1]], 1.0, E=[[1], [0]])
+    with pytest.raises(ValueError, match=r"no steady state for d\[0\]"):
+        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, terminal_cost=np.eye(2))
+
+
+def test_references_without_a_box_are_named_when_the_law_is_asked_for() -> None:
+    with pytest.raises(ValueError, match="where theta holds them, r_min and r_max"):
+        servo(r_min=None).explicit()
+
+
+def test_a_law_that_is_held_away_from_rest_has_no_value() -> None:
+    mpc = servo(u_min=0.2)
+    with pytest.raises(ValueError, match="does not rest at the origin"):
+        mpc.value_matrix(0.9)
+
+
+def test_a_linear_cost_moves_the_rest_to_the_economic_optimum_and_changes_nothing_else() -> None:
+    # Without a discount: by duality the linear cost is a shift of the operating point.
+    q, r = np.array([0.3, 0]), np.array([-0.2])
+    mpc = servo(tracked=None, r_min=None, r_max=None, linear_cost=(q, r), x_min=None, x_max=None,
+                theta_min=-5, theta_max=5, u_min=-2, u_max=2)  # fmt: skip
+    A, B = mpc.model.A, mpc.model.B
+    M = np.hstack([A - np.eye(2), B])
+    kkt = np.block([[np.diag([2, 2, 0.2]), M.T], [M, np.zeros((2, 2))]])
+    rest = np.linalg.solve(kkt, np.concatenate([-q, -r, np.zeros(2)]))[:3]
+    x_e, u_e = rest[:2], rest[2:]
+    assert np.linalg.norm(rest) > 0.1
+    shifted = servo(tracked=None, r_min=None, r_max=None, x_min=None, x_max=None,
+                    theta_min=-6, theta_max=6, u_min=-2 - u_e, u_max=2 - u_e)  # fmt: skip
+    points = box_points(mpc, 500)
+    np.testing.assert_allclose(
+        mpc.explicit()(points), shifted.explicit()(points - x_e) + u_e, atol=1e-9
+    )
+    with pytest.raises(
+        ValueError, match=r"linear_cost has no quadratic value .* leave linear_cost"
+    ):
+        mpc.value_matrix(0.9)
+
+
+def test_online_qp_itself_agrees_with_a_plan_by_hand() -> None:
+    # One step, no bound: u = argmin (u - u_s)^2 0.1 + (x_1 - x_s)'P(x_1 - x_s).
+    mpc = servo(horizon=1, x_min=None, x_max=None, theta_min=-1, theta_max=1, u_min=-9, u_max=9)
+    x, (x_s, u_s) = np.array([0.2, -0.1]), mpc.steady_state([0.5])
+    P, B = mpc.terminal_cost, mpc.model.B
+    v = -np.linalg.solve(mpc.R + B.T @ P @ B, B.T @ P @ mpc.model.A @ (x - x_s))
+    np.testing.assert_allclose(OnlineMPC(mpc)(np.array([*x, 0.5])), u_s + v, rtol=1e-9)
+
+
+def test_two_tanks_are_the_model_that_the_other_tests_take_them_for() -> None:
+    assert (TWO_TANKS.n_states, TWO_TANKS.n_inputs, TWO_TANKS.n_disturbances) == (2, 2, 2)

@@ -1,0 +1,230 @@
+"""References are reached without offset; steady states, and which references have one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from general_problems import LOADED, THERMAL, servo, solved, two_tanks
+from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC
+
+TRACKING = ["servo", "servo with all of it", "two tanks, all parts", "more inputs than outputs"]
+
+
+def reachable_constants(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """References (count, p) and disturbances (count, d) with a steady state inside the bounds."""
+    rng, parts = np.random.default_rng(seed), mpc.parameters
+    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (20 * count, mpc.n_theta))
+    r, d = theta[:, parts.reference], theta[:, parts.disturbance]
+    inside = mpc.is_reachable(r, d)
+    assert inside.sum() >= count
+    return r[inside][:count], d[inside][:count]
+
+
+@pytest.mark.parametrize("name", TRACKING)
+def test_a_hundred_reachable_references_are_reached_without_offset(name: str) -> None:
+    mpc = solved(name)
+    r, d = reachable_constants(mpc, 100)
+    start = np.zeros((100, mpc.n_theta))
+    start[:, mpc.parameters.constant] = np.hstack([r, d])
+    theta = start
+    for _ in range(150):
+        theta = mpc.predict(theta, mpc.explicit()(theta))
+    reached = theta[:, mpc.parameters.state] @ mpc.tracked.T
+    assert np.max(np.abs(reached - r)) < 1e-6
+
+
+@pytest.mark.parametrize("measured", [None, [0]], ids=["all states", "the tracked output"])
+@pytest.mark.parametrize("name", ["servo with a disturbance", "servo with all of it"])
+def test_a_hundred_references_are_reached_under_a_disturbance_nobody_measures(
+    name: str, measured: list[int] | None
+) -> None:
+    mpc = solved(name)
+    observer, law, parts = DisturbanceObserver(mpc.model, measured), mpc.explicit(), mpc.parameters
+    r, d = reachable_constants(mpc, 100)
+    worst = 0.0
+    for reference, disturbance in zip(r, d, strict=True):
+        x, u = np.zeros(2), np.zeros(1)
+        x_hat, d_hat = observer.reset(observer.C @ x)
+        for _ in range(200):
+            theta = np.concatenate([x_hat, reference, d_hat, u[: parts.n_previous]])
+            u = law(np.clip(theta, mpc.theta_min, mpc.theta_max))
+            x = mpc.model.step(x, u, disturbance)
+            x_hat, d_hat = observer.update(observer.C @ x, u)
+        worst = max(worst, float(np.max(np.abs(mpc.tracked @ x - reference))))
+    assert worst < 1e-6
+
+
+def test_with_as_many_disturbances_as_measurements_a_wrong_model_leaves_no_offset() -> None:
+    mpc, observer = solved("two tanks"), DisturbanceObserver(solved("two tanks").model)
+    model = mpc.model
+    # The plant: other gains, other poles, and a load that enters elsewhere.
+    A, B = model.A * [[1.02, 1], [0.9, 0.97]], model.B * [[0.9, 1.2], [1, 1.1]]
+    load, r = np.array([0.05, -0.03]), np.array([0.2, 0.3])
+    x, u = np.zeros(2), np.zeros(2)
+    x_hat, d_hat = observer.reset(x)
+    for _ in range(400):
+        u = mpc.explicit()(np.concatenate([x_hat, r, d_hat]))
+        x = A @ x + B @ u + load
+        x_hat, d_hat = observer.update(x, u)
+    np.testing.assert_allclose(x, r, atol=1e-6)
+    blind = np.zeros(2)
+    for _ in range(400):  # without the estimate there is an offset
+        blind = A @ blind + B @ mpc.explicit()(np.concatenate([blind, r, 0 * d_hat])) + load
+    assert np.max(np.abs(blind - r)) > 0.02
+
+
+@pytest.mark.parametrize("name", TRACKING)
+def test_the_steady_state_rests_and_shows_the_reference(name: str) -> None:
+    mpc = solved(name)
+    for r, d in zip(*reachable_constants(mpc, 5), strict=True):
+        x, u = mpc.steady_state(r, d)
+        np.testing.assert_allclose(mpc.model.step(x, u, d), x, atol=1e-12)
+        np.testing.assert_allclose(mpc.tracked @ x, r, atol=1e-12)
+        theta = np.concatenate([x, r, d, u[: mpc.parameters.n_previous]])
+        np.testing.assert_allclose(mpc.explicit()(theta), u, atol=1e-9)
+
+
+def test_of_many_steady_states_it_is_the_cheapest() -> None:
+    mpc = solved("more inputs than outputs")
+    x, u = mpc.steady_state([0.3], [0.1, -0.1])
+    A, B = mpc.model.A, mpc.model.B
+
+    def state(v: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(np.eye(2) - A, B @ v + mpc.model.E @ [0.1, -0.1])
+
+    best = optimize.minimize(
+        lambda v: state(v) @ mpc.Q @ state(v) + v @ mpc.R @ v,
+        np.zeros(2),
+        constraints={"type": "eq", "fun": lambda v: mpc.tracked @ state(v) - 0.3},
+        tol=1e-14,
+    )
+    np.testing.assert_allclose(u, best.x, atol=1e-6)
+    np.testing.assert_allclose(x, state(u), atol=1e-9)
+
+
+def test_units_change_no_steady_state() -> None:
+    plain = two_tanks(tracked=[[1, 1]], r_min=-0.5, r_max=0.5)
+    unit = np.array([1e6, 1e-6])
+    to, back = np.diag(unit), np.diag(1 / unit)
+    model = LinearModel(to @ plain.model.A @ back, to @ plain.model.B, 1.0, E=to @ plain.model.E)
+    other = LinearMPC(
+        model, Q=back @ back, R=plain.R, horizon=1, tracked=plain.tracked @ back,
+        r_min=-0.5, r_max=0.5, d_min=-0.2, d_max=0.2, x_min=-2 * unit, x_max=2 * unit,
+        u_min=plain.u_min, u_max=plain.u_max,
+    )  # fmt: skip
+    np.testing.assert_allclose(other.steady_states.u, plain.steady_states.u, rtol=1e-9)
+    np.testing.assert_allclose(other.steady_states.x, to @ plain.steady_states.x, rtol=1e-9)
+
+
+def test_reachable_is_what_the_bounds_allow() -> None:
+    mpc = servo(u_max=0.1)  # gain from u to x[0] at rest is 0.5 / 0.2 * 0.2 / 0.1 = 5
+    assert mpc.is_reachable([0.49])
+    assert not mpc.is_reachable([0.51])
+    np.testing.assert_array_equal(mpc.is_reachable([[0.2], [0.9]]), [True, False])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"u_max": 0.1}, r"r = \[0.9\] with d = \[\] is not reachable: .*, and u\[0\] > u_max\[0"),
+        ({"x_max": 0.5}, r"and x\[0\] > x_max\[0\]. Ask is_reachable"),
+        ({"outputs": [[1, 1]], "y_max": 0.5}, r"and y\[0\] > y_max\[0\]"),
+    ],
+)
+def test_an_unreachable_reference_is_named_with_the_bound(
+    changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        servo(**changes).steady_state([0.9])
+
+
+def test_a_reference_of_another_shape_is_named() -> None:
+    with pytest.raises(ValueError, match=r"r has shape \(2,\), expected \(1,\)"):
+        servo().steady_state([1, 2])
+    with pytest.raises(ValueError, match=r"d has shape \(1,\), expected \(0,\)"):
+        servo().is_reachable([1], [1])
+
+
+def test_a_regulator_rests_at_the_origin() -> None:
+    x, u = servo(tracked=None, r_min=None, r_max=None).steady_state()
+    assert (x.tolist(), u.tolist()) == ([0, 0], [0])
+
+
+# --- the observer ------------------------------------------------------------------------------
+
+
+def test_the_estimate_of_a_constant_disturbance_is_exact_in_the_end() -> None:
+    observer, rng = DisturbanceObserver(LOADED, [0]), np.random.default_rng(0)
+    x, d = np.array([1.0, -1.0]), np.array([0.2])
+    observer.reset(x[:1])
+    for _ in range(200):
+        u = rng.uniform(-1, 1, 1)
+        x = LOADED.step(x, u, d)
+        x_hat, d_hat = observer.update(x[:1], u)
+    np.testing.assert_allclose(x_hat, x, atol=1e-9)
+    np.testing.assert_allclose(d_hat, d, atol=1e-9)
+
+
+def test_the_kalman_gain_is_the_limit_of_the_time_varying_filter() -> None:
+    observer = DisturbanceObserver(
+        LOADED, [0], state_noise=[0.1, 0.2], disturbance_noise=0.3, measurement_noise=0.5
+    )
+    P = np.eye(3)
+    for _ in range(500):
+        P = observer.A @ P @ observer.A.T + np.diag([0.01, 0.04, 0.09])
+        K = P @ observer.seen.T / (observer.seen @ P @ observer.seen.T + 0.25)
+        P = P - K @ observer.seen @ P
+    np.testing.assert_allclose(observer.gain, K, rtol=1e-9)
+
+
+def test_more_disturbance_noise_makes_a_faster_estimate() -> None:
+    slow, fast = (
+        float(np.abs(DisturbanceObserver(LOADED, disturbance_noise=size).gain[2]).max())
+        for size in (0.1, 10.0)
+    )
+    assert fast > slow
+
+
+def test_a_reset_forgets_what_was_estimated() -> None:
+    observer = DisturbanceObserver(LOADED)
+    observer.update([1, 2], [0])
+    x_hat, d_hat = observer.reset([0.5, 0.1])
+    assert (x_hat.tolist(), d_hat.tolist()) == (pytest.approx([0.5, 0.1]), [0.0])
+
+
+@pytest.mark.parametrize(
+    ("model", "kwargs", "message"),
+    [
+        (THERMAL, {}, "no disturbance to estimate: pass its matrix E"),
+        (LinearModel(LOADED.A, LOADED.B, 1.0, E=np.eye(2)), {"measured": [0]}, "at most as many"),
+        (
+            LinearModel([[1.2, 0], [0, 0.5]], [[1], [1]], 1.0, E=[[1], [1]]),
+            {"measured": [1]},
+            "do not see an unstable mode: eigenvalue 1.2",
+        ),
+        (
+            LinearModel([[1, 0], [0, 0.5]], [[1], [1]], 1.0, E=[[0], [0]]),
+            {},
+            r"has rank 2, needed is 3",
+        ),
+        (LOADED, {"gain": np.zeros((3, 2))}, "does not make the error of the estimate decay"),
+        (LOADED, {"gain": np.zeros((2, 2))}, r"gain has shape \(2, 2\), expected \(3, 2\)"),
+        (LOADED, {"measurement_noise": 0}, "measurement_noise = .* standard deviations, above 0"),
+        (LOADED, {"measured": 0}, r"measured = 0 must be a list of indices of states: \[0\]"),
+        (LOADED, {"measured": [5]}, r"measured = \[5\] must be indices of states"),
+    ],
+)
+def test_bad_argument_of_an_observer_is_named(
+    model: LinearModel, kwargs: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        DisturbanceObserver(model, **kwargs)  # type: ignore[arg-type]
+
+
+def test_bad_measurements_are_named() -> None:
+    with pytest.raises(ValueError, match=r"y has shape \(1,\), expected \(2,\)"):
+        DisturbanceObserver(LOADED).update([1], [0])
+    with pytest.raises(ValueError, match="u holds NaN"):
+        DisturbanceObserver(LOADED).update([1, 2], [np.nan])

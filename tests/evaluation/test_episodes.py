@@ -1,0 +1,260 @@
+"""Seeded, paired episodes, and what is printed and drawn of them."""
+
+from __future__ import annotations
+
+from io import StringIO
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from matplotlib.image import imread
+from rich.console import Console
+from stable_baselines3 import DDPG
+
+from sb3_yann import YannPolicy
+from sb3_yann.evaluation.episodes import Episodes, evaluate
+from sb3_yann.evaluation.plots import comparison_table, save_trajectories
+from sb3_yann_envs import problems
+
+SEEDS = range(3)
+
+
+def test_the_same_seeds_give_the_same_episodes() -> None:
+    law = problems.clipped_pendulum().explicit()
+    one, two = (evaluate(law, "ClippedPendulum-v0", SEEDS) for _ in range(2))
+    np.testing.assert_array_equal(one.costs, two.costs)
+    np.testing.assert_array_equal(one.observations[2], two.observations[2])
+
+
+def test_an_untrained_model_costs_what_its_law_costs() -> None:
+    law = evaluate(problems.cstr().explicit(), "CSTR-v0", SEEDS)
+    model = evaluate(DDPG(YannPolicy, "CSTR-v0"), "CSTR-v0", SEEDS)
+    np.testing.assert_allclose(model.costs, law.costs, rtol=1e-4)
+
+
+def test_the_cost_is_minus_the_sum_of_the_rewards() -> None:
+    env, u = gym.make("CSTR-v0"), np.zeros(1, np.float32)
+    env.reset(seed=0)
+    total, done = 0.0, False
+    while not done:
+        _, reward, terminated, truncated, _ = env.step(u)
+        total += float(reward)
+        done = terminated or truncated
+    episodes = evaluate(lambda _: u, env, [0])
+    assert episodes.costs == pytest.approx([-total])
+    assert episodes.observations[0].shape == (401, 4)
+    assert episodes.actions[0].shape == (400, 1)
+
+
+def test_violations_are_counted_for_each_episode() -> None:
+    too_little_cooling = np.full(1, -55, np.float32)
+    episodes = evaluate(lambda _: too_little_cooling, "CSTR-v0", SEEDS)
+    assert episodes.violations.tolist() == [1, 1, 1]
+    assert (episodes.costs > 1e5).all()
+
+
+@pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
+def test_episodes_side_by_side_are_those_of_one_env_after_the_other(env_id) -> None:
+    law = gym.make(env_id).observation_space.problem.explicit()
+    made = evaluate(law, lambda: gym.make(env_id), SEEDS)
+    assert_equal(made, evaluate(law, gym.make(env_id), SEEDS))
+
+
+@pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
+@pytest.mark.parametrize("start", [None, -0.9])
+def test_episodes_of_a_vectorised_env_are_those_of_single_ones_to_rounding(env_id, start) -> None:
+    env = gym.make(env_id)
+    law, n = env.observation_space.problem.explicit(), env.observation_space.shape[0]
+    starts = None if start is None else [np.full(n, start * k / 2) * np.eye(n)[-1] for k in SEEDS]
+    assert gym.spec(env_id).vector_entry_point is not None
+    together, alone = evaluate(law, env_id, SEEDS, starts), evaluate(law, env, SEEDS, starts)
+    np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(together.violations, alone.violations)
+    np.testing.assert_array_equal(together.terminated, alone.terminated)
+    for name in ("observations", "actions"):
+        for a, b in zip(getattr(together, name), getattr(alone, name), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_an_episode_of_a_vectorised_env_stops_where_it_ends() -> None:
+    starts, u = [[0, 0.3, 0, 4.0], [0, 0, 0, -5.0]], np.full(1, -55, np.float32)
+    together = evaluate(lambda _: u, "CSTR-v0", [0, 1], starts)
+    alone = evaluate(lambda _: u, gym.make("CSTR-v0"), [0, 1], starts)
+    lengths = [len(each) for each in together.actions]
+    assert lengths == [len(each) for each in alone.actions] and lengths[0] < lengths[1]
+    assert together.violations.tolist() == alone.violations.tolist() == [1, 1]
+    np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-9)
+    assert [len(each) for each in together.observations] == [k + 1 for k in lengths]
+
+
+def test_a_policy_that_has_learnt_does_the_same_side_by_side_to_rounding() -> None:
+    model = DDPG(YannPolicy, "ClippedPendulum-v0", seed=0)
+    with th.no_grad():
+        for parameter in model.actor.parameters():
+            parameter += 0.1 * th.randn_like(parameter)
+    together = evaluate(model, "ClippedPendulum-v0", SEEDS)
+    alone = evaluate(model, gym.make("ClippedPendulum-v0"), SEEDS)
+    law = evaluate(model.policy.problem.explicit(), "ClippedPendulum-v0", SEEDS)
+    assert np.abs(together.costs - law.costs).max() > 1e-3  # it is another policy
+    np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-4)
+    for one, other in zip(together.observations, alone.observations, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4)
+
+
+def assert_equal(one: Episodes, other: Episodes) -> None:
+    np.testing.assert_array_equal(one.costs, other.costs)
+    np.testing.assert_array_equal(one.violations, other.violations)
+    for name in ("observations", "actions"):
+        for a, b in zip(getattr(one, name), getattr(other, name), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+class Countdown(gym.Env):
+    """Starts at the state that it is given, or at its seed, and ends at 0; each step costs that."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    open = 0
+
+    def __init__(self) -> None:
+        Countdown.open += 1
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = seed if options is None else int(options["state"][0])
+        return np.full(1, self.left, np.float32), {}
+
+    def step(self, action):
+        reward, violation = -float(self.left + action[0]), self.left == 2
+        self.left -= 1
+        observation = np.full(1, self.left, np.float32)
+        return observation, reward, self.left == 0, False, {"violation": violation}
+
+    def close(self) -> None:
+        Countdown.open -= 1
+
+
+class Tenth:
+    """A policy that remembers how many observations it saw at a time."""
+
+    def __init__(self) -> None:
+        self.batches: list[int] = []
+
+    def predict(self, observation, *, deterministic):
+        assert deterministic
+        self.batches.append(len(observation))
+        return observation / 10, None
+
+
+def test_episodes_of_different_length_wait_for_nobody() -> None:
+    policy = Tenth()
+    episodes = evaluate(policy, Countdown, [3, 1, 4])
+    assert policy.batches == [3, 2, 2, 1]
+    np.testing.assert_allclose(episodes.costs, [1.1 * 6, 1.1, 1.1 * 10], rtol=1e-6)
+    assert episodes.violations.tolist() == [1, 0, 1]
+    assert [len(each) for each in episodes.observations] == [4, 2, 5]
+    assert [each[:, 0].tolist() for each in episodes.observations][:2] == [[3, 2, 1, 0], [1, 0]]
+    np.testing.assert_allclose(episodes.actions[0][:, 0], [0.3, 0.2, 0.1], rtol=1e-6)
+    assert_equal(episodes, evaluate(Tenth(), Countdown(), [3, 1, 4]))
+
+
+def test_starts_are_the_states_of_the_episodes() -> None:
+    starts = [[0.1, 0.0], [-0.2, 0.3], [0.0, -0.5]]
+    law = problems.clipped_pendulum().explicit()
+    episodes = evaluate(law, "ClippedPendulum-v0", SEEDS, starts=starts)
+    firsts = np.array([each[0] for each in episodes.observations])
+    np.testing.assert_allclose(firsts, starts, atol=1e-6)
+    one_env = gym.make("ClippedPendulum-v0")
+    alone = evaluate(law, one_env, SEEDS, starts=np.array(starts))
+    np.testing.assert_allclose(episodes.costs, alone.costs, rtol=1e-9)
+
+
+@pytest.mark.parametrize("env", [Countdown, Countdown(), "no such env"])
+@pytest.mark.parametrize("starts", [[], [[2]], [[2], [3], [4], [5]]])
+def test_starts_that_are_not_as_many_as_the_seeds_are_refused(env, starts) -> None:
+    with pytest.raises(ValueError, match=r"zip\(\)"):
+        evaluate(Tenth(), env, [1, 2, 3], starts=starts)
+
+
+def test_no_seeds_give_no_episodes() -> None:
+    episodes = evaluate(Tenth(), Countdown, [])
+    assert episodes.costs.shape == episodes.violations.shape == (0,)
+    assert episodes.observations == episodes.actions == ()
+
+
+def test_envs_made_for_the_episodes_are_closed() -> None:
+    before = Countdown.open
+    evaluate(Tenth(), Countdown, [3, 1, 4])
+    assert Countdown.open == before
+
+
+def test_envs_are_closed_where_the_policy_fails() -> None:
+    def fails(observation):
+        assert Countdown.open == before + 3
+        raise RuntimeError("this policy fails")
+
+    before = Countdown.open
+    with pytest.raises(RuntimeError, match="this policy fails"):
+        evaluate(fails, Countdown, [3, 1, 4])
+    assert Countdown.open == before
+
+
+def test_envs_are_closed_where_one_of_them_cannot_be_made() -> None:
+    def make() -> Countdown:
+        if Countdown.open == before + 2:
+            raise RuntimeError("no third env")
+        return Countdown()
+
+    before = Countdown.open
+    with pytest.raises(RuntimeError, match="no third env"):
+        evaluate(Tenth(), make, [3, 1, 4])
+    assert Countdown.open == before
+
+
+def test_an_env_that_is_given_stays_open() -> None:
+    env = Countdown()
+    before = Countdown.open
+    evaluate(Tenth(), env, [3, 1])
+    assert Countdown.open == before
+
+
+def test_something_that_is_no_policy_is_named() -> None:
+    with pytest.raises(TypeError, match="predict"):
+        evaluate(3, "CSTR-v0", SEEDS)  # type: ignore[arg-type]
+
+
+def fake(costs: list[float]) -> Episodes:
+    steps = np.linspace(0, 1, 11)[:, None]
+    episodes = len(costs)
+    return Episodes(
+        np.array(costs),
+        np.zeros(episodes, int),
+        (steps,) * episodes,
+        (steps[1:],) * episodes,
+        np.zeros(episodes, bool),
+    )
+
+
+def test_the_table_shows_losses_as_well_as_gains() -> None:
+    console = Console(record=True, width=100, file=StringIO())
+    console.print(comparison_table("costs", fake([10.0, 20.0]), fake([9.0, 27.0])))
+    text = console.export_text()
+    assert "-1.00" in text
+    assert "+7.00" in text
+    assert "+3.00 (+20.0 %)" in text
+
+
+def test_the_picture_is_a_png_that_shows_something(tmp_path) -> None:
+    path = save_trajectories(
+        tmp_path / "new folder" / "run.png",
+        {"before": fake([1.0]), "after": fake([2.0])},
+        states={0: "x"},
+        inputs=["u"],
+        dt=0.1,
+        time_unit="s",
+        limits={0: (0.9, "limit")},
+    )
+    image = imread(path)
+    assert image.shape[0] > 300
+    assert image[..., :3].std() > 0.01

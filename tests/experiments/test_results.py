@@ -1,0 +1,271 @@
+"""The figures of the tables by hand, the criteria both ways, and the report as a whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import types
+
+import numpy as np
+import pytest
+
+import experiments
+from experiments.__main__ import main
+from experiments.criteria import criteria
+from experiments.markdown import number, table
+from experiments.measures import interval_of, standing
+from experiments.published import paper_table
+from experiments.results import write_report
+from experiments.runner import Outcome, Run
+from experiments.summary import BEGIN, END, quote
+
+MPC_COSTS = np.array([100.0, 300.0])  # mean 200
+OPTIMUM = np.array([90.0, 290.0])  # mean 190
+
+
+def fixed(costs) -> Outcome:
+    none = np.zeros(0)
+    return Outcome([0], [costs], [np.zeros(len(costs))], none, none, none, {}, 1.0)
+
+
+def learned(final, initial=MPC_COSTS, excess=0.0, unsafe=0, episodes=50) -> Outcome:
+    """Return a run that is tested before, half way, and after; `excess` is over all episodes."""
+    tests = [initial, initial, final] if episodes == 50 else [initial, final, initial, initial]
+    checkpoints = [0, 25, 50] if episodes == 50 else [0, 50, 100, 200]
+    mpc = np.full(episodes, 7.0)
+    violations = np.zeros(episodes)
+    violations[:unsafe] = 1
+    seen = np.zeros(np.shape(tests))
+    return Outcome(checkpoints, tests, seen, mpc + excess / episodes, mpc, violations, {}, 60.0)
+
+
+def reactor(ours=None, ddpg_final=(200.0, 400.0), plant="CSTR", seeds=10) -> dict[Run, Outcome]:
+    outcomes = {
+        Run(plant, "MPC", 0, 0): fixed(MPC_COSTS),
+        Run(plant, "optimum", 0, 0): fixed(OPTIMUM),
+    }
+    for seed in range(seeds):
+        worse = np.array(ddpg_final)
+        outcomes[Run(plant, "DDPG", seed, 50)] = learned(worse, worse + 100 + seed, 4000.0, 3)
+        outcomes[Run(plant, "YANN-RL", seed, 50)] = ours or learned(OPTIMUM + 1, excess=-20.0)
+    return outcomes
+
+
+def pendulum(final=(1.0, 30.0), mpc=(1.0, 200.0), optimum=(0.9, 29.1)) -> dict[Run, Outcome]:
+    name = "pendulum, Q = I"
+    outcomes = {Run(name, "MPC", 0, 0): fixed(mpc), Run(name, "optimum", 0, 0): fixed(optimum)}
+    for seed in range(10):
+        outcomes[Run(name, "YANN-RL", seed, 50)] = learned(np.array(final), np.array(mpc))
+    return outcomes
+
+
+def test_a_row_by_hand() -> None:
+    runs = {
+        Run("CSTR", "YANN-RL", 0, 50): learned([96.0, 296.0], excess=-10.0),  # mean 196
+        Run("CSTR", "YANN-RL", 1, 50): learned([92.0, 292.0], excess=30.0, unsafe=2),  # 192
+        Run("CSTR", "YANN-RL", 2, 50): learned([106.0, 298.0], excess=5.0, unsafe=1),  # 202
+        Run("CSTR", "YANN-RL", 3, 50): learned([94.0, 294.0], excess=7.0),  # 194
+    }
+    row = standing({**reactor(seeds=0), **runs}, "CSTR", 50).row("YANN-RL")
+    assert (row.seeds, row.median, row.low, row.high) == (4, 195, 192, 202)
+    assert row.iqm == 195  # of 194 and 196
+    assert row.change == pytest.approx(-2.5)
+    assert row.closed == pytest.approx(50)
+    assert (row.below, row.above) == (3, 1)
+    assert (row.worst, row.worst_share) == (6, 3)
+    assert row.distance == 5
+    assert row.excess == pytest.approx((6, -10, 30))
+    assert (row.unsafe_training, row.unsafe_tests) == (3, 0)
+    assert row.near == 4  # all below 209
+    assert row.held is None  # no pendulum
+
+
+def test_the_held_starts_are_those_that_the_mpc_holds() -> None:
+    row = standing(pendulum((1.02, 500.0)), "pendulum, Q = I", 50).row("YANN-RL")
+    assert row.held == pytest.approx(0.02)
+    assert row.worst == pytest.approx(300)
+    assert row.near == 0
+
+
+def test_a_long_run_is_read_at_its_checkpoint() -> None:
+    run = Run("CSTR", "YANN-RL", 0, 200)
+    outcomes = {**reactor(seeds=0), run: learned(OPTIMUM, episodes=200, excess=400.0)}
+    short = standing(outcomes, "CSTR", 50).row("YANN-RL")
+    assert short.median == 190
+    assert short.excess == pytest.approx((100, 100, 100))
+    long = standing(outcomes, "CSTR", 200).row("YANN-RL")
+    assert long.median == 200
+    assert long.excess == pytest.approx((400, 400, 400))
+    assert "YANN-RL" not in standing(outcomes, "CSTR", 75).learners
+
+
+def test_the_interval_over_seeds() -> None:
+    assert interval_of([3.0]) is None
+    assert interval_of([3.0, 3.0, 3.0]) == (3, 3)
+    low, high = interval_of([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0])
+    assert 1 < low < 4.5 < high < 8
+    assert interval_of([1.0, 2.0, 9.0]) == interval_of([1.0, 2.0, 9.0])
+
+
+def reached(outcomes, words: str) -> list[str]:
+    lines = [line.reached for line in criteria(outcomes) if words in line.required]
+    assert lines, words
+    return lines
+
+
+def test_all_criteria_can_be_reached() -> None:
+    outcomes = {**reactor(), **reactor(plant="CSTR, true model"), **pendulum()}
+    lines = criteria(outcomes)
+    assert {line.reached for line in lines} == {"yes"}
+    assert len(lines) == 7 + 1 + 4
+
+
+@pytest.mark.parametrize(
+    ("words", "outcomes"),
+    [
+        ("no violation", reactor(learned(OPTIMUM, unsafe=1))),
+        ("in every seed", reactor(learned(MPC_COSTS))),
+        ("at least 2.2 %", reactor(learned(MPC_COSTS * 0.979))),
+        ("85 %", reactor(learned(OPTIMUM + 1.6))),
+        ("no test start worse", reactor(learned([60.0, 302.1]))),
+        ("DDPG at least five", reactor(ddpg_final=OPTIMUM + 4.9)),
+        ("DDPG at least twenty", reactor(learned(OPTIMUM, excess=201.0))),
+        ("not worse", reactor(learned(MPC_COSTS + 0.1), plant="CSTR, true model")),
+        ("is held", pendulum((51.0, 10.0))),
+        ("0.05 more", pendulum((1.06, 10.0))),
+        ("10 % of the optimum", pendulum((1.0, 33.0))),
+        ("never above", pendulum((1.0, 200.1))),
+    ],
+)
+def test_a_criterion_can_be_missed(words, outcomes) -> None:
+    assert reached(outcomes, words) == ["**no**"]
+
+
+def test_few_seeds_do_not_reach_a_criterion() -> None:
+    assert set(reached(reactor(seeds=3), "")) == {"so far (3 of 10 seeds)"}
+    assert reached(reactor(learned(OPTIMUM, unsafe=1), seeds=3), "no violation") == ["**no**"]
+
+
+def test_two_seeds_of_ten_may_be_far_from_the_optimum() -> None:
+    outcomes = pendulum()
+    for seed, verdict in ((0, "yes"), (1, "yes"), (2, "**no**")):
+        far = learned(np.array([1.0, 100.0]), np.array([1.0, 200.0]))
+        outcomes[Run("pendulum, Q = I", "YANN-RL", seed, 50)] = far
+        assert reached(outcomes, "10 % of the optimum") == [verdict]
+
+
+def test_the_papers_table_takes_the_best_and_the_worst_beginning() -> None:
+    text = paper_table(reactor(), "CSTR", 50)
+    assert "DDPG-G: seed 0, DDPG-P: seed 9, YANN-RL: seed 0" in text
+    assert "| 1 | 300.00 | 200.00 | 309.00 | 200.00 | 100.00 | 91.00 | -9.00 |" in text
+    assert "| safety violations in training | 3 |  | 3 |  | 0 |  |  |" in text
+    average = "| **400.00** | **300.00** | **409.00** | **300.00** | **200.00** | **191.00** |"
+    assert average in text
+    assert "| 800.24 | 664.39 | > 3e4 | 603.78 | 94.32 | 92.22 | -2.10 |" in text
+    assert "| 1,586.97 |" not in paper_table(pendulum(), "pendulum, Q = I", 50)  # no DDPG there
+    assert "| 270.99 | 26.08 | -244.91 |" in paper_table(pendulum(), "pendulum, Q = I", 50)
+    assert paper_table(reactor(), "CSTR, true model", 50) == ""
+
+
+def test_numbers_and_tables() -> None:
+    cells = [number(None), number(-0.001), number(12345.678), number(2.5e5), number(1.0, 1, "+")]
+    assert cells == ["—", "0.00", "12,345.68", "2.50e+05", "+1.0"]
+    assert table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
+
+
+def test_the_report_is_whole(tmp_path) -> None:
+    notes = tmp_path / "notes.md"
+    notes.write_text("## What was tried\n\nThis | and *that*.\n", encoding="utf-8")
+    outcomes = {**reactor(), **pendulum()}
+    outcomes[Run("CSTR", "YANN-RL, guard off", 0, 50)] = learned(OPTIMUM)
+    outcomes[Run("CSTR", "YANN-RL", 0, 200)] = learned(OPTIMUM, episodes=200)
+    paths = write_report(outcomes, tmp_path / "docs", notes=notes)
+    names = ["results.md", "results-cstr.png", "results-pendulum-q-i.png"]
+    assert [path.name for path in paths] == names
+    assert all(path.stat().st_size > 1000 for path in paths)
+    text = paths[0].read_text(encoding="utf-8")
+    for heading in (
+        "How this was made",
+        "What was required, and what was reached",
+        "The paper's tables",
+        "After 50 training episodes",
+        "Variants of YANN-RL, after 50 training episodes",
+        "After 200 training episodes",
+        "Learning curves",
+        "What was tried",
+    ):
+        assert f"\n## {heading}\n" in text
+    assert text.endswith("This | and *that*.\n")
+    assert "![CSTR](results-cstr.png)" in text
+
+
+def test_every_learner_that_is_run_for_longer_has_a_row_of_its_own_after_that_time() -> None:
+    from experiments.catalog import RUNS
+
+    long = [run for run in RUNS if run.episodes == 200]
+    assert len(long) > 4
+    outcomes = {run: learned(OPTIMUM, episodes=200) for run in long}
+    rows, _ = standing({**reactor(seeds=0), **outcomes}, "CSTR", 200).tables()
+    assert {row.learner for row in rows} - {"MPC", "optimum"} == {run.learner for run in long}
+    assert any(run.learner.startswith("YANN-RL") for run in long)
+
+
+@pytest.mark.parametrize("missing", ["MPC", "optimum", "YANN-RL", "DDPG", "MPC optimum YANN-RL"])
+def test_the_report_does_without(missing, tmp_path) -> None:
+    everything = {**reactor(seeds=2), **pendulum()}
+    left = {run: out for run, out in everything.items() if run.learner not in missing}
+    text = write_report(left, tmp_path, notes=tmp_path / "none.md")[0].read_text(encoding="utf-8")
+    for row in text.splitlines():
+        assert not row.startswith(f"| {missing} |") and "nan" not in row
+    assert ("## What was required" in text) == (not {"MPC", "YANN-RL"} & {*missing.split()})
+
+
+@pytest.fixture
+def catalog(monkeypatch, tmp_path):
+    """Offer experiments that take no time, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    outcomes = reactor(seeds=1)
+    module = types.ModuleType("experiments.catalog")
+    module.RUNS, module.QUICK, module.FINGERPRINT = [*outcomes], [*outcomes][:3], "made up"
+    module.execute = outcomes.__getitem__
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(experiments, "catalog", module, raising=False)
+    return module
+
+
+def test_the_command_writes_its_report(catalog, tmp_path, capsys) -> None:
+    assert main(["--jobs", "1"]) == 0
+    assert "docs/results.md" in capsys.readouterr().out
+    assert '`make paper ARGS="--jobs 1"`' in (tmp_path / "docs/results.md").read_text()
+    assert len(list((tmp_path / "out/paper").iterdir())) == 4
+    assert main(["--quick", "--jobs", "1", "--only", "cstr / (MPC|optimum)"]) == 0
+    assert len(list((tmp_path / "out/paper-quick/runs").iterdir())) == 2
+    assert (tmp_path / "out/paper-quick/results.md").exists()
+    assert "2 of 3 runs" in capsys.readouterr().out
+
+
+def test_the_command_reports_what_failed(catalog, tmp_path, capsys) -> None:
+    assert main(["--report-only"]) == 1  # nothing there
+    good = catalog.execute
+
+    def fails(run: Run) -> Outcome:
+        return good(run if run.learner != "DDPG" else dataclasses.replace(run, seed=99))
+
+    catalog.execute = fails
+    assert main(["--jobs", "1", "--results", "elsewhere"]) == 1
+    said = capsys.readouterr().out
+    assert "KeyError" in said and "CSTR / DDPG / seed 0 / 50 episodes" in said
+    assert len(list((tmp_path / "elsewhere").iterdir())) == 3
+    assert (tmp_path / "docs/results.md").exists()
+    assert main(["--report-only", "--results", "elsewhere"]) == 0
+
+
+def test_the_readme_gets_the_short_tables_between_its_marks(tmp_path) -> None:
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n", encoding="utf-8")
+    assert quote("| new |", readme)
+    assert readme.read_text(encoding="utf-8") == f"before\n{BEGIN}\n| new |\n\n{END}\nafter\n"
+    readme.write_text("nothing to replace", encoding="utf-8")
+    assert not quote("| new |", readme)
+    assert readme.read_text(encoding="utf-8") == "nothing to replace"
+    assert not quote("| new |", tmp_path / "missing.md")

@@ -1,0 +1,215 @@
+"""The yardsticks start where they claim to, and learn."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import Recorder
+from stable_baselines3.common.callbacks import BaseCallback
+
+from experiments import yardsticks
+from experiments.yardsticks import (
+    BurnIn,
+    Learner,
+    best_of_ddpg,
+    cloned,
+    lqr,
+    residual_rl,
+    sb3_ddpg,
+    sb3_td3,
+)
+from sb3_yann.control import lqr as formulas
+from sb3_yann.evaluation.episodes import evaluate
+from sb3_yann_envs import problems
+
+ENVS = ["CSTR-v0", "ClippedPendulum-v0"]
+BUILDERS = {
+    "ddpg": sb3_ddpg,
+    "td3": sb3_td3,
+    "residual": residual_rl,
+    "quiet residual": partial(residual_rl, noise=0.0),
+    "cloned": cloned,
+}
+
+
+def recorder(env_id: str) -> Recorder:
+    return Recorder(gym.make(env_id))
+
+
+def law_of(env: gym.Env):
+    return env.observation_space.problem.explicit()
+
+
+def random_states(env: gym.Env, count: int = 200) -> np.ndarray:
+    rng, space = np.random.default_rng(0), env.observation_space
+    return rng.uniform(space.low, space.high, (count, *space.shape)).astype(np.float32)
+
+
+@pytest.fixture
+def quick_cloning(monkeypatch) -> None:
+    monkeypatch.setattr(yardsticks, "CLONING_STEPS", 20)
+    monkeypatch.setattr(yardsticks, "CLONING_SEEDS", range(500, 502))
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+@pytest.mark.parametrize("env_id", ENVS)
+def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_cloning) -> None:
+    env = recorder(env_id)
+    learner = BUILDERS[name](lambda: env, 0)
+    states = random_states(env)
+    before, _ = learner.policy.predict(states)
+    learner.model.learn(150, callback=learner.callbacks)
+    for callback in learner.callbacks:
+        callback.steps = 100  # the second half is past the burn-in
+    learner.model.learn(150, callback=learner.callbacks, reset_num_timesteps=False)
+    after, _ = learner.policy.predict(states, deterministic=True)
+    assert len(env.pairs) == learner.model.num_timesteps == 300
+    assert after.shape == (len(states), 1)
+    assert after.dtype == np.float32
+    assert np.any(after != before)
+    assert np.all(np.abs(after) <= env.action_space.high)
+    executed = env.recorded()[1]
+    assert np.all(np.abs(executed) <= env.action_space.high)
+    one, _ = learner.policy.predict(states[0])
+    np.testing.assert_allclose(one, after[0], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["ddpg", "residual", "cloned"])
+def test_equal_seeds_give_equal_results(name, quick_cloning) -> None:
+    def trained(seed: int) -> np.ndarray:
+        env = recorder("ClippedPendulum-v0")
+        learner = BUILDERS[name](lambda: env, seed)
+        learner.model.learn(120, callback=learner.callbacks)
+        return np.concatenate([env.recorded()[1], learner.policy.predict(random_states(env))[0]])
+
+    first = trained(1)
+    np.testing.assert_array_equal(first, trained(1))
+    assert np.any(first != trained(2))
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+def test_the_residual_policy_is_the_mpc_before_training(env_id) -> None:
+    env = gym.make(env_id)
+    learner = residual_rl(lambda: env, 0)
+    states = random_states(env)
+    expected = law_of(env)(states).astype(np.float32)
+    np.testing.assert_array_equal(learner.policy.predict(states)[0], expected)
+    np.testing.assert_array_equal(learner.policy.predict(states[0])[0], expected[0])
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+def test_without_noise_the_residual_executes_the_mpc_until_the_actor_moves(env_id) -> None:
+    env = recorder(env_id)
+    learner = residual_rl(lambda: env, 0, noise=0.0)
+    learner.callbacks[0].steps = 100
+    learner.model.learn(120, callback=learner.callbacks)
+    observations, executed = env.recorded()
+    expected = law_of(env)(observations).astype(np.float32)
+    np.testing.assert_array_equal(executed[:100], expected[:100])
+    assert np.any(executed[101:] != expected[101:])
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+def test_residual_noise_is_a_fraction_of_half_the_input_range(env_id) -> None:
+    env = recorder(env_id)
+    learner = residual_rl(lambda: env, 0, noise=0.01)
+    learner.model.learn(150, callback=learner.callbacks)  # within the burn-in
+    observations, executed = env.recorded()
+    high = env.action_space.high
+    inside = np.abs(executed) < high
+    noise = ((executed - law_of(env)(observations)) / high)[inside]
+    assert len(noise) > 50
+    assert 0.007 < noise.std() < 0.013
+
+
+def test_the_residual_reaches_every_input_from_any_other() -> None:
+    learner = residual_rl(lambda: gym.make("ClippedPendulum-v0"), 0)
+    assert learner.model.action_space == gym.spaces.Box(-4.0, 4.0, (1,), np.float32)
+    residual = learner.model.env.envs[0].get_wrapper_attr("combine")
+    state = np.array([-0.5, -0.5], dtype=np.float32)
+    assert residual(state, np.zeros(1)) == 2.0
+    assert residual(state, np.array([-4.0])) == -2.0
+
+
+@pytest.mark.parametrize("name", ["quiet residual", "cloned"])
+def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
+    env = gym.make("ClippedPendulum-v0")
+    learner = BUILDERS[name](lambda: env, 0)
+    (burn_in,) = learner.callbacks
+    assert isinstance(burn_in, BurnIn)
+    burn_in.steps = 100
+    states = random_states(env)
+    before, _ = learner.policy.predict(states)
+    learner.model.learn(100, callback=burn_in)
+    np.testing.assert_array_equal(learner.policy.predict(states)[0], before)
+    learner.model.learn(5, callback=burn_in, reset_num_timesteps=False)
+    assert np.any(learner.policy.predict(states)[0] != before)
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+def test_a_cloned_actor_is_close_to_the_mpc_from_other_starts(env_id) -> None:
+    env = recorder(env_id)
+    learner = cloned(lambda: env, 0)
+    assert env.pairs == []  # the MPC was watched on an environment of its own
+    law = law_of(env)
+    states = np.concatenate(evaluate(law, env_id, range(5000, 5010)).observations)
+    states = states[law.in_domain(states)]  # the law jumps outside, which no such network does
+    error = (learner.policy.predict(states)[0] - law(states)) / (2 * env.action_space.high)
+    assert np.sqrt(np.mean(error**2)) < 0.01
+
+
+def test_networks_see_the_pendulum_as_gymnasium_shows_it() -> None:
+    learner: Learner = sb3_ddpg(lambda: gym.make("ClippedPendulum-v0"), 0)
+    env = learner.model.env.envs[0]
+    seen, info = env.reset(seed=3)
+    angle, speed = info["state"]
+    np.testing.assert_allclose(seen, [np.cos(angle), np.sin(angle), speed], rtol=1e-6)
+    plain = info["state"].astype(np.float32)
+    np.testing.assert_array_equal(learner.policy.predict(plain)[0], learner.model.predict(seen)[0])
+
+
+def test_networks_see_the_reactor_as_it_is() -> None:
+    learner = sb3_ddpg(lambda: gym.make("CSTR-v0"), 0)
+    seen, info = learner.model.env.envs[0].reset(seed=3)
+    np.testing.assert_array_equal(seen, info["state"].astype(np.float32))
+    np.testing.assert_array_equal(learner.policy.predict(seen)[0], learner.model.predict(seen)[0])
+
+
+@pytest.mark.parametrize("problem", [problems.clipped_pendulum(), problems.cstr()], ids=ENVS[::-1])
+def test_lqr_is_linear_inside_and_clipped_outside(problem) -> None:
+    P = formulas.riccati(problem.model, problem.Q, problem.R)
+    K = formulas.gain(problem.model, problem.R, P)
+    law = lqr(problem)
+    rng = np.random.default_rng(0)
+    states = rng.uniform(problem.theta_min, problem.theta_max, (500, problem.n_theta))
+    u = -states @ K.T
+    outside = np.abs(u) > problem.u_max
+    assert outside.any()
+    assert not outside.all()
+    actions = law(states)
+    assert actions.dtype == np.float32
+    np.testing.assert_allclose(actions[~outside], u[~outside], rtol=1e-6)
+    np.testing.assert_allclose(actions[outside], (np.sign(u) * problem.u_max)[outside], rtol=1e-6)
+    np.testing.assert_array_equal(law(states[0]), actions[0])
+
+
+def test_the_best_is_kept_of_what_ddpg_was_after_any_episode() -> None:
+    starts = range(700, 703)
+    learner = best_of_ddpg(lambda: gym.make("ClippedPendulum-v0"), 0, starts)
+    (keep,) = learner.callbacks
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.locals["dones"][0]:
+                now = yardsticks.Controller(learner.model, learner.policy.features)
+                seen.append(evaluate(now, "ClippedPendulum-v0", starts).costs.mean())
+                kept = evaluate(learner.policy, "ClippedPendulum-v0", starts).costs.mean()
+                assert kept == pytest.approx(min(seen), rel=1e-6)
+            return True
+
+    learner.model.learn(1000, callback=[keep, Watch()])
+    assert len(set(seen)) == 5

@@ -1,0 +1,174 @@
+"""Where the whole candidate is refused, the regions that improve the policy may still stay."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG, TD3
+
+from guard_samples import (
+    CENTRE,
+    LEFT,
+    REGION,
+    RIGHT,
+    STEPS,
+    At,
+    Slide,
+    accepted_bits,
+    actor_bits,
+    bits,
+    build,
+    correct,
+    make_guard,
+    train,
+    verdicts,
+)
+from sb3_yann.evaluation.episodes import evaluate
+from sb3_yann.guard import region_mixing as guard_regions
+from sb3_yann.guard.actor_checkpoint import Snapshot
+from sb3_yann.policy.policies import YannPolicy
+
+
+@th.no_grad()
+def spoil_centre(policy: YannPolicy) -> None:
+    network = policy.actor.mu.network
+    network.first.nodes[REGION[CENTRE], ..., :-1] = 3.0
+    network.first.nodes[REGION[CENTRE], ..., -1] = 0.0
+    network.rest[-1].weight[REGION[CENTRE]] = 3.0
+
+
+def half_good(policy: YannPolicy) -> None:
+    correct(policy, LEFT, -2.0)
+    correct(policy, RIGHT, 0.5)
+
+
+def rows(snapshot: Snapshot, region: int) -> list[object]:
+    """Return what belongs to a region: parameters of actor and target, and moments."""
+    parts = [snapshot.actor, snapshot.target, *snapshot.optimizer["state"].values()]
+    tensors = [
+        value
+        for part in parts
+        for key, value in part.items()
+        if str(key).startswith("exp_avg") or ".network." in str(key)
+    ]
+    return [bits(value[region]) for value in tensors]
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorithm) -> None:
+    model, guard = build(algorithm), make_guard(margin=0.03)
+    snapshots: dict[str, Snapshot] = {}
+
+    def change(policy) -> None:
+        snapshots["accepted"] = guard.state.accepted
+        half_good(policy)
+        snapshots["candidate"] = Snapshot.of(policy)
+
+    step = 3 * STEPS  # the first candidate, from the first episode, is accepted with its moments
+    seen: list[bool] = []
+    look = At([step], lambda policy: seen.append(actor_bits(policy) == accepted_bits(guard)))
+    keep = At([step], lambda policy: snapshots.update(mixed=Snapshot.of(policy)))
+    fix = At([STEPS], lambda policy: correct(policy, LEFT, -0.2))
+    train(model, step, fix, At([step], change), guard, look, keep)
+    assert snapshots["accepted"].optimizer["state"]
+    (decision,) = [each for each in guard.decisions if each.timestep == step][:1]
+    assert decision.verdict == "accepted in part"
+    assert REGION[RIGHT] in decision.regions
+    assert REGION[LEFT] not in decision.regions
+    assert "costs" in decision.reason
+    for region in REGION.values():
+        source = "candidate" if region in decision.regions else "accepted"
+        assert rows(snapshots["mixed"], region) == rows(snapshots[source], region)
+    assert rows(snapshots["candidate"], 0) != rows(snapshots["accepted"], 0)
+    assert seen == [True]
+
+
+def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
+    model, guard = build(gradient_steps=0), make_guard()
+    train(model, STEPS, At([STEPS], half_good), guard)
+    assert guard.decisions[0].regions == (REGION[RIGHT],)
+    played = evaluate(model, Slide, guard.trials.seeds)
+    np.testing.assert_allclose(guard.state.evidence.paired.costs, played.costs, atol=1e-5)
+    assert guard.decisions[0].accepted_cost == pytest.approx(played.costs.mean())
+    assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
+    assert guard.decisions[0].candidate_cost > guard.decisions[0].mpc_cost
+    assert guard.decisions[0].step == 1  # neither shrinks nor grows
+
+
+@pytest.mark.parametrize("most_lost", [0.0, 0.5], ids=["one by one", "all but those that lose"])
+def test_only_the_starts_that_come_through_a_region_are_played_again(
+    most_lost, monkeypatch
+) -> None:
+    monkeypatch.setattr(guard_regions, "MOST_LOST", most_lost)
+    simulator = Slide()
+    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=0)
+    count: list[int] = []
+    before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
+    train(model, STEPS, At([STEPS], half_good), before, guard, after)
+    assert guard.decisions[0].regions == (REGION[RIGHT],)
+    left, right = guard.state.evidence.visits[:, [REGION[LEFT], REGION[RIGHT]]].sum(0)
+    assert 0 < left < right < 10
+    # One by one, the candidate's own episodes stand for those that come through one region only.
+    episodes = 10 if most_lost == 0 else 10 + left
+    assert count[1] - count[0] == episodes * STEPS
+
+
+def test_a_region_that_no_start_comes_through_is_never_taken_over() -> None:
+    simulator = partial(Slide, low=2.0)
+    model, guard = build(gradient_steps=0), make_guard(simulator)
+
+    def change(policy) -> None:
+        spoil_centre(policy)
+        correct(policy, RIGHT, 0.5)
+        correct(policy, LEFT, -0.5)
+
+    train(model, STEPS, At([STEPS], change), guard)
+    assert not guard.state.evidence.visits[:, REGION[LEFT]].any()
+    assert guard.decisions[0].regions == (REGION[RIGHT],)
+    assert not model.policy.actor.mu.network.rest[-1].weight[REGION[LEFT], :, -1].any()
+
+
+def test_without_by_region_the_whole_returns() -> None:
+    model, guard = build(gradient_steps=0), make_guard(by_region=False)
+    train(model, STEPS, At([STEPS], half_good), guard)
+    assert verdicts(guard) == ["rejected"]
+    assert guard.decisions[0].regions == ()
+    assert model.policy.actor.mu.network.is_zero()
+
+
+def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
+    # To the right half the input violates; nothing else does.
+    simulator = partial(Slide, low=-4.0, limits=(-1.1, 0.9))
+    model, guard = build(gradient_steps=0), make_guard(simulator)
+    train(model, STEPS, At([STEPS], lambda policy: correct(policy, RIGHT, 2.0)), guard)
+    assert verdicts(guard) == ["rejected"]
+    assert "violations" in guard.decisions[0].reason
+
+
+def test_regions_may_be_taken_over_while_patience_lasts() -> None:
+    model, guard = build(gradient_steps=0), make_guard(patience=2, wander=True)
+    seen: list[bytes] = []
+    before, after = (
+        At([STEPS], lambda policy: seen.append(bits(policy.actor.state_dict()))) for _ in range(2)
+    )
+    train(model, STEPS + 1, At([STEPS], half_good), before, guard, after)
+    assert seen[0] == seen[1]  # the actor goes on as it was
+    assert guard.decisions[0].verdict == "accepted in part"
+    weight = model.policy.actor.mu.network.rest[-1].weight
+    assert float(weight[REGION[RIGHT], 0, -1].detach()) == 0.5
+    assert float(weight[REGION[LEFT], 0, -1].detach()) == 0
+
+
+def test_moments_that_the_accepted_policy_has_not_got_are_zero_elsewhere() -> None:
+    trained = build()
+    train(trained, 3)
+    mixed = Snapshot.of(build().policy).with_regions(Snapshot.of(trained.policy), [REGION[RIGHT]])
+    assert mixed.optimizer["state"]
+    for state in mixed.optimizer["state"].values():
+        assert float(state["step"]) == 3
+        for region in (REGION[LEFT], REGION[CENTRE]):
+            assert not state["exp_avg"][region].any()
+            assert not state["exp_avg_sq"][region].any()

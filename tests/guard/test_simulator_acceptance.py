@@ -1,0 +1,129 @@
+"""Simulators of all kinds, and what is left of a run that was cut off."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+
+from guard_samples import At, Slide, accepted_bits, actor_bits, better, build, make_guard, train
+from sb3_yann import restore_accepted
+from sb3_yann.evaluation.episodes import LONGEST, evaluate
+
+
+class CutShort(Slide):
+    """Terminates at an input below 0.9 in size far from the origin: the episode is cheap then."""
+
+    def step(self, action):
+        far, u = abs(float(self.x[0])) > 1.5, abs(float(np.asarray(action)[0]))
+        observation, reward, _, truncated, _ = super().step(action)
+        return observation, reward, far and u < 0.9, truncated, {}
+
+
+class InPlace(Slide):
+    """Returns its own state, which the next step overwrites."""
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        self.observation = observation
+        return self.observation, info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        self.observation[:] = observation
+        return self.observation, *rest
+
+
+class Forgetful(Slide):
+    """Starts where it likes, whatever the seed."""
+
+    starts = iter(np.random.default_rng(0).uniform(-4, 4, 10_000))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.array([next(self.starts)])
+        return self.x.astype(np.float32), {}
+
+
+class Endless(Slide):
+    def step(self, action):
+        observation, reward, *_ = super().step(action)
+        return observation, reward, False, False, {}
+
+
+def test_a_policy_whose_episodes_are_terminated_is_refused_however_cheap_they_are() -> None:
+    model, guard = (
+        build(learning_rate=0.0),
+        make_guard(lambda: gym.wrappers.TimeLimit(CutShort(), 4)),
+    )
+    train(model, 8, At([2], better), guard)
+    assert guard.decisions[0].verdict == "rejected"
+    assert "an episode that the env terminates" in guard.decisions[0].reason
+    assert guard.decisions[0].candidate_cost < guard.decisions[0].mpc_cost
+    assert model.policy.actor.mu.network.is_zero()
+
+
+def test_an_env_that_overwrites_its_observation_gives_the_same_episodes() -> None:
+    seeds, policy = range(3), build().policy
+    for ours, theirs in zip(
+        evaluate(policy, InPlace, seeds).observations,
+        evaluate(policy, Slide, seeds).observations,
+        strict=True,
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_simulator_that_does_not_follow_its_seed_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"from the seed 1000000, at costs of .*np_random"):
+        train(build(), 4, make_guard(Forgetful))
+
+
+def test_one_env_for_all_starts_is_refused() -> None:
+    env = Slide()
+    with pytest.raises(ValueError, match="returned the same one twice"):
+        train(build(), 4, make_guard(lambda: env))
+
+
+def test_a_function_that_makes_no_env_is_named() -> None:
+    with pytest.raises(TypeError, match=r"returned None, not a gymnasium\.Env"):
+        train(build(), 4, make_guard(lambda: None))
+
+
+def test_an_episode_that_never_ends_is_reported(monkeypatch) -> None:
+    monkeypatch.setattr("sb3_yann.evaluation.episodes.LONGEST", 50)
+    assert LONGEST > 1e5
+    with pytest.raises(RuntimeError, match="has not ended after 50 steps"):
+        train(build(), 4, make_guard(Endless))
+
+
+class Stop(BaseCallback):
+    def _on_step(self) -> bool:
+        if self.n_calls == 6:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_after_an_interruption_the_accepted_policy_can_be_had() -> None:
+    model, guard = build(learning_rate=0.0), make_guard(every=100)
+    with pytest.raises(KeyboardInterrupt):
+        train(model, 20, At([5], better), guard, Stop())
+    assert actor_bits(model.policy) != accepted_bits(guard)
+    restore_accepted(model)
+    assert actor_bits(model.policy) == accepted_bits(guard)
+    assert model.policy.actor_step == 1.0
+
+
+def test_the_accepted_policy_can_be_had_from_a_checkpoint(tmp_path) -> None:
+    model, guard = build(learning_rate=0.0), make_guard(every=100)
+    train(model, 6, At([5], better), guard, CheckpointCallback(5, str(tmp_path), "run"))
+    loaded = DDPG.load(tmp_path / "run_5_steps", device="cpu")
+    assert not loaded.policy.actor.mu.network.is_zero()
+    restore_accepted(loaded)
+    assert loaded.policy.actor.mu.network.is_zero()
+
+
+def test_a_model_without_a_guard_has_nothing_to_restore() -> None:
+    with pytest.raises(ValueError, match="No ImprovementGuard has been at work on this DDPG"):
+        restore_accepted(build())

@@ -1,0 +1,228 @@
+"""What was decided can be read, and a stopped run goes on from there."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import os
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.callbacks import CheckpointCallback
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from guard_samples import (
+    LEFT,
+    REGION,
+    RIGHT,
+    STEPS,
+    At,
+    Slide,
+    accepted_bits,
+    actor_bits,
+    better,
+    bits,
+    build,
+    correct,
+    make_guard,
+    overwrite,
+    randomize,
+    train,
+    verdicts,
+)
+from sb3_yann import Decision
+from sb3_yann.guard import state as record
+
+NAMES = [each.name for each in dataclasses.fields(Decision)]
+
+
+def half_good(policy) -> None:
+    correct(policy, LEFT, -2.0)
+    correct(policy, RIGHT, 0.3)
+
+
+def three_decisions(*guards, model=None, **kwargs):
+    """Train with a candidate accepted in part, one that diverged, and a good one."""
+    model = build(gradient_steps=0, **kwargs) if model is None else model
+    acts = [half_good, partial(overwrite, value=np.nan), better]
+    moves = [At([(i + 1) * STEPS], act) for i, act in enumerate(acts)]
+    train(model, 3 * STEPS, *moves, *guards)
+    return model
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
+    path = tmp_path / "new" / "guard.csv"
+    guard = make_guard(record=str(path))
+    three_decisions(guard)
+    written = rows(path)
+    assert [*written[0]] == NAMES
+    assert verdicts(guard) == ["accepted in part", "rejected", "accepted"]
+    assert [row["verdict"] for row in written] == verdicts(guard)
+    assert [row["episode"] for row in written] == ["1", "2", "3"]
+    assert [row["timestep"] for row in written] == ["4", "8", "12"]
+    assert [row["regions"] for row in written] == [str(REGION[RIGHT]), "", ""]
+    assert [row["returned"] for row in written] == ["True", "True", "False"]
+    assert "not a finite number" in written[1]["reason"]
+    for row, decision in zip(written, guard.decisions, strict=True):
+        for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
+            np.testing.assert_equal(float(row[name]), getattr(decision, name))
+
+
+def test_the_record_is_up_to_date_after_each_decision(tmp_path) -> None:
+    path = tmp_path / "guard.csv"
+    guard, lengths = make_guard(record=path), []
+    look = At([STEPS, 2 * STEPS, 3 * STEPS], lambda _: lengths.append(len(rows(path))))
+    three_decisions(guard, look)
+    assert lengths == [1, 2, 3]
+    assert [each.name for each in tmp_path.iterdir()] == ["guard.csv"]
+
+
+def test_a_record_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "guard.csv"
+    guard = make_guard(record=path)
+    three_decisions(guard)
+    before = path.read_bytes()
+
+    def fail(*_) -> None:
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(record.csv.DictWriter, "writerow", fail)
+    with pytest.raises(OSError, match="full"):
+        record.write_csv(path, guard.decisions)
+    monkeypatch.undo()
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="full"):
+        record.write_csv(path, guard.decisions[:1])
+    assert path.read_bytes() == before
+
+
+def scalars(folder: Path) -> dict[str, list[float]]:
+    (run,) = folder.iterdir()
+    events = EventAccumulator(str(run)).Reload()
+    return {tag: [e.value for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+
+def test_tensorboard_shows_every_decision_the_last_one_too(tmp_path) -> None:
+    guard = make_guard()
+    model = build(gradient_steps=0, tensorboard_log=str(tmp_path))
+    three_decisions(guard, At([3 * STEPS], partial(correct, region=RIGHT, value=0.45)), model=model)
+    shown = scalars(tmp_path)
+    assert shown["guard/accepted"] == [1, 1, 2, 2]
+    assert shown["guard/rejected"] == [0, 1, 1, 2]
+    for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
+        expected = [getattr(each, name) for each in guard.decisions]
+        np.testing.assert_allclose(shown[f"guard/{name}"], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_verbose_prints_a_line_for_each_decision_and_silence_is_the_default(capsys) -> None:
+    three_decisions(make_guard())
+    assert capsys.readouterr().out == ""
+    three_decisions(make_guard(verbose=1))
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3
+    assert lines[0].startswith("Episode 1: accepted in part (start ")
+    assert lines[1].startswith("Episode 2: rejected (a parameter of the actor is not a finite")
+    assert lines[2].startswith("Episode 3: accepted; mean cost 4, MPC 4.175")
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+@pytest.mark.parametrize("place", ["before the guard", "after the guard"])
+def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place, tmp_path) -> None:
+    model, guard = build(algorithm), make_guard(record=tmp_path / "guard.csv")
+    stop = 4 * STEPS
+    save = CheckpointCallback(stop, str(tmp_path), "model")
+    kept: list[object] = []
+
+    def keep(policy) -> None:
+        kept.extend([accepted_bits(guard), [*guard.decisions], guard.state.step])
+        kept.extend([guard.state.episodes, guard.state.evidence.paired])
+
+    spoil = At([2 * STEPS], randomize)
+    callbacks = (
+        [save, At([stop], keep), guard] if place[0] == "b" else [guard, save, At([stop], keep)]
+    )
+    train(model, 5 * STEPS, spoil, *callbacks)
+    bits_, decisions, step, episodes, paired = kept
+    assert decisions
+    assert "rejected" in [each.verdict for each in decisions]
+
+    loaded = algorithm.load(tmp_path / f"model_{stop}_steps", env=Slide(), device="cpu")
+    again = make_guard(record=tmp_path / "guard.csv", n_starts=10)
+    seen: list[object] = []
+    again.trials.first_evidence = lambda _: seen.append("afresh")  # type: ignore[method-assign]
+    look = At(
+        [1], lambda p: seen.extend([accepted_bits(again), p.actor_step, again.state.episodes])
+    )
+    train(loaded, 3 * STEPS, look, again, reset_num_timesteps=False)
+    assert seen == [bits_, step, episodes]
+    assert again.decisions[: len(decisions)] == decisions
+    assert again.state.evidence.paired.costs.mean() <= paired.costs.mean() + 1e-9
+    assert again.decisions[-1].timestep > stop
+    assert bits(loaded.policy.actor.state_dict()) == bits(again.state.accepted.actor)
+    assert [row["verdict"] for row in rows(tmp_path / "guard.csv")] == verdicts(again)
+
+
+@pytest.mark.parametrize(
+    "change", [{"n_starts": 4}, {"seed": 7}, {"margin": 0.5}, {"env": "Slide-v0"}, {"env": None}]
+)
+def test_with_other_settings_the_guard_starts_afresh(change) -> None:
+    first, second = make_guard(), make_guard(**change)
+    model = three_decisions(first)
+    assert len(first.decisions) == 3
+    before, evidence = [*first.decisions], first.state.evidence
+    train(model, 1, second)
+    assert second.decisions == before  # what was decided is not forgotten
+    assert second.state.evidence is not evidence
+    assert accepted_bits(second) == actor_bits(model.policy)  # it is better than the MPC: kept
+
+
+def test_what_does_not_concern_the_evidence_may_change_in_between() -> None:
+    model = three_decisions(make_guard())
+    second = make_guard(every=2, patience=2, by_region=False, shrink=0.9, record=None)
+    train(model, 1, second)
+    assert len(second.decisions) == 3
+
+
+def test_a_simulator_made_by_a_partial_is_known_again_in_another_process() -> None:
+    one, other = (make_guard(partial(partial(Slide, low=0.0), high=2.0)) for _ in range(2))
+    assert one.trials.settings == other.trials.settings
+    assert "0x" not in str(one.trials.settings)
+    assert one.trials.settings != make_guard(partial(Slide, low=0.5)).trials.settings
+
+
+def test_a_second_learn_goes_on_and_the_step_is_the_one_decided_last() -> None:
+    guard = make_guard()
+    model = three_decisions(guard)
+    steps: list[float] = []
+    train(model, STEPS, At([1], lambda policy: steps.append(policy.actor_step)), guard)
+    assert steps == [guard.decisions[-1].step] == [0.75]
+    assert len(guard.decisions) == 3
+
+
+def test_one_guard_may_serve_two_models_one_after_the_other() -> None:
+    guard = make_guard(patience=2, wander=True)
+    for _ in range(2):
+        three_decisions(guard)
+        assert verdicts(guard) == ["accepted in part", "rejected", "accepted"]
+        assert [each.returned for each in guard.decisions] == [False, True, False]
+
+
+def test_a_saved_model_holds_the_guard_s_state_in_main_memory(tmp_path) -> None:
+    model = build()
+    train(model, 3 * STEPS, make_guard())
+    model.save(tmp_path / "model")
+    accepted = DDPG.load(tmp_path / "model", device="cpu").guard_state.accepted
+    tensors = [*accepted.actor.values(), *accepted.target.values()]
+    tensors += [each for state in accepted.optimizer["state"].values() for each in state.values()]
+    assert {str(each.device) for each in tensors} == {"cpu"}
+    memory = {each.data_ptr() for each in model.policy.state_dict().values()}
+    kept = model.guard_state.accepted
+    assert memory.isdisjoint(each.data_ptr() for each in kept.actor.values())

@@ -1,0 +1,214 @@
+"""What counts as no worse: paired episodes, and the test on a plant alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sb3_yann.guard.statistics import (
+    OUTLIER,
+    Paired,
+    PlantEpisodes,
+    excess_of_an_outlier,
+    probability_of_chance,
+)
+
+NONE = np.zeros((3, 2), dtype=np.int64)
+NAN, INF = np.nan, np.inf
+
+
+def objection(costs, violations=NONE, accepted=(10.0, 20.0, 30.0), margin=1.0) -> str:
+    mpc = np.array([10.0, 20.0, 30.0])
+    return Paired(mpc, np.array(accepted), NONE, margin).objection(
+        np.array(costs, float), violations
+    )
+
+
+@pytest.mark.parametrize(
+    ("costs", "why"),
+    [
+        ([10, 20, 30], ""),
+        ([11, 19, 30], ""),  # one start worse by exactly the margin
+        ([11.01, 5, 5], "start 0 costs 1.01 more than with the MPC"),
+        ([5, 5, 31.5], "start 2 costs 1.5 more"),
+        ([10, 20.5, 30], "mean cost 20.1667, accepted 20"),
+        ([NAN, 1, 1], "start 0 costs nan more"),
+        ([1, 1, INF], "start 2 costs inf more"),
+        ([-INF, NAN, 1], "start 1 costs nan more"),
+    ],
+)
+def test_a_worse_mean_or_one_start_beyond_the_margin_is_refused(costs, why) -> None:
+    assert why in objection(costs)
+    assert bool(objection(costs)) == bool(why)
+
+
+def test_the_mean_is_compared_with_the_accepted_policy_and_each_start_with_the_mpc() -> None:
+    assert "mean" in objection([10, 20, 30], accepted=(9, 20, 30))
+    assert objection([10.9, 18, 29], accepted=(1, 28, 29)) == ""
+
+
+def test_without_a_margin_no_start_may_cost_more() -> None:
+    assert objection([10, 20, 20], margin=0.0) == ""
+    assert "start 0" in objection([10 + 1e-9, 20, 20], margin=0.0)
+
+
+def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_costs() -> None:
+    def violations(*steps: int):
+        return np.column_stack([steps, [0, 0, 0]])
+
+    message = "1 starts with violations, the first is number 2"
+    assert message in objection([1, 1, 1], violations(0, 0, 1))
+    paired = Paired(np.ones(3), np.ones(3), violations(0, 2, 0), 1.0)
+    assert paired.objection(np.ones(3), violations(0, 2, 0)) == ""
+    assert paired.objection(np.ones(3), violations(0, 1, 0)) == ""
+    assert "violations" in paired.objection(np.zeros(3), violations(0, 3, 0))
+    assert "violations" in paired.objection(np.zeros(3), violations(1, 0, 0))
+
+
+def test_an_episode_that_is_terminated_is_refused_though_it_has_fewer_violations() -> None:
+    accepted = np.array([[2, 0], [0, 1]])
+    paired = Paired(np.ones(2), np.ones(2), accepted, 1.0)
+    assert "the env terminates" in paired.objection(np.zeros(2), np.array([[1, 1], [0, 1]]))
+    assert paired.objection(np.zeros(2), accepted) == ""
+    assert "violations" in paired.objection(np.zeros(2), np.array([[2, 0], [1, 0]]))
+
+
+def episodes(costs, predicted=None) -> PlantEpisodes:
+    costs = np.array(costs, float)
+    return PlantEpisodes(costs, np.ones_like(costs) if predicted is None else np.array(predicted))
+
+
+@pytest.mark.parametrize("sizes", [(10, 10), (4, 9), (3, 3)])
+@pytest.mark.parametrize("predicted", ["equal", "missing"])
+def test_without_a_covariate_it_is_student_s_test(sizes, predicted) -> None:
+    rng = np.random.default_rng(0)
+    new, old = (rng.normal(size=size) for size in sizes)
+    covariates = [np.full(size, 7.0 if predicted == "equal" else NAN) for size in sizes]
+    chance = probability_of_chance(episodes(new, covariates[0]), episodes(old, covariates[1]))
+    expected = stats.ttest_ind(new, old, alternative="less").pvalue
+    assert chance == pytest.approx(expected, rel=1e-9)
+
+
+def test_with_a_covariate_it_is_the_test_of_the_partial_correlation() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        sizes = rng.integers(3, 12, 2)
+        predicted = rng.exponential(size=sizes.sum()) * 1e3
+        costs = 2 * predicted + rng.normal(size=sizes.sum()) * 300
+        policy = np.arange(sizes.sum()) < sizes[0]
+
+        def residual(y, x=predicted):
+            slope = np.cov(x, y)[0, 1] / np.var(x, ddof=1)
+            return y - y.mean() - slope * (x - x.mean())
+
+        r = np.corrcoef(residual(costs), residual(policy.astype(float)))[0, 1]
+        freedom = len(costs) - 3
+        expected = stats.t.cdf(r * np.sqrt(freedom / (1 - r**2)), freedom)
+        chance = probability_of_chance(
+            episodes(costs[policy], predicted[policy]), episodes(costs[~policy], predicted[~policy])
+        )
+        assert chance == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("slope", [0.0, 3.0])
+def test_under_no_difference_it_accepts_as_often_as_its_size_says(slope) -> None:
+    rng, trials, size = np.random.default_rng(2), 2000, 0.05
+    accepted = 0
+    for _ in range(trials):
+        predicted = rng.exponential(size=16)
+        costs = 5 + slope * predicted + rng.normal(size=16)
+        chance = probability_of_chance(
+            episodes(costs[:8], predicted[:8]), episodes(costs[8:], predicted[8:])
+        )
+        accepted += chance < size
+    low, high = stats.binom.interval(0.9999, trials, size)
+    assert low <= accepted <= high
+
+
+def test_the_covariate_finds_a_difference_that_the_starts_hide() -> None:
+    rng = np.random.default_rng(3)
+    predicted = rng.exponential(size=20) * 100
+    costs = predicted + rng.normal(size=20)
+    costs[:10] -= 3
+    with_it = probability_of_chance(
+        episodes(costs[:10], predicted[:10]), episodes(costs[10:], predicted[10:])
+    )
+    without = probability_of_chance(episodes(costs[:10]), episodes(costs[10:]))
+    assert with_it < 1e-3 < 0.05 < without
+
+
+def test_units_do_not_matter() -> None:
+    rng = np.random.default_rng(4)
+    costs, predicted = rng.normal(size=12), rng.normal(size=12)
+    chances = [
+        probability_of_chance(
+            episodes(scale * costs[:6], shift + scale * predicted[:6]),
+            episodes(scale * costs[6:], shift + scale * predicted[6:]),
+        )
+        for scale, shift in [(1, 0), (1e-9, 0), (1e9, 0), (1, 1e6)]
+    ]
+    np.testing.assert_allclose(chances, chances[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("value", [0.1, 5.3, 1e9 / 3, 1e-9 / 3, 0.0, -7.7])
+@pytest.mark.parametrize("count", [3, 10, 11])
+def test_equal_costs_are_no_improvement_whatever_rounding_says(value, count) -> None:
+    predicted = np.random.default_rng(5).normal(size=2 * count)
+    new = episodes([value] * count, predicted[:count])
+    old = episodes([value] * count, predicted[count:])
+    assert probability_of_chance(new, old) > 0.5
+    assert probability_of_chance(episodes([value] * count), episodes([value] * count)) > 0.5
+
+
+def test_without_scatter_the_sign_decides() -> None:
+    assert probability_of_chance(episodes([4.0] * 3), episodes([4.25] * 3)) < 1e-6
+    assert probability_of_chance(episodes([4.25] * 3), episodes([4.0] * 3)) > 1 - 1e-6
+
+
+@pytest.mark.parametrize("bad", [NAN, INF, -INF])
+def test_a_cost_that_is_not_a_number_is_no_improvement(bad) -> None:
+    assert probability_of_chance(episodes([bad, 1, 1]), episodes([5, 6, 7])) == 1
+    assert probability_of_chance(episodes([0, 1, 1]), episodes([5, bad, 7])) == 1
+
+
+def test_starts_that_tell_the_policies_apart_are_no_evidence() -> None:
+    new, old = episodes([1, 2, 1, 2], [1.0] * 4), episodes([9, 8, 9, 8], [2.0] * 4)
+    assert probability_of_chance(new, old) == 1
+
+
+def test_too_few_episodes_are_an_error() -> None:
+    with pytest.raises(ValueError, match="2 episodes are too few"):
+        probability_of_chance(episodes([1]), episodes([2]))
+
+
+@pytest.mark.parametrize("slope", [0.0, 3.0])
+def test_an_episode_of_a_policy_like_the_accepted_one_is_seldom_an_outlier(slope) -> None:
+    rng, trials, found = np.random.default_rng(6), 2000, 0
+    for _ in range(trials):
+        predicted = rng.exponential(size=20)
+        costs = slope * predicted + rng.normal(size=20)
+        blocks = [episodes(costs[i : i + 10], predicted[i : i + 10]) for i in (0, 10)]
+        found += excess_of_an_outlier(*blocks) > 0
+    assert found <= stats.binom.ppf(0.9999, trials, OUTLIER)
+
+
+def test_one_heavy_loss_is_an_outlier_though_the_test_of_the_mean_may_not_mind() -> None:
+    rng, found, passed = np.random.default_rng(7), 0, 0
+    for _ in range(200):
+        predicted = rng.exponential(size=20) * 60
+        costs = predicted + 5 * rng.normal(size=20)
+        costs[:10] -= 12
+        costs[rng.integers(10)] += 200
+        new, old = episodes(costs[:10], predicted[:10]), episodes(costs[10:], predicted[10:])
+        passed += probability_of_chance(new, old) < 0.3
+        found += excess_of_an_outlier(new, old) > 100
+    assert found >= 195
+    assert passed < 195
+
+
+@pytest.mark.parametrize("predicted", [None, [1.0, 2.0, 3.0]], ids=["missing", "known"])
+def test_without_scatter_equal_or_lower_costs_are_no_outlier_and_higher_ones_are(predicted) -> None:
+    old = episodes([4.25] * 3, predicted)
+    assert excess_of_an_outlier(episodes([4.25, 4.0, 4.25], predicted), old) == 0
+    assert excess_of_an_outlier(episodes([4.25, 4.0, 5.25], predicted), old) == pytest.approx(1)

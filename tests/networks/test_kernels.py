@@ -1,0 +1,337 @@
+"""Compiled code does what the operations of torch do, forward and backward."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch as th
+
+from sample_laws import box_points, law_of
+from sb3_yann.networks import AfterstateValue, LinearPrediction, YannLayer, ZeroOutputNetwork
+from sb3_yann.networks._kernels.mlp import tanh
+from sb3_yann_envs import problems
+
+NAMES = ["pendulum", "reactor", "two inputs", "asymmetric bounds"]
+
+
+def shaken(module: th.nn.Module, size: float, seed: int = 0) -> None:
+    """Move all weights at random."""
+    generator = th.Generator().manual_seed(seed)
+    with th.no_grad():
+        for each in module.parameters():
+            each += size * th.randn(each.shape, generator=generator, dtype=each.dtype)
+
+
+def by_torch(module: th.nn.Module) -> th.nn.Module:
+    """Return a copy that has no compiled code."""
+    plain = copy.deepcopy(module)
+    plain.network.has_loops = False
+    assert not plain.network.compiles
+    return plain
+
+
+def gradients(output: th.Tensor, module: th.nn.Module) -> list[th.Tensor]:
+    weights = th.linspace(-1, 1, output.numel()).view(output.shape)
+    return th.autograd.grad((output * weights).sum(), list(module.parameters()))
+
+
+def assert_close(ours: th.Tensor, theirs: th.Tensor, factor: float = 1e-5) -> None:
+    size = float(theirs.detach().abs().max())
+    assert th.allclose(ours, theirs, rtol=0, atol=factor * size + 1e-12)
+
+
+def rate_of(law) -> tuple[np.ndarray, np.ndarray]:
+    width = law.u_max - law.u_min
+    return -0.1 * width, 0.2 * width
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("outside", ["nearest", "zero"])
+@pytest.mark.parametrize("options", [{}, {"max_correction": 0.1}, {"pinned": False}, "rate"])
+@pytest.mark.parametrize("size", [0.1, 0.5])
+def test_the_layer_is_that_of_torch_inside_and_outside_the_domain(
+    name: str, outside: str, options, size: float
+) -> None:
+    law = law_of(name, outside)
+    options = {"rate": rate_of(law)} if options == "rate" else options
+    layer = YannLayer(law, **options)
+    shaken(layer, size)
+    plain = by_torch(layer)
+    theta = box_points(law, 400, stretch=1.5)
+    ours, theirs = layer(theta), plain(theta)
+    assert_close(ours, theirs)
+    assert th.any(theirs.abs() == 1)
+    for one, other in zip(gradients(ours, layer), gradients(theirs, plain), strict=True):
+        assert_close(one, other, 1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_by_row_are_those_of_the_regions_in_use_and_nothing_else(name: str) -> None:
+    layer = YannLayer(law_of(name))
+    shaken(layer, 0.1)
+    theta = box_points(law_of(name), 30)
+    dense = gradients(layer(theta), layer)
+    layer.row_gradients = True
+    used = np.unique(law_of(name).locate(theta.double().numpy()))
+    for sparse, full in zip(gradients(layer(theta), layer), dense, strict=True):
+        assert sorted(sparse.coalesce().indices()[0].tolist()) == used.tolist()
+        assert th.equal(sparse.to_dense(), full)
+
+
+@pytest.mark.parametrize("hidden", [(16,), (5, 7), (1, 1)])
+def test_layers_of_other_shapes_are_the_law_at_first_and_are_trained(hidden) -> None:
+    law = law_of("reactor")
+    layer = YannLayer(law, hidden)
+    theta = box_points(law, 50)
+    assert th.allclose(layer(theta), layer.law(theta), atol=1e-6)
+    shaken(layer, 0.3)
+    assert_close(layer(theta), by_torch(layer)(theta), 1e-6)
+
+
+def test_nodes_beyond_a_pair_are_summed_pair_by_pair() -> None:
+    law = law_of("reactor")
+    layer = YannLayer(law)
+    layer.network = ZeroOutputNetwork(4, 1, (16, 16), n_nodes=5, pinned=th.ones(7, dtype=th.bool))
+    theta = box_points(law, 100)
+    assert th.equal(layer(theta), layer.law(theta))
+    shaken(layer, 0.2)
+    assert_close(layer(theta), by_torch(layer)(theta), 1e-6)
+
+
+def test_a_theta_that_needs_a_gradient_gets_one() -> None:
+    layer = YannLayer(law_of("reactor"))
+    shaken(layer, 0.1)
+    theta = box_points(law_of("reactor"), 10).requires_grad_()
+    layer(theta).sum().backward()
+    assert theta.grad is not None and th.any(theta.grad != 0)
+
+
+def test_a_theta_that_is_not_finite_gives_nan_and_spoils_no_other_row() -> None:
+    layer = YannLayer(law_of("reactor"))
+    theta = box_points(law_of("reactor"), 10)
+    expected = layer(theta).detach().clone()
+    theta[3, 1] = th.nan
+    actions = layer(theta)
+    assert th.isnan(actions[3]).all()
+    rest = [i for i in range(10) if i != 3]
+    assert th.equal(actions[rest], expected[rest])
+
+
+def test_weights_that_change_before_the_way_back_are_noticed() -> None:
+    layer = YannLayer(law_of("reactor"))
+    actions = layer(box_points(law_of("reactor"), 10))
+    shaken(layer, 0.1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        actions.sum().backward()
+
+
+def test_a_state_of_another_law_is_used_as_it_is() -> None:
+    law = law_of("reactor")
+    layer, theta = YannLayer(law), box_points(law, 50)
+    state = layer.state_dict()
+    state["gains"] = state["gains"] / 2
+    layer.load_state_dict(state)
+    assert not layer.has_its_law
+    assert not th.allclose(layer(theta), YannLayer(law)(theta))
+    layer.load_state_dict(YannLayer(law).state_dict())
+    assert layer.has_its_law
+
+
+@pytest.mark.parametrize("x", [0.0, -0.0])
+def test_tanh_is_exactly_zero_at_zero(x: float) -> None:
+    assert tanh(np.float32(x)) == 0
+
+
+def test_tanh_is_exact_to_two_units_in_the_last_place_odd_and_bounded() -> None:
+    x = np.concatenate([np.logspace(-30, 2, 20_001), np.linspace(0, 12, 20_001)])
+    x = x.astype(np.float32)
+    ours = np.array([tanh(each) for each in x])
+    exact = np.tanh(x.astype(np.float64))
+    assert np.max(np.abs(ours - exact) / np.spacing(exact.astype(np.float32)).clip(1e-45)) < 3
+    assert np.array_equal(ours, [-tanh(-each) for each in x])
+    assert ours.max() == 1
+    assert np.isnan(tanh(np.float32(np.nan)))
+
+
+def value(pinned: bool, hidden=(64, 64), gamma: float = 0.99) -> AfterstateValue:
+    mpc = problems.cstr()
+    return AfterstateValue(
+        mpc.stage_matrix, mpc.value_matrix(gamma), LinearPrediction(*mpc.prediction), gamma,
+        (mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max, hidden, pinned=pinned,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("pinned", [True, False])
+@pytest.mark.parametrize("hidden", [(64, 64), (3, 200)])
+@pytest.mark.parametrize("dtype", [th.float32, th.float64])
+def test_the_value_is_that_of_torch(pinned: bool, hidden, dtype: th.dtype) -> None:
+    ours = value(pinned, hidden)
+    shaken(ours, 0.1)
+    plain = by_torch(ours)
+    theta = box_points(law_of("reactor"), 100)
+    points = th.cat([theta, th.linspace(-1, 1, 100)[:, None]], 1).to(dtype)
+    points[7] = 0
+    found = []
+    for each in (ours, plain):
+        x = points.clone().requires_grad_()
+        q = each(x)
+        by = th.autograd.grad(q.square().sum(), [x, *each.parameters()])
+        found.append([q, *by])
+    for one, other in zip(*found, strict=True):
+        assert one.dtype == other.dtype
+        assert_close(one, other)
+    with th.no_grad():
+        assert th.equal(ours(points), found[0][0])
+
+
+def test_a_fixed_value_has_a_gradient_by_the_action_alone() -> None:
+    ours = value(True)
+    points = th.rand(8, 5).requires_grad_()
+    q = ours.compiled_with_fixed_weights(points)
+    assert th.equal(q, ours(points))
+    q.sum().backward()
+    assert points.grad is not None
+    assert all(each.grad is None for each in ours.parameters())
+
+
+def test_a_pinned_value_is_exactly_zero_at_the_equilibrium_whatever_is_learnt() -> None:
+    ours = value(True)
+    shaken(ours.network, 1.0)
+    for size in (1, 3, 64):
+        middle = th.zeros(size, 5)
+        middle[:, 4] = -float(ours.middle / ours.to_input)
+        assert th.all(ours(middle).abs() < 1e-9)
+
+
+def test_a_value_that_is_loaded_is_that_of_its_file() -> None:
+    ours, other = value(True), value(True, gamma=0.99)
+    points = th.rand(20, 5)
+    ours(points)
+    state = {**other.state_dict(), "W": 2 * other.W}
+    ours.load_state_dict(state)
+    other.load_state_dict(state)
+    assert th.equal(ours(points), other(points))
+    assert_close(ours(points), by_torch(ours)(points))
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (3, 6), (4,), (2, 3, 4)])
+def test_shapes_that_do_not_fit_are_refused_before_compiled_code_reads_them(shape) -> None:
+    for module in (YannLayer(law_of("reactor")), value(True)):
+        with pytest.raises(ValueError, match=r"shape \(\d.*expected \(batch, [45]\)"):
+            module(th.zeros(shape))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_torch_traces_still_depends_on_the_state() -> None:
+    for module, n in ((YannLayer(law_of("reactor")), 4), (value(True), 5)):
+        shaken(module.network, 0.1)
+        one, other = th.rand(2, 6, n)
+        with th.no_grad():
+            traced = th.jit.trace(module, one)
+            assert_close(traced(other), module(other))
+
+
+def test_a_value_notices_a_change_of_its_model() -> None:
+    ours, points = value(True), th.rand(20, 5)
+    ours(points)
+    ours.model.A.mul_(1.1)
+    ours.gamma = 0.5
+    assert_close(ours(points), by_torch(ours)(points))
+
+
+def test_a_value_notices_a_buffer_in_the_place_of_another() -> None:
+    ours, points = value(True), th.rand(20, 5)
+    before = ours(points)
+    for _ in range(20):
+        new = (2 * ours.W).numpy().copy()
+        ours.W = None  # its memory is free, and often given to the next one
+        ours.W = th.from_numpy(new)
+        now = ours(points)
+        assert th.all(now < before)
+        before = now
+    assert_close(before, by_torch(ours)(points))
+
+
+def test_parameters_of_a_type_that_numpy_lacks_are_taken() -> None:
+    theta = box_points(law_of("reactor"), 50).bfloat16()
+    points = th.cat([theta, theta[:, :1]], 1)
+    for module, x in ((YannLayer(law_of("reactor")), theta), (value(True), points)):
+        shaken(module, 0.1)
+        assert_close(module(x), by_torch(module)(x))
+
+
+def test_layers_of_another_type_are_left_to_torch() -> None:
+    layer = YannLayer(law_of("reactor"))
+    layer.network.rest.double()
+    assert not layer.network.compiles
+
+
+class Double(th.nn.Module):
+    def forward(self, weight: th.Tensor) -> th.Tensor:
+        return 2 * weight
+
+
+@pytest.mark.parametrize("name", ["layer", "value"])
+def test_weights_that_are_made_of_others_are_used_and_trained(name: str) -> None:
+    module, n = {"layer": (YannLayer(law_of("reactor")), 4), "value": (value(True), 5)}[name]
+    shaken(module, 0.1)
+    th.nn.utils.parametrize.register_parametrization(module.network.rest[-1], "weight", Double())
+    theta = box_points(law_of("reactor"), 50)
+    points = th.cat([theta, th.linspace(-1, 1, 50)[:, None]], 1)[:, :n]
+    ours, theirs = module(points), (plain := by_torch(module))(points)
+    assert_close(ours, theirs)
+    for one, other in zip(gradients(ours, module), gradients(theirs, plain), strict=True):
+        assert_close(one, other, 1e-4)
+
+
+@pytest.mark.parametrize("name", ["layer", "value"])
+def test_weights_that_are_lent_for_a_call_are_used(name: str) -> None:
+    module, n = {"layer": (YannLayer(law_of("reactor")), 4), "value": (value(True), 5)}[name]
+    other = copy.deepcopy(module)
+    shaken(other, 0.1)
+    points = 0.1 * th.rand(20, n)  # where the law is not saturated
+    lent = dict(other.named_parameters())
+    assert th.equal(th.func.functional_call(module, lent, points), other(points))
+    assert not th.equal(module(points), other(points))
+
+
+def test_matrices_may_come_in_any_order_of_memory() -> None:
+    mpc = problems.cstr()
+    given = mpc.stage_matrix, mpc.value_matrix(0.99)
+    rest = LinearPrediction(*mpc.prediction), 0.99, mpc.theta_max, mpc.u_min, mpc.u_max
+    found = [
+        AfterstateValue(*map(order, given), *rest)(th.ones(2, 5))
+        for order in (np.ascontiguousarray, np.asfortranarray)
+    ]
+    assert th.equal(*found)
+
+
+@pytest.mark.parametrize("rate", [(np.ones(1), np.ones(1)), (np.ones(3), np.ones(3))])
+def test_a_rate_that_does_not_fit_is_refused(rate) -> None:
+    with pytest.raises(ValueError, match=r"rate has shape \(2, \d\), expected \(2, 2\)"):
+        YannLayer(law_of("two inputs"), rate=rate)
+
+
+def test_autocast_runs_the_operations_of_torch() -> None:
+    layer = YannLayer(law_of("reactor"))
+    shaken(layer, 0.1)
+    theta = box_points(law_of("reactor"), 20)
+    exact = layer(theta)
+    with th.autocast("cpu"):
+        assert not layer.network.compiles
+        assert th.allclose(layer(theta), exact, atol=0.05)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_regions_are_those_whose_networks_are_used(name: str) -> None:
+    layer = YannLayer(law_of(name, "nearest"))
+    shaken(layer, 0.1)
+    theta = box_points(law_of(name, "nearest"), 60, stretch=1.5)
+    layer.row_gradients = True
+    for row, region in zip(theta, layer.regions(theta), strict=True):
+        for gradient in gradients(layer(row[None]), layer):
+            assert gradient.coalesce().indices()[0].tolist() == [region]
+    theta[1, 0] = th.nan
+    assert layer.regions(theta)[1] == 0 and len(layer.regions(theta)) == 60

@@ -1,0 +1,146 @@
+"""The paper's own network, layer by layer: its parameter counts, its values and its defects."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch as th
+
+from sample_laws import PROBLEMS, box_points, facet_points, law_of, smallest_slack
+from sb3_yann.control import PiecewiseAffine
+from sb3_yann.networks import YannLayer
+from sb3_yann.networks.paper_yann import LiteralYann
+
+EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> Iterator[None]:
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        yield
+
+
+@pytest.fixture
+def float64() -> Iterator[None]:
+    before = th.get_default_dtype()
+    th.set_default_dtype(th.float64)
+    yield
+    th.set_default_dtype(before)
+
+
+def well_inside(law: PiecewiseAffine, count: int, margin: float) -> th.Tensor:
+    """Points at least ``margin`` away from every facet of their region."""
+    theta = box_points(law, count)
+    return theta[th.as_tensor(smallest_slack(law, theta).max(axis=1) > margin)]
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "total", "trainable"),
+    # Braniff & Tian, Sections 5.1 and 5.2: the parameter counts of the two YANN-actors.
+    [("pendulum", 16, 15_188, 12_880), ("reactor", 8, 5_320, 3_416)],
+)
+def test_parameter_counts_are_those_of_the_paper(
+    name: str, width: int, total: int, trainable: int
+) -> None:
+    parameters = list(LiteralYann(law_of(name), width).parameters())
+    assert sum(p.numel() for p in parameters) == total
+    assert sum(p.numel() for p in parameters if p.requires_grad) == trainable
+
+
+@EVERY_LAW
+@pytest.mark.parametrize("width", [1, 7, 16])
+@pytest.mark.usefixtures("float64")
+def test_network_is_the_law_away_from_facets(name: str, width: int) -> None:
+    law = law_of(name)
+    theta = well_inside(law, 5000, margin=1e-6).double()
+    assert len(theta) > 1000
+    u = LiteralYann(law, width)(theta).detach().numpy()
+    np.testing.assert_allclose(u, law(theta.numpy()), rtol=0, atol=1e-9)
+
+
+@EVERY_LAW
+@pytest.mark.usefixtures("float64")
+def test_network_is_the_fast_form_away_from_facets(name: str) -> None:
+    law = law_of(name)
+    theta = well_inside(law, 5000, margin=1e-6).double()
+    action = YannLayer(law).double()(theta).detach().numpy()
+    u = (law.u_max + law.u_min) / 2 + action * (law.u_max - law.u_min) / 2
+    np.testing.assert_allclose(LiteralYann(law, 8)(theta).detach().numpy(), u, rtol=0, atol=1e-9)
+
+
+@EVERY_LAW
+def test_float32_loses_what_the_suppression_constant_swallows(name: str) -> None:
+    law = law_of(name)
+    theta = well_inside(law, 5000, margin=1e-4)
+    network = LiteralYann(law, 8)
+    error = np.abs(network(theta).detach().numpy() - law(theta.numpy()))
+    suppression = float(network.fixed["suppress_bias"].abs().max())
+    assert error.max() < 8 * np.finfo(np.float32).eps * suppression
+    assert error.max() > np.finfo(np.float32).eps  # the fast form is exact to rounding
+
+
+@pytest.mark.usefixtures("float64")
+def test_network_doubles_or_drops_the_law_on_facets() -> None:
+    # The known defect of step indicators: on a shared facet two regions are active, or none.
+    law = law_of("pendulum")
+    theta = facet_points(law, 20_000).double()
+    # To the facet itself: from the float32 point along its normal, in float64.
+    slack = law.b - theta.numpy() @ law.A.T
+    nearest = np.argmin(np.abs(slack), axis=1)
+    normal = law.A[nearest] / np.sum(law.A[nearest] ** 2, axis=1, keepdims=True)
+    on_facet = theta.numpy() + slack[np.arange(len(theta)), nearest, None] * normal
+    u = law(on_facet)[:, 0]
+    got = LiteralYann(law, 8)(th.as_tensor(on_facet)).detach().numpy()[:, 0]
+    clear = np.abs(u) > 0.1
+    ratio = got[clear] / u[clear]
+    doubled, dropped = np.abs(ratio - 2) < 1e-6, np.abs(ratio) < 1e-6
+    assert np.all(doubled | dropped | (np.abs(ratio - 1) < 1e-6))
+    assert np.mean(doubled | dropped) > 0.1
+
+
+@EVERY_LAW
+def test_output_is_zero_where_no_region_holds_theta(name: str) -> None:
+    law = law_of(name)
+    theta = th.cat([box_points(law, 5000), box_points(law, 5000, stretch=1.02)])
+    theta = theta[th.as_tensor(smallest_slack(law, theta).max(axis=1) < -1e-4)]
+    assert len(theta) > 20
+    assert not th.any(LiteralYann(law, 8)(theta))
+
+
+@EVERY_LAW
+def test_inactive_regions_stay_suppressed_whatever_is_learnt(name: str) -> None:
+    law = law_of(name)
+    network = LiteralYann(law, 16)
+    for weight in (network.first_weight, network.first_bias, network.second_weight):
+        th.nn.init.normal_(weight, std=100.0)  # every node at its bound of 1
+    theta = box_points(law, 5000, stretch=1.02)
+    theta = theta[th.as_tensor(smallest_slack(law, theta).max(axis=1) < -1e-4)]
+    assert len(theta) > 20
+    assert not th.any(network(theta))
+
+
+@pytest.mark.parametrize("width", [6, 7])
+@pytest.mark.usefixtures("float64")
+def test_every_trainable_entry_has_moved_after_the_second_update_and_no_other(width: int) -> None:
+    law = law_of("pendulum")
+    network = LiteralYann(law, width)
+    before = copy.deepcopy(network)
+    theta = box_points(law, 5000).double()
+    optimizer = th.optim.Adam([p for p in network.parameters() if p.requires_grad], 1e-3)
+    for _ in range(2):
+        optimizer.zero_grad()
+        (network(theta) - 0.3).square().mean().backward()
+        optimizer.step()
+    for (name, new), old in zip(network.named_parameters(), before.parameters(), strict=True):
+        assert bool(th.all(new != old)) if new.requires_grad else th.equal(new, old), name
+
+
+def test_fixed_parameters_get_no_gradient() -> None:
+    law = law_of("pendulum")
+    network = LiteralYann(law, 8)
+    network(box_points(law, 100)).sum().backward()
+    assert all(parameter.grad is None for parameter in network.fixed.values())

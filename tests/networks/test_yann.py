@@ -1,0 +1,501 @@
+"""The YANN layer: the explicit law, exactly, and a network for each region."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch as th
+
+from sample_laws import (
+    PROBLEMS,
+    box_points,
+    facet_points,
+    law_of,
+    smallest_slack,
+    solved,
+    to_action,
+)
+from sb3_yann import LinearMPC
+from sb3_yann.control import PiecewiseAffine
+from sb3_yann.networks import YannLayer
+from sb3_yann.networks.yann import clamp_alive
+
+EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
+OUTSIDE = pytest.mark.parametrize("outside", ["nearest", "zero"])
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> Iterator[None]:
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        yield
+
+
+def scrambled(layer: YannLayer, size: float = 1.0) -> YannLayer:
+    """The layer with random weights, as after much training."""
+    for parameter in layer.parameters():
+        th.nn.init.normal_(parameter, std=size)
+    return layer
+
+
+def region_of(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
+    return layer.locate(theta)[0]
+
+
+def train(layer: YannLayer, theta: th.Tensor, target: float, steps: int = 20) -> None:
+    optimizer = th.optim.Adam(layer.parameters(), 1e-2)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        (layer(theta) - target).square().mean().backward()
+        optimizer.step()
+
+
+# --- the law -----------------------------------------------------------------------------------
+
+
+@OUTSIDE
+@EVERY_LAW
+def test_layer_is_the_law_inside_and_outside_the_feasible_set(name: str, outside: str) -> None:
+    law = law_of(name, outside)
+    theta = th.cat([box_points(law, 20_000), box_points(law, 20_000, stretch=3)])
+    assert 0.1 < np.mean(law.in_domain(theta.numpy())) < 0.9
+    with th.no_grad():
+        action = YannLayer(law)(theta)
+    error = (action - to_action(law, law(theta.numpy()))).abs() / 2  # of the input range
+    assert error.max() < 1e-7  # the rounding of the output to float32
+
+
+@EVERY_LAW
+def test_law_alone_stays_what_it_was_whatever_is_learnt(name: str) -> None:
+    layer = YannLayer(law_of(name))
+    theta = box_points(law_of(name), 1000)
+    before = layer(theta)
+    scrambled(layer)
+    assert th.equal(layer.law(theta), before)
+    assert not th.equal(layer(theta), before)
+
+
+def test_stiff_law_keeps_its_digits() -> None:
+    # Terms of 1e4 that cancel to an input of the order of 1: float32 would leave errors of 1e-3.
+    base = law_of("pendulum")
+    law = PiecewiseAffine(
+        gains=np.array([[[1e4, 1.0]]]),
+        offsets=np.array([[-1e4]]),
+        A=np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]),
+        b=np.full(4, 2.0),
+        starts=np.array([0]),
+        u_min=base.u_min,
+        u_max=base.u_max,
+        theta_min=np.full(2, -2.0),
+        theta_max=np.full(2, 2.0),
+    )
+    theta = th.tensor([1.0, 0.0]) + th.tensor([1e-4, 1.0]) * (2 * th.rand(1000, 2) - 1)
+    action = YannLayer(law)(theta).detach()
+    assert (action - to_action(law, law(theta.numpy()))).abs().max() < 2e-7
+
+
+@EVERY_LAW
+def test_layer_in_float64_is_the_law_to_rounding(name: str) -> None:
+    law = law_of(name)
+    theta = box_points(law, 5000).double()
+    theta = theta[th.as_tensor(law.in_domain(theta.numpy()))]
+    action = YannLayer(law).double()(theta).detach()
+    assert (action - to_action(law, law(theta.numpy()))).abs().max() < 1e-12
+
+
+@EVERY_LAW
+def test_region_on_a_facet_is_that_of_the_law(name: str) -> None:
+    law = law_of(name)
+    theta = facet_points(law)
+    assert len(theta) > 500
+    ours = region_of(YannLayer(law), theta)
+    theirs = th.as_tensor(law.locate(theta.numpy()))
+    assert th.equal(ours, theirs)
+    slack = smallest_slack(law, theta)
+    chosen = slack[np.arange(len(theta)), ours.numpy()]
+    assert np.max(slack.max(axis=1) - chosen) < 1e-12
+
+
+@EVERY_LAW
+def test_output_on_a_facet_is_that_of_the_law(name: str) -> None:
+    law = law_of(name)
+    theta = facet_points(law)
+    action = YannLayer(law)(theta).detach()
+    assert (action - to_action(law, law(theta.numpy()))).abs().max() < 2e-7
+
+
+def test_points_of_a_facet_that_float32_holds_exactly_go_to_the_first_region() -> None:
+    # Three strips of equal law side by side, with facets at -0.5 and 0.5.
+    base = law_of("pendulum")
+    edges = [-2.0, -0.5, 0.5, 2.0]
+    law = PiecewiseAffine(
+        gains=np.zeros((3, 1, 2)),
+        offsets=np.zeros((3, 1)),
+        A=np.tile([[1.0, 0.0], [-1.0, 0.0]], (3, 1)),
+        b=np.array([s * e for i in range(3) for s, e in ((1, edges[i + 1]), (-1, edges[i]))]),
+        starts=np.array([0, 2, 4]),
+        u_min=base.u_min,
+        u_max=base.u_max,
+        theta_min=np.full(2, -2.0),
+        theta_max=np.full(2, 2.0),
+    )
+    theta = th.tensor([[-0.5, 1.0], [0.5, 1.0], [0.5, -1.0], [0.0, 0.0]])
+    assert region_of(YannLayer(law), theta).tolist() == [0, 1, 1, 1]
+    assert law.locate(theta.numpy()).tolist() == [0, 1, 1, 1]
+
+
+@EVERY_LAW
+def test_layer_knows_where_no_region_holds_theta(name: str) -> None:
+    law = law_of(name)
+    theta = box_points(law, 5000, stretch=1.5)
+    inside = YannLayer(law).locate(theta)[1]
+    assert 0 < inside.sum() < len(inside)
+    assert th.equal(inside, th.as_tensor(law.in_domain(theta.numpy())))
+
+
+def test_a_single_point_gives_what_it_gives_in_a_batch() -> None:
+    law = law_of("two inputs")
+    layer = scrambled(YannLayer(law), 0.1)
+    theta = box_points(law, 50)
+    alone = th.cat([layer(row[None]) for row in theta])
+    th.testing.assert_close(alone, layer(theta), rtol=0, atol=1e-6)
+
+
+def test_empty_batch_gives_an_empty_batch() -> None:
+    assert YannLayer(law_of("two inputs"))(th.zeros(0, 2)).shape == (0, 2)
+
+
+# --- the bounds --------------------------------------------------------------------------------
+
+
+@OUTSIDE
+@EVERY_LAW
+@pytest.mark.parametrize("weights", [1.0, 1e6, 1e30])
+def test_output_never_leaves_the_bounds(name: str, outside: str, weights: float) -> None:
+    law = law_of(name, outside)
+    layer = scrambled(YannLayer(law), weights)
+    for stretch in (1.0, 1e3, 1e6):
+        action = layer(box_points(law, 2000, stretch=stretch))
+        assert bool(th.all(action.abs() <= 1))
+
+
+@OUTSIDE
+@EVERY_LAW
+def test_output_far_out_is_within_the_bounds_at_first(name: str, outside: str) -> None:
+    law = law_of(name, outside)
+    theta = 1e6 * (2 * th.rand(5000, law.n_theta) - 1)
+    assert bool(th.all(YannLayer(law)(theta).abs() <= 1))
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.1, 1.0, 2.0])
+def test_clamp_alive_is_the_clamp(limit: float) -> None:
+    x = th.cat([3 * th.randn(1000), th.tensor([-1.0, 1.0, th.inf, -th.inf, 0.0])])
+    assert th.equal(clamp_alive(x, limit), x.clamp(-limit, limit))
+
+
+def test_clamp_alive_has_a_limit_of_one_by_default() -> None:
+    x = 3 * th.randn(1000)
+    assert th.equal(clamp_alive(x), x.clamp(-1, 1))
+
+
+@pytest.mark.parametrize(
+    ("x", "passes_up", "passes_down"),
+    [
+        (0.0, True, True),
+        (0.999, True, True),
+        (-0.999, True, True),
+        (1.0, False, True),
+        (2.5, False, True),
+        (-1.0, True, False),
+        (-2.5, True, False),
+    ],
+)
+@pytest.mark.parametrize("limit", [0.25, 1.0, 2.0])
+def test_clamp_alive_stops_only_what_would_push_further_out(
+    limit: float, x: float, passes_up: bool, passes_down: bool
+) -> None:
+    # Descent moves x up where its gradient is negative.
+    for gradient, passes in ((-0.7, passes_up), (0.7, passes_down)):
+        leaf = th.tensor([limit * x], requires_grad=True)
+        clamp_alive(leaf, limit).backward(th.tensor([gradient]))
+        assert leaf.grad is not None
+        assert leaf.grad.item() == pytest.approx(gradient if passes else 0.0)
+
+
+def test_clamp_alive_treats_each_component_by_itself() -> None:
+    x = th.tensor([[2.0, 2.0], [-2.0, 0.5]], requires_grad=True)
+    clamp_alive(x).backward(th.tensor([[-1.0, 3.0], [-2.0, -4.0]]))
+    assert x.grad is not None
+    assert x.grad.tolist() == [[0.0, 3.0], [-2.0, -4.0]]
+
+
+@pytest.mark.parametrize("start", [-3.0, -1.0, 1.0, 3.0])
+def test_descent_returns_from_saturation(start: float) -> None:
+    x = th.tensor([start], requires_grad=True)
+    optimizer = th.optim.SGD([x], 0.1)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (clamp_alive(x) - 0.25).square().sum().backward()
+        optimizer.step()
+    assert x.item() == pytest.approx(0.25, abs=1e-4)
+
+
+def test_descent_towards_a_bound_does_not_run_away_beyond_it() -> None:
+    x = th.tensor([0.9], requires_grad=True)
+    optimizer = th.optim.SGD([x], 0.1)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (-clamp_alive(x)).sum().backward()
+        optimizer.step()
+    assert 1 <= x.item() < 1.11  # one step of 0.1 beyond
+
+
+def test_saturated_region_learns_to_leave_its_bound() -> None:
+    law = law_of("pendulum")
+    layer = YannLayer(law)
+    theta = box_points(law, 4000)
+    theta = theta[(layer(theta) == 1).all(1)]
+    train(layer, theta, target=0.0, steps=100)
+    assert layer(theta).abs().mean() < 0.2
+
+
+# --- the bound on the correction ---------------------------------------------------------------
+
+
+@OUTSIDE
+@EVERY_LAW
+@pytest.mark.parametrize("bound", [0.1, 0.5])
+def test_output_is_never_further_from_the_law_than_the_bound(
+    name: str, outside: str, bound: float
+) -> None:
+    law = law_of(name, outside)
+    layer = scrambled(YannLayer(law, max_correction=bound), 1e3)
+    theta = box_points(law, 5000, stretch=3)
+    with th.no_grad():
+        distance = (layer(theta).double() - to_action(law, law(theta.numpy()))).abs() / 2
+    assert 0.99 * bound < distance.max() <= bound
+
+
+@EVERY_LAW
+@pytest.mark.parametrize("bound", [0, 1e-8])
+def test_bound_of_zero_is_the_law_bit_for_bit(name: str, bound: float) -> None:
+    layer = scrambled(YannLayer(law_of(name), max_correction=bound), 1e3)
+    theta = box_points(law_of(name), 5000, stretch=3)
+    assert th.equal(layer(theta), layer.law(theta))
+
+
+@EVERY_LAW
+@pytest.mark.parametrize("weight", [np.nan, np.inf, -np.inf, 3e38])
+def test_bound_holds_for_weights_that_overflow_or_are_no_numbers(name: str, weight: float) -> None:
+    law = law_of(name)
+    layer = YannLayer(law, max_correction=0.1)
+    with th.no_grad():
+        for parameter in layer.parameters():
+            parameter.fill_(weight)
+    theta = box_points(law, 100)
+    with th.no_grad():
+        distance = (layer(theta).double() - to_action(law, law(theta.numpy()))).abs() / 2
+    assert distance.max() <= 0.1
+
+
+@EVERY_LAW
+def test_bound_that_is_not_reached_changes_nothing(name: str) -> None:
+    law = law_of(name)
+    free = scrambled(YannLayer(law), 1e-3)
+    bound = YannLayer(law, max_correction=0.5)
+    bound.load_state_dict(free.state_dict())
+    theta = box_points(law, 1000)
+    assert th.equal(bound(theta), free(theta))
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_correction_at_its_bound_gets_the_gradient_that_leads_back_and_no_other(side: int) -> None:
+    law = law_of("pendulum")
+    layer = YannLayer(law, max_correction=0.1, pinned=False)
+    with th.no_grad():  # the bias of the output alone: far beyond the bound
+        layer.network.rest[-1].weight[..., -1] = 3.0 * side
+    theta = box_points(law, 4000)
+    theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
+    bias = layer.network.rest[-1].weight
+    for slope, alive in ((side, True), (-side, False)):  # descent goes against the slope
+        layer.zero_grad()
+        (slope * layer(theta)).sum().backward()
+        assert bias.grad is not None
+        assert bool(bias.grad[..., -1].any()) is alive
+
+
+def test_correction_learns_to_leave_its_bound() -> None:
+    law = law_of("pendulum")
+    layer = YannLayer(law, max_correction=0.1, pinned=False)
+    with th.no_grad():
+        layer.network.rest[-1].weight[..., -1] = 3.0
+    theta = box_points(law, 2000)
+    theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
+
+    def distance() -> float:
+        return (layer(theta) - layer.law(theta)).abs().mean().item()
+
+    assert distance() > 0.199
+    optimizer = th.optim.Adam(layer.parameters(), 1e-1)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (layer(theta) - layer.law(theta)).square().mean().backward()
+        optimizer.step()
+    assert distance() < 0.05
+
+
+# --- training ----------------------------------------------------------------------------------
+
+
+@EVERY_LAW
+def test_only_the_active_regions_get_a_gradient(name: str) -> None:
+    law = law_of(name)
+    layer = scrambled(YannLayer(law), 0.1)
+    theta = box_points(law, 4000)
+    active = int(region_of(layer, theta).mode().values)
+    theta = theta[region_of(layer, theta) == active]
+    (layer(theta) * th.randn(len(theta), law.n_inputs)).sum().backward()
+    others = th.arange(law.n_regions) != active
+    for parameter in layer.parameters():
+        assert parameter.grad is not None
+        assert bool(th.any(parameter.grad[active] != 0))
+        assert not th.any(parameter.grad[others])
+
+
+@EVERY_LAW
+def test_training_one_region_leaves_the_others_bit_for_bit(name: str) -> None:
+    law = law_of(name)
+    layer = YannLayer(law)
+    theta = box_points(law, 4000, stretch=1.5)
+    region = region_of(layer, theta)
+    trained = region == region.mode().values
+    before = layer(theta).detach()
+    train(layer, theta[trained], target=0.3)
+    after = layer(theta).detach()
+    assert th.equal(after[~trained], before[~trained])
+    assert not th.equal(after[trained], before[trained])
+
+
+@EVERY_LAW
+def test_every_region_learns(name: str) -> None:
+    law = law_of(name)
+    layer = YannLayer(law)
+    theta = box_points(law, 20_000, stretch=1.5)
+    before = copy.deepcopy(layer)
+    train(layer, theta, target=0.3, steps=3)
+    visited = region_of(layer, theta).unique()
+    assert len(visited) > law.n_regions / 2
+    for new, old in zip(layer.parameters(), before.parameters(), strict=True):
+        assert bool((new != old).flatten(1).any(1)[visited].all())
+
+
+@OUTSIDE
+@EVERY_LAW
+def test_equilibrium_is_where_it_was_after_training(name: str, outside: str) -> None:
+    law = law_of(name, outside)
+    layer = YannLayer(law)
+    origin = th.zeros(1, law.n_theta)
+    at_rest = to_action(law, np.zeros((1, law.n_inputs))).float()
+    th.testing.assert_close(layer(origin), at_rest, rtol=0, atol=1e-7)
+    before = layer(origin).detach()
+    theta = th.cat([box_points(law, 500), 0.01 * box_points(law, 500), origin])
+    train(layer, theta, target=0.3, steps=50)
+    assert th.equal(layer(origin), before)
+    assert (layer(theta) - layer.law(theta)).abs().max() > 0.01  # it has learnt something
+
+
+def test_region_away_from_the_origin_is_not_pinned() -> None:
+    law = law_of("pendulum")
+    pinned = YannLayer(law).network.pinned.flatten().bool()
+    assert int(pinned.sum()) == 1
+    assert bool(pinned[law.locate(np.zeros(2))])
+
+
+@OUTSIDE
+@EVERY_LAW
+def test_equilibrium_moves_where_no_region_is_pinned(name: str, outside: str) -> None:
+    law = law_of(name, outside)
+    layer = YannLayer(law, pinned=False)
+    assert not layer.network.pinned.any()
+    origin = th.zeros(1, law.n_theta)
+    assert th.equal(layer(origin), layer.law(origin))
+    train(layer, origin, target=0.3, steps=100)
+    assert (layer(origin) - 0.3).abs().max() < 0.05
+
+
+# --- what torch and Stable-Baselines3 see --------------------------------------------------------
+
+
+@pytest.mark.parametrize(("hidden", "tensors"), [((16,), 2), ((16, 16), 3)])
+def test_there_are_few_parameter_tensors_however_many_regions(
+    hidden: tuple[int, ...], tensors: int
+) -> None:
+    # Adam and the target update cost by the tensor.
+    assert law_of("two inputs").n_regions > 3 * law_of("pendulum").n_regions
+    for name in ("pendulum", "two inputs"):
+        assert len(list(YannLayer(law_of(name), hidden).parameters())) == tensors
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "count"),
+    # p [2 h (n + 1) + h (h + 1) + m (h + 1)]: two nodes summed into each of h units of the first
+    # layer, then h units, then m outputs.
+    [("pendulum", 16, 7 * (96 + 272 + 17)), ("reactor", 8, 7 * (80 + 72 + 9))],
+)
+def test_number_of_parameters_is_linear_in_the_regions(name: str, width: int, count: int) -> None:
+    layer = YannLayer(law_of(name), (width, width))
+    assert sum(p.numel() for p in layer.parameters()) == count
+
+
+def test_law_is_kept_in_buffers_that_no_optimizer_sees() -> None:
+    layer = YannLayer(law_of("pendulum"))
+    buffers = {"gains", "offsets", "half_space_A", "half_space_b", "theta_half", "resting"}
+    assert buffers <= dict(layer.named_buffers()).keys()
+    assert all(name.startswith("network.") for name, _ in layer.named_parameters())
+
+
+def test_no_state_dict_key_contains_running() -> None:
+    # Stable-Baselines3 copies those hard at every target update.
+    keys = YannLayer(law_of("pendulum")).state_dict()
+    assert len(keys) > 6
+    assert not [key for key in keys if "running_" in key]
+
+
+@EVERY_LAW
+def test_state_dict_brings_everything_back(name: str) -> None:
+    law = law_of(name)
+    layer = scrambled(YannLayer(law))
+    other = YannLayer(law)
+    theta = box_points(law, 1000, stretch=1.5)
+    assert not th.equal(other(theta), layer(theta))
+    other.load_state_dict(layer.state_dict())
+    assert th.equal(other(theta), layer(theta))
+
+
+def test_layer_does_not_share_memory_with_the_law() -> None:
+    law = law_of("pendulum")
+    layer = YannLayer(law)
+    with th.no_grad():
+        for buffer in layer.buffers():
+            buffer.fill_(7.0)
+    assert law == law_of("pendulum")
+    assert not np.any(law.gains == 7.0)
+
+
+def test_law_without_input_bounds_is_refused() -> None:
+    bounded = solved("two inputs")
+    free = LinearMPC(
+        bounded.model,
+        Q=bounded.Q,
+        R=bounded.R,
+        horizon=1,
+        theta_min=-1,
+        theta_max=1,
+        u_min=[-1, -np.inf],
+        u_max=1,
+    )
+    with pytest.raises(ValueError, match=r"u_min = \[-1\.0, -inf\].*Pass u_min and u_max"):
+        YannLayer(free.explicit())

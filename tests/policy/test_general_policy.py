@@ -1,0 +1,197 @@
+"""YannPolicy on problems with references, disturbances and rates: exact at the start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import LinearPlant, feasible_states
+from stable_baselines3 import DDPG, TD3
+
+from general_problems import LOADED, servo, solved
+from sb3_yann import NoActionNoise, YannPolicy
+from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.guard.plant_acceptance import predicted_cost
+from sb3_yann.wrappers import ObserveDisturbance, PreviousInput, SetPoint, StageCost
+
+NAMES = [
+    "servo",
+    "servo with a disturbance",
+    "servo with all of it",
+    "soft states",
+    "invariant with all of it",
+    "two tanks, all parts",
+]
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+@pytest.mark.parametrize("name", NAMES)
+def test_predict_equals_an_independent_online_qp(name: str, algorithm: type[DDPG]) -> None:
+    mpc = solved(name)
+    model = algorithm(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc})
+    thetas, expected = feasible_states(mpc, 1000)
+    actions, _ = model.predict(thetas.astype(np.float32))
+    assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
+
+
+RATED = ["servo with rates", "servo with all of it", "two tanks, all parts"]
+
+
+def scrambled(model: DDPG, size: float) -> DDPG:
+    """Give the networks of the actor random weights."""
+    with th.no_grad():
+        for parameter in model.actor.parameters():
+            parameter.copy_(size * th.randn(parameter.shape))
+    return model
+
+
+@pytest.mark.parametrize("max_correction", [None, 0.3])
+@pytest.mark.parametrize("size", [0.5, 50.0])
+@pytest.mark.parametrize("name", RATED)
+def test_rates_are_kept_whatever_the_weights(
+    name: str, size: float, max_correction: float | None
+) -> None:
+    mpc = solved(name)
+    options = {"problem": mpc, "max_correction": max_correction}
+    model = scrambled(DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs=options), size)
+    rng = np.random.default_rng(0)
+    box = mpc.theta_min, mpc.theta_max  # inside the domain and outside
+    theta = rng.uniform(*box, (5000, mpc.n_theta)).astype(np.float32)
+    moved = model.predict(theta)[0] - theta[:, mpc.parameters.previous]
+    assert np.all((mpc.du_min <= moved) & (moved <= mpc.du_max))
+    assert np.max(moved / mpc.du_max) > 0.999  # and they are what holds it
+
+
+def test_an_output_at_the_limit_of_its_rate_learns_to_leave_it() -> None:
+    mpc = solved("servo with rates")
+    model = DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs={"problem": mpc})
+    layer = model.actor.mu
+    theta = th.zeros(1, mpc.n_theta)
+    theta[0, mpc.parameters.reference] = 1.0  # asks for more than the rate allows
+    assert layer(theta).item() == pytest.approx((0.7 - 0.5) / 1.5, abs=1e-5)
+    optimizer = th.optim.Adam(layer.parameters(), 1e-2)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (layer(theta) + 0.4).square().sum().backward()
+        optimizer.step()
+    assert layer(theta).item() < 0
+
+
+def unconstrained_steps(mpc: LinearMPC, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return theta, u and the next theta where both lie in the region at the origin."""
+    law, rng = mpc.explicit(), np.random.default_rng(0)
+    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (50_000, mpc.n_theta)) / 2
+    theta = theta.astype(np.float32).astype(np.float64)
+    u = law(theta)
+    following = mpc.predict(theta, u)
+    region = law.locate(np.zeros(mpc.n_theta))
+    inside = (law.locate(theta) == region) & (law.locate(following) == region)
+    assert inside.sum() >= count
+    return theta[inside][:count], u[inside][:count], following[inside][:count]
+
+
+@pytest.mark.parametrize("critic", ["afterstate", "state_action"])
+@pytest.mark.parametrize("gamma", [0.9, 0.99])
+@pytest.mark.parametrize("name", NAMES)
+def test_sb3_s_own_critic_loss_is_zero_at_the_start(name: str, gamma: float, critic: str) -> None:
+    mpc = solved(name)
+    kwargs = {"problem": mpc, "critic": critic}
+    model = DDPG(YannPolicy, LinearPlant(mpc), gamma=gamma, policy_kwargs=kwargs, buffer_size=500)
+    model.learn(1)
+    model.replay_buffer.reset()
+    for theta, u, following in zip(*unconstrained_steps(mpc, 500), strict=True):
+        action = model.policy.scale_action(u.astype(np.float32))
+        reward = -mpc.stage_cost(theta, u)
+        model.replay_buffer.add(theta, following, action, reward, np.zeros(1), [{}])
+    sample = model.replay_buffer.sample(500)
+    with th.no_grad():
+        q = model.critic.q1_forward(sample.observations, sample.actions)
+    model.train(gradient_steps=1, batch_size=500)
+    loss = model.logger.name_to_value["train/critic_loss"]
+    assert loss < 1e-11 * float((q**2).mean())
+    assert float((q**2).mean()) > 0
+
+
+@pytest.mark.parametrize("gamma", [0.9, 0.99, 1.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_bellman_s_equation_holds_in_float64(name: str, gamma: float) -> None:
+    mpc = solved(name)
+    theta, u, following = unconstrained_steps(mpc, 500)
+    P = mpc.value_matrix(gamma)
+    now, then = (np.einsum("bi,ij,bj->b", each, P, each) for each in (theta, following))
+    residual = now - mpc.stage_cost(theta, u) - gamma * then
+    assert np.max(np.abs(residual)) < 1e-10 * np.max(now)
+
+
+class LoadedPlant(gym.Env):
+    """The linear plant with a load that nobody measures; a plain regulator's observation."""
+
+    def __init__(self, load: float = 0.2) -> None:
+        self.load = np.array([load])
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.action_space = gym.spaces.Box(np.float32([-1]), np.float32([2]))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.zeros(2)
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        self.x = LOADED.step(self.x, np.asarray(action, np.float64), self.load)
+        return self.x.astype(np.float32), 0.0, False, False, {}
+
+
+def wrapped(mpc: LinearMPC, reference: float = 0.5) -> gym.Env:
+    env = SetPoint(LoadedPlant(), [-1], [1], schedule=lambda step: [reference])
+    env = ObserveDisturbance(env, DisturbanceObserver(LOADED), mpc.d_min, mpc.d_max)
+    return StageCost(PreviousInput(env), mpc)
+
+
+def test_a_wrapped_plant_starts_as_offset_free_mpc_in_sb3() -> None:
+    mpc = solved("servo with all of it")
+    env = wrapped(mpc)
+    model = DDPG(YannPolicy, env, policy_kwargs={"problem": mpc})
+    theta, _ = env.reset(seed=0)
+    for _ in range(150):
+        action, _ = model.predict(theta)
+        error = np.abs(action - mpc.explicit()(theta)) / (mpc.u_max - mpc.u_min)
+        assert np.max(error) < 1e-5
+        theta, reward, *_ = env.step(action)
+    np.testing.assert_allclose(theta, [*mpc.steady_state([0.5], [0.2])[0], 0.5, 0.2, action[0]],
+                               atol=1e-5)  # fmt: skip
+    assert abs(reward) < 1e-9
+
+
+def test_it_trains_and_loads(tmp_path: Path) -> None:
+    mpc = solved("servo with all of it")
+    kwargs = {"problem": mpc, "critic_warmup": 0}
+    model = DDPG(YannPolicy, gym.wrappers.TimeLimit(wrapped(mpc), 20), policy_kwargs=kwargs)
+    model.learn(60, callback=NoActionNoise())
+    model.save(tmp_path / "model")
+    loaded = DDPG.load(tmp_path / "model")
+    theta = np.float32([0.1, 0.2, 0.3, 0.1, 0.0])
+    np.testing.assert_array_equal(loaded.predict(theta)[0], model.predict(theta)[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "pinned"),
+    [("servo", False), ("regulator with a disturbance", False), ("regulator with rates", True)],
+)
+def test_the_equilibrium_is_pinned_only_where_there_is_one(name: str, pinned: bool) -> None:
+    mpc = solved(name)
+    policy = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc}).policy
+    assert policy.actor_options["pin_equilibrium"] is pinned
+    kwargs = {"problem": mpc, "pin_equilibrium": True}
+    policy = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs=kwargs).policy
+    assert policy.actor_options["pin_equilibrium"] is True
+
+
+def test_the_guard_predicts_the_cost_of_a_start_with_its_reference() -> None:
+    mpc = solved("servo")
+    start = np.array([0.0, 0.0, 0.5])
+    value = float(start @ mpc.value_matrix(1.0) @ start)
+    assert predicted_cost(mpc, start, 300) == pytest.approx(value, rel=1e-6)
+    assert predicted_cost(servo(u_max=0.15), start, 300) > value

@@ -1,0 +1,265 @@
+"""Several envs at once, in this process or in others: callbacks, time limits, ends of episodes."""
+
+from __future__ import annotations
+
+import copy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import LinearPlant, two_input_mpc
+from gymnasium.wrappers import NormalizeReward, TimeLimit
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecFrameStack,
+    VecNormalize,
+)
+
+from sb3_yann import (
+    ActionRepeat,
+    AffineObservation,
+    ControlDiagnostics,
+    CostAudit,
+    CostMismatchWarning,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    YannPolicy,
+)
+from sb3_yann.guard.actor_checkpoint import Snapshot
+
+MPC = two_input_mpc()
+STEPS = 6
+
+
+def plant(start: float = 1.0) -> gym.Env:
+    return TimeLimit(LinearPlant(MPC, start), STEPS)
+
+
+def wrong_plant() -> gym.Env:
+    return NormalizeReward(plant())
+
+
+def build(env, algorithm=DDPG, policy=None, **kwargs):
+    options = {"problem": MPC, "critic_warmup": 0, **(policy or {})}
+    kwargs = {"seed": 0, "buffer_size": 1000, "learning_rate": 1e-2, **kwargs}
+    return algorithm(YannPolicy, env, policy_kwargs=options, **kwargs)
+
+
+def transitions(model, name: str) -> np.ndarray:
+    """Return what the replay buffer has stored so far, (steps, envs, ...)."""
+    return getattr(model.replay_buffer, name)[: model.replay_buffer.pos]
+
+
+def assert_every_action_is_the_law_s(model) -> None:
+    theta = transitions(model, "observations").reshape(-1, 3)
+    u = model.policy.unscale_action(transitions(model, "actions").reshape(-1, 2))
+    far = np.abs(u - MPC.explicit()(theta)) / (MPC.u_max - MPC.u_min)
+    assert far.max() < 1e-5
+
+
+# One start method after the other: each starts two processes that import PyTorch.
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 on, if threads run
+@pytest.mark.parametrize("start_method", ["fork", "forkserver", "spawn"])
+def test_all_callbacks_work_with_envs_in_other_processes(start_method) -> None:
+    env = SubprocVecEnv([plant, plant], start_method=start_method)
+    try:
+        noise = NormalActionNoise(np.zeros(2), np.ones(2))
+        model = build(env, gradient_steps=0, action_noise=noise)
+        guard = ImprovementGuard(plant, n_starts=3)
+        audit, diagnostics = CostAudit(steps=40, strict=True), ControlDiagnostics()
+        model.learn(60, callback=[NoActionNoise(), guard, diagnostics, audit])
+        assert_every_action_is_the_law_s(model)
+        assert model.replay_buffer.pos == 30
+        assert audit.finding.matches
+        assert guard.state.episodes == 2 * 30 // STEPS
+        assert diagnostics._distances
+        assert max(diagnostics._distances) < 1e-6
+        starts = transitions(model, "observations")[::STEPS]
+        assert len(np.unique(starts, axis=0)) == 5
+        assert np.all(starts[:, 0] != starts[:, 1])  # each env has a seed of its own
+    finally:
+        env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_wrapper_in_another_process_is_found() -> None:
+    env = SubprocVecEnv([wrong_plant] * 2, start_method="fork")
+    try:
+        with pytest.warns(CostMismatchWarning, match="NormalizeReward"):
+            build(env, gradient_steps=0).learn(60, callback=[NoActionNoise(), CostAudit(40)])
+    finally:
+        env.close()
+
+
+def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> None:
+    env = make_vec_env("sb3_yann:CSTR-v0", n_envs=2, vec_env_cls=SubprocVecEnv)
+    try:
+        model = DDPG(YannPolicy, env, seed=0)
+        observations = env.reset()
+        law = model.policy.problem.explicit()
+        far = np.abs(model.predict(observations)[0] - law(observations))
+        assert far.max() < 1e-5 * float(law.u_max[0] - law.u_min[0])
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm) -> None:
+    model = build(DummyVecEnv([plant] * 3), algorithm, gradient_steps=-1)
+    before, guard = copy.deepcopy(model.actor), ImprovementGuard(plant, n_starts=3, every=6)
+    tried: list[int] = []
+    learnt: list[dict[str, th.Tensor]] = []
+    attempt = guard.trials._try
+
+    def note(guard: ImprovementGuard) -> None:
+        tried.append(guard.state.episodes)
+        learnt.append(Snapshot.of(guard.policy).networks())
+        attempt(guard)
+
+    guard.trials._try = note
+    callbacks = [NoActionNoise(), guard, ControlDiagnostics(), CostAudit(60, strict=True)]
+    model.learn(3 * STEPS * 6, callback=callbacks)
+    assert model._n_updates == 3 * STEPS * 6
+    assert guard.state.episodes == 18
+    assert tried == [3, 9, 15, 18]  # three end at each sixth step; and once more at the end
+    assert [each.episode for each in guard.decisions] == tried
+    pairs = zip(before.parameters(), learnt[0].values(), strict=True)
+    assert any(not th.equal(a, b) for a, b in pairs)
+
+
+def test_the_diagnostics_follow_each_env_for_itself() -> None:
+    model = build(DummyVecEnv([plant, lambda: TimeLimit(LinearPlant(MPC), 4)]), gradient_steps=0)
+    diagnostics, lengths = ControlDiagnostics(), []
+    record = diagnostics._record_critic_error
+    diagnostics._record_critic_error = lambda episode, info: (  # type: ignore[method-assign]
+        lengths.append(len(episode)),
+        record(episode, info),
+    )[-1]
+    model.learn(24, callback=[NoActionNoise(), diagnostics], log_interval=1000)
+    assert lengths == [4, 6, 4, 6, 4]  # at steps 4, 6, 8 and both at 12
+    # Small starts stay in the region where the critic is exact; the limit is bootstrapped there.
+    model = build(DummyVecEnv([lambda: plant(0.05)] * 2), gradient_steps=0)
+    model.learn(12, callback=[NoActionNoise(), ControlDiagnostics()], log_interval=1000)
+    assert model.logger.name_to_value["yann/critic_error"] < 1e-5
+
+
+# --- time limits ----------------------------------------------------------------------------------
+
+
+def stacked(n: int):
+    return VecFrameStack(DummyVecEnv([lambda: plant(0.05)] * n), 3)
+
+
+def normalised(n: int):
+    env = VecNormalize(
+        DummyVecEnv([lambda: plant(0.05)] * n), norm_reward=False, clip_obs=np.inf, training=False
+    )
+    env.obs_rms.mean, env.obs_rms.var = np.array([0.1, 0, -0.2]), np.array([4, 1, 0.04])
+    return env
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("kind", ["plain", "stacked", "normalised"])
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_a_time_limit_is_no_end_to_the_critic(algorithm, kind, n_envs) -> None:
+    if kind == "plain":
+        env, observation = DummyVecEnv([lambda: plant(0.05)] * n_envs), None
+    elif kind == "stacked":
+        env, observation = stacked(n_envs), AffineObservation.newest_frame(3, 3)
+    else:
+        env = normalised(n_envs)
+        observation = AffineObservation.from_vec_normalize(env)
+    quiet = {"target_policy_noise": 0.0} if algorithm is TD3 else {}
+    policy = {"observation": observation, "reward_scale": 1.0}
+    model = build(env, algorithm, policy, gradient_steps=0, **quiet)
+    model.learn(10 * n_envs * STEPS, callback=NoActionNoise())
+    ends = transitions(model, "timeouts")
+    assert ends.sum() == 10 * n_envs
+    assert np.array_equal(ends, transitions(model, "dones"))
+    # The buffer holds the last state of the episode, not the first of the next.
+    jumps = np.abs(transitions(model, "next_observations") - transitions(model, "observations"))
+    assert jumps.max() < 0.2
+    sample = model.replay_buffer.sample(500, env=model.get_vec_normalize_env())
+    assert float(sample.dones.sum()) == 0
+    with th.no_grad():
+        size = float((model.critic.q1_forward(sample.observations, sample.actions) ** 2).mean())
+    model.train(gradient_steps=1, batch_size=500)
+    assert model.logger.name_to_value["train/critic_loss"] < 1e-10 * size
+
+
+def test_an_end_by_the_env_is_one_to_the_critic() -> None:
+    class Ends(gym.Wrapper):
+        steps = 0
+
+        def reset(self, **kwargs):
+            self.steps = 0
+            return self.env.reset(**kwargs)
+
+        def step(self, action):
+            observation, reward, _, truncated, info = self.env.step(action)
+            self.steps += 1
+            return observation, reward, self.steps == STEPS, truncated, info
+
+    model = build(DummyVecEnv([lambda: Ends(plant())] * 2), gradient_steps=0)
+    model.learn(4 * STEPS, callback=NoActionNoise())
+    assert transitions(model, "timeouts").sum() == 0  # also where the limit comes at the same step
+    assert transitions(model, "dones").sum() == 4
+
+
+# --- action repeat --------------------------------------------------------------------------------
+
+
+class Continuous(gym.Env):
+    """A cart, x'' = u, sampled every 0.02 s."""
+
+    model = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], 0.02)
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(-0.5, 0.5, 2)
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        cost = float(self.x @ self.x + 0.1 * action @ action)
+        self.x = self.model.step(self.x, action)
+        return self.x.astype(np.float32), -cost, False, False, {}
+
+
+def test_a_model_of_k_times_the_sampling_time_is_right_for_k_repetitions() -> None:
+    k, dt = 5, Continuous.model.dt
+    model = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], k * dt)
+    mpc = LinearMPC(
+        model,
+        Q=k * np.eye(2),
+        R=[[k * 0.1]],
+        horizon=5,
+        x_min=-3,
+        x_max=3,
+        u_min=-1,
+        u_max=1,
+    )
+    learner = DDPG(
+        YannPolicy,
+        DummyVecEnv([lambda: TimeLimit(ActionRepeat(Continuous(), k), 30)] * 2),
+        policy_kwargs={"problem": mpc},
+        seed=0,
+        gradient_steps=0,
+        buffer_size=500,
+    )
+    audit = CostAudit(tolerance=0.3, strict=True)  # the cost changes a little in between
+    learner.learn(120, callback=[NoActionNoise(), audit])
+    assert audit.finding.scale == pytest.approx(1, abs=0.15)
+    x = transitions(learner, "observations").reshape(-1, 2).astype(np.float64)
+    following = transitions(learner, "next_observations").reshape(-1, 2)
+    u = transitions(learner, "actions").reshape(-1, 1)
+    np.testing.assert_allclose(model.step(x, u), following, atol=1e-6)
+    np.testing.assert_allclose(learner.predict(x.astype(np.float32))[0], u, atol=1e-6)
