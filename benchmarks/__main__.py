@@ -13,10 +13,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-# One thread for everything, and nothing solved before; both are read at the first import.
+# One thread for everything; read at the first import.
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_name] = "1"
-os.environ["SB3_YANN_CACHE"] = "off"
 
 BEGIN, END = "<!-- speed: begin -->\n", "<!-- speed: end -->"
 

@@ -12,7 +12,7 @@ from benchmarks import peers
 from benchmarks.problems import Array, Problem
 from benchmarks.records import Bench, timed
 from benchmarks.timing import Task
-from sb3_yann.networks.paper_yann import LiteralYann
+from sb3_yann.networks.paper_yann import PaperYann
 
 ONE, MANY = "law, one point", "law, batch of 256"
 OURS, LOCATE = "ours", "ours, location alone"
@@ -63,7 +63,7 @@ def literal_network(problem: Problem) -> Network | None:
     """Return the paper's network, float64 numpy in and out, None where it would be too large."""
     if peers.literal_bytes(problem.law, LITERAL_WIDTH) > LARGEST_LITERAL:
         return None
-    network = LiteralYann(problem.law, LITERAL_WIDTH)
+    network = PaperYann(problem.law, LITERAL_WIDTH)
 
     def evaluate(batch: Array) -> Array:
         with th.no_grad():

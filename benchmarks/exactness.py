@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.peers import centres
+from benchmarks.peers import centers
 from benchmarks.problems import Array, Problem
 from benchmarks.records import Bench, Figure
 from sb3_yann.control import PiecewiseAffine
@@ -27,12 +27,12 @@ def exactness(bench: Bench, problem: Problem) -> None:
     count = 10_000 if bench.quick else 1_000_000
     points = sample(law, count)
     held, covered = scan(points, law)
-    outside = np.flatnonzero(~covered)
+    beyond = np.flatnonzero(~covered)
     region = np.concatenate([law.locate(part) for part in np.array_split(points, count // 1000)])
     lost = (slack_in(points, region, law) < -law.tolerance) & covered
     found: dict[str, tuple[float, str]] = {
         POINTS: (len(points), "count"),
-        UNCOVERED: (_feasible(problem, points[outside[:AT_MOST]]), "count"),
+        UNCOVERED: (_feasible(problem, points[beyond[:AT_MOST]]), "count"),
         MISPLACED: (np.count_nonzero(lost), "count"),
         DOUBLED: (np.count_nonzero(held > 1), "count"),
         ERROR: (largest_error(problem, points, 300 if bench.quick else 10_000), "error"),
@@ -55,7 +55,7 @@ def sample(law: PiecewiseAffine, count: int, seed: int = 0) -> Array:
     region = np.arange(each) % law.n_regions
     points = [rng.uniform(law.theta_min, law.theta_max, (count - n * each, n))]
     A, b = law.A * half, law.b - law.A @ middle
-    at = ((centres(law) - middle) / half)[region]
+    at = ((centers(law) - middle) / half)[region]
     basis = np.zeros((each, n, n))  # orthonormal normals of the facets that each is on
     for k in range(n):
         direction = rng.standard_normal((each, n))

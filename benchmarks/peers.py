@@ -56,15 +56,15 @@ def ppopt_program(program: ParametricQP) -> Any:
 def ppopt_solution(program: ParametricQP, law: PiecewiseAffine, overlap: bool) -> Any:
     """Return ppopt's solution object with the regions of a law, whoever found these.
 
-    Each region's law of all variables comes from the constraints that are active at its centre.
+    Each region's law of all variables comes from the constraints that are active at its center.
     """
     from ppopt.critical_region import CriticalRegion
     from ppopt.solution import Solution
 
     regions, ends = [], [*law.starts[1:], law.n_halfspaces]
     nothing = np.zeros((0, law.n_theta)), np.zeros((0, 1))
-    for start, end, centre in zip(law.starts, ends, centres(law), strict=True):
-        gain, offset = affine_law(program, centre)
+    for start, end, center in zip(law.starts, ends, centers(law), strict=True):
+        gain, offset = affine_law(program, center)
         E, f = np.ascontiguousarray(law.A[start:end]), law.b[start:end, None]
         regions.append(CriticalRegion(gain, offset[:, None], *nothing, E, f, []))
     return Solution(ppopt_program(program), regions, is_overlapping=overlap)
@@ -88,7 +88,7 @@ def affine_law(program: ParametricQP, theta: Array) -> tuple[Array, Array]:
 
 
 @functools.cache
-def centres(law: PiecewiseAffine) -> Array:
+def centers(law: PiecewiseAffine) -> Array:
     """Return the point of each region that lies farthest inside, shape (p, n)."""
     middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
     A, b = law.A * half, law.b - law.A @ middle  # rows of unit length

@@ -45,7 +45,7 @@ class Stopwatch:
     def compare(self, tasks: Mapping[str, Task]) -> dict[str, Array]:
         """Return seconds per call of each task, shape (repeats,), measured in turns.
 
-        What disturbs one measurement is likely to disturb its neighbours, so ratios of the tasks
+        What disturbs one measurement is likely to disturb its neighbors, so ratios of the tasks
         are taken turn by turn. Every function has run before, so that compilers and caches have
         done their work. All begin at the same input and go through them in the same order; in the
         time of a block a fast one meets more of them.

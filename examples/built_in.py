@@ -1,4 +1,4 @@
-"""A built-in environment of Gymnasium, linearised by its own simulator, from its MPC onward.
+"""A built-in environment of Gymnasium, linearized by its own simulator, from its MPC onward.
 
 python examples/built_in.py [--episodes 30] [--seed 0]
 """
@@ -42,7 +42,7 @@ def make_env() -> gymnasium.Env:
 
 
 def main() -> None:
-    """Linearise, design, check, train, and compare the policy with the MPC that it was."""
+    """Linearize, design, check, train, and compare the policy with the MPC that it was."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0)
@@ -53,7 +53,13 @@ def main() -> None:
     plant = LinearModel.from_env(make_env, state=[0, 0], action=[0])
     console.print(plant.report())
     cost = {"Q": np.diag([1.0, 0.1]), "R": [[0.001]]}  # what Gymnasium's documentation says
-    limits = {"x_min": [-2, -8], "x_max": [2, 8], "u_min": -2, "u_max": 2, "outside": "zero"}
+    limits = {
+        "x_min": [-2, -8],
+        "x_max": [2, 8],
+        "u_min": -2,
+        "u_max": 2,
+        "infeasible": "zero_input",
+    }
     mpc = LinearMPC(plant, **cost, horizon=2, **limits)
 
     model = DDPG(YannPolicy, make_env(), seed=arguments.seed, policy_kwargs={"problem": mpc})

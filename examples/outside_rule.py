@@ -22,13 +22,13 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     arguments = parser.parse_args()
 
-    table = Table("plant", "outside", "median cost", "mean cost", "largest", "steps outside")
+    table = Table("plant", "infeasible", "median cost", "mean cost", "largest", "steps outside")
     for env_id, mpc in (
         ("CSTR-v0", problems.cstr()),
         ("ClippedPendulum-v0", problems.clipped_pendulum()),
     ):
-        for rule in ("nearest", "zero"):
-            law = dataclasses.replace(mpc.explicit(), outside=rule)
+        for rule in ("nearest_region", "zero_input"):
+            law = dataclasses.replace(mpc.explicit(), infeasible=rule)
             episodes = evaluate(law, env_id, range(2000, 2000 + arguments.episodes))
             inside = law.in_domain(np.concatenate([x[:-1] for x in episodes.observations]))
             numbers = [np.median(episodes.costs), episodes.costs.mean(), episodes.costs.max()]

@@ -102,7 +102,7 @@ def yann(
     guard: dict[str, Any] | None = {},  # noqa: B006 (never written to)
     noise: float = 0.0,
     gamma: float = 0.99,
-    outside: str | None = None,
+    infeasible: str | None = None,
     plant_alone: bool = False,
     gradient_steps: int | None = None,
     tau: float = 0.005,
@@ -110,8 +110,8 @@ def yann(
 ) -> Learner:
     """Return a YANN learner, with the plant's gradient steps; None as guard trains without one."""
     problem = plant.problem()
-    if outside is not None:
-        problem = replace(problem, outside=outside)
+    if infeasible is not None:
+        problem = replace(problem, infeasible=infeasible)
     env = make_env()
     model = algorithm(
         YannPolicy,
@@ -156,7 +156,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "discount 0.95": {"gamma": 0.95},
     "two gradient steps": {"gradient_steps": 2},
     "target rate 0.02": {"tau": 0.02},
-    "nearest outside": {"outside": "nearest"},
+    "nearest outside": {"infeasible": "nearest_region"},
 }
 """What is changed of YANN-RL, one thing at a time."""
 LEARNERS: dict[str, Callable[..., Learner]] = {
@@ -313,7 +313,7 @@ class _StopAfter(BaseCallback):
         self.episodes, self.recorder = episodes, recorder
 
     def _on_step(self) -> bool:
-        # The vectorised env has begun the next episode already where one is over.
+        # The vectorized env has begun the next episode already where one is over.
         return len(self.recorder.costs) <= self.episodes
 
 

@@ -19,7 +19,7 @@ from experiments.runner import Outcome, Run
 
 Array = NDArray[np.float64]
 
-# Okabe and Ito's colours, told apart with any colour vision; ours is always the first.
+# Okabe and Ito's colors, told apart with any color vision; ours is always the first.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = "osD^vPX"

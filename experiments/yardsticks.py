@@ -211,7 +211,7 @@ def residual_rl(make_env: MakeEnv, seed: int, noise: float = NOISE) -> Learner:
 def cloned(make_env: MakeEnv, seed: int) -> Learner:
     """Return DDPG from an actor that was fitted to the linear MPC before.
 
-    Behaviour cloning minimises the squared error of the input, with Adam, on states that the MPC
+    Behavior cloning minimizes the squared error of the input, with Adam, on states that the MPC
     visits from the environment's own starts, and on as many around them. The root mean squared
     error at states from other starts is below 1 % of the input range wherever the MPC has a
     solution; outside, where the pendulum's law jumps, it is larger. As in `residual_rl` the actor

@@ -289,7 +289,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         if space.shape != (problem.n_theta,):
             raise ValueError(
                 f"The observation has shape {space.shape}, but theta = "
-                f"[{', '.join(problem.parameters.names)}] has {problem.n_theta} entries. Wrap the "
+                f"[{', '.join(problem.layout.names)}] has {problem.n_theta} entries. Wrap the "
                 "env so that it shows all of them, in this order."
             )
         self.problem, self.violation_cost = problem, violation_cost
@@ -317,7 +317,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         mpc = self.problem
         if not mpc.has_rate_bounds:
             return False
-        moved = u - self.theta[mpc.parameters.previous]
+        moved = u - self.theta[mpc.layout.previous]
         rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
         return bool(np.any((moved < mpc.du_min - rounding) | (moved > mpc.du_max + rounding)))
 

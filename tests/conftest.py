@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 
 import gymnasium as gym
 import numpy as np
@@ -13,9 +12,6 @@ import torch as th
 from online_mpc import OnlineMPC
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann_envs import problems
-
-# No test reads or leaves laws in the cache of who runs it.
-os.environ["SB3_YANN_CACHE"] = "off"
 
 
 @pytest.fixture(autouse=True)

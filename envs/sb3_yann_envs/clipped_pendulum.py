@@ -151,7 +151,7 @@ class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
       about 127 after training, which is what one swing round costs. The range here was chosen so
       that 20.5 % of the starts need the swing. At rest the border is at 0.4115 rad, where
       gravity balances 2 N m.
-    - **Model and simulator.** The printed A and B are the exact zero-order hold of the linearised
+    - **Model and simulator.** The printed A and B are the exact zero-order hold of the linearized
       equations. The simulator integrates with a semi-implicit Euler step of 0.05 s, which has
       (1.0375, 0.05; 0.75, 1) and (0.0075, 0.15). This mismatch is the paper's and is kept.
     - **Observation.** The size of the paper's DDPG network shows three inputs, that is cosine and

@@ -28,7 +28,7 @@ def clipped_pendulum() -> LinearMPC:
         x_max=[2.0, 8.0],
         u_min=-2.0,
         u_max=2.0,
-        outside="zero",
+        infeasible="zero_input",
     )
 
 

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
-    """What the vectorised environments share: starts, time limit, and resets at the next step.
+    """What the vectorized environments share: starts, time limit, and resets at the next step.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ class CostAudit(BaseCallback):
     ``reward_offset``, where the policy has them). The first steps of every `learn` are compared;
     then the callback rests. Steps with ``info["violation"]`` and those by which the env terminates
     an episode may cost more. Where they differ, it looks for the reason among scaled, shifted,
-    negated, clipped and normalised rewards, costs of another state or action in time, repeated
+    negated, clipped and normalized rewards, costs of another state or action in time, repeated
     actions, observations and actions in other units or from another zero, and other weights, and
     asks the env for its wrappers. The law must leave its steady state for it to see anything.
 
@@ -93,7 +93,7 @@ class CostAudit(BaseCallback):
 
     def _record(self) -> None:
         normalize = self.model.get_vec_normalize_env()
-        # The buffer holds what VecNormalize has not touched, and normalises samples of it.
+        # The buffer holds what VecNormalize has not touched, and normalizes samples of it.
         rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
         for i, records in enumerate(self._records):
             info, done = self.locals["infos"][i], bool(self.locals["dones"][i])
@@ -168,7 +168,7 @@ class CostAudit(BaseCallback):
         digits = observations.dtype if observations.dtype.kind == "f" else np.float64
         size = np.abs(observations).astype(np.float64)
         if (seen := self.policy.observation) is not None:
-            # What a normalisation hides of its size is in t0.
+            # What a normalization hides of its size is in t0.
             size = size @ np.abs(seen.T).T + np.abs(seen.t0)
         return np.asarray(size * float(np.finfo(digits).eps))
 
@@ -182,13 +182,13 @@ class CostAudit(BaseCallback):
             return None
         if normalize.norm_reward:
             return Cause(
-                "normalised reward",
-                "VecNormalize normalises the rewards that the critic learns from. Set "
+                "normalized reward",
+                "VecNormalize normalizes the rewards that the critic learns from. Set "
                 "venv.norm_reward = False; reward_scale is for a constant factor.",
             )
         if normalize.norm_obs and normalize.training:
             return Cause(
-                "normalised observation",
+                "normalized observation",
                 "the statistics of VecNormalize move, so that an observation means another state "
                 "at each step. Set venv.training = False.",
             )

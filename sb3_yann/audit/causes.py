@@ -64,7 +64,7 @@ def _straight_line(sample: Sample, tolerance: float) -> Cause | None:
         size = "" if abs(line.scale + 1) < 1e-3 else f" (times {-line.scale:.6g})"
         return Cause(
             "sign flipped",
-            f"the env returns the cost itself{size} as its reward. The learner would maximise it: "
+            f"the env returns the cost itself{size} as its reward. The learner would maximize it: "
             "return minus the cost.",
         )
     if line.offset == 0:
@@ -171,7 +171,7 @@ def _sticky_action(sample: Sample, tolerance: float) -> Cause | None:
     return None
 
 
-def _normalised_reward(sample: Sample, tolerance: float) -> Cause | None:
+def _normalized_reward(sample: Sample, tolerance: float) -> Cause | None:
     """Run the statistics of `gymnasium.wrappers.NormalizeReward` on minus the cost.
 
     Its discount is not known: the learner's, its default and a few others are tried.
@@ -179,7 +179,7 @@ def _normalised_reward(sample: Sample, tolerance: float) -> Cause | None:
     for gamma in dict.fromkeys((sample.gamma, 0.99, 0.9, 0.95, 0.98, 0.995, 0.999, 1.0)):
         if sample.agrees(sample.cost * _running_factors(sample, gamma), tolerance):
             return Cause(
-                "normalised reward",
+                "normalized reward",
                 "the reward is divided by running statistics, as by NormalizeReward: its unit "
                 "changes as they do. Leave it out; reward_scale is for a constant factor.",
             )
@@ -237,7 +237,7 @@ _EXPLANATIONS = (
     _clipped,
     _timing,
     _sticky_action,
-    _normalised_reward,
+    _normalized_reward,
     _repeated_action,
     _scaled_entries,
 )

@@ -141,7 +141,7 @@ class Line:
         x, y = -sample.cost[sample.counted], sample.rewards[sample.counted]
         if np.ptp(x) <= 1e-12 * np.abs(x).max() or np.ptp(y) <= 1e-12 * np.abs(y).max():
             return cls(0.0, float(y.mean()), 0.0)
-        # Centred: with a large offset the normal equations would lose what varies.
+        # Centerd: with a large offset the normal equations would lose what varies.
         dx, dy = x - x.mean(), y - y.mean()
         scale = float(dx @ dy / (dx @ dx))
         offset = float(y.mean() - scale * x.mean())

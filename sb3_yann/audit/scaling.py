@@ -80,8 +80,8 @@ def scaled_entries(sample: Sample, tolerance: float) -> tuple[str, str] | None:
         ("shifted observation", none, acts & state),
         ("rescaled action", acts & ~state, acts & ~state),
         ("other weights", acts, none),
-        ("normalised observation", acts & state, acts & state),
-        ("normalised observation and action", acts, acts),
+        ("normalized observation", acts & state, acts & state),
+        ("normalized observation and action", acts, acts),
     ):
         free = np.count_nonzero(scaled) + np.count_nonzero(shifted)
         if free == 0 or len(quadratic.z) < 3 * free:
@@ -131,13 +131,13 @@ def _explanation(name: str, s: Array, z0: Array, state: NDArray[np.bool_], W: Ar
         )
     action = (
         ""
-        if name == "normalised observation"
+        if name == "normalized observation"
         else (f", and that of the input {_listed(s[~state])} * action + {_listed(z0[~state])}")
     )
     return (
         f"the cost is that of theta = {theta_s} * obs + {theta_0}{action}: observations are "
-        'normalised. Pass policy_kwargs={"observation": '
-        f"AffineObservation.normalised(mean={theta_0}, std={theta_s})}}."
+        'normalized. Pass policy_kwargs={"observation": '
+        f"AffineObservation.normalized(mean={theta_0}, std={theta_s})}}."
     )
 
 

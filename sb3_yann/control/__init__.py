@@ -5,7 +5,7 @@ from sb3_yann.control.identification.identify import Identified, identify
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
-from sb3_yann.control.mpc.theta_layout import Parameters
+from sb3_yann.control.mpc.theta_layout import ThetaLayout
 from sb3_yann.control.observer import DisturbanceObserver
 
 __all__ = [
@@ -15,8 +15,8 @@ __all__ = [
     "Identified",
     "LinearMPC",
     "LinearModel",
-    "Parameters",
     "ParametricQP",
     "PiecewiseAffine",
+    "ThetaLayout",
     "identify",
 ]

@@ -25,7 +25,7 @@ def riccati(
     ------
     ValueError
         If a mode that the discount does not make stable cannot be reached by any input, or the
-        cost does not see a mode on the unit circle: no stabilising solution exists.
+        cost does not see a mode on the unit circle: no stabilizing solution exists.
     """
     A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
     try:
@@ -33,7 +33,7 @@ def riccati(
         radius = spectral_radius(A - B @ gain(model, R, P, gamma, cross))
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
-    # SciPy also returns matrices that do not stabilise, where a mode on the unit circle cannot be
+    # SciPy also returns matrices that do not stabilize, where a mode on the unit circle cannot be
     # reached or has no weight; the closed loop then keeps it there to rounding.
     if not radius < 1 - 1e-9:
         raise ValueError(_why_no_solution(A, B))
@@ -43,7 +43,7 @@ def riccati(
 def gain(
     model: LinearModel, R: Array, P: Array, gamma: float = 1.0, cross: Array | None = None
 ) -> Array:
-    """Return K (m, n): ``u = -K x`` minimises ``2x'Nu + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
+    """Return K (m, n): ``u = -K x`` minimizes ``2x'Nu + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
     PB = P @ model.B
     factor = linalg.cho_factor(R + gamma * model.B.T @ PB)
     slope = gamma * PB.T @ model.A
@@ -109,6 +109,6 @@ def _why_no_solution(A: Array, B: Array) -> str:
                 "Remove the mode from the model, add an input, or use a smaller gamma."
             )
     return (
-        "The Riccati equation has no stabilising solution: a mode on the unit circle carries no "
+        "The Riccati equation has no stabilizing solution: a mode on the unit circle carries no "
         "weight in Q. Give it a positive weight, use gamma < 1, or pass terminal_cost."
     )

@@ -40,7 +40,7 @@ class Region:
     inside: Array | None = None
 
     def ball(self) -> tuple[Array, float]:
-        """Return the centre of a large ball inside, and its radius, negative if there is none."""
+        """Return the center of a large ball inside, and its radius, negative if there is none."""
         if self.inside is not None:
             radius = float(np.min(self.b - self.A @ self.inside))
             if radius > 0:
@@ -59,18 +59,18 @@ def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, f
         rows[facet, -1] = 0.0
     cost = np.zeros(rows.shape[1])
     cost[-1] = -1.0
-    point = _minimise(cost, rows, b, facet)
+    point = _minimize(cost, rows, b, facet)
     if abs(point[-1]) < THIN:
-        point = _minimise(cost, rows, b, facet, eta_prox=1e-14, iter_limit=1000)
+        point = _minimize(cost, rows, b, facet, eta_prox=1e-14, iter_limit=1000)
     return point[:-1], float(point[-1])
 
 
 def farthest_point(A: Array, b: Array, direction: Array) -> Array:
     """Return the point of a bounded polyhedron that is farthest in one direction."""
-    return _minimise(-np.asarray(direction, dtype=float), A, b, None)
+    return _minimize(-np.asarray(direction, dtype=float), A, b, None)
 
 
-def _minimise(cost: Array, A: Array, b: Array, equal: int | None, **settings: float) -> Array:
+def _minimize(cost: Array, A: Array, b: Array, equal: int | None, **settings: float) -> Array:
     """Return the solution of a small linear program from DAQP, or where that fails from HiGHS."""
     import daqp
 
@@ -134,7 +134,7 @@ def _facets_one_by_one(A: Array, b: Array, radius: float) -> NDArray[np.intp]:
     for k in range(len(b)):
         relaxed = b.copy()
         relaxed[k] += radius
-        farthest = _minimise(-A[k], A, relaxed, None, eta_prox=1e-14, iter_limit=1000)
+        farthest = _minimize(-A[k], A, relaxed, None, eta_prox=1e-14, iter_limit=1000)
         if A[k] @ farthest > b[k] - max(1e-6 * radius, 1e-13):
             bounding.append(k)
     return np.array(bounding, dtype=np.intp)

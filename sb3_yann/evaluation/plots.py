@@ -68,7 +68,7 @@ def save_trajectories(
     limits: Mapping[int, tuple[float, str]] | None = None,
     references: Mapping[int, int] | None = None,
 ) -> Path:
-    """Save a PNG of some states and all inputs over time, one colour for each run.
+    """Save a PNG of some states and all inputs over time, one color for each run.
 
     Parameters
     ----------

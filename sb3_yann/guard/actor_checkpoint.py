@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 
 from sb3_yann.policy.policies import YannPolicy
 
-Parameters = dict[str, th.Tensor]
+Tensors = dict[str, th.Tensor]
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class ActorCheckpoint:
     """What makes an actor and its learning go on as if nothing had happened since.
 
     It lies in the main memory, so that a model saved on one device loads on another.
     """
 
-    actor: Parameters
-    target: Parameters
+    actor: Tensors
+    target: Tensors
     optimizer: dict[str, Any]
 
     @classmethod
-    def of(cls, policy: YannPolicy) -> Snapshot:
+    def of(cls, policy: YannPolicy) -> ActorCheckpoint:
         """Return a copy of the policy's present actor, its target and its optimizer."""
         return cls(
             _copied(policy.actor.state_dict()),
@@ -37,7 +37,7 @@ class Snapshot:
         )
 
     @classmethod
-    def of_parts(cls, actor: Parameters, optimizer: dict[str, Any]) -> Snapshot:
+    def of_parts(cls, actor: Tensors, optimizer: dict[str, Any]) -> ActorCheckpoint:
         """Return a copy of an actor that is its own target, and of an optimizer."""
         return cls(_copied(actor), _copied(actor), _copied(optimizer))
 
@@ -53,7 +53,7 @@ class Snapshot:
         stored = [*self.actor.values(), *self.target.values(), *2 * [*self.networks().values()]]
         return sum(each.numel() * each.element_size() for each in stored)
 
-    def networks(self) -> Parameters:
+    def networks(self) -> Tensors:
         """Return the actor's trainable parameters; the first axis of each is the region."""
         return {
             name: value
@@ -61,7 +61,7 @@ class Snapshot:
             if ".network." in name and not name.endswith("pinned")
         }
 
-    def with_regions(self, other: Snapshot, regions: Iterable[int]) -> Snapshot:
+    def with_regions(self, other: ActorCheckpoint, regions: Iterable[int]) -> ActorCheckpoint:
         """Return a copy that has the networks of some regions, with their moments, from other."""
         index = th.tensor(sorted(regions), dtype=th.long)
         mixed = copy.deepcopy(self)
@@ -93,19 +93,19 @@ def _copy_rows(ours: th.Tensor, theirs: th.Tensor, index: th.Tensor) -> None:
     ours[index] = theirs[index]
 
 
-def same(snapshot: Snapshot, policy: YannPolicy) -> bool:
-    """Return whether the policy's actor is still that of the snapshot, bit for bit."""
+def same(checkpoint: ActorCheckpoint, policy: YannPolicy) -> bool:
+    """Return whether the policy's actor is still that of the checkpoint, bit for bit."""
     now = policy.actor.state_dict()
-    return all(th.equal(value, now[name].cpu()) for name, value in snapshot.actor.items())
+    return all(th.equal(value, now[name].cpu()) for name, value in checkpoint.actor.items())
 
 
-def same_networks(one: Snapshot, other: Snapshot) -> bool:
+def same_networks(one: ActorCheckpoint, other: ActorCheckpoint) -> bool:
     """Return whether both hold the same actor, whatever its optimizer remembers."""
     networks = other.networks()
     return all(th.equal(value, networks[name]) for name, value in one.networks().items())
 
 
-def changed(before: Snapshot, after: Snapshot) -> NDArray[np.bool_]:
+def changed(before: ActorCheckpoint, after: ActorCheckpoint) -> NDArray[np.bool_]:
     """Return in which regions the network is another one, shape (regions,)."""
     networks = after.networks()
     different = [

@@ -14,12 +14,12 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.guard.actor_checkpoint import Snapshot
-from sb3_yann.guard.plant_acceptance import PlantTrials
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.plant_acceptance import PlantAcceptance
 from sb3_yann.guard.preconditions import check_between, check_not_nested, check_whole
 from sb3_yann.guard.restoring import restore_accepted
-from sb3_yann.guard.rng import chance_untouched
-from sb3_yann.guard.simulator_acceptance import SimulatorTrials
+from sb3_yann.guard.rng import preserve_rng
+from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance
 from sb3_yann.guard.state import Decision, GuardState, write_csv
 from sb3_yann.policy.policies import YannPolicy
 
@@ -180,12 +180,12 @@ class ImprovementGuard(BaseCallback):
             check_between(name, factor, low, high)
         self.shrink, self.grow, self.smallest_step = shrink, grow, smallest_step
         self.record = None if record is None else Path(record)
-        self.trials: SimulatorTrials | PlantTrials
+        self.trials: SimulatorAcceptance | PlantAcceptance
         if env is None:
-            self.trials = PlantTrials(trial_episodes, significance)
+            self.trials = PlantAcceptance(trial_episodes, significance)
         else:
             final = 10 * fresh if final is None else final
-            self.trials = SimulatorTrials(
+            self.trials = SimulatorAcceptance(
                 env, n_starts, fresh, final, seed, every, margin, by_region, patience, wander
             )
 
@@ -214,7 +214,7 @@ class ImprovementGuard(BaseCallback):
             )
         self.policy = policy
         untrained = policy.actor.mu.network.is_zero()
-        self._mpc = Snapshot.of(policy) if untrained else None
+        self._mpc = ActorCheckpoint.of(policy) if untrained else None
 
     def _on_training_start(self) -> None:
         check_not_nested(self)
@@ -236,7 +236,7 @@ class ImprovementGuard(BaseCallback):
 
     def _start_afresh(self, known: GuardState | None) -> None:
         """Gather first evidence; where that fails, leave everything as it was."""
-        present = Snapshot.of(self.policy)
+        present = ActorCheckpoint.of(self.policy)
         state = GuardState(self.trials.settings, present, evidence=None)
         if known is not None:  # other starts or another plant: the policies are tried anew
             state.decisions, state.episodes = [*known.decisions], known.episodes
@@ -262,19 +262,19 @@ class ImprovementGuard(BaseCallback):
 
     # What the trials call.
 
-    def accept(self, evidence: Any, snapshot: Snapshot | None = None) -> None:
-        """Make the present policy the accepted one; its snapshot may be at hand already."""
-        self.state.accepted = Snapshot.of(self.policy) if snapshot is None else snapshot
+    def accept(self, evidence: Any, checkpoint: ActorCheckpoint | None = None) -> None:
+        """Make the present policy the accepted one; its checkpoint may be at hand already."""
+        self.state.accepted = ActorCheckpoint.of(self.policy) if checkpoint is None else checkpoint
         self.state.evidence = evidence
 
     @property
-    def mpc(self) -> Snapshot:
+    def mpc(self) -> ActorCheckpoint:
         """The MPC itself, with an optimizer as new."""
         if self._mpc is None:
-            with chance_untouched():  # building an actor draws weights
+            with preserve_rng():  # building an actor draws weights
                 actor = self.policy.make_actor()
             optimizer = {**self.policy.actor.optimizer.state_dict(), "state": {}}
-            self._mpc = Snapshot.of_parts(actor.state_dict(), optimizer)
+            self._mpc = ActorCheckpoint.of_parts(actor.state_dict(), optimizer)
         return self._mpc
 
     def decide(self, decision: Decision) -> None:

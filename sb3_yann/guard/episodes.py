@@ -12,8 +12,8 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann.evaluation.episodes import Episodes, Predictor, evaluate
-from sb3_yann.guard.actor_checkpoint import Snapshot
-from sb3_yann.guard.rng import chance_untouched
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.statistics import Paired
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class _FinitePolicy:
 
 def played(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Episodes:
     """Return the present policy's episodes; raises Unplayable, or what the env raises."""
-    with chance_untouched():
+    with preserve_rng():
         return evaluate(_FinitePolicy(guard.policy, _seen(guard)), env, seeds)
 
 
@@ -120,7 +120,7 @@ def play(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Outcome:
     except Unplayable:
         raise
     except Exception as error:
-        present = Snapshot.of(guard.policy)
+        present = ActorCheckpoint.of(guard.policy)
         guard.mpc.restore(guard.policy)
         try:
             played(guard, env, seeds)
@@ -136,7 +136,7 @@ def outcome_of(guard: ImprovementGuard, episodes: Episodes) -> Outcome:
     return Outcome(episodes.costs, unsafe, _visits(guard, episodes))
 
 
-def judged(guard: ImprovementGuard, env: Any) -> tuple[Outcome | None, str]:
+def evaluate_candidate(guard: ImprovementGuard, env: Any) -> tuple[Outcome | None, str]:
     """Return the episodes of the present policy and what speaks against it, if anything."""
     if not finite(guard):
         return None, "a parameter of the actor is not a finite number"
@@ -154,12 +154,12 @@ def finite(guard: ImprovementGuard) -> bool:
 
 
 @contextmanager
-def all_or_nothing(guard: ImprovementGuard) -> Iterator[Snapshot]:
+def all_or_nothing(guard: ImprovementGuard) -> Iterator[ActorCheckpoint]:
     """Yield the candidate; bring it back, and what was accepted, if it is cut off by an error.
 
     Or by Ctrl-C: what is under trial stands in the place of what is accepted until it is over.
     """
-    state, candidate = guard.state, Snapshot.of(guard.policy)
+    state, candidate = guard.state, ActorCheckpoint.of(guard.policy)
     before = state.accepted, state.evidence, [*state.passed]
     try:
         yield candidate

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann.guard.actor_checkpoint import Snapshot, same_networks
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint, same_networks
 from sb3_yann.guard.episodes import Evidence, Outcome, Unplayable, play
 from sb3_yann.guard.region_mixing import accept_parts
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
-    from sb3_yann.guard.simulator_acceptance import SimulatorTrials
+    from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance
 
 HARDEST = 10
 """New starts that are added at a time to those of every later trial."""
@@ -87,7 +87,9 @@ class NewStarts:
         return order[: min(HARDEST, worse.sum() or np.count_nonzero(excess > 0))]
 
 
-def settle(guard: ImprovementGuard, trials: SimulatorTrials, n_starts: int) -> str:
+def confirm_on_new_starts(
+    guard: ImprovementGuard, trials: SimulatorAcceptance, n_starts: int
+) -> str:
     """Try what is accepted on new starts; where it loses, go back to what was accepted before.
 
     That is the last of what was accepted earlier that passes on all of these starts, or the MPC.
@@ -124,25 +126,25 @@ def settle(guard: ImprovementGuard, trials: SimulatorTrials, n_starts: int) -> s
     return first
 
 
-def remember(guard: ImprovementGuard, snapshot: Snapshot, outcome: Outcome | None) -> None:
+def remember(guard: ImprovementGuard, checkpoint: ActorCheckpoint, outcome: Outcome | None) -> None:
     """Keep what was accepted, with its outcome on the known starts, as far as memory allows."""
-    forget(guard, snapshot)
-    if same_networks(snapshot, guard.mpc):  # which is always there
+    forget(guard, checkpoint)
+    if same_networks(checkpoint, guard.mpc):  # which is always there
         return
     passed = guard.state.passed
-    passed.append((snapshot, outcome))
-    most = min(len(passed), MOST_KEPT, max(1, MEMORY // snapshot.size))
+    passed.append((checkpoint, outcome))
+    most = min(len(passed), MOST_KEPT, max(1, MEMORY // checkpoint.size))
     del passed[:-most]
 
 
-def forget(guard: ImprovementGuard, snapshot: Snapshot) -> None:
+def forget(guard: ImprovementGuard, checkpoint: ActorCheckpoint) -> None:
     """Remove what lost on new starts after all."""
     passed = guard.state.passed
-    passed[:] = [each for each in passed if not same_networks(each[0], snapshot)]
+    passed[:] = [each for each in passed if not same_networks(each[0], checkpoint)]
 
 
 def _new_starts(
-    guard: ImprovementGuard, trials: SimulatorTrials, n_starts: int
+    guard: ImprovementGuard, trials: SimulatorAcceptance, n_starts: int
 ) -> NewStarts | None:
     """Return as many new starts, None where there is nothing to be tried on them."""
     state = guard.state
@@ -159,7 +161,7 @@ def _new_starts(
 
 
 def _tried(
-    guard: ImprovementGuard, trials: SimulatorTrials, new: NewStarts
+    guard: ImprovementGuard, trials: SimulatorAcceptance, new: NewStarts
 ) -> tuple[Outcome | None, str]:
     """Return what came of the accepted policy on new starts, and what speaks against it."""
     guard.state.accepted.restore(guard.policy)
@@ -171,25 +173,25 @@ def _tried(
 
 
 def _go_back(
-    guard: ImprovementGuard, trials: SimulatorTrials, new: NewStarts, hard: NDArray[np.int64]
+    guard: ImprovementGuard, trials: SimulatorAcceptance, new: NewStarts, hard: NDArray[np.int64]
 ) -> None:
     """Accept the last of what was accepted that loses on no new start, or the MPC."""
     evidence: Evidence = guard.state.evidence
     some = new.at(hard)
     seeds, mpc = (*evidence.seeds, *some.seeds), evidence.mpc.and_also(some.mpc)
-    for snapshot, outcome in reversed(guard.state.passed):
-        snapshot.restore(guard.policy)
+    for checkpoint, outcome in reversed(guard.state.passed):
+        checkpoint.restore(guard.policy)
         everywhere = _passes(guard, trials, evidence, outcome, new, hard)
         if everywhere is not None:
-            guard.accept(Evidence(seeds, mpc, everywhere, evidence.margin), snapshot)
-            remember(guard, snapshot, everywhere)
+            guard.accept(Evidence(seeds, mpc, everywhere, evidence.margin), checkpoint)
+            remember(guard, checkpoint, everywhere)
             return
     guard.accept(Evidence(seeds, mpc, mpc, evidence.margin), guard.mpc)
 
 
 def _passes(
     guard: ImprovementGuard,
-    trials: SimulatorTrials,
+    trials: SimulatorAcceptance,
     evidence: Evidence,
     outcome: Outcome | None,
     new: NewStarts,
@@ -220,7 +222,7 @@ def _passes(
 
 
 def _unless_lost(
-    guard: ImprovementGuard, trials: SimulatorTrials, starts: NewStarts
+    guard: ImprovementGuard, trials: SimulatorAcceptance, starts: NewStarts
 ) -> Outcome | None:
     """Return the present policy's outcome, None where it loses one of the starts."""
     if not starts.seeds:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann.control import LinearMPC
-from sb3_yann.guard.actor_checkpoint import Snapshot, same
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint, same
 from sb3_yann.guard.preconditions import check_acts_alone
 from sb3_yann.guard.state import Decision, GuardState
 from sb3_yann.guard.statistics import PlantEpisodes, compared, excess_of_an_outlier
@@ -35,11 +35,11 @@ class Evidence:
     accepted: PlantEpisodes | None = None
     costs: list[float] = field(default_factory=list)
     predicted: list[float] = field(default_factory=list)
-    resting: Snapshot | None = None
+    resting: ActorCheckpoint | None = None
     terminates: bool = False
 
 
-class PlantTrials:
+class PlantAcceptance:
     """Lets the actor learn for a block of episodes, then rest for one that is tested."""
 
     def __init__(self, trial_episodes: int, significance: float) -> None:
@@ -69,7 +69,7 @@ class PlantTrials:
         if known is not None:  # what the present one is, if it is another, nobody has found out
             other = not same(known.accepted, guard.policy)
             known.accepted.restore(guard.policy)
-        guard.accept(evidence := Evidence(resting=Snapshot.of(guard.policy)))
+        guard.accept(evidence := Evidence(resting=ActorCheckpoint.of(guard.policy)))
         if other:
             self._report(guard, evidence, "rejected", "before training, it is not accepted", np.nan)
 
@@ -149,7 +149,7 @@ class PlantTrials:
     ) -> None:
         evidence.phase = phase
         evidence.costs, evidence.predicted = [], []
-        evidence.resting = None if phase == "learning" else Snapshot.of(guard.policy)
+        evidence.resting = None if phase == "learning" else ActorCheckpoint.of(guard.policy)
         self.block += 1
 
     def _return(self, guard: ImprovementGuard, evidence: Evidence, reason: str) -> None:

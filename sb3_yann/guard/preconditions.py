@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann.evaluation.episodes import Episodes, one_env
 from sb3_yann.guard.episodes import Outcome, outcome_of, played
-from sb3_yann.guard.rng import chance_untouched
+from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.policy._checks import as_factor
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def check_simulator(
 ) -> None:
     """Raise ValueError if the simulator is the training env, or an env of another shape."""
     training = [env.unwrapped for env in getattr(training_env, "envs", [])]
-    with chance_untouched(), one_env(simulator) as env:
+    with preserve_rng(), one_env(simulator) as env:
         if any(env.unwrapped is each for each in training):
             raise ValueError(
                 "The guard's env is the training env, whose episodes its own would interrupt. "

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann.guard.actor_checkpoint import Snapshot, changed
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint, changed
 from sb3_yann.guard.episodes import Evidence, Outcome, Unplayable, play
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ MOST_LOST = 0.2
 """Share of losing starts beyond which no part of a candidate is looked for."""
 
 
-def accept_visited(guard: ImprovementGuard, candidate: Snapshot, outcome: Outcome) -> None:
+def accept_visited(guard: ImprovementGuard, candidate: ActorCheckpoint, outcome: Outcome) -> None:
     """Accept the candidate in the regions that its episodes come through.
 
     They say nothing of the others: there the networks stay those that were accepted before.
@@ -29,7 +29,7 @@ def accept_visited(guard: ImprovementGuard, candidate: Snapshot, outcome: Outcom
 
 
 def accept_parts(
-    guard: ImprovementGuard, env: Any, candidate: Snapshot, outcome: Outcome | None
+    guard: ImprovementGuard, env: Any, candidate: ActorCheckpoint, outcome: Outcome | None
 ) -> None:
     """Take over what regions of a refused candidate can be accepted. Changes the policy.
 
@@ -41,7 +41,7 @@ def accept_parts(
 
 
 def _accept_the_rest(
-    guard: ImprovementGuard, env: Any, candidate: Snapshot, outcome: Outcome
+    guard: ImprovementGuard, env: Any, candidate: ActorCheckpoint, outcome: Outcome
 ) -> None:
     """Give back the regions by which few starts lose, until what is left can be accepted.
 
@@ -75,7 +75,7 @@ def _accept_the_rest(
 
 
 def _accept_regions(
-    guard: ImprovementGuard, env: Any, candidate: Snapshot, outcome: Outcome | None
+    guard: ImprovementGuard, env: Any, candidate: ActorCheckpoint, outcome: Outcome | None
 ) -> None:
     """Take over the regions of the candidate that improve the accepted policy, one by one.
 
@@ -116,7 +116,10 @@ def _play_some(guard: ImprovementGuard, env: Any, starts: NDArray[np.int64]) -> 
 
 
 def _same_episodes(
-    starts: NDArray[np.int64], candidate: Snapshot, mixed: Snapshot, outcome: Outcome | None
+    starts: NDArray[np.int64],
+    candidate: ActorCheckpoint,
+    mixed: ActorCheckpoint,
+    outcome: Outcome | None,
 ) -> NDArray[np.int64]:
     """Return the starts whose episodes are the candidate's: they meet no region that differs."""
     if outcome is None:
@@ -133,7 +136,9 @@ def _worse_than_the_mpc_somewhere(
     return bool(lost.any() or np.any(trial.unsafe[some] > evidence.accepted.unsafe[some]))
 
 
-def taken_over(before: Snapshot, candidate: Snapshot, accepted: Snapshot) -> list[int]:
+def taken_over(
+    before: ActorCheckpoint, candidate: ActorCheckpoint, accepted: ActorCheckpoint
+) -> list[int]:
     """Return the regions in which the accepted networks are new, and the candidate's."""
     new = changed(before, accepted) & ~changed(candidate, accepted)
     return [int(region) for region in np.flatnonzero(new)]

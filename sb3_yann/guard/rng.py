@@ -15,7 +15,7 @@ def _uses_cuda() -> bool:
 
 
 @contextmanager
-def chance_untouched() -> Iterator[None]:
+def preserve_rng() -> Iterator[None]:
     """Put back the global random states of python, numpy and torch afterwards.
 
     Older envs seed them in `reset` and draw from them, as does whatever builds a torch module.

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any, Final
 import gymnasium as gym
 import numpy as np
 
-from sb3_yann.guard.actor_checkpoint import Snapshot, changed, same, same_networks
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint, changed, same, same_networks
 from sb3_yann.guard.episodes import (
     Evidence,
     Outcome,
     Unplayable,
     all_or_nothing,
+    evaluate_candidate,
     finite,
-    judged,
     outcome_of,
     played,
 )
-from sb3_yann.guard.new_starts import VIOLATES, remember, settle
+from sb3_yann.guard.new_starts import VIOLATES, confirm_on_new_starts, remember
 from sb3_yann.guard.preconditions import check_simulator, first_episodes
 from sb3_yann.guard.region_mixing import accept_parts, accept_visited, taken_over
 from sb3_yann.guard.state import Decision, GuardState
@@ -34,7 +34,7 @@ REPLAYED = 5
 """Starts from which the accepted policy is played again when a run goes on."""
 
 
-class SimulatorTrials:
+class SimulatorAcceptance:
     """Tries each candidate on the same seeded starts, and what is to be accepted on new ones."""
 
     def __init__(
@@ -59,7 +59,7 @@ class SimulatorTrials:
     def start(self, guard: ImprovementGuard) -> None:
         """Check that the simulator is another env than the training env, and a like one."""
         check_simulator(self.env, self.settings["env"], guard.training_env)
-        self._final: Snapshot | None = None
+        self._final: ActorCheckpoint | None = None
         self.last_trial = -self.every  # the first episode that ends is always followed by a trial
 
     def still_holds(self, guard: ImprovementGuard) -> bool:
@@ -72,7 +72,7 @@ class SimulatorTrials:
             return False
         last = len(evidence.seeds) - 1
         some = np.unique(np.linspace(0, last, REPLAYED).astype(int))
-        present, expected = Snapshot.of(guard.policy), evidence.accepted.at(some)
+        present, expected = ActorCheckpoint.of(guard.policy), evidence.accepted.at(some)
         try:
             guard.state.accepted.restore(guard.policy)
             again = outcome_of(
@@ -91,7 +91,7 @@ class SimulatorTrials:
         That may be the policy that is accepted by a run with other settings, whose hard starts
         stay, and the present one.
         """
-        state, present = guard.state, Snapshot.of(guard.policy)
+        state, present = guard.state, ActorCheckpoint.of(guard.policy)
         candidates, seeds = [present], (*self.seeds,)
         state.next_start = self.seeds.stop
         if known is not None:
@@ -108,14 +108,14 @@ class SimulatorTrials:
             if same(candidate, guard.policy):
                 continue
             candidate.restore(guard.policy)
-            outcome, reason = judged(guard, self.env)
+            outcome, reason = evaluate_candidate(guard, self.env)
             if outcome is not None and not reason:
                 accept_visited(guard, candidate, outcome)
             else:
                 state.accepted.restore(guard.policy)
                 self._report(guard, outcome, f"before training, {reason}", [], returned=True)
-        for snapshot, _ in [] if known is None else known.passed:
-            remember(guard, snapshot, None)
+        for checkpoint, _ in [] if known is None else known.passed:
+            remember(guard, checkpoint, None)
         remember(guard, state.accepted, state.evidence.accepted)
 
     def before_steps(self, guard: ImprovementGuard) -> None:
@@ -140,7 +140,7 @@ class SimulatorTrials:
         if last is self._final:  # the Zoo ends its first callback a second time
             return
         with all_or_nothing(guard):
-            reason = settle(guard, self, self.final)
+            reason = confirm_on_new_starts(guard, self, self.final)
         self._final = accepted = state.accepted
         accepted.restore(guard.policy)
         if reason:
@@ -159,18 +159,18 @@ class SimulatorTrials:
         regions = taken_over(before, candidate, accepted) if reason else []
         self._report(guard, outcome, reason, regions, returned)
 
-    def _plays_alike(self, guard: ImprovementGuard, candidate: Snapshot) -> bool:
+    def _plays_alike(self, guard: ImprovementGuard, candidate: ActorCheckpoint) -> bool:
         """Return whether it differs only where none of the accepted policy's episodes comes."""
         visited = guard.state.evidence.visits.any(0)
         return finite(guard) and not np.any(changed(guard.state.accepted, candidate) & visited)
 
     def _judge(
-        self, guard: ImprovementGuard, candidate: Snapshot
+        self, guard: ImprovementGuard, candidate: ActorCheckpoint
     ) -> tuple[Outcome | None, str, bool]:
         """Return the candidate's episodes, why it is refused, and whether the actor returns."""
         state = guard.state
-        before: tuple[Snapshot, Evidence] = state.accepted, state.evidence
-        outcome, reason = judged(guard, self.env)
+        before: tuple[ActorCheckpoint, Evidence] = state.accepted, state.evidence
+        outcome, reason = evaluate_candidate(guard, self.env)
         hopeless = outcome is None or bool(np.any(outcome.unsafe > before[1].accepted.unsafe))
         if outcome is not None and not reason:
             accept_visited(guard, candidate, outcome)
@@ -179,7 +179,7 @@ class SimulatorTrials:
             if self.by_region:
                 accept_parts(guard, self.env, candidate, outcome)
         moved = not same_networks(before[0], state.accepted)
-        lost = settle(guard, self, self.fresh) if moved else ""
+        lost = confirm_on_new_starts(guard, self, self.fresh) if moved else ""
         returned = False
         if reason or lost:
             state.rejections += 1

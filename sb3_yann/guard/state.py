@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from sb3_yann.guard.actor_checkpoint import Snapshot
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,14 @@ class GuardState:
     """
 
     settings: dict[str, Any]
-    accepted: Snapshot
+    accepted: ActorCheckpoint
     evidence: Any
     step: float = 1.0
     episodes: int = 0
     rejections: int = 0
     fresh: int = 0
     next_start: int = 0
-    passed: list[tuple[Snapshot, Any]] = field(default_factory=list)
+    passed: list[tuple[ActorCheckpoint, Any]] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
 
 

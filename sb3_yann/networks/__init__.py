@@ -1,6 +1,6 @@
 """Networks that start as something known, exactly, and are trainable. torch, no SB3."""
 
-from sb3_yann.networks.paper_yann import LiteralYann
+from sb3_yann.networks.paper_yann import PaperYann
 from sb3_yann.networks.row_adam import RowAdam
 from sb3_yann.networks.value import (
     AfterstateValue,
@@ -13,7 +13,7 @@ from sb3_yann.networks.zero_output import ZeroOutputNetwork
 __all__ = [
     "AfterstateValue",
     "LinearPrediction",
-    "LiteralYann",
+    "PaperYann",
     "QuadraticStateActionValue",
     "RowAdam",
     "YannLayer",

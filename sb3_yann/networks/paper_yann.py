@@ -14,7 +14,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 
 
-class LiteralYann(nn.Module):
+class PaperYann(nn.Module):
     """theta -> u in physical units, (batch, n) -> (batch, m), zero outside every region.
 
     Subdomain identification (three layers), all affine laws with both signs, and a two-layer

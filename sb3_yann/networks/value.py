@@ -115,7 +115,7 @@ class AfterstateValue(nn.Module):
 
     At first it is the same function as :class:`QuadraticStateActionValue`, to rounding, where f is
     the linear model ``A theta + B u``. What is learnt is V alone, over predicted next states, of
-    which even a policy that never explores sees a whole neighbourhood of each state. How Q depends
+    which even a policy that never explores sees a whole neighborhood of each state. How Q depends
     on the action follows from the known stage cost and from the model: an error of the model bends
     the direction of improvement, but not the values that are compared, since V is fitted to the
     plant's own returns at the states the model predicts.

@@ -22,7 +22,7 @@ class YannLayer(nn.Module):
     network is zero at the origin for good, so the equilibrium stays where it is; unless it is
     not ``pinned``.
 
-    Neighbouring regions have networks of their own: once trained, the layer may jump where it
+    Neighboring regions have networks of their own: once trained, the layer may jump where it
     passes from one region to the next.
 
     Parameters
@@ -74,7 +74,7 @@ class YannLayer(nn.Module):
                 f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
                 "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
             )
-        self.outside, self.piecewise_affine, self.row_gradients = law.outside, law, False
+        self.infeasible, self.piecewise_affine, self.row_gradients = law.infeasible, law, False
         # The input range is 2 here. A little is left for the float32 rounding of what follows.
         self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
         self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
@@ -125,11 +125,11 @@ class YannLayer(nn.Module):
         if self.reach is not None:
             # The bound holds for weights that overflow, or are no numbers, as well.
             correction = correction.nan_to_num(0.0, self.reach, -self.reach)
-            correction = clamp_alive(correction, self.reach)
+            correction = clamp_with_inward_gradient(correction, self.reach)
         output = self._law(theta, region, inside) + correction
         if not self.rated:
-            return clamp_alive(output)
-        return clamp_alive_between(output, *self._within_reach(theta))
+            return clamp_with_inward_gradient(output)
+        return clamp_between_with_inward_gradient(output, *self._within_reach(theta))
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
@@ -160,7 +160,7 @@ class YannLayer(nn.Module):
 
     def _law(self, theta: th.Tensor, region: th.Tensor, inside: th.Tensor) -> th.Tensor:
         u = (self.gains[region] * theta[:, None]).sum(-1) + self.offsets[region]
-        if self.outside == "zero":
+        if self.infeasible == "zero_input":
             u = th.where(inside[:, None], u, self.resting)
         u = u.clamp(-1, 1).to(self.theta_half)
         return u.clamp(*self._within_reach(theta)) if self.rated else u
@@ -212,7 +212,7 @@ def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
     return A.reshape(law.n_theta, -1), b.ravel()
 
 
-class _ClampAlive(th.autograd.Function):
+class _InwardGradientClamp(th.autograd.Function):
     """Clamp to [low, high]; backward, stop only what would push further out."""
 
     @staticmethod
@@ -230,17 +230,17 @@ class _ClampAlive(th.autograd.Function):
         return grad.masked_fill(outward, 0.0), None, None
 
 
-def clamp_alive(x: th.Tensor, limit: float = 1.0) -> th.Tensor:
+def clamp_with_inward_gradient(x: th.Tensor, limit: float = 1.0) -> th.Tensor:
     """Return x clamped to [-limit, limit], with a gradient that can still lead back inside.
 
     The gradient of `torch.clamp` vanishes beyond the bounds, so a saturated region would never
     learn to leave its bound.
     """
-    clamped: th.Tensor = _ClampAlive.apply(x, -limit, limit)  # type: ignore[no-untyped-call]
+    clamped: th.Tensor = _InwardGradientClamp.apply(x, -limit, limit)  # type: ignore[no-untyped-call]
     return clamped
 
 
-def clamp_alive_between(x: th.Tensor, low: th.Tensor, high: th.Tensor) -> th.Tensor:
-    """Return x clamped to bounds of its own shape, with the gradient of :func:`clamp_alive`."""
-    clamped: th.Tensor = _ClampAlive.apply(x, low, high)  # type: ignore[no-untyped-call]
+def clamp_between_with_inward_gradient(x: th.Tensor, low: th.Tensor, high: th.Tensor) -> th.Tensor:
+    """Return x clamped to bounds of its own shape, and the inward gradient."""
+    clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
     return clamped

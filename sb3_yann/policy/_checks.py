@@ -32,7 +32,7 @@ def require_plain_td3(algorithm: BaseAlgorithm | None, other: dict[str, Any]) ->
         )
 
 
-def require_undone_normalisation(
+def require_undone_normalization(
     problem: LinearMPC, algorithm: BaseAlgorithm | None, observation: AffineObservation | None
 ) -> None:
     """Raise unless ``observation`` can undo what a VecNormalize does to the observations."""
@@ -44,7 +44,7 @@ def require_undone_normalisation(
         return
     if observation is None:
         raise ValueError(
-            "The VecNormalize normalises observations, and the law takes the state. Undo it: "
+            "The VecNormalize normalizes observations, and the law takes the state. Undo it: "
             "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}."
         )
     if normalize.observation_space.shape != algorithm.observation_space.shape:
@@ -57,7 +57,7 @@ def require_undone_normalisation(
     if largest > normalize.clip_obs:
         raise ValueError(
             f"The VecNormalize clips at clip_obs = {normalize.clip_obs:g}, but in the box of the "
-            f"law normalised observations reach {largest:.4g}: beyond the clipping the state is "
+            f"law normalized observations reach {largest:.4g}: beyond the clipping the state is "
             "not known. Set venv.clip_obs = numpy.inf."
         )
 
@@ -166,7 +166,7 @@ def _require_theta(
     observation: AffineObservation | None,
 ) -> None:
     """Raise unless theta is what is observed, or what ``observation`` makes of it."""
-    shape, names = observation_space.shape, ", ".join(problem.parameters.names)
+    shape, names = observation_space.shape, ", ".join(problem.layout.names)
     takes = f"takes theta of shape ({problem.n_theta},), that is {names}"
     if observation is None:
         if shape != (problem.n_theta,):

@@ -21,7 +21,7 @@ class AffineObservation(ReadOnlyArrays):
     ``policy_kwargs={"observation": ...}``. An observation of several dimensions is flattened first,
     in C order. Maps compose like matrices: ``outer @ inner`` applies ``inner`` first, so that an
     env that shows ``(T - 400) / 20`` as its only entry, for a law about 410, is undone by
-    ``AffineObservation.deviation([410]) @ AffineObservation.normalised([400], [20])``.
+    ``AffineObservation.deviation([410]) @ AffineObservation.normalized([400], [20])``.
 
     The map is computed in float64, and an observation of dtype float64 keeps all its digits on the
     way to the law. One of float32, as most are, has been rounded by ``2^-24`` (6e-8) of its own
@@ -68,7 +68,7 @@ class AffineObservation(ReadOnlyArrays):
         return cls(np.eye(len(steady)), -steady)
 
     @classmethod
-    def normalised(cls, mean: ArrayLike, std: ArrayLike) -> AffineObservation:
+    def normalized(cls, mean: ArrayLike, std: ArrayLike) -> AffineObservation:
         """Return ``theta = std * obs + mean``: the env shows ``(theta - mean) / std``.
 
         Parameters
@@ -153,12 +153,12 @@ class AffineObservation(ReadOnlyArrays):
         It gives what the env below shows. Where that is not theta yet, compose:
         ``AffineObservation.deviation(x_ss) @ AffineObservation.from_vec_normalize(venv)``.
         The policy also checks that no clipping (``clip_obs``) acts within the box of the law. It
-        takes normalised observations from then on, also where it is loaded without the env.
+        takes normalized observations from then on, also where it is loaded without the env.
 
         Raises
         ------
         ValueError
-            If there is no VecNormalize, its statistics still move, it normalises rewards, or it is
+            If there is no VecNormalize, its statistics still move, it normalizes rewards, or it is
             not what the learner sees.
         """
         normalize = unwrap_vec_normalize(venv)
@@ -175,7 +175,7 @@ class AffineObservation(ReadOnlyArrays):
             return cls.identity(int(np.prod(shape)))
         statistics = cast(RunningMeanStd, normalize.obs_rms)  # a dict only for a space of dicts
         std = np.sqrt(statistics.var + normalize.epsilon)
-        return cls.normalised(np.ravel(statistics.mean), np.ravel(std))
+        return cls.normalized(np.ravel(statistics.mean), np.ravel(std))
 
     @property
     def n_theta(self) -> int:
@@ -220,7 +220,7 @@ def require_frozen(normalize: VecNormalize) -> None:
     """Raise if a VecNormalize changes what it has said, or changes the rewards."""
     if normalize.norm_reward:
         raise ValueError(
-            "The VecNormalize normalises rewards: they are not the cost that the critic stands "
+            "The VecNormalize normalizes rewards: they are not the cost that the critic stands "
             "for. Pass norm_reward=False; policy_kwargs={'reward_scale': ...} takes care of sizes."
         )
     if normalize.norm_obs and normalize.training:

@@ -27,7 +27,7 @@ from sb3_yann.policy._checks import (
     require_critic_options,
     require_matching,
     require_plain_td3,
-    require_undone_normalisation,
+    require_undone_normalization,
     warn_of_absolute_inputs,
 )
 from sb3_yann.policy._features import AffineFeatures
@@ -118,7 +118,7 @@ class YannPolicy(TD3Policy):
         If a space is not a Box, or the algorithm is not TD3 or DDPG. (DDPG and TD3 themselves
         refuse actions that are no Box, or have no bounds, with an AssertionError of their own.)
     ValueError
-        If there is no problem, the spaces do not fit it, or the env normalises.
+        If there is no problem, the spaces do not fit it, or the env normalizes.
     """
 
     actor: YannActor
@@ -171,7 +171,7 @@ class YannPolicy(TD3Policy):
             algorithm.policy_kwargs = {**algorithm.policy_kwargs, "problem": self.problem}
         require_matching(self.problem, observation_space, action_space, observation)
         warn_of_absolute_inputs(self.problem, algorithm)
-        require_undone_normalisation(self.problem, algorithm, observation)
+        require_undone_normalization(self.problem, algorithm, observation)
         self.observation = observation
         self.gamma = getattr(algorithm, "gamma", 0.99) if gamma is None else gamma
         self.reward_scale, self.reward_offset = as_reward(reward_scale, reward_offset, self.gamma)
@@ -187,7 +187,7 @@ class YannPolicy(TD3Policy):
         }
         require_critic_options(critic, prediction_model, value_scale, critic_warmup)
         if pin_equilibrium is None:
-            pin_equilibrium = not self.problem.parameters.has_constants
+            pin_equilibrium = not self.problem.layout.has_constants
         if not isinstance(pin_equilibrium, bool):
             raise TypeError(f"pin_equilibrium = {pin_equilibrium!r} must be True or False.")
         if optimizer_class is th.optim.Adam and optimizer_kwargs is None:

@@ -86,7 +86,7 @@ LOW, HIGH = MPC.u_min.astype(np.float32), MPC.u_max.astype(np.float32)
 WRONG = {
     "NormalizeReward": (
         lambda: wrappers.NormalizeReward(plant()),
-        "normalised reward",
+        "normalized reward",
         "NormalizeReward",
         "Leave it out",
     ),
@@ -100,7 +100,7 @@ WRONG = {
         lambda: wrappers.TransformReward(plant(), lambda reward: -reward),
         "sign flipped",
         "TransformReward",
-        "The learner would maximise it",
+        "The learner would maximize it",
     ),
     "TransformReward: scale": (
         lambda: wrappers.TransformReward(plant(), lambda reward: 0.01 * reward),
@@ -182,9 +182,9 @@ WRONG = {
     ),
     "RescaleObservation": (
         lambda: wrappers.RescaleObservation(boxed(), np.float32(-1), np.float32(1)),
-        "normalised observation",
+        "normalized observation",
         "RescaleObservation",
-        "AffineObservation.normalised(mean=[0, 0.5, 1], std=[5, 5.5, 6])",
+        "AffineObservation.normalized(mean=[0, 0.5, 1], std=[5, 5.5, 6])",
     ),
     "absolute observations": (
         lambda: show_shifted(plant()),
@@ -295,7 +295,7 @@ def test_a_map_to_theta_is_taken_into_account() -> None:
 
 
 def test_penalties_at_violations_and_at_ends_are_no_mismatch() -> None:
-    def penalise(env, theta, action, outcome):
+    def penalize(env, theta, action, outcome):
         observation, reward, _, truncated, info = outcome
         violation = bool(np.abs(theta).max() > 1.5)
         over = bool(np.abs(observation).max() < 0.4)
@@ -310,17 +310,17 @@ def test_penalties_at_violations_and_at_ends_are_no_mismatch() -> None:
             },
         )
 
-    finding = audited(Changed(plant(), penalise)).finding
+    finding = audited(Changed(plant(), penalize)).finding
     assert finding.matches
     assert 10 < finding.steps < 95  # those with a penalty are left out
 
 
 def test_a_penalty_without_a_flag_is_a_mismatch() -> None:
-    def penalise(env, theta, action, outcome):
+    def penalize(env, theta, action, outcome):
         observation, reward, *rest = outcome
         return observation, reward - 100 * bool(np.abs(theta).max() > 1.5), *rest
 
-    assert audited(Changed(plant(), penalise)).finding.cause == "unknown"
+    assert audited(Changed(plant(), penalize)).finding.cause == "unknown"
 
 
 @pytest.mark.parametrize("start", [0.0, 1e-3, 0.05, 2.0])
@@ -390,12 +390,12 @@ def test_a_frozen_vec_normalize_is_seen_through() -> None:
     policy = {"observation": AffineObservation.from_vec_normalize(env)}
     assert audited(env, policy=policy).finding.matches
     forgotten = {"observation": AffineObservation.identity(3)}
-    assert audited(env, policy=forgotten).finding.cause == "normalised observation"
+    assert audited(env, policy=forgotten).finding.cause == "normalized observation"
 
 
 @pytest.mark.parametrize(
     ("switch", "cause"),
-    [("norm_reward", "normalised reward"), ("training", "normalised observation")],
+    [("norm_reward", "normalized reward"), ("training", "normalized observation")],
 )
 def test_a_vec_normalize_that_is_switched_on_later_is_named(switch, cause) -> None:
     env = VecNormalize(DummyVecEnv([plant]), training=False, norm_reward=False, clip_obs=np.inf)

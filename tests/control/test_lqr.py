@@ -52,7 +52,7 @@ def test_riccati_solution_satisfies_the_discounted_equation(gamma: float) -> Non
 
 
 @pytest.mark.parametrize("gamma", [*GAMMAS, 1.0])
-def test_gain_minimises_cost_plus_discounted_value(gamma: float) -> None:
+def test_gain_minimizes_cost_plus_discounted_value(gamma: float) -> None:
     P = lqr.riccati(TWO_BY_TWO, Q, R, gamma)
     x = np.array([0.7, -1.3])
 
@@ -72,7 +72,7 @@ def test_golden_ratio_is_the_riccati_solution_of_the_unit_integrator() -> None:
 
 @pytest.mark.parametrize("gamma", GAMMAS)
 def test_policy_value_is_the_simulated_discounted_sum(gamma: float) -> None:
-    K = np.array([[0.6, 0.1], [0.0, 0.4]])  # stabilising, and optimal for no weights in use
+    K = np.array([[0.6, 0.1], [0.0, 0.4]])  # stabilizing, and optimal for no weights in use
     x = np.array([1.0, -2.0])
     P, total, state = lqr.policy_value(TWO_BY_TWO, Q, R, K, gamma), 0.0, x
     for k in range(2000):
@@ -98,7 +98,7 @@ def test_no_gain_has_a_smaller_value_than_the_optimal_one() -> None:
         assert np.linalg.eigvalsh(other - P)[0] > -1e-12
 
 
-def test_a_law_that_does_not_stabilise_has_no_value() -> None:
+def test_a_law_that_does_not_stabilize_has_no_value() -> None:
     with pytest.raises(ValueError, match=r"infinite cost: the spectral radius .* below 1"):
         lqr.policy_value(DOUBLE_INTEGRATOR, np.eye(2), np.eye(1), np.zeros((1, 2)), 1.0)
 
@@ -125,7 +125,7 @@ def test_state_action_matrix_satisfies_bellman_under_the_law(
 
 @pytest.mark.parametrize("gamma", GAMMAS)
 @pytest.mark.parametrize("name", MPCS)
-def test_with_equal_discounts_the_law_maximises_its_own_critic(name: str, gamma: float) -> None:
+def test_with_equal_discounts_the_law_maximizes_its_own_critic(name: str, gamma: float) -> None:
     mpc = discounted(MPCS[name](), gamma)
     M, n = mpc.state_action_matrix(gamma), mpc.n_theta
     law = mpc.explicit()

@@ -102,7 +102,7 @@ def test_upright_is_a_fixed_point() -> None:
 # --- the printed model -------------------------------------------------------------------------
 
 
-def test_the_linearised_dynamics_give_the_printed_model() -> None:
+def test_the_linearized_dynamics_give_the_printed_model() -> None:
     plant = control.nlsys(
         lambda t, x, u, params: clipped_pendulum.dynamics(x, u), None, states=2, inputs=1, outputs=2
     )

@@ -150,7 +150,7 @@ def test_no_random_start_leads_to_where_a_step_is_divided_more_finely() -> None:
 
 @pytest.mark.parametrize("row", range(4))
 @pytest.mark.parametrize("column", range(4))
-def test_the_linearised_dynamics_give_the_printed_state_matrix_but_for_six_entries(
+def test_the_linearized_dynamics_give_the_printed_state_matrix_but_for_six_entries(
     linear_model: Any, row: int, column: int
 ) -> None:
     printed = cstr.PRINTED_A[row, column]
@@ -159,7 +159,7 @@ def test_the_linearised_dynamics_give_the_printed_state_matrix_but_for_six_entri
     assert (expected != printed) == ((row, column) in NOT_REPRODUCED)
 
 
-def test_the_linearised_dynamics_give_the_printed_input_matrix(linear_model: Any) -> None:
+def test_the_linearized_dynamics_give_the_printed_input_matrix(linear_model: Any) -> None:
     np.testing.assert_array_equal(np.round(linear_model.B, 4), cstr.PRINTED_B)
 
 

@@ -17,7 +17,7 @@ ENV_IDS = ["CSTR-v0", "ClippedPendulum-v0"]
 
 # Actions are in physical units on purpose: the controllers that these environments are for have
 # theirs in kJ/(h m2 K) and N m. Stable-Baselines3's actors rescale to the bounds by themselves.
-NORMALISE = "symmetric and normalized"
+NORMALIZE = "symmetric and normalized"
 
 
 def messages(check: Callable[[], None]) -> list[str]:
@@ -29,21 +29,21 @@ def messages(check: Callable[[], None]) -> list[str]:
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
-def test_gymnasium_only_recommends_normalised_actions(env_id: str) -> None:
+def test_gymnasium_only_recommends_normalized_actions(env_id: str) -> None:
     env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, render_mode="rgb_array").unwrapped
     (message,) = messages(lambda: gymnasium_check(env))
     assert "For Box action spaces, we recommend" in message
-    assert NORMALISE in message
+    assert NORMALIZE in message
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 @pytest.mark.parametrize("wrapped", [True, False])
-def test_stable_baselines3_only_recommends_normalised_actions(env_id: str, wrapped: bool) -> None:
+def test_stable_baselines3_only_recommends_normalized_actions(env_id: str, wrapped: bool) -> None:
     env: gymnasium.Env[Any, Any] = gymnasium.make(env_id, render_mode="rgb_array")
     checked = env if wrapped else env.unwrapped
     (message,) = messages(lambda: sb3_check(checked, warn=True, skip_render_check=False))
     assert "We recommend you to use a" in message
-    assert NORMALISE in message
+    assert NORMALIZE in message
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)

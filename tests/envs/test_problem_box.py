@@ -1,4 +1,4 @@
-"""A ProblemBox is a Box that hands its problem to whoever asks, wherever it has travelled."""
+"""A ProblemBox is a Box that hands its problem to whoever asks, wherever it has traveled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The vectorised environments are the single ones, many at a time."""
+"""The vectorized environments are the single ones, many at a time."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def test_episodes_side_by_side_are_those_of_one_env_after_the_other(env_id) -> N
 
 @pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
 @pytest.mark.parametrize("start", [None, -0.9])
-def test_episodes_of_a_vectorised_env_are_those_of_single_ones_to_rounding(env_id, start) -> None:
+def test_episodes_of_a_vectorized_env_are_those_of_single_ones_to_rounding(env_id, start) -> None:
     env = gym.make(env_id)
     law, n = env.observation_space.problem.explicit(), env.observation_space.shape[0]
     starts = None if start is None else [np.full(n, start * k / 2) * np.eye(n)[-1] for k in SEEDS]
@@ -77,7 +77,7 @@ def test_episodes_of_a_vectorised_env_are_those_of_single_ones_to_rounding(env_i
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
-def test_an_episode_of_a_vectorised_env_stops_where_it_ends() -> None:
+def test_an_episode_of_a_vectorized_env_stops_where_it_ends() -> None:
     starts, u = [[0, 0.3, 0, 4.0], [0, 0, 0, -5.0]], np.full(1, -55, np.float32)
     together = evaluate(lambda _: u, "CSTR-v0", [0, 1], starts)
     alone = evaluate(lambda _: u, gym.make("CSTR-v0"), [0, 1], starts)

@@ -84,7 +84,7 @@ def test_no_change_of_an_input_makes_it_cheaper(plant) -> None:
     ("env_id", "start"),
     [("CSTR-v0", [0.03, 0.3, -0.2, 3.0]), ("ClippedPendulum-v0", [0.2, -0.1])],
 )
-def test_a_general_optimiser_finds_the_same_cost(env_id, start) -> None:
+def test_a_general_optimizer_finds_the_same_cost(env_id, start) -> None:
     # Few steps: L-BFGS-B with differences of the environment's cost, from no input at all.
     _, optimal, _, max_input, _ = PLANTS[env_id]
     found = minimize(

@@ -300,7 +300,7 @@ def test_a_plant_alone_draws_no_random_numbers() -> None:
 def test_of_episodes_that_end_at_one_step_no_more_count_than_a_block_has() -> None:
     model = still(env=DummyVecEnv([plant] * 4))
     guard = guard_alone(trial_episodes=6)
-    move = At([2 * STEPS + 1], better)  # vectorised steps: two rounds of four episodes a block
+    move = At([2 * STEPS + 1], better)  # vectorized steps: two rounds of four episodes a block
     train(model, 4 * 6 * STEPS, move, guard, phases := Phases(guard))
     assert phases.phases[2 * STEPS - 1 :: 2 * STEPS] == ["learning", "trial", "learning"]
     assert verdicts(guard) == ["accepted"]

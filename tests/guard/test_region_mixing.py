@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3 import DDPG, TD3
 
 from guard_samples import (
-    CENTRE,
+    CENTER,
     LEFT,
     REGION,
     RIGHT,
@@ -28,16 +28,16 @@ from guard_samples import (
 )
 from sb3_yann.evaluation.episodes import evaluate
 from sb3_yann.guard import region_mixing as guard_regions
-from sb3_yann.guard.actor_checkpoint import Snapshot
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import YannPolicy
 
 
 @th.no_grad()
-def spoil_centre(policy: YannPolicy) -> None:
+def spoil_center(policy: YannPolicy) -> None:
     network = policy.actor.mu.network
-    network.first.nodes[REGION[CENTRE], ..., :-1] = 3.0
-    network.first.nodes[REGION[CENTRE], ..., -1] = 0.0
-    network.rest[-1].weight[REGION[CENTRE]] = 3.0
+    network.first.nodes[REGION[CENTER], ..., :-1] = 3.0
+    network.first.nodes[REGION[CENTER], ..., -1] = 0.0
+    network.rest[-1].weight[REGION[CENTER]] = 3.0
 
 
 def half_good(policy: YannPolicy) -> None:
@@ -45,9 +45,9 @@ def half_good(policy: YannPolicy) -> None:
     correct(policy, RIGHT, 0.5)
 
 
-def rows(snapshot: Snapshot, region: int) -> list[object]:
+def rows(checkpoint: ActorCheckpoint, region: int) -> list[object]:
     """Return what belongs to a region: parameters of actor and target, and moments."""
-    parts = [snapshot.actor, snapshot.target, *snapshot.optimizer["state"].values()]
+    parts = [checkpoint.actor, checkpoint.target, *checkpoint.optimizer["state"].values()]
     tensors = [
         value
         for part in parts
@@ -60,20 +60,20 @@ def rows(snapshot: Snapshot, region: int) -> list[object]:
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorithm) -> None:
     model, guard = build(algorithm), make_guard(margin=0.03)
-    snapshots: dict[str, Snapshot] = {}
+    checkpoints: dict[str, ActorCheckpoint] = {}
 
     def change(policy) -> None:
-        snapshots["accepted"] = guard.state.accepted
+        checkpoints["accepted"] = guard.state.accepted
         half_good(policy)
-        snapshots["candidate"] = Snapshot.of(policy)
+        checkpoints["candidate"] = ActorCheckpoint.of(policy)
 
     step = 3 * STEPS  # the first candidate, from the first episode, is accepted with its moments
     seen: list[bool] = []
     look = At([step], lambda policy: seen.append(actor_bits(policy) == accepted_bits(guard)))
-    keep = At([step], lambda policy: snapshots.update(mixed=Snapshot.of(policy)))
+    keep = At([step], lambda policy: checkpoints.update(mixed=ActorCheckpoint.of(policy)))
     fix = At([STEPS], lambda policy: correct(policy, LEFT, -0.2))
     train(model, step, fix, At([step], change), guard, look, keep)
-    assert snapshots["accepted"].optimizer["state"]
+    assert checkpoints["accepted"].optimizer["state"]
     (decision,) = [each for each in guard.decisions if each.timestep == step][:1]
     assert decision.verdict == "accepted in part"
     assert REGION[RIGHT] in decision.regions
@@ -81,8 +81,8 @@ def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorit
     assert "costs" in decision.reason
     for region in REGION.values():
         source = "candidate" if region in decision.regions else "accepted"
-        assert rows(snapshots["mixed"], region) == rows(snapshots[source], region)
-    assert rows(snapshots["candidate"], 0) != rows(snapshots["accepted"], 0)
+        assert rows(checkpoints["mixed"], region) == rows(checkpoints[source], region)
+    assert rows(checkpoints["candidate"], 0) != rows(checkpoints["accepted"], 0)
     assert seen == [True]
 
 
@@ -121,7 +121,7 @@ def test_a_region_that_no_start_comes_through_is_never_taken_over() -> None:
     model, guard = build(gradient_steps=0), make_guard(simulator)
 
     def change(policy) -> None:
-        spoil_centre(policy)
+        spoil_center(policy)
         correct(policy, RIGHT, 0.5)
         correct(policy, LEFT, -0.5)
 
@@ -165,10 +165,12 @@ def test_regions_may_be_taken_over_while_patience_lasts() -> None:
 def test_moments_that_the_accepted_policy_has_not_got_are_zero_elsewhere() -> None:
     trained = build()
     train(trained, 3)
-    mixed = Snapshot.of(build().policy).with_regions(Snapshot.of(trained.policy), [REGION[RIGHT]])
+    mixed = ActorCheckpoint.of(build().policy).with_regions(
+        ActorCheckpoint.of(trained.policy), [REGION[RIGHT]]
+    )
     assert mixed.optimizer["state"]
     for state in mixed.optimizer["state"].values():
         assert float(state["step"]) == 3
-        for region in (REGION[LEFT], REGION[CENTRE]):
+        for region in (REGION[LEFT], REGION[CENTER]):
             assert not state["exp_avg"][region].any()
             assert not state["exp_avg_sq"][region].any()

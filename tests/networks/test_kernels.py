@@ -48,13 +48,13 @@ def rate_of(law) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("outside", ["nearest", "zero"])
+@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
 @pytest.mark.parametrize("options", [{}, {"max_correction": 0.1}, {"pinned": False}, "rate"])
 @pytest.mark.parametrize("size", [0.1, 0.5])
 def test_the_layer_is_that_of_torch_inside_and_outside_the_domain(
-    name: str, outside: str, options, size: float
+    name: str, infeasible: str, options, size: float
 ) -> None:
-    law = law_of(name, outside)
+    law = law_of(name, infeasible)
     options = {"rate": rate_of(law)} if options == "rate" else options
     layer = YannLayer(law, **options)
     shaken(layer, size)
@@ -326,9 +326,9 @@ def test_autocast_runs_the_operations_of_torch() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_regions_are_those_whose_networks_are_used(name: str) -> None:
-    layer = YannLayer(law_of(name, "nearest"))
+    layer = YannLayer(law_of(name, "nearest_region"))
     shaken(layer, 0.1)
-    theta = box_points(law_of(name, "nearest"), 60, stretch=1.5)
+    theta = box_points(law_of(name, "nearest_region"), 60, stretch=1.5)
     layer.row_gradients = True
     for row, region in zip(theta, layer.regions(theta), strict=True):
         for gradient in gradients(layer(row[None]), layer):

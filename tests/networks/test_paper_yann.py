@@ -12,7 +12,7 @@ import torch as th
 from sample_laws import PROBLEMS, box_points, facet_points, law_of, smallest_slack
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.networks import YannLayer
-from sb3_yann.networks.paper_yann import LiteralYann
+from sb3_yann.networks.paper_yann import PaperYann
 
 EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
 
@@ -46,7 +46,7 @@ def well_inside(law: PiecewiseAffine, count: int, margin: float) -> th.Tensor:
 def test_parameter_counts_are_those_of_the_paper(
     name: str, width: int, total: int, trainable: int
 ) -> None:
-    parameters = list(LiteralYann(law_of(name), width).parameters())
+    parameters = list(PaperYann(law_of(name), width).parameters())
     assert sum(p.numel() for p in parameters) == total
     assert sum(p.numel() for p in parameters if p.requires_grad) == trainable
 
@@ -58,7 +58,7 @@ def test_network_is_the_law_away_from_facets(name: str, width: int) -> None:
     law = law_of(name)
     theta = well_inside(law, 5000, margin=1e-6).double()
     assert len(theta) > 1000
-    u = LiteralYann(law, width)(theta).detach().numpy()
+    u = PaperYann(law, width)(theta).detach().numpy()
     np.testing.assert_allclose(u, law(theta.numpy()), rtol=0, atol=1e-9)
 
 
@@ -69,14 +69,14 @@ def test_network_is_the_fast_form_away_from_facets(name: str) -> None:
     theta = well_inside(law, 5000, margin=1e-6).double()
     action = YannLayer(law).double()(theta).detach().numpy()
     u = (law.u_max + law.u_min) / 2 + action * (law.u_max - law.u_min) / 2
-    np.testing.assert_allclose(LiteralYann(law, 8)(theta).detach().numpy(), u, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(PaperYann(law, 8)(theta).detach().numpy(), u, rtol=0, atol=1e-9)
 
 
 @EVERY_LAW
 def test_float32_loses_what_the_suppression_constant_swallows(name: str) -> None:
     law = law_of(name)
     theta = well_inside(law, 5000, margin=1e-4)
-    network = LiteralYann(law, 8)
+    network = PaperYann(law, 8)
     error = np.abs(network(theta).detach().numpy() - law(theta.numpy()))
     suppression = float(network.fixed["suppress_bias"].abs().max())
     assert error.max() < 8 * np.finfo(np.float32).eps * suppression
@@ -94,7 +94,7 @@ def test_network_doubles_or_drops_the_law_on_facets() -> None:
     normal = law.A[nearest] / np.sum(law.A[nearest] ** 2, axis=1, keepdims=True)
     on_facet = theta.numpy() + slack[np.arange(len(theta)), nearest, None] * normal
     u = law(on_facet)[:, 0]
-    got = LiteralYann(law, 8)(th.as_tensor(on_facet)).detach().numpy()[:, 0]
+    got = PaperYann(law, 8)(th.as_tensor(on_facet)).detach().numpy()[:, 0]
     clear = np.abs(u) > 0.1
     ratio = got[clear] / u[clear]
     doubled, dropped = np.abs(ratio - 2) < 1e-6, np.abs(ratio) < 1e-6
@@ -108,13 +108,13 @@ def test_output_is_zero_where_no_region_holds_theta(name: str) -> None:
     theta = th.cat([box_points(law, 5000), box_points(law, 5000, stretch=1.02)])
     theta = theta[th.as_tensor(smallest_slack(law, theta).max(axis=1) < -1e-4)]
     assert len(theta) > 20
-    assert not th.any(LiteralYann(law, 8)(theta))
+    assert not th.any(PaperYann(law, 8)(theta))
 
 
 @EVERY_LAW
 def test_inactive_regions_stay_suppressed_whatever_is_learnt(name: str) -> None:
     law = law_of(name)
-    network = LiteralYann(law, 16)
+    network = PaperYann(law, 16)
     for weight in (network.first_weight, network.first_bias, network.second_weight):
         th.nn.init.normal_(weight, std=100.0)  # every node at its bound of 1
     theta = box_points(law, 5000, stretch=1.02)
@@ -127,7 +127,7 @@ def test_inactive_regions_stay_suppressed_whatever_is_learnt(name: str) -> None:
 @pytest.mark.usefixtures("float64")
 def test_every_trainable_entry_has_moved_after_the_second_update_and_no_other(width: int) -> None:
     law = law_of("pendulum")
-    network = LiteralYann(law, width)
+    network = PaperYann(law, width)
     before = copy.deepcopy(network)
     theta = box_points(law, 5000).double()
     optimizer = th.optim.Adam([p for p in network.parameters() if p.requires_grad], 1e-3)
@@ -141,6 +141,6 @@ def test_every_trainable_entry_has_moved_after_the_second_update_and_no_other(wi
 
 def test_fixed_parameters_get_no_gradient() -> None:
     law = law_of("pendulum")
-    network = LiteralYann(law, 8)
+    network = PaperYann(law, 8)
     network(box_points(law, 100)).sum().backward()
     assert all(parameter.grad is None for parameter in network.fixed.values())

@@ -21,10 +21,10 @@ from sample_laws import (
 from sb3_yann import LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.networks import YannLayer
-from sb3_yann.networks.yann import clamp_alive
+from sb3_yann.networks.yann import clamp_with_inward_gradient
 
 EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
-OUTSIDE = pytest.mark.parametrize("outside", ["nearest", "zero"])
+INFEASIBLE = pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
 
 
 @pytest.fixture(autouse=True)
@@ -56,10 +56,10 @@ def train(layer: YannLayer, theta: th.Tensor, target: float, steps: int = 20) ->
 # --- the law -----------------------------------------------------------------------------------
 
 
-@OUTSIDE
+@INFEASIBLE
 @EVERY_LAW
-def test_layer_is_the_law_inside_and_outside_the_feasible_set(name: str, outside: str) -> None:
-    law = law_of(name, outside)
+def test_layer_is_the_law_inside_and_outside_the_feasible_set(name: str, infeasible: str) -> None:
+    law = law_of(name, infeasible)
     theta = th.cat([box_points(law, 20_000), box_points(law, 20_000, stretch=3)])
     assert 0.1 < np.mean(law.in_domain(theta.numpy())) < 0.9
     with th.no_grad():
@@ -171,21 +171,21 @@ def test_empty_batch_gives_an_empty_batch() -> None:
 # --- the bounds --------------------------------------------------------------------------------
 
 
-@OUTSIDE
+@INFEASIBLE
 @EVERY_LAW
 @pytest.mark.parametrize("weights", [1.0, 1e6, 1e30])
-def test_output_never_leaves_the_bounds(name: str, outside: str, weights: float) -> None:
-    law = law_of(name, outside)
+def test_output_never_leaves_the_bounds(name: str, infeasible: str, weights: float) -> None:
+    law = law_of(name, infeasible)
     layer = scrambled(YannLayer(law), weights)
     for stretch in (1.0, 1e3, 1e6):
         action = layer(box_points(law, 2000, stretch=stretch))
         assert bool(th.all(action.abs() <= 1))
 
 
-@OUTSIDE
+@INFEASIBLE
 @EVERY_LAW
-def test_output_far_out_is_within_the_bounds_at_first(name: str, outside: str) -> None:
-    law = law_of(name, outside)
+def test_output_far_out_is_within_the_bounds_at_first(name: str, infeasible: str) -> None:
+    law = law_of(name, infeasible)
     theta = 1e6 * (2 * th.rand(5000, law.n_theta) - 1)
     assert bool(th.all(YannLayer(law)(theta).abs() <= 1))
 
@@ -193,12 +193,12 @@ def test_output_far_out_is_within_the_bounds_at_first(name: str, outside: str) -
 @pytest.mark.parametrize("limit", [0.0, 0.1, 1.0, 2.0])
 def test_clamp_alive_is_the_clamp(limit: float) -> None:
     x = th.cat([3 * th.randn(1000), th.tensor([-1.0, 1.0, th.inf, -th.inf, 0.0])])
-    assert th.equal(clamp_alive(x, limit), x.clamp(-limit, limit))
+    assert th.equal(clamp_with_inward_gradient(x, limit), x.clamp(-limit, limit))
 
 
 def test_clamp_alive_has_a_limit_of_one_by_default() -> None:
     x = 3 * th.randn(1000)
-    assert th.equal(clamp_alive(x), x.clamp(-1, 1))
+    assert th.equal(clamp_with_inward_gradient(x), x.clamp(-1, 1))
 
 
 @pytest.mark.parametrize(
@@ -220,14 +220,14 @@ def test_clamp_alive_stops_only_what_would_push_further_out(
     # Descent moves x up where its gradient is negative.
     for gradient, passes in ((-0.7, passes_up), (0.7, passes_down)):
         leaf = th.tensor([limit * x], requires_grad=True)
-        clamp_alive(leaf, limit).backward(th.tensor([gradient]))
+        clamp_with_inward_gradient(leaf, limit).backward(th.tensor([gradient]))
         assert leaf.grad is not None
         assert leaf.grad.item() == pytest.approx(gradient if passes else 0.0)
 
 
 def test_clamp_alive_treats_each_component_by_itself() -> None:
     x = th.tensor([[2.0, 2.0], [-2.0, 0.5]], requires_grad=True)
-    clamp_alive(x).backward(th.tensor([[-1.0, 3.0], [-2.0, -4.0]]))
+    clamp_with_inward_gradient(x).backward(th.tensor([[-1.0, 3.0], [-2.0, -4.0]]))
     assert x.grad is not None
     assert x.grad.tolist() == [[0.0, 3.0], [-2.0, -4.0]]
 
@@ -238,7 +238,7 @@ def test_descent_returns_from_saturation(start: float) -> None:
     optimizer = th.optim.SGD([x], 0.1)
     for _ in range(100):
         optimizer.zero_grad()
-        (clamp_alive(x) - 0.25).square().sum().backward()
+        (clamp_with_inward_gradient(x) - 0.25).square().sum().backward()
         optimizer.step()
     assert x.item() == pytest.approx(0.25, abs=1e-4)
 
@@ -248,7 +248,7 @@ def test_descent_towards_a_bound_does_not_run_away_beyond_it() -> None:
     optimizer = th.optim.SGD([x], 0.1)
     for _ in range(100):
         optimizer.zero_grad()
-        (-clamp_alive(x)).sum().backward()
+        (-clamp_with_inward_gradient(x)).sum().backward()
         optimizer.step()
     assert 1 <= x.item() < 1.11  # one step of 0.1 beyond
 
@@ -265,13 +265,13 @@ def test_saturated_region_learns_to_leave_its_bound() -> None:
 # --- the bound on the correction ---------------------------------------------------------------
 
 
-@OUTSIDE
+@INFEASIBLE
 @EVERY_LAW
 @pytest.mark.parametrize("bound", [0.1, 0.5])
 def test_output_is_never_further_from_the_law_than_the_bound(
-    name: str, outside: str, bound: float
+    name: str, infeasible: str, bound: float
 ) -> None:
-    law = law_of(name, outside)
+    law = law_of(name, infeasible)
     layer = scrambled(YannLayer(law, max_correction=bound), 1e3)
     theta = box_points(law, 5000, stretch=3)
     with th.no_grad():
@@ -392,10 +392,10 @@ def test_every_region_learns(name: str) -> None:
         assert bool((new != old).flatten(1).any(1)[visited].all())
 
 
-@OUTSIDE
+@INFEASIBLE
 @EVERY_LAW
-def test_equilibrium_is_where_it_was_after_training(name: str, outside: str) -> None:
-    law = law_of(name, outside)
+def test_equilibrium_is_where_it_was_after_training(name: str, infeasible: str) -> None:
+    law = law_of(name, infeasible)
     layer = YannLayer(law)
     origin = th.zeros(1, law.n_theta)
     at_rest = to_action(law, np.zeros((1, law.n_inputs))).float()
@@ -414,10 +414,10 @@ def test_region_away_from_the_origin_is_not_pinned() -> None:
     assert bool(pinned[law.locate(np.zeros(2))])
 
 
-@OUTSIDE
+@INFEASIBLE
 @EVERY_LAW
-def test_equilibrium_moves_where_no_region_is_pinned(name: str, outside: str) -> None:
-    law = law_of(name, outside)
+def test_equilibrium_moves_where_no_region_is_pinned(name: str, infeasible: str) -> None:
+    law = law_of(name, infeasible)
     layer = YannLayer(law, pinned=False)
     assert not layer.network.pinned.any()
     origin = th.zeros(1, law.n_theta)

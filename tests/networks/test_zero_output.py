@@ -249,7 +249,7 @@ def test_stack_computes_what_its_networks_compute_alone() -> None:
 @pytest.mark.parametrize("hidden", [(16,), (16, 16)])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_pinned_output_at_zero_stays_exactly_zero(activation: str, hidden: tuple[int, ...]) -> None:
-    # With a target that is not 0 there, and in batches of odd sizes, where vectorised kernels
+    # With a target that is not 0 there, and in batches of odd sizes, where vectorized kernels
     # round differently from entry to entry.
     net = ZeroOutputNetwork(
         2, 1, hidden, activation=ACTIVATIONS[activation], pinned=pins(True, True)

@@ -60,7 +60,7 @@ def test_rates_are_kept_whatever_the_weights(
     rng = np.random.default_rng(0)
     box = mpc.theta_min, mpc.theta_max  # inside the domain and outside
     theta = rng.uniform(*box, (5000, mpc.n_theta)).astype(np.float32)
-    moved = model.predict(theta)[0] - theta[:, mpc.parameters.previous]
+    moved = model.predict(theta)[0] - theta[:, mpc.layout.previous]
     assert np.all((mpc.du_min <= moved) & (moved <= mpc.du_max))
     assert np.max(moved / mpc.du_max) > 0.999  # and they are what holds it
 
@@ -70,7 +70,7 @@ def test_an_output_at_the_limit_of_its_rate_learns_to_leave_it() -> None:
     model = DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs={"problem": mpc})
     layer = model.actor.mu
     theta = th.zeros(1, mpc.n_theta)
-    theta[0, mpc.parameters.reference] = 1.0  # asks for more than the rate allows
+    theta[0, mpc.layout.reference] = 1.0  # asks for more than the rate allows
     assert layer(theta).item() == pytest.approx((0.7 - 0.5) / 1.5, abs=1e-5)
     optimizer = th.optim.Adam(layer.parameters(), 1e-2)
     for _ in range(100):

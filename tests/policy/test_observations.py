@@ -66,9 +66,9 @@ def error(model, observations: np.ndarray, theta: np.ndarray) -> float:
 
 # What an env may show of x = theta, and the map that undoes it.
 SHOWN = {
-    "normalised": (
+    "normalized": (
         lambda x: (x - [1, 2, 3]) / [4, 5, 0.1],
-        AffineObservation.normalised([1, 2, 3], [4, 5, 0.1]),
+        AffineObservation.normalized([1, 2, 3], [4, 5, 0.1]),
         3,
     ),
     "rescaled": (
@@ -87,10 +87,10 @@ SHOWN = {
         AffineObservation.minus_set_point([2, 3, 1], [0, None, None], 4),
         4,
     ),
-    "normalised deviations of what is absolute": (
+    "normalized deviations of what is absolute": (
         lambda x: (x - [5, -2, -1]) / [10, 20, 30],
         AffineObservation.deviation([300, 2, 1])
-        @ AffineObservation.normalised([305, 0, 0], [10, 20, 30]),
+        @ AffineObservation.normalized([305, 0, 0], [10, 20, 30]),
         3,
     ),
 }
@@ -167,7 +167,7 @@ def test_the_map_of_gymnasium_s_rescaling_is_the_one_that_undoes_it() -> None:
 @pytest.mark.parametrize("reward", [(1.0, 0.0), (0.01, 0.0), (3.0, -20.0), (250.0, 7.0)])
 def test_sb3_s_own_critic_loss_is_zero_at_the_start(critic, reward) -> None:
     scale, offset = reward
-    show, observation, size = SHOWN["normalised"]
+    show, observation, size = SHOWN["normalized"]
     kwargs = {"critic": critic, "reward_scale": scale, "reward_offset": offset}
     model = build(Seen(show, size), observation, policy_kwargs=kwargs)
     model.learn(1)  # sets up the logger
@@ -232,7 +232,7 @@ def test_a_reward_that_means_nothing_is_named(kwargs, error, message) -> None:
 
 
 def test_a_map_is_part_of_what_is_saved(tmp_path) -> None:
-    show, observation, size = SHOWN["normalised"]
+    show, observation, size = SHOWN["normalized"]
     kwargs = {"reward_scale": 2.0, "reward_offset": 3.0}
     model = build(Seen(show, size), observation, policy_kwargs=kwargs)
     model.learn(50, callback=NoActionNoise())
@@ -276,7 +276,7 @@ def test_maps_compose_like_functions() -> None:
 
 
 def normalize(frozen: bool = True, n_envs: int = 1, **kwargs) -> VecNormalize:
-    """Return an env of absolute values, normalised by the statistics of a few steps."""
+    """Return an env of absolute values, normalized by the statistics of a few steps."""
     plants = [lambda: Seen(lambda x: x + STEADY, 3)] * n_envs
     env = VecNormalize(DummyVecEnv(plants), **{"norm_reward": False, "clip_obs": np.inf} | kwargs)
     env.seed(0)
@@ -322,7 +322,7 @@ def mpc_costs(seeds) -> list[float]:
     ("make", "message"),
     [
         (lambda: normalize(frozen=False), "still moves its statistics"),
-        (lambda: normalize(norm_reward=True), "normalises rewards"),
+        (lambda: normalize(norm_reward=True), "normalizes rewards"),
         (lambda: VecFrameStack(normalize(), 2), "Make VecNormalize the last wrapper"),
         (lambda: DummyVecEnv([lambda: LinearPlant(MPC)]), "holds no VecNormalize"),
     ],
@@ -336,7 +336,7 @@ def test_a_vec_normalize_that_cannot_be_undone_is_refused(make, message) -> None
     ("make", "observation", "message"),
     [
         (lambda: normalize(frozen=False), ABSOLUTE, "still moves its statistics"),
-        (lambda: normalize(norm_reward=True), ABSOLUTE, "normalises rewards"),
+        (lambda: normalize(norm_reward=True), ABSOLUTE, "normalizes rewards"),
         (normalize, None, r"AffineObservation\.from_vec_normalize\(venv\)"),
         (
             lambda: VecFrameStack(normalize(), 2),
@@ -396,8 +396,8 @@ def test_a_map_that_does_not_fit_is_named(observation, error, message) -> None:
         (lambda: AffineObservation([[1]], [1, 2]), ValueError, "t0 has shape"),
         (lambda: AffineObservation([["a"]]), TypeError, "T = "),
         (lambda: AffineObservation([[np.nan]]), ValueError, "T holds NaN"),
-        (lambda: AffineObservation.normalised([0], [0]), ValueError, "std"),
-        (lambda: AffineObservation.normalised([0, 0], [1]), ValueError, "std has shape"),
+        (lambda: AffineObservation.normalized([0], [0]), ValueError, "std"),
+        (lambda: AffineObservation.normalized([0, 0], [1]), ValueError, "std has shape"),
         (lambda: AffineObservation.rescaled([1], [0]), ValueError, "must lie below"),
         (lambda: AffineObservation.rescaled([0], [1], to=(1, 1)), ValueError, "to = "),
         (lambda: AffineObservation.pick([3], 3), ValueError, "indices from 0 to 2"),

@@ -797,9 +797,9 @@ def test_integer_actions_are_refused() -> None:
         make_policy(unbounded(), spaces.Box(-1, 1, (1,), np.int32), problem=scalar_mpc())
 
 
-@pytest.mark.parametrize("normalised", ["norm_obs", "norm_reward"])
-def test_a_normalising_env_is_refused(normalised) -> None:
-    switches = {"norm_obs": False, "norm_reward": False, normalised: True}
+@pytest.mark.parametrize("normalized", ["norm_obs", "norm_reward"])
+def test_a_normalizing_env_is_refused(normalized) -> None:
+    switches = {"norm_obs": False, "norm_reward": False, normalized: True}
     env = VecNormalize(make_vec_env("sb3_yann:CSTR-v0"), **switches)
     with pytest.raises(ValueError, match="VecNormalize"):
         DDPG(YannPolicy, env)

@@ -32,7 +32,7 @@ from sb3_yann import (
     NoActionNoise,
     YannPolicy,
 )
-from sb3_yann.guard.actor_checkpoint import Snapshot
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 
 MPC = two_input_mpc()
 STEPS = 6
@@ -120,7 +120,7 @@ def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm
 
     def note(guard: ImprovementGuard) -> None:
         tried.append(guard.state.episodes)
-        learnt.append(Snapshot.of(guard.policy).networks())
+        learnt.append(ActorCheckpoint.of(guard.policy).networks())
         attempt(guard)
 
     guard.trials._try = note
@@ -157,7 +157,7 @@ def stacked(n: int):
     return VecFrameStack(DummyVecEnv([lambda: plant(0.05)] * n), 3)
 
 
-def normalised(n: int):
+def normalized(n: int):
     env = VecNormalize(
         DummyVecEnv([lambda: plant(0.05)] * n), norm_reward=False, clip_obs=np.inf, training=False
     )
@@ -166,7 +166,7 @@ def normalised(n: int):
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-@pytest.mark.parametrize("kind", ["plain", "stacked", "normalised"])
+@pytest.mark.parametrize("kind", ["plain", "stacked", "normalized"])
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_a_time_limit_is_no_end_to_the_critic(algorithm, kind, n_envs) -> None:
     if kind == "plain":
@@ -174,7 +174,7 @@ def test_a_time_limit_is_no_end_to_the_critic(algorithm, kind, n_envs) -> None:
     elif kind == "stacked":
         env, observation = stacked(n_envs), AffineObservation.newest_frame(3, 3)
     else:
-        env = normalised(n_envs)
+        env = normalized(n_envs)
         observation = AffineObservation.from_vec_normalize(env)
     quiet = {"target_policy_noise": 0.0} if algorithm is TD3 else {}
     policy = {"observation": observation, "reward_scale": 1.0}

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
 
-LEFT, CENTRE, RIGHT = range(3)
+LEFT, CENTER, RIGHT = range(3)
 STEPS = 4
 """Steps of an episode."""
 
@@ -37,7 +37,7 @@ def slide_mpc() -> LinearMPC:
 MPC = slide_mpc()
 LAW = MPC.explicit()
 _SIDES = [int(LAW.locate(np.array([x]))) for x in (-4.0, 0.0, 4.0)]
-REGION = dict(zip((LEFT, CENTRE, RIGHT), _SIDES, strict=True))
+REGION = dict(zip((LEFT, CENTER, RIGHT), _SIDES, strict=True))
 
 
 class Slide(gym.Env):
@@ -90,7 +90,7 @@ def make_guard(env: Any = Slide, **kwargs) -> ImprovementGuard:
 
 @th.no_grad()
 def correct(policy: YannPolicy, region: int, value: float) -> None:
-    """Make the actor's input in a region (not the centre) the MPC's plus a constant."""
+    """Make the actor's input in a region (not the center) the MPC's plus a constant."""
     policy.actor.mu.network.rest[-1].weight[REGION[region]] = 0.0
     policy.actor.mu.network.rest[-1].weight[REGION[region], :, -1] = value
 

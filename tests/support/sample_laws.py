@@ -62,8 +62,8 @@ def solved(name: str) -> LinearMPC:
     return mpc
 
 
-def law_of(name: str, outside: str = "nearest") -> PiecewiseAffine:
-    return replace(solved(name).explicit(), outside=outside)
+def law_of(name: str, infeasible: str = "nearest_region") -> PiecewiseAffine:
+    return replace(solved(name).explicit(), infeasible=infeasible)
 
 
 def box_points(law: PiecewiseAffine, count: int, stretch: float = 1.0, seed: int = 0) -> th.Tensor:

@@ -31,7 +31,7 @@ class ExplicitLimitError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Limits:
+class SolveBudget:
     """How long a search may take.
 
     Attributes
@@ -80,19 +80,19 @@ class Limits:
             )
 
 
-class Watch:
+class BudgetTimer:
     """Counts the regions of one search, shows them, and ends it at its limits.
 
     The time counts from when this is made.
     """
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: SolveBudget) -> None:
         self.limits, self.found, self._start = limits, 0, time.monotonic()
         self._bar = tqdm(
             desc="Critical regions", unit=" regions", leave=False, disable=not limits.progress
         )
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> BudgetTimer:
         return self
 
     def __exit__(

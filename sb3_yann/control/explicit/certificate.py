@@ -80,7 +80,7 @@ class _Check:
         for i, law, rows, labels in self._conditions():
             self._require_law(i, law, balls[i][0])
             self._require_implied(i, rows, *balls[i])
-            self._require_neighbours(i, rows, labels)
+            self._require_neighbors(i, rows, labels)
         self._require_agreement()
         self._require_no_doubles(balls)
 
@@ -150,7 +150,7 @@ class _Check:
             if rows[k, :n] @ point > rows[k, n] + LAW:
                 self._fail(f"the law of region {i} violates the KKT conditions", point)
 
-    def _require_neighbours(self, i: int, rows: Array, labels: list[int]) -> None:
+    def _require_neighbors(self, i: int, rows: Array, labels: list[int]) -> None:
         region = self.regions[i]
         known = np.concatenate([self.outer, rows])
         own = np.column_stack([region.A, region.b])

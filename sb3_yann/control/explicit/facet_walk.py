@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.control.explicit.budget import Watch
+from sb3_yann.control.explicit.budget import BudgetTimer
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
 
@@ -33,7 +33,7 @@ class _Found:
     inside: Array
 
 
-def walk(program: ParametricQP, watch: Watch) -> list[Region]:
+def walk(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     Across a facet where constraint k becomes active, or inactive, lies the region of the active
@@ -56,7 +56,7 @@ def walk(program: ParametricQP, watch: Watch) -> list[Region]:
 
 
 class _Walk:
-    def __init__(self, program: ParametricQP, watch: Watch) -> None:
+    def __init__(self, program: ParametricQP, watch: BudgetTimer) -> None:
         self.program, self.watch = program, watch
         self.conditions = Conditions(program)
         self.found: dict[int, _Found] = {}
@@ -77,7 +77,7 @@ class _Walk:
         ]
 
     def seeds(self, count: int) -> Iterator[int]:
-        """Yield the active sets where no region is known: at the centre and at random points."""
+        """Yield the active sets where no region is known: at the center and at random points."""
         n = self.program.F.shape[1]
         points = np.vstack([np.zeros(n), np.random.default_rng(0).uniform(-1, 1, (count, n))])
         for point in points[~self._known(points)]:

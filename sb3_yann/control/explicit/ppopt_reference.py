@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.control.explicit.budget import Watch
+from sb3_yann.control.explicit.budget import BudgetTimer
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.polyhedra import Region
 
 
-def ppopt_regions(program: ParametricQP, watch: Watch) -> list[Region]:
+def ppopt_regions(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     They come from ppopt's combinatorial graph search (Arnström et al.,
@@ -68,7 +68,7 @@ def _unconstrained(program: ParametricQP, box_A: Array, box_b: Array) -> Region:
     return Region((), law[:, :-1], law[:, -1], A, b)
 
 
-def _watched_solver(watch: Watch) -> Any:
+def _watched_solver(watch: BudgetTimer) -> Any:
     """Return ppopt's solvers without Gurobi, which its defaults want, ended at the time limit."""
     from ppopt.solver import Solver
 

@@ -8,8 +8,7 @@ import numpy as np
 from scipy import optimize
 
 from sb3_yann._validation import Array
-from sb3_yann.control.explicit import law_cache
-from sb3_yann.control.explicit.budget import ExplicitLimitError, Limits, Watch
+from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, SolveBudget
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError, check
 from sb3_yann.control.explicit.facet_walk import walk
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
@@ -21,42 +20,38 @@ __all__ = [
     "SOLVERS",
     "ExplicitLimitError",
     "ExplicitSolutionError",
-    "Limits",
     "ParametricQP",
+    "SolveBudget",
     "solve_explicit",
 ]
 
 SOLVERS = {"walk": walk, "ppopt": ppopt_regions}
-
-# A law that took less, in seconds, is not worth a file in the cache.
-WORTH_KEEPING = 0.5
 
 
 def solve_explicit(
     program: ParametricQP,
     u_min: Array,
     u_max: Array,
-    outside: str,
+    infeasible: str,
     solver: str = "walk",
-    limits: Limits = Limits(),  # noqa: B008 (it is frozen)
+    limits: SolveBudget = SolveBudget(),  # noqa: B008 (it is frozen)
 ) -> PiecewiseAffine:
     """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
 
     The regions are in the order of their active sets, fewest constraints first, so that a problem
-    always gives the same law. A law that took long is kept on disk
-    (:mod:`sb3_yann.control.explicit.law_cache`) and read from there the next time.
+    always gives the same law.
 
     Parameters
     ----------
     program : ParametricQP
     u_min, u_max : ndarray, shape (m,)
         The input range, in which the tolerances are measured; infinite where there is none.
-    outside : {"nearest", "zero"}
+    infeasible : {"nearest_region", "zero_input"}
         See :class:`PiecewiseAffine`.
     solver : {"walk", "ppopt"}
         Our walk from facet to facet (:mod:`sb3_yann.control.explicit.facet_walk`), or ppopt's
         combinatorial graph search, which takes tens of times longer above a hundred regions.
-    limits : Limits
+    limits : SolveBudget
         When to give up.
 
     Raises
@@ -72,14 +67,8 @@ def solve_explicit(
         raise ValueError(f"solver = {solver!r} must be one of {tuple(SOLVERS)}.")
     _require_box(program)
     units = _Units(program, u_min, u_max)
-    key = law_cache.cache_key(program, u_min, u_max, outside, solver)
-    law = law_cache.load_law(key)
-    if law is not None:
-        if units.agree(law, u_min, u_max, outside):
-            return law
-        law_cache.warn_of(key, "it holds the law of another problem.")
     _require_feasible(units.scaled)
-    with Watch(limits) as watch:
+    with BudgetTimer(limits) as watch:
         regions = _critical_regions(units.scaled, solver, watch)
         try:
             check(units.scaled, regions, units.center, units.half)
@@ -87,13 +76,10 @@ def solve_explicit(
             if solver == "walk":
                 raise
             raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
-        law = units.law(regions, u_min, u_max, outside)
-    if watch.seconds > WORTH_KEEPING:
-        law_cache.store_law(key, law)
-    return law
+        return units.law(regions, u_min, u_max, infeasible)
 
 
-def _critical_regions(program: ParametricQP, solver: str, watch: Watch) -> list[Region]:
+def _critical_regions(program: ParametricQP, solver: str, watch: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program whose box is the unit box, sorted."""
     found = SOLVERS[solver](program, watch)
     return sorted(found, key=lambda region: (len(region.active_set), region.active_set))
@@ -116,7 +102,7 @@ class _Units:
         self.scaled = program.scaled(self.center, self.half, self.reach)
 
     def law(
-        self, regions: list[Region], u_min: Array, u_max: Array, outside: str
+        self, regions: list[Region], u_min: Array, u_max: Array, infeasible: str
     ) -> PiecewiseAffine:
         """Return the law of the first inputs in the units of the problem."""
         m, reach, half = len(u_min), self.reach, self.half
@@ -133,28 +119,9 @@ class _Units:
             u_max=u_max,
             theta_min=self.program.theta_min,
             theta_max=self.program.theta_max,
-            outside=outside,
+            infeasible=infeasible,
             disjoint=True,
         )
-
-    def agree(self, law: PiecewiseAffine, u_min: Array, u_max: Array, outside: str) -> bool:
-        """Tell whether a law that was read is that of QPs at random points of the same box."""
-        m, n = len(u_min), len(self.center)
-        ours = (u_min, u_max, self.program.theta_min, self.program.theta_max)
-        theirs = (law.u_min, law.u_max, law.theta_min, law.theta_max)
-        if law.gains.shape[1:] != (m, n) or law.outside != outside:
-            return False
-        if not all(np.array_equal(one, other) for one, other in zip(ours, theirs, strict=True)):
-            return False
-        points = np.random.default_rng(0).uniform(-1, 1, (30, n))
-        theta = points * self.half + self.center
-        for point, u, inside in zip(points, law(theta), law.in_domain(theta), strict=True):
-            U = self.scaled.solve(point)
-            if (U is not None) != inside:
-                return False
-            if U is not None and np.max(np.abs(U[:m] - u / self.reach[:m])) > 1e-6:
-                return False
-        return True
 
 
 def _require_box(program: ParametricQP) -> None:

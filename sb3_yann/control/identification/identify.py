@@ -39,7 +39,7 @@ class Identified(ReadOnlyArrays):
         Steps fitted minus parameters of each row.
     residual_autocorrelation : ndarray, shape (n,)
         Of each state's residuals, one step apart. Far from zero, there is measurement noise or an
-        unmodelled state, and neither the matrices nor the standard errors hold.
+        unmodeled state, and neither the matrices nor the standard errors hold.
     one_step_fit, ten_step_fit : ndarray, shape (n,)
         ``100 (1 - |x - predicted| / |x - mean|)`` in percent for each state over the data that
         were held out, predicted one step ahead, and ten with the inputs as measured. 100 is
@@ -207,14 +207,14 @@ def _model(
     model = LinearModel(A, B, dt, x, u, E, d)
     drift = found.predict(point[None])[0] - x
     doubt = np.diag(found.covariance) / found.steps
-    doubt = np.sqrt(doubt + found.standard_errors**2 @ (point - found.centre) ** 2)
+    doubt = np.sqrt(doubt + found.standard_errors**2 @ (point - found.center) ** 2)
     allowed = 3 * doubt + 1e-9 * (1 + np.abs(x))
     if np.any(np.abs(drift) > allowed):
         model = model.with_drift(drift).with_notes(
             f"At the operating point the fitted plant moves by {_list(drift)} in one step. The "
             "model leaves that out."
         )
-    away = np.abs(x - found.centre[:n]) > FAR * found.spread[:n]
+    away = np.abs(x - found.center[:n]) > FAR * found.spread[:n]
     if np.any(away):
         model = model.with_notes(
             f"x_ss[{int(np.argmax(away))}] lies far outside the data: the model is extrapolated."
@@ -260,11 +260,11 @@ def _quality(
         )
     if ridge > 0:
         notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
-    coloured = np.abs(found.autocorrelation) > 3 / np.sqrt(found.steps)
-    if np.any(coloured):
+    colored = np.abs(found.autocorrelation) > 3 / np.sqrt(found.steps)
+    if np.any(colored):
         notes.append(
-            f"The residuals of neighbouring steps are correlated ({_list(found.autocorrelation)}): "
-            "there is sensor noise or an unmodelled state. A is biased, towards zero by noise, by "
+            f"The residuals of neighboring steps are correlated ({_list(found.autocorrelation)}): "
+            "there is sensor noise or an unmodeled state. A is biased, towards zero by noise, by "
             "more than the standard errors tell."
         )
     return notes

@@ -68,7 +68,7 @@ def _delays(
     for lag in range(1, LONGEST + 1):
         longer = [episode for episode in episodes if len(episode) > lag]
         steps = sum(len(episode) - lag for episode in longer)
-        if steps <= 4 * found.centre.size:
+        if steps <= 4 * found.center.size:
             break
         now = np.concatenate([episode.regressors[lag:] for episode in longer])
         residuals = np.concatenate([episode.states[1 + lag :] for episode in longer])
@@ -76,7 +76,7 @@ def _delays(
         if np.all(np.std(residuals, axis=0) <= 1e-9 * found.spread[: sizes[0]]):
             break  # nothing but rounding
         past = np.concatenate([episode.driven[:-lag] for episode in longer])
-        for j, size in enumerate(_correlations(now - found.centre, residuals, past)):
+        for j, size in enumerate(_correlations(now - found.center, residuals, past)):
             if size > max(best[j][1], FOLLOWS, 5 / np.sqrt(steps)):
                 best[j] = (lag, float(size))
     return best

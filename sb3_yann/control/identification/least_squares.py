@@ -16,15 +16,15 @@ move that much by rounding alone."""
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """``x[k+1] = reached + coefficients (z[k] - centre)``, with z of states, inputs, disturbances.
+    """``x[k+1] = reached + coefficients (z[k] - center)``, with z of states, inputs, disturbances.
 
     Attributes
     ----------
     coefficients, standard_errors : ndarray, shape (n, n+m+d)
-    centre : ndarray, shape (n+m+d,)
+    center : ndarray, shape (n+m+d,)
     reached : ndarray, shape (n,)
     spread : ndarray, shape (n+m+d,)
-        Root mean square of each regressor about the centre.
+        Root mean square of each regressor about the center.
     factors : ndarray, shape (n+m+d,)
         Standard errors of each column in units of the residuals' standard deviation.
     covariance : ndarray, shape (n, n)
@@ -40,7 +40,7 @@ class Regression:
 
     coefficients: Array
     standard_errors: Array
-    centre: Array
+    center: Array
     reached: Array
     spread: Array
     factors: Array
@@ -53,7 +53,7 @@ class Regression:
 
     def predict(self, regressors: Array) -> Array:
         """Return the next states (k, n) for regressors (k, n+m+d)."""
-        return np.asarray(self.reached + (regressors - self.centre) @ self.coefficients.T)
+        return np.asarray(self.reached + (regressors - self.center) @ self.coefficients.T)
 
 
 def regress(
@@ -85,28 +85,28 @@ def regress(
             f"There are {steps} steps to fit {unknowns} parameters for each state: more steps than "
             "parameters are needed. Record more, or hold less out (held_out)."
         )
-    centre = np.mean(regressors, axis=0) if origin is None else origin
+    center = np.mean(regressors, axis=0) if origin is None else origin
     reached = np.mean(targets, axis=0) if origin is None else origin[:n]
-    centred = regressors - centre
-    spread = np.sqrt(np.mean(centred**2, axis=0))
+    centerd = regressors - center
+    spread = np.sqrt(np.mean(centerd**2, axis=0))
     # What is left of a constant after its mean is taken off is rounding, not a signal.
     still = spread <= 1e-10 * np.max(np.abs(regressors), axis=0)
     scale = np.where(still, 1.0, spread)
-    left, sizes_of, right = np.linalg.svd(np.where(still, 0.0, centred / scale), False)
+    left, sizes_of, right = np.linalg.svd(np.where(still, 0.0, centerd / scale), False)
     excitation = float(sizes_of[-1] / sizes_of[0]) if sizes_of[0] > 0 else 0.0
     missing = [v for s, v in zip(sizes_of, right, strict=True) if s <= WEAKEST * sizes_of[0]]
     if missing and ridge == 0:
         raise ValueError(_not_excited([direction(v / scale, v, sizes) for v in missing]))
     inverse = right.T * (sizes_of / (sizes_of**2 + ridge)) if ridge else right.T / sizes_of
     coefficients = ((inverse @ left.T @ (targets - reached)) / scale[:, None]).T
-    residuals = targets - reached - centred @ coefficients.T
+    residuals = targets - reached - centerd @ coefficients.T
     freedom = steps - unknowns
     covariance = residuals.T @ residuals / freedom
     factors = np.linalg.norm(inverse, axis=1) / scale
     return Regression(
         coefficients=coefficients,
         standard_errors=np.sqrt(np.diag(covariance))[:, None] * factors,
-        centre=centre,
+        center=center,
         reached=reached,
         spread=spread,
         factors=factors,

@@ -22,7 +22,7 @@ def operating_point(
 ) -> Array:
     """Return the state, inputs and disturbances (n+m+d,) where the fitted plant rests."""
     n, m, _ = sizes
-    x, u, d = np.split(found.centre, [n, n + m])
+    x, u, d = np.split(found.center, [n, n + m])
     start = np.concatenate([x if given[0] is None else given[0], u, d])
     for place, value in ((slice(n, n + m), given[1]), (slice(n + m, None), given[2])):
         if value is not None:

@@ -25,7 +25,7 @@ Integers = NDArray[np.int64]
 F = TypeVar("F", bound=Callable[..., Any])
 
 HEADER = 8
-"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero outside, disjoint."""
+"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero input, disjoint."""
 
 ROWS = 2
 """Floats before the packed arrays: how far outside counts as inside, and which slacks tie."""
@@ -92,7 +92,7 @@ def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers
     nodes, leaves = (len(tree.levels), len(tree.leaf_starts) - 1) if tree else (0, 0)
     p, m, n = law.gains.shape
     header = [n, m, p, law.n_halfspaces, nodes, leaves]
-    header += [law.outside == "zero", law.disjoint]
+    header += [law.infeasible == "zero_input", law.disjoint]
     rows = np.column_stack([law.A, law.b])
     floats: list[Any] = [(law.tolerance, law.tie_tolerance), rows, law.gains, law.offsets]
     floats += [law.u_min, law.u_max, *((tree.normals, tree.levels) if tree else ())]

@@ -26,7 +26,7 @@ from sb3_yann._validation import (
 if TYPE_CHECKING:
     from sb3_yann.control.law.search_tree import SearchTree
 
-OUTSIDE = ("nearest", "zero")
+INFEASIBLE = ("nearest_region", "zero_input")
 SCAN = 4
 """Up to this many regions are asked one by one."""
 
@@ -42,14 +42,14 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     One region is chosen at every theta: the one whose smallest slack ``b - A theta`` over its own
     half-spaces is largest, the first of them on a tie. Inside the feasible set that is a region
-    which holds theta (on a facet, one of its neighbours, where both laws agree); outside it is the
+    which holds theta (on a facet, one of its neighbors, where both laws agree); outside it is the
     region that theta violates least.
 
-    Outside the feasible set, where the MPC has no solution, ``outside`` decides:
+    Outside the feasible set, where the MPC has no solution, ``infeasible`` decides:
 
-    - ``"nearest"``: the affine law of the chosen region, clipped to the input bounds.
-    - ``"zero"``: no deviation of the input (clipped to the bounds), as in Braniff & Tian, where
-      no indicator of a region is active. It jumps at the border of the feasible set.
+    - ``"nearest_region"``: the affine law of the chosen region, clipped to the input bounds.
+    - ``"zero_input"``: no deviation of the input (clipped to the bounds), as in Braniff & Tian,
+      where no indicator of a region is active. It jumps at the border of the feasible set.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class PiecewiseAffine(ReadOnlyArrays):
         Bounds of the input, infinite where there is none.
     theta_min, theta_max : ndarray, shape (n,)
         The box for which the law was solved; a network scales its inputs by it.
-    outside : {"nearest", "zero"}
+    infeasible : {"nearest_region", "zero_input"}
     disjoint : bool, default False
         That no two regions share an interior, as `LinearMPC.explicit` checks of its laws: the
         search then ends at the first region found to hold theta, several times as fast. It is not
@@ -81,14 +81,14 @@ class PiecewiseAffine(ReadOnlyArrays):
     u_max: Array
     theta_min: Array
     theta_max: Array
-    outside: str = "nearest"
+    infeasible: str = "nearest_region"
     disjoint: bool = False
 
     # To find a region, more than SCAN of them are held in a tree of hyperplanes, built in a moment
     # when it is first needed; machine code of numba searches it.
 
     # How far outside every region a point may lie, in half-widths of the box, and still count as
-    # inside: facets of neighbours agree to rounding only.
+    # inside: facets of neighbors agree to rounding only.
     tolerance = 1e-8
 
     # Slacks that differ by less, relative to 1 + their size, tie. Outside the feasible set whole
@@ -106,8 +106,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         values["theta_min"], values["theta_max"] = as_bounds(
             "theta", self.theta_min, self.theta_max, n
         )
-        if self.outside not in OUTSIDE:
-            raise ValueError(f"outside = {self.outside!r} must be one of {OUTSIDE}.")
+        if self.infeasible not in INFEASIBLE:
+            raise ValueError(f"infeasible = {self.infeasible!r} must be one of {INFEASIBLE}.")
         if not isinstance(self.disjoint, bool):
             raise TypeError(f"disjoint = {self.disjoint!r} must be True or False.")
         rows = as_array("starts", self.starts, (p,))
@@ -201,7 +201,10 @@ class PiecewiseAffine(ReadOnlyArrays):
                 raise ValueError("it is a single array")
             with data:
                 values = {field.name: data[field.name] for field in fields(cls)}
-                values |= {"outside": str(data["outside"]), "disjoint": bool(data["disjoint"])}
+                values |= {
+                    "infeasible": str(data["infeasible"]),
+                    "disjoint": bool(data["disjoint"]),
+                }
                 tree = {name[5:]: data[name] for name in data.files if name.startswith("tree_")}
             law = cls(**values)
             if tree:
@@ -223,13 +226,13 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""
-        return hash((self.gains.tobytes(), self.b.tobytes(), self.outside))
+        return hash((self.gains.tobytes(), self.b.tobytes(), self.infeasible))
 
     def __repr__(self) -> str:
         """Name the sizes."""
         return (
             f"PiecewiseAffine(regions={self.n_regions}, halfspaces={self.n_halfspaces}, "
-            f"theta={self.n_theta}, inputs={self.n_inputs}, outside={self.outside!r})"
+            f"theta={self.n_theta}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
         )
 
     def _choose(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:

@@ -59,7 +59,7 @@ def jacobian(
 
     The difference over h and the one over h/4 give an extrapolation that is exact up to fourth
     order in h. Of the extrapolations over ever shorter steps, each entry takes the one that agrees
-    best with its neighbour: Ridders (1982), *Advances in Engineering Software* 4, 75-76. SciPy
+    best with its neighbor: Ridders (1982), *Advances in Engineering Software* 4, 75-76. SciPy
     has such a method too (`scipy.differentiate`, from 1.15 on) but for smooth functions only: a
     simulator clips and wraps, which has to be noticed rather than averaged.
 
@@ -79,9 +79,9 @@ def jacobian(
     NotDifferentiableError
         If f has a kink or a jump at the point, or no value next to it.
     """
-    centre = f(actual(point))
+    center = f(actual(point))
     columns = [
-        _column(f, centre, actual(point), i, steps[i], noise, actual) for i in range(point.size)
+        _column(f, center, actual(point), i, steps[i], noise, actual) for i in range(point.size)
     ]
     value, error, change = (np.array(part) for part in zip(*columns, strict=True))
     lost = np.abs(value) <= error
@@ -96,7 +96,7 @@ def jacobian(
 
 def _column(
     f: Callable[[Array], Array],
-    centre: Array,
+    center: Array,
     point: Array,
     i: int,
     longest: float,
@@ -111,8 +111,8 @@ def _column(
         above, below = actual(point + offset), actual(point - offset)
         if above[i] <= point[i] or below[i] >= point[i]:
             break  # the step is lost in the rounding of the point
-        ahead.append((f(above) - centre) / (above[i] - point[i]))
-        behind.append((centre - f(below)) / (point[i] - below[i]))
+        ahead.append((f(above) - center) / (above[i] - point[i]))
+        behind.append((center - f(below)) / (point[i] - below[i]))
         spans.append(above[i] - below[i])
     one, other, span = np.array(ahead), np.array(behind), np.array(spans)[:, None]
     valid = np.all(np.isfinite(one) & np.isfinite(other), axis=1) if spans else np.zeros(0, bool)

@@ -40,7 +40,7 @@ SHORTER = 64.0
 """How much shorter steps become where a function has no value next to the point."""
 
 
-def linearise_dynamics(
+def linearize_dynamics(
     f: Callable[..., ArrayLike],
     x_ss: ArrayLike,
     u_ss: ArrayLike,
@@ -99,7 +99,7 @@ def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
     return size
 
 
-def linearise_env(
+def linearize_env(
     env: Maker,
     state: ArrayLike | None,
     action: ArrayLike | None,
@@ -114,13 +114,13 @@ def linearise_env(
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)
         x, u = _partly_known("state", state), _partly_known("action", action)
-        model = _linearise(simulator, x, u, step_time, scale)
+        model = _linearize(simulator, x, u, step_time, scale)
         return model.with_notes(f"What was stepped: {borrowed.note}.")
     finally:
         borrowed.close()
 
 
-def _linearise(
+def _linearize(
     simulator: Simulator, x: Array | None, u: Array | None, dt: float, scale: ArrayLike | None
 ) -> LinearModel:
     """Connect to the simulator, find where it rests, and take the differences there."""
@@ -143,7 +143,7 @@ def _linearise(
     idle = _idle_inputs(B)
     return LinearModel(A, B, dt, point[:n], point[n:]).with_notes(
         *idle,
-        "Linearised by central differences over one step. The state was set by "
+        "Linearized by central differences over one step. The state was set by "
         f"{simulator.setter} and read from {simulator.reader}.",
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
         "for and the others given or taken from the middle of the action space.",
@@ -185,7 +185,7 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian
         i = int(np.argmin(room / scale[n:]))
         raise ValueError(
             f"action = {point[n:].tolist()}: entry {i} lies on its bound in {space}, where the "
-            "plant cannot be linearised. Choose an operating point with room to both sides."
+            "plant cannot be linearized. Choose an operating point with room to both sides."
         )
 
     def step(point: Array) -> Array:
@@ -223,7 +223,7 @@ def _differences(
                 break
             steps[i] /= SHORTER
     raise ValueError(
-        f"The plant cannot be linearised at {point.tolist()}: along {_name(i, sizes)}, {reason}, "
+        f"The plant cannot be linearized at {point.tolist()}: along {_name(i, sizes)}, {reason}, "
         f"with steps up to {steps[i]:.3g}. Clipping, dry friction and angles that wrap do this, "
         "and steps that are too long: pass scale=..., how far each state moves in use. Or move "
         "the operating point off it, or fit data that reach across it: LinearModel.from_data."

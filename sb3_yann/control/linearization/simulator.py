@@ -71,7 +71,7 @@ def borrow(env: Maker) -> Borrowed:
     else:
         raise TypeError(
             f"env = {env!r} must be a single gymnasium.Env, its id, or a function that makes one "
-            "(of a vectorised environment, pass one of its parts)."
+            "(of a vectorized environment, pass one of its parts)."
         )
     if not isinstance(found.env, gymnasium.Env):
         raise TypeError(f"env() returned {found.env!r}, expected a single gymnasium.Env.")

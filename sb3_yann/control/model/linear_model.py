@@ -123,7 +123,7 @@ class LinearModel(ReadOnlyArrays):
     ) -> LinearModel:
         """Sample ``dx/dt = A x + B u + E d`` every ``dt``, with u and d held constant in between.
 
-        The discretisation is exact (matrix exponential, `control.sample_system`).
+        The discretization is exact (matrix exponential, `control.sample_system`).
         """
         import control  # brings matplotlib in: only paid for where it is used
 
@@ -143,7 +143,7 @@ class LinearModel(ReadOnlyArrays):
         d_ss: ArrayLike | None = None,
         scale: ArrayLike | None = None,
     ) -> LinearModel:
-        """Linearise ``dx/dt = f(x, u)``, or ``f(x, u, d)``, at a steady state; sample it every dt.
+        """Linearize ``dx/dt = f(x, u)``, or ``f(x, u, d)``, at a steady state; sample it every dt.
 
         The Jacobian comes from central differences that check themselves, the sampling from
         :meth:`from_continuous`.
@@ -170,9 +170,9 @@ class LinearModel(ReadOnlyArrays):
             If ``f`` returns another shape or NaN at the operating point, has a kink or a jump
             there, or the operating point moves by more than 0.1 % of ``scale`` within one sample.
         """
-        from sb3_yann.control.linearization.linearize import linearise_dynamics
+        from sb3_yann.control.linearization.linearize import linearize_dynamics
 
-        return linearise_dynamics(f, x_ss, u_ss, dt, d_ss, scale)
+        return linearize_dynamics(f, x_ss, u_ss, dt, d_ss, scale)
 
     @staticmethod
     def from_env(
@@ -185,7 +185,7 @@ class LinearModel(ReadOnlyArrays):
         get_state: Callable[[Any], ArrayLike] | None = None,
         scale: ArrayLike | None = None,
     ) -> LinearModel:
-        """Linearise one step of a simulator, wrappers and all, by central differences.
+        """Linearize one step of a simulator, wrappers and all, by central differences.
 
         An id or a function makes an environment of its own, closed in the end. An environment is
         deep-copied and left as it is; one that cannot be copied is used itself, without a seed, and
@@ -218,15 +218,15 @@ class LinearModel(ReadOnlyArrays):
         Raises
         ------
         TypeError
-            For vectorised environments and other than Box actions.
+            For vectorized environments and other than Box actions.
         ValueError
             If ``dt`` is not found, the environment cannot be put into a state, a step is not
             repeatable (noise, hidden states), no steady state is found or the given one is none,
             the action lies on its bound, or the plant has a kink or a jump at the point.
         """
-        from sb3_yann.control.linearization.linearize import linearise_env
+        from sb3_yann.control.linearization.linearize import linearize_env
 
-        return linearise_env(env, state, action, dt, set_state, get_state, scale)
+        return linearize_env(env, state, action, dt, set_state, get_state, scale)
 
     @staticmethod
     def from_data(

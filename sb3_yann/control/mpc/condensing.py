@@ -38,7 +38,7 @@ class _Prediction:
         if k > 0:
             inputs[:, (k - 1) * m : k * m] = -np.eye(m)
         else:
-            start[:, problem.parameters.previous] = -np.eye(m)
+            start[:, problem.layout.previous] = -np.eye(m)
         return inputs, start
 
 
@@ -99,7 +99,7 @@ def condense(problem: LinearMPC) -> tuple[ParametricQP, tuple[str, ...]]:
 
 def _cost(problem: LinearMPC, prediction: _Prediction) -> tuple[Array, Array]:
     """Return H and F of ``1/2 U'HU + (F theta)'U``, whence the factors 2."""
-    N, gamma, errors = problem.horizon, problem.gamma, problem.errors
+    N, gamma, errors = problem.horizon, problem.gamma, problem.error_system
     T, states = errors.T, errors.T[: problem.model.n_states]
     H: Array = np.asarray(2 * np.kron(np.diag(gamma ** np.arange(N)), problem.R), np.float64)
     F: Array = -H @ np.tile(errors.U, (N, 1))
@@ -127,7 +127,7 @@ def _linear_cost(problem: LinearMPC, prediction: _Prediction) -> Array:
     c: Array = np.zeros(N * len(r))
     if not (np.any(q) or np.any(r)):
         return c
-    errors, n = problem.errors, len(q)
+    errors, n = problem.error_system, len(q)
     model = errors.model
     K = lqr.gain(model, errors.R, problem.terminal_cost, gamma, errors.cross)
     wide = np.concatenate([q, np.zeros(len(errors.T) - n)])
@@ -157,7 +157,7 @@ def _constraints(
         rows.add("x[{}] at its lower bound", -forced, -problem.x_min, powers, *soft)
     last, upper = problem.terminal_set
     rows.add("the terminal set", last @ prediction.forced[N], upper, -last @ prediction.powers[N])
-    if problem.parameters.n_previous:
+    if problem.layout.n_previous:
         for k in range(N):
             change, start = prediction.rate(problem, k)
             rows.add("the rate of u[{}] at its upper bound", change, problem.du_max, -start)

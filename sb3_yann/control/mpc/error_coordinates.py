@@ -10,11 +10,11 @@ from scipy import linalg
 from sb3_yann._validation import Array, ReadOnlyArrays
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.steady_state import SteadyStates
-from sb3_yann.control.mpc.theta_layout import Parameters
+from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorCoordinates(ReadOnlyArrays):
+class ErrorSystem(ReadOnlyArrays):
     """``z = T theta`` and ``v = u - U theta``, with ``z+ = A z + B v`` and a quadratic stage cost.
 
     z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate of the input has a weight. The
@@ -54,9 +54,9 @@ class ErrorCoordinates(ReadOnlyArrays):
         return np.asarray(to_error.T @ weight @ to_error)
 
 
-def error_coordinates(
-    model: LinearModel, parameters: Parameters, steady: SteadyStates, Q: Array, R: Array, S: Array
-) -> ErrorCoordinates:
+def error_system(
+    model: LinearModel, parameters: ThetaLayout, steady: SteadyStates, Q: Array, R: Array, S: Array
+) -> ErrorSystem:
     """Return the coordinates of a problem with weights Q (n, n), R (m, m) and S (m, m).
 
     The stage cost is ``(x - x_s)'Q(x - x_s) + (u - u_s)'R(u - u_s) + (u - u_prev)'S(u - u_prev)``.
@@ -68,11 +68,11 @@ def error_coordinates(
     U[:, parameters.constant] = steady.u
     if not np.any(S):
         plain = LinearModel(model.A, model.B, model.dt)
-        return ErrorCoordinates(plain, T, U, Q, R, None)
+        return ErrorSystem(plain, T, U, Q, R, None)
     # v_prev+ = v, and (v - v_prev)'S(v - v_prev) couples the two
     previous = -U
     previous[:, parameters.previous] = np.eye(m)
-    return ErrorCoordinates(
+    return ErrorSystem(
         model=LinearModel(
             linalg.block_diag(model.A, np.zeros((m, m))),
             np.vstack([model.B, np.eye(m)]),

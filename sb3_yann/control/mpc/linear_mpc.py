@@ -19,8 +19,8 @@ from sb3_yann._validation import (
     same_fields,
 )
 from sb3_yann.control import lqr
-from sb3_yann.control.explicit.solve import Limits, ParametricQP, solve_explicit
-from sb3_yann.control.law.piecewise_affine import OUTSIDE, PiecewiseAffine
+from sb3_yann.control.explicit.solve import ParametricQP, SolveBudget, solve_explicit
+from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import reachability
 from sb3_yann.control.mpc import value as quadratic_value
@@ -43,11 +43,11 @@ from sb3_yann.control.mpc._checks import (
     warn_of_unused_softness,
 )
 from sb3_yann.control.mpc.condensing import condense
-from sb3_yann.control.mpc.error_coordinates import ErrorCoordinates, error_coordinates
+from sb3_yann.control.mpc.error_coordinates import ErrorSystem, error_system
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.steady_state import SteadyStates, steady_states
 from sb3_yann.control.mpc.terminal_set import invariant_set
-from sb3_yann.control.mpc.theta_layout import Parameters
+from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -105,8 +105,8 @@ class LinearMPC(ReadOnlyArrays):
         terminal cost is: replace it by "invariant" again where anything else changes.
     gamma : float, default 1
         Discount in (0, 1]. At 1 this is the usual MPC. With the discount of the learner, the
-        policy starts as the maximiser of its own critic wherever no constraint acts.
-    outside : {"nearest", "zero"}, default "nearest"
+        policy starts as the maximizer of its own critic wherever no constraint acts.
+    infeasible : {"nearest_region", "zero_input"}, default "nearest_region"
         The law where the problem has no solution. See :class:`PiecewiseAffine`.
     tracked : array_like, shape (p, n), or list of int, optional
         C of the tracked outputs ``C x``, or indices of tracked states.
@@ -157,7 +157,7 @@ class LinearMPC(ReadOnlyArrays):
     terminal_cost: Array
     terminal_set: tuple[Array, Array]
     gamma: float
-    outside: str
+    infeasible: str
     tracked: Array
     r_min: Array
     r_max: Array
@@ -190,7 +190,7 @@ class LinearMPC(ReadOnlyArrays):
         terminal_cost: ArrayLike | None = None,
         terminal_set: tuple[ArrayLike, ArrayLike] | str | None = None,
         gamma: float = 1.0,
-        outside: str = "nearest",
+        infeasible: str = "nearest_region",
         tracked: ArrayLike | Sequence[int] | None = None,
         r_min: ArrayLike | None = None,
         r_max: ArrayLike | None = None,
@@ -210,9 +210,9 @@ class LinearMPC(ReadOnlyArrays):
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         n, m = model.n_states, model.n_inputs
-        if not (isinstance(outside, str) and outside in OUTSIDE):
-            raise ValueError(f"outside = {outside!r} must be one of {OUTSIDE}.")
-        self._set(model=model, outside=outside, horizon=as_horizon(horizon))
+        if not (isinstance(infeasible, str) and infeasible in INFEASIBLE):
+            raise ValueError(f"infeasible = {infeasible!r} must be one of {INFEASIBLE}.")
+        self._set(model=model, infeasible=infeasible, horizon=as_horizon(horizon))
         self._set(gamma=as_discount(gamma), Q=as_symmetric("Q", Q, n))
         self._set(R=as_symmetric("R", R, m, definite=True), S=as_rate_weight(S, m))
         self._set(tracked=as_outputs("tracked", tracked, n))
@@ -232,7 +232,7 @@ class LinearMPC(ReadOnlyArrays):
         self._set(x_soft=as_softness("x_soft", x_soft, self.x_min, self.x_max))
         self._set(y_soft=as_softness("y_soft", y_soft, self.y_min, self.y_max))
         self._set(soft_penalty=as_soft_penalty(soft_penalty, self.x_soft, self.y_soft))
-        inputs, free = (self.u_min, self.u_max), self.parameters.has_constants
+        inputs, free = (self.u_min, self.u_max), self.layout.has_constants
         require_room_to_rest(*inputs, self.du_min, self.du_max, free)
         self._set_box(theta_min, theta_max)
         box = self.theta_min[:n], self.theta_max[:n]
@@ -250,11 +250,11 @@ class LinearMPC(ReadOnlyArrays):
         default = softened_box(self.x_min, self.x_max, self.x_soft)
         parts = [as_box("theta", (theta_min, theta_max), default, size)]
         parts += [(self.r_min, self.r_max), (self.d_min, self.d_max)]
-        parts += [(self.u_min, self.u_max)] if self.parameters.n_previous else []
+        parts += [(self.u_min, self.u_max)] if self.layout.n_previous else []
         low, high = (np.concatenate(bounds) for bounds in zip(*parts, strict=True))
         low, high = as_bounds("theta", low, high, size)
         for name, given, stored in (("theta_min", theta_min, low), ("theta_max", theta_max, high)):
-            require_same_rest(name, given, stored, self.parameters.names, self.model.n_states)
+            require_same_rest(name, given, stored, self.layout.names, self.model.n_states)
         self._set(theta_min=low, theta_max=high)
 
     def _set_terminal(
@@ -262,7 +262,7 @@ class LinearMPC(ReadOnlyArrays):
         cost: ArrayLike | None,
         half_spaces: tuple[ArrayLike, ArrayLike] | str | None,
     ) -> None:
-        errors = self.errors
+        errors = self.error_system
         self._set(
             terminal_cost=lqr.riccati(errors.model, errors.Q, errors.R, self.gamma, errors.cross)
             if cost is None
@@ -280,10 +280,10 @@ class LinearMPC(ReadOnlyArrays):
         return bool(np.any(np.isfinite([self.du_min, self.du_max])))
 
     @cached_property
-    def parameters(self) -> Parameters:
+    def layout(self) -> ThetaLayout:
         """What theta holds, and where."""
         rated = np.any(self.S) or self.has_rate_bounds
-        return Parameters(
+        return ThetaLayout(
             n_states=self.model.n_states,
             n_references=len(self.tracked),
             n_disturbances=self.model.n_disturbances,
@@ -293,12 +293,12 @@ class LinearMPC(ReadOnlyArrays):
     @property
     def n_theta(self) -> int:
         """Number of parameters of the law."""
-        return self.parameters.size
+        return self.layout.size
 
     @cached_property
     def prediction(self) -> tuple[Array, Array]:
         """A_bar (n_theta, n_theta) and B_bar (n_theta, m): ``theta+ = A_bar theta + B_bar u``."""
-        parts, model = self.parameters, self.model
+        parts, model = self.layout, self.model
         A, B = np.eye(parts.size), np.zeros((parts.size, model.n_inputs))
         A[parts.state, parts.state], A[parts.state, parts.disturbance] = model.A, model.E
         A[parts.previous, parts.previous] = 0.0
@@ -314,17 +314,15 @@ class LinearMPC(ReadOnlyArrays):
     @cached_property
     def steady_states(self) -> SteadyStates:
         """The map from r and d to the steady state, within bounds or not."""
-        x_unit = np.maximum(np.abs(self.theta_min), np.abs(self.theta_max))[self.parameters.state]
+        x_unit = np.maximum(np.abs(self.theta_min), np.abs(self.theta_max))[self.layout.state]
         u_unit = (self.u_max - self.u_min) / 2
         x_unit, u_unit = (np.where(np.isfinite(unit), unit, 1.0) for unit in (x_unit, u_unit))
         return steady_states(self.model, self.tracked, self.Q, self.R, x_unit, u_unit)
 
     @cached_property
-    def errors(self) -> ErrorCoordinates:
+    def error_system(self) -> ErrorSystem:
         """The coordinates about the steady state in which the cost is quadratic."""
-        return error_coordinates(
-            self.model, self.parameters, self.steady_states, self.Q, self.R, self.S
-        )
+        return error_system(self.model, self.layout, self.steady_states, self.Q, self.R, self.S)
 
     def is_reachable(
         self, r: ArrayLike | None = None, d: ArrayLike | None = None
@@ -353,14 +351,14 @@ class LinearMPC(ReadOnlyArrays):
     @property
     def stage_matrix(self) -> Array:
         """W (n_theta + m, n_theta + m): the stage cost is ``[theta; u]' W [theta; u]``."""
-        return self.errors.stage_matrix
+        return self.error_system.stage_matrix
 
     def stage_cost(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the stage cost, ``x'Qx + u'Ru`` for a regulator, without penalties.
 
         theta is (n_theta,) or (batch, n_theta), u is (m,) or (batch, m).
         """
-        at, v, errors = np.asarray(theta, np.float64), np.asarray(u, np.float64), self.errors
+        at, v, errors = np.asarray(theta, np.float64), np.asarray(u, np.float64), self.error_system
         z, v = at @ errors.T.T, v - at @ errors.U.T
         cost = np.sum((z @ errors.Q) * z, axis=-1) + np.sum((v @ errors.R) * v, axis=-1)
         q, r = self.linear_cost
@@ -381,7 +379,7 @@ class LinearMPC(ReadOnlyArrays):
         Raises
         ------
         ValueError
-            If the law does not stabilise the model under this discount, or does not rest at the
+            If the law does not stabilize the model under this discount, or does not rest at the
             origin.
         """
         return quadratic_value.value_matrix(self, gamma)
@@ -403,9 +401,6 @@ class LinearMPC(ReadOnlyArrays):
         progress: bool = False,
     ) -> PiecewiseAffine:
         """Return the explicit law theta -> u_0, solved once, checked, and kept.
-
-        A law that took more than half a second is also kept on disk, in the user's cache folder or
-        the one that the environment variable ``SB3_YANN_CACHE`` names (``off`` for none).
 
         Parameters
         ----------
@@ -429,10 +424,10 @@ class LinearMPC(ReadOnlyArrays):
         ExplicitSolutionError
             If the solution fails its check; the message says where.
         """
-        limits = Limits(time_limit, region_limit, progress)
+        limits = SolveBudget(time_limit, region_limit, progress)
         if solver not in self._laws:
             self._laws[solver] = solve_explicit(
-                self.condensed(), self.u_min, self.u_max, self.outside, solver, limits
+                self.condensed(), self.u_min, self.u_max, self.infeasible, solver, limits
             )
         limits.require(self._laws[solver].n_regions)
         return self._laws[solver]
@@ -470,5 +465,5 @@ class LinearMPC(ReadOnlyArrays):
         """Name the sizes and what is bounded."""
         return (
             f"LinearMPC(states={self.model.n_states}, inputs={self.model.n_inputs}, "
-            f"horizon={self.horizon}, gamma={self.gamma:g}, outside={self.outside!r})"
+            f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r})"
         )

@@ -56,7 +56,7 @@ def _parameters(problem: LinearMPC) -> Iterator[str]:
         "u_prev": "input of the step before",
     }
     yield f"Parameters of the law, {problem.n_theta}, as deviations from the operating point:"
-    bounds = zip(problem.parameters.names, problem.theta_min, problem.theta_max, strict=True)
+    bounds = zip(problem.layout.names, problem.theta_min, problem.theta_max, strict=True)
     for name, low, high in bounds:
         kind, index = name[:-1].split("[")
         yield f"  {name:<10} {low:>10.4g} to {high:<10.4g} {meanings[kind]} {index}"
@@ -81,7 +81,7 @@ def _shares(problem: LinearMPC, points: Array, feasible: Array) -> Iterator[str]
     yield f"Of {len(points)} random parameters of the box"
     yield f"  {_percent(len(feasible), len(points))} are feasible;"
     if len(problem.tracked):
-        parts = problem.parameters
+        parts = problem.layout
         reachable = problem.is_reachable(points[:, parts.reference], points[:, parts.disturbance])
         yield f"  {_percent(reachable.sum(), len(points))} have a reachable steady state;"
     kept = _stay_feasible(problem, feasible).sum() if len(feasible) else 0
@@ -130,7 +130,7 @@ def _active(problem: LinearMPC, feasible: Array) -> Iterator[str]:
 
 def _values(problem: LinearMPC, feasible: Array) -> Iterator[str]:
     law, few = problem.explicit(), feasible[:3]
-    yield f"The law at a few parameters [{', '.join(problem.parameters.names)}]:"
+    yield f"The law at a few parameters [{', '.join(problem.layout.names)}]:"
     for theta in np.vstack([np.zeros((1, problem.n_theta)), few]):
         where = "" if law.in_domain(theta) else " (not feasible)"
         yield f"  {_numbers(theta)} -> u = {_numbers(law(theta))}{where}"

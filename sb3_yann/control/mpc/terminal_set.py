@@ -36,15 +36,15 @@ def invariant_set(problem: LinearMPC) -> tuple[Array, Array]:
     Raises
     ------
     ValueError
-        If the gain does not stabilise the model, the origin is not inside all bounds, the number
+        If the gain does not stabilize the model, the origin is not inside all bounds, the number
         of steps is not finite within 500, or there are more than 200 rows.
     """
-    errors, parts = problem.errors, problem.parameters
+    errors, parts = problem.error_system, problem.layout
     K = lqr.gain(errors.model, errors.R, problem.terminal_cost, problem.gamma, errors.cross)
     radius = lqr.spectral_radius(errors.model.A - errors.model.B @ K)
     if radius >= 1:
         raise ValueError(
-            "terminal_set='invariant' needs a terminal gain that stabilises the model, but the "
+            "terminal_set='invariant' needs a terminal gain that stabilizes the model, but the "
             f"spectral radius of A - BK is {radius:.6g}. Use gamma=1, or the default terminal cost."
         )
     gain = errors.U - K @ errors.T
@@ -99,7 +99,7 @@ def _until_nothing_new(
 
 def _bounds(problem: LinearMPC, gain: Array) -> tuple[Array, Array]:
     """Return the hard bounds of x, u, y and the rate under ``u = gain theta``: rows and bounds."""
-    parts, size = problem.parameters, problem.n_theta
+    parts, size = problem.layout, problem.n_theta
     state = np.eye(size)[parts.state]
     values = [(gain, problem.u_min, problem.u_max)]
     for seen, low, high, soft in (
@@ -119,7 +119,7 @@ def _bounds(problem: LinearMPC, gain: Array) -> tuple[Array, Array]:
 
 def _steady_projection(problem: LinearMPC, half: Array) -> Array:
     """Return the map from theta to the theta at rest under the same r and d, in units of half."""
-    parts, steady = problem.parameters, problem.steady_states
+    parts, steady = problem.layout, problem.steady_states
     at_rest = np.zeros((problem.n_theta, problem.n_theta))
     at_rest[parts.state, parts.constant] = steady.x
     at_rest[parts.constant, parts.constant] = np.eye(parts.constant.stop - parts.constant.start)
@@ -129,7 +129,7 @@ def _steady_projection(problem: LinearMPC, half: Array) -> Array:
 
 def _granted(problem: LinearMPC, half: Array) -> tuple[Array, Array]:
     """Return the half-spaces that every predicted theta satisfies anyway."""
-    first = problem.parameters.constant.start
+    first = problem.layout.constant.start
     eye = np.eye(problem.n_theta)[first:]
     rows = np.vstack([eye, -eye])
     bounds = np.concatenate([problem.theta_max[first:], -problem.theta_min[first:]])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Parameters:
+class ThetaLayout:
     """The layout of ``theta = [x, r, d, u_prev]``, of which a problem has the parts that it uses.
 
     Attributes

@@ -19,7 +19,7 @@ def value_matrix(problem: LinearMPC, gamma: float) -> Array:
     The Lyapunov equation is solved in the error coordinates z, which exist for any discount, and
     ``z'Pz`` is mapped back by ``z = T theta``.
     """
-    gamma, errors = as_discount(gamma), problem.errors
+    gamma, errors = as_discount(gamma), problem.error_system
     K = gain_at_rest(problem)
     P = lqr.policy_value(errors.model, errors.Q, errors.R, K, gamma, errors.cross)
     return np.asarray(errors.T.T @ P @ errors.T)
@@ -46,7 +46,7 @@ def gain_at_rest(problem: LinearMPC) -> Array:
             "can start from it. Take the state and input where its law rests as the operating "
             "point, and leave linear_cost out."
         )
-    law, errors, parts = problem.explicit(), problem.errors, problem.parameters
+    law, errors, parts = problem.explicit(), problem.error_system, problem.layout
     origin = np.zeros(problem.n_theta)
     width = problem.u_max - problem.u_min
     unit = np.where(np.isfinite(width), width, 1.0)

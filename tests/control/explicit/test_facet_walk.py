@@ -15,7 +15,7 @@ from sample_problems import box_points, half_spaces, input_bounds_only, small_mp
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.control.explicit import solve as module
-from sb3_yann.control.explicit.budget import Limits, Watch
+from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
 
 # Those that ppopt solves in about a second.
@@ -41,7 +41,7 @@ def problem(name: str) -> LinearMPC:
 
 def regions_of(mpc: LinearMPC, solver: str) -> list[Region]:
     units = module._Units(mpc.condensed(), mpc.u_min, mpc.u_max)
-    return module._critical_regions(units.scaled, solver, Watch(Limits()))
+    return module._critical_regions(units.scaled, solver, BudgetTimer(SolveBudget()))
 
 
 def reaches_beyond(one: Region, other: Region) -> float:

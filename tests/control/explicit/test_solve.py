@@ -150,7 +150,7 @@ def test_published_benchmark_has_nine_regions_and_the_published_gains() -> None:
     assert table == {*published, (0, 0, 1), (0, 0, -1)}
 
 
-def test_benchmark_region_with_a_saturated_second_input_is_the_minimiser_by_hand() -> None:
+def test_benchmark_region_with_a_saturated_second_input_is_the_minimizer_by_hand() -> None:
     # With u_1 fixed the cost is a parabola in u_0: independent of any solver.
     mpc = benchmark()
     A, B, P = mpc.model.A, mpc.model.B, mpc.terminal_cost
@@ -240,7 +240,7 @@ def test_solving_does_not_change_equality() -> None:
         {"terminal_cost": np.eye(2)},
         {"terminal_set": ([[1, 1]], [3])},
         {"gamma": 0.9},
-        {"outside": "zero"},
+        {"infeasible": "zero_input"},
     ],
 )
 def test_problems_that_differ_in_one_argument_are_not_equal(changes: dict[str, Any]) -> None:

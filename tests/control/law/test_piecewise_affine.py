@@ -27,8 +27,8 @@ PLANAR = ["pendulum", "benchmark", "asymmetric input bounds", "two inputs", "ter
 
 
 @cache
-def law_of(name: str, outside: str = "nearest") -> PiecewiseAffine:
-    return dataclasses.replace(solved(name).explicit(), outside=outside)
+def law_of(name: str, infeasible: str = "nearest_region") -> PiecewiseAffine:
+    return dataclasses.replace(solved(name).explicit(), infeasible=infeasible)
 
 
 def far_points(law: PiecewiseAffine, seed: int = 0) -> np.ndarray:
@@ -57,7 +57,7 @@ def test_facets_and_vertices_belong_to_the_domain(name: str) -> None:
 def test_law_is_continuous_on_facets_and_at_vertices(name: str) -> None:
     law, points = law_of(name), special_points(name)
     half = (law.theta_max - law.theta_min) / 2
-    jumps, neighbours = [], 0
+    jumps, neighbors = [], 0
     for point in points:
         holding = [
             i
@@ -66,28 +66,28 @@ def test_law_is_continuous_on_facets_and_at_vertices(name: str) -> None:
         ]
         values = law.gains[holding] @ point + law.offsets[holding]
         jumps.append(np.max(np.abs(values - law(point)) / (law.u_max - law.u_min)))
-        neighbours += len(holding) > 1
+        neighbors += len(holding) > 1
     assert np.all(half > 0)
-    assert neighbours > 5  # the points do lie between regions
+    assert neighbors > 5  # the points do lie between regions
     assert max(jumps) <= 1e-9
 
 
-@pytest.mark.parametrize("outside", ["nearest", "zero"])
+@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
 @pytest.mark.parametrize("name", [*PLANAR, "reactor"])
 def test_every_facet_and_vertex_has_exactly_the_input_of_its_one_region(
-    name: str, outside: str
+    name: str, infeasible: str
 ) -> None:
-    law, points = law_of(name, outside), special_points(name)
+    law, points = law_of(name, infeasible), special_points(name)
     region = law.locate(points)
     for point, i, u in zip(points, region, law(points), strict=True):
         one = np.clip(law.gains[i] @ point + law.offsets[i], law.u_min, law.u_max)
         np.testing.assert_allclose(u, one, rtol=0, atol=1e-14 * np.max(law.u_max))
 
 
-@pytest.mark.parametrize("outside", ["nearest", "zero"])
+@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
 @pytest.mark.parametrize("name", [*PLANAR, "reactor", "four states, two inputs"])
-def test_one_point_and_a_batch_agree(name: str, outside: str) -> None:
-    law = law_of(name, outside)
+def test_one_point_and_a_batch_agree(name: str, infeasible: str) -> None:
+    law = law_of(name, infeasible)
     points = np.vstack([special_points(name), far_points(law)])
     np.testing.assert_allclose(
         np.stack([law(point) for point in points]),
@@ -112,10 +112,10 @@ def test_shapes_follow_those_of_theta(batch: tuple[int, ...]) -> None:
     assert np.shape(law.locate(theta)) == np.shape(law.in_domain(theta)) == batch
 
 
-@pytest.mark.parametrize("outside", ["nearest", "zero"])
+@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_input_is_finite_and_within_bounds_a_million_boxes_away(name: str, outside: str) -> None:
-    law = law_of(name, outside)
+def test_input_is_finite_and_within_bounds_a_million_boxes_away(name: str, infeasible: str) -> None:
+    law = law_of(name, infeasible)
     u = law(far_points(law))
     assert np.all(np.isfinite(u))
     assert np.all((law.u_min <= u) & (u <= law.u_max))
@@ -124,34 +124,34 @@ def test_input_is_finite_and_within_bounds_a_million_boxes_away(name: str, outsi
 def test_nearest_is_the_clipped_law_of_the_region_violated_least() -> None:
     law = law_of("benchmark")
     points = far_points(law)
-    outside = points[~law.in_domain(points)]
-    assert len(outside) > 100
-    i = law.locate(outside)
-    affine = np.einsum("bmn,bn->bm", law.gains[i], outside) + law.offsets[i]
-    np.testing.assert_array_equal(law(outside), np.clip(affine, -1, 1))
+    infeasible = points[~law.in_domain(points)]
+    assert len(infeasible) > 100
+    i = law.locate(infeasible)
+    affine = np.einsum("bmn,bn->bm", law.gains[i], infeasible) + law.offsets[i]
+    np.testing.assert_array_equal(law(infeasible), np.clip(affine, -1, 1))
 
 
 @pytest.mark.parametrize(
     ("name", "value"), [("asymmetric input bounds", 0.0), ("zero input not allowed", 0.2)]
 )
 def test_zero_is_no_input_outside_or_the_bound_nearest_to_it(name: str, value: float) -> None:
-    law = law_of(name, "zero")
+    law = law_of(name, "zero_input")
     points = far_points(law)
-    outside = points[~law.in_domain(points)]
-    assert len(outside) > 100
-    np.testing.assert_array_equal(law(outside), value)
+    infeasible = points[~law.in_domain(points)]
+    assert len(infeasible) > 100
+    np.testing.assert_array_equal(law(infeasible), value)
 
 
 @pytest.mark.parametrize("name", [*PLANAR, "reactor"])
 def test_both_options_are_the_same_law_inside(name: str) -> None:
     points = box_points(solved(name), 1000)
     inside = points[law_of(name).in_domain(points)]
-    np.testing.assert_array_equal(law_of(name, "zero")(inside), law_of(name)(inside))
+    np.testing.assert_array_equal(law_of(name, "zero_input")(inside), law_of(name)(inside))
 
 
-@pytest.mark.parametrize("outside", ["nearest", "zero"])
-def test_law_read_from_a_file_is_equal_to_the_one_saved(tmp_path: Path, outside: str) -> None:
-    law, path = law_of("reactor", outside), tmp_path / "law"
+@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
+def test_law_read_from_a_file_is_equal_to_the_one_saved(tmp_path: Path, infeasible: str) -> None:
+    law, path = law_of("reactor", infeasible), tmp_path / "law"
     law.save(path)
     assert PiecewiseAffine.load(path) == law
     assert hash(PiecewiseAffine.load(str(path))) == hash(law)
@@ -233,7 +233,7 @@ GARBAGE: dict[str, Callable[[Path], Any]] = {
     "half rows": arrays_with(starts=np.arange(7) / 2),
     "no region": arrays_with(gains=np.zeros((0, 1, 2)), offsets=np.zeros((0, 1)), starts=[]),
     "crossed bounds": arrays_with(u_min=np.array([3.0])),
-    "an unknown option": arrays_with(outside="mean"),
+    "an unknown option": arrays_with(infeasible="mean"),
 }
 
 
@@ -274,7 +274,7 @@ def test_arrays_are_read_only_in_every_copy(name: str, copied: Any) -> None:
 @pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(PiecewiseAffine)])
 def test_laws_that_differ_in_one_field_are_not_equal(name: str) -> None:
     law = law_of("pendulum")
-    value = {"outside": "zero", "disjoint": False}.get(name)
+    value = {"infeasible": "zero_input", "disjoint": False}.get(name)
     if value is None:
         value = getattr(law, name) + 0
         value.flat[-1] += 1 if name == "starts" else 1e-3

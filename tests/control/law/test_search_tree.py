@@ -20,12 +20,12 @@ from sb3_yann.control.law.search_tree import SearchTree, build_tree
 
 
 @cache
-def many_regions(outside: str = "nearest") -> PiecewiseAffine:
+def many_regions(infeasible: str = "nearest_region") -> PiecewiseAffine:
     """The law of a cart with 125 regions, part of whose box has no solution."""
     model = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
     return LinearMPC(
         model, Q=np.eye(2), R=[[0.03]], horizon=6,
-        x_min=[-5, -2], x_max=[5, 2], u_min=-1, u_max=1, outside=outside,
+        x_min=[-5, -2], x_max=[5, 2], u_min=-1, u_max=1, infeasible=infeasible,
     ).explicit()  # fmt: skip
 
 
@@ -124,7 +124,7 @@ def test_the_search_tries_hardly_more_than_the_region_that_holds_a_point(make) -
 
 
 def test_regions_that_overlap_go_by_the_largest_slack() -> None:
-    """Of twenty intervals that reach into their neighbours each holds what it has the middle of."""
+    """Of twenty intervals that reach into their neighbors each holds what it has the middle of."""
     middles = np.linspace(-0.95, 0.95, 20)
     law = PiecewiseAffine(
         np.zeros((20, 1, 1)), middles[:, None], np.tile([[1.0], [-1.0]], (20, 1)),
@@ -137,9 +137,9 @@ def test_regions_that_overlap_go_by_the_largest_slack() -> None:
     assert np.array_equal(law.locate(points), nearest)
 
 
-@pytest.mark.parametrize("outside", ["nearest", "zero"])
-def test_one_point_and_a_batch_give_the_same_input(outside: str) -> None:
-    law = many_regions(outside)
+@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
+def test_one_point_and_a_batch_give_the_same_input(infeasible: str) -> None:
+    law = many_regions(infeasible)
     points = in_box(law, 500, 1.5)
     assert np.array_equal(law(points), [law(point) for point in points])
 
@@ -258,7 +258,7 @@ def test_without_a_compiler_the_law_is_the_same() -> None:
     )
     outputs = [
         subprocess.run(
-            [sys.executable, "-c", program], env={**os.environ, "NUMBA_DISABLE_JIT": off},
+            [sys.executable, "-c", program], env={**os.environ, "NUMBA_DISABLE_JIT": off, "PYTHONPATH": os.pathsep.join(sys.path)},
             capture_output=True, text=True, check=True, cwd=Path(__file__).parent,
         ).stdout
         for off in "01"

@@ -1,4 +1,4 @@
-"""A simulator is linearised where it rests; what cannot be is refused with the reason."""
+"""A simulator is linearized where it rests; what cannot be is refused with the reason."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Plant(gym.Env):
         return self.x.copy(), 0.0, False, False, {}
 
 
-def test_reactor_is_linearised_as_its_equations_are() -> None:
+def test_reactor_is_linearized_as_its_equations_are() -> None:
     truth = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
     model = LinearModel.from_env("CSTR-v0", np.zeros(4), [0.0])
     # the environment integrates with two Runge-Kutta steps
@@ -60,7 +60,7 @@ def test_entries_that_are_nan_are_solved_for() -> None:
     np.testing.assert_allclose(f, 0, atol=1e-5)
 
 
-def test_pendulum_is_linearised_as_its_integrator_is() -> None:
+def test_pendulum_is_linearized_as_its_integrator_is() -> None:
     model = LinearModel.from_env("ClippedPendulum-v0", [0.0, 0.0])
     np.testing.assert_allclose(model.A, UPRIGHT_A, atol=1e-10)
     np.testing.assert_allclose(model.B, UPRIGHT_B, atol=1e-10)
@@ -74,7 +74,7 @@ def test_input_that_holds_a_tilted_pendulum_is_found() -> None:
 
 
 @pytest.mark.parametrize(("angle", "A"), [(0.0, UPRIGHT_A), (np.pi, HANGING_A)])
-def test_gymnasiums_pendulum_is_linearised_in_the_state_it_does_not_observe(
+def test_gymnasiums_pendulum_is_linearized_in_the_state_it_does_not_observe(
     angle: float, A: Any
 ) -> None:
     model = LinearModel.from_env("Pendulum-v1", [angle, 0.0])
@@ -191,7 +191,7 @@ BAD_PLANTS: list[tuple[Any, dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("step", "arguments", "message"), BAD_PLANTS)
-def test_plant_that_cannot_be_linearised_is_refused_with_the_reason(
+def test_plant_that_cannot_be_linearized_is_refused_with_the_reason(
     step: Any, arguments: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=f"(?s){message}"):
@@ -278,9 +278,9 @@ def test_missing_sampling_time_is_asked_for_and_render_fps_is_none() -> None:
         ("CartPole-v1", r"Discrete\(2\): a linear model needs a Box"),
         (3, "env = 3 must be a single gymnasium.Env"),
         (lambda: 3, "returned 3, expected a single"),
-        (gym.make_vec("CSTR-v0", num_envs=2), "of a vectorised environment, pass one of its parts"),
+        (gym.make_vec("CSTR-v0", num_envs=2), "of a vectorized environment, pass one of its parts"),
     ],
-    ids=["discrete", "number", "function", "vectorised"],
+    ids=["discrete", "number", "function", "vectorized"],
 )
 def test_what_is_no_environment_of_a_plant_is_named(env: Any, message: str) -> None:
     with pytest.raises(TypeError, match=message):

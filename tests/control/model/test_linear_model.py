@@ -1,4 +1,4 @@
-"""A LinearModel is sampled exactly, is linearised rightly, and cannot be changed."""
+"""A LinearModel is sampled exactly, is linearized rightly, and cannot be changed."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_sampling_keeps_the_operating_point_and_the_sampling_time() -> None:
     assert (model.dt, model.x_ss.tolist(), model.u_ss.tolist()) == (0.25, [2.0], [3.0])
 
 
-def test_dynamics_are_linearised_by_their_jacobian() -> None:
+def test_dynamics_are_linearized_by_their_jacobian() -> None:
     def raw(x: Any, u: Any) -> Any:
         return np.array([np.sin(x[1]) * x[0] + u[0] ** 2, np.exp(x[0]) - x[1] * u[1]])
 
@@ -97,7 +97,7 @@ def test_kink_in_the_dynamics_is_refused() -> None:
         LinearModel.from_dynamics(lambda x, u: -x + np.maximum(u, 0), [0], [0], 0.1)
 
 
-def test_pendulum_linearises_to_the_printed_matrices() -> None:
+def test_pendulum_linearizes_to_the_printed_matrices() -> None:
     model = LinearModel.from_dynamics(pendulum.dynamics, pendulum.X_SS, pendulum.U_SS, pendulum.DT)
     # printed to 4 decimals
     np.testing.assert_allclose(model.A, pendulum.PRINTED_A, atol=0.5e-4)
@@ -227,7 +227,7 @@ def test_trace_off_its_steady_state_is_refused_by_its_scale_and_warned_of_withou
     np.testing.assert_allclose(model.A, np.exp(0.1 * (-1 - 2e4 * TRACE)), rtol=1e-9)
 
 
-def test_bend_that_is_short_beside_one_is_linearised_with_its_scale() -> None:
+def test_bend_that_is_short_beside_one_is_linearized_with_its_scale() -> None:
     def f(x, u):
         return 1e-6 * (u - np.tanh(x / 1e-6))
 
@@ -238,7 +238,7 @@ def test_bend_that_is_short_beside_one_is_linearised_with_its_scale() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered in sqrt")
-def test_tank_that_is_nearly_empty_is_linearised_with_shorter_steps() -> None:
+def test_tank_that_is_nearly_empty_is_linearized_with_shorter_steps() -> None:
     level = 1e-4
     rest = [2e-3 * np.sqrt(level)]
     model = LinearModel.from_dynamics(lambda x, u: u - 2e-3 * np.sqrt(x), [level], rest, 0.1)

@@ -84,7 +84,7 @@ def test_law_and_domain_of_random_problems_are_those_of_an_online_qp(mpc: Linear
 def test_eight_parameters_and_two_inputs() -> None:
     mpc = solved("two tanks, all parts")
     assert (mpc.n_theta, mpc.model.n_inputs) == (8, 2)
-    assert mpc.parameters.names == (
+    assert mpc.layout.names == (
         *("x[0]", "x[1]", "r[0]", "r[1]", "d[0]", "d[1]", "u_prev[0]", "u_prev[1]"),
     )
 
@@ -222,7 +222,7 @@ def test_a_problem_with_one_thing_replaced_is_that_problem(name: str) -> None:
     assert dataclasses.replace(mpc) == mpc
     changed = dataclasses.replace(mpc, r_max=mpc.r_max / 2)
     assert (changed == mpc) == (mpc.r_max.size == 0)
-    assert changed.theta_max[changed.parameters.reference].tolist() == (mpc.r_max / 2).tolist()
+    assert changed.theta_max[changed.layout.reference].tolist() == (mpc.r_max / 2).tolist()
 
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [

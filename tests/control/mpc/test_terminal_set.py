@@ -68,7 +68,7 @@ def test_the_set_is_invariant_under_its_gain_which_keeps_the_bounds(name: str) -
     following = mpc.predict(theta, u)
     assert np.all(following @ F.T <= g + 1e-9)
     assert np.all((u <= mpc.u_max + 1e-9) & (u >= mpc.u_min - 1e-9))
-    x = following[:, mpc.parameters.state]
+    x = following[:, mpc.layout.state]
     assert np.all((x <= mpc.x_max + 1e-9) & (x >= mpc.x_min - 1e-9))
 
 

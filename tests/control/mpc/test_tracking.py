@@ -14,7 +14,7 @@ TRACKING = ["servo", "servo with all of it", "two tanks, all parts", "more input
 
 def reachable_constants(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """References (count, p) and disturbances (count, d) with a steady state inside the bounds."""
-    rng, parts = np.random.default_rng(seed), mpc.parameters
+    rng, parts = np.random.default_rng(seed), mpc.layout
     theta = rng.uniform(mpc.theta_min, mpc.theta_max, (20 * count, mpc.n_theta))
     r, d = theta[:, parts.reference], theta[:, parts.disturbance]
     inside = mpc.is_reachable(r, d)
@@ -27,11 +27,11 @@ def test_a_hundred_reachable_references_are_reached_without_offset(name: str) ->
     mpc = solved(name)
     r, d = reachable_constants(mpc, 100)
     start = np.zeros((100, mpc.n_theta))
-    start[:, mpc.parameters.constant] = np.hstack([r, d])
+    start[:, mpc.layout.constant] = np.hstack([r, d])
     theta = start
     for _ in range(150):
         theta = mpc.predict(theta, mpc.explicit()(theta))
-    reached = theta[:, mpc.parameters.state] @ mpc.tracked.T
+    reached = theta[:, mpc.layout.state] @ mpc.tracked.T
     assert np.max(np.abs(reached - r)) < 1e-6
 
 
@@ -41,7 +41,7 @@ def test_a_hundred_references_are_reached_under_a_disturbance_nobody_measures(
     name: str, measured: list[int] | None
 ) -> None:
     mpc = solved(name)
-    observer, law, parts = DisturbanceObserver(mpc.model, measured), mpc.explicit(), mpc.parameters
+    observer, law, parts = DisturbanceObserver(mpc.model, measured), mpc.explicit(), mpc.layout
     r, d = reachable_constants(mpc, 100)
     worst = 0.0
     for reference, disturbance in zip(r, d, strict=True):
@@ -82,7 +82,7 @@ def test_the_steady_state_rests_and_shows_the_reference(name: str) -> None:
         x, u = mpc.steady_state(r, d)
         np.testing.assert_allclose(mpc.model.step(x, u, d), x, atol=1e-12)
         np.testing.assert_allclose(mpc.tracked @ x, r, atol=1e-12)
-        theta = np.concatenate([x, r, d, u[: mpc.parameters.n_previous]])
+        theta = np.concatenate([x, r, d, u[: mpc.layout.n_previous]])
         np.testing.assert_allclose(mpc.explicit()(theta), u, atol=1e-9)
 
 
