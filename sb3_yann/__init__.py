@@ -8,13 +8,19 @@ import sb3_yann_envs
 from sb3_yann.audit import CostAudit, CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
 from sb3_yann.control import (
+    DisturbanceBounds,
     DisturbanceObserver,
     ExplicitLimitError,
     ExplicitSolutionError,
     Identified,
     LinearModel,
     LinearMPC,
+    OutputBounds,
     PiecewiseAffine,
+    RateLimits,
+    SoftBounds,
+    Terminal,
+    Tracking,
     identify,
 )
 from sb3_yann.guard import Decision, ImprovementGuard, restore_accepted
@@ -35,6 +41,7 @@ __all__ = [
     "CostMismatchError",
     "CostMismatchWarning",
     "Decision",
+    "DisturbanceBounds",
     "DisturbanceObserver",
     "ExplicitLimitError",
     "ExplicitSolutionError",
@@ -43,7 +50,12 @@ __all__ = [
     "LinearMPC",
     "LinearModel",
     "NoActionNoise",
+    "OutputBounds",
     "PiecewiseAffine",
+    "RateLimits",
+    "SoftBounds",
+    "Terminal",
+    "Tracking",
     "YannActor",
     "YannCritic",
     "YannPolicy",
