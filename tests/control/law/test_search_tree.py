@@ -45,7 +45,9 @@ LAWS = pytest.mark.parametrize("make", [many_regions, two_masses])
 
 
 def scanned(law: PiecewiseAffine, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return locate_batch(*pack(law, None), np.ascontiguousarray(points))
+    region, inside = np.empty(len(points), np.int64), np.empty(len(points))
+    locate_batch(*pack(law, None), np.ascontiguousarray(points), region, inside)
+    return region, inside
 
 
 def in_box(law: PiecewiseAffine, count: int, stretch: float = 1.0) -> np.ndarray:
