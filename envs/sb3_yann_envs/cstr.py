@@ -110,6 +110,7 @@ PRINTED_A = constant(
 PRINTED_B = constant([[0.0], [0.0], [0.0], [-0.0007]])
 """Input matrix as printed in the paper, for deviations and one sample."""
 
+_STATE = "UniTuple(float64, 4)"  # which numba returns without running Python code
 _STATE_NAMES = ("C_A deviation", "C_B deviation", "C_S deviation", "T deviation")
 
 
@@ -134,7 +135,7 @@ def dynamics(x: ArrayLike, u: ArrayLike) -> NDArray[np.float64]:
     return np.array(_rates(c_a, c_b, c_s, temperature, transfer))
 
 
-@compiled
+@compiled(f"{_STATE}(float64, float64, float64, float64, float64)")
 def _rates(
     c_a: float, c_b: float, c_s: float, temperature: float, transfer: float
 ) -> tuple[float, float, float, float]:
@@ -159,13 +160,13 @@ def stage_cost(a: Any, b: Any, s: Any, t: Any, u: Any) -> Any:
     return 0.1 * (a * a + b * b + s * s + t * t) + 1e-4 * u * u
 
 
-@compiled
+@compiled("boolean(float64, float64)")
 def is_rich(a: float, b: float) -> bool:
     """Tell whether deviations of C_A and C_B are so large that a step needs `RICH_SUBSTEPS`."""
     return (_A_SS + a) * (_B_SS + b) > RICH
 
 
-@compiled
+@compiled(f"{_STATE}(float64, float64, float64, float64, float64)")
 def advance(
     a: float, b: float, s: float, t: float, transfer: float
 ) -> tuple[float, float, float, float]:
@@ -194,14 +195,14 @@ def advance(
     return a, b, s, t
 
 
-@compiled
-def advance_all(deviations: NDArray[np.float64], transfer: NDArray[np.float64]) -> Any:
-    """Return `advance` of many reactors: deviations of shape (4, n), transfer of shape (n,)."""
-    after = np.empty_like(deviations)
+@compiled("void(float64[:, ::1], float64[::1], float64[:, ::1])")
+def advance_all(
+    deviations: NDArray[np.float64], transfer: NDArray[np.float64], after: NDArray[np.float64]
+) -> None:
+    """Write `advance` of many reactors: deviations of shape (4, n), transfer of shape (n,)."""
     for i in range(len(transfer)):
         a, b, s, t = deviations[0, i], deviations[1, i], deviations[2, i], deviations[3, i]
         after[0, i], after[1, i], after[2, i], after[3, i] = advance(a, b, s, t, transfer[i])
-    return after
 
 
 class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):

@@ -55,6 +55,9 @@ def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
     With types that are given nothing is ever compiled for others: those are refused. Without any
     the function is a part of those that call it. With ``fastmath`` sums may be taken in any order,
     several terms at a time.
+
+    What Python calls returns a plain number or nothing, and writes arrays to those it is given. To
+    return one, numba runs Python code behind Python's back: a Ctrl-C there is a SystemError.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
@@ -255,31 +258,25 @@ def input_at(floats: Array, whole: Integers, theta: Array, out: Array, at: int) 
     return region
 
 
-@compiled("optional(float64[::1])(float64[::1], int64[::1], float64[::1])")
-def law_at(floats: Array, whole: Integers, theta: Array) -> Array | None:
-    """Return the input (m,) at one theta (n,), None where theta is not finite or too long."""
+@compiled("boolean(float64[::1], int64[::1], float64[::1], float64[::1])")
+def law_at(floats: Array, whole: Integers, theta: Array, out: Array) -> bool:
+    """Write the input (m,) at one theta (n,); False where theta is not finite or too long."""
     if len(theta) != whole[0]:
-        return None
-    out = np.empty((1, whole[1]))
-    if input_at(floats, whole, theta.reshape(1, -1), out, 0) < 0:
-        return None
-    u: Array = out[0]
-    return u
+        return False
+    return input_at(floats, whole, theta.reshape(1, -1), out.reshape(1, -1), 0) >= 0
 
 
-@compiled("float64[:, ::1](float64[::1], int64[::1], float64[:, ::1])")
-def law_of_batch(floats: Array, whole: Integers, theta: Array) -> Array:
-    """Return the inputs (batch, m) at the rows of theta (batch, n), all finite."""
-    out = np.empty((len(theta), whole[1]))
+@compiled("void(float64[::1], int64[::1], float64[:, ::1], float64[:, ::1])")
+def law_of_batch(floats: Array, whole: Integers, theta: Array, out: Array) -> None:
+    """Write the inputs (batch, m) at the rows of theta (batch, n), all finite."""
     for i in range(len(theta)):
         input_at(floats, whole, theta, out, i)
-    return out
 
 
-@compiled("Tuple((int64[::1], float64[::1]))(float64[::1], int64[::1], float64[:, ::1])")
-def locate_batch(floats: Array, whole: Integers, theta: Array) -> tuple[Integers, Array]:
-    """Return the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
-    region, inside = np.empty(len(theta), np.int64), np.empty(len(theta))
+@compiled("void(float64[::1], int64[::1], float64[:, ::1], int64[::1], float64[::1])")
+def locate_batch(
+    floats: Array, whole: Integers, theta: Array, region: Integers, inside: Array
+) -> None:
+    """Write the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
     for i in range(len(theta)):
         region[i], inside[i] = _choose(floats, whole, theta, i)
-    return region, inside

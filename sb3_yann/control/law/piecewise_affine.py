@@ -150,16 +150,18 @@ class PiecewiseAffine(ReadOnlyArrays):
             If theta is not numeric, has another shape or holds NaN or infinite entries.
         """
         if getattr(theta, "ndim", 0) == 1:
+            u = np.empty(len(self.u_min))
             try:
-                u = self._at(theta)
+                if self._at(theta, u):
+                    return u
             except TypeError:  # not float64, which is all that this was compiled for
-                u = None
-            if u is not None:
-                return u
+                pass
         from sb3_yann.control.law._kernels import law_of_batch
 
         points = self._as_theta(theta)
-        inputs: Array = law_of_batch(*self.packed, np.atleast_2d(points))
+        rows = np.atleast_2d(points)
+        inputs = np.empty((len(rows), self.n_inputs))
+        law_of_batch(*self.packed, rows, inputs)
         return inputs if points.ndim == 2 else inputs[0]
 
     def locate(self, theta: ArrayLike) -> NDArray[np.int64]:
@@ -240,7 +242,9 @@ class PiecewiseAffine(ReadOnlyArrays):
         from sb3_yann.control.law._kernels import locate_batch
 
         points = self._as_theta(theta)
-        region, inside = locate_batch(*self.packed, np.atleast_2d(points))
+        rows = np.atleast_2d(points)
+        region, inside = np.empty(len(rows), np.int64), np.empty(len(rows))
+        locate_batch(*self.packed, rows, region, inside)
         return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
 
     @cached_property
@@ -262,7 +266,7 @@ class PiecewiseAffine(ReadOnlyArrays):
         return pack(self, self.tree)
 
     @cached_property
-    def _at(self) -> Callable[[Any], Array | None]:
+    def _at(self) -> Callable[[Any, Array], bool]:
         from sb3_yann.control.law._kernels import law_at
 
         return partial(law_at, *self.packed)

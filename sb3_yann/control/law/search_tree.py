@@ -181,7 +181,8 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
     first, last = regions.vertex_starts[which], regions.vertex_starts[which + 1]
     corners = regions.vertices[random.integers(first, last, (n + 1, len(which)))]
     within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
-    all_over, in_each = (
+    all_over, in_each = np.zeros((2, len(tree.leaf_regions)), np.int64)
+    for points, hits in ((everywhere, all_over), (within, in_each)):
         _hits(
             tree.normals,
             tree.levels,
@@ -192,17 +193,16 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
             regions.b,
             regions.row_starts,
             points,
+            hits,
         )
-        for points in (everywhere, within)
-    )
     leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
     order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
     return np.ascontiguousarray(tree.leaf_regions[order])
 
 
 @compiled(
-    "int64[::1](float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
-    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1])"
+    "void(float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1], int64[::1])"
 )
 def _hits(
     normals: Array,
@@ -214,9 +214,9 @@ def _hits(
     b: Array,
     row_starts: Integers,
     points: Array,
-) -> Integers:
-    """Return for each entry of ``leaf_regions`` how many points it is the first one to hold."""
-    hits = np.zeros(len(leaf_regions), np.int64)
+    hits: Integers,
+) -> None:
+    """Count for each entry of ``leaf_regions`` the points that it is the first one to hold."""
     for each in range(len(points)):
         point, node = points[each], 0
         while node >= 0:
@@ -232,7 +232,6 @@ def _hits(
             if inside:
                 hits[k] += 1
                 break
-    return hits
 
 
 def _polytopes(A: Array, b: Array, row_starts: Integers) -> _Polytopes:
@@ -256,7 +255,8 @@ def _best_split(
     chosen = random.choice(inside, min(CANDIDATES, len(inside)), replace=False)
     first, last = regions.row_starts[chosen], regions.row_starts[chosen + 1]
     rows = random.integers(np.tile(first, 2), np.tile(last, 2))
-    sides = _sides(
+    sides = np.empty((len(rows), len(inside)), np.uint8)
+    _sides(
         regions.vertices,
         regions.vertex_starts,
         regions.middles,
@@ -264,6 +264,7 @@ def _best_split(
         inside,
         regions.A[rows],
         regions.b[rows],
+        sides,
     )
     below, above = (sides & 1).sum(axis=1), (sides >> 1).sum(axis=1)
     larger = np.maximum(below, above)
@@ -274,8 +275,8 @@ def _best_split(
 
 
 @compiled(
-    "uint8[:, ::1](float64[:, ::1], int64[::1], float64[:, ::1], float64[::1], int64[::1], "
-    "float64[:, ::1], float64[::1])"
+    "void(float64[:, ::1], int64[::1], float64[:, ::1], float64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1], uint8[:, ::1])"
 )
 def _sides(
     points: Array,
@@ -285,10 +286,10 @@ def _sides(
     inside: Integers,
     normals: Array,
     levels: Array,
-) -> NDArray[np.uint8]:
-    """Return for each hyperplane and region: 1 below it, 2 above it, 3 on both sides."""
+    sides: NDArray[np.uint8],
+) -> None:
+    """Write for each hyperplane and region: 1 below it, 2 above it, 3 on both sides."""
     n = points.shape[1]
-    sides = np.zeros((len(levels), len(inside)), np.uint8)
     for c in range(len(levels)):
         for k in range(len(inside)):
             i = inside[k]
@@ -306,7 +307,6 @@ def _sides(
                 side |= 1 if distance < -OVERLAP else 0
                 side |= 2 if distance > OVERLAP else 0
             sides[c, k] = side if side else 3
-    return sides
 
 
 def vertices(A: Array, b: Array) -> Array:

@@ -45,7 +45,9 @@ LAWS = pytest.mark.parametrize("make", [many_regions, two_masses])
 
 
 def scanned(law: PiecewiseAffine, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return locate_batch(*pack(law, None), np.ascontiguousarray(points))
+    region, inside = np.empty(len(points), np.int64), np.empty(len(points))
+    locate_batch(*pack(law, None), np.ascontiguousarray(points), region, inside)
+    return region, inside
 
 
 def in_box(law: PiecewiseAffine, count: int, stretch: float = 1.0) -> np.ndarray:
@@ -256,10 +258,10 @@ def test_without_a_compiler_the_law_is_the_same() -> None:
         "from test_search_tree import *; law = many_regions(); points = in_box(law, 200, 1.5)\n"
         "print(law(points).tobytes().hex(), law(points[0]).tobytes().hex())"
     )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    here = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     outputs = [
         subprocess.run(
-            [sys.executable, "-c", program], env={**environment, "NUMBA_DISABLE_JIT": off},
+            [sys.executable, "-c", program], env={**here, "NUMBA_DISABLE_JIT": off},
             capture_output=True, text=True, check=True, cwd=Path(__file__).parent,
         ).stdout
         for off in "01"
