@@ -64,11 +64,6 @@ class MPCProblem(ReadOnlyArrays):
         return self.layout.size
 
     @cached_property
-    def theta_center(self) -> Array:
-        """The middle of the box of theta (n_theta,)."""
-        return np.asarray((self.theta_max + self.theta_min) / 2)
-
-    @cached_property
     def theta_half(self) -> Array:
         """The half-widths of the box of theta (n_theta,), 1 where it is unbounded."""
         return half_widths(self.theta_min, self.theta_max)
