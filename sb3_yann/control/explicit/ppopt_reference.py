@@ -18,8 +18,7 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     They come from ppopt's combinatorial graph search (Arnström et al.,
-    https://arxiv.org/abs/2404.05511) with GLPK and DAQP. ppopt tells its regions only at the end,
-    so the number of regions is looked at only then.
+    https://arxiv.org/abs/2404.05511) with GLPK and DAQP. It tells its regions only at the end.
     """
     n = program.F.shape[1]
     box_A, box_b = np.vstack([np.eye(n), -np.eye(n)]), np.ones(2 * n)

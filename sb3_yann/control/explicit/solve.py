@@ -29,19 +29,17 @@ def solve_explicit(
 ) -> PiecewiseAffine:
     """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
 
-    The regions are in the order of their active sets, fewest constraints first, so that a problem
-    always gives the same law.
+    The regions are in the order of their active sets, fewest constraints first.
 
     Parameters
     ----------
     program : ParametricQP
     u_min, u_max : ndarray, shape (m,)
-        The input range, in which the tolerances are measured; infinite where there is none.
+        The input range, in which tolerances are measured; infinite where there is none.
     infeasible : {"nearest_region", "zero_input"}
         See :class:`PiecewiseAffine`.
     solver : {"walk", "ppopt"}
-        Our walk from facet to facet (:mod:`sb3_yann.control.explicit.facet_walk`), or ppopt's
-        combinatorial graph search, which takes tens of times longer above a hundred regions.
+        Our walk from facet to facet, or ppopt's combinatorial graph search, tens of times slower.
     budget : SolveBudget
         When to give up.
 

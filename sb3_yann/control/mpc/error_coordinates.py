@@ -17,12 +17,9 @@ from sb3_yann.control.mpc.theta_layout import ThetaLayout
 class ErrorSystem(ReadOnlyArrays):
     """The problem in ``z = to_error theta`` and ``v = u - to_input theta``: ``z+ = A z + B v``.
 
-    There the stage cost is quadratic.
-
-    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate of the input has a weight. The
-    reference and the disturbance are constant, so they are modes on the unit circle of
-    ``theta+ = A_bar theta + B_bar u``: no Lyapunov or Riccati equation has a solution there without
-    a discount. In z they are gone.
+    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate has a weight. The stage cost is
+    quadratic there. In theta the constant r and d are modes on the unit circle, where no Lyapunov
+    or Riccati equation has a solution without a discount. In z they are gone.
 
     Attributes
     ----------
