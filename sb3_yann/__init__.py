@@ -5,6 +5,7 @@ policy alias ``"YannPolicy"`` with TD3 and DDPG.
 """
 
 import sb3_yann_envs
+from sb3_yann._finite import NonFiniteWarning
 from sb3_yann.actor_critic import YannActor, YannCritic
 from sb3_yann.audit import CostAudit, CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics, NoActionNoise
@@ -43,6 +44,7 @@ __all__ = [
     "LinearMPC",
     "LinearModel",
     "NoActionNoise",
+    "NonFiniteWarning",
     "PiecewiseAffine",
     "YannActor",
     "YannCritic",

@@ -14,6 +14,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._finite import watch_buffer
 from sb3_yann.guard.chance import chance_untouched
 from sb3_yann.guard.checks import check_between, check_not_nested, check_whole
 from sb3_yann.guard.plant import PlantTrials
@@ -213,6 +214,7 @@ class ImprovementGuard(BaseCallback):
                 f"{type(policy).__name__}."
             )
         self.policy = policy
+        watch_buffer(self.model)
         untrained = policy.actor.mu.network.is_zero()
         self._mpc = Snapshot.of(policy) if untrained else None
 

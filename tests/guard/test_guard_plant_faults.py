@@ -24,7 +24,7 @@ from guard_samples import (
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_yann import NoActionNoise
+from sb3_yann import NoActionNoise, NonFiniteWarning
 
 BLOCK = 3 * STEPS
 plant = partial(Slide, low=2.0, high=2.8)
@@ -98,7 +98,10 @@ def test_a_cost_of_the_first_block_that_is_no_number_is_an_error() -> None:
             observation, _, *rest = super().step(action)
             return observation, np.nan, *rest
 
-    with pytest.raises(ValueError, match=r"first block cost .*Rewards must be finite numbers"):
+    with (
+        pytest.warns(NonFiniteWarning, match="reward"),
+        pytest.raises(ValueError, match=r"first block cost .*Rewards must be finite numbers"),
+    ):
         train(still(env=Faulty()), BLOCK, guard_alone())
 
 
