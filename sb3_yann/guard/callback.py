@@ -18,7 +18,7 @@ from sb3_yann._finite import watch_buffer
 from sb3_yann.guard.chance import chance_untouched
 from sb3_yann.guard.checks import check_between, check_not_nested, check_whole
 from sb3_yann.guard.plant import PlantTrials
-from sb3_yann.guard.record import Decision, GuardState, write_csv
+from sb3_yann.guard.record import Decision, GuardState, append_csv, write_csv
 from sb3_yann.guard.restoring import restore_accepted
 from sb3_yann.guard.simulator import SimulatorTrials
 from sb3_yann.guard.snapshot import Snapshot
@@ -295,7 +295,7 @@ class ImprovementGuard(BaseCallback):
         self.logger.record("guard/rejected", rejected)
         self.logger.record("guard/accepted", len(self.decisions) - rejected)
         if self.record is not None:
-            write_csv(self.record, self.decisions)
+            append_csv(self.record, self.decisions)
         self.logger.dump(self.num_timesteps)  # as EvalCallback does, or the next would replace it
         if self.verbose:
             print(
