@@ -149,14 +149,12 @@ def warn_of_refused_step(name: str, optimizer: th.optim.Optimizer, refused: int)
     )
 
 
-def warn_of_lost_entries(lost: NDArray[np.bool_]) -> None:
-    """Name the entries of observations (batch, n) that the law did without."""
+def what_is_not_finite(lost: NDArray[np.bool_]) -> str:
+    """Say what an actor did without: entries of observations (batch, n), or its networks."""
     entries = np.flatnonzero(lost.any(0)).tolist()
-    warnings.warn(
-        f"The observation is not finite in entries {entries}: the law acts, at the operating point "
-        "in what depends on them."
-        if entries
-        else "The actor's networks put out what is not finite: the law acts alone.",
-        NonFiniteWarning,
-        stacklevel=4,
-    )
+    if entries:
+        return (
+            f"The observation is not finite in entries {entries}: the law acts, at the operating "
+            "point in what depends on them."
+        )
+    return "The actor's networks put out what is not finite: the law acts alone."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,7 +15,7 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from sb3_yann._features import SeesTheta, without_entries
-from sb3_yann._finite import warn_of_lost_entries
+from sb3_yann._finite import NonFiniteWarning, what_is_not_finite
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import (
     AfterstateValue,
@@ -58,6 +59,7 @@ class YannActor(SeesTheta, Actor):
             normalize_images,
         )
         self.net_arch = net_arch
+        self.named = ""
         self.options = {
             "problem": problem,
             "max_correction": max_correction,
@@ -86,6 +88,8 @@ class YannActor(SeesTheta, Actor):
         # NaN is all that an action can be beside a number in [-1, 1].
         total = actions if actions.numel() == 1 else actions.detach().sum()
         if math.isfinite(total.item()):
+            if self.named and not th.is_grad_enabled():  # the sensor is back, and no batch is it
+                self.named = ""
             return actions
         return self._without_what_is_not_finite(obs)
 
@@ -96,7 +100,10 @@ class YannActor(SeesTheta, Actor):
         theta = without_entries(theta, lost, self.features_extractor)
         actions: th.Tensor = self.mu(theta)
         whole = (~lost.any(1, keepdim=True)) & actions.detach().isfinite().all(1, keepdim=True)
-        warn_of_lost_entries(lost.cpu().numpy())
+        said = what_is_not_finite(lost.cpu().numpy())
+        if said != self.named:  # once, for a sensor that stays so
+            warnings.warn(said, NonFiniteWarning, stacklevel=3)
+        self.named = said
         return th.where(whole, actions, self.mu.law(theta).to(actions))
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:

@@ -50,6 +50,11 @@ class YannPolicy(TD3Policy):
     The actor's output is the explicit law of the MPC plus networks that are zero at first; the
     critic is the state-action value of the law on the linear model, plus such a network.
 
+    Nothing is learnt from what is not finite. The replay buffer leaves such transitions out, and a
+    step is not taken whose gradient overflows float32, so that training cannot make actor or critic
+    NaN. Where an observation or the actor's networks are not finite, the law acts. Each is named by
+    a :class:`NonFiniteWarning`.
+
     TD3 adds noise to the target policy by default, which teaches the critic the value of a noisy
     controller: pass ``target_policy_noise=0.0`` to TD3, so that the exact critic stays the target.
 

@@ -64,7 +64,15 @@ def shaken(model, size: float = 1.0):
 
 
 def is_finite(model) -> bool:
-    return all(bool(each.isfinite().all()) for each in model.policy.state_dict().values())
+    return all(bool(each.isfinite().all()) for each in model.policy.parameters())
+
+
+def told(learn, *args, **kwargs) -> list[str]:
+    """Return what is said of numbers that are not finite."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        learn(*args, **kwargs)
+    return [str(each.message) for each in caught if each.category is NonFiniteWarning]
 
 
 def stored(model) -> np.ndarray:
@@ -75,13 +83,13 @@ def stored(model) -> np.ndarray:
 
 
 @pytest.mark.parametrize("what", ["reward", "observation"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_one_value_that_is_not_finite_is_named_and_spoils_nothing(what, value, algorithm) -> None:
-    env = Recorder(pendulum([100], what, value if what == "reward" or value < 1e300 else -np.inf))
+    env = Recorder(pendulum([100], what, value))
     model = build(env, algorithm)
-    with pytest.warns(NonFiniteWarning, match=rf"Step 100: {what}\[\d\] of env 0 is"):
-        model.learn(350, callback=NoActionNoise())
+    said = told(model.learn, 350, callback=NoActionNoise())
+    assert said[-1 if what == "reward" else 0].startswith(f"Step 100: {what}[")
     assert np.all(np.isfinite(env.recorded()[1]))
     assert is_finite(model)
     assert np.all(np.isfinite(stored(model)))
@@ -92,32 +100,27 @@ def test_one_value_that_is_not_finite_is_named_and_spoils_nothing(what, value, a
 @pytest.mark.parametrize("what", ["reward", "observation"])
 def test_it_is_so_without_any_callback(what) -> None:
     model = build(pendulum([100], what), learning_starts=20)
-    with pytest.warns(NonFiniteWarning):
-        model.learn(150)
+    assert told(model.learn, 150)
     assert is_finite(model) and np.all(np.isfinite(stored(model)))
 
 
 @pytest.mark.parametrize("what", ["reward", "observation"])
 def test_what_is_not_finite_from_the_first_step_on_is_not_learnt_from(what) -> None:
     model = build(pendulum(range(4), what), policy={"critic_warmup": 0})
-    before = copy.deepcopy(model.policy.state_dict())
-    with pytest.warns(NonFiniteWarning):
-        model.learn(3, callback=NoActionNoise())
-    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NonFiniteWarning)
-        model.learn(20, callback=NoActionNoise(), reset_num_timesteps=False)
+    networks = th.nn.ModuleList([model.actor, model.critic])
+    before = copy.deepcopy(networks.state_dict())
+    assert told(model.learn, 3, callback=NoActionNoise())
+    assert all(th.equal(value, before[name]) for name, value in networks.state_dict().items())
+    told(model.learn, 20, callback=NoActionNoise(), reset_num_timesteps=False)
     assert is_finite(model) and np.all(np.isfinite(stored(model)))
     assert int(model.policy.critic_updates) > 10
 
 
 def test_a_sensor_that_stays_out_is_named_once() -> None:
     model = build(pendulum(range(20, 80), "observation"))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        model.learn(90, callback=NoActionNoise())
-    told = [str(each.message) for each in caught if each.category is NonFiniteWarning]
-    assert len([each for each in told if each.startswith("Step")]) == 1
+    said = told(model.learn, 90, callback=NoActionNoise())
+    assert len([each for each in said if each.startswith("Step")]) == 1
+    assert len([each for each in said if each.startswith("The observation")]) == 1
     assert model.replay_buffer.add.left_out == 61
 
 
@@ -145,15 +148,14 @@ def test_under_a_frozen_vec_normalize_too() -> None:
     env = VecNormalize(DummyVecEnv([lambda: pendulum([50], "observation")]), norm_reward=False)
     env.training, env.clip_obs = False, np.inf
     model = build(env, policy={"observation": AffineObservation.from_vec_normalize(env)})
-    with pytest.warns(NonFiniteWarning):
-        model.learn(100, callback=NoActionNoise())
+    assert told(model.learn, 100, callback=NoActionNoise())
     assert is_finite(model) and np.all(np.isfinite(stored(model)))
 
 
 def test_a_saved_copied_or_loaded_buffer_leaves_out_what_is_not_finite(tmp_path) -> None:
-    model = build(pendulum([20, 60, 100]))
+    model = build(pendulum([20, 130, 240]))
     with pytest.warns(NonFiniteWarning):
-        model.learn(40, callback=NoActionNoise())
+        model.learn(100, callback=NoActionNoise())
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
     assert copy.deepcopy(model.replay_buffer).add.buffer() is not model.replay_buffer
@@ -162,12 +164,12 @@ def test_a_saved_copied_or_loaded_buffer_leaves_out_what_is_not_finite(tmp_path)
     assert loaded.replay_buffer.add.buffer() is loaded.replay_buffer
     assert is_finite(loaded)
     with pytest.warns(NonFiniteWarning, match="2 left out so far"):
-        loaded.learn(40, callback=NoActionNoise(), reset_num_timesteps=False)
+        loaded.learn(100, callback=NoActionNoise(), reset_num_timesteps=False)
     del loaded.replay_buffer.add  # as a buffer from elsewhere would be
     with pytest.warns(NonFiniteWarning, match="1 left out so far"):
-        loaded.learn(40, callback=NoActionNoise(), reset_num_timesteps=False)
+        loaded.learn(100, callback=NoActionNoise(), reset_num_timesteps=False)
     assert isinstance(loaded.replay_buffer.add, FiniteRows)
-    assert loaded.replay_buffer.size() == 117
+    assert loaded.replay_buffer.size() == 297
 
 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])

@@ -149,7 +149,7 @@ class CostAudit(BaseCallback):
         first = np.r_[True, np.diff(env) != 0][: len(env)]
         begins = first | np.r_[True, ended[:-1]][~lost]
         problem = self.policy.problem
-        observations = column("observation").reshape(len(env), -1)
+        observations = column("observation").reshape(len(env), records[0]["observation"].size)
         terminated = done & ~column("truncated")
         return Sample(
             theta=theta("observation"),
