@@ -11,6 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
+class NonFiniteWarning(RuntimeWarning):
+    """An observation, a reward, an action or a gradient is not a finite number."""
+
+
 def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
     """Return ``value`` as a read-only float64 array of ``shape``; a letter leaves a size free.
 

@@ -20,7 +20,8 @@ from sb3_yann.guard.preconditions import check_between, check_not_nested, check_
 from sb3_yann.guard.restoring import restore_accepted
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance
-from sb3_yann.guard.state import Decision, GuardState, write_csv
+from sb3_yann.guard.state import Decision, GuardState, append_csv, write_csv
+from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import YannPolicy
 
 
@@ -213,6 +214,7 @@ class ImprovementGuard(BaseCallback):
                 f"{type(policy).__name__}."
             )
         self.policy = policy
+        watch_buffer(self.model)
         untrained = policy.actor.mu.network.is_zero()
         self._mpc = ActorCheckpoint.of(policy) if untrained else None
 
@@ -293,7 +295,7 @@ class ImprovementGuard(BaseCallback):
         self.logger.record("guard/rejected", rejected)
         self.logger.record("guard/accepted", len(self.decisions) - rejected)
         if self.record is not None:
-            write_csv(self.record, self.decisions)
+            append_csv(self.record, self.decisions)
         self.logger.dump(self.num_timesteps)  # as EvalCallback does, or the next would replace it
         if self.verbose:
             print(

@@ -29,8 +29,9 @@ class Outcome:
     Attributes
     ----------
     costs : ndarray, shape (episodes,)
-    unsafe : ndarray of int, shape (episodes, 2)
-        Steps with a violation, and whether the env terminated the episode.
+    unsafe : ndarray of int, shape (episodes, 3)
+        Steps with a violation, whether the env terminated the episode, and whether its cost or an
+        observation is no finite number.
     visits : ndarray of bool, shape (episodes, regions)
         Through which regions it comes: whatever the networks of the others become, the episode
         stays as it is.
@@ -132,7 +133,9 @@ def play(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Outcome:
 
 def outcome_of(guard: ImprovementGuard, episodes: Episodes) -> Outcome:
     """Return what matters of the episodes."""
-    unsafe = np.column_stack([episodes.violations, episodes.terminated]).astype(np.int64)
+    finite = [np.all(np.isfinite(each)) for each in episodes.observations]
+    lost = ~(np.isfinite(episodes.costs) & finite)
+    unsafe = np.column_stack([episodes.violations, episodes.terminated, lost]).astype(np.int64)
     return Outcome(episodes.costs, unsafe, _visits(guard, episodes))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 
 import numpy as np
@@ -30,7 +31,7 @@ from guard_samples import (
     verdicts,
     worse,
 )
-from sb3_yann import ImprovementGuard
+from sb3_yann import ImprovementGuard, NonFiniteWarning
 from sb3_yann.evaluation.episodes import evaluate
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -280,3 +281,23 @@ def test_while_nothing_has_moved_nothing_is_tried() -> None:
     train(model, 5 * STEPS, guard)
     assert guard.decisions == []
     assert model.policy.actor.mu.network.is_zero()
+
+
+@pytest.mark.parametrize("what", ["cost", "observation"])
+def test_a_candidate_with_what_is_not_finite_in_its_episodes_violates_and_returns(what) -> None:
+    class Faulty(Slide):
+        """Half the MPC's input breaks a sensor."""
+
+        def step(self, action):
+            broken = self.x[0] > 1.9 and abs(float(action[0])) < 0.9
+            observation, reward, *rest = super().step(action)
+            if broken and what == "cost":
+                reward = np.nan
+            return observation * (np.nan if broken and what != "cost" else 1), reward, *rest
+
+    model, guard = build(gradient_steps=0), make_guard(Faulty, patience=5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NonFiniteWarning)
+        train(model, STEPS, At([1], better), guard)
+    assert "a cost or an observation that is no finite number" in guard.decisions[0].reason
+    assert guard.decisions[0].returned
