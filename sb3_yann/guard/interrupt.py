@@ -1,0 +1,69 @@
+"""Ctrl-C in the midst of `learn`: the model is left with the policy that was accepted last.
+
+Nothing of SB3 tells a callback that `learn` ended by an exception. A handler of the signal can: it
+runs in the main thread, between two operations of Python, wherever training is.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import weakref
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_yann.guard.callback import ImprovementGuard
+
+
+class Handler:
+    """Calls the handler that was there; where that raises, the accepted policy is put back first.
+
+    It knows by itself whether its `learn` is still running: another exception than Ctrl-C ends that
+    without a word. From then on it only passes on, until the guard is gone or learns again.
+    """
+
+    def __init__(self, guard: ImprovementGuard, before: Any) -> None:
+        self.before, self.run = before, guard.model.start_time
+        self.guard = weakref.ref(guard, lambda _: self.remove())
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle the signal."""
+        try:
+            self.before(number, frame)
+        except BaseException:
+            guard = self.guard()
+            if guard is not None and self.is_needed(frame):
+                guard.leave_accepted()
+            self.remove()
+            raise
+
+    def is_needed(self, frame: FrameType | None) -> bool:
+        """Return whether what is running is the same `learn` as at the beginning."""
+        guard = self.guard()
+        if guard is None or guard.model.start_time != self.run:
+            return False
+        while frame is not None:
+            if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is guard.model:
+                return True
+            frame = frame.f_back
+        return False
+
+    def remove(self) -> None:
+        """Put back what was there, unless somebody else's handler has come since."""
+        in_main = threading.current_thread() is threading.main_thread()
+        if in_main and signal.getsignal(signal.SIGINT) is self:
+            signal.signal(signal.SIGINT, self.before)
+
+
+def install(guard: ImprovementGuard, frame: FrameType) -> Handler | None:
+    """Return the handler for a `learn` that begins; None where there can be or need be none."""
+    before = signal.getsignal(signal.SIGINT)
+    while isinstance(before, Handler) and not before.is_needed(frame):
+        known: Any = before.before
+        before = known
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        return None
+    handler = Handler(guard, before)
+    signal.signal(signal.SIGINT, handler)
+    return handler
