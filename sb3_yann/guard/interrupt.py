@@ -52,16 +52,16 @@ class Handler:
     def remove(self) -> None:
         """Put back what was there, unless somebody else's handler has come since."""
         in_main = threading.current_thread() is threading.main_thread()
-        if in_main and signal.getsignal(signal.SIGINT) is self:
+        present: object = signal.getsignal(signal.SIGINT)
+        if in_main and present is self:
             signal.signal(signal.SIGINT, self.before)
 
 
 def install(guard: ImprovementGuard, frame: FrameType) -> Handler | None:
     """Return the handler for a `learn` that begins; None where there can be or need be none."""
-    before = signal.getsignal(signal.SIGINT)
+    before: Any = signal.getsignal(signal.SIGINT)
     while isinstance(before, Handler) and not before.is_needed(frame):
-        known: Any = before.before
-        before = known
+        before = before.before
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         return None
     handler = Handler(guard, before)

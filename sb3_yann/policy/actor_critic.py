@@ -220,9 +220,9 @@ class YannCritic(SeesTheta, ContinuousCritic):
             points = th.cat([theta, actions], dim=1)
             return self._in_rewards(q_network.compiled_with_fixed_weights(points))
         trained = [each for each in q_network.parameters() if each.requires_grad]
-        for parameter in trained:
-            parameter.requires_grad_(False)
         try:
+            for parameter in trained:
+                parameter.requires_grad_(False)
             return self._in_rewards(super().q1_forward(obs, actions))
         finally:
             for parameter in trained:
