@@ -14,11 +14,11 @@ from numba.core.dispatcher import Dispatcher
 from stable_baselines3 import DDPG
 
 from sb3_yann import NoActionNoise, YannPolicy
-from sb3_yann.control import _location, search_tree
-from sb3_yann.networks import compiled_layer, compiled_value
+from sb3_yann.control.law import _kernels, search_tree
+from sb3_yann.networks._kernels import afterstate_value, yann_layer
 from sb3_yann_envs import cstr
 
-MODULES = (_location, search_tree, compiled_layer, compiled_value, cstr)
+MODULES = (_kernels, search_tree, yann_layer, afterstate_value, cstr)
 CALLED = {
     f"{module.__name__}.{name}": function
     for module in MODULES

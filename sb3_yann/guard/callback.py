@@ -16,9 +16,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.plant_acceptance import PlantAcceptance
 from sb3_yann.guard.preconditions import check_between, check_not_nested, check_whole
-from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.restoring import restore_accepted
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance
@@ -241,7 +241,7 @@ class ImprovementGuard(BaseCallback):
                 stacklevel=2,
             )
             self._start_afresh(known)
-        self._handler = install(self, sys._getframe())
+        self._handler = install(self.model, self.leave_accepted, sys._getframe())
         self.policy.actor_step = self.state.step
         if self.record is not None:
             write_csv(self.record, self.decisions)

@@ -7,6 +7,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+
 from guard_samples import (
     STEPS,
     At,
@@ -18,7 +20,6 @@ from guard_samples import (
     make_guard,
     train,
 )
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 FIRST = 1_000_000
 
