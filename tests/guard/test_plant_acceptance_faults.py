@@ -25,6 +25,7 @@ from guard_samples import (
     verdicts,
 )
 from sb3_yann import NoActionNoise
+from weights import last_layer
 
 BLOCK = 3 * STEPS
 plant = partial(Slide, low=2.0, high=2.8)
@@ -137,5 +138,5 @@ def test_what_an_earlier_guard_accepted_is_what_a_plant_alone_begins_with() -> N
     correct(model.policy, RIGHT, 1.9)
     train(model, STEPS, guard := guard_alone())
     assert guard.decisions[-1].reason.startswith("before training, ")
-    weight = model.policy.actor.mu.network.rest[-1].weight[REGION[RIGHT], 0, -1]
+    weight = last_layer(model)[REGION[RIGHT], 0, -1]
     assert float(weight.detach()) == pytest.approx(0.4)

@@ -25,6 +25,7 @@ import sb3_yann
 from sb3_yann import LinearModel, LinearMPC, NoActionNoise, YannActor, YannCritic, YannPolicy
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, RowAdam
 from sb3_yann_envs import problems
+from weights import network_of
 
 ENVS = ("CSTR-v0", "ClippedPendulum-v0")
 POLICIES = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -828,12 +829,12 @@ def test_beyond_32_regions_those_without_data_do_not_move_not_even_by_momentum()
     assert isinstance(model.actor.optimizer, RowAdam)
     assert two_inputs().explicit().n_regions > 32
     updates(model, 5)
-    before = copy.deepcopy(model.actor.mu.network)
+    before = copy.deepcopy(network_of(model))
     data = model.replay_buffer.sample(3)
     model.replay_buffer.sample = lambda *_, **__: data
     updates(model, 1)
     seen = set(two_inputs().explicit().locate(data.observations.double().numpy()).tolist())
-    for old, new in zip(before.parameters(), model.actor.mu.network.parameters(), strict=True):
+    for old, new in zip(before.parameters(), network_of(model).parameters(), strict=True):
         moved = (old != new).flatten(1).any(1).nonzero()[:, 0].tolist()
         assert moved and set(moved) <= seen
 

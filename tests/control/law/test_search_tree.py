@@ -258,9 +258,13 @@ def test_without_a_compiler_the_law_is_the_same() -> None:
     )
     outputs = [
         subprocess.run(
-            [sys.executable, "-c", program], env={**os.environ, "NUMBA_DISABLE_JIT": off, "PYTHONPATH": os.pathsep.join(sys.path)},
-            capture_output=True, text=True, check=True, cwd=Path(__file__).parent,
+            [sys.executable, "-c", program],
+            env={**os.environ, "NUMBA_DISABLE_JIT": off, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=Path(__file__).parent,
         ).stdout
         for off in "01"
-    ]  # fmt: skip
+    ]
     assert outputs[0] == outputs[1]
