@@ -1,0 +1,187 @@
+"""No circle of files, no import against the direction of the house, walls that hold at run time."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import sb3_yann
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = {"sb3_yann": ROOT, "sb3_yann_envs": ROOT / "envs"}
+
+FLOORS = [
+    {"sb3_yann._validation", "sb3_yann._numba"},
+    {"sb3_yann.control"},
+    {"sb3_yann_envs"},
+    {"sb3_yann.networks"},
+    {"sb3_yann.twin"},
+    {"sb3_yann.evaluation"},
+    {"sb3_yann.policy"},
+    {"sb3_yann.callbacks", "sb3_yann.wrappers"},
+    {"sb3_yann.audit", "sb3_yann.guard"},
+    {"sb3_yann.commissioning"},
+    {"sb3_yann.export"},
+    {"sb3_yann"},
+]
+"""Each floor may import from those before it: control -> networks -> twin -> the parts for
+Stable-Baselines3 -> export. `sb3_yann` itself, which only names what there is, comes last."""
+
+FORBIDDEN = {
+    "sb3_yann._validation": {"torch", "stable_baselines3", "gymnasium"},
+    "sb3_yann._numba": {"torch", "stable_baselines3", "gymnasium"},
+    "sb3_yann.control": {"torch", "stable_baselines3", "sb3_contrib", "rl_zoo3"},
+    "sb3_yann.networks": {"stable_baselines3", "sb3_contrib", "rl_zoo3", "gymnasium"},
+    "sb3_yann_envs": {"torch", "stable_baselines3", "sb3_contrib", "rl_zoo3"},
+}
+"""Libraries of a floor above."""
+
+
+def _modules() -> dict[str, Path]:
+    """Return all modules of the packages by their names."""
+    found = {}
+    for package, root in PACKAGES.items():
+        for path in sorted((root / package).rglob("*.py")):
+            name = ".".join(path.relative_to(root).with_suffix("").parts)
+            found[name.removesuffix(".__init__")] = path
+    return found
+
+
+MODULES = _modules()
+
+
+def _imports(name: str) -> set[str]:
+    """Return what a module imports anywhere: in functions and for type checkers too."""
+    found, package = set(), name if MODULES[name].stem == "__init__" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package.split(".")[: len(package.split(".")) - node.level + 1])
+            module = ".".join(filter(None, [base if node.level else "", node.module]))
+            for alias in node.names:
+                whole = f"{module}.{alias.name}"
+                found.add(whole if whole in MODULES else module)
+    return found
+
+
+IMPORTS = {name: _imports(name) for name in MODULES}
+
+
+def _room(name: str) -> str:
+    """Return the part of the house that a module belongs to."""
+    head, *rest = name.split(".")
+    return f"{head}.{rest[0]}" if head == "sb3_yann" and rest else head
+
+
+def _floor(name: str) -> int:
+    return next(i for i, rooms in enumerate(FLOORS) if _room(name) in rooms)
+
+
+def circle(imports: dict[str, set[str]]) -> list[str]:
+    """Return modules that import each other in a circle, none if there is no circle."""
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    own = {name: found & MODULES.keys() - {name} for name, found in IMPORTS.items()}
+    assert circle(own) == []
+
+
+def test_a_circle_would_be_found() -> None:
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+
+
+def test_every_module_has_a_floor() -> None:
+    assert [name for name in MODULES if not any(_room(name) in rooms for rooms in FLOORS)] == []
+
+
+def test_no_import_goes_up() -> None:
+    against = [
+        f"{name} imports {other}"
+        for name, found in IMPORTS.items()
+        for other in sorted(found & MODULES.keys())
+        if _floor(other) > _floor(name)
+    ]
+    assert against == []
+
+
+def test_rooms_of_one_floor_do_not_import_each_other() -> None:
+    beside = [
+        f"{name} imports {other}"
+        for name, found in IMPORTS.items()
+        for other in sorted(found & MODULES.keys())
+        if _floor(other) == _floor(name) and _room(other) != _room(name)
+    ]
+    assert beside == []
+
+
+@pytest.mark.parametrize("room", FORBIDDEN)
+def test_a_lower_floor_imports_no_library_of_a_higher_one(room: str) -> None:
+    against = [
+        f"{name} imports {library}"
+        for name, found in IMPORTS.items()
+        for library in sorted({each.partition(".")[0] for each in found} & FORBIDDEN[room])
+        if _room(name) == room
+    ]
+    assert against == []
+
+
+LOADED = "; import sys; print(sorted({'torch', 'stable_baselines3'} & sys.modules.keys()))"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import sb3_yann",
+        "import sb3_yann.control",
+        "import gymnasium, sb3_yann_envs; "
+        "gymnasium.make('CSTR-v0').observation_space.problem.explicit()",
+    ],
+)
+def test_the_design_side_loads_neither_torch_nor_stable_baselines3(code: str) -> None:
+    done = subprocess.run([sys.executable, "-c", code + LOADED], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import sb3_yann; from stable_baselines3 import DDPG",
+        "from stable_baselines3 import DDPG; import sb3_yann",
+        "import sb3_yann.policy; from stable_baselines3 import DDPG",
+        "import importlib.util, sb3_yann; importlib.util.find_spec('stable_baselines3'); "
+        "from stable_baselines3.ddpg import DDPG",
+    ],
+)
+def test_the_alias_is_known_in_whichever_order_one_imports(imports: str) -> None:
+    code = f"{imports}; print(DDPG.policy_aliases['YannPolicy'].__name__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.stderr) == ("YannPolicy", "")
+
+
+def test_names_for_type_checkers_are_those_that_are_loaded() -> None:
+    tree = ast.parse(Path(sb3_yann.__file__).read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    shown = {
+        alias.name: node.module
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert shown == sb3_yann._HOMES
+    assert all(getattr(sb3_yann, name) is not None for name in sb3_yann.__all__)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        sb3_yann.nothing  # noqa: B018
