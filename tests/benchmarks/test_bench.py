@@ -49,7 +49,7 @@ def test_the_devices_are_compared_where_there_are_no_learners_and_no_solvers(tmp
     code = (
         f"{block}; import importlib.util as u; find = u.find_spec\n"
         f"u.find_spec = lambda name, *a: None if name in {absent!r} else find(name, *a)\n"
-        "from bench import gpu; gpu.BATCHES = (1, 8); sys.exit(gpu.main(['law.npz']))"
+        "from benchmarks import gpu; gpu.BATCHES = (1, 8); sys.exit(gpu.main(['law.npz']))"
     )
     (tmp_path / "alone.py").write_text(code)
     assert "7 regions" in run(tmp_path, "alone")

@@ -194,7 +194,7 @@ def test_constraints_that_say_the_same_give_no_more_regions() -> None:
 
 
 def test_law_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sb3_yann.control import mpc as module
+    from sb3_yann.control.mpc import linear_mpc as module
 
     calls, solve = [], module.solve_explicit
     monkeypatch.setattr(module, "solve_explicit", lambda *args: calls.append(args) or solve(*args))
