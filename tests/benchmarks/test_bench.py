@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from benchmarks import exactness, gpu, peers
 from benchmarks.criteria import criteria
@@ -32,6 +33,7 @@ def run(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_quick_form_runs_to_its_report(tmp_path) -> None:
     run(tmp_path, "benchmarks", "--quick")
     folder = tmp_path / "out" / "bench-quick"

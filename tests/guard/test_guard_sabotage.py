@@ -175,6 +175,7 @@ def test_the_final_model_is_the_accepted_policy_also_when_loaded(algorithm, tmp_
     assert np.all(played.costs <= guard.state.evidence.paired.mpc_costs + 1e-2)
 
 
+@pytest.mark.slow
 def test_the_accepted_cost_never_rises_and_is_never_above_the_mpc_s() -> None:
     model, guard = build(learning_rate=0.1), make_guard()
     train(model, 40 * STEPS, guard, At(range(0, 200, 7 * STEPS), randomize))

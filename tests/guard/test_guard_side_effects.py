@@ -50,6 +50,7 @@ def after_training(algorithm, *guards: ImprovementGuard, **kwargs):
     return model, state
 
 
+@pytest.mark.slow
 @ALGORITHMS
 @pytest.mark.parametrize("env", [Slide, "an instance", "Slide-v0"], ids=["factory", "own", "id"])
 def test_a_run_whose_candidates_are_all_accepted_is_the_run_without_a_guard(

@@ -103,6 +103,7 @@ def test_ddpg_has_one_critic_and_td3_two() -> None:
     assert build(TD3).critic.n_critics == 2
 
 
+@pytest.mark.slow
 @CRITICS
 @pytest.mark.parametrize("make", [problems.clipped_pendulum, problems.cstr])
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
@@ -280,6 +281,7 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, critic, 
         assert th.equal(value, loaded.policy.state_dict()[name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [None, "CSTR-v0", "sb3_yann_envs.problems:cstr"])
 def test_a_fresh_process_predicts_without_any_solver(problem, tmp_path) -> None:
     kwargs = {"critic_warmup": 0} if problem is None else {"critic_warmup": 0, "problem": problem}
