@@ -154,7 +154,7 @@ def test_a_region_thinner_than_a_millionth_of_the_box_is_found() -> None:
 def test_regions_that_no_first_point_leads_to_are_found_from_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from sb3_yann.control import facet_walk
+    from sb3_yann.control.explicit import facet_walk
 
     explore, calls = facet_walk._Walk.explore, []
 

@@ -167,6 +167,7 @@ def test_solving_twice_gives_the_same_law_bit_for_bit(name: str) -> None:
     assert PROBLEMS[name]().explicit() == solved(name).explicit()
 
 
+@pytest.mark.slow
 def test_a_fresh_process_gives_the_same_law_bit_for_bit(tmp_path: Any) -> None:
     path = tmp_path / "law.npz"
     code = (
@@ -194,7 +195,7 @@ def test_constraints_that_say_the_same_give_no_more_regions() -> None:
 
 
 def test_law_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sb3_yann.control import mpc as module
+    from sb3_yann.control.mpc import linear_mpc as module
 
     calls, solve = [], module.solve_explicit
     monkeypatch.setattr(module, "solve_explicit", lambda *args: calls.append(args) or solve(*args))
