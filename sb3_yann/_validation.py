@@ -97,7 +97,7 @@ def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -
 
 
 def as_outputs(name: str, value: ArrayLike | Sequence[int] | None, n_states: int) -> Array:
-    """Return an output matrix ``(q, n)`` from a matrix or from a list of state indices.
+    """Return an output matrix ``(q, n)`` from a matrix or from a list of indices of states.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def as_outputs(name: str, value: ArrayLike | Sequence[int] | None, n_states: int
         return as_array(name, np.zeros((0, n_states)), (0, n_states))
     entries = to_float(name, value)
     if entries.ndim == 0:
-        raise ValueError(f"{name} = {value!r} must be a list of state indices: [{value}].")
+        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value}].")
     if entries.ndim != 1:
         return as_array(name, value, ("q", n_states))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]

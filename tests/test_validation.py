@@ -62,7 +62,7 @@ def test_a_positive_vector_takes_one_number_for_all() -> None:
 
 @pytest.mark.parametrize("value", [True, 2.0, "2", None, 0])
 def test_what_is_no_whole_number_is_refused(value: Any) -> None:
-    with pytest.raises(ValueError, match="n = .* must be a whole number of at least 1"):
+    with pytest.raises(ValueError, match=r"n = .* must be a whole number of at least 1"):
         as_whole("n", value)
 
 
@@ -73,7 +73,7 @@ def test_whole_numbers_of_numpy_become_ints() -> None:
 @pytest.mark.parametrize("value", [0, 1, "no", None])
 def test_a_flag_is_true_or_false(value: Any) -> None:
     assert (as_flag("f", True), as_flag("f", np.False_)) == (True, False)
-    with pytest.raises(TypeError, match="f = .* must be True or False"):
+    with pytest.raises(TypeError, match=r"f = .* must be True or False"):
         as_flag("f", value)
 
 

@@ -11,11 +11,11 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.linear_system import LinearSystem
 
 
 def riccati(
-    model: LinearModel, Q: Array, R: Array, gamma: float = 1.0, cross: Array | None = None
+    model: LinearSystem, Q: Array, R: Array, gamma: float = 1.0, cross: Array | None = None
 ) -> Array:
     """Return P (n, n) with ``x' P x`` the smallest discounted cost from x, without constraints.
 
@@ -41,7 +41,7 @@ def riccati(
 
 
 def gain(
-    model: LinearModel, R: Array, P: Array, gamma: float = 1.0, cross: Array | None = None
+    model: LinearSystem, R: Array, P: Array, gamma: float = 1.0, cross: Array | None = None
 ) -> Array:
     """Return K (m, n): ``u = -K x`` minimizes ``2x'Nu + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
     PB = P @ model.B
@@ -51,7 +51,7 @@ def gain(
 
 
 def policy_value(
-    model: LinearModel, Q: Array, R: Array, K: Array, gamma: float, cross: Array | None = None
+    model: LinearSystem, Q: Array, R: Array, K: Array, gamma: float, cross: Array | None = None
 ) -> Array:
     """Return P (n, n) with ``x' P x`` the discounted cost of the law ``u = -K x``, whatever K is.
 
@@ -80,7 +80,7 @@ def policy_value(
     return np.asarray((P + P.T) / 2)
 
 
-def state_action_matrix(model: LinearModel, Q: Array, R: Array, P: Array, gamma: float) -> Array:
+def state_action_matrix(model: LinearSystem, Q: Array, R: Array, P: Array, gamma: float) -> Array:
     """Return M (n+m, n+m) with ``[x; u]' M [x; u] = x'Qx + u'Ru + gamma (Ax+Bu)' P (Ax+Bu)``.
 
     The state-action value of Braniff & Tian, Section 4.2. Their P is that of the undiscounted

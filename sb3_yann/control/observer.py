@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, as_array, to_float
+from sb3_yann._validation import Array, as_array, as_outputs, as_positive_vector
 from sb3_yann.control import lqr
 from sb3_yann.control.model.linear_model import LinearModel
-from sb3_yann.control.mpc._arguments import as_outputs
+
+STANDARD = "Give standard deviations, above 0."
 
 
 class DisturbanceObserver:
@@ -69,11 +70,11 @@ class DisturbanceObserver:
         self.seen = np.hstack([self.C, np.zeros((q, d))])
         moves = np.concatenate(
             [
-                _deviations("state_noise", state_noise, n),
-                _deviations("disturbance_noise", disturbance_noise, d),
+                as_positive_vector("state_noise", state_noise, n, STANDARD),
+                as_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD),
             ]
         )
-        errors = _deviations("measurement_noise", measurement_noise, q)
+        errors = as_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
         self.gain = (
             self._kalman_gain(np.diag(moves**2), np.diag(errors**2))
             if gain is None
@@ -163,11 +164,3 @@ def _rank(matrix: Array) -> int:
         length = np.linalg.norm(matrix, axis=axis, keepdims=True)
         matrix = matrix / np.where(length > 0, length, 1.0)
     return int(np.linalg.matrix_rank(matrix, tol=1e-9))
-
-
-def _deviations(name: str, value: ArrayLike, size: int) -> Array:
-    array = to_float(name, value)
-    array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
-    if np.any(array <= 0):
-        raise ValueError(f"{name} = {array.tolist()} holds standard deviations, above 0.")
-    return array

@@ -67,15 +67,7 @@ def as_episodes(
 
 
 def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list[Episode]]:
-    """Return what to fit and what to test: the last of all steps, cutting an episode if need be.
-
-    Raises
-    ------
-    ValueError
-        If ``held_out`` is not a fraction in [0, 1).
-    """
-    if not 0 <= held_out < 1:
-        raise ValueError(f"held_out = {held_out!r} must be a fraction in [0, 1).")
+    """Return what to fit and what to test: the last of all steps, cutting an episode if need be."""
     total = sum(map(len, episodes))
     left = total - max(1, round(held_out * total)) if held_out else total
     fitted, tested = [], []

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.linear_system import LinearSystem
 
 ON_CIRCLE = 1e-6
 """Poles this close to a magnitude of 1 neither grow nor die out."""
@@ -27,7 +27,7 @@ SLOW_SAMPLING, FAST_SAMPLING = 1.0, 50.0
 to 10 samples in the rise time of the closed loop."""
 
 
-def describe(model: LinearModel) -> str:
+def describe(model: LinearSystem) -> str:
     """Return the report of `LinearModel.report`."""
     blocks = (
         _head(model),
@@ -41,7 +41,7 @@ def describe(model: LinearModel) -> str:
     return "\n".join(line for block in blocks for line in block)
 
 
-def _head(model: LinearModel) -> list[str]:
+def _head(model: LinearSystem) -> list[str]:
     sizes = ", ".join(
         f"{count} {word}{'s' * (count != 1)}"
         for count, word in (
@@ -56,7 +56,7 @@ def _head(model: LinearModel) -> list[str]:
     return [f"Linear model: {sizes}, sampled every {model.dt:.4g}.", f"Operating point: {point}."]
 
 
-def poles(model: LinearModel) -> Array:
+def poles(model: LinearSystem) -> Array:
     """Return the eigenvalues of A, the largest first, one of each complex pair."""
     values = np.linalg.eigvals(model.A)
     values = values[values.imag >= 0]
@@ -71,7 +71,7 @@ def time_constant(pole: complex) -> float:
     return float(-1 / np.log(size)) if size > 0 else 0.0
 
 
-def _modes(model: LinearModel) -> list[str]:
+def _modes(model: LinearSystem) -> list[str]:
     return [f"{_number(pole)}: {_mode(pole, model.dt)}" for pole in poles(model)]
 
 
@@ -92,7 +92,7 @@ def _mode(pole: complex, dt: float) -> str:
     return words
 
 
-def _stability(model: LinearModel) -> str:
+def _stability(model: LinearSystem) -> str:
     sizes = np.abs(np.linalg.eigvals(model.A))
     growing = int(np.sum(sizes > 1 + ON_CIRCLE))
     largest = f"the largest magnitude of a pole is {np.max(sizes):.6g}"
@@ -103,7 +103,7 @@ def _stability(model: LinearModel) -> str:
     return f"Stable: {largest}."
 
 
-def reach(model: LinearModel) -> tuple[Array, Array]:
+def reach(model: LinearSystem) -> tuple[Array, Array]:
     """Return how far the inputs move the state along independent directions, and these (n, n).
 
     They are the principal axes of the controllability Gramian, each state in units of how far it
@@ -130,7 +130,7 @@ def reach(model: LinearModel) -> tuple[Array, Array]:
     return sizes / (sizes[0] or 1.0), axes[:, ::-1].T / unit
 
 
-def _reach(model: LinearModel) -> list[str]:
+def _reach(model: LinearSystem) -> list[str]:
     """Return how well the inputs reach the states."""
     sizes, axes = reach(model)
     rank = int(np.sum(sizes > UNREACHED))
@@ -143,7 +143,7 @@ def _reach(model: LinearModel) -> list[str]:
     return lines + [f"  u[{i}] has no effect." for i in idle]
 
 
-def _scaling(model: LinearModel) -> list[str]:
+def _scaling(model: LinearSystem) -> list[str]:
     """Return how the units fit each other."""
     _, (factors, _) = linalg.matrix_balance(model.A, permute=False, separate=True)
     spread = np.max(factors) / np.min(factors)
@@ -166,7 +166,7 @@ def _scaling(model: LinearModel) -> list[str]:
     return lines
 
 
-def _sampling(model: LinearModel) -> list[str]:
+def _sampling(model: LinearSystem) -> list[str]:
     """Return how the sampling time fits the plant."""
     found = poles(model)
     constants = [abs(time_constant(pole)) for pole in found]
