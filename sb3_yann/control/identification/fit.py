@@ -75,7 +75,7 @@ def fit_log(  # noqa: PLR0913 - the options of `identify`
 
 
 def _given(name: str, value: ArrayLike | None, size: int, offset: bool) -> Array | None:
-    """Return an operating point that is given, None if it is to be found."""
+    """Return a given part of the operating point, None if it is to be found."""
     if value is None:
         return None if offset else np.zeros(size)
     return as_array(name, value, (size,))
@@ -84,7 +84,7 @@ def _given(name: str, value: ArrayLike | None, size: int, offset: bool) -> Array
 def _system(
     found: Regression, sizes: tuple[int, int, int], given: Sequence[Array | None], dt: float
 ) -> LinearSystem:
-    """Return the system about its operating point, with a note if the plant moves there."""
+    """Return the system about its operating point, with notes on drift and extrapolation."""
     n, m, _ = sizes
     point = operating_point(found, sizes, given)
     A, B, E = np.split(found.coefficients, [n, n + m], axis=1)
@@ -108,7 +108,7 @@ def _system(
 
 
 def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:
-    """Return the fit in percent of each state (n,), predicted so many steps ahead."""
+    """Return each state's fit (n,) in percent, predicted so many steps ahead."""
     errors, targets = [], []
     for episode in episodes:
         starts = len(episode) - steps + 1
@@ -131,7 +131,7 @@ def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:
 def _quality(
     found: Regression, tested: list[Episode], fits: tuple[Array, Array], ridge: float
 ) -> list[str]:
-    """Return what the data say of the model, in words."""
+    """Return notes on residuals, fit, excitation and bias."""
     notes = [
         f"Fitted to {found.steps} steps; one step differs from the prediction by "
         f"{_list(np.sqrt(np.diag(found.covariance)))} (standard deviation of each state)."
@@ -156,7 +156,7 @@ def _quality(
 
 
 def _words_for(fits: tuple[Array, Array], steps: int) -> str:
-    """Return the fits over data held out in words, a poor one as such."""
+    """Return a note on the fits to held-out data."""
     words = [
         f"{_list(fit)} % {ahead} ahead"
         for fit, ahead in zip(fits, ("one step", f"{AHEAD} steps"), strict=True)

@@ -1,4 +1,4 @@
-"""The least-squares step of the identification: coefficients, their errors, and the excitation."""
+"""Least squares on measured steps: coefficients, their standard errors, and the excitation."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control.identification.logs import Episode
 
 WEAKEST = 1e-6
-"""Singular values below this part of the largest are a lack of excitation: float32 observations
-move that much by rounding alone."""
+"""Least excitation, below which float32 rounding alone may be what moves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,17 +63,13 @@ def regress(
     Parameters
     ----------
     episodes : list of Episode
-    sizes : tuple
+        The measured steps.
+    sizes : tuple of int
         Numbers of states, inputs and disturbances.
     origin : ndarray, shape (n+m+d,), optional
-        The point through which the fit goes; the mean of the data (an offset is fitted) if None.
+        The fit passes through it. The default is the mean of the data: an offset is fitted.
     ridge : float
-        Penalty on the squared coefficients, each in units of the spread of its regressor.
-
-    Raises
-    ------
-    ValueError
-        If there are too few steps or the data do not excite the plant.
+        Penalty on the squared coefficients, each in units of its regressor's spread.
     """
     n = sizes[0]
     regressors = np.concatenate([episode.regressors for episode in episodes])
@@ -87,19 +82,19 @@ def regress(
         )
     center = np.mean(regressors, axis=0) if origin is None else origin
     reached = np.mean(targets, axis=0) if origin is None else origin[:n]
-    centerd = regressors - center
-    spread = np.sqrt(np.mean(centerd**2, axis=0))
+    centered = regressors - center
+    spread = np.sqrt(np.mean(centered**2, axis=0))
     # What is left of a constant after its mean is taken off is rounding, not a signal.
     still = spread <= 1e-10 * np.max(np.abs(regressors), axis=0)
     scale = np.where(still, 1.0, spread)
-    left, sizes_of, right = np.linalg.svd(np.where(still, 0.0, centerd / scale), False)
+    left, sizes_of, right = np.linalg.svd(np.where(still, 0.0, centered / scale), False)
     excitation = float(sizes_of[-1] / sizes_of[0]) if sizes_of[0] > 0 else 0.0
     missing = [v for s, v in zip(sizes_of, right, strict=True) if s <= WEAKEST * sizes_of[0]]
     if missing and ridge == 0:
         raise ValueError(_not_excited([direction(v / scale, v, sizes) for v in missing]))
     inverse = right.T * (sizes_of / (sizes_of**2 + ridge)) if ridge else right.T / sizes_of
     coefficients = ((inverse @ left.T @ (targets - reached)) / scale[:, None]).T
-    residuals = targets - reached - centerd @ coefficients.T
+    residuals = targets - reached - centered @ coefficients.T
     freedom = steps - unknowns
     covariance = residuals.T @ residuals / freedom
     factors = np.linalg.norm(inverse, axis=1) / scale
@@ -120,10 +115,9 @@ def regress(
 
 
 def direction(coefficients: Array, weights: Array, sizes: tuple[int, int, int]) -> str:
-    """Return a combination of states, inputs and disturbances in words, without small terms.
+    """Return a combination of states, inputs and disturbances in words.
 
-    `coefficients` are those in physical units; `weights`, those in units of each one's spread,
-    say which terms are small.
+    Terms with small `weights`, in units of their spread, are left out.
     """
     n, m, d = sizes
     labels = (*(("x", i) for i in range(n)), *(("u", i) for i in range(m)))

@@ -1,4 +1,4 @@
-"""Measured episodes as the transitions that a regression takes."""
+"""Measured episodes: checked, cut at gaps, and split into fitted and held-out steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, to_float
 
 UNEVEN = 0.1
-"""How far a step may take longer or shorter than dt, in parts of it."""
+"""Largest deviation of a step's time from dt, relative to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +39,7 @@ def as_episodes(
     actions: ArrayLike | Sequence[ArrayLike],
     disturbances: ArrayLike | Sequence[ArrayLike] | None,
 ) -> tuple[list[Episode], tuple[int, int, int]]:
-    """Return the checked episodes and the sizes (n, m, d).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the arrays are no matrices, do not fit each other, are empty, or hold NaN.
-    """
+    """Return the checked episodes and the sizes (n, m, d)."""
     x, u = _matrices("states", states), _matrices("actions", actions)
     if disturbances is None:
         d: list[Array] = [np.zeros((len(each), 0)) for each in u]
@@ -82,13 +76,7 @@ def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list
 def without_gaps(
     episodes: list[Episode], time: ArrayLike | Sequence[ArrayLike], dt: float
 ) -> tuple[list[Episode], int]:
-    """Return the episodes cut wherever a step took another time than dt, and the steps left out.
-
-    Raises
-    ------
-    ValueError
-        If the times do not fit the episodes or do not increase, or most steps take another time.
-    """
+    """Return the episodes cut at steps that do not take dt, and the number of these steps."""
     times = _times(time)
     if len(times) != len(episodes):
         raise ValueError(f"time has {len(times)} episodes, states has {len(episodes)}.")

@@ -11,29 +11,28 @@ from sb3_yann._validation import Array, as_array, as_positive_vector
 from sb3_yann.control.linearization.simulator import Simulator
 
 LONGEST_DELAY = 20
-"""Samples after which an input is no longer waited for."""
+"""Longest input delay, in samples, that is detected."""
 ADVICE = (
-    "Make what it remembers part of the state (of a delay, the inputs on their way), have "
-    "set_state set it too, or identify the plant: LinearModel.from_data"
+    "Make them part of the state (of a delay, the inputs on their way), have set_state set them "
+    "too, or identify the plant: LinearModel.from_data"
 )
 
 
 def connect(
     simulator: Simulator, x: Array | None, u: Array, scale: ArrayLike | None
 ) -> tuple[Array, Array]:
-    """Choose how the state is set and read, by trying it; return the state tried and its scale.
+    """Choose how the state is set and read, by trial; return the state tried and its scale.
 
     Parameters
     ----------
+    simulator : Simulator
+        Its ``setter`` and ``reader`` are set to the first pair that passes.
     x : ndarray, shape (n,), optional
-        A state to try, NaN where it is not known; None takes that of the reset.
+        A state to try, NaN where it is not known. The default is that of the reset.
     u : ndarray, shape (m,)
         An action to try.
-
-    Raises
-    ------
-    ValueError
-        If no way passes the trial; the message says what each failed at.
+    scale : array_like, shape (n,), optional
+        Range in which each state moves in use.
     """
     begun = {name: simulator.read(name) for name in simulator.readers}
     tried = []
@@ -113,20 +112,11 @@ def _room(simulator: Simulator, u: Array) -> Array:
 def _hidden_state(
     simulator: Simulator, x: Array, u: Array, other: Array, scale: Array
 ) -> str | None:
-    """Return how a step depends on more than x and u, None if no trial shows that it does.
+    """Describe the hidden states that show in steps from x with u and other, None without any.
 
-    Differences from a set state would be wrong without a sign of it. What setting the state leaves
-    alone shows when a step is repeated after other inputs; what it starts anew shows when the
-    plant goes on by itself.
-
-    Parameters
-    ----------
-    x, u : ndarray, shapes (n,) and (m,)
-        A state and an action to try.
-    other : ndarray, shape (m,)
-        Another action.
-    scale : ndarray, shape (n,)
-        How far each state moves in use.
+    They would make differences wrong. A hidden state that setting x leaves alone shows when a step
+    is repeated after other inputs. One that setting x resets shows when the plant goes on by
+    itself.
     """
     first = simulator.next_state(x, u)
     for _ in range(LONGEST_DELAY):

@@ -23,21 +23,21 @@ from sb3_yann.control.linearization.simulator import (
     sample_time,
     to_vector,
 )
-from sb3_yann.control.linearization.steady_state import check_rest, steady_state
+from sb3_yann.control.linearization.steady_state import require_steady_state, steady_state
 
 if TYPE_CHECKING:
     from sb3_yann.control.linearization.simulator import Maker
 
 LONGEST = 0.01
-"""The longest step of a difference, in parts of the scale of its coordinate."""
+"""Longest step of a difference, relative to the scale of its coordinate."""
 LONGEST_SINGLE = 0.05
 """The same where states are read in float32."""
 STEADY = 1e-3
-"""How far a steady state may move in one sample, in parts of its scale."""
+"""Largest motion of a steady state in one sample, relative to its scale."""
 MOVES = 0.01
-"""The same in parts of its own size, from which on a state smaller than 1 is warned of."""
+"""The same relative to its own size: beyond it, a state smaller than 1 gets a warning."""
 SHORTER = 64.0
-"""How much shorter steps become where a function has no value next to the point."""
+"""Factor by which steps shrink where a function has no value next to the point."""
 
 
 def linearize_dynamics(
@@ -96,7 +96,7 @@ def _require_steady_dynamics(
 
 
 def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
-    """Return how far each state, input and disturbance moves in use, from what is given of it."""
+    """Return the scale of each state, input and disturbance, completed by their sizes."""
     size: Array = np.maximum(np.abs(point), 1.0)
     if scale is None:
         return size
@@ -145,7 +145,7 @@ def _linearize(
     point = steady_state(simulator, np.concatenate([x_start, u_start]), free, scales)
     found = _differentiate(simulator, point, scales)
     if not np.any(free):
-        check_rest(simulator, point, found.value, scales)
+        require_steady_state(simulator, point, found.value, scales)
     A, B = found.value[:, :n], found.value[:, n:]
     notes = (
         *_idle_inputs(B, 5),
@@ -179,13 +179,7 @@ def _partly_known(name: str, value: ArrayLike | None) -> Array | None:
 
 
 def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian:
-    """Return the Jacobian (n, n+m) of the next state with respect to state and action.
-
-    Raises
-    ------
-    ValueError
-        If an action lies on its bound, or the plant has a kink or a jump at the point.
-    """
+    """Return the Jacobian (n, n+m) of the next state with respect to state and action."""
     space = simulator.env.action_space
     n = scale.size - space.shape[0]
     room = np.minimum(point[n:] - space.low, space.high - point[n:]).astype(np.float64)
@@ -239,7 +233,7 @@ def _differences(
 
 
 def _idle_inputs(B: Array, stacklevel: int) -> list[str]:
-    """Return, and warn of, the inputs that no entry of B has an effect of."""
+    """Return a note on inputs without effect, and warn of them."""
     idle = np.flatnonzero(~np.any(B, axis=0))
     if not idle.size:
         return []
@@ -253,27 +247,27 @@ def _idle_inputs(B: Array, stacklevel: int) -> list[str]:
 
 
 def _remarks(simulator: Simulator, point: Array) -> list[str]:
-    """Return what a user of the model has to know of the environment."""
+    """Return notes on the end of the episode and on the observation."""
     n = point.size - simulator.env.action_space.shape[0]
     simulator.next_state(point[:n], point[n:])
     remarks = []
     if simulator.ended:
         remarks.append("The environment terminates the episode at the operating point.")
     seen, state = to_vector(simulator.observation), simulator.read()
-    if seen is None or state is None or not _same(seen, state):
+    if (
+        seen is None
+        or state is None
+        or seen.shape != state.shape
+        or not np.allclose(seen, state, rtol=1e-5, atol=1e-5)
+    ):
         remarks.append(
             "The observation is not this state. A policy needs a wrapper that makes it so."
         )
     return remarks
 
 
-def _same(one: Array, other: Array) -> bool:
-    """Tell whether two states agree in float32."""
-    return one.shape == other.shape and np.allclose(one, other, rtol=1e-5, atol=1e-5)
-
-
 def _curvature(found: Jacobian, sizes: tuple[int, int]) -> list[str]:
-    """Return notes on entries that were dropped, and where the plant bends soon."""
+    """Return notes on dropped entries, strong nonlinearity, and what has no effect."""
     notes = []
     if found.dropped > 0:
         notes.append(

@@ -33,7 +33,7 @@ READERS: dict[str, Reader] = {
 
 @dataclass
 class Borrowed:
-    """An environment to experiment with, and what becomes of the user's."""
+    """An environment for experiments: `private` to them, or `owned` and so closed afterwards."""
 
     env: Any
     note: str
@@ -47,13 +47,7 @@ class Borrowed:
 
 
 def borrow(env: Maker) -> Borrowed:
-    """Return an environment of one's own: made from an id or a function, or a deep copy.
-
-    Raises
-    ------
-    TypeError
-        If it is none, or its actions are not a one-dimensional Box.
-    """
+    """Return an environment made from an id or a function, or a deep copy of the given one."""
     import gymnasium
 
     if isinstance(env, str):
@@ -84,13 +78,7 @@ def borrow(env: Maker) -> Borrowed:
 
 
 def sample_time(env: Any, dt: float | None) -> float:
-    """Return the time of one step: ``dt``, or what the environment is seen to use.
-
-    Raises
-    ------
-    ValueError
-        If none is given and none is found.
-    """
+    """Return the time of one step: ``dt``, or the one that the environment states."""
     if dt is not None:
         return as_positive("dt", dt)
     plant = env.unwrapped
@@ -106,14 +94,10 @@ def sample_time(env: Any, dt: float | None) -> float:
 
 
 class Simulator:
-    """``next_state(x, u)`` of an environment that can be put into a state.
+    """``next_state(x, u)`` of an environment whose state can be set.
 
-    Parameters
-    ----------
-    borrowed : Borrowed
-        The environment; it is reset once here, with a fixed seed unless it is the user's.
-    set_state, get_state : callable, optional
-        See `LinearModel.from_env`.
+    `LinearModel.from_env` documents ``set_state`` and ``get_state``. The environment is reset once
+    here, with a fixed seed unless it is the user's.
     """
 
     def __init__(
@@ -123,10 +107,8 @@ class Simulator:
         get_state: Callable[[Any], ArrayLike] | None,
     ) -> None:
         self.env, self.origin = borrowed.env, borrowed.note
-        self.refusal = ""
-        self.ended = False
+        self.refusal, self.ended, self.over = "", False, False
         self.observation, self.info = self.env.reset(seed=0 if borrowed.private else None)
-        self.over = False
         self.readers = dict(READERS)
         if get_state is not None:
             self.readers = {"get_state": lambda env, observation, info: get_state(env)}
@@ -150,13 +132,7 @@ class Simulator:
         return self.setter == RESET
 
     def put(self, x: Array) -> bool:
-        """Put the environment into the state x; tell whether `read` then returns it already.
-
-        Raises
-        ------
-        ValueError, AssertionError, TypeError
-            Whatever the environment raises for a state that it does not take.
-        """
+        """Put the environment into the state x; tell whether `read` then returns it already."""
         if self.over and not self.resets:
             self.observation, self.info = self.env.reset()
             self.over = False

@@ -16,28 +16,37 @@ from sb3_yann.control.model.linear_model import LinearModel
 
 @dataclass(frozen=True, eq=False)
 class Identified(ReadOnlyArrays):
-    """A model fitted to data, with what the data say of it.
+    """A model fitted to data by :func:`identify`, and its uncertainty.
 
     Attributes
     ----------
     model : LinearModel
         Its notes, and so its report, state the fit in words.
     standard_error_A, standard_error_B, standard_error_E : ndarray, shapes of A, B and E
-        Standard errors of the entries, for process noise (see :func:`identify`).
+        Standard errors of the entries, valid for process noise.
     noise_covariance : ndarray, shape (n, n)
-        Covariance of what one step differs from the prediction by.
+        Covariance of the one-step prediction errors.
     degrees_of_freedom : int
-        Steps fitted minus parameters of each row.
+        Fitted steps minus the parameters of each row.
     residual_autocorrelation : ndarray, shape (n,)
         Of each state's residuals, one step apart. Far from zero, there is measurement noise or an
         unmodeled state, and neither the matrices nor the standard errors hold.
     one_step_fit, ten_step_fit : ndarray, shape (n,)
-        ``100 (1 - |x - predicted| / |x - mean|)`` in percent for each state over the data that
-        were held out, predicted one step ahead, and ten with the inputs as measured. 100 is
-        perfect, 0 no better than the mean. NaN without such data, or of a state that never moves.
+        ``100 (1 - |x - predicted| / |x - mean|)`` in percent for each state over the held-out data,
+        predicted one and ten steps ahead. NaN without such data, or for a constant state.
     excitation : float
-        The least that any combination of states and inputs moved, each in units of its own
-        spread, relative to the most. Below 1e-6 the data are refused.
+        Smallest over largest singular value of the states and inputs, each in units of its own
+        spread. Below 1e-6 the data are refused.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> x, u = np.zeros((201, 1)), rng.normal(size=(200, 1))
+    >>> for k in range(200):
+    ...     x[k + 1] = 0.8 * x[k] + 0.5 * u[k] + 0.01 * rng.normal()
+    >>> low, high = identify(x, u, dt=1).interval("A")
+    >>> bool(low < 0.8 < high)
+    True
     """
 
     model: LinearModel
@@ -52,19 +61,10 @@ class Identified(ReadOnlyArrays):
     excitation: float
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
-        """Return the lower and upper ends of each entry's confidence interval.
+        """Return the ends of each entry's confidence interval (Student's t).
 
-        Parameters
-        ----------
-        name : {"A", "B", "E"}
-            Which matrix.
-        level : float, default 0.95
-            Probability with which a true entry lies inside: each for itself, Student's t.
-
-        Raises
-        ------
-        ValueError
-            For another name, or a level outside (0, 1).
+        ``name`` is "A", "B" or "E". Each true entry for itself lies inside with probability
+        ``level``.
         """
         name = as_choice("name", name, ("A", "B", "E"))
         level = as_between("level", level, 0, 1, "()")
@@ -87,17 +87,11 @@ def identify(  # noqa: PLR0913 - the columns of a log, and how to fit them
     held_out: float = 0.2,
     time: ArrayLike | Sequence[ArrayLike] | None = None,
 ) -> Identified:
-    r"""Fit ``x[k+1] = A x[k] + B u[k] + E d[k] + c`` to measured episodes by least squares.
+    """Fit ``x[k+1] = A x[k] + B u[k] + E d[k] + c`` to measured episodes by least squares.
 
-    The estimate is consistent, and its standard errors hold in long records, where what disturbs
-    the plant is *process noise*: independent from step to step and acting on the state itself
-    (Ljung, *System Identification*, 2nd ed., section 7.3 and appendix II). Noise of the *sensors*
-    stands on both sides of the equation and biases A towards zero (errors in variables), the same
-    however long the record is, while the standard errors shrink and know nothing of it. Measured
-    on a plant with the poles .9 and .7: noise of 2 % of each state's spread lowers both by .0004,
-    of 10 % by .009. After 400 steps that is within the standard errors; after 4,000, at 10 %, no
-    95 % interval holds the pole. It shows in the residuals, which then alternate, and the notes of
-    the model say so.
+    The estimate is consistent under process noise, independent from step to step (Ljung, *System
+    Identification*, 2nd ed., section 7.3). Sensor noise biases A towards zero, however long the
+    record is. It shows in the residuals, and the model's notes then say so.
 
     Parameters
     ----------
@@ -110,32 +104,41 @@ def identify(  # noqa: PLR0913 - the columns of a log, and how to fit them
     disturbances : array_like, shape (T, d), or a sequence of such, optional
         Measured disturbances, which make E.
     x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
-        The operating point. Left out, inputs and disturbances take their mean, and the state is
-        where the fitted model rests with them. Along what integrates, as far as the data tell, the
-        state keeps its mean, and the inputs are those that hold it.
+        The operating point. By default, inputs and disturbances take their mean, and the state is
+        the fitted model's steady state. Along integrating directions the state keeps its mean, and
+        the inputs are those that hold it.
     offset : bool, default True
-        Fit c too, so that the operating point need not be a steady state exactly. Without it,
-        deviations from (x_ss, u_ss, d_ss), zeros where left out, are fitted with c = 0.
+        Fit c too, so that the operating point need not be an exact steady state. Without it, c is
+        0, and the default operating point is zero.
     ridge : float, default 0
         Weight of the squared entries, each in units of the spread of its regressor, relative to
-        that of one step. It makes data that do not excite the plant usable, at the price of a
-        bias towards zero that the standard errors do not contain.
+        that of one step. It makes poorly exciting data usable, but biases towards zero, which the
+        standard errors do not contain.
     held_out : float, default 0.2
-        Fraction of all steps that is kept out of the model to state its fit: the last ones, for
-        which an episode is cut in two.
+        Fraction of all steps, the last ones, that tests the fit instead of making the model.
     time : array_like, shape (T+1,), or a sequence of such, optional
-        When each row of the states was measured, in the unit of ``dt``. Steps that took another
-        time, by more than 10 %, are left out: a log with missing rows is no record of the plant.
+        When each row of the states was measured, in the unit of ``dt``. Steps whose time differs
+        from ``dt`` by more than 10 % are left out.
 
     Returns
     -------
     Identified
+        The model, its standard errors and its fits.
 
     Raises
     ------
     TypeError, ValueError
         For arrays that do not fit each other, hold NaN or are too few, and for data in which some
         combination of states and inputs does not move: the message names it.
+
+    Examples
+    --------
+    >>> x, u = np.zeros((101, 1)), np.random.default_rng(0).normal(size=(100, 1))
+    >>> for k in range(100):
+    ...     x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+    >>> found = identify(x, u, dt=1)
+    >>> found.model.A.round(6).tolist(), found.ten_step_fit.round(3).tolist()
+    ([[0.8]], [100.0])
     """
     found = fit_log(
         states,
@@ -151,9 +154,8 @@ def identify(  # noqa: PLR0913 - the columns of a log, and how to fit them
         time=time,
     )
     model, step = LinearModel(**vars(found.system)), found.regression
-    A, B, E = np.split(
-        step.standard_errors, [model.n_states, model.n_states + model.n_inputs], axis=1
-    )
+    n = model.n_states
+    A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)
     return Identified(
         model=model,
         standard_error_A=A,
