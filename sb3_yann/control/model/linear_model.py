@@ -111,9 +111,7 @@ class LinearModel(LinearSystem):
         E: ArrayLike | None = None,
         d_ss: ArrayLike | None = None,
     ) -> LinearModel:
-        """Sample ``dx/dt = A x + B u + E d`` every ``dt``, with u and d held constant in between.
-
-        The discretization is exact (matrix exponential, `control.sample_system`).
+        """Sample ``dx/dt = A x + B u + E d`` exactly every ``dt``, with a zero-order hold.
 
         Parameters
         ----------
@@ -143,10 +141,7 @@ class LinearModel(LinearSystem):
         d_ss: ArrayLike | None = None,
         scale: ArrayLike | None = None,
     ) -> LinearModel:
-        """Linearize ``dx/dt = f(x, u)``, or ``f(x, u, d)``, at a steady state; sample it every dt.
-
-        The Jacobian comes from central differences that check themselves, the sampling from
-        :meth:`from_continuous`.
+        """Linearize ``dx/dt = f(x, u)`` or ``f(x, u, d)`` at a steady state, and sample it.
 
         Parameters
         ----------
@@ -160,15 +155,15 @@ class LinearModel(LinearSystem):
         d_ss : array_like, shape (d,), optional
             Measured disturbances at the operating point.
         scale : array_like, shape (n,) or (n + m + d,), optional
-            How far each state moves in use, or each state, input and disturbance: sets the step
-            sizes (1 % of it) and how far the operating point may move. The default is the size
-            of each, at least 1: for trace concentrations give their own.
+            Range in which each state, or each state, input and disturbance, moves in use. Steps
+            are 1 % of it. The default is the size of each, at least 1: give trace concentrations
+            their own.
 
         Raises
         ------
         ValueError
             If ``f`` returns another shape or NaN at the operating point, has a kink or a jump
-            there, or the operating point moves by more than 0.1 % of ``scale`` within one sample.
+            there, or the state moves by more than 0.1 % of ``scale`` within one sample.
 
         Examples
         --------
@@ -190,44 +185,42 @@ class LinearModel(LinearSystem):
         get_state: Callable[[Any], ArrayLike] | None = None,
         scale: ArrayLike | None = None,
     ) -> LinearModel:
-        """Linearize one step of a simulator, wrappers and all, by central differences.
+        """Linearize one step of a simulator and its wrappers by central differences.
 
-        An id or a function makes an environment of its own, closed in the end. An environment is
-        deep-copied and left as it is; one that cannot be copied is used itself, without a seed, and
-        needs a reset afterwards, which the notes then say.
+        An environment is deep-copied and stays untouched. One that cannot be copied is used itself
+        and needs a reset afterwards; the notes then say so.
 
         Parameters
         ----------
         env : gymnasium.Env, str or callable
             A single environment with a one-dimensional Box of actions, its id, or its maker.
         state : array_like, shape (n,), optional
-            The operating point, as the environment has it. NaN entries are solved for; all are if
-            it is left out, from the state of a reset on.
+            The operating point in the environment's units. NaN entries are solved for; the default
+            solves for all of them, starting from a reset.
         action : array_like, shape (m,), optional
-            Likewise; the middle of the action space if both are left out.
+            Likewise. The default is the middle of the action space if ``state`` is left out too.
         dt : float, optional
             Time of one step. The default is ``dt``, ``tau`` or ``DT`` of the unwrapped environment,
-            or ``DT`` of its module, never ``render_fps``. Pass it if a wrapper repeats actions.
+            or ``DT`` of its module. Pass it if a wrapper repeats actions.
         set_state : callable, optional
-            ``set_state(env, x)`` puts the environment into the state x. The default tries
-            ``env.reset(options={"state": x})``, then ``env.unwrapped.state = x``, and takes the
-            first that is seen to work.
+            ``set_state(env, x)`` puts the environment into the state x. The default is the first of
+            ``env.reset(options={"state": x})`` and ``env.unwrapped.state = x`` that works.
         get_state : callable, optional
-            ``get_state(env)`` returns the state, shape (n,). The default takes the first of
-            ``info["state"]``, ``env.unwrapped.state`` and the observation that is what was set.
+            ``get_state(env)`` returns the state, shape (n,). The default is the first of
+            ``info["state"]``, ``env.unwrapped.state`` and the observation that returns what was set.
         scale : array_like, shape (n,), optional
-            How far each state moves in use: sets the step sizes (at most 1 % of it, 5 % where
-            states are float32) and how far off a given steady state may be (1 %). The default is
-            half the width of the observation space, or the size of the state, at least 1.
+            Range in which each state moves in use. Steps are at most 1 % of it, 5 % for float32
+            states; a given steady state may be 1 % off. The default is half the width of the
+            observation space, or the size of the state, at least 1.
 
         Raises
         ------
         TypeError
             For vectorized environments and other than Box actions.
         ValueError
-            If ``dt`` is not found, the environment cannot be put into a state, a step is not
-            repeatable (noise, hidden states), no steady state is found or the given one is none,
-            the action lies on its bound, or the plant has a kink or a jump at the point.
+            If ``dt`` is unknown, the state cannot be set, steps do not repeat (noise, hidden
+            states), there is no steady state, the action lies on its bound, or the plant has a
+            kink or a jump at the point.
 
         Examples
         --------
@@ -261,13 +254,11 @@ class LinearModel(LinearSystem):
 
         Examples
         --------
-        >>> x = np.zeros((101, 1))
-        >>> u = np.random.default_rng(0).normal(size=(100, 1))
+        >>> x, u = np.zeros((101, 1)), np.random.default_rng(0).normal(size=(100, 1))
         >>> for k in range(100):
         ...     x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
-        >>> model = LinearModel.from_data(x, u, dt=1)
-        >>> model.A.round(6).tolist(), model.B.round(6).tolist()
-        ([[0.8]], [[0.5]])
+        >>> LinearModel.from_data(x, u, dt=1).B.round(6).tolist()
+        [[0.5]]
         """
         return cls(**vars(fit_log(states, actions, dt=dt, **options).system))
 
@@ -284,9 +275,8 @@ class LinearModel(LinearSystem):
     ) -> LinearModel:
         """Take over a `control.StateSpace`: a discrete one as it is, a continuous one sampled.
 
-        The states are kept, since they are what the law depends on; the outputs are not. Where
-        they are not the states (C is not the identity, D not zero), the notes say so, and whether
-        an observer could find the states from them.
+        The outputs are dropped. Where C is not the identity or D not zero, the notes say so, and
+        whether an observer could estimate the states.
 
         Parameters
         ----------
@@ -302,8 +292,7 @@ class LinearModel(LinearSystem):
         Raises
         ------
         TypeError, ValueError
-            If it is no state space, its time base is not stated, ``dt`` is missing or not that
-            of the system, or there is no such input.
+            If it is no state space, ``dt`` is missing or not the system's, or an input is unknown.
 
         Examples
         --------
@@ -321,7 +310,7 @@ class LinearModel(LinearSystem):
         return moved if d is None else moved + np.asarray(d) @ self.E.T
 
     def report(self) -> str:
-        """Return a readable account: poles, reach of the inputs, scaling, sampling, notes."""
+        """Return an account in words: poles, controllability, scaling, sampling and notes."""
         return describe(self)
 
     def __eq__(self, other: object) -> bool:
