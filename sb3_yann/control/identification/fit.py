@@ -16,10 +16,8 @@ from sb3_yann.control.identification.logs import Episode, as_episodes, split, wi
 from sb3_yann.control.identification.operating_point import FAR, operating_point
 from sb3_yann.control.linear_system import LinearSystem
 
-AHEAD = 10
-"""Steps of the longer prediction whose fit is stated."""
-POOR = 50.0
-"""Percent of the longer prediction's fit below which a model is called poor."""
+AHEAD = 10  # steps of the longer prediction whose fit is stated
+POOR = 50.0  # percent of the longer prediction's fit below which a model is called poor
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +33,6 @@ class LogFit:
 def fit_log(  # noqa: PLR0913 - the options of `identify`
     states: ArrayLike | Sequence[ArrayLike],
     actions: ArrayLike | Sequence[ArrayLike],
-    *,
     dt: float,
     disturbances: ArrayLike | Sequence[ArrayLike] | None = None,
     x_ss: ArrayLike | None = None,

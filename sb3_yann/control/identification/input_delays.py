@@ -9,12 +9,9 @@ from sb3_yann._validation import Array
 from sb3_yann.control.identification.least_squares import Regression
 from sb3_yann.control.identification.logs import Episode
 
-LONGEST = 10
-"""Longest input delay, in samples, that is looked for."""
-CHANCE = 0.01
-"""Significance level of an input's effect."""
-FOLLOWS = 0.25
-"""Least correlation of residuals with an earlier input that is a delay. Sensor noise leaves some."""
+LONGEST = 10  # longest input delay, in samples, that is looked for
+CHANCE = 0.01  # significance level of an input's effect
+FOLLOWS = 0.25  # least correlation of residuals with an earlier input: sensor noise leaves some
 
 
 def input_notes(
@@ -22,7 +19,7 @@ def input_notes(
 ) -> list[str]:
     """Return notes on inputs and disturbances without effect, or with a delay."""
     n, m, d = sizes
-    names = [f"u[{i}]" for i in range(m)] + [f"d[{i}]" for i in range(d)]
+    names = [f"{k}[{i}]" for k, size in (("u", m), ("d", d)) for i in range(size)]
     delays, notes = _delays(found, episodes, sizes), []
     for j, (name, (lag, correlation)) in enumerate(zip(names, delays, strict=True)):
         idle = _chance(found, n, n + j) > CHANCE

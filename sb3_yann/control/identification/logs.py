@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, to_float
 
-UNEVEN = 0.1
-"""Largest deviation of a step's time from dt, relative to it."""
+UNEVEN = 0.1  # largest deviation of a step's time from dt, relative to it
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.least_squares import Regression
 
-FAR = 5.0
-"""Spreads from the mean of the data beyond which a model is extrapolated."""
+FAR = 5.0  # spreads from the mean of the data beyond which a model is extrapolated
 SURE = 5.0
 """Standard errors above which a direction does not integrate: more than in other tests, since those
 of an integrator are not normally distributed (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""

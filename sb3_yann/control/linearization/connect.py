@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, as_array, as_positive_vector
 from sb3_yann.control.linearization.simulator import Simulator
 
-LONGEST_DELAY = 20
-"""Longest input delay, in samples, that is detected."""
+LONGEST_DELAY = 20  # longest input delay, in samples, that is detected
 ADVICE = (
     "Make them part of the state (of a delay, the inputs on their way), have set_state set them "
     "too, or identify the plant: LinearModel.from_data"

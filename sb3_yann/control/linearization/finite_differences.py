@@ -16,25 +16,12 @@ RATIO = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Jacobian:
-    """A Jacobian and what its differences showed.
+    """A Jacobian (r, c), and what its differences showed."""
 
-    Attributes
-    ----------
-    value : ndarray, shape (r, c)
-        The derivatives; those not above their own error are exactly zero.
-    dropped : float
-        The largest derivative that was set to zero.
-    steps : ndarray, shape (c,)
-        The longest step in each coordinate.
-    change : ndarray, shape (c,)
-        Nonlinearity: the error of the difference over the longest step, relative to the column's
-        largest entry. NaN where the function has no value there.
-    """
-
-    value: Array
-    dropped: float
-    steps: Array
-    change: Array
+    value: Array  # (r, c), exactly zero where not above its own error
+    dropped: float  # the largest derivative that was set to zero
+    steps: Array  # (c,), the longest step in each coordinate
+    change: Array  # (c,), error of the longest step relative to its column, NaN without a value
 
 
 class NotDifferentiableError(ValueError):

@@ -28,16 +28,11 @@ from sb3_yann.control.linearization.steady_state import require_steady_state, st
 if TYPE_CHECKING:
     from sb3_yann.control.linearization.simulator import Maker
 
-LONGEST = 0.01
-"""Longest step of a difference, relative to the scale of its coordinate."""
-LONGEST_SINGLE = 0.05
-"""The same where states are read in float32."""
-STEADY = 1e-3
-"""Largest motion of a steady state in one sample, relative to its scale."""
-MOVES = 0.01
-"""The same relative to its own size: beyond it, a state smaller than 1 gets a warning."""
-SHORTER = 64.0
-"""Factor by which steps shrink where a function has no value next to the point."""
+LONGEST = 0.01  # longest step of a difference, relative to the scale of its coordinate
+LONGEST_SINGLE = 0.05  # the same where states are read in float32
+STEADY = 1e-3  # largest motion of a steady state in one sample, relative to its scale
+MOVES = 0.01  # the same relative to its own size: beyond it, a state smaller than 1 gets a warning
+SHORTER = 64.0  # factor by which steps shrink where a function has no value next to the point
 
 
 def linearize_dynamics(
@@ -100,10 +95,8 @@ def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
     size: Array = np.maximum(np.abs(point), 1.0)
     if scale is None:
         return size
-    given = to_float("scale", scale)
-    given = as_array("scale", given, (point.size if given.shape == point.shape else n,))
-    given = as_positive_vector("scale", given, given.size)
-    size[: given.size] = given
+    k = point.size if np.shape(scale) == point.shape else n
+    size[:k] = as_positive_vector("scale", as_array("scale", scale, (k,)), k)
     return size
 
 

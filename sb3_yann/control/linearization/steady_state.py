@@ -10,12 +10,9 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control.linearization.simulator import Simulator
 
-MOVED = 1e-3
-"""Largest residual of a given steady state in one step, relative to the scale."""
-AWAY = 1e-2
-"""Largest distance to the linear model's steady state, relative to the scale."""
-SOLVED = 1e-6
-"""Largest residual of a steady state that was solved for."""
+MOVED = 1e-3  # largest residual of a given steady state in one step, relative to the scale
+AWAY = 1e-2  # largest distance to the linear model's steady state, relative to the scale
+SOLVED = 1e-6  # largest residual of a steady state that was solved for
 
 
 def steady_state(

@@ -206,8 +206,8 @@ class LinearModel(LinearSystem):
             ``set_state(env, x)`` puts the environment into the state x. The default is the first of
             ``env.reset(options={"state": x})`` and ``env.unwrapped.state = x`` that works.
         get_state : callable, optional
-            ``get_state(env)`` returns the state, shape (n,). The default is the first of
-            ``info["state"]``, ``env.unwrapped.state`` and the observation that returns what was set.
+            ``get_state(env)`` returns the state, shape (n,). The default is the first that works of
+            ``info["state"]``, ``env.unwrapped.state`` and the observation.
         scale : array_like, shape (n,), optional
             Range in which each state moves in use. Steps are at most 1 % of it, 5 % for float32
             states; a given steady state may be 1 % off. The default is half the width of the

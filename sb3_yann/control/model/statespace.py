@@ -70,7 +70,7 @@ def _input(system: Any, name: int | str) -> int:
 
 
 def _dropped(system: Any, A: Array) -> list[str]:
-    """Return notes on what of the outputs is lost."""
+    """Return notes on the dropped outputs."""
     import control
 
     C, n = np.asarray(system.C), len(A)
