@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import YannPolicy
 
 
@@ -37,6 +38,8 @@ class NoActionNoise(BaseCallback):
             )
         self.model.action_noise = None
         self.model.learning_starts = 0
+        if isinstance(self.model.policy, YannPolicy):
+            watch_buffer(self.model)  # another one may have been loaded since
 
     def _on_step(self) -> bool:
         return True
@@ -88,7 +91,8 @@ class ControlDiagnostics(BaseCallback):
             theta = self.policy.theta(observations)
             law = layer.law(theta).cpu().numpy()
             self._regions.extend(layer.regions(theta).tolist())
-        self._distances.extend(np.max(np.abs(actions - law), axis=1) / 2)
+        distances = np.max(np.abs(actions - law), axis=1) / 2
+        self._distances.extend(distances[np.isfinite(distances)])
         dones, infos = self.locals["dones"], self.locals["infos"]
         self.violations += sum(bool(info.get("violation", False)) for info in infos)
         for i, episode in enumerate(self._episodes):
@@ -106,8 +110,9 @@ class ControlDiagnostics(BaseCallback):
         self._recorded = False
 
     def _record(self) -> None:
-        self.logger.record("yann/distance_from_mpc_mean", float(np.mean(self._distances)))
-        self.logger.record("yann/distance_from_mpc_max", float(np.max(self._distances)))
+        if self._distances:  # the law knows none where an observation is not finite
+            self.logger.record("yann/distance_from_mpc_mean", float(np.mean(self._distances)))
+            self.logger.record("yann/distance_from_mpc_max", float(np.max(self._distances)))
         self.logger.record("yann/region", int(np.bincount(self._regions).argmax()))
         self.logger.record("yann/regions_visited", len(set(self._regions)))
         self.logger.record("yann/violations", self.violations)

@@ -11,6 +11,7 @@ Each appends one part. Wrap in the order of theta, the state innermost::
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_yann._validation import NonFiniteWarning
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 
 Vector = NDArray[np.floating[Any]]
@@ -49,6 +51,11 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
             raise ValueError(
                 f"low has shape {self.low.shape} and high {self.high.shape}; give the bounds of "
                 "each appended entry as two vectors of the same length."
+            )
+        if np.any(np.isnan([self.low, self.high])):
+            raise ValueError(
+                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers: give "
+                "the bounds of each appended entry."
             )
         if not np.all(self.low <= self.high):
             raise ValueError(f"low = {self.low.tolist()} exceeds high = {self.high.tolist()}.")
@@ -86,6 +93,11 @@ class PreviousInput(_Appending):
         start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
         if start.shape != bounds.shape:
             raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
+        if not np.all(np.isfinite(start)):
+            raise ValueError(
+                f"initial = {start.tolist()} must be finite: give the input that acts before the "
+                "first step, or leave it out for the operating point."
+            )
         self.initial = self.executed(start)
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
@@ -130,8 +142,12 @@ class SetPoint(_Appending):
         super().__init__(env, low, high)
         if not np.all(np.isfinite([self.low, self.high])):
             raise ValueError("low and high must be finite: references are drawn between them.")
-        if hold is not None and (isinstance(hold, bool) or hold < 1):
-            raise ValueError(f"hold = {hold!r} must be a number of steps of at least 1, or None.")
+        whole = isinstance(hold, (int, np.integer)) and not isinstance(hold, bool)
+        if hold is not None and not (whole and hold >= 1):
+            raise ValueError(
+                f"hold = {hold!r} must be a whole number of steps of at least 1, or None for one "
+                "reference in each episode."
+            )
         self.hold, self.schedule = hold, schedule
         self.steps = 0
         self.reference: Array = np.zeros(len(self.low))
@@ -167,6 +183,9 @@ class SetPoint(_Appending):
 class MeasuredDisturbance(_Appending):
     """Appends a disturbance d (d,) that the env measures and reports in ``info``.
 
+    An entry that is no finite number is named, and the last one that was holds: at first 0, the
+    operating point, or the nearest bound to it.
+
     Parameters
     ----------
     env : gymnasium.Env
@@ -185,7 +204,11 @@ class MeasuredDisturbance(_Appending):
         key: str = "disturbance",
     ) -> None:
         super().__init__(env, low, high)
+        if not isinstance(key, str):
+            raise TypeError(f"key = {key!r} must be a str, the entry of info that holds d.")
         self.key = key
+        self.held: Array = np.clip(np.zeros(self.low.shape), self.low, self.high)
+        self.failing = np.zeros(self.low.shape, dtype=bool)
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode."""
@@ -207,7 +230,17 @@ class MeasuredDisturbance(_Appending):
         d = np.atleast_1d(np.asarray(info[self.key], np.float64))
         if d.shape != self.low.shape:
             raise ValueError(f"info[{self.key!r}] has shape {d.shape}, expected {self.low.shape}.")
-        return d
+        failing = ~np.isfinite(d)
+        self.held = np.where(failing, self.held, d)
+        if np.any(failing & ~self.failing):  # once, for a sensor that stays so
+            warnings.warn(
+                f"info[{self.key!r}] = {d.tolist()} is not finite: {self.held.tolist()} holds "
+                "until it is again. Mend the sensor.",
+                NonFiniteWarning,
+                stacklevel=3,
+            )
+        self.failing = failing
+        return self.held
 
 
 class ObserveDisturbance(_Appending):

@@ -6,10 +6,11 @@ import warnings
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.audit.causes import Cause, likely_cause
+from sb3_yann.audit.causes import Cause, likely_cause, not_finite
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.audit.sample import FEWEST, Array, Sample
 from sb3_yann.policy._checks import as_factor
@@ -104,6 +105,7 @@ class CostAudit(BaseCallback):
                     "following": np.array(following),  # copies: an env may write into its arrays
                     "action": np.array(self.locals["actions"][i], dtype=np.float64),
                     "reward": float(rewards[i]),
+                    "step": len(records) + 1,
                     "violation": bool(info.get("violation", False)),
                     "truncated": done and bool(info.get("TimeLimit.truncated", False)),
                     "done": done,
@@ -112,11 +114,14 @@ class CostAudit(BaseCallback):
         self._seen += len(self._records)
 
     def _judge(self) -> None:
-        sample = self._sample()
+        records = [each for of_one_env in self._records for each in of_one_env]
+        lost = np.array([not _is_finite(each) for each in records], dtype=bool)
+        sample = self._sample(records, lost)
         self._records = []
-        if np.count_nonzero(sample.counted) < FEWEST:
+        enough = np.count_nonzero(sample.counted) >= FEWEST
+        if not (enough or lost.any()):
             return
-        cause = self._of_the_vec_normalize()
+        cause = not_finite(lost, records) if lost.any() else self._of_the_vec_normalize()
         if cause is None and sample.is_the_problem_s_cost(self.tolerance):
             self.finding = CostFinding.match(sample)
             if self.verbose:
@@ -129,20 +134,22 @@ class CostAudit(BaseCallback):
             raise CostMismatchError(self.finding.message)
         warnings.warn(self.finding.message, CostMismatchWarning, stacklevel=2)
 
-    def _sample(self) -> Sample:
-        records = [each for of_one_env in self._records for each in of_one_env]
+    def _sample(self, records: list[dict[str, Any]], lost: NDArray[np.bool_]) -> Sample:
+        """Return the records without the lost ones, after which another episode begins."""
 
         def column(name: str) -> Any:
-            return np.array([each[name] for each in records])
+            return np.array([each[name] for each in records])[~lost]
 
         def theta(name: str) -> Array:
             return np.asarray(self.policy.theta(column(name)).double().cpu().numpy())
 
-        done, env = column("done"), np.repeat(*self._env_numbers())
-        first = np.r_[True, np.diff(env) != 0]
-        begins = first | np.r_[False, done[:-1]]
+        every_env = np.repeat(*self._env_numbers())
+        ended = np.array([each["done"] for each in records], dtype=bool) | lost
+        done, env = column("done"), every_env[~lost]
+        first = np.r_[True, np.diff(env) != 0][: len(env)]
+        begins = first | np.r_[True, ended[:-1]][~lost]
         problem = self.policy.problem
-        observations = column("observation").reshape(len(records), -1)
+        observations = column("observation").reshape(len(env), records[0]["observation"].size)
         terminated = done & ~column("truncated")
         return Sample(
             theta=theta("observation"),
@@ -193,3 +200,7 @@ class CostAudit(BaseCallback):
                 "at each step. Set venv.training = False.",
             )
         return None
+
+
+def _is_finite(record: dict[str, Any]) -> bool:
+    return all(np.all(np.isfinite(record[each])) for each in ("observation", "following", "reward"))

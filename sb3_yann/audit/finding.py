@@ -84,7 +84,16 @@ class CostFinding:
     @classmethod
     def mismatch(cls, sample: Sample, cause: Cause, venv: VecEnv) -> CostFinding:
         """Return what is wrong, with the wrappers that may have to do with it."""
-        steps, line, wrappers = int(sample.counted.sum()), Line.through(sample), suspects(venv)
+        steps, wrappers = int(sample.counted.sum()), suspects(venv)
+        if steps == 0:  # nothing is finite, to be compared
+            message = f"The rewards cannot be compared. Likely cause: {cause.explanation}"
+            return cls(False, cause.name, message, np.nan, np.nan, np.nan, 0, wrappers)
+        line = Line.through(sample)
+        if cause.name == "not finite":
+            message = f"The rewards cannot all be compared: {cause.explanation}"
+            return cls(
+                False, cause.name, message, line.scale, line.offset, line.r2, steps, wrappers
+            )
         expected = "minus the cost of the problem"
         if (sample.scale, sample.offset) != (1, 0):
             expected = f"{sample.scale:g} * (-cost) {sample.offset:+g}, as the policy assumes"

@@ -3,8 +3,8 @@
 from sb3_yann.control.explicit.budget import ExplicitLimitError
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.identification.identify import Identified, identify
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.model.identify import Identified, identify
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,

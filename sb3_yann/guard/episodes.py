@@ -29,8 +29,9 @@ class Outcome:
     Attributes
     ----------
     costs : ndarray, shape (episodes,)
-    unsafe : ndarray of int, shape (episodes, 2)
-        Steps with a violation, and whether the env terminated the episode.
+    unsafe : ndarray of int, shape (episodes, 3)
+        Steps with a violation, whether the env terminated the episode, and whether its cost or an
+        observation is no finite number.
     visits : ndarray of bool, shape (episodes, regions)
         Through which regions it comes: whatever the networks of the others become, the episode
         stays as it is.
@@ -120,19 +121,24 @@ def play(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Outcome:
     except Unplayable:
         raise
     except Exception as error:
+        if guard.interrupted:  # what a simulator has made of it in compiled code of its own
+            raise KeyboardInterrupt from error
         present = ActorCheckpoint.of(guard.policy)
         guard.mpc.restore(guard.policy)
         try:
             played(guard, env, seeds)
         finally:
-            present.restore(guard.policy)
+            if not guard.interrupted:
+                present.restore(guard.policy)
         reason = f"the simulator failed: {type(error).__name__}: {error}"
         raise Unplayable(reason) from error
 
 
 def outcome_of(guard: ImprovementGuard, episodes: Episodes) -> Outcome:
     """Return what matters of the episodes."""
-    unsafe = np.column_stack([episodes.violations, episodes.terminated]).astype(np.int64)
+    finite = [np.all(np.isfinite(each)) for each in episodes.observations]
+    lost = ~(np.isfinite(episodes.costs) & finite)
+    unsafe = np.column_stack([episodes.violations, episodes.terminated, lost]).astype(np.int64)
     return Outcome(episodes.costs, unsafe, _visits(guard, episodes))
 
 
@@ -161,12 +167,16 @@ def all_or_nothing(guard: ImprovementGuard) -> Iterator[ActorCheckpoint]:
     """
     state, candidate = guard.state, ActorCheckpoint.of(guard.policy)
     before = state.accepted, state.evidence, [*state.passed]
+    guard.before_trial = before
     try:
         yield candidate
     except BaseException:
         state.accepted, state.evidence, state.passed = before
-        candidate.restore(guard.policy)
+        if not guard.interrupted:
+            candidate.restore(guard.policy)
         raise
+    finally:
+        guard.before_trial = None
 
 
 def _seen(guard: ImprovementGuard) -> Callable[[Any], Any]:

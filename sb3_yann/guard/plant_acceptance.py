@@ -16,6 +16,7 @@ from sb3_yann.guard.statistics import PlantEpisodes, compared, excess_of_an_outl
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
+    from sb3_yann.policy.policies import YannPolicy
 
 Array = NDArray[np.float64]
 LARGEST = 1e9
@@ -58,6 +59,8 @@ class PlantAcceptance:
         self.starts: list[Array] = [np.empty(0)] * n_envs
         self.blocks = np.full(n_envs, -1)
         self.block = 0
+        self.returned = "", -1  # why, and after how many episodes, the actor returned last
+        self.lost = 0  # episodes of the first block whose cost is not known
 
     def still_holds(self, guard: ImprovementGuard) -> bool:
         """Return whether the evidence is there; a plant cannot be played again."""
@@ -69,6 +72,9 @@ class PlantAcceptance:
         if known is not None:  # what the present one is, if it is another, nobody has found out
             other = not same(known.accepted, guard.policy)
             known.accepted.restore(guard.policy)
+        if diverged(guard.policy):  # there is nothing to return to, but the MPC
+            other = True
+            guard.mpc.restore(guard.policy)
         guard.accept(evidence := Evidence(resting=ActorCheckpoint.of(guard.policy)))
         if other:
             self._report(guard, evidence, "rejected", "before training, it is not accepted", np.nan)
@@ -78,8 +84,7 @@ class PlantAcceptance:
 
         SB3 calls this after each training of the networks, before the next action.
         """
-        largest = [each.detach().abs().max() for each in guard.policy.actor.parameters()]
-        if not all(bool(each <= LARGEST) for each in largest):  # nor does nan pass
+        if diverged(guard.policy):
             reason = "a parameter of the actor is not a finite number, or too large"
             self._return(guard, guard.state.evidence, reason)
 
@@ -103,7 +108,10 @@ class PlantAcceptance:
                 elif terminated and self.accepted_led[i]:
                     evidence.terminates = True
             if done:
-                if self.blocks[i] == self.block:
+                known = np.isfinite(self.costs[i])
+                if self.blocks[i] == self.block and not known and evidence.phase == "first":
+                    self._lose(i)
+                elif self.blocks[i] == self.block:
                     evidence.costs.append(float(self.costs[i]))
                     if evidence.phase != "learning":
                         evidence.predicted.append(
@@ -128,9 +136,11 @@ class PlantAcceptance:
         if len(starting) == 0:
             return
         self.accepted_led[starting] = True
-        theta = guard.policy.theta(guard.model._last_obs)  # type: ignore[arg-type]
+        theta = guard.policy.theta(guard.model._last_obs).double().cpu().numpy()  # type: ignore[arg-type]
         for i in starting:  # s_t, before the step
-            self.starts[i] = theta[i].double().cpu().numpy()
+            self.starts[i] = theta[i]
+            if not np.all(np.isfinite(theta[i])):
+                continue  # what it should cost from there is not known
             counted = len(evidence.costs) + np.count_nonzero(self.blocks == self.block)
             if counted < self.trial_episodes:
                 self.blocks[i] = self.block
@@ -153,10 +163,25 @@ class PlantAcceptance:
         self.block += 1
 
     def _return(self, guard: ImprovementGuard, evidence: Evidence, reason: str) -> None:
-        """Bring the accepted policy back at once, whatever the block."""
+        """Bring the accepted policy back at once, whatever the block.
+
+        What does so step after step is one decision in each episode.
+        """
         guard.state.accepted.restore(guard.policy)
-        self._report(guard, evidence, "rejected", reason, np.nan)
+        if self.returned != (reason, guard.state.episodes):
+            self._report(guard, evidence, "rejected", reason, np.nan)
+        self.returned = reason, guard.state.episodes
         self._next(guard, evidence, "first" if evidence.accepted is None else "learning")
+
+    def _lose(self, i: int) -> None:
+        """Leave out an episode of the first block; where no end of that is in sight, say so."""
+        self.lost += 1
+        if self.lost >= self.trial_episodes:
+            raise ValueError(
+                f"{self.lost} episodes of the guard's first block cost what is no finite number, "
+                f"the last {self.costs[i]:g}: no policy can be compared with that. Rewards must be "
+                "finite numbers."
+            )
 
     def _block_is_over(self, guard: ImprovementGuard, evidence: Evidence) -> None:
         if evidence.phase == "learning":
@@ -164,11 +189,6 @@ class PlantAcceptance:
             return
         played = PlantEpisodes(np.array(evidence.costs), np.array(evidence.predicted))
         if evidence.phase == "first":
-            if not np.all(np.isfinite(played.costs)):
-                raise ValueError(
-                    f"The episodes of the guard's first block cost {played.costs.tolist()}: "
-                    "no policy can be compared with that. Rewards must be finite numbers."
-                )
             evidence.accepted = played
             if guard.policy.actor.mu.network.is_zero():
                 evidence.mpc = played
@@ -213,6 +233,12 @@ class PlantAcceptance:
                 regions=(),
             )
         )
+
+
+def diverged(policy: YannPolicy) -> bool:
+    """Return whether a parameter of the actor is not a finite number, or too large."""
+    largest = [each.detach().abs().max() for each in policy.actor.parameters()]
+    return not all(bool(each <= LARGEST) for each in largest)  # nor does nan pass
 
 
 def predicted_cost(problem: LinearMPC, start: Array, steps: int) -> float:

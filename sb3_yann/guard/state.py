@@ -6,7 +6,7 @@ import csv
 import os
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 
@@ -49,6 +49,9 @@ class Decision:
     step: float = 1.0
 
 
+NAMES = [each.name for each in fields(Decision)]
+
+
 @dataclass
 class GuardState:
     """All that a stopped run needs to go on; it travels in the model's zip.
@@ -75,9 +78,22 @@ def write_csv(path: Path, decisions: list[Decision]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".unfinished")
     with unfinished.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [each.name for each in fields(Decision)])
-        writer.writeheader()
-        for decision in decisions:
-            regions = " ".join(map(str, decision.regions))
-            writer.writerow({**asdict(decision), "regions": regions})
+        csv.DictWriter(file, NAMES).writeheader()
+        _write_rows(file, decisions)
     os.replace(unfinished, path)
+
+
+def append_csv(path: Path, decisions: list[Decision]) -> None:
+    """Write the last decision, as all but it are there: all of them would take ever longer."""
+    if not path.exists():
+        write_csv(path, decisions)
+        return
+    with path.open("a", newline="", encoding="utf-8") as file:
+        _write_rows(file, decisions[-1:])
+
+
+def _write_rows(file: TextIO, decisions: list[Decision]) -> None:
+    writer = csv.DictWriter(file, NAMES)
+    for decision in decisions:
+        regions = " ".join(map(str, decision.regions))
+        writer.writerow({**asdict(decision), "regions": regions})

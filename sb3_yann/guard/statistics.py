@@ -11,6 +11,11 @@ from scipy import stats
 Array = NDArray[np.float64]
 OUTLIER = 1e-3
 """Probability that one episode of a policy like the accepted one is taken for far outside."""
+UNSAFE = (
+    "violations",
+    "an episode that the env terminates",
+    "a cost or an observation that is no finite number",
+)
 
 
 @dataclass(frozen=True)
@@ -21,8 +26,9 @@ class Paired:
     ----------
     mpc_costs, costs : ndarray, shape (starts,)
         Of the MPC and of the accepted policy.
-    unsafe : ndarray of int, shape (starts, 2)
-        Of the accepted policy: steps with a violation, and whether the env terminated the episode.
+    unsafe : ndarray of int, shape (starts, up to 3)
+        Of the accepted policy: steps with a violation, whether the env terminated the episode, and
+        whether its cost or an observation is no finite number.
         They are compared one by one: an episode that is cut short has fewer steps to violate in.
     margin : float
         By how much one start may cost more than with the MPC, in units of the cost.
@@ -46,8 +52,8 @@ class Paired:
 
         Comparisons are written so that a cost that is not a number is refused.
         """
-        for column, what in enumerate(("violations", "an episode that the env terminates")):
-            more = np.flatnonzero(unsafe[:, column] > self.unsafe[:, column])
+        for what, now, before in zip(UNSAFE, unsafe.T, self.unsafe.T, strict=False):
+            more = np.flatnonzero(now > before)
             if len(more):
                 return f"{len(more)} starts with {what}, the first is number {more[0]}"
         excess = costs - self.mpc_costs

@@ -127,6 +127,8 @@ class YannLayer(nn.Module):
             correction = correction.nan_to_num(0.0, self.reach, -self.reach)
             correction = clamp_with_inward_gradient(correction, self.reach)
         output = self._law(theta, region, inside) + correction
+        # As compiled: where theta is not finite nothing is passed off as an input.
+        output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
         if not self.rated:
             return clamp_with_inward_gradient(output)
         return clamp_between_with_inward_gradient(output, *self._within_reach(theta))

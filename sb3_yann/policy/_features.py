@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
 from sb3_yann.policy.observations import AffineObservation
 
@@ -29,6 +30,18 @@ class AffineFeatures(BaseFeaturesExtractor):
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return theta."""
         return th.addmm(self.t0, observations.flatten(1).double(), self.T)
+
+
+def without_entries(
+    theta: th.Tensor, lost: th.Tensor, extractor: BaseFeaturesExtractor | nn.Module
+) -> th.Tensor:
+    """Return theta at the operating point where it depends on entries that are lost.
+
+    ``lost`` (batch, n_obs) names those of the observations.
+    """
+    if isinstance(extractor, AffineFeatures):
+        lost = lost.double() @ (extractor.T != 0).double() > 0
+    return theta.masked_fill(lost | ~theta.isfinite(), 0.0)
 
 
 class SeesTheta(BaseModel):

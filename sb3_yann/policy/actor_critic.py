@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,6 +14,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 
+from sb3_yann._validation import NonFiniteWarning
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import (
     AfterstateValue,
@@ -20,7 +23,8 @@ from sb3_yann.networks import (
     YannLayer,
 )
 from sb3_yann.networks.value import PredictionModel
-from sb3_yann.policy._features import SeesTheta
+from sb3_yann.policy._features import SeesTheta, without_entries
+from sb3_yann.policy._finite import what_is_not_finite
 
 
 class YannActor(SeesTheta, Actor):
@@ -56,6 +60,7 @@ class YannActor(SeesTheta, Actor):
             normalize_images,
         )
         self.net_arch = net_arch
+        self.named = ""
         self.options = {
             "problem": problem,
             "max_correction": max_correction,
@@ -69,6 +74,38 @@ class YannActor(SeesTheta, Actor):
             pinned=pin_equilibrium,
             rate=(problem.rate.du_min, problem.rate.du_max) if problem.has_rate_bounds else None,
         )
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        """Return the actions in [-1, 1], (batch, m).
+
+        Finite whatever is observed and learnt: where it is not, the law acts alone, at the
+        operating point in those entries of theta that are not known.
+        """
+        modules: Any = self._modules  # an attribute of a module takes a microsecond to find
+        theta = self.extract_features(obs, modules["features_extractor"])
+        actions: th.Tensor = modules["mu"](theta)
+        if th.jit.is_tracing() or th.compiler.is_compiling():  # type: ignore[attr-defined, no-untyped-call]
+            return actions  # no branch that depends on numbers
+        # NaN is all that an action can be beside a number in [-1, 1].
+        total = actions if actions.numel() == 1 else actions.detach().sum()
+        if math.isfinite(total.item()):
+            if self.named and not th.is_grad_enabled():  # the sensor is back, and no batch is it
+                self.named = ""
+            return actions
+        return self._without_what_is_not_finite(obs)
+
+    def _without_what_is_not_finite(self, obs: th.Tensor) -> th.Tensor:
+        lost = ~obs.flatten(1).isfinite()
+        kept = obs.masked_fill(lost.view_as(obs), 0.0)
+        theta = self.extract_features(kept, self.features_extractor)
+        theta = without_entries(theta, lost, self.features_extractor)
+        actions: th.Tensor = self.mu(theta)
+        whole = (~lost.any(1, keepdim=True)) & actions.detach().isfinite().all(1, keepdim=True)
+        said = what_is_not_finite(lost.cpu().numpy())
+        if said != self.named:  # once, for a sensor that stays so
+            warnings.warn(said, NonFiniteWarning, stacklevel=3)
+        self.named = said
+        return th.where(whole, actions, self.mu.law(theta).to(actions))
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
         """Yield the weights, without the search of all modules for them.
@@ -183,9 +220,9 @@ class YannCritic(SeesTheta, ContinuousCritic):
             points = th.cat([theta, actions], dim=1)
             return self._in_rewards(q_network.compiled_with_fixed_weights(points))
         trained = [each for each in q_network.parameters() if each.requires_grad]
-        for parameter in trained:
-            parameter.requires_grad_(False)
         try:
+            for parameter in trained:
+                parameter.requires_grad_(False)
             return self._in_rewards(super().q1_forward(obs, actions))
         finally:
             for parameter in trained:

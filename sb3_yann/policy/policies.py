@@ -31,6 +31,7 @@ from sb3_yann.policy._checks import (
     warn_of_absolute_inputs,
 )
 from sb3_yann.policy._features import AffineFeatures
+from sb3_yann.policy._finite import finite_gradient, warn_of_refused_step, watch_buffer
 from sb3_yann.policy._sb3_hooks import (
     algorithm_under_construction,
     multiply_learning_rate,
@@ -48,6 +49,11 @@ class YannPolicy(TD3Policy):
 
     The actor's output is the explicit law of the MPC plus networks that are zero at first; the
     critic is the state-action value of the law on the linear model, plus such a network.
+
+    Nothing is learnt from what is not finite. The replay buffer leaves such transitions out, and a
+    step is not taken whose gradient overflows float32, so that training cannot make actor or critic
+    NaN. Where an observation or the actor's networks are not finite, the law acts. Each is named by
+    a :class:`NonFiniteWarning`.
 
     TD3 adds noise to the target policy by default, which teaches the critic the value of a noisy
     controller: pass ``target_policy_noise=0.0`` to TD3, so that the exact critic stays the target.
@@ -194,6 +200,9 @@ class YannPolicy(TD3Policy):
             optimizer_kwargs = {"fused": True}  # the same steps, in a third of the time
         self.actor_step = 1.0
         """Another factor of the actor's learning rate, which an ImprovementGuard sets."""
+        self.refused = {"actor": 0, "critic": 0}
+        """Steps that were not taken, since their gradient was not finite."""
+        self.batch_is_finite = True
         self.critic_warmup = critic_warmup
         self.actor_options: dict[str, Any] = {
             "max_correction": as_max_correction(max_correction),
@@ -221,6 +230,8 @@ class YannPolicy(TD3Policy):
             n_critics=n_critics,
             share_features_extractor=share_features_extractor,
         )
+        if algorithm is not None:
+            watch_buffer(algorithm)
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
@@ -242,13 +253,27 @@ class YannPolicy(TD3Policy):
             optimizer.register_step_pre_hook(before)
             optimizer.register_step_post_hook(restore_learning_rate)
 
+    def _refuses(self, name: str, optimizer: th.optim.Optimizer) -> bool:
+        """Return whether a step must not be taken, for which it has no gradient any more then."""
+        if finite_gradient(optimizer):
+            return False
+        self.refused[name] += 1
+        warn_of_refused_step(name, optimizer, self.refused[name])
+        optimizer.zero_grad()
+        return True
+
     def _before_actor_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
-        if self.critic_updates < self.critic_warmup:
+        # What the critic refuses to learn from says nothing to the actor either.
+        if self.critic_updates < self.critic_warmup or not self.batch_is_finite:
             optimizer.zero_grad()  # no gradient at all: neither parameters nor moments move
+        else:
+            self._refuses("actor", optimizer)
         multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
 
     def _before_critic_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
-        self.critic_updates.add_(1)
+        self.batch_is_finite = not self._refuses("critic", optimizer)
+        if self.batch_is_finite:
+            self.critic_updates.add_(1)
         multiply_learning_rate(optimizer, self.lr_mult["critic"])
 
     def __setstate__(self, state: dict[str, Any]) -> None:

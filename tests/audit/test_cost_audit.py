@@ -21,6 +21,7 @@ from sb3_yann import (
     CostMismatchError,
     CostMismatchWarning,
     NoActionNoise,
+    NonFiniteWarning,
     YannPolicy,
 )
 
@@ -248,7 +249,31 @@ def test_an_action_that_acts_late_is_named() -> None:
 
 def test_a_reward_that_is_not_a_number_is_named() -> None:
     env = wrappers.TransformReward(plant(), lambda reward: np.nan)
-    assert audited(env).finding.cause == "not finite"
+    with pytest.warns(NonFiniteWarning):
+        assert audited(env).finding.cause == "not finite"
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_one_step_that_is_not_finite_is_named_and_left_out_of_the_statistics(what) -> None:
+    class Faulty(gym.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            observation, reward, *rest = self.env.step(action)
+            self.steps += 1
+            if self.steps == 30:
+                observation, reward = (
+                    (observation, np.nan) if what == "reward" else (observation * np.nan, reward)
+                )
+            return observation, reward, *rest
+
+    with pytest.warns(NonFiniteWarning):
+        finding = audited(Faulty(plant())).finding
+    assert (finding.matches, finding.cause) == (False, "not finite")
+    assert f"{'the reward' if what == 'reward' else 'an observation'}" in finding.message
+    assert "of step 30" in finding.message
+    assert (finding.scale, finding.offset) == (pytest.approx(1), 0)
+    assert finding.r2 == pytest.approx(1)
 
 
 # --- what is no mismatch --------------------------------------------------------------------------

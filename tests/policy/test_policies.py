@@ -25,6 +25,7 @@ import sb3_yann
 from sb3_yann import LinearModel, LinearMPC, NoActionNoise, YannActor, YannCritic, YannPolicy
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, RowAdam
 from sb3_yann_envs import problems
+from weights import network_of
 
 ENVS = ("CSTR-v0", "ClippedPendulum-v0")
 POLICIES = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -102,6 +103,7 @@ def test_ddpg_has_one_critic_and_td3_two() -> None:
     assert build(TD3).critic.n_critics == 2
 
 
+@pytest.mark.slow
 @CRITICS
 @pytest.mark.parametrize("make", [problems.clipped_pendulum, problems.cstr])
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
@@ -279,6 +281,7 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, critic, 
         assert th.equal(value, loaded.policy.state_dict()[name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [None, "CSTR-v0", "sb3_yann_envs.problems:cstr"])
 def test_a_fresh_process_predicts_without_any_solver(problem, tmp_path) -> None:
     kwargs = {"critic_warmup": 0} if problem is None else {"critic_warmup": 0, "problem": problem}
@@ -828,12 +831,12 @@ def test_beyond_32_regions_those_without_data_do_not_move_not_even_by_momentum()
     assert isinstance(model.actor.optimizer, RowAdam)
     assert two_inputs().explicit().n_regions > 32
     updates(model, 5)
-    before = copy.deepcopy(model.actor.mu.network)
+    before = copy.deepcopy(network_of(model))
     data = model.replay_buffer.sample(3)
     model.replay_buffer.sample = lambda *_, **__: data
     updates(model, 1)
     seen = set(two_inputs().explicit().locate(data.observations.double().numpy()).tolist())
-    for old, new in zip(before.parameters(), model.actor.mu.network.parameters(), strict=True):
+    for old, new in zip(before.parameters(), network_of(model).parameters(), strict=True):
         moved = (old != new).flatten(1).any(1).nonzero()[:, 0].tolist()
         assert moved and set(moved) <= seen
 

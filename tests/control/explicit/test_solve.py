@@ -167,6 +167,7 @@ def test_solving_twice_gives_the_same_law_bit_for_bit(name: str) -> None:
     assert PROBLEMS[name]().explicit() == solved(name).explicit()
 
 
+@pytest.mark.slow
 def test_a_fresh_process_gives_the_same_law_bit_for_bit(tmp_path: Any) -> None:
     path = tmp_path / "law.npz"
     code = (

@@ -318,8 +318,8 @@ BAD_DATA: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"states": X[:1], "actions": U[:0]}, ValueError, "actions of episode 0 has 0 rows"),
     ({"states": X[:5], "actions": U[:4]}, ValueError, "3 steps to fit 4 parameters"),
     ({"disturbances": U[:-1]}, ValueError, "disturbances of episode 0 has 399 rows"),
-    ({"held_out": 1.0}, ValueError, r"held_out = 1\.0 must be a fraction"),
-    ({"ridge": -1}, ValueError, "ridge = -1 must be 0 or"),
+    ({"held_out": 1.0}, ValueError, r"held_out = 1\.0 must lie in \[0, 1\)"),
+    ({"ridge": -1}, ValueError, "ridge = -1 must be a finite number of at least 0"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
     ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
     (
@@ -348,5 +348,5 @@ def test_bad_data_are_named(changes: dict[str, Any], error: type[Exception], mes
 
 @pytest.mark.parametrize(("name", "level"), [("C", 0.95), ("A", 1.0), ("A", 0.0)])
 def test_bad_interval_is_named(name: str, level: float) -> None:
-    with pytest.raises(ValueError, match=r"must be 'A', 'B' or 'E'|must lie in \(0, 1\)"):
+    with pytest.raises(ValueError, match=r"must be one of \('A', 'B', 'E'\)|must lie in \(0, 1\)"):
         identify(X, U, dt=1).interval(name, level)

@@ -258,6 +258,7 @@ def test_theta_that_is_none_is_refused_also_where_compiled_code_sees_it_first(gi
         many_regions()(np.array(given))
 
 
+@pytest.mark.slow
 def test_without_a_compiler_the_law_is_the_same() -> None:
     program = (
         "from test_search_tree import *; law = many_regions(); points = in_box(law, 200, 1.5)\n"
