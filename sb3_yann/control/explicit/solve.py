@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import optimize
 
-from sb3_yann._validation import Array, half_widths
+from sb3_yann._validation import Array, as_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError, certify
 from sb3_yann.control.explicit.facet_walk import walk
@@ -15,8 +15,6 @@ from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
-
-SOLVERS = ("walk", "ppopt")
 
 
 def solve_explicit(
@@ -52,8 +50,7 @@ def solve_explicit(
     ExplicitSolutionError
         If the solution fails its check.
     """
-    if solver not in SOLVERS:
-        raise ValueError(f"solver = {solver!r} must be one of {SOLVERS}.")
+    as_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
     units = ProgramUnits(program, u_min, u_max)
     _require_feasible(units.scaled)

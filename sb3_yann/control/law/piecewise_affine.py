@@ -14,7 +14,16 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_bounds, same_fields, to_float
+from sb3_yann._validation import (
+    Array,
+    ReadOnlyArrays,
+    as_array,
+    as_bounds,
+    as_choice,
+    as_flag,
+    same_fields,
+    to_float,
+)
 from sb3_yann.control.law._kernels import law_at, law_of_batch, locate_batch, pack
 from sb3_yann.control.law.search_tree import SearchTree, build_tree
 
@@ -100,10 +109,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         values["theta_min"], values["theta_max"] = as_bounds(
             "theta", self.theta_min, self.theta_max, n
         )
-        if self.infeasible not in INFEASIBLE:
-            raise ValueError(f"infeasible = {self.infeasible!r} must be one of {INFEASIBLE}.")
-        if not isinstance(self.disjoint, bool):
-            raise TypeError(f"disjoint = {self.disjoint!r} must be True or False.")
+        as_choice("infeasible", self.infeasible, INFEASIBLE)
+        as_flag("disjoint", self.disjoint)
         rows = as_array("starts", self.starts, (p,))
         if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):
             raise ValueError(

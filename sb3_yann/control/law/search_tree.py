@@ -222,16 +222,8 @@ def _best_split(
     first, last = regions.row_starts[chosen], regions.row_starts[chosen + 1]
     rows = random.integers(np.tile(first, 2), np.tile(last, 2))
     sides = np.empty((len(rows), len(inside)), np.uint8)
-    _sides(
-        regions.vertices,
-        regions.vertex_starts,
-        regions.middles,
-        regions.radii,
-        inside,
-        regions.A[rows],
-        regions.b[rows],
-        sides,
-    )
+    shapes = regions.vertices, regions.vertex_starts, regions.middles, regions.radii
+    _sides(*shapes, inside, regions.A[rows], regions.b[rows], sides)
     below, above = (sides & 1).sum(axis=1), (sides >> 1).sum(axis=1)
     larger = np.maximum(below, above)
     best = int(np.lexsort((below + above, larger))[0])

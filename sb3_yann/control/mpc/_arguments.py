@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, as_array, as_bounds, to_float
 from sb3_yann.control.model.linear_model import LinearModel
@@ -32,33 +31,6 @@ def as_horizon(value: int) -> int:
     return int(value)
 
 
-def as_output_rows(
-    name: str, value: ArrayLike | Sequence[int], most: float = np.inf
-) -> NDArray[Any]:
-    """Return indices of states (q,), at most ``most``, or an output matrix (q, n)."""
-    entries = to_float(name, value)
-    if entries.ndim == 0:
-        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value!r}].")
-    if entries.ndim != 1:
-        return as_array(name, value, ("q", "n"))
-    whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
-    if not whole or np.any(entries < 0) or np.any(entries > most):
-        limit = f"from 0 to {most}" if np.isfinite(most) else "from 0 on"
-        raise ValueError(
-            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers "
-            f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
-        )
-    indices = entries.astype(int)
-    indices.setflags(write=False)
-    return indices
-
-
-def as_outputs(name: str, value: ArrayLike | Sequence[int], n_states: int) -> Array:
-    """Return an output matrix (q, n) from a matrix or from a list of indices of states."""
-    rows = as_output_rows(name, value, n_states - 1)
-    return as_array(name, np.eye(n_states)[rows] if rows.ndim == 1 else rows, ("q", n_states))
-
-
 def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
     """Return the unit of violation (size,) of soft bounds; one number is for all that are there."""
     size, bounded, units = len(bounds[0]), np.isfinite(bounds).any(axis=0), given
@@ -80,10 +52,7 @@ def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
 
 
 def theta_box(
-    layout: ThetaLayout,
-    given: tuple[Given, Given],
-    states: Bounds,
-    others: Sequence[Bounds],
+    layout: ThetaLayout, given: tuple[Given, Given], states: Bounds, others: Sequence[Bounds]
 ) -> Bounds:
     """Return the box of theta: that of the states, and those of r, d and the previous input.
 

@@ -73,12 +73,9 @@ def error_system(
     # v_prev+ = v, and (v - v_prev)'R_du(v - v_prev) couples the two
     previous = -to_input
     previous[:, layout.previous] = np.eye(m)
+    A, B = linalg.block_diag(model.A, np.zeros((m, m))), np.vstack([model.B, np.eye(m)])
     return ErrorSystem(
-        model=LinearModel(
-            linalg.block_diag(model.A, np.zeros((m, m))),
-            np.vstack([model.B, np.eye(m)]),
-            model.dt,
-        ),
+        model=LinearModel(A, B, model.dt),
         to_error=np.vstack([to_error, previous]),
         to_input=to_input,
         Q=linalg.block_diag(Q, R_du),

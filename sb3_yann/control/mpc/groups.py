@@ -17,12 +17,14 @@ from sb3_yann._validation import (
     ReadOnlyArrays,
     as_array,
     as_bounds,
+    as_output_rows,
+    as_outputs,
     as_positive,
     as_symmetric,
     same_fields,
     to_float,
 )
-from sb3_yann.control.mpc._arguments import Bounds, Given, as_output_rows, as_outputs, as_softness
+from sb3_yann.control.mpc._arguments import Bounds, Given, as_softness
 
 Outputs = ArrayLike | Sequence[int]
 HalfSpaces = tuple[ArrayLike, ArrayLike]

@@ -8,7 +8,14 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, as_array, as_bounds, as_discount, as_symmetric
+from sb3_yann._validation import (
+    Array,
+    as_array,
+    as_bounds,
+    as_choice,
+    as_discount,
+    as_symmetric,
+)
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.budget import SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
@@ -112,7 +119,7 @@ class LinearMPC(MPCProblem):
     array([1.])
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the keywords of a problem
         self,
         model: LinearModel,
         *,
@@ -136,10 +143,9 @@ class LinearMPC(MPCProblem):
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
-        if not (isinstance(infeasible, str) and infeasible in INFEASIBLE):
-            raise ValueError(f"infeasible = {infeasible!r} must be one of {INFEASIBLE}.")
         n, m = model.n_states, model.n_inputs
         horizon, gamma = as_horizon(horizon), as_discount(gamma)
+        infeasible = as_choice("infeasible", infeasible, INFEASIBLE)
         Q, R = as_symmetric("Q", Q, n), as_symmetric("R", R, m, definite=True)
         x, u = as_bounds("x", x_min, x_max, n), as_bounds("u", u_min, u_max, m)
         tracking = _as_group("tracking", tracking, Tracking).sized(n)
