@@ -232,3 +232,9 @@ def _frozen(array: Array) -> Array:
     array[array == 0] = 0.0  # -0.0 equals 0.0 but has other bytes; equal objects share a hash
     array.setflags(write=False)
     return array
+
+
+def half_widths(lower: Array, upper: Array) -> Array:
+    """Return half the width of each range, and 1 where it is infinite: a unit to measure in."""
+    half = (upper - lower) / 2
+    return np.asarray(np.where(np.isfinite(half), half, 1.0))

@@ -109,7 +109,7 @@ def test_ddpg_has_one_critic_and_td3_two() -> None:
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 @pytest.mark.parametrize("discounted", [False, True], ids=["paper's MPC", "discounted MPC"])
 def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted, critic) -> None:
-    mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal_cost=None)
+    mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal=None)
     kwargs = {"critic": critic}
     model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0, policy_kwargs=kwargs)
     model.learn(1)  # sets up the logger
@@ -256,7 +256,7 @@ def test_a_problem_may_be_an_object_a_name_or_a_reference(reference) -> None:
 
 
 def test_the_given_problem_goes_before_the_one_in_the_space() -> None:
-    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal_cost=None)
+    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=None)
     model = DDPG(YannPolicy, "ClippedPendulum-v0", policy_kwargs={"problem": mpc})
     assert model.policy.problem is mpc
 

@@ -63,7 +63,7 @@ class LinearModel(LinearSystem):
     notes: tuple[str, ...] = field(init=False, repr=False)
     drift: Array = field(init=False, repr=False)
 
-    def __init__(  # noqa: PLR0913 - the matrices and the operating point of one equation
+    def __init__(
         self,
         A: ArrayLike,
         B: ArrayLike,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_yann import Identified, LinearModel, LinearMPC, identify
+from sb3_yann import Identified, LinearModel, LinearMPC, Tracking, identify
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
@@ -207,7 +207,7 @@ def test_law_of_a_model_whose_operating_point_moves_is_warned_of() -> None:
     np.testing.assert_allclose(model.drift, [0.05, 0], atol=1e-3)
     box = {"theta_min": -5, "theta_max": 5, "u_min": -1, "u_max": 1}
     with pytest.warns(UserWarning, match=r"moves by \[0\.0.* will rest beside its references"):
-        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracked=[0], r_min=-1, r_max=1, **box)
+        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracking=Tracking([0], -1, 1), **box)
 
 
 def delayed(steps: int, hold: int = 1, process: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
