@@ -224,9 +224,9 @@ class LinearModel(LinearSystem):
 
         Examples
         --------
-        >>> reactor = LinearModel.from_env("CSTR-v0")
-        >>> reactor.A.shape, reactor.B.shape
-        ((4, 4), (4, 1))
+        >>> pendulum = LinearModel.from_env("ClippedPendulum-v0")
+        >>> pendulum.dt, pendulum.A.shape, pendulum.B.shape
+        (0.05, (2, 2), (2, 1))
         """
         return cls(**vars(linearize_env(env, state, action, dt, set_state, get_state, scale)))
 
