@@ -30,7 +30,7 @@ class LogFit:
     ten_step_fit: Array
 
 
-def fit_log(  # noqa: PLR0913 - the options of `identify`
+def fit_log(
     states: ArrayLike | Sequence[ArrayLike],
     actions: ArrayLike | Sequence[ArrayLike],
     dt: float,

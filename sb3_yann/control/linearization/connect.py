@@ -57,7 +57,7 @@ def connect(
 
 
 def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
-    """Return how far each state moves in use, shape (n,)."""
+    """Return the scale of each state, shape (n,)."""
     if scale is not None:
         return as_positive_vector("scale", as_array("scale", scale, (x.size,)), x.size)
     size = np.maximum(np.abs(x), 1.0)
@@ -70,7 +70,7 @@ def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
 
 
 def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | None:
-    """Try a way to set and read the state; return what is wrong with it, None if nothing is."""
+    """Try the present way to set and read the state; return its fault, None without one."""
     for other in (x + 0.01 * scale, x - 0.01 * scale):
         try:
             seen = [simulator.read() if simulator.put(state) else None for state in (x, other)]

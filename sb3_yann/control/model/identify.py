@@ -73,7 +73,7 @@ class Identified(ReadOnlyArrays):
         return value - width, value + width
 
 
-def identify(  # noqa: PLR0913 - the columns of a log, and how to fit them
+def identify(
     states: ArrayLike | Sequence[ArrayLike],
     actions: ArrayLike | Sequence[ArrayLike],
     *,

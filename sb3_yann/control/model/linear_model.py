@@ -63,7 +63,7 @@ class LinearModel(LinearSystem):
     notes: tuple[str, ...] = field(init=False, repr=False)
     drift: Array = field(init=False, repr=False)
 
-    def __init__(  # noqa: PLR0913 - the matrices and the operating point of one equation
+    def __init__(
         self,
         A: ArrayLike,
         B: ArrayLike,
@@ -224,9 +224,9 @@ class LinearModel(LinearSystem):
 
         Examples
         --------
-        >>> reactor = LinearModel.from_env("CSTR-v0")
-        >>> reactor.A.shape, reactor.B.shape
-        ((4, 4), (4, 1))
+        >>> pendulum = LinearModel.from_env("ClippedPendulum-v0")
+        >>> pendulum.dt, pendulum.A.shape, pendulum.B.shape
+        (0.05, (2, 2), (2, 1))
         """
         return cls(**vars(linearize_env(env, state, action, dt, set_state, get_state, scale)))
 
