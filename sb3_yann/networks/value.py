@@ -211,11 +211,7 @@ class AfterstateValue(nn.Module):
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
         if self.compiles and theta_and_action.device.type == "cpu":
-            from sb3_yann.networks._kernels.afterstate_value import (
-                value_on_processor,  # compiled once
-            )
-
-            return value_on_processor(self, theta_and_action)
+            return self._compiled(theta_and_action, self._weights())
         theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
         u = action * self.to_input + self.middle
         z = th.cat([theta, u], 1)
@@ -224,9 +220,17 @@ class AfterstateValue(nn.Module):
 
     def compiled_with_fixed_weights(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q where :attr:`compiles`, with a gradient by the rows, but not by the weights."""
-        from sb3_yann.networks._kernels.afterstate_value import value_on_processor
+        return self._compiled(theta_and_action, tuple(each.detach() for each in self._weights()))
 
-        return value_on_processor(self, theta_and_action, fixed=True)
+    def _weights(self) -> tuple[th.Tensor, ...]:
+        modules: Any = self._modules  # an attribute of a module takes a microsecond to find
+        return (modules["quadratic"].entries, *modules["network"].weights())
+
+    def _compiled(self, points: th.Tensor, weights: tuple[th.Tensor, ...]) -> th.Tensor:
+        from sb3_yann.networks._kernels.afterstate_value import value_on_cpu  # compiled once
+
+        pinned = self._modules["network"].pinned_array  # type: ignore[union-attr]
+        return value_on_cpu(points, weights, (*self.constants, pinned, self.gamma * self.scale))
 
     def value(self, theta: th.Tensor) -> th.Tensor:
         """Return V, the discounted cost to go in float64, shape (batch, 1), for (batch, n)."""
