@@ -22,7 +22,15 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import sb3_yann
-from sb3_yann import LinearModel, LinearMPC, NoActionNoise, YannActor, YannCritic, YannPolicy
+from sb3_yann import (
+    CriticOptions,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    YannActor,
+    YannCritic,
+    YannPolicy,
+)
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, RowAdam
 from sb3_yann_envs import problems
 
@@ -561,7 +569,9 @@ MODELS = pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModul
 def test_the_linear_model_given_as_prediction_model_changes_no_more_than_rounding(
     algorithm, make
 ) -> None:
-    mine = with_full_buffer(algorithm, two_inputs(), prediction_model=make(), critic_warmup=3)
+    mine = with_full_buffer(
+        algorithm, two_inputs(), critic={"prediction_model": make()}, critic_warmup=3
+    )
     default = with_full_buffer(algorithm, two_inputs(), critic_warmup=3)
     updates(default, 10)
     mine.critic.load_state_dict(default.critic.state_dict(), strict=False)
@@ -577,7 +587,7 @@ def test_the_linear_model_given_as_prediction_model_changes_no_more_than_roundin
 
 def test_a_module_that_predicts_is_not_trained() -> None:
     module = LinearModule()
-    model = with_full_buffer(mpc=two_inputs(), prediction_model=module, critic_warmup=0)
+    model = with_full_buffer(mpc=two_inputs(), critic={"prediction_model": module}, critic_warmup=0)
     updates(model, 20)
     for each in (module, model.critic.qf0.model, model.critic_target.qf0.model):
         assert th.equal(each.A, A)
@@ -589,7 +599,8 @@ def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) ->
     if critic == "state_action":
         kwargs = {"critic": critic}
     else:
-        kwargs = {"prediction_model": lambda theta, u: 0 * theta + 0 * u.sum(1, keepdim=True)}
+        options = {"prediction_model": lambda theta, u: 0 * theta + 0 * u.sum(1, keepdim=True)}
+        kwargs = {"critic": options}
     mpc = two_inputs()
     model = build(mpc=mpc, policy_kwargs=kwargs)
     theta, u = starts(mpc), mpc.explicit()(starts(mpc))
@@ -602,7 +613,7 @@ def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) ->
 
 @pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModule, lambda: bent])
 def test_a_saved_model_brings_its_prediction_model_with_it(make, tmp_path) -> None:
-    model = with_full_buffer(mpc=two_inputs(), prediction_model=make(), critic_warmup=0)
+    model = with_full_buffer(mpc=two_inputs(), critic={"prediction_model": make()}, critic_warmup=0)
     updates(model, 5)
     model.save(tmp_path / "model")
     model.policy.save(tmp_path / "policy")
@@ -617,7 +628,8 @@ def bent(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
 
 
 def test_a_saved_model_may_predict_with_a_lambda(tmp_path) -> None:
-    model = build(policy_kwargs={"prediction_model": lambda theta, u: th.sin(1.1 * theta + u)})
+    options = CriticOptions(prediction_model=lambda theta, u: th.sin(1.1 * theta + u))
+    model = build(policy_kwargs={"critic": options})
     model.save(tmp_path / "model")
     theta = th.as_tensor(starts(scalar_mpc()))
     critic = DDPG.load(tmp_path / "model").critic
@@ -627,7 +639,7 @@ def test_a_saved_model_may_predict_with_a_lambda(tmp_path) -> None:
 
 def test_value_scale_is_that_of_the_critic_s_network() -> None:
     assert build().critic.qf0.scale == 30
-    assert build(policy_kwargs={"value_scale": 7.0}).critic.qf0.scale == 7
+    assert build(policy_kwargs={"critic": {"value_scale": 7.0}}).critic.qf0.scale == 7
 
 
 # --- what is refused ---------------------------------------------------------------------------
@@ -760,17 +772,8 @@ def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
         ({"activation_fn": th.nn.Sigmoid}, ValueError, "activation"),
         ({"critic": "quadratic"}, ValueError, "critic = 'quadratic'"),
         ({"critic": None}, ValueError, "critic = None"),
-        ({"prediction_model": 3}, TypeError, "prediction_model = 3"),
-        ({"prediction_model": "f", "critic": "state_action"}, TypeError, "prediction_model = 'f'"),
-        (
-            {"prediction_model": lambda theta, u: theta, "critic": "state_action"},
-            ValueError,
-            "prediction_model is for critic='afterstate'",
-        ),
-        ({"value_scale": 0}, ValueError, "value_scale = 0"),
-        ({"value_scale": -30.0}, ValueError, "value_scale = -30.0"),
-        ({"value_scale": float("nan")}, ValueError, "value_scale = nan"),
-        ({"value_scale": "big"}, TypeError, "value_scale = 'big'"),
+        ({"prediction_model": None}, TypeError, "'prediction_model'.*CriticOptions"),
+        ({"pin_equilibrium": 1}, TypeError, "pin_equilibrium = 1"),
         ({"critic_warmup": -1}, ValueError, "critic_warmup = -1"),
         ({"critic_warmup": 1.5}, ValueError, r"critic_warmup = 1\.5"),
         ({"critic_warmup": True}, ValueError, "critic_warmup = True"),
@@ -783,6 +786,40 @@ def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
 def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> None:
     with pytest.raises(error, match=message):
         make_policy(unbounded(), actions(), problem=scalar_mpc(), **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"kind": "quadratic"}, ValueError, "kind = 'quadratic'"),
+        ({"scale": 3}, TypeError, "critic has no 'scale'.*value_scale"),
+        ({"prediction_model": 3}, TypeError, "prediction_model = 3"),
+        ({"prediction_model": "f", "kind": "state_action"}, TypeError, "prediction_model = 'f'"),
+        (
+            {"prediction_model": lambda theta, u: theta, "kind": "state_action"},
+            ValueError,
+            "prediction_model is for kind='afterstate'",
+        ),
+        ({"value_scale": 0}, ValueError, "value_scale = 0"),
+        ({"value_scale": -30.0}, ValueError, "value_scale = -30.0"),
+        ({"value_scale": float("nan")}, ValueError, "value_scale = nan"),
+        ({"value_scale": "big"}, TypeError, "value_scale = 'big'"),
+    ],
+)
+def test_options_of_a_critic_that_mean_nothing_are_named(options, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make_policy(unbounded(), actions(), problem=scalar_mpc(), critic=options)
+
+
+@pytest.mark.parametrize("critic", [{"reward_scale": 2.0}, CriticOptions(reward_scale=2.0)])
+def test_options_of_a_critic_compare_by_value_when_a_model_is_loaded(critic, tmp_path) -> None:
+    build(policy_kwargs={"critic": critic}).save(tmp_path / "model")
+    for changes in ({}, {"critic": copy.deepcopy(critic)}):
+        kwargs = {"problem": scalar_mpc(), "critic": critic, "n_critics": 1, **changes}
+        loaded = DDPG.load(tmp_path / "model", policy_kwargs=kwargs)
+        assert loaded.policy.critic_options == CriticOptions(reward_scale=2.0)
+    with pytest.raises(ValueError, match="policy kwargs"):
+        DDPG.load(tmp_path / "model", policy_kwargs={**kwargs, "critic": CriticOptions()})
 
 
 def test_a_net_arch_may_leave_out_or_join_actor_and_critic() -> None:
