@@ -128,8 +128,10 @@ class Run:
 
 @pytest.fixture(
     scope="module",
-    params=[("ddpg", "CSTR-v0"), ("td3", "ClippedPendulum-v0")],
-    ids=["ddpg-CSTR", "td3-pendulum"],
+    params=[
+        pytest.param(("ddpg", "CSTR-v0"), id="ddpg-CSTR", marks=pytest.mark.slow),
+        pytest.param(("td3", "ClippedPendulum-v0"), id="td3-pendulum", marks=pytest.mark.slow),
+    ],
 )
 def run(request, tmp_path_factory) -> Run:
     """Return a run of one episode, evaluated at its end."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.plant_acceptance import PlantAcceptance
 from sb3_yann.guard.preconditions import check_between, check_not_nested, check_whole
 from sb3_yann.guard.restoring import restore_accepted
@@ -32,8 +34,8 @@ class ImprovementGuard(BaseCallback):
     worse than the last accepted one. Otherwise it is refused: at once, or when ``patience`` is
     over, actor, target actor and the actor's optimizer return to the accepted state, bit for bit,
     while the critic goes on learning. A return shrinks the actor's steps, an acceptance lets them
-    grow again. When `learn` returns, the model *is* the accepted policy. Until then, after an
-    exception, Ctrl-C, and in the zips of a CheckpointCallback, it is a candidate:
+    grow again. When `learn` returns, or is ended by Ctrl-C, the model *is* the accepted policy.
+    Until then, after another exception, and in the zips of a CheckpointCallback, it is a candidate:
     :func:`restore_accepted` puts the accepted policy in its place.
 
     **With a simulator** (``env`` given) the deterministic policy plays seeded episodes there,
@@ -129,6 +131,12 @@ class ImprovementGuard(BaseCallback):
 
     model: OffPolicyAlgorithm
 
+    interrupted = False
+    """Whether Ctrl-C has put the accepted policy back, so that nothing else may be."""
+    before_trial: tuple[Any, Any, list[Any]] | None = None
+    """What was accepted before the trial that is under way, with its evidence and ``passed``."""
+    _handler: Handler | None = None
+
     def __init__(
         self,
         env: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | None,
@@ -220,6 +228,7 @@ class ImprovementGuard(BaseCallback):
 
     def _on_training_start(self) -> None:
         check_not_nested(self)
+        self.interrupted = False
         self.trials.start(self)
         known = getattr(self.model, "guard_state", None)
         if known is None or known.settings != self.trials.settings:
@@ -232,6 +241,7 @@ class ImprovementGuard(BaseCallback):
                 stacklevel=2,
             )
             self._start_afresh(known)
+        self._handler = install(self.model, self.leave_accepted, sys._getframe())
         self.policy.actor_step = self.state.step
         if self.record is not None:
             write_csv(self.record, self.decisions)
@@ -259,7 +269,17 @@ class ImprovementGuard(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
+        self.interrupted = False  # the Zoo ends training after Ctrl-C as well
         self.trials.end(self)
+        restore_accepted(self.model)
+        if self._handler is not None:
+            self._handler.remove()
+
+    def leave_accepted(self) -> None:
+        """Leave the accepted policy where `learn` is about to be ended, wherever it is."""
+        if self.before_trial is not None:
+            self.state.accepted, self.state.evidence, self.state.passed = self.before_trial
+        self.interrupted = True
         restore_accepted(self.model)
 
     # What the trials call.

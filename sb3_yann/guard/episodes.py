@@ -121,12 +121,15 @@ def play(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Outcome:
     except Unplayable:
         raise
     except Exception as error:
+        if guard.interrupted:  # what a simulator has made of it in compiled code of its own
+            raise KeyboardInterrupt from error
         present = ActorCheckpoint.of(guard.policy)
         guard.mpc.restore(guard.policy)
         try:
             played(guard, env, seeds)
         finally:
-            present.restore(guard.policy)
+            if not guard.interrupted:
+                present.restore(guard.policy)
         reason = f"the simulator failed: {type(error).__name__}: {error}"
         raise Unplayable(reason) from error
 
@@ -164,12 +167,16 @@ def all_or_nothing(guard: ImprovementGuard) -> Iterator[ActorCheckpoint]:
     """
     state, candidate = guard.state, ActorCheckpoint.of(guard.policy)
     before = state.accepted, state.evidence, [*state.passed]
+    guard.before_trial = before
     try:
         yield candidate
     except BaseException:
         state.accepted, state.evidence, state.passed = before
-        candidate.restore(guard.policy)
+        if not guard.interrupted:
+            candidate.restore(guard.policy)
         raise
+    finally:
+        guard.before_trial = None
 
 
 def _seen(guard: ImprovementGuard) -> Callable[[Any], Any]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_yann._validation import Array, as_bounds, as_positive_vector
+from sb3_yann._validation import Array, as_bounds, as_positive_vector, half_widths
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
 PredictionModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
@@ -47,7 +47,7 @@ class Ranges:
     @property
     def u_half(self) -> Array:
         """Half the ranges of the inputs, (m,)."""
-        return (self.u_max - self.u_min) / 2
+        return half_widths(self.u_min, self.u_max)
 
     @property
     def u_middle(self) -> Array:

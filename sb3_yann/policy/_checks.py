@@ -107,7 +107,7 @@ def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> 
         return np.inf
     back = np.linalg.pinv(matrix)
     middle = (problem.theta_max + problem.theta_min) / 2 - observation.offset
-    reach = np.abs(back) @ ((problem.theta_max - problem.theta_min) / 2)
+    reach = np.abs(back) @ problem.theta_half
     return float(np.max(np.abs(back @ middle) + reach))
 
 

@@ -76,7 +76,7 @@ class YannActor(SeesTheta, Actor):
             activation_fn(),
             max_correction=max_correction,
             pinned=pin_equilibrium,
-            rate=(problem.du_min, problem.du_max) if problem.has_rate_bounds else None,
+            rate=(problem.rate.du_min, problem.rate.du_max) if problem.has_rate_bounds else None,
         )
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
@@ -165,9 +165,7 @@ class YannCritic(SeesTheta, ContinuousCritic):
         )
         self.scale, self.offset = float(options.reward_scale), options.offset_of_return(gamma)
         common: dict[str, Any] = {
-            "ranges": Ranges(
-                (problem.theta_max - problem.theta_min) / 2, problem.u_min, problem.u_max
-            ),
+            "ranges": Ranges(problem.theta_half, problem.u_min, problem.u_max),
             "hidden": tuple(net_arch),
             "pinned": pin_equilibrium,
         }
@@ -209,9 +207,9 @@ class YannCritic(SeesTheta, ContinuousCritic):
             points = th.cat([theta, actions], dim=1)
             return self._in_rewards(q_network.compiled_with_fixed_weights(points))
         trained = [each for each in q_network.parameters() if each.requires_grad]
-        for parameter in trained:
-            parameter.requires_grad_(False)
         try:
+            for parameter in trained:
+                parameter.requires_grad_(False)
             return self._in_rewards(super().q1_forward(obs, actions))
         finally:
             for parameter in trained:

@@ -54,6 +54,7 @@ def quick_cloning(monkeypatch) -> None:
     monkeypatch.setattr(yardsticks, "CLONING_SEEDS", range(500, 502))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BUILDERS)
 @pytest.mark.parametrize("env_id", ENVS)
 def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_cloning) -> None:
@@ -77,6 +78,7 @@ def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_
     np.testing.assert_allclose(one, after[0], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ddpg", "residual", "cloned"])
 def test_equal_seeds_give_equal_results(name, quick_cloning) -> None:
     def trained(seed: int) -> np.ndarray:
@@ -134,6 +136,7 @@ def test_the_residual_reaches_every_input_from_any_other() -> None:
     assert residual(state, np.array([-4.0])) == -2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["quiet residual", "cloned"])
 def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
     env = gym.make("ClippedPendulum-v0")
@@ -149,6 +152,7 @@ def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
     assert np.any(learner.policy.predict(states)[0] != before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ENVS)
 def test_a_cloned_actor_is_close_to_the_mpc_from_other_starts(env_id) -> None:
     env = recorder(env_id)

@@ -25,6 +25,7 @@ from guard_samples import (
     verdicts,
 )
 from sb3_yann import NoActionNoise, NonFiniteWarning
+from weights import is_mpc, last_layer
 
 BLOCK = 3 * STEPS
 plant = partial(Slide, low=2.0, high=2.8)
@@ -140,7 +141,7 @@ def test_what_an_earlier_guard_accepted_is_what_a_plant_alone_begins_with() -> N
     correct(model.policy, RIGHT, 1.9)
     train(model, STEPS, guard := guard_alone())
     assert guard.decisions[-1].reason.startswith("before training, ")
-    weight = model.policy.actor.mu.network.rest[-1].weight[REGION[RIGHT], 0, -1]
+    weight = last_layer(model)[REGION[RIGHT], 0, -1]
     assert float(weight.detach()) == pytest.approx(0.4)
 
 
@@ -157,7 +158,7 @@ def test_a_policy_that_diverged_before_training_gives_way_to_the_mpc_once() -> N
     overwrite(model.policy, np.nan)
     train(model, BLOCK, guard)
     assert [each.reason for each in guard.decisions] == ["before training, it is not accepted"]
-    assert model.policy.actor.mu.network.is_zero()
+    assert is_mpc(model)
 
 
 def test_one_episode_whose_cost_is_not_known_is_left_out_of_the_first_block() -> None:

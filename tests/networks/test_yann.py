@@ -22,6 +22,7 @@ from sb3_yann import LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import clamp_with_inward_gradient
+from weights import last_layer, network_of
 
 EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
 INFEASIBLE = pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
@@ -316,10 +317,10 @@ def test_correction_at_its_bound_gets_the_gradient_that_leads_back_and_no_other(
     law = law_of("pendulum")
     layer = YannLayer(law, max_correction=0.1, pinned=False)
     with th.no_grad():  # the bias of the output alone: far beyond the bound
-        layer.network.rest[-1].weight[..., -1] = 3.0 * side
+        last_layer(layer)[..., -1] = 3.0 * side
     theta = box_points(law, 4000)
     theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
-    bias = layer.network.rest[-1].weight
+    bias = last_layer(layer)
     for slope, alive in ((side, True), (-side, False)):  # descent goes against the slope
         layer.zero_grad()
         (slope * layer(theta)).sum().backward()
@@ -331,7 +332,7 @@ def test_correction_learns_to_leave_its_bound() -> None:
     law = law_of("pendulum")
     layer = YannLayer(law, max_correction=0.1, pinned=False)
     with th.no_grad():
-        layer.network.rest[-1].weight[..., -1] = 3.0
+        last_layer(layer)[..., -1] = 3.0
     theta = box_points(law, 2000)
     theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
 
@@ -409,7 +410,7 @@ def test_equilibrium_is_where_it_was_after_training(name: str, infeasible: str) 
 
 def test_region_away_from_the_origin_is_not_pinned() -> None:
     law = law_of("pendulum")
-    pinned = YannLayer(law).network.pinned.flatten().bool()
+    pinned = network_of(YannLayer(law)).pinned.flatten().bool()
     assert int(pinned.sum()) == 1
     assert bool(pinned[law.locate(np.zeros(2))])
 
@@ -419,7 +420,7 @@ def test_region_away_from_the_origin_is_not_pinned() -> None:
 def test_equilibrium_moves_where_no_region_is_pinned(name: str, infeasible: str) -> None:
     law = law_of(name, infeasible)
     layer = YannLayer(law, pinned=False)
-    assert not layer.network.pinned.any()
+    assert not network_of(layer).pinned.any()
     origin = th.zeros(1, law.n_theta)
     assert th.equal(layer(origin), layer.law(origin))
     train(layer, origin, target=0.3, steps=100)

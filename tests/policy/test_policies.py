@@ -33,6 +33,7 @@ from sb3_yann import (
 )
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, RowAdam
 from sb3_yann_envs import problems
+from weights import network_of
 
 ENVS = ("CSTR-v0", "ClippedPendulum-v0")
 POLICIES = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -110,12 +111,13 @@ def test_ddpg_has_one_critic_and_td3_two() -> None:
     assert build(TD3).critic.n_critics == 2
 
 
+@pytest.mark.slow
 @CRITICS
 @pytest.mark.parametrize("make", [problems.clipped_pendulum, problems.cstr])
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 @pytest.mark.parametrize("discounted", [False, True], ids=["paper's MPC", "discounted MPC"])
 def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted, critic) -> None:
-    mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal_cost=None)
+    mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal=None)
     kwargs = {"critic": critic}
     model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0, policy_kwargs=kwargs)
     model.learn(1)  # sets up the logger
@@ -262,7 +264,7 @@ def test_a_problem_may_be_an_object_a_name_or_a_reference(reference) -> None:
 
 
 def test_the_given_problem_goes_before_the_one_in_the_space() -> None:
-    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal_cost=None)
+    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=None)
     model = DDPG(YannPolicy, "ClippedPendulum-v0", policy_kwargs={"problem": mpc})
     assert model.policy.problem is mpc
 
@@ -287,6 +289,7 @@ def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, critic, 
         assert th.equal(value, loaded.policy.state_dict()[name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [None, "CSTR-v0", "sb3_yann_envs.problems:cstr"])
 def test_a_fresh_process_predicts_without_any_solver(problem, tmp_path) -> None:
     kwargs = {"critic_warmup": 0} if problem is None else {"critic_warmup": 0, "problem": problem}
@@ -865,12 +868,12 @@ def test_beyond_32_regions_those_without_data_do_not_move_not_even_by_momentum()
     assert isinstance(model.actor.optimizer, RowAdam)
     assert two_inputs().explicit().n_regions > 32
     updates(model, 5)
-    before = copy.deepcopy(model.actor.mu.network)
+    before = copy.deepcopy(network_of(model))
     data = model.replay_buffer.sample(3)
     model.replay_buffer.sample = lambda *_, **__: data
     updates(model, 1)
     seen = set(two_inputs().explicit().locate(data.observations.double().numpy()).tolist())
-    for old, new in zip(before.parameters(), model.actor.mu.network.parameters(), strict=True):
+    for old, new in zip(before.parameters(), network_of(model).parameters(), strict=True):
         moved = (old != new).flatten(1).any(1).nonzero()[:, 0].tolist()
         assert moved and set(moved) <= seen
 

@@ -14,6 +14,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
+from weights import last_layer
 
 LEFT, CENTER, RIGHT = range(3)
 STEPS = 4
@@ -91,8 +92,8 @@ def make_guard(env: Any = Slide, **kwargs) -> ImprovementGuard:
 @th.no_grad()
 def correct(policy: YannPolicy, region: int, value: float) -> None:
     """Make the actor's input in a region (not the center) the MPC's plus a constant."""
-    policy.actor.mu.network.rest[-1].weight[REGION[region]] = 0.0
-    policy.actor.mu.network.rest[-1].weight[REGION[region], :, -1] = value
+    last_layer(policy)[REGION[region]] = 0.0
+    last_layer(policy)[REGION[region], :, -1] = value
 
 
 def better(policy: YannPolicy) -> None:

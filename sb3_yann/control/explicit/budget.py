@@ -86,10 +86,10 @@ class BudgetTimer:
     The time counts from when this is made.
     """
 
-    def __init__(self, limits: SolveBudget) -> None:
-        self.limits, self.found, self._start = limits, 0, time.monotonic()
+    def __init__(self, budget: SolveBudget) -> None:
+        self.budget, self.found, self._start = budget, 0, time.monotonic()
         self._bar = tqdm(
-            desc="Critical regions", unit=" regions", leave=False, disable=not limits.progress
+            desc="Critical regions", unit=" regions", leave=False, disable=not budget.progress
         )
 
     def __enter__(self) -> BudgetTimer:
@@ -119,14 +119,14 @@ class BudgetTimer:
         """
         self.found += more
         self._bar.update(more)
-        most = self.limits.region_limit
+        most = self.budget.region_limit
         if most is not None and self.found > most:
             self._stop(f"The law has more than region_limit = {most} regions")
         self.tick()
 
     def tick(self) -> None:
         """Raise ExplicitLimitError if the time is over."""
-        most = self.limits.time_limit
+        most = self.budget.time_limit
         if most is not None and self.seconds > most:
             self._stop(f"The law was not solved in time_limit = {most:g} s")
 

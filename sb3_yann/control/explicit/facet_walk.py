@@ -33,7 +33,7 @@ class _Found:
     inside: Array
 
 
-def walk(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
+def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     Across a facet where constraint k becomes active, or inactive, lies the region of the active
@@ -45,7 +45,7 @@ def walk(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
 
     Sets of constraints are whole numbers, with bit k for constraint k.
     """
-    found = _Walk(program, watch)
+    found = _Walk(program, timer)
     found.explore(found.seeds(20))
     for _ in range(10):
         missed = set(found.seeds(20 * program.F.shape[1])) - found.seen
@@ -56,8 +56,8 @@ def walk(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
 
 
 class _Walk:
-    def __init__(self, program: ParametricQP, watch: BudgetTimer) -> None:
-        self.program, self.watch = program, watch
+    def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
+        self.program, self.timer = program, timer
         self.conditions = Conditions(program)
         self.found: dict[int, _Found] = {}
         self.seen: set[int] = set()
@@ -117,7 +117,7 @@ class _Walk:
                 facets = [pair for pair, active in left if active is not None]
 
     def _add(self, one: _Found) -> _Found:
-        self.watch.count()
+        self.timer.count()
         self.found[one.active] = one
         return one
 
@@ -130,7 +130,7 @@ class _Walk:
 
     def _across(self, one: _Found, row: int) -> int | None:
         """Return the active set across a facet, None if none is new or feasible there."""
-        self.watch.tick()
+        self.timer.tick()
         middle, distance = largest_ball(one.A, one.b, row)
         if distance <= THINNEST:  # the row only touches the region
             return None

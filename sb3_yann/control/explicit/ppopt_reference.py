@@ -14,7 +14,7 @@ from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.polyhedra import Region
 
 
-def ppopt_regions(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
+def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     They come from ppopt's combinatorial graph search (Arnström et al.,
@@ -24,7 +24,7 @@ def ppopt_regions(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
     n = program.F.shape[1]
     box_A, box_b = np.vstack([np.eye(n), -np.eye(n)]), np.ones(2 * n)
     if not np.any(program.G):  # nothing binds U, which ppopt does not take
-        watch.count()
+        timer.count()
         return [_unconstrained(program, box_A, box_b)]
 
     # Rows without U bound theta: with them in the constraints ppopt's active sets degenerate.
@@ -43,10 +43,10 @@ def ppopt_regions(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
             A_t=np.vstack([box_A, -program.S[~moving]]),
             b_t=np.concatenate([box_b, program.w[~moving]])[:, None],
             F=program.S[moving],
-            solver=_watched_solver(watch),
+            solver=_timed_solver(timer),
         )
         found = mpqp_combi_graph.solve(problem).critical_regions
-    watch.count(len(found))
+    timer.count(len(found))
     rows = _rows_of(program, problem)
     return [
         Region(
@@ -68,16 +68,16 @@ def _unconstrained(program: ParametricQP, box_A: Array, box_b: Array) -> Region:
     return Region((), law[:, :-1], law[:, -1], A, b)
 
 
-def _watched_solver(watch: BudgetTimer) -> Any:
+def _timed_solver(timer: BudgetTimer) -> Any:
     """Return ppopt's solvers without Gurobi, which its defaults want, ended at the time limit."""
     from ppopt.solver import Solver
 
-    class Watched(Solver):  # type: ignore[misc]
+    class Timed(Solver):  # type: ignore[misc]
         def solve_lp(self, *args: Any, **kwargs: Any) -> Any:
-            watch.tick()
+            timer.tick()
             return super().solve_lp(*args, **kwargs)
 
-    return Watched({"lp": "glpk", "qp": "daqp"})
+    return Timed({"lp": "glpk", "qp": "daqp"})
 
 
 def _rows_of(program: ParametricQP, problem: Any) -> NDArray[np.intp]:

@@ -6,16 +6,12 @@ of a microsecond, a good part of what a whole evaluation takes.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
-
-if TYPE_CHECKING:
-    from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
-    from sb3_yann.control.law.search_tree import SearchTree
 
 HEADER = 8
 """Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero input, disjoint."""
@@ -31,20 +27,40 @@ CLEAR = 1e-6
 """So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
 
 
-def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers]:
+def pack(
+    gains: Array,
+    offsets: Array,
+    rows: Array,
+    starts: Integers,
+    bounds: Array,
+    tolerances: tuple[float, float],
+    flags: tuple[bool, bool],
+    tree: Sequence[Array | Integers] = (),
+) -> tuple[Array, Integers]:
     """Return a law as one array of floats and one of whole numbers, for the functions below.
 
-    Without a tree the regions are scanned one by one.
+    Parameters
+    ----------
+    gains, offsets : ndarray, shapes (p, m, n) and (p, m)
+    rows : ndarray, shape (q, n + 1)
+        The half-spaces [A b] of all regions.
+    starts : ndarray of int, shape (p,)
+        The first row of each region.
+    bounds : ndarray, shape (2, m)
+        u_min and u_max.
+    tolerances : pair of float
+        How far outside counts as inside, and which slacks tie.
+    flags : pair of bool
+        Whether outside all regions the input is zero, and whether no two of them overlap.
+    tree : sequence of ndarray, optional
+        The arrays of a search tree, in its order. Without one the regions are scanned one by one.
     """
-    nodes, leaves = (len(tree.levels), len(tree.leaf_starts) - 1) if tree else (0, 0)
-    p, m, n = law.gains.shape
-    header = [n, m, p, law.n_halfspaces, nodes, leaves]
-    header += [law.infeasible == "zero_input", law.disjoint]
-    rows = np.column_stack([law.A, law.b])
-    floats: list[Any] = [(law.tolerance, law.tie_tolerance), rows, law.gains, law.offsets]
-    floats += [law.u_min, law.u_max, *((tree.normals, tree.levels) if tree else ())]
-    whole: list[Any] = [header, law.starts, [law.n_halfspaces]]
-    whole += [tree.children, tree.leaf_starts, tree.leaf_regions] if tree else []
+    (p, m, n), q = gains.shape, len(rows)
+    normals, levels, *numbers = tree or (np.empty(0), np.empty(0))
+    leaves = len(numbers[1]) - 1 if numbers else 0
+    header = [n, m, p, q, len(levels), leaves, *flags]
+    floats = (np.array(tolerances), rows, gains, offsets, bounds, normals, levels)
+    whole = (header, starts, [q], *numbers)
     return (
         np.concatenate([np.ravel(each) for each in floats]),
         np.concatenate([np.ravel(each) for each in whole]).astype(np.int64),

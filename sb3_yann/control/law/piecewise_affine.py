@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -22,9 +22,8 @@ from sb3_yann._validation import (
     same_fields,
     to_float,
 )
-
-if TYPE_CHECKING:
-    from sb3_yann.control.law.search_tree import SearchTree
+from sb3_yann.control.law._kernels import law_at, law_of_batch, locate_batch, pack
+from sb3_yann.control.law.search_tree import SearchTree, build_tree
 
 INFEASIBLE = ("nearest_region", "zero_input")
 SCAN = 4
@@ -156,8 +155,6 @@ class PiecewiseAffine(ReadOnlyArrays):
                     return u
             except TypeError:  # not float64, which is all that this was compiled for
                 pass
-        from sb3_yann.control.law._kernels import law_of_batch
-
         points = self._as_theta(theta)
         rows = np.atleast_2d(points)
         inputs = np.empty((len(rows), self.n_inputs))
@@ -210,8 +207,6 @@ class PiecewiseAffine(ReadOnlyArrays):
                 tree = {name[5:]: data[name] for name in data.files if name.startswith("tree_")}
             law = cls(**values)
             if tree:
-                from sb3_yann.control.law.search_tree import SearchTree
-
                 law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
             return law
         except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
@@ -239,8 +234,6 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     def _choose(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:
         """Return the region in use and how far inside it each point lies, negative outside."""
-        from sb3_yann.control.law._kernels import locate_batch
-
         points = self._as_theta(theta)
         rows = np.atleast_2d(points)
         region, inside = np.empty(len(rows), np.int64), np.empty(len(rows))
@@ -253,22 +246,25 @@ class PiecewiseAffine(ReadOnlyArrays):
         bounded = np.all(np.isfinite([self.theta_min, self.theta_max]))
         if self.n_regions <= SCAN or self.n_theta > MOST_PARAMETERS or not bounded:
             return None
-        from sb3_yann.control.law.search_tree import build_tree
-
         tree = build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
         return tree if len(tree.levels) else None  # regions that no hyperplane parts
 
     @cached_property
     def packed(self) -> tuple[Array, NDArray[np.int64]]:
         """The law as two arrays for compiled code, see `_kernels.pack`."""
-        from sb3_yann.control.law._kernels import pack
-
-        return pack(self, self.tree)
+        return pack(
+            self.gains,
+            self.offsets,
+            np.column_stack([self.A, self.b]),
+            self.starts,
+            np.stack([self.u_min, self.u_max]),
+            (self.tolerance, self.tie_tolerance),
+            (self.infeasible == "zero_input", self.disjoint),
+            tuple(vars(self.tree).values()) if self.tree else (),
+        )
 
     @cached_property
     def _at(self) -> Callable[[Any, Array], bool]:
-        from sb3_yann.control.law._kernels import law_at
-
         return partial(law_at, *self.packed)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> PiecewiseAffine:

@@ -46,6 +46,7 @@ sys.exit(mpc.explicit().n_regions)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "code", [NO_GUROBI, NOT_INSTALLED], ids=["gurobi has no licence", "gurobi is not installed"]
 )
@@ -54,6 +55,7 @@ def test_solving_needs_no_gurobi_and_prints_nothing(code: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (7, b"", b"")
 
 
+@pytest.mark.slow
 def test_a_solved_problem_needs_no_solver() -> None:
     mpc = benchmark()
     mpc.explicit()
