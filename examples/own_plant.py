@@ -58,7 +58,7 @@ def main() -> None:
     console.print(plant.report(), mpc.report(), sep="\n")
     make = partial(make_env, mpc)
     # Five per cent of the pumps' range is more than the wear takes; V differs by about ten.
-    policy = {"problem": mpc, "max_correction": 0.05, "value_scale": 10.0}
+    policy = {"problem": mpc, "max_correction": 0.05, "critic": {"value_scale": 10.0}}
     settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed}
     model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
     before = evaluate(model, make, TEST_SEEDS)

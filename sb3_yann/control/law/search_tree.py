@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection, QhullError
 
+from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
-from sb3_yann.control.law._kernels import Integers, compiled
 from sb3_yann.control.polyhedra import largest_ball
 
 LEAF = 4
