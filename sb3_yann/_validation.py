@@ -81,22 +81,29 @@ def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -
     return array
 
 
-def as_outputs(name: str, value: ArrayLike | Sequence[int] | None, n_states: int) -> Array:
+def as_outputs(name: str, value: ArrayLike | Sequence[int], n_states: int) -> Array:
     """Return an output matrix ``(q, n)`` from a matrix or from a list of indices of states."""
-    if value is None:
-        return as_array(name, np.zeros((0, n_states)), (0, n_states))
+    rows = as_output_rows(name, value, n_states - 1)
+    return as_array(name, np.eye(n_states)[rows] if rows.ndim == 1 else rows, ("q", n_states))
+
+
+def as_output_rows(
+    name: str, value: ArrayLike | Sequence[int], most: float = np.inf
+) -> NDArray[Any]:
+    """Return indices of states ``(q,)``, at most ``most``, or an output matrix ``(q, n)``."""
     entries = to_float(name, value)
     if entries.ndim == 0:
-        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value}].")
+        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value!r}].")
     if entries.ndim != 1:
-        return as_array(name, value, ("q", n_states))
+        return as_array(name, value, ("q", "n"))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
-    if not whole or np.any(entries < 0) or np.any(entries >= n_states):
+    if not whole or np.any(entries < 0) or np.any(entries > most):
+        limit = f"from 0 to {most}" if np.isfinite(most) else "from 0 on"
         raise ValueError(
-            f"{name} = {value!r} must be indices of states, whole numbers from 0 to "
-            f"{n_states - 1}, or an output matrix as a list of rows, [[...], [...]]."
+            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers "
+            f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
         )
-    return as_array(name, np.eye(n_states)[entries.astype(int)], ("q", n_states))
+    return entries.astype(int)
 
 
 def as_number(name: str, value: Any, hint: str = "") -> float:

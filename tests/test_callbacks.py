@@ -8,11 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import Recorder
 from stable_baselines3 import DDPG, PPO, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sample_plants import Recorder
 from sb3_yann import ControlDiagnostics, NoActionNoise, YannPolicy
 from weights import last_layer, unpin
 

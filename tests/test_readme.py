@@ -8,8 +8,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import LinearPlant
 
+from sample_plants import LinearPlant
 from sb3_yann import LinearModel, LinearMPC
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import LinearPlant, two_input_mpc
 from gymnasium.utils.env_checker import check_env
 
 from general_problems import servo
+from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, NonFiniteWarning, RateLimits
 from sb3_yann.wrappers import (
     MeasuredDisturbance,

@@ -141,7 +141,7 @@ class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
 
     ```
 
-    `docs/environments.md` lists where the paper's numbers cannot be right, and what was chosen here.
+    `docs/environments.md` lists the paper's slips, and what was chosen here.
 
     ## Version History
 

@@ -287,7 +287,7 @@ class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ```
 
-    `docs/environments.md` lists where the paper's numbers cannot be right, and what was chosen here.
+    `docs/environments.md` lists the paper's slips, and what was chosen here.
 
     ## Version History
 

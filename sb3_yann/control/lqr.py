@@ -112,5 +112,5 @@ def _why_no_solution(A: Array, B: Array) -> str:
             )
     return (
         "The Riccati equation has no stabilizing solution: a mode on the unit circle carries no "
-        "weight in Q. Give it a positive weight, use gamma < 1, or pass terminal_cost."
+        "weight in Q. Give it a positive weight, use gamma < 1, or pass a Terminal(cost)."
     )

@@ -7,7 +7,6 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import Recorder
 from stable_baselines3.common.callbacks import BaseCallback
 
 from experiments import yardsticks
@@ -21,6 +20,7 @@ from experiments.yardsticks import (
     sb3_ddpg,
     sb3_td3,
 )
+from sample_plants import Recorder
 from sb3_yann.control import lqr as formulas
 from sb3_yann.evaluation.episodes import evaluate
 from sb3_yann_envs import problems
@@ -200,6 +200,7 @@ def test_lqr_is_linear_inside_and_clipped_outside(problem) -> None:
     np.testing.assert_array_equal(law(states[0]), actions[0])
 
 
+@pytest.mark.slow
 def test_the_best_is_kept_of_what_ddpg_was_after_any_episode() -> None:
     starts = range(700, 703)
     learner = best_of_ddpg(lambda: gym.make("ClippedPendulum-v0"), 0, starts)

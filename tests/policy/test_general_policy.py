@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import LinearPlant, feasible_states
 from stable_baselines3 import DDPG, TD3
 
 from general_problems import LOADED, servo, solved
+from sample_plants import LinearPlant, feasible_states
 from sb3_yann import NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.guard.plant_acceptance import predicted_cost

@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import LinearPlant, two_input_mpc
 from gymnasium.wrappers import NormalizeReward, TimeLimit
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.env_util import make_vec_env
@@ -20,6 +19,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
+from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import (
     ActionRepeat,
     AffineObservation,

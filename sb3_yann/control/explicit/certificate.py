@@ -17,7 +17,13 @@ LAW, INSIDE = 1e-6, 1e-8
 
 
 class ExplicitSolutionError(RuntimeError):
-    """An explicit solution failed its check: it does not solve the program it came from."""
+    """An explicit solution failed its check: it does not solve the program it came from.
+
+    Examples
+    --------
+    >>> issubclass(ExplicitSolutionError, RuntimeError)
+    True
+    """
 
 
 def certify(program: ParametricQP, regions: list[Region], center: Array, half: Array) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import optimize
 
-from sb3_yann._validation import Array, half_widths
+from sb3_yann._validation import Array, as_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError, certify
 from sb3_yann.control.explicit.facet_walk import walk
@@ -15,8 +15,6 @@ from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
-
-SOLVERS = ("walk", "ppopt")
 
 
 def solve_explicit(
@@ -29,19 +27,17 @@ def solve_explicit(
 ) -> PiecewiseAffine:
     """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
 
-    The regions are in the order of their active sets, fewest constraints first, so that a problem
-    always gives the same law.
+    The regions are in the order of their active sets, fewest constraints first.
 
     Parameters
     ----------
     program : ParametricQP
     u_min, u_max : ndarray, shape (m,)
-        The input range, in which the tolerances are measured; infinite where there is none.
+        The input range, in which tolerances are measured; infinite where there is none.
     infeasible : {"nearest_region", "zero_input"}
         See :class:`PiecewiseAffine`.
     solver : {"walk", "ppopt"}
-        Our walk from facet to facet (:mod:`sb3_yann.control.explicit.facet_walk`), or ppopt's
-        combinatorial graph search, which takes tens of times longer above a hundred regions.
+        Our walk from facet to facet, or ppopt's combinatorial graph search, tens of times slower.
     budget : SolveBudget
         When to give up.
 
@@ -54,8 +50,7 @@ def solve_explicit(
     ExplicitSolutionError
         If the solution fails its check.
     """
-    if solver not in SOLVERS:
-        raise ValueError(f"solver = {solver!r} must be one of {SOLVERS}.")
+    as_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
     units = ProgramUnits(program, u_min, u_max)
     _require_feasible(units.scaled)

@@ -95,21 +95,10 @@ def pack(
 ) -> tuple[Array, Integers]:
     """Return a law as one array of floats and one of whole numbers, for the functions below.
 
-    Parameters
-    ----------
-    gains, offsets : ndarray, shapes (p, m, n) and (p, m)
-    rows : ndarray, shape (q, n + 1)
-        The half-spaces [A b] of all regions.
-    starts : ndarray of int, shape (p,)
-        The first row of each region.
-    bounds : ndarray, shape (2, m)
-        u_min and u_max.
-    tolerances : pair of float
-        How far outside counts as inside, and which slacks tie.
-    flags : pair of bool
-        Whether outside all regions the input is zero, and whether no two of them overlap.
-    tree : sequence of ndarray, optional
-        The arrays of a search tree, in its order. Without one the regions are scanned one by one.
+    ``rows`` are [A b] (q, n + 1) of all regions, each from ``starts`` on; ``bounds`` are u_min and
+    u_max (2, m). ``tolerances`` tell how far outside counts as inside and which slacks tie,
+    ``flags`` whether the input is zero outside and whether no regions overlap. ``tree`` holds the
+    arrays of a search tree; without one the regions are scanned one by one.
     """
     (p, m, n), q = gains.shape, len(rows)
     normals, levels, *numbers = tree or (np.empty(0), np.empty(0))

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, as_array, as_bounds, to_float
 from sb3_yann.control.model.linear_model import LinearModel
@@ -20,6 +19,7 @@ BEYOND = 0.5
 """How far the box of theta reaches beyond soft bounds by default, in parts of their width."""
 
 Bounds = tuple[Array, Array]
+Given = ArrayLike | None
 
 
 def as_horizon(value: int) -> int:
@@ -31,49 +31,8 @@ def as_horizon(value: int) -> int:
     return int(value)
 
 
-def as_output_rows(
-    name: str, value: ArrayLike | Sequence[int], most: float = np.inf
-) -> NDArray[Any]:
-    """Return indices of states (q,), at most ``most``, or an output matrix (q, n).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is neither.
-    """
-    entries = to_float(name, value)
-    if entries.ndim == 0:
-        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value!r}].")
-    if entries.ndim != 1:
-        return as_array(name, value, ("q", "n"))
-    whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
-    if not whole or np.any(entries < 0) or np.any(entries > most):
-        limit = f"from 0 to {most}" if np.isfinite(most) else "from 0 on"
-        raise ValueError(
-            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers "
-            f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
-        )
-    indices = entries.astype(int)
-    indices.setflags(write=False)
-    return indices
-
-
-def as_outputs(name: str, value: ArrayLike | Sequence[int], n_states: int) -> Array:
-    """Return an output matrix (q, n) from a matrix or from a list of indices of states."""
-    rows = as_output_rows(name, value, n_states - 1)
-    return as_array(name, np.eye(n_states)[rows] if rows.ndim == 1 else rows, ("q", n_states))
-
-
 def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
-    """Return the unit of violation (size,) of soft bounds, 0 where they are hard.
-
-    A single number is for the entries that have a bound.
-
-    Raises
-    ------
-    ValueError
-        For something without a bound.
-    """
+    """Return the unit of violation (size,) of soft bounds; one number is for all that are there."""
     size, bounded, units = len(bounds[0]), np.isfinite(bounds).any(axis=0), given
     if given.ndim == 0:
         units = np.where(bounded, given, 0.0) if np.any(bounded) else np.full(size, float(given))
@@ -93,29 +52,19 @@ def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
 
 
 def theta_box(
-    layout: ThetaLayout,
-    given: tuple[ArrayLike | None, ArrayLike | None],
-    states: Bounds,
-    others: Sequence[Bounds],
+    layout: ThetaLayout, given: tuple[Given, Given], states: Bounds, others: Sequence[Bounds]
 ) -> Bounds:
-    """Return the box of theta.
+    """Return the box of theta: that of the states, and those of r, d and the previous input.
 
     Parameters
     ----------
     layout : ThetaLayout
     given : pair of array_like or None
-        theta_min and theta_max, each a number, (n,) for the states or (n_theta,) for all of theta,
-        as a problem stores it.
+        theta_min and theta_max: a number, (n,) for the states, or (n_theta,) as stored.
     states : pair of ndarray, shape (n,)
         The box of the states where none is given.
     others : sequence of pairs
-        The boxes of r, d and the previous input.
-
-    Raises
-    ------
-    ValueError
-        If a lower bound is not below its upper bound, or what is given for r, d or the previous
-        input differs from their own bounds.
+        The boxes of r, d and the previous input, from which those given must not differ.
     """
     n, parts = layout.n_states, []
     for value, fallback in zip(given, states, strict=True):
@@ -129,9 +78,7 @@ def theta_box(
     return low, high
 
 
-def _require_same_rest(
-    name: str, given: ArrayLike | None, stored: Array, layout: ThetaLayout
-) -> None:
+def _require_same_rest(name: str, given: Given, stored: Array, layout: ThetaLayout) -> None:
     """Raise where a box given for all of theta differs from that of r, d and u_prev.
 
     A box that a problem has stored is read-only: of it `dataclasses.replace` means the states.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.mpc._arguments import Bounds
 from sb3_yann.control.mpc.problem import MPCProblem
 
 
@@ -56,6 +58,11 @@ class _Rows:
         self.parts.append((np.hstack([G, soft]), w, S))
         self.names += [name.format(i) for i in range(len(w))]
 
+    def add_bounds(self, name: str, G: Array, bounds: Bounds, S: Array, *softness: Any) -> None:
+        """Add rows for ``low <= G U + S theta <= high``."""
+        self.add(f"{name} at its upper bound", G, bounds[1], -S, *softness)
+        self.add(f"{name} at its lower bound", -G, -bounds[0], S, *softness)
+
     def stacked(self) -> tuple[Array, Array, Array, tuple[str, ...]]:
         """Return G, w, S and the names of the rows that bound something."""
         G, w, S = (np.concatenate(each) for each in zip(*self.parts, strict=True))
@@ -67,29 +74,17 @@ class _Rows:
 def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
     """Return the program in ``(u_0, ..., u_{N-1})`` and slacks, and what each row bounds."""
     prediction = _Prediction(problem)
-    slacks = [
-        kind
-        for kind, softness, bounds in (
-            ("x", problem.soft.x, (problem.x_min, problem.x_max)),
-            ("y", problem.soft.y, (problem.outputs.y_min, problem.outputs.y_max)),
-        )
-        if np.any((softness > 0) & np.isfinite(bounds).any(axis=0))
-    ]
+    units = {"x": problem.soft.x, "y": problem.soft.y}
+    slacks = [kind for kind, unit in units.items() if np.any(unit)]
     H, F = _cost(problem, prediction)
     G, w, S, names = _constraints(problem, prediction, slacks)
-    penalty = np.full(len(slacks), problem.soft.penalty)
-    program = ParametricQP(
-        H=linalg.block_diag((H + H.T) / 2, np.diag(2 * penalty)) if slacks else (H + H.T) / 2,
-        F=np.vstack([F, np.zeros((len(slacks), problem.n_theta))]),
-        c=np.concatenate([np.zeros(len(H)), penalty]),
-        G=G,
-        w=w,
-        S=S,
-        theta_min=problem.theta_min,
-        theta_max=problem.theta_max,
-        n_slacks=len(slacks),
-    )
-    return program, names
+    penalty, H = np.full(len(slacks), problem.soft.penalty), (H + H.T) / 2
+    c = np.concatenate([np.zeros(len(H)), penalty])
+    if slacks:
+        H = linalg.block_diag(H, np.diag(2 * penalty))
+        F = np.vstack([F, np.zeros((len(slacks), problem.n_theta))])
+    box = problem.theta_min, problem.theta_max
+    return ParametricQP(H, F, c, G, w, S, *box, n_slacks=len(slacks)), names
 
 
 def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array]:
@@ -122,25 +117,20 @@ def _constraints(
     rows.add("", -np.eye(N * m), -np.tile(problem.u_min, N), free)
     rows.names = [name.format(side) for side in ("upper", "lower") for name in inputs]
 
-    states = slice(0, problem.model.n_states)
+    states, rate = slice(0, problem.model.n_states), problem.rate
+    x = problem.x_min, problem.x_max
     for k in range(1, N + 1):
         forced, powers = prediction.forced[k][states], prediction.powers[k][states]
-        soft = (problem.soft.x, "x")
-        rows.add("x[{}] at its upper bound", forced, problem.x_max, -powers, *soft)
-        rows.add("x[{}] at its lower bound", -forced, -problem.x_min, powers, *soft)
+        rows.add_bounds("x[{}]", forced, x, powers, problem.soft.x, "x")
     last, upper = problem.terminal.set
     rows.add("the terminal set", last @ prediction.forced[N], upper, -last @ prediction.powers[N])
-    if problem.layout.n_previous:
-        for k in range(N):
-            change, start = prediction.rate(problem, k)
-            rows.add("the rate of u[{}] at its upper bound", change, problem.rate.du_max, -start)
-            rows.add("the rate of u[{}] at its lower bound", -change, -problem.rate.du_min, start)
-    for k in range(1, N + 1) if len(problem.outputs.C) else ():
-        forced = problem.outputs.C @ prediction.forced[k][states]
-        powers = problem.outputs.C @ prediction.powers[k][states]
-        soft = (problem.soft.y, "y")
-        rows.add("y[{}] at its upper bound", forced, problem.outputs.y_max, -powers, *soft)
-        rows.add("y[{}] at its lower bound", -forced, -problem.outputs.y_min, powers, *soft)
+    for k in range(N) if problem.layout.n_previous else ():
+        change, start = prediction.rate(problem, k)
+        rows.add_bounds("the rate of u[{}]", change, (rate.du_min, rate.du_max), start)
+    C, y = problem.outputs.C, (problem.outputs.y_min, problem.outputs.y_max)
+    for k in range(1, N + 1) if len(C) else ():
+        forced, powers = prediction.forced[k][states], prediction.powers[k][states]
+        rows.add_bounds("y[{}]", C @ forced, y, C @ powers, problem.soft.y, "y")
     if slacks:
         zeros = np.zeros((1, N * m))
         for kind in slacks:

@@ -17,12 +17,9 @@ from sb3_yann.control.mpc.theta_layout import ThetaLayout
 class ErrorSystem(ReadOnlyArrays):
     """The problem in ``z = to_error theta`` and ``v = u - to_input theta``: ``z+ = A z + B v``.
 
-    There the stage cost is quadratic.
-
-    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate of the input has a weight. The
-    reference and the disturbance are constant, so they are modes on the unit circle of
-    ``theta+ = A_bar theta + B_bar u``: no Lyapunov or Riccati equation has a solution there without
-    a discount. In z they are gone.
+    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate has a weight. The stage cost is
+    quadratic there. In theta the constant r and d are modes on the unit circle, where no Lyapunov
+    or Riccati equation has a solution without a discount. In z they are gone.
 
     Attributes
     ----------
@@ -76,12 +73,9 @@ def error_system(
     # v_prev+ = v, and (v - v_prev)'R_du(v - v_prev) couples the two
     previous = -to_input
     previous[:, layout.previous] = np.eye(m)
+    A, B = linalg.block_diag(model.A, np.zeros((m, m))), np.vstack([model.B, np.eye(m)])
     return ErrorSystem(
-        model=LinearModel(
-            linalg.block_diag(model.A, np.zeros((m, m))),
-            np.vstack([model.B, np.eye(m)]),
-            model.dt,
-        ),
+        model=LinearModel(A, B, model.dt),
         to_error=np.vstack([to_error, previous]),
         to_input=to_input,
         Q=linalg.block_diag(Q, R_du),

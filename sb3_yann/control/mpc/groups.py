@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,19 +17,23 @@ from sb3_yann._validation import (
     ReadOnlyArrays,
     as_array,
     as_bounds,
+    as_output_rows,
+    as_outputs,
     as_positive,
     as_symmetric,
     same_fields,
     to_float,
 )
-from sb3_yann.control.mpc._arguments import Bounds, as_output_rows, as_outputs, as_softness
+from sb3_yann.control.mpc._arguments import Bounds, Given, as_softness
+
+Outputs = ArrayLike | Sequence[int]
+HalfSpaces = tuple[ArrayLike, ArrayLike]
 
 
 class _Group(ReadOnlyArrays):
-    """Equality by the stored values, of which arrays are read-only."""
+    """A group stores read-only arrays, and equals one with the same."""
 
-    def _store(self, **values: Any) -> None:
-        self.__setstate__(values)
+    _store = ReadOnlyArrays.__setstate__
 
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
@@ -40,7 +43,7 @@ class _Group(ReadOnlyArrays):
     __hash__ = None  # type: ignore[assignment]
 
 
-def _loose(name: str, lower: ArrayLike | None, upper: ArrayLike | None) -> Bounds:
+def _loose(name: str, lower: Given, upper: Given) -> Bounds:
     """Return bounds that fit each other, of a size that is still open."""
     low = to_float(f"{name}_min", -np.inf if lower is None else lower)
     high = to_float(f"{name}_max", np.inf if upper is None else upper)
@@ -48,9 +51,7 @@ def _loose(name: str, lower: ArrayLike | None, upper: ArrayLike | None) -> Bound
     return low, high
 
 
-def _bounds(
-    name: str, lower: ArrayLike | None, upper: ArrayLike | None, size: int, missing: str
-) -> Bounds:
+def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> Bounds:
     """Return bounds of shape (size,); they must be infinite of what the problem does not have."""
     low, high = _loose(name, lower, upper)
     if size == 0 and np.any(np.isfinite(np.append(low, high))):
@@ -79,15 +80,10 @@ class Tracking(_Group):
     r_min: Array
     r_max: Array
 
-    def __init__(
-        self,
-        C: ArrayLike | Sequence[int] = (),
-        r_min: ArrayLike | None = None,
-        r_max: ArrayLike | None = None,
-    ) -> None:
+    def __init__(self, C: Outputs = (), r_min: Given = None, r_max: Given = None) -> None:
         rows = as_output_rows("Tracking.C", C)
         low, high = _bounds("r", r_min, r_max, len(rows), "output in Tracking.C")
-        self._store(C=rows, r_min=low, r_max=high)
+        self._store({"C": rows, "r_min": low, "r_max": high})
 
     def sized(self, n_states: int) -> Tracking:
         """Return it with C as a matrix (p, n)."""
@@ -115,15 +111,10 @@ class OutputBounds(_Group):
     y_min: Array
     y_max: Array
 
-    def __init__(
-        self,
-        C: ArrayLike | Sequence[int] = (),
-        y_min: ArrayLike | None = None,
-        y_max: ArrayLike | None = None,
-    ) -> None:
+    def __init__(self, C: Outputs = (), y_min: Given = None, y_max: Given = None) -> None:
         rows = as_output_rows("OutputBounds.C", C)
         low, high = _bounds("y", y_min, y_max, len(rows), "output in OutputBounds.C")
-        self._store(C=rows, y_min=low, y_max=high)
+        self._store({"C": rows, "y_min": low, "y_max": high})
 
     def sized(self, n_states: int) -> OutputBounds:
         """Return it with C as a matrix (q, n)."""
@@ -148,9 +139,9 @@ class DisturbanceBounds(_Group):
     d_min: Array
     d_max: Array
 
-    def __init__(self, d_min: ArrayLike | None = None, d_max: ArrayLike | None = None) -> None:
+    def __init__(self, d_min: Given = None, d_max: Given = None) -> None:
         low, high = _loose("d", d_min, d_max)
-        self._store(d_min=low, d_max=high)
+        self._store({"d_min": low, "d_max": high})
 
     def sized(self, n_disturbances: int) -> DisturbanceBounds:
         """Return it with bounds of shape (d,)."""
@@ -179,12 +170,7 @@ class RateLimits(_Group):
     du_max: Array
     R_du: Array
 
-    def __init__(
-        self,
-        du_min: ArrayLike | None = None,
-        du_max: ArrayLike | None = None,
-        R_du: ArrayLike | None = None,
-    ) -> None:
+    def __init__(self, du_min: Given = None, du_max: Given = None, R_du: Given = None) -> None:
         low, high = _loose("du", du_min, du_max)
         for i in np.flatnonzero((low > 0) | (high < 0)):
             raise ValueError(
@@ -194,7 +180,7 @@ class RateLimits(_Group):
         weight = to_float("R_du", np.zeros((0, 0)) if R_du is None else R_du)
         if weight.size:
             weight = as_symmetric("R_du", weight, len(np.atleast_1d(weight)))
-        self._store(du_min=low, du_max=high, R_du=weight)
+        self._store({"du_min": low, "du_max": high, "R_du": weight})
 
     @property
     def bounded(self) -> bool:
@@ -254,7 +240,7 @@ class SoftBounds(_Group):
         if penalty and not soft:
             raise ValueError(f"SoftBounds.penalty = {penalty!r}, but nothing is soft: pass x or y.")
         cost = as_positive("SoftBounds.penalty", penalty) if soft and penalty is not None else 0.0
-        self._store(**units, penalty=cost)
+        self._store({**units, "penalty": cost})
 
     def sized(self, x: Bounds, y: Bounds) -> SoftBounds:
         """Return it with an entry for each bound of the states and of the outputs."""
@@ -286,20 +272,16 @@ class Terminal(_Group):
     cost: Array
     set: tuple[Array, Array]
 
-    def __init__(
-        self,
-        cost: ArrayLike | None = None,
-        set: tuple[ArrayLike, ArrayLike] | str | None = None,
-    ) -> None:
+    def __init__(self, cost: Given = None, set: HalfSpaces | str | None = None) -> None:
         if cost is not None:
             matrix = to_float("Terminal.cost", cost)
             cost = as_symmetric("Terminal.cost", matrix, len(np.atleast_1d(matrix)))
         if set is not None and not (isinstance(set, str) and set == "invariant"):
             set = _half_spaces(set)
-        self._store(cost=cost, set=set)
+        self._store({"cost": cost, "set": set})
 
 
-def _half_spaces(value: tuple[ArrayLike, ArrayLike] | str) -> tuple[Array, Array]:
+def _half_spaces(value: HalfSpaces | str) -> tuple[Array, Array]:
     try:
         F, g = () if isinstance(value, str) else value  # type: ignore[misc]
     except (TypeError, ValueError):

@@ -3,43 +3,39 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, as_array, to_float
+from sb3_yann.control.mpc._arguments import Given
 from sb3_yann.control.mpc.problem import MPCProblem
 
 TOLERANCE = 1e-9
 """How far beyond a bound a steady state still counts as within, relative to the bound."""
 
 
-def is_reachable(
-    problem: MPCProblem, r: ArrayLike | None, d: ArrayLike | None
-) -> NDArray[np.bool_]:
+def is_reachable(problem: MPCProblem, r: Given, d: Given) -> NDArray[np.bool_]:
     """Tell whether the steady state lies within the bounds, see :meth:`LinearMPC.is_reachable`."""
     return np.asarray(np.all(margins(problem, r, d) >= 0, axis=-1))
 
 
-def margins(problem: MPCProblem, r: ArrayLike | None, d: ArrayLike | None) -> Array:
+def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
     """Return the room to each upper and lower bound of x, u and y at the steady state.
 
     The shape is (2 (n + m + q),), or (batch, 2 (n + m + q)) for a batch of r or d; negative
     entries are violations, by more than rounding.
     """
     constant = _constants(problem, r, d)
-    x = constant @ problem.steady_states.x.T
-    value = np.concatenate(
-        [x, constant @ problem.steady_states.u.T, x @ problem.outputs.C.T], axis=-1
-    )
-    low = np.concatenate([problem.x_min, problem.u_min, problem.outputs.y_min])
-    high = np.concatenate([problem.x_max, problem.u_max, problem.outputs.y_max])
+    x, u = constant @ problem.steady_states.x.T, constant @ problem.steady_states.u.T
+    outputs = problem.outputs
+    value = np.concatenate([x, u, x @ outputs.C.T], axis=-1)
+    low = np.concatenate([problem.x_min, problem.u_min, outputs.y_min])
+    high = np.concatenate([problem.x_max, problem.u_max, outputs.y_max])
     room = np.concatenate([high - value, value - low], axis=-1)
     bound = np.abs(np.concatenate([high, low]))
     return np.asarray(room + TOLERANCE * np.where(np.isfinite(bound), bound, 0.0))
 
 
-def steady_state(
-    problem: MPCProblem, r: ArrayLike | None, d: ArrayLike | None
-) -> tuple[Array, Array]:
+def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]:
     """Return x_s and u_s, see :meth:`LinearMPC.steady_state`."""
     constant = _constants(problem, r, d)
     if constant.ndim != 1:
@@ -61,7 +57,7 @@ def steady_state(
     return x, u
 
 
-def _constants(problem: MPCProblem, r: ArrayLike | None, d: ArrayLike | None) -> Array:
+def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:
     """Return [r; d], of shape (p + d,) or (batch, p + d)."""
     p, n_d = len(problem.tracking.C), problem.model.n_disturbances
     parts = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 
@@ -24,10 +25,8 @@ def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: 
     ----------
     problem : MPCProblem
     law : PiecewiseAffine
-        Its explicit law.
     samples : int, default 500
-        Points drawn uniformly from the box of parameters: a share is good to about
-        ``1 / sqrt(samples)``.
+        Points drawn uniformly from the box of parameters: shares are good to 1 / sqrt(samples).
     seed : int, default 0
 
     Raises
@@ -40,14 +39,8 @@ def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: 
     rng = np.random.default_rng(seed)
     points = rng.uniform(problem.theta_min, problem.theta_max, (samples, problem.n_theta))
     feasible = points[law.in_domain(points)]
-    lines = [
-        *_parameters(problem),
-        *_size(problem, law),
-        *_shares(problem, law, points, feasible),
-        *_active(problem, feasible),
-        *_values(problem, law, feasible),
-    ]
-    return "\n".join(lines)
+    parts = _parameters(problem), _size(problem, law), _shares(problem, law, points, feasible)
+    return "\n".join(chain(*parts, _active(problem, feasible), _values(problem, law, feasible)))
 
 
 def _parameters(problem: MPCProblem) -> Iterator[str]:

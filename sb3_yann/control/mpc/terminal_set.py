@@ -13,21 +13,22 @@ MARGIN = 0.01
 """How far inside the bounds steady states must lie, relative to the bounds."""
 MAX_ROWS, MAX_STEPS = 200, 500
 
+Rows = tuple[Array, Array]
+"""Half-spaces ``F theta <= g``."""
 
-def invariant_set(problem: MPCProblem, cost: Array) -> tuple[Array, Array]:
+
+def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     """Return F (rows, n_theta) and g (rows,): the maximal output admissible set F theta <= g.
 
     From a theta in it the law ``v = -K z``, with K the gain of the terminal cost, keeps all hard
-    bounds of x, u, y and the rate for ever on the model, with r and d constant. Gilbert & Tan,
-    Linear systems with state and control constraints, IEEE Trans. Autom. Control 36 (1991): the
-    bounds after 0, 1, 2 ... steps are added until those of the next step are all redundant, which
-    linear programs tell. In ``x_min`` and ``x_max`` this keeps the law in its domain for ever; a
-    box of states given by ``theta_min`` and ``theta_max`` alone is no bound of the predictions, and
-    may still be left. Soft bounds do not count.
+    bounds of x, u, y and the rate for ever on the model, with r and d constant. Soft bounds do not
+    count, and neither does a box of states given by ``theta_min`` and ``theta_max`` alone.
 
-    r and d never decay; as in Section V there, their steady states must lie inside the bounds by a
-    little, here one percent of each bound, which makes the number of steps finite. The box of r and
-    d is taken for granted, and so are the bounds of ``u_prev``.
+    The bounds after 0, 1, 2 ... steps are added until those of the next step are all redundant, by
+    linear programs. r and d never decay: with steady states inside the bounds by one percent, the
+    number of steps is finite. Their box is taken for granted, and so are the bounds of ``u_prev``.
+    Gilbert & Tan, Linear systems with state and control constraints, IEEE Trans. Autom. Control 36
+    (1991), Section V.
 
     Raises
     ------
@@ -43,8 +44,7 @@ def invariant_set(problem: MPCProblem, cost: Array) -> tuple[Array, Array]:
             "Terminal(set='invariant') needs a terminal gain that stabilizes the model, but the "
             f"spectral radius of A - BK is {radius:.6g}. Use gamma=1, or the default terminal cost."
         )
-    gain = errors.to_input - K @ errors.to_error
-    half = problem.theta_half
+    gain, half = errors.to_input - K @ errors.to_error, problem.theta_half
     rows, bounds = _bounds(problem, gain)
     A, B = problem.prediction
     rows, closed = rows * half, (A + B @ gain) * half / half[:, None]
@@ -55,26 +55,19 @@ def invariant_set(problem: MPCProblem, cost: Array) -> tuple[Array, Array]:
             "theta = 0 lies on or beyond a hard one. Move the bounds or the operating point."
         )
     granted = _granted(problem, half)
-    found = _remove_redundant(rows, bounds, *granted)
+    found = _remove_redundant((rows, bounds), granted)
     if parts.has_constants:
         moving = np.any(np.abs(steady) > 1e-12, axis=1)
         inside = (steady[moving], (1 - MARGIN) * bounds[moving])
         found = np.vstack([found[0], inside[0]]), np.concatenate([found[1], inside[1]])
-    found = _until_nothing_new(rows, bounds, closed, found, granted)
-    F, g = _remove_redundant(*found, *granted)
+    found = _until_nothing_new((rows, bounds), closed, found, granted)
+    F, g = _remove_redundant(found, granted)
     return F / half, g
 
 
-def _until_nothing_new(
-    rows: Array,
-    bounds: Array,
-    closed: Array,
-    found: tuple[Array, Array],
-    granted: tuple[Array, Array],
-) -> tuple[Array, Array]:
+def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -> Rows:
     """Add the bounds of later steps until those of one step say nothing new."""
-    F, g = found
-    later = rows
+    (F, g), (later, bounds) = found, ahead
     for _ in range(MAX_STEPS):
         later = later @ closed
         A, b = np.vstack([F, granted[0]]), np.concatenate([g, granted[1]])
@@ -93,7 +86,7 @@ def _until_nothing_new(
     )
 
 
-def _bounds(problem: MPCProblem, gain: Array) -> tuple[Array, Array]:
+def _bounds(problem: MPCProblem, gain: Array) -> Rows:
     """Return the hard bounds of x, u, y and the rate under ``u = gain theta``: rows and bounds."""
     parts, size, outputs = problem.layout, problem.n_theta, problem.outputs
     state = np.eye(size)[parts.state]
@@ -123,7 +116,7 @@ def _steady_projection(problem: MPCProblem, half: Array) -> Array:
     return np.asarray(at_rest / half[:, None] * half)
 
 
-def _granted(problem: MPCProblem, half: Array) -> tuple[Array, Array]:
+def _granted(problem: MPCProblem, half: Array) -> Rows:
     """Return the half-spaces that every predicted theta satisfies anyway."""
     first = problem.layout.constant.start
     eye = np.eye(problem.n_theta)[first:]
@@ -134,15 +127,13 @@ def _granted(problem: MPCProblem, half: Array) -> tuple[Array, Array]:
     return rows[bounded], bounds[bounded]
 
 
-def _remove_redundant(
-    rows: Array, bounds: Array, granted_rows: Array, granted_bounds: Array
-) -> tuple[Array, Array]:
+def _remove_redundant(found: Rows, granted: Rows) -> Rows:
     """Return the half-spaces that the others and the granted ones do not imply."""
-    kept = list(range(len(bounds)))
+    (rows, bounds), kept = found, list(range(len(found[1])))
     for i in range(len(bounds)):
         others = [j for j in kept if j != i]
-        A = np.vstack([rows[others], granted_rows])
-        b = np.concatenate([bounds[others], granted_bounds])
+        A = np.vstack([rows[others], granted[0]])
+        b = np.concatenate([bounds[others], granted[1]])
         if _is_redundant(rows[i], float(bounds[i]), A, b):
             kept = others
     return rows[kept], bounds[kept]

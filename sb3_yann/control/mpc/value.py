@@ -11,11 +11,7 @@ from sb3_yann.control.mpc.problem import MPCProblem
 
 
 def value_matrix(problem: MPCProblem, law: PiecewiseAffine, gamma: float) -> Array:
-    """Return P (n_theta, n_theta), see :meth:`LinearMPC.value_matrix`.
-
-    The Lyapunov equation is solved in the error coordinates z, which exist for any discount, and
-    ``z'Pz`` is mapped back by ``z = to_error theta``.
-    """
+    """Return P (n_theta, n_theta) of :meth:`LinearMPC.value_matrix`, solved for in z."""
     gamma, errors = as_discount(gamma), problem.error_system
     K = gain_at_rest(problem, law)
     P = lqr.policy_value(errors.model, errors.Q, errors.R, K, gamma, errors.cross)
@@ -23,7 +19,7 @@ def value_matrix(problem: MPCProblem, law: PiecewiseAffine, gamma: float) -> Arr
 
 
 def state_action_matrix(problem: MPCProblem, law: PiecewiseAffine, gamma: float) -> Array:
-    """Return M (n_theta + m, n_theta + m), see :meth:`LinearMPC.state_action_matrix`."""
+    """Return M (n_theta + m, n_theta + m) of :meth:`LinearMPC.state_action_matrix`."""
     P = value_matrix(problem, law, gamma)
     AB = np.hstack(problem.prediction)
     return np.asarray(problem.stage_matrix + gamma * AB.T @ P @ AB)

@@ -62,8 +62,11 @@ def test_laws_of_many_regions_have_a_tree_with_small_leaves(make) -> None:
     law = make()
     assert law.n_regions > 16
     assert law.tree is not None
-    assert law.tree.largest_leaf < law.n_regions / 3
-    assert law.tree.depth < 3 * np.log2(law.n_regions)
+    assert np.diff(law.tree.leaf_starts).max() < law.n_regions / 3
+    depth = np.zeros(len(law.tree.children), dtype=int)
+    for node, children in enumerate(law.tree.children):  # children come after their parents
+        depth[children[children > 0]] = depth[node] + 1
+    assert depth.max() + 1 < 3 * np.log2(law.n_regions)
 
 
 def test_laws_of_few_regions_have_none() -> None:
