@@ -24,8 +24,7 @@ from sb3_yann import (
     Tracking,
     YannPolicy,
 )
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import save_trajectories, summary_table
+from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change

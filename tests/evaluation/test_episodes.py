@@ -13,8 +13,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from sb3_yann import YannPolicy
-from sb3_yann.evaluation.episodes import Episodes, evaluate
-from sb3_yann.evaluation.plots import comparison_table, save_trajectories
+from sb3_yann.evaluation import Episodes, comparison_table, evaluate, save_trajectories
 from sb3_yann_envs import problems
 
 SEEDS = range(3)
