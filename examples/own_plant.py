@@ -16,8 +16,7 @@ from stable_baselines3 import DDPG
 from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
 from sb3_yann import CostAudit, ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import save_trajectories, summary_table
+from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
