@@ -91,20 +91,121 @@ def as_bounds(
     return low, high
 
 
-def as_positive(name: str, value: float) -> float:
-    """Return ``value`` as a finite float above zero."""
-    number = _number(name, value)
-    if not (np.isfinite(number) and number > 0):
-        raise ValueError(f"{name} = {value!r} must be a finite number above 0.")
-    return number
+def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -> Array:
+    """Return ``value`` as positive numbers of shape ``(size,)``; a scalar is for all entries."""
+    array = to_float(name, value)
+    array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
+    if np.any(array <= 0):
+        raise ValueError(f"{name} = {array.tolist()} must be above 0 in each entry.{_after(hint)}")
+    return array
 
 
-def as_discount(value: float) -> float:
+def as_outputs(name: str, value: ArrayLike | Sequence[int] | None, n_states: int) -> Array:
+    """Return an output matrix ``(q, n)`` from a matrix or from a list of state indices.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is neither.
+    """
+    if value is None:
+        return as_array(name, np.zeros((0, n_states)), (0, n_states))
+    entries = to_float(name, value)
+    if entries.ndim == 0:
+        raise ValueError(f"{name} = {value!r} must be a list of state indices: [{value}].")
+    if entries.ndim != 1:
+        return as_array(name, value, ("q", n_states))
+    whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
+    if not whole or np.any(entries < 0) or np.any(entries >= n_states):
+        raise ValueError(
+            f"{name} = {value!r} must be indices of states, whole numbers from 0 to "
+            f"{n_states - 1}, or an output matrix as a list of rows, [[...], [...]]."
+        )
+    return as_array(name, np.eye(n_states)[entries.astype(int)], ("q", n_states))
+
+
+def as_number(name: str, value: Any, hint: str = "") -> float:
+    """Return ``value`` as a finite float.
+
+    Python's and numpy's numbers and 0-d arrays are numbers. Bools, strings, and complex numbers
+    raise TypeError; NaN and infinity raise ValueError. ``hint`` ends the message.
+    """
+    return as_between(name, value, -np.inf, np.inf, "()", hint)
+
+
+def as_positive(name: str, value: Any, hint: str = "") -> float:
+    """Return ``value`` as a finite float above 0."""
+    return as_between(name, value, 0, np.inf, "()", hint)
+
+
+def as_discount(value: Any) -> float:
     """Return ``value`` as a discount factor in (0, 1]."""
-    number = _number("gamma", value)
-    if not 0 < number <= 1:
-        raise ValueError(f"gamma = {value!r} must lie in (0, 1].")
-    return number
+    return as_between("gamma", value, 0, 1, "(]")
+
+
+def as_between(
+    name: str, value: Any, low: float, high: float, ends: str = "[]", hint: str = ""
+) -> float:
+    """Return ``value`` as a finite float between ``low`` and ``high``.
+
+    Parameters
+    ----------
+    name : str
+        The argument's name, for the message.
+    value : Any
+        What the user gave.
+    low, high : float
+        Limits; infinite for none.
+    ends : {"[]", "(]", "[)", "()"}
+        Square where a limit itself is allowed, round where it is not.
+    hint : str, optional
+        What to do, a sentence at the end of the message.
+
+    Raises
+    ------
+    TypeError
+        If it is no real number.
+    ValueError
+        If it is NaN, infinite, or beyond a limit.
+    """
+    array = np.asarray(value) if np.ndim(value) == 0 else None
+    if array is None or array.dtype.kind not in "iuf":
+        raise TypeError(f"{name} = {_short(value)} must be a number.{_after(hint)}")
+    number = float(array)
+    left = number >= low if ends[0] == "[" else number > low
+    right = number <= high if ends[1] == "]" else number < high
+    if left and right and np.isfinite(number):
+        return number
+    if high < np.inf:
+        kind = "be between {} and {}" if ends == "[]" else f"lie in {ends[0]}{{}}, {{}}{ends[1]}"
+        wanted = kind.format(f"{low:g}", f"{high:g}")
+    else:
+        above = f" {'above' if ends[0] == '(' else 'of at least'} {low:g}" if low > -np.inf else ""
+        wanted = f"be a finite number{above}"
+    raise ValueError(f"{name} = {value!r} must {wanted}.{_after(hint)}")
+
+
+def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
+    """Return ``value`` as an int of at least ``least``, else raise ValueError; bools are none."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(
+            f"{name} = {_short(value)} must be a whole number of at least {least}.{_after(hint)}"
+        )
+    return int(value)
+
+
+def as_flag(name: str, value: Any) -> bool:
+    """Return ``value`` as a bool, else raise TypeError: 0 and 1 are none."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} = {_short(value)} must be True or False.")
+    return bool(value)
+
+
+def as_choice(name: str, value: Any, options: Sequence[str]) -> str:
+    """Return ``value`` if it is one of the options, else raise ValueError."""
+    if not isinstance(value, str) or value not in options:
+        raise ValueError(f"{name} = {_short(value)} must be one of {tuple(options)}.")
+    return value
 
 
 def to_float(name: str, value: Any) -> Array:
@@ -129,6 +230,10 @@ def _short(value: Any) -> str:
     """Return the representation of a value, without the middle of a long one."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:120]} ... {text[-40:]}"
+
+
+def _after(hint: str) -> str:
+    return hint and f" {hint}"
 
 
 class ReadOnlyArrays:
@@ -164,13 +269,6 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
     if np.any(np.isnan(array)):
         raise ValueError(f"{name} holds NaN: {array.tolist()}. Use inf for 'no bound'.")
     return _frozen(array)
-
-
-def _number(name: str, value: float) -> float:
-    array = to_float(name, value)
-    if array.size != 1:
-        raise ValueError(f"{name} = {value!r} must be a single number.")
-    return float(array.reshape(()))
 
 
 def _frozen(array: Array) -> Array:

@@ -31,8 +31,8 @@ BAD_MODELS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"dt": -0.1}, ValueError, "dt = -0.1 must be a finite number above 0"),
     ({"dt": NAN}, ValueError, "dt = nan must be a finite number above 0"),
     ({"dt": INF}, ValueError, "dt = inf must be a finite number above 0"),
-    ({"dt": "soon"}, TypeError, "dt = 'soon' is not an array of real numbers"),
-    ({"dt": [1, 2]}, ValueError, r"dt = \[1, 2\] must be a single number"),
+    ({"dt": "soon"}, TypeError, "dt = 'soon' must be a number"),
+    ({"dt": [1, 2]}, TypeError, r"dt = \[1, 2\] must be a number"),
     ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
     ({"x_ss": [NAN, 0]}, ValueError, "x_ss holds NaN or infinite entries"),
     ({"u_ss": [1, 2]}, ValueError, r"u_ss has shape \(2,\), expected \(1,\)"),
@@ -93,8 +93,8 @@ BAD_PROBLEMS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"gamma": 0}, ValueError, r"gamma = 0 must lie in \(0, 1\]"),
     ({"gamma": 1.5}, ValueError, r"gamma = 1.5 must lie in \(0, 1\]"),
     ({"gamma": NAN}, ValueError, r"gamma = nan must lie in \(0, 1\]"),
-    ({"gamma": "high"}, TypeError, "gamma = 'high' is not an array of real numbers"),
-    ({"gamma": [0.9, 0.9]}, ValueError, r"gamma = \[0.9, 0.9\] must be a single number"),
+    ({"gamma": "high"}, TypeError, "gamma = 'high' must be a number"),
+    ({"gamma": [0.9, 0.9]}, TypeError, r"gamma = \[0.9, 0.9\] must be a number"),
     ({"u_min": 2}, ValueError, "u_min must lie below u_max, but entry 0 has u_min = 2 and u_max ="),
     ({"u_min": 1}, ValueError, "u_min must lie below u_max, but entry 0 has u_min = 1 and u_max ="),
     ({"u_min": [-1, -1]}, ValueError, r"u_min has shape \(2,\), expected \(1,\) or a single"),
@@ -218,7 +218,7 @@ def test_an_unbounded_box_is_a_value_error(changes: dict[str, Any]) -> None:
     [
         (0, ValueError, r"gamma = 0 must lie in \(0, 1\]"),
         (1.5, ValueError, r"gamma = 1.5 must lie in \(0, 1\]"),
-        ("high", TypeError, "gamma = 'high' is not an array of real numbers"),
+        ("high", TypeError, "gamma = 'high' must be a number"),
     ],
 )
 def test_bad_discount_of_the_critic_is_named(
