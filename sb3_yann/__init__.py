@@ -36,8 +36,10 @@ if TYPE_CHECKING:
     from sb3_yann.control import LinearMPC as LinearMPC
     from sb3_yann.control import PiecewiseAffine as PiecewiseAffine
     from sb3_yann.control import identify as identify
+    from sb3_yann.guard import AcceptanceRule as AcceptanceRule
     from sb3_yann.guard import Decision as Decision
     from sb3_yann.guard import ImprovementGuard as ImprovementGuard
+    from sb3_yann.guard import StepSize as StepSize
     from sb3_yann.guard import restore_accepted as restore_accepted
     from sb3_yann.policy import AffineObservation as AffineObservation
     from sb3_yann.policy import NonFiniteWarning as NonFiniteWarning
@@ -62,7 +64,13 @@ _NAMES = {
         "PiecewiseAffine",
         "identify",
     ],
-    "sb3_yann.guard": ["Decision", "ImprovementGuard", "restore_accepted"],
+    "sb3_yann.guard": [
+        "AcceptanceRule",
+        "Decision",
+        "ImprovementGuard",
+        "StepSize",
+        "restore_accepted",
+    ],
     "sb3_yann.policy": [
         "AffineObservation",
         "NonFiniteWarning",

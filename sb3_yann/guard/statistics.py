@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-Array = NDArray[np.float64]
+from sb3_yann._validation import Array
+
 OUTLIER = 1e-3
 """Probability that one episode of a policy like the accepted one is taken for far outside."""
 UNSAFE = (
@@ -19,7 +20,7 @@ UNSAFE = (
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedEpisodes:
     """Episodes from the same starts, under the MPC and under the accepted policy.
 
     Attributes
@@ -109,12 +110,7 @@ def _varies(predicted: Array) -> bool:
     return finite and bool(np.ptp(predicted) > 1e-9 * np.abs(predicted).max())
 
 
-def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
-    """Return the one-sided p-value of "the candidate costs less" against "it does not"."""
-    return compared(candidate, accepted)[1]
-
-
-def compared(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, float]:
+def analyze_covariance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, float]:
     """Return how much more the candidate costs from the same starts, and the one-sided p-value.
 
     Analysis of covariance: ordinary least squares of the cost on the cost predicted by the linear

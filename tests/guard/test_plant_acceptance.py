@@ -28,7 +28,7 @@ from guard_samples import (
     build,
     correct,
     critic_bits,
-    make_guard,
+    guard_alone,
     overwrite,
     random_states,
     randomize,
@@ -40,10 +40,6 @@ from sb3_yann.guard.plant_acceptance import predicted_cost
 BLOCK = 3 * STEPS
 # One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
 plant = partial(Slide, low=2.0, high=2.8)
-
-
-def guard_alone(**kwargs):
-    return make_guard(None, **({"trial_episodes": 3} | kwargs))
 
 
 def still(**kwargs):
@@ -134,7 +130,7 @@ def test_a_violation_brings_the_accepted_policy_back_at_once(where) -> None:
     (decision,) = guard.decisions
     assert decision.timestep == step
     assert decision.reason == "a limit was violated"
-    assert decision.returned
+    assert decision.restored
     assert np.isnan(decision.candidate_cost)
     assert guard.state.evidence.phase == "learning"
 

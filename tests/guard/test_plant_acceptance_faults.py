@@ -19,6 +19,7 @@ from guard_samples import (
     actor_bits,
     build,
     correct,
+    guard_alone,
     make_guard,
     overwrite,
     train,
@@ -28,10 +29,6 @@ from sb3_yann import NoActionNoise, NonFiniteWarning
 
 BLOCK = 3 * STEPS
 plant = partial(Slide, low=2.0, high=2.8)
-
-
-def guard_alone(**kwargs):
-    return make_guard(None, **({"trial_episodes": 3} | kwargs))
 
 
 def still(**kwargs):
@@ -145,7 +142,7 @@ def test_what_an_earlier_guard_accepted_is_what_a_plant_alone_begins_with() -> N
 
 
 def test_an_actor_that_diverges_at_every_step_is_one_decision_in_each_episode(tmp_path) -> None:
-    model, guard = still(), guard_alone(record=tmp_path / "guard.csv")
+    model, guard = still(), guard_alone(log_path=tmp_path / "guard.csv")
     train(model, 4 * STEPS, guard, At(range(1, 99), partial(overwrite, value=np.nan)))
     assert len(guard.decisions) == 4
     assert len((tmp_path / "guard.csv").read_text().splitlines()) == 1 + 4
@@ -179,7 +176,7 @@ def test_one_reward_that_is_not_finite_lets_the_guard_alone_go_on_learning(tmp_p
             return observation, np.nan if self.played == 100 else reward, *rest
 
     model = build(env=Faulty(low=2.0, high=2.8))
-    guard = guard_alone(record=tmp_path / "guard.csv")
+    guard = guard_alone(log_path=tmp_path / "guard.csv")
     with pytest.warns(NonFiniteWarning, match="Step 100"):
         train(model, 450, guard)
     assert all(bool(each.isfinite().all()) for each in model.policy.parameters())

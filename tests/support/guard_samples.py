@@ -13,7 +13,14 @@ import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
+from sb3_yann import (
+    AcceptanceRule,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    YannPolicy,
+)
 
 LEFT, CENTER, RIGHT = range(3)
 STEPS = 4
@@ -88,6 +95,13 @@ def make_guard(env: Any = Slide, **kwargs) -> ImprovementGuard:
     return ImprovementGuard(env, **({"n_starts": 10, "patience": 1} | kwargs))
 
 
+def guard_alone(
+    trial_episodes: int = 3, significance: float = 0.05, **kwargs: Any
+) -> ImprovementGuard:
+    rule = AcceptanceRule(trial_episodes=trial_episodes, significance=significance)
+    return make_guard(None, rule=rule, **kwargs)
+
+
 @th.no_grad()
 def correct(policy: YannPolicy, region: int, value: float) -> None:
     """Make the actor's input in a region (not the center) the MPC's plus a constant."""
@@ -156,7 +170,7 @@ def bits(value: Any) -> Any:
 
 
 def actor_bits(policy: YannPolicy) -> dict[str, Any]:
-    """Return all that a rejection puts back, but the rate, which SB3 sets before every step."""
+    """Return all that is restored, but the rate, which SB3 sets before every step."""
     return {
         "actor": bits(policy.actor.state_dict()),
         "target": bits(policy.actor_target.state_dict()),
