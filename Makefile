@@ -5,16 +5,18 @@ PYTHON ?= python3
 VENV := .venv
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
+PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
+	$(PY) -m pytest -n logical --maxprocesses 4 --dist loadfile
 # python -m, not the scripts in .venv/bin: their first line breaks on a path with spaces.
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
 CODE := sb3_yann envs benchmarks experiments examples tests
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper bench test check format clean
+.PHONY: help demo paper bench test test-fast check format clean
 
 help:  ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: $(STAMP)  ## run the example, examples/cstr.py
 	@$(PY) examples/cstr.py
@@ -26,8 +28,10 @@ bench: $(STAMP)  ## measure the speed, ten minutes (make bench ARGS="--quick" fo
 	@OMP_NUM_THREADS=1 $(PY) -m benchmarks $(ARGS)
 
 test: $(STAMP)  ## run the tests, side by side (make test ARGS="-n 0 -k name" for pytest alone)
-	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
-		$(PY) -m pytest -n logical --maxprocesses 4 --dist loadfile $(ARGS)
+	@$(PYTEST) $(ARGS)
+
+test-fast: $(STAMP)  ## run the tests that are not marked slow, in less than two minutes
+	@$(PYTEST) -m "not slow" $(ARGS)
 
 check: $(STAMP)  ## lint, check the formatting and the types
 	$(PY) -m ruff check $(CODE)

@@ -14,7 +14,16 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
-from sb3_yann import CostAudit, ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
+from sb3_yann import (
+    CostAudit,
+    DisturbanceBounds,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    Tracking,
+    YannPolicy,
+)
 from sb3_yann.evaluation.episodes import evaluate
 from sb3_yann.evaluation.plots import save_trajectories, summary_table
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
@@ -30,8 +39,8 @@ def make_env(mpc: LinearMPC) -> gymnasium.Env:
     levels, pumps = box(0 - x_ss, FULL - x_ss, dtype=float), box(mpc.u_min, mpc.u_max, dtype=float)
     env = TransformObservation(env, lambda level: level - x_ss, levels)
     env = TransformAction(env, lambda u: u + u_ss, pumps)
-    env = SetPoint(env, mpc.r_min, mpc.r_max, hold=HOLD)
-    env = MeasuredDisturbance(env, mpc.d_min, mpc.d_max)
+    env = SetPoint(env, mpc.tracking.r_min, mpc.tracking.r_max, hold=HOLD)
+    env = MeasuredDisturbance(env, mpc.disturbances.d_min, mpc.disturbances.d_max)
     return TimeLimit(StageCost(env, mpc), STEPS)
 
 
@@ -51,7 +60,7 @@ def main() -> None:
     console.print(plant.report())
     # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
     weights = {"Q": np.diag([1, 1, 0, 0]), "R": 0.5 * np.eye(2), "horizon": 2, "gamma": 0.9}
-    wishes = {"tracked": [0, 1], "r_min": -4, "r_max": 4, "d_min": -1, "d_max": 1}
+    wishes = {"tracking": Tracking([0, 1], -4, 4), "disturbances": DisturbanceBounds(-1, 1)}
     limits = {"u_min": 0 - plant.u_ss, "u_max": MAX_VOLTAGE - plant.u_ss}
     limits |= {"theta_min": 0 - plant.x_ss, "theta_max": FULL - plant.x_ss}
     mpc = LinearMPC(plant, **weights, **wishes, **limits)

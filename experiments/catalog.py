@@ -55,12 +55,12 @@ class Plant:
 def true_reactor() -> LinearMPC:
     """Return the reactor's MPC with the model that its equations give, not the printed one."""
     model = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
-    return replace(problems.cstr(), model=model, terminal_cost=None)
+    return replace(problems.cstr(), model=model, terminal=None)
 
 
 def printed_pendulum() -> LinearMPC:
     """Return the pendulum's MPC with the printed weight, Q = I: nine regions instead of seven."""
-    return replace(problems.clipped_pendulum(), Q=np.eye(2), terminal_cost=None)
+    return replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=None)
 
 
 _REACTOR = Plant(

@@ -282,7 +282,7 @@ def _lookahead(values: Array, x: Array) -> Array:
     theta, speed = _wrapped(_pendulum_step(pairs, torch.from_numpy(TORQUES))).numpy().T
     i = (theta / math.pi + 1) / 2 * (angles - 1)
     j = (speed / pendulum.MAX_SPEED + 1) / 2 * (speeds - 1)
-    ahead: Array = map_coordinates(values, [i.T, j.T], order=1, mode="nearest_region")
+    ahead: Array = map_coordinates(values, [i.T, j.T], order=1, mode="nearest")
     now = _wrapped(torch.from_numpy(x)).numpy() ** 2 @ pendulum.Q.diagonal()
     ahead += now[:, None] + PENDULUM.R * TORQUES**2
     return ahead

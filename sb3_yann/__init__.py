@@ -28,13 +28,19 @@ if TYPE_CHECKING:
     from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
     from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
     from sb3_yann.callbacks import NoActionNoise as NoActionNoise
+    from sb3_yann.control import DisturbanceBounds as DisturbanceBounds
     from sb3_yann.control import DisturbanceObserver as DisturbanceObserver
     from sb3_yann.control import ExplicitLimitError as ExplicitLimitError
     from sb3_yann.control import ExplicitSolutionError as ExplicitSolutionError
     from sb3_yann.control import Identified as Identified
     from sb3_yann.control import LinearModel as LinearModel
     from sb3_yann.control import LinearMPC as LinearMPC
+    from sb3_yann.control import OutputBounds as OutputBounds
     from sb3_yann.control import PiecewiseAffine as PiecewiseAffine
+    from sb3_yann.control import RateLimits as RateLimits
+    from sb3_yann.control import SoftBounds as SoftBounds
+    from sb3_yann.control import Terminal as Terminal
+    from sb3_yann.control import Tracking as Tracking
     from sb3_yann.control import identify as identify
     from sb3_yann.guard import AcceptanceRule as AcceptanceRule
     from sb3_yann.guard import Decision as Decision
@@ -55,13 +61,19 @@ _NAMES = {
     "sb3_yann.audit": ["CostAudit", "CostFinding", "CostMismatchError", "CostMismatchWarning"],
     "sb3_yann.callbacks": ["ControlDiagnostics", "NoActionNoise"],
     "sb3_yann.control": [
+        "DisturbanceBounds",
         "DisturbanceObserver",
         "ExplicitLimitError",
         "ExplicitSolutionError",
         "Identified",
         "LinearMPC",
         "LinearModel",
+        "OutputBounds",
         "PiecewiseAffine",
+        "RateLimits",
+        "SoftBounds",
+        "Terminal",
+        "Tracking",
         "identify",
     ],
     "sb3_yann.guard": [

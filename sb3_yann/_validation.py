@@ -16,15 +16,7 @@ class NonFiniteWarning(RuntimeWarning):
 
 
 def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
-    """Return ``value`` as a read-only float64 array of ``shape``; a letter leaves a size free.
-
-    Raises
-    ------
-    TypeError
-        If ``value`` does not convert to real numbers.
-    ValueError
-        If the shape is another one or an entry is NaN or infinite.
-    """
+    """Return ``value`` as a finite, read-only float64 array of ``shape``; a letter is any size."""
     array = to_float(name, value)
     if array.ndim != len(shape) or any(
         isinstance(want, int) and got != want for got, want in zip(array.shape, shape, strict=True)
@@ -42,13 +34,7 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
 
 
 def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
-    """Return ``value`` as a symmetric positive (semi-)definite ``(size, size)`` matrix.
-
-    Raises
-    ------
-    ValueError
-        If it is not symmetric, or an eigenvalue is negative (or zero where ``definite``).
-    """
+    """Return ``value`` as a symmetric positive (semi-)definite ``(size, size)`` matrix."""
     matrix = as_array(name, value, (size, size))
     scale = max(float(np.max(np.abs(matrix))), np.finfo(float).tiny)
     if np.max(np.abs(matrix - matrix.T)) > 1e-9 * scale:
@@ -71,14 +57,9 @@ def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = Fal
 def as_bounds(
     name: str, lower: ArrayLike | None, upper: ArrayLike | None, size: int
 ) -> tuple[Array, Array]:
-    """Return lower and upper bounds of shape ``(size,)``; a scalar is for all entries.
+    """Return bounds of shape ``(size,)``, the lower below the upper.
 
-    ``None`` is no bound.
-
-    Raises
-    ------
-    ValueError
-        If the shape is another one, an entry is NaN, or a lower bound is not below its upper bound.
+    A scalar is for all entries; None and infinity are no bound.
     """
     low = _bound(f"{name}_min", lower, size, -np.inf)
     high = _bound(f"{name}_max", upper, size, np.inf)
@@ -100,36 +81,33 @@ def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -
     return array
 
 
-def as_outputs(name: str, value: ArrayLike | Sequence[int] | None, n_states: int) -> Array:
-    """Return an output matrix ``(q, n)`` from a matrix or from a list of state indices.
+def as_outputs(name: str, value: ArrayLike | Sequence[int], n_states: int) -> Array:
+    """Return an output matrix ``(q, n)`` from a matrix or from a list of indices of states."""
+    rows = as_output_rows(name, value, n_states - 1)
+    return as_array(name, np.eye(n_states)[rows] if rows.ndim == 1 else rows, ("q", n_states))
 
-    Raises
-    ------
-    TypeError, ValueError
-        If it is neither.
-    """
-    if value is None:
-        return as_array(name, np.zeros((0, n_states)), (0, n_states))
+
+def as_output_rows(
+    name: str, value: ArrayLike | Sequence[int], most: float = np.inf
+) -> NDArray[Any]:
+    """Return indices of states ``(q,)``, at most ``most``, or an output matrix ``(q, n)``."""
     entries = to_float(name, value)
     if entries.ndim == 0:
-        raise ValueError(f"{name} = {value!r} must be a list of state indices: [{value}].")
+        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value!r}].")
     if entries.ndim != 1:
-        return as_array(name, value, ("q", n_states))
+        return as_array(name, value, ("q", "n"))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
-    if not whole or np.any(entries < 0) or np.any(entries >= n_states):
+    if not whole or np.any(entries < 0) or np.any(entries > most):
+        limit = f"from 0 to {most}" if np.isfinite(most) else "from 0 on"
         raise ValueError(
-            f"{name} = {value!r} must be indices of states, whole numbers from 0 to "
-            f"{n_states - 1}, or an output matrix as a list of rows, [[...], [...]]."
+            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers "
+            f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
         )
-    return as_array(name, np.eye(n_states)[entries.astype(int)], ("q", n_states))
+    return entries.astype(int)
 
 
 def as_number(name: str, value: Any, hint: str = "") -> float:
-    """Return ``value`` as a finite float.
-
-    Python's and numpy's numbers and 0-d arrays are numbers. Bools, strings, and complex numbers
-    raise TypeError; NaN and infinity raise ValueError. ``hint`` ends the message.
-    """
+    """Return ``value`` as a finite float."""
     return as_between(name, value, -np.inf, np.inf, "()", hint)
 
 
@@ -153,23 +131,16 @@ def as_between(
     name : str
         The argument's name, for the message.
     value : Any
-        What the user gave.
+        A real number, of Python or numpy. Bools and strings are none (TypeError).
     low, high : float
-        Limits; infinite for none.
+        Limits (ValueError beyond), infinite for none.
     ends : {"[]", "(]", "[)", "()"}
-        Square where a limit itself is allowed, round where it is not.
+        Round where the limit itself is refused.
     hint : str, optional
-        What to do, a sentence at the end of the message.
-
-    Raises
-    ------
-    TypeError
-        If it is no real number.
-    ValueError
-        If it is NaN, infinite, or beyond a limit.
+        What to do: a sentence that ends the message.
     """
-    array = np.asarray(value) if np.ndim(value) == 0 else None
-    if array is None or array.dtype.kind not in "iuf":
+    array = np.asarray(value if np.ndim(value) == 0 else None)
+    if array.dtype.kind not in "iuf":
         raise TypeError(f"{name} = {_short(value)} must be a number.{_after(hint)}")
     number = float(array)
     left = number >= low if ends[0] == "[" else number > low
@@ -209,13 +180,7 @@ def as_choice(name: str, value: Any, options: Sequence[str]) -> str:
 
 
 def to_float(name: str, value: Any) -> Array:
-    """Return ``value`` as a new float64 array of any shape.
-
-    Raises
-    ------
-    TypeError
-        If it does not convert to real numbers.
-    """
+    """Return ``value`` as a new float64 array of any shape; raise TypeError if it is none."""
     try:
         if np.iscomplexobj(value):
             raise TypeError("it is complex")
@@ -249,13 +214,12 @@ class ReadOnlyArrays:
 
 def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
     """Tell whether the named attributes of two objects are equal, arrays entry by entry."""
-    return all(_same(getattr(one, name), getattr(other, name)) for name in names)
 
+    def same(a: Any, b: Any) -> bool:
+        pairs = zip(a, b, strict=True) if isinstance(a, tuple) else [(a, b)]
+        return all(np.array_equal(x, y) for x, y in pairs)
 
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, tuple):
-        return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
-    return bool(np.array_equal(one, other))
+    return all(same(getattr(one, name), getattr(other, name)) for name in names)
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:
@@ -275,3 +239,9 @@ def _frozen(array: Array) -> Array:
     array[array == 0] = 0.0  # -0.0 equals 0.0 but has other bytes; equal objects share a hash
     array.setflags(write=False)
     return array
+
+
+def half_widths(lower: Array, upper: Array) -> Array:
+    """Return half the width of each range, and 1 where it is infinite: a unit to measure in."""
+    half = (upper - lower) / 2
+    return np.asarray(np.where(np.isfinite(half), half, 1.0))

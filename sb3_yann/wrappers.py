@@ -352,7 +352,9 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
             return False
         moved = u - self.theta[mpc.layout.previous]
         rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
-        return bool(np.any((moved < mpc.du_min - rounding) | (moved > mpc.du_max + rounding)))
+        return bool(
+            np.any((moved < mpc.rate.du_min - rounding) | (moved > mpc.rate.du_max + rounding))
+        )
 
 
 def _require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:

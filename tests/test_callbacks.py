@@ -8,12 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import Recorder
 from stable_baselines3 import DDPG, PPO, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sample_plants import Recorder
 from sb3_yann import ControlDiagnostics, NoActionNoise, YannPolicy
+from weights import last_layer, unpin
 
 
 class FixedRewards(gym.Wrapper):
@@ -124,8 +125,8 @@ def test_tensorboard_shows_distance_regions_violations_and_critic_error(tmp_path
 def test_the_distance_is_a_fraction_of_the_input_range(tmp_path) -> None:
     model, _ = noisy(tensorboard_log=str(tmp_path))
     with th.no_grad():  # push every output to its upper bound
-        model.actor.mu.network.rest[-1].weight[..., -1] = 100.0
-        model.actor.mu.network.pinned.zero_()
+        last_layer(model)[..., -1] = 100.0
+        unpin(model)
     model.learn(800, callback=[NoActionNoise(), ControlDiagnostics()])
     shown = scalars(tmp_path)
     assert 0.4 < shown["yann/distance_from_mpc_max"][-1] <= 1

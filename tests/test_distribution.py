@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tarfile
 import zipfile
 from email.message import Message
 from email.parser import Parser
@@ -40,6 +41,24 @@ def metadata(wheel: Path, wheel_names: set[str]) -> Message:
     (name,) = (name for name in wheel_names if name.endswith(".dist-info/METADATA"))
     with zipfile.ZipFile(wheel) as archive:
         return Parser().parsestr(archive.read(name).decode())
+
+
+@pytest.fixture(scope="module")
+def sdist_names(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    from hatchling.builders.sdist import SdistBuilder
+
+    target = tmp_path_factory.mktemp("sdist")
+    (path,) = SdistBuilder(str(ROOT)).build(directory=str(target), versions=["standard"])
+    with tarfile.open(path) as archive:
+        return {name.partition("/")[2] for name in archive.getnames()}
+
+
+def test_the_sdist_holds_the_code_of_every_room_and_no_outcome_of_it(sdist_names: set[str]) -> None:
+    rooms = ("sb3_yann", "envs", "benchmarks", "experiments", "examples", "tests")
+    code = {path for room in rooms for path in (ROOT / room).rglob("*.py")}
+    assert {path.relative_to(ROOT).as_posix() for path in code} <= sdist_names
+    outcomes = [name for name in sdist_names if name.startswith(("benchmarks/", "experiments/"))]
+    assert all(name.endswith(".py") for name in outcomes)
 
 
 def test_metadata(metadata: Message) -> None:

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-from conftest import LinearPlant
+import pytest
 
+from sample_plants import LinearPlant
 from sb3_yann import LinearModel, LinearMPC
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     code = "\n".join(re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import LinearPlant, two_input_mpc
 from gymnasium.utils.env_checker import check_env
 
 from general_problems import servo
-from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, NonFiniteWarning
+from sample_plants import LinearPlant, two_input_mpc
+from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, NonFiniteWarning, RateLimits
 from sb3_yann.wrappers import (
     MeasuredDisturbance,
     ObserveDisturbance,
@@ -103,9 +103,8 @@ def test_the_reward_is_minus_the_stage_cost_where_the_action_was_chosen() -> Non
 
 
 def test_an_input_that_moves_faster_than_its_bounds_is_a_violation() -> None:
-    plain = {"tracked": None, "r_min": None, "r_max": None}
-    mpc = servo(du_min=-0.5, du_max=0.7, **plain)
-    env = StageCost(PreviousInput(LinearPlant(servo(**plain))), mpc)
+    mpc = servo(tracking=None, rate=RateLimits(-0.5, 0.7))
+    env = StageCost(PreviousInput(LinearPlant(servo(tracking=None))), mpc)
     env.reset(seed=0)
     reported = [env.step(np.float32([u]))[4].get("violation", False) for u in (0.7, 0.2, 1, -1)]
     assert reported == [False, False, True, True]

@@ -14,12 +14,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from conftest import LinearPlant, feasible_states
 from stable_baselines3 import DDPG, TD3
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sb3_yann
 import sb3_yann_envs
+from sample_plants import LinearPlant, feasible_states
 
 ALGORITHMS = {"ddpg": DDPG, "td3": TD3}
 EPISODE = {"CSTR-v0": 400, "ClippedPendulum-v0": 200}
@@ -128,8 +128,10 @@ class Run:
 
 @pytest.fixture(
     scope="module",
-    params=[("ddpg", "CSTR-v0"), ("td3", "ClippedPendulum-v0")],
-    ids=["ddpg-CSTR", "td3-pendulum"],
+    params=[
+        pytest.param(("ddpg", "CSTR-v0"), id="ddpg-CSTR", marks=pytest.mark.slow),
+        pytest.param(("td3", "ClippedPendulum-v0"), id="td3-pendulum", marks=pytest.mark.slow),
+    ],
 )
 def run(request, tmp_path_factory) -> Run:
     """Return a run of one episode, evaluated at its end."""

@@ -287,30 +287,7 @@ class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ```
 
-    ## Deviations from Braniff & Tian
-
-    The paper's equations and table do not give its printed A and B. The values above do, to the
-    four printed decimals, except for six entries of A.
-
-    - **Sample time.** Printed as 1/60 s. The frequency factors are per hour, and only 1/60 h
-      reproduces A and B.
-    - **Flow terms.** Printed with C_A in the balance of every species and as a difference of flows.
-      Here each species has its own, F (feed - concentration).
-    - **Density and heat capacity.** Printed as 36 mol/L and 430.91 J/(mol K), a product 4.9 times
-      larger than the 3150 J/(L K) that A and B need.
-    - **Heat of reaction 1.** Printed as -45.6 kJ/mol; A needs -45.4.
-    - **Feed temperature.** Not printed. It follows from the heat balance at 475 K and U = 55.
-    - **Entries of A.** The true A[0, 1], A[0, 3], A[1, 3] and A[3, 2] are -0.0047, -0.0003, -0.0003
-      and 0.0002 where the paper prints 0; A[2, 2] is 0.9990, not 0.9909; and A[3, 3] is 1.0029, not
-      1.0030 (a U of 50 at the steady state would round to the printed value). The true steady state
-      is stable; the printed A has the eigenvalue 1.003. `PRINTED_A` keeps the paper's values,
-      because a controller built on them is what the paper improves.
-    - **Weights.** Q is printed as 0.1 times the 2 x 2 identity, for four states; here 4 x 4.
-    - **Chosen here.** U = 55 at the steady state (so that |u| <= 55 never makes U negative), the
-      feed of S, 400 steps, and the starts. The starts are such that the linear MPC on the printed A
-      and B costs about as much as in the paper: 90 on average over 1,000 starts, none of which
-      violates the limit, where the paper has 94 over ten.
-    - **Limit.** Checked at the end of a sample, since the paper does not say when.
+    `docs/environments.md` lists the paper's slips, and what was chosen here.
 
     ## Version History
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping
 from os import PathLike
@@ -15,12 +16,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_flag, as_whole
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.options import AcceptanceRule, StepSize, as_options
 from sb3_yann.guard.plant_acceptance import PlantAcceptance
 from sb3_yann.guard.preconditions import check_not_nested
 from sb3_yann.guard.session import GuardSession, Simulator, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
-from sb3_yann.guard.state import Decision, DecisionLog, GuardState
+from sb3_yann.guard.state import Decision, GuardState, write_csv
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import YannPolicy
 
@@ -28,9 +30,9 @@ from sb3_yann.policy.policies import YannPolicy
 class ImprovementGuard(BaseCallback):
     """Keeps only what is no worse than the MPC; restores the accepted policy otherwise.
 
-    When `learn` returns, the model is the accepted policy. Until then it is a candidate, also after
-    an exception and in the zips of a CheckpointCallback: :func:`restore_accepted` gives it the
-    accepted policy.
+    When `learn` returns, or Ctrl-C ends it, the model is the accepted policy. Until then it is a
+    candidate, also after another exception and in the zips of a CheckpointCallback:
+    :func:`restore_accepted` gives it the accepted policy.
 
     - With a simulator, candidates and the MPC play the same seeded starts. A candidate is refused
       if its mean cost is above the accepted policy's, if one start costs more than with the MPC by
@@ -44,34 +46,27 @@ class ImprovementGuard(BaseCallback):
     - The state travels with the model, as ``model.guard_state``. A guard with the same settings
       goes on from there; with other settings the accepted policy is tried anew.
 
-    Tensorboard shows ``guard/candidate_cost``, ``guard/accepted_cost``, ``guard/mpc_cost``,
-    ``guard/worst_start``, ``guard/step``, ``guard/accepted`` and ``guard/rejected``.
-
     Parameters
     ----------
     env : str, gymnasium.Env, callable or None
-        The simulator: an id, an env of its own (not the training env), or a function that makes
-        one. An id or a function plays all starts side by side. None is for a plant alone.
+        The simulator: an id, a function that makes an env, or an env other than the training env.
+        The first two play all starts side by side. None is for a plant alone.
     n_starts : int, default 100
         Number of seeded starts.
     n_new_starts : int, default 50
-        Number of new starts that confirm a policy before it is accepted, 0 for none. A policy
-        loses by one start, or by a mean cost above the MPC's. Then the ten hardest of these starts
-        join the others for good. The latest earlier policy that passes all of them is restored,
-        else the MPC.
-    n_final_starts : int, optional
-        Number of new starts that confirm the accepted policy when training ends, by default ten
-        times ``n_new_starts``.
+        Number of new starts that confirm a policy before it is accepted, 0 for none. Where it loses
+        some, the ten hardest join the known starts, and an earlier policy or the MPC is restored.
+    n_final_starts : int, default 10 * n_new_starts
+        Number of new starts that confirm the accepted policy when training ends.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
     eval_every : int, default 1
         Training episodes from one candidate to the next.
     patience : int, default 5
-        Refusals in a row until the accepted policy is restored. Until then the candidate goes on
-        and plays: the critic learns from that.
+        Refusals in a row until the accepted policy is restored. Until then the candidate plays on.
     keep_if_worse : bool, default False
-        Whether patience holds for a candidate whose mean cost is above the MPC's as well. After a
-        violation there is no patience in any case.
+        Whether patience holds where the mean cost is above the MPC's. After a violation there is
+        none in any case.
     rule : AcceptanceRule or mapping, optional
         When a candidate counts as no worse.
     step_size : StepSize or mapping, optional
@@ -85,8 +80,7 @@ class ImprovementGuard(BaseCallback):
     ------
     TypeError, ValueError
         If an argument is out of range. When training starts: if the policy is no YannPolicy, the
-        simulator cannot compare policies, the guard is within an EveryNTimesteps or the like, or
-        noise acts on a plant alone.
+        simulator cannot compare policies, or noise acts on a plant alone.
 
     Examples
     --------
@@ -100,6 +94,7 @@ class ImprovementGuard(BaseCallback):
     """
 
     model: OffPolicyAlgorithm
+    _handler: Handler | None = None
 
     def __init__(
         self,
@@ -135,7 +130,7 @@ class ImprovementGuard(BaseCallback):
         as_flag("keep_if_worse", keep_if_worse)
         rule = as_options("rule", rule, AcceptanceRule)
         self.env, self.step_size = env, as_options("step_size", step_size, StepSize)
-        self.log = DecisionLog(None if log_path is None else Path(log_path), verbose)
+        self.log_path = None if log_path is None else Path(log_path)
         self.acceptance: SimulatorAcceptance | PlantAcceptance
         if env is None:
             self.acceptance = PlantAcceptance(rule)
@@ -176,7 +171,9 @@ class ImprovementGuard(BaseCallback):
                 f"{type(policy).__name__}."
             )
         watch_buffer(self.model)
-        self.session = GuardSession(self.model, policy, self.env, self.step_size, self.log)
+        self.session = GuardSession(
+            self.model, policy, self.env, self.step_size, self.log_path, self.verbose
+        )
 
     def _on_training_start(self) -> None:
         check_not_nested(self)
@@ -192,8 +189,10 @@ class ImprovementGuard(BaseCallback):
                 stacklevel=2,
             )
             self._start_afresh(known)
+        self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
         self.session.policy.actor_step = self.state.step
-        self.log.begin(self.decisions)
+        if self.log_path is not None:
+            write_csv(self.log_path, self.decisions)
 
     def _start_afresh(self, known: GuardState | None) -> None:
         """Gather first evidence; where that fails, leave everything as it was."""
@@ -219,5 +218,8 @@ class ImprovementGuard(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
+        self.session.interrupted = False  # the Zoo ends training after Ctrl-C as well
         self.acceptance.end(self.session)
         restore_accepted(self.model)
+        if self._handler is not None:
+            self._handler.remove()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +16,20 @@ from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
 from sb3_yann.guard.statistics import PairedEpisodes
 
+HARDEST = 10
+"""New starts that join those of every later candidate at a time."""
+ROUNDING = 1e-6
+"""Relative difference of mean costs that float32 makes between batches of other sizes."""
+VIOLATES: Final = "violates a limit"
+
 
 @dataclass(frozen=True)
 class Outcome:
     """What came of a policy's episodes, in the order of their seeds.
 
-    Attributes
-    ----------
-    costs : ndarray, shape (episodes,)
-    unsafe : ndarray of int, shape (episodes, 3)
-        Steps with a violation, whether the env terminated the episode, and whether its cost or an
-        observation is not finite.
-    visits : ndarray of bool, shape (episodes, regions)
-        Regions that it comes through: networks of the others have no effect on it.
+    The columns of ``unsafe`` (episodes, 3) are steps with a violation, whether the env terminated
+    the episode, and whether its cost or an observation is not finite. ``visits`` (episodes,
+    regions) tells which regions it comes through: other networks have no effect on it.
     """
 
     costs: Array
@@ -56,13 +57,74 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """The MPC's episodes and the accepted policy's: what a candidate is compared with."""
+class Starts:
+    """Starts, and what came of them under the MPC."""
 
     seeds: tuple[int, ...]
     mpc: Outcome
-    accepted: Outcome
     margin: float
+
+    def at(self, index: Any) -> Starts:
+        """Return some of them."""
+        seeds = tuple(np.array(self.seeds)[index].tolist())
+        return Starts(seeds, self.mpc.at(index), self.margin)
+
+    def joined_with(self, other: Starts) -> Starts:
+        """Return the starts of both."""
+        return Starts((*self.seeds, *other.seeds), self.mpc.extended_by(other.mpc), self.margin)
+
+    def excess(self, outcome: Outcome) -> Array:
+        """Return what each costs more than with the MPC; inf where that cannot be told."""
+        return np.asarray(np.nan_to_num(outcome.costs - self.mpc.costs, nan=np.inf))
+
+    def more_unsafe(self, outcome: Outcome) -> NDArray[np.bool_]:
+        """Return which violate a limit more often than with the MPC, or are terminated."""
+        return np.asarray((outcome.unsafe > self.mpc.unsafe).any(1))
+
+    def lost(self, outcome: Outcome) -> NDArray[np.bool_]:
+        """Return which a policy loses against the MPC."""
+        return (self.excess(outcome) > self.margin) | self.more_unsafe(outcome)
+
+    def mean_is_above(self, outcome: Outcome) -> bool:
+        """Return whether the mean cost is above the MPC's, by more than rounding."""
+        rounding = ROUNDING * np.abs(self.mpc.costs).mean()
+        return not outcome.costs.mean() <= self.mpc.costs.mean() + rounding
+
+    def objection(self, outcome: Outcome) -> str:
+        """Return why a policy is refused on these starts, empty where it is not."""
+        lost, excess = self.lost(outcome), self.excess(outcome)
+        if lost.any():
+            first = self.hardest(outcome)[0]
+            return (
+                f"{lost.sum()} of {len(self.seeds)} new starts lose against the MPC, seed "
+                f"{self.seeds[first]} costs {excess[first]:.4g} more"
+                + (f" and {VIOLATES}" if self.more_unsafe(outcome).any() else "")
+            )
+        if self.mean_is_above(outcome):
+            return (
+                f"mean cost {outcome.costs.mean():.6g} on {len(self.seeds)} new starts, "
+                f"MPC {self.mpc.costs.mean():.6g}"
+            )
+        return ""
+
+    def hardest(self, outcome: Outcome | None) -> NDArray[np.int64]:
+        """Return the places of the hardest of those that cost more than with the MPC.
+
+        The first one where there is no outcome.
+        """
+        if outcome is None:
+            return np.zeros(1, dtype=np.int64)
+        excess, more = self.excess(outcome), self.more_unsafe(outcome)
+        order = np.argsort(np.where(more, -np.inf, -excess), kind="stable")
+        worse = self.lost(outcome)
+        return order[: min(HARDEST, worse.sum() or np.count_nonzero(excess > 0))]
+
+
+@dataclass(frozen=True)
+class Evidence(Starts):
+    """The MPC's episodes and the accepted policy's: what a candidate is compared with."""
+
+    accepted: Outcome
 
     @property
     def paired(self) -> PairedEpisodes:
@@ -75,10 +137,6 @@ class Evidence:
     def visits(self) -> NDArray[np.bool_]:
         """Regions that the accepted policy's episodes come through."""
         return self.accepted.visits
-
-    def with_accepted(self, accepted: Outcome) -> Evidence:
-        """Return the evidence for another accepted policy, from the same starts."""
-        return Evidence(self.seeds, self.mpc, accepted, self.margin)
 
 
 class Unplayable(Exception):
@@ -120,6 +178,8 @@ def play(session: GuardSession, checkpoint: ActorCheckpoint, seeds: Sequence[int
     except Unplayable:
         raise
     except Exception as error:
+        if session.interrupted:  # a simulator has made of it what it can, e.g. in compiled code
+            raise KeyboardInterrupt from error
         play_episodes(session, session.mpc, seeds)
         reason = f"the simulator failed: {type(error).__name__}: {error}"
         raise Unplayable(reason) from error

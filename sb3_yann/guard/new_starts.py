@@ -2,95 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
-from sb3_yann.guard.episodes import Evidence, Outcome, Unplayable, play
+from sb3_yann.guard.episodes import Evidence, Outcome, Starts, Unplayable, play
 from sb3_yann.guard.region_mixing import accept_parts
 from sb3_yann.guard.session import GuardSession
 
-HARDEST = 10
-"""New starts that join those of every later candidate at a time."""
 ROUNDS = 3
 """How often the parts of what lost on new starts are played from others."""
-ROUNDING = 1e-6
-"""Relative difference of mean costs that float32 makes between batches of other sizes."""
 MEMORY, MOST_KEPT = 10_000_000, 20
 """Bytes and number of earlier accepted checkpoints that are kept."""
-VIOLATES: Final = "violates a limit"
-
-
-@dataclass(frozen=True)
-class Starts:
-    """Starts, and what came of them under the MPC."""
-
-    seeds: tuple[int, ...]
-    mpc: Outcome
-    margin: float
-
-    def at(self, index: Any) -> Starts:
-        """Return some of them."""
-        seeds = tuple(np.array(self.seeds)[index].tolist())
-        return Starts(seeds, self.mpc.at(index), self.margin)
-
-    @classmethod
-    def known(cls, evidence: Evidence) -> Starts:
-        """Return the known starts in the same form."""
-        return cls(evidence.seeds, evidence.mpc, evidence.margin)
-
-    def joined_with(self, other: Starts) -> Starts:
-        """Return the starts of both."""
-        return Starts((*self.seeds, *other.seeds), self.mpc.extended_by(other.mpc), self.margin)
-
-    def excess(self, outcome: Outcome) -> NDArray[np.float64]:
-        """Return what each costs more than with the MPC; inf where that cannot be told."""
-        return np.asarray(np.nan_to_num(outcome.costs - self.mpc.costs, nan=np.inf))
-
-    def more_unsafe(self, outcome: Outcome) -> NDArray[np.bool_]:
-        """Return which violate a limit more often than with the MPC, or are terminated."""
-        return np.asarray((outcome.unsafe > self.mpc.unsafe).any(1))
-
-    def lost(self, outcome: Outcome) -> NDArray[np.bool_]:
-        """Return which a policy loses against the MPC."""
-        return (self.excess(outcome) > self.margin) | self.more_unsafe(outcome)
-
-    def mean_is_above(self, outcome: Outcome) -> bool:
-        """Return whether the mean cost is above the MPC's, by more than rounding."""
-        rounding = ROUNDING * np.abs(self.mpc.costs).mean()
-        return not outcome.costs.mean() <= self.mpc.costs.mean() + rounding
-
-    def objection(self, outcome: Outcome) -> str:
-        """Return why a policy is refused on these starts, empty where it is not."""
-        lost, excess = self.lost(outcome), self.excess(outcome)
-        if lost.any():
-            first = self.hardest(outcome)[0]
-            return (
-                f"{lost.sum()} of {len(self.seeds)} new starts lose against the MPC, seed "
-                f"{self.seeds[first]} costs {excess[first]:.4g} more"
-                + (f" and {VIOLATES}" if self.more_unsafe(outcome).any() else "")
-            )
-        if self.mean_is_above(outcome):
-            return (
-                f"mean cost {outcome.costs.mean():.6g} on {len(self.seeds)} new starts, "
-                f"MPC {self.mpc.costs.mean():.6g}"
-            )
-        return ""
-
-    def hardest(self, outcome: Outcome | None) -> NDArray[np.int64]:
-        """Return the places of the hardest of those that cost more than with the MPC.
-
-        The first one where there is no outcome.
-        """
-        if outcome is None:
-            return np.zeros(1, dtype=np.int64)
-        excess, more = self.excess(outcome), self.more_unsafe(outcome)
-        order = np.argsort(np.where(more, -np.inf, -excess), kind="stable")
-        worse = self.lost(outcome)
-        return order[: min(HARDEST, worse.sum() or np.count_nonzero(excess > 0))]
 
 
 def confirm_on_new_starts(session: GuardSession, n_starts: int, by_region: bool) -> str:
@@ -108,7 +31,12 @@ def confirm_on_new_starts(session: GuardSession, n_starts: int, by_region: bool)
         if n_starts == 0 or not session.has_learned(lost):
             return first
         new = _new_starts(session, n_starts)
-        outcome, reason = _confirm(session, lost, new)
+        outcome: Outcome | None = None
+        try:
+            outcome = play(session, lost, new.seeds)
+            reason = new.objection(outcome)
+        except Unplayable as error:
+            reason = f"on new starts, {error}"
         if not reason:
             keep_passed(session, lost, evidence.accepted)
             return first
@@ -160,28 +88,17 @@ def _new_starts(session: GuardSession, n_starts: int) -> Starts:
     return new
 
 
-def _confirm(
-    session: GuardSession, checkpoint: ActorCheckpoint, new: Starts
-) -> tuple[Outcome | None, str]:
-    """Return what comes of a checkpoint on new starts, and why it is refused, if it is."""
-    try:
-        outcome = play(session, checkpoint, new.seeds)
-    except Unplayable as error:
-        return None, f"on new starts, {error}"
-    return outcome, new.objection(outcome)
-
-
 def _accept_earlier(session: GuardSession, new: Starts, hard: NDArray[np.int64]) -> None:
     """Accept the latest earlier checkpoint that loses on no new start, else the MPC."""
-    state, evidence = session.state, session.state.evidence
-    known = Starts.known(evidence).joined_with(new.at(hard))
+    state = session.state
+    known = state.evidence.joined_with(new.at(hard))
     for checkpoint, outcome in reversed(state.passed):
         everywhere = _passes(session, checkpoint, outcome, new, hard)
         if everywhere is not None:
-            state.accept(checkpoint, Evidence(known.seeds, known.mpc, everywhere, known.margin))
+            state.accept(checkpoint, Evidence(known.seeds, known.mpc, known.margin, everywhere))
             keep_passed(session, checkpoint, everywhere)
             return
-    state.accept(session.mpc, Evidence(known.seeds, known.mpc, known.mpc, known.margin))
+    state.accept(session.mpc, Evidence(known.seeds, known.mpc, known.margin, known.mpc))
 
 
 def _passes(
@@ -196,7 +113,7 @@ def _passes(
     The hard ones come first: they are few, and most checkpoints lose some. Then come the other new
     ones, and those known ones that its ``outcome`` lacks.
     """
-    known = Starts.known(session.state.evidence)
+    known: Evidence = session.state.evidence
     others = np.setdiff1d(np.arange(len(new.seeds)), hard)
     on_hard = _play_unless_lost(session, checkpoint, new.at(hard))
     if on_hard is None:

@@ -64,8 +64,8 @@ class StepSize:
     Examples
     --------
     >>> from sb3_yann import StepSize
-    >>> StepSize(shrink=0.3).after_restore(1.0), StepSize().after_acceptance(0.5)
-    (0.3, 0.75)
+    >>> StepSize(shrink=0.3).grow
+    1.5
     """
 
     shrink: float = 0.5
@@ -76,14 +76,6 @@ class StepSize:
         as_between("shrink", self.shrink, 0, 1)
         as_between("grow", self.grow, 1, np.inf)
         as_between("smallest", self.smallest, 0, 1)
-
-    def after_acceptance(self, step: float) -> float:
-        """Return the next step size after an acceptance."""
-        return min(1.0, step * self.grow)
-
-    def after_restore(self, step: float) -> float:
-        """Return the next step size after the accepted policy has been restored."""
-        return max(min(self.smallest, step), step * self.shrink)
 
 
 def as_options(name: str, value: Any, kind: type[Options]) -> Options:

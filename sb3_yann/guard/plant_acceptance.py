@@ -26,17 +26,8 @@ Phase = Literal["first", "learning", "trial"]
 class BlockEvidence:
     """Episodes of the MPC, of the accepted policy, and of the block that is being played.
 
-    Attributes
-    ----------
-    phase : str
-        In the "first" and in "trial" blocks the actor rests, in "learning" blocks it learns.
-    mpc, accepted : PlantEpisodes or None
-    costs, predicted : list of float
-        Of the block's episodes so far.
-    resting : ActorCheckpoint or None
-        The policy that plays a block in which the actor rests.
-    terminates : bool
-        Whether the env itself has ended an episode of an accepted policy.
+    In a "learning" block the actor learns, else it is at rest: it stays the ``resting`` checkpoint.
+    ``terminates`` tells whether the env itself has ended an episode of an accepted policy.
     """
 
     phase: Phase = "first"

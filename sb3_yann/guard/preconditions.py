@@ -81,15 +81,9 @@ def _event_above(
 
 
 def first_episodes(session: GuardSession, name: str, seeds: Sequence[int]) -> Outcome:
-    """Return what comes of the MPC, if the simulator can compare policies.
+    """Return what comes of the MPC; raise ValueError if the simulator cannot compare policies.
 
-    The actor plays it, not the law in float64: the MPC must be no worse than itself to the last
-    bit.
-
-    Raises
-    ------
-    ValueError
-        If a second episode from the same seed costs something else, or a cost is not finite.
+    The actor plays, not the law in float64: the MPC must be no worse than itself to the last bit.
     """
     mpc = play_episodes(session, session.mpc, seeds)
     for seed, cost in zip(seeds, mpc.costs, strict=True):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +23,7 @@ def accept_visited(session: GuardSession, candidate: ActorCheckpoint, outcome: O
     state, visited = session.state, outcome.visits.any(0)
     if np.any(state.accepted.changed_regions(candidate) & ~visited):
         candidate = state.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
-    state.accept(candidate, state.evidence.with_accepted(outcome))
+    state.accept(candidate, replace(state.evidence, accepted=outcome))
 
 
 def accept_parts(
@@ -94,7 +96,7 @@ def _accept_one_by_one(
         except Unplayable:
             continue
         if _improves(evidence, trial):
-            state.accept(mixed, evidence.with_accepted(trial))
+            state.accept(mixed, replace(evidence, accepted=trial))
 
 
 def _improves(evidence: Evidence, outcome: Outcome) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import gymnasium as gym
@@ -15,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.options import StepSize
 from sb3_yann.guard.rng import preserve_rng
-from sb3_yann.guard.state import Decision, DecisionLog, GuardState
+from sb3_yann.guard.state import Decision, GuardState, log_last
 from sb3_yann.policy.policies import YannPolicy
 
 Simulator: TypeAlias = str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
@@ -25,23 +26,20 @@ Simulator: TypeAlias = str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
 class GuardSession:
     """One model under guard, during one `learn`.
 
-    Attributes
-    ----------
-    model : OffPolicyAlgorithm
-        Holds the state as ``model.guard_state``, which is saved and loaded with it.
-    policy : YannPolicy
-        The model's. It is the candidate, until a checkpoint is restored to it.
-    simulator : str, gymnasium.Env, callable or None
-        Where checkpoints are played; None on a plant alone.
-    step_size : StepSize
-    log : DecisionLog
+    The policy is the candidate, until a checkpoint is restored to it. ``simulator`` is None on a
+    plant alone.
     """
 
     model: OffPolicyAlgorithm
     policy: YannPolicy
     simulator: Simulator | None
     step_size: StepSize
-    log: DecisionLog
+    log_path: Path | None
+    verbose: int
+    interrupted: bool = False
+    """Whether Ctrl-C has restored the accepted policy, so that nothing else may be restored."""
+    before_trial: tuple[ActorCheckpoint, Any, list[Any]] | None = None
+    """What was accepted before the trial that is under way, with its evidence and ``passed``."""
 
     def __post_init__(self) -> None:
         if self.policy.actor.mu.network.is_zero():
@@ -71,7 +69,8 @@ class GuardSession:
             self.policy.actor.load_state_dict(checkpoint.actor)
             yield self.policy
         finally:
-            self.policy.actor.load_state_dict(own)
+            if not self.interrupted:
+                self.policy.actor.load_state_dict(own)
 
     @contextmanager
     def all_or_nothing(self) -> Iterator[None]:
@@ -80,12 +79,21 @@ class GuardSession:
         A policy on trial stands in the place of the accepted one until its trial is over.
         """
         state = self.state
-        before = state.accepted, state.evidence, [*state.passed]
+        before = self.before_trial = state.accepted, state.evidence, [*state.passed]
         try:
             yield
         except BaseException:
             state.accepted, state.evidence, state.passed = before
             raise
+        finally:
+            self.before_trial = None
+
+    def leave_accepted(self) -> None:
+        """Restore the accepted policy where Ctrl-C is about to end `learn`, also in a trial."""
+        if self.before_trial is not None:
+            self.state.accepted, self.state.evidence, self.state.passed = self.before_trial
+        self.interrupted = True
+        restore_accepted(self.model)
 
     def has_learned(self, checkpoint: ActorCheckpoint) -> bool:
         """Return whether the networks of a checkpoint correct the MPC anywhere."""
@@ -104,19 +112,19 @@ class GuardSession:
         """Set the step size, and log a decision."""
         step = self.state.step
         if decision.verdict == "accepted":
-            step = self.step_size.after_acceptance(step)
+            step = min(1.0, step * self.step_size.grow)
         elif decision.verdict == "rejected" and decision.restored:
-            step = self.step_size.after_restore(step)
+            step = max(min(self.step_size.smallest, step), step * self.step_size.shrink)
         self.state.step = self.policy.actor_step = step
         self.state.decisions.append(replace(decision, step=step))
-        self.log.add_last(self.state.decisions, self.model)
+        log_last(self.state.decisions, self.model, self.log_path, self.verbose)
 
 
 def restore_accepted(model: BaseAlgorithm) -> None:
     """Give the model the policy that a guard accepted last, bit for bit.
 
-    `learn` does so at its end. Call it after an exception, and for a model that was saved during
-    training.
+    `learn` does so at its end and after Ctrl-C. Call it after another exception, and for a model
+    that was saved during training.
 
     Raises
     ------
@@ -135,7 +143,8 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     state, policy = getattr(model, "guard_state", None), model.policy
     if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
         raise ValueError(
-            f"No ImprovementGuard has been at work on this {type(model).__name__}. Pass one to learn."
+            f"No ImprovementGuard has been at work on this {type(model).__name__}: pass one to "
+            "learn."
         )
     state.accepted.restore(policy)
     policy.actor_step = 1.0

@@ -11,6 +11,7 @@ import numpy as np
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.episodes import (
+    VIOLATES,
     Evidence,
     Outcome,
     Unplayable,
@@ -18,7 +19,7 @@ from sb3_yann.guard.episodes import (
     outcome_of,
     play_episodes,
 )
-from sb3_yann.guard.new_starts import VIOLATES, confirm_on_new_starts, keep_passed
+from sb3_yann.guard.new_starts import confirm_on_new_starts, keep_passed
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.preconditions import check_simulator, first_episodes
 from sb3_yann.guard.region_mixing import accept_parts, accept_visited, accepted_regions
@@ -91,7 +92,7 @@ class SimulatorAcceptance:
             seeds = (*seeds, *sorted(hard - {*seeds}))
         mpc = first_episodes(session, self.name, seeds)
         margin = self.rule.margin * float(np.median(np.abs(mpc.costs[: len(self.seeds)])))
-        state.accept(session.mpc, Evidence(seeds, mpc, mpc, margin))
+        state.accept(session.mpc, Evidence(seeds, mpc, margin, mpc))
         leading = session.mpc
         for candidate in candidates:
             if not candidate.has_networks_of(leading):

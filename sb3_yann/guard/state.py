@@ -28,12 +28,11 @@ class Decision:
     reason : str
         Why not all of it was accepted.
     restored : bool
-        Whether the actor was restored to the accepted checkpoint.
+        Whether the accepted checkpoint was restored.
     candidate_cost, accepted_cost, mpc_cost : float
-        Mean cost of an episode of the candidate, of the policy that is accepted now, and of the
-        MPC. The mean is over all starts known at that time; new starts that were lost join them.
+        Mean cost of the candidate, the policy accepted now and the MPC, over the known starts.
     worst_start : float
-        Largest excess over the MPC that the accepted policy has on one start, nan if not known.
+        Largest excess of the accepted policy over the MPC on one start, nan if not known.
     regions : tuple of int
         Regions whose networks were accepted, where it was a part.
     step : float
@@ -66,23 +65,9 @@ NAMES = [each.name for each in fields(Decision)]
 class GuardState:
     """All that a stopped run needs to go on; it travels in the model's zip.
 
-    Attributes
-    ----------
-    settings : dict
-        What the evidence depends on.
-    accepted : ActorCheckpoint
-    evidence : object
-        The episodes that a candidate is compared with.
-    step : float
-        Factor of the actor's learning rate.
-    episodes, rejections : int
-        Training episodes so far, and rejections in a row.
-    new_starts, next_start : int
-        How many new starts were played, and the seed of the next.
-    passed : list of tuple
-        Earlier accepted checkpoints that can be restored, the latest last. Each has its outcome on
-        the first of the known starts.
-    decisions : list of Decision
+    ``evidence`` is what a candidate is compared with. ``passed`` are earlier accepted checkpoints,
+    the latest last, with their outcomes on the first of the known starts. ``new_starts`` counts the
+    new starts that were played, ``next_start`` is the seed of the next.
     """
 
     settings: dict[str, Any]
@@ -101,35 +86,25 @@ class GuardState:
         self.accepted, self.evidence = checkpoint, evidence
 
 
-@dataclass(frozen=True)
-class DecisionLog:
-    """Writes decisions to a CSV file, to the model's logger and to the screen."""
-
-    path: Path | None = None
-    verbose: int = 0
-
-    def begin(self, decisions: list[Decision]) -> None:
-        """Write a file of the decisions of earlier runs."""
-        if self.path is not None:
-            write_csv(self.path, decisions)
-
-    def add_last(self, decisions: list[Decision], model: BaseAlgorithm) -> None:
-        """Write the last decision."""
-        last = decisions[-1]
-        for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
-            model.logger.record(f"guard/{name}", getattr(last, name))
-        rejected = sum(each.verdict == "rejected" for each in decisions)
-        model.logger.record("guard/rejected", rejected)
-        model.logger.record("guard/accepted", len(decisions) - rejected)
-        if self.path is not None:
-            append_csv(self.path, decisions)
-        model.logger.dump(model.num_timesteps)  # as EvalCallback; the next would replace it
-        if self.verbose:
-            print(
-                f"Episode {last.episode}: {last.verdict}"
-                + (f" ({last.reason})" if last.reason else "")
-                + f"; mean cost {last.accepted_cost:.6g}, MPC {last.mpc_cost:.6g}"
-            )
+def log_last(
+    decisions: list[Decision], model: BaseAlgorithm, path: Path | None, verbose: int
+) -> None:
+    """Write the last decision to the CSV file, to the model's logger and to the screen."""
+    last = decisions[-1]
+    for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
+        model.logger.record(f"guard/{name}", getattr(last, name))
+    rejected = sum(each.verdict == "rejected" for each in decisions)
+    model.logger.record("guard/rejected", rejected)
+    model.logger.record("guard/accepted", len(decisions) - rejected)
+    if path is not None:
+        append_csv(path, decisions)
+    model.logger.dump(model.num_timesteps)  # as EvalCallback does, or the next would replace it
+    if verbose:
+        print(
+            f"Episode {last.episode}: {last.verdict}"
+            + (f" ({last.reason})" if last.reason else "")
+            + f"; mean cost {last.accepted_cost:.6g}, MPC {last.mpc_cost:.6g}"
+        )
 
 
 def write_csv(path: Path, decisions: list[Decision]) -> None:

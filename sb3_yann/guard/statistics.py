@@ -23,16 +23,9 @@ UNSAFE = (
 class PairedEpisodes:
     """Episodes from the same starts, under the MPC and under the accepted policy.
 
-    Attributes
-    ----------
-    mpc_costs, costs : ndarray, shape (starts,)
-        Of the MPC and of the accepted policy.
-    unsafe : ndarray of int, shape (starts, up to 3)
-        Of the accepted policy: steps with a violation, whether the env terminated the episode, and
-        whether its cost or an observation is no finite number.
-        They are compared one by one: an episode that is cut short has fewer steps to violate in.
-    margin : float
-        By how much one start may cost more than with the MPC, in units of the cost.
+    ``costs`` and ``unsafe`` are the accepted policy's. The columns of ``unsafe`` (starts, up to 3),
+    named in ``UNSAFE``, are compared one by one: an episode that is cut short has fewer steps to
+    violate in. ``margin`` is what one start may cost more than with the MPC.
     """
 
     mpc_costs: Array
@@ -70,12 +63,8 @@ class PairedEpisodes:
 class PlantEpisodes:
     """Training episodes played by one and the same policy on the plant.
 
-    Attributes
-    ----------
-    costs : ndarray, shape (episodes,)
-    predicted : ndarray, shape (episodes,)
-        What the MPC would cost from the same start on its own linear model: it explains most of
-        the difference between starts, which is not to be taken for one between policies.
+    ``predicted`` is what the MPC would cost from the same start on its own linear model. It
+    explains most of the difference between starts.
     """
 
     costs: Array
@@ -85,10 +74,9 @@ class PlantEpisodes:
 def excess_of_an_outlier(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
     """Return by how much one of the candidate's episodes costs more than the accepted policy's.
 
-    0 where none is far outside: beyond the upper prediction limit, of size ``OUTLIER`` for all of
-    them together, of the least-squares line of the accepted policy's costs on the predicted ones
-    (e.g. Montgomery, chapter 10). The mean would not show it: a heavy loss raises the
-    scatter as well.
+    0 where none is beyond the upper prediction limit, of size ``OUTLIER`` for all of them together,
+    of the least-squares line of the accepted policy's costs on the predicted ones (e.g. Montgomery,
+    chapter 10). The mean would not show it: a heavy loss raises the scatter as well.
     """
     covariate = _varies(accepted.predicted) and bool(np.all(np.isfinite(candidate.predicted)))
     X, new = (
@@ -113,11 +101,10 @@ def _varies(predicted: Array) -> bool:
 def analyze_covariance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, float]:
     """Return how much more the candidate costs from the same starts, and the one-sided p-value.
 
-    Analysis of covariance: ordinary least squares of the cost on the cost predicted by the linear
-    model and on which policy played; Student's t test of the policy's coefficient. It assumes
-    independent episodes with normal residuals of one variance and one slope for both policies
-    (e.g. Montgomery, *Design and Analysis of Experiments*, chapter 15). Where nothing can be told
-    the difference is nan and p is 1.
+    Ordinary least squares of the cost on the cost that the linear model predicts and on which
+    policy played; Student's t test of the policy's coefficient. It assumes independent episodes
+    with normal residuals of one variance, and one slope for both policies (e.g. Montgomery, *Design
+    and Analysis of Experiments*, chapter 15). Where nothing can be told: nan and p = 1.
     """
     costs = np.concatenate([candidate.costs, accepted.costs])
     if not np.all(np.isfinite(costs)):

@@ -70,7 +70,7 @@ def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> 
         return np.inf
     back = np.linalg.pinv(T)
     middle = (problem.theta_max + problem.theta_min) / 2 - observation.t0
-    reach = np.abs(back) @ ((problem.theta_max - problem.theta_min) / 2)
+    reach = np.abs(back) @ problem.theta_half
     return float(np.max(np.abs(back @ middle) + reach))
 
 

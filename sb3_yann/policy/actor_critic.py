@@ -72,7 +72,7 @@ class YannActor(SeesTheta, Actor):
             activation_fn(),
             max_correction=max_correction,
             pinned=pin_equilibrium,
-            rate=(problem.du_min, problem.du_max) if problem.has_rate_bounds else None,
+            rate=(problem.rate.du_min, problem.rate.du_max) if problem.has_rate_bounds else None,
         )
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
@@ -159,7 +159,7 @@ class YannCritic(SeesTheta, ContinuousCritic):
             share_features_extractor,
         )
         common: dict[str, Any] = {
-            "theta_half": (problem.theta_max - problem.theta_min) / 2,
+            "theta_half": problem.theta_half,
             "u_min": problem.u_min,
             "u_max": problem.u_max,
             "hidden": tuple(net_arch),
@@ -220,9 +220,9 @@ class YannCritic(SeesTheta, ContinuousCritic):
             points = th.cat([theta, actions], dim=1)
             return self._in_rewards(q_network.compiled_with_fixed_weights(points))
         trained = [each for each in q_network.parameters() if each.requires_grad]
-        for parameter in trained:
-            parameter.requires_grad_(False)
         try:
+            for parameter in trained:
+                parameter.requires_grad_(False)
             return self._in_rewards(super().q1_forward(obs, actions))
         finally:
             for parameter in trained:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from benchmarks import exactness, gpu, peers
 from benchmarks.criteria import criteria
@@ -32,6 +33,7 @@ def run(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_quick_form_runs_to_its_report(tmp_path) -> None:
     run(tmp_path, "benchmarks", "--quick")
     folder = tmp_path / "out" / "bench-quick"
@@ -49,7 +51,7 @@ def test_the_devices_are_compared_where_there_are_no_learners_and_no_solvers(tmp
     code = (
         f"{block}; import importlib.util as u; find = u.find_spec\n"
         f"u.find_spec = lambda name, *a: None if name in {absent!r} else find(name, *a)\n"
-        "from bench import gpu; gpu.BATCHES = (1, 8); sys.exit(gpu.main(['law.npz']))"
+        "from benchmarks import gpu; gpu.BATCHES = (1, 8); sys.exit(gpu.main(['law.npz']))"
     )
     (tmp_path / "alone.py").write_text(code)
     assert "7 regions" in run(tmp_path, "alone")

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -23,6 +25,7 @@ def paper(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_quick_form_runs_to_its_report_and_does_nothing_twice(tmp_path) -> None:
     assert "9 of 9 runs" in paper(tmp_path)
     folder = tmp_path / "out" / "paper-quick"

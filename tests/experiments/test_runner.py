@@ -55,6 +55,7 @@ def test_what_is_saved_is_not_done_again(tmp_path) -> None:
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.mark.slow
 def test_a_failing_run_is_reported_and_the_others_are_kept(tmp_path, capfd) -> None:
     def fails(run: Run) -> Outcome:
         if run.seed == 1:
@@ -116,6 +117,7 @@ run_all(RUNS, slow, sys.argv[1], jobs=1, progress=False)
 """
 
 
+@pytest.mark.slow
 def test_a_killed_parent_loses_only_the_runs_in_flight(tmp_path) -> None:
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     parent = subprocess.Popen(
@@ -187,6 +189,7 @@ def test_an_outcome_must_fit_together(change, message) -> None:
         Outcome(**{**vars(good), **change})
 
 
+@pytest.mark.slow
 def test_dask_gives_the_same(tmp_path) -> None:
     def traced(run: Run) -> Outcome:  # local, therefore sent by value as ours are
         if run.seed == 1:
@@ -213,6 +216,7 @@ def test_dask_gives_the_same(tmp_path) -> None:
     assert all(run_all([run], forbidden, tmp_path / "dask") for run in remote.value.outcomes)
 
 
+@pytest.mark.slow
 def test_dask_workers_with_several_threads_are_refused(tmp_path) -> None:
     with LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0"

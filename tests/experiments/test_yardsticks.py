@@ -7,7 +7,6 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import Recorder
 from stable_baselines3.common.callbacks import BaseCallback
 
 from experiments import yardsticks
@@ -21,6 +20,7 @@ from experiments.yardsticks import (
     sb3_ddpg,
     sb3_td3,
 )
+from sample_plants import Recorder
 from sb3_yann.control import lqr as formulas
 from sb3_yann.evaluation.episodes import evaluate
 from sb3_yann_envs import problems
@@ -54,6 +54,7 @@ def quick_cloning(monkeypatch) -> None:
     monkeypatch.setattr(yardsticks, "CLONING_SEEDS", range(500, 502))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BUILDERS)
 @pytest.mark.parametrize("env_id", ENVS)
 def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_cloning) -> None:
@@ -77,6 +78,7 @@ def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_
     np.testing.assert_allclose(one, after[0], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ddpg", "residual", "cloned"])
 def test_equal_seeds_give_equal_results(name, quick_cloning) -> None:
     def trained(seed: int) -> np.ndarray:
@@ -134,6 +136,7 @@ def test_the_residual_reaches_every_input_from_any_other() -> None:
     assert residual(state, np.array([-4.0])) == -2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["quiet residual", "cloned"])
 def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
     env = gym.make("ClippedPendulum-v0")
@@ -149,6 +152,7 @@ def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
     assert np.any(learner.policy.predict(states)[0] != before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ENVS)
 def test_a_cloned_actor_is_close_to_the_mpc_from_other_starts(env_id) -> None:
     env = recorder(env_id)
@@ -196,6 +200,7 @@ def test_lqr_is_linear_inside_and_clipped_outside(problem) -> None:
     np.testing.assert_array_equal(law(states[0]), actions[0])
 
 
+@pytest.mark.slow
 def test_the_best_is_kept_of_what_ddpg_was_after_any_episode() -> None:
     starts = range(700, 703)
     learner = best_of_ddpg(lambda: gym.make("ClippedPendulum-v0"), 0, starts)

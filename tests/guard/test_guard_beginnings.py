@@ -10,6 +10,7 @@ import pytest
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
 
 from guard_samples import (
+    FIRST,
     REGION,
     RIGHT,
     STEPS,
@@ -24,8 +25,7 @@ from guard_samples import (
     train,
     verdicts,
 )
-
-FIRST = 1_000_000
+from weights import last_layer
 
 
 def test_a_fault_while_the_first_episodes_are_played_leaves_the_next_learn_a_clean_start() -> None:
@@ -168,7 +168,7 @@ def test_with_other_settings_the_accepted_policy_the_hard_starts_and_the_count_a
     seen.clear()
     train(model, STEPS, second := make_guard(LostLater, n_new_starts=10, n_starts=4))
     assert set(second.state.evidence.seeds) >= hard | set(range(FIRST, FIRST + 4))
-    right = model.policy.actor.mu.network.rest[-1].weight[REGION[RIGHT], 0, -1]
+    right = last_layer(model)[REGION[RIGHT], 0, -1]
     assert float(right.detach()) == pytest.approx(0.3)
     new = {seed for seed in seen if seed is not None} - set(second.state.evidence.seeds)
     assert new

@@ -9,6 +9,7 @@ import pytest
 from stable_baselines3 import DDPG
 
 from guard_samples import (
+    FIRST,
     LAW,
     LEFT,
     REGION,
@@ -27,13 +28,11 @@ from guard_samples import (
 )
 from sb3_yann import restore_accepted
 from sb3_yann.evaluation.episodes import evaluate
-
-FIRST = 1_000_000
-"""The first of the guard's own seeds."""
+from weights import is_mpc, last_layer
 
 
 def weights(model) -> np.ndarray:
-    return model.policy.actor.mu.network.rest[-1].weight[:, 0, -1].detach().numpy().copy()
+    return last_layer(model)[:, 0, -1].detach().numpy().copy()
 
 
 class LateLosses(Slide):
@@ -87,7 +86,7 @@ def test_a_policy_whose_mean_cost_on_new_starts_is_above_the_mpc_s_is_refused() 
     model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=50, patience=5)
     train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     assert "mean cost 4.0375 on 50 new starts, MPC 4" in guard.decisions[0].reason
-    assert model.policy.actor.mu.network.is_zero()
+    assert is_mpc(model)
     assert guard.state.evidence.margin > 0.0375  # no single start would have been refused
 
 
@@ -145,7 +144,7 @@ def test_a_trial_that_is_cut_off_accepts_nothing_and_leaves_the_candidate(error,
     passed_once = at > FIRST + 15
     assert len(guard.decisions) == len(guard.state.passed) == passed_once
     restore_accepted(model)
-    assert model.policy.actor.mu.network.is_zero() != passed_once
+    assert is_mpc(model) != passed_once
     assert actor_bits(model.policy) == accepted_bits(guard)
 
 
@@ -163,7 +162,7 @@ def test_termination_is_refused_where_the_accepted_policy_violates_a_limit() -> 
     model, guard = build(gradient_steps=0), make_guard(partial(Tripping, low=2.0), n_new_starts=5)
     train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     assert "an episode that the env terminates" in guard.decisions[0].reason
-    assert model.policy.actor.mu.network.is_zero()
+    assert is_mpc(model)
 
 
 @pytest.mark.parametrize("alone", [True, False], ids=["alone", "beside an improvement"])
@@ -206,7 +205,7 @@ def test_an_error_of_the_simulator_under_a_candidate_alone_is_a_refusal() -> Non
     (decision,) = guard.decisions
     assert decision.reason == "the simulator failed: FloatingPointError: integrator failed"
     assert decision.restored
-    assert model.policy.actor.mu.network.is_zero()
+    assert is_mpc(model)
 
 
 def test_after_learn_there_are_as_many_refusals_left_as_patience_says() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from guard_samples import (
+    FIRST,
     LEFT,
     REGION,
     RIGHT,
@@ -23,9 +24,9 @@ from guard_samples import (
     make_guard,
     train,
 )
+from weights import is_mpc, last_layer
 
-FIRST = 1_000_000
-"""The first of the guard's own seeds."""
+WHOLE = {"by_region": False}
 
 
 class OftenRight(Slide):
@@ -63,7 +64,7 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
     assert decision.verdict == "accepted in part"
     assert "7 of 20 new starts lose against the MPC, seed 1000" in decision.reason
     assert decision.regions == (REGION[RIGHT],)
-    weights = model.policy.actor.mu.network.rest[-1].weight[:, :, -1]
+    weights = last_layer(model)[:, :, -1]
     assert not weights[REGION[LEFT]].any() and weights[REGION[RIGHT]].any()
     known = guard.state.evidence.seeds
     assert known[:10] == tuple(range(FIRST, FIRST + 10))
@@ -80,19 +81,16 @@ def test_without_new_starts_it_passes() -> None:
 @pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
 def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, seeds) -> None:
     model = build(gradient_steps=0)
-    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=final, rule={"by_region": False})
+    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=final, rule=WHOLE)
     train(model, STEPS, At([STEPS], spoil_left), guard)
     assert guard.state.new_starts == seeds
-    assert model.policy.actor.mu.network.is_zero() == (final is not None)
+    assert is_mpc(model) == (final is not None)
     if final is not None:
         assert guard.decisions[-1].reason.startswith("at the end, 10 of 30 new starts lose")
 
 
-def test_without_by_region_the_whole_of_it_is_put_back() -> None:
-    model, guard = (
-        build(gradient_steps=0),
-        make_guard(OftenRight, n_new_starts=20, rule={"by_region": False}),
-    )
+def test_without_by_region_the_whole_of_it_is_refused() -> None:
+    model, guard = build(gradient_steps=0), make_guard(OftenRight, n_new_starts=20, rule=WHOLE)
     before = actor_bits(model.policy)
     train(model, STEPS, At([STEPS], spoil_left), guard)
     (decision,) = guard.decisions
@@ -102,10 +100,7 @@ def test_without_by_region_the_whole_of_it_is_put_back() -> None:
 
 def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> None:
     simulator = partial(OftenRight, after=FIRST + 10)
-    model, guard = (
-        build(gradient_steps=0),
-        make_guard(simulator, n_new_starts=20, rule={"by_region": False}),
-    )
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
     again = At([2 * STEPS], spoil_left)
     train(model, 2 * STEPS, At([STEPS], spoil_left), again, guard)
     first, second = guard.decisions[:2]
@@ -117,10 +112,7 @@ def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> No
 def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() -> None:
     # The first twenty new starts show the right only: all of it is accepted.
     simulator = partial(OftenRight, after=FIRST + 30)
-    model, guard = (
-        build(gradient_steps=0),
-        make_guard(simulator, n_new_starts=20, rule={"by_region": False}),
-    )
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
 
     def a_little_better(policy) -> None:
         correct(policy, RIGHT, 0.4)
@@ -136,7 +128,7 @@ def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() 
     train(model, 2 * STEPS, *steps, guard)
     assert [each.verdict for each in guard.decisions] == ["accepted", "rejected"]
     assert actor_bits(model.policy) == accepted_bits(guard)
-    assert model.policy.actor.mu.network.is_zero()
+    assert is_mpc(model)
     assert guard.decisions[-1].accepted_cost == pytest.approx(guard.decisions[-1].mpc_cost)
 
 
@@ -145,7 +137,7 @@ def test_of_what_was_accepted_before_the_regions_that_do_not_lose_are_kept() -> 
     model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20)
     second = At([2 * STEPS], lambda policy: correct(policy, RIGHT, 0.1))  # would be no better
     train(model, 2 * STEPS, At([STEPS], spoil_left), second, guard)
-    weights = model.policy.actor.mu.network.rest[-1].weight[:, 0, -1]
+    weights = last_layer(model)[:, 0, -1]
     assert weights[REGION[RIGHT]] == 0.5 and weights[REGION[LEFT]] == 0
     assert actor_bits(model.policy) == accepted_bits(guard)
 
@@ -160,7 +152,7 @@ def test_violations_on_new_starts_are_refused_though_they_cost_less() -> None:
             return observation, reward, terminated, truncated, {"violation": violation}
 
     model = build(gradient_steps=0)
-    guard = make_guard(Brittle, n_new_starts=20, rule={"by_region": False}, patience=5)
+    guard = make_guard(Brittle, n_new_starts=20, rule=WHOLE, patience=5)
     train(model, STEPS, At([STEPS], lambda policy: correct(policy, LEFT, -0.5)), guard)
     (decision,) = guard.decisions
     assert "violates a limit" in decision.reason and decision.restored
@@ -174,7 +166,7 @@ def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
     whole, end = guard.decisions
     assert whole.verdict == "accepted"
     assert end.verdict == "accepted in part" and end.reason.startswith("at the end, 1 of 200 new")
-    assert not model.policy.actor.mu.network.rest[-1].weight[REGION[LEFT], :, -1].any()
+    assert not last_layer(model)[REGION[LEFT], :, -1].any()
     assert actor_bits(model.policy) == accepted_bits(guard)
     assert guard.state.evidence.seeds[10:] == (FIRST + 10 + 20 + 199,)
 

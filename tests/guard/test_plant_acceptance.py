@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from guard_samples import (
+    BLOCK,
     MPC,
     REGION,
     RIGHT,
@@ -30,20 +31,15 @@ from guard_samples import (
     critic_bits,
     guard_alone,
     overwrite,
+    plant,
     random_states,
     randomize,
+    still,
     train,
     verdicts,
 )
 from sb3_yann.guard.plant_acceptance import predicted_cost
-
-BLOCK = 3 * STEPS
-# One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
-plant = partial(Slide, low=2.0, high=2.8)
-
-
-def still(**kwargs):
-    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
+from weights import last_layer
 
 
 class Phases(At):
@@ -71,7 +67,7 @@ def test_a_better_candidate_passes_after_a_first_a_learning_and_a_trial_block() 
     assert decision.mpc_cost == pytest.approx(4.25)
     assert np.isnan(decision.worst_start)
     assert actor_bits(model.policy) == accepted_bits(guard)
-    assert float(model.actor.mu.network.rest[-1].weight[REGION[RIGHT], 0, -1].detach()) == 0.5
+    assert float(last_layer(model)[REGION[RIGHT], 0, -1].detach()) == 0.5
 
 
 @pytest.mark.parametrize("value", [-0.5, 1.0, 1.2], ids=["no effect", "no better", "worse"])

@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.noise import NormalActionNoise
 
 from guard_samples import (
+    BLOCK,
     REGION,
     RIGHT,
     STEPS,
@@ -22,17 +23,12 @@ from guard_samples import (
     guard_alone,
     make_guard,
     overwrite,
+    still,
     train,
     verdicts,
 )
 from sb3_yann import NoActionNoise, NonFiniteWarning
-
-BLOCK = 3 * STEPS
-plant = partial(Slide, low=2.0, high=2.8)
-
-
-def still(**kwargs):
-    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
+from weights import is_mpc, last_layer
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
@@ -137,7 +133,7 @@ def test_what_an_earlier_guard_accepted_is_what_a_plant_alone_begins_with() -> N
     correct(model.policy, RIGHT, 1.9)
     train(model, STEPS, guard := guard_alone())
     assert guard.decisions[-1].reason.startswith("before training, ")
-    weight = model.policy.actor.mu.network.rest[-1].weight[REGION[RIGHT], 0, -1]
+    weight = last_layer(model)[REGION[RIGHT], 0, -1]
     assert float(weight.detach()) == pytest.approx(0.4)
 
 
@@ -154,7 +150,7 @@ def test_a_policy_that_diverged_before_training_gives_way_to_the_mpc_once() -> N
     overwrite(model.policy, np.nan)
     train(model, BLOCK, guard)
     assert [each.reason for each in guard.decisions] == ["before training, it is not accepted"]
-    assert model.policy.actor.mu.network.is_zero()
+    assert is_mpc(model)
 
 
 def test_one_episode_whose_cost_is_not_known_is_left_out_of_the_first_block() -> None:

@@ -30,14 +30,14 @@ from sb3_yann.evaluation.episodes import evaluate
 from sb3_yann.guard import region_mixing as guard_regions
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import YannPolicy
+from weights import first_layer, is_learnt, is_mpc, last_layer
 
 
 @th.no_grad()
 def spoil_center(policy: YannPolicy) -> None:
-    network = policy.actor.mu.network
-    network.first.nodes[REGION[CENTER], ..., :-1] = 3.0
-    network.first.nodes[REGION[CENTER], ..., -1] = 0.0
-    network.rest[-1].weight[REGION[CENTER]] = 3.0
+    first_layer(policy)[REGION[CENTER], ..., :-1] = 3.0
+    first_layer(policy)[REGION[CENTER], ..., -1] = 0.0
+    last_layer(policy)[REGION[CENTER]] = 3.0
 
 
 def half_good(policy: YannPolicy) -> None:
@@ -52,7 +52,7 @@ def rows(checkpoint: ActorCheckpoint, region: int) -> list[object]:
         value
         for part in parts
         for key, value in part.items()
-        if str(key).startswith("exp_avg") or ".network." in str(key)
+        if str(key).startswith("exp_avg") or is_learnt(str(key))
     ]
     return [bits(value[region]) for value in tensors]
 
@@ -128,7 +128,7 @@ def test_a_region_that_no_start_comes_through_is_never_taken_over() -> None:
     train(model, STEPS, At([STEPS], change), guard)
     assert not guard.state.evidence.visits[:, REGION[LEFT]].any()
     assert guard.decisions[0].regions == (REGION[RIGHT],)
-    assert not model.policy.actor.mu.network.rest[-1].weight[REGION[LEFT], :, -1].any()
+    assert not last_layer(model)[REGION[LEFT], :, -1].any()
 
 
 def test_without_by_region_the_whole_returns() -> None:
@@ -136,7 +136,7 @@ def test_without_by_region_the_whole_returns() -> None:
     train(model, STEPS, At([STEPS], half_good), guard)
     assert verdicts(guard) == ["rejected"]
     assert guard.decisions[0].regions == ()
-    assert model.policy.actor.mu.network.is_zero()
+    assert is_mpc(model)
 
 
 def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
@@ -157,7 +157,7 @@ def test_regions_may_be_taken_over_while_patience_lasts() -> None:
     train(model, STEPS + 1, At([STEPS], half_good), before, guard, after)
     assert seen[0] == seen[1]  # the actor goes on as it was
     assert guard.decisions[0].verdict == "accepted in part"
-    weight = model.policy.actor.mu.network.rest[-1].weight
+    weight = last_layer(model)
     assert float(weight[REGION[RIGHT], 0, -1].detach()) == 0.5
     assert float(weight[REGION[LEFT], 0, -1].detach()) == 0
 

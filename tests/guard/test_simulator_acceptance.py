@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from guard_samples import At, Slide, accepted_bits, actor_bits, better, build, make_guard, train
 from sb3_yann import restore_accepted
 from sb3_yann.evaluation.episodes import LONGEST, evaluate
+from weights import is_mpc
 
 
 class CutShort(Slide):
@@ -62,7 +63,7 @@ def test_a_policy_whose_episodes_are_terminated_is_refused_however_cheap_they_ar
     assert guard.decisions[0].verdict == "rejected"
     assert "an episode that the env terminates" in guard.decisions[0].reason
     assert guard.decisions[0].candidate_cost < guard.decisions[0].mpc_cost
-    assert model.policy.actor.mu.network.is_zero()
+    assert is_mpc(model)
 
 
 def test_an_env_that_overwrites_its_observation_gives_the_same_episodes() -> None:
@@ -119,9 +120,9 @@ def test_the_accepted_policy_can_be_had_from_a_checkpoint(tmp_path) -> None:
     model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
     train(model, 6, At([5], better), guard, CheckpointCallback(5, str(tmp_path), "run"))
     loaded = DDPG.load(tmp_path / "run_5_steps", device="cpu")
-    assert not loaded.policy.actor.mu.network.is_zero()
+    assert not is_mpc(loaded)
     restore_accepted(loaded)
-    assert loaded.policy.actor.mu.network.is_zero()
+    assert is_mpc(loaded)
 
 
 def test_a_model_without_a_guard_has_nothing_to_restore() -> None:

@@ -187,13 +187,8 @@ def test_with_other_settings_the_guard_starts_afresh(change) -> None:
 
 def test_what_does_not_concern_the_evidence_may_change_in_between() -> None:
     model = three_decisions(make_guard())
-    second = make_guard(
-        eval_every=2,
-        patience=2,
-        rule={"by_region": False},
-        step_size={"shrink": 0.9},
-        log_path=None,
-    )
+    others = {"rule": {"by_region": False}, "step_size": {"shrink": 0.9}, "log_path": None}
+    second = make_guard(eval_every=2, patience=2, **others)
     train(model, 1, second)
     assert len(second.decisions) == 3
 

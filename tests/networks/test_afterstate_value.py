@@ -15,6 +15,7 @@ from scipy import linalg
 from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
 from sb3_yann.networks import AfterstateValue, LinearPrediction, QuadraticStateActionValue
 from sb3_yann.networks.value import PredictionModel
+from weights import first_layer, last_layer
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
@@ -168,8 +169,8 @@ def test_all_parameters_learn_and_the_model_has_none() -> None:
 
 def test_network_counts_by_its_scale() -> None:
     small, large = critic("pendulum", scale=1.0), critic("pendulum", scale=100.0)
-    th.nn.init.normal_(small.network.rest[-1].weight)
-    th.nn.init.normal_(small.network.first.nodes)
+    th.nn.init.normal_(last_layer(small))
+    th.nn.init.normal_(first_layer(small))
     large.load_state_dict(small.state_dict())
     theta = box_points(law_of("pendulum"), 100).double()
     with th.no_grad():

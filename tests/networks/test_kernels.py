@@ -12,6 +12,7 @@ from sample_laws import box_points, law_of
 from sb3_yann.networks import AfterstateValue, LinearPrediction, YannLayer, ZeroOutputNetwork
 from sb3_yann.networks._kernels.mlp import tanh
 from sb3_yann_envs import problems
+from weights import later_layers, network_of
 
 NAMES = ["pendulum", "reactor", "two inputs", "asymmetric bounds"]
 
@@ -27,8 +28,8 @@ def shaken(module: th.nn.Module, size: float, seed: int = 0) -> None:
 def by_torch(module: th.nn.Module) -> th.nn.Module:
     """Return a copy that has no compiled code."""
     plain = copy.deepcopy(module)
-    plain.network.has_loops = False
-    assert not plain.network.compiles
+    network_of(plain).has_loops = False
+    assert not network_of(plain).compiles
     return plain
 
 
@@ -198,7 +199,7 @@ def test_a_fixed_value_has_a_gradient_by_the_action_alone() -> None:
 
 def test_a_pinned_value_is_exactly_zero_at_the_equilibrium_whatever_is_learnt() -> None:
     ours = value(True)
-    shaken(ours.network, 1.0)
+    shaken(network_of(ours), 1.0)
     for size in (1, 3, 64):
         middle = th.zeros(size, 5)
         middle[:, 4] = -float(ours.middle / ours.to_input)
@@ -226,7 +227,7 @@ def test_shapes_that_do_not_fit_are_refused_before_compiled_code_reads_them(shap
 @pytest.mark.filterwarnings("ignore")
 def test_what_torch_traces_still_depends_on_the_state() -> None:
     for module, n in ((YannLayer(law_of("reactor")), 4), (value(True), 5)):
-        shaken(module.network, 0.1)
+        shaken(network_of(module), 0.1)
         one, other = th.rand(2, 6, n)
         with th.no_grad():
             traced = th.jit.trace(module, one)
@@ -264,8 +265,8 @@ def test_parameters_of_a_type_that_numpy_lacks_are_taken() -> None:
 
 def test_layers_of_another_type_are_left_to_torch() -> None:
     layer = YannLayer(law_of("reactor"))
-    layer.network.rest.double()
-    assert not layer.network.compiles
+    later_layers(layer).double()
+    assert not network_of(layer).compiles
 
 
 class Double(th.nn.Module):
@@ -277,7 +278,7 @@ class Double(th.nn.Module):
 def test_weights_that_are_made_of_others_are_used_and_trained(name: str) -> None:
     module, n = {"layer": (YannLayer(law_of("reactor")), 4), "value": (value(True), 5)}[name]
     shaken(module, 0.1)
-    th.nn.utils.parametrize.register_parametrization(module.network.rest[-1], "weight", Double())
+    th.nn.utils.parametrize.register_parametrization(later_layers(module)[-1], "weight", Double())
     theta = box_points(law_of("reactor"), 50)
     points = th.cat([theta, th.linspace(-1, 1, 50)[:, None]], 1)[:, :n]
     ours, theirs = module(points), (plain := by_torch(module))(points)
@@ -320,7 +321,7 @@ def test_autocast_runs_the_operations_of_torch() -> None:
     theta = box_points(law_of("reactor"), 20)
     exact = layer(theta)
     with th.autocast("cpu"):
-        assert not layer.network.compiles
+        assert not network_of(layer).compiles
         assert th.allclose(layer(theta), exact, atol=0.05)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
 from sb3_yann.networks import QuadraticStateActionValue, YannLayer
+from weights import network_of
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
@@ -189,7 +190,7 @@ def test_training_fits_what_the_quadratic_cannot() -> None:
     rows = random_rows("pendulum", 512)
     value = critic("pendulum")
     target = value(rows).detach() + 5 * th.sin(3 * rows[:, :1])
-    optimizer = th.optim.Adam(value.network.parameters(), 1e-2)
+    optimizer = th.optim.Adam(network_of(value).parameters(), 1e-2)
     for _ in range(300):
         optimizer.zero_grad()
         loss = (value(rows) - target).square().mean()

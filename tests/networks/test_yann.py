@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 import torch as th
 
 from sample_laws import (
-    PROBLEMS,
     box_points,
     facet_points,
     law_of,
@@ -18,13 +16,12 @@ from sample_laws import (
     solved,
     to_action,
 )
+from sample_layers import EVERY_LAW, INFEASIBLE, region_of, scrambled, train
 from sb3_yann import LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import clamp_with_inward_gradient
-
-EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
-INFEASIBLE = pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
+from weights import last_layer
 
 
 @pytest.fixture(autouse=True)
@@ -32,25 +29,6 @@ def seeded() -> Iterator[None]:
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
         yield
-
-
-def scrambled(layer: YannLayer, size: float = 1.0) -> YannLayer:
-    """The layer with random weights, as after much training."""
-    for parameter in layer.parameters():
-        th.nn.init.normal_(parameter, std=size)
-    return layer
-
-
-def region_of(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
-    return layer.locate(theta)[0]
-
-
-def train(layer: YannLayer, theta: th.Tensor, target: float, steps: int = 20) -> None:
-    optimizer = th.optim.Adam(layer.parameters(), 1e-2)
-    for _ in range(steps):
-        optimizer.zero_grad()
-        (layer(theta) - target).square().mean().backward()
-        optimizer.step()
 
 
 # --- the law -----------------------------------------------------------------------------------
@@ -316,10 +294,10 @@ def test_correction_at_its_bound_gets_the_gradient_that_leads_back_and_no_other(
     law = law_of("pendulum")
     layer = YannLayer(law, max_correction=0.1, pinned=False)
     with th.no_grad():  # the bias of the output alone: far beyond the bound
-        layer.network.rest[-1].weight[..., -1] = 3.0 * side
+        last_layer(layer)[..., -1] = 3.0 * side
     theta = box_points(law, 4000)
     theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
-    bias = layer.network.rest[-1].weight
+    bias = last_layer(layer)
     for slope, alive in ((side, True), (-side, False)):  # descent goes against the slope
         layer.zero_grad()
         (slope * layer(theta)).sum().backward()
@@ -331,7 +309,7 @@ def test_correction_learns_to_leave_its_bound() -> None:
     law = law_of("pendulum")
     layer = YannLayer(law, max_correction=0.1, pinned=False)
     with th.no_grad():
-        layer.network.rest[-1].weight[..., -1] = 3.0
+        last_layer(layer)[..., -1] = 3.0
     theta = box_points(law, 2000)
     theta = theta[layer.law(theta).abs()[:, 0] < 0.5]
 
@@ -345,144 +323,6 @@ def test_correction_learns_to_leave_its_bound() -> None:
         (layer(theta) - layer.law(theta)).square().mean().backward()
         optimizer.step()
     assert distance() < 0.05
-
-
-# --- training ----------------------------------------------------------------------------------
-
-
-@EVERY_LAW
-def test_only_the_active_regions_get_a_gradient(name: str) -> None:
-    law = law_of(name)
-    layer = scrambled(YannLayer(law), 0.1)
-    theta = box_points(law, 4000)
-    active = int(region_of(layer, theta).mode().values)
-    theta = theta[region_of(layer, theta) == active]
-    (layer(theta) * th.randn(len(theta), law.n_inputs)).sum().backward()
-    others = th.arange(law.n_regions) != active
-    for parameter in layer.parameters():
-        assert parameter.grad is not None
-        assert bool(th.any(parameter.grad[active] != 0))
-        assert not th.any(parameter.grad[others])
-
-
-@EVERY_LAW
-def test_training_one_region_leaves_the_others_bit_for_bit(name: str) -> None:
-    law = law_of(name)
-    layer = YannLayer(law)
-    theta = box_points(law, 4000, stretch=1.5)
-    region = region_of(layer, theta)
-    trained = region == region.mode().values
-    before = layer(theta).detach()
-    train(layer, theta[trained], target=0.3)
-    after = layer(theta).detach()
-    assert th.equal(after[~trained], before[~trained])
-    assert not th.equal(after[trained], before[trained])
-
-
-@EVERY_LAW
-def test_every_region_learns(name: str) -> None:
-    law = law_of(name)
-    layer = YannLayer(law)
-    theta = box_points(law, 20_000, stretch=1.5)
-    before = copy.deepcopy(layer)
-    train(layer, theta, target=0.3, steps=3)
-    visited = region_of(layer, theta).unique()
-    assert len(visited) > law.n_regions / 2
-    for new, old in zip(layer.parameters(), before.parameters(), strict=True):
-        assert bool((new != old).flatten(1).any(1)[visited].all())
-
-
-@INFEASIBLE
-@EVERY_LAW
-def test_equilibrium_is_where_it_was_after_training(name: str, infeasible: str) -> None:
-    law = law_of(name, infeasible)
-    layer = YannLayer(law)
-    origin = th.zeros(1, law.n_theta)
-    at_rest = to_action(law, np.zeros((1, law.n_inputs))).float()
-    th.testing.assert_close(layer(origin), at_rest, rtol=0, atol=1e-7)
-    before = layer(origin).detach()
-    theta = th.cat([box_points(law, 500), 0.01 * box_points(law, 500), origin])
-    train(layer, theta, target=0.3, steps=50)
-    assert th.equal(layer(origin), before)
-    assert (layer(theta) - layer.law(theta)).abs().max() > 0.01  # it has learnt something
-
-
-def test_region_away_from_the_origin_is_not_pinned() -> None:
-    law = law_of("pendulum")
-    pinned = YannLayer(law).network.pinned.flatten().bool()
-    assert int(pinned.sum()) == 1
-    assert bool(pinned[law.locate(np.zeros(2))])
-
-
-@INFEASIBLE
-@EVERY_LAW
-def test_equilibrium_moves_where_no_region_is_pinned(name: str, infeasible: str) -> None:
-    law = law_of(name, infeasible)
-    layer = YannLayer(law, pinned=False)
-    assert not layer.network.pinned.any()
-    origin = th.zeros(1, law.n_theta)
-    assert th.equal(layer(origin), layer.law(origin))
-    train(layer, origin, target=0.3, steps=100)
-    assert (layer(origin) - 0.3).abs().max() < 0.05
-
-
-# --- what torch and Stable-Baselines3 see --------------------------------------------------------
-
-
-@pytest.mark.parametrize(("hidden", "tensors"), [((16,), 2), ((16, 16), 3)])
-def test_there_are_few_parameter_tensors_however_many_regions(
-    hidden: tuple[int, ...], tensors: int
-) -> None:
-    # Adam and the target update cost by the tensor.
-    assert law_of("two inputs").n_regions > 3 * law_of("pendulum").n_regions
-    for name in ("pendulum", "two inputs"):
-        assert len(list(YannLayer(law_of(name), hidden).parameters())) == tensors
-
-
-@pytest.mark.parametrize(
-    ("name", "width", "count"),
-    # p [2 h (n + 1) + h (h + 1) + m (h + 1)]: two nodes summed into each of h units of the first
-    # layer, then h units, then m outputs.
-    [("pendulum", 16, 7 * (96 + 272 + 17)), ("reactor", 8, 7 * (80 + 72 + 9))],
-)
-def test_number_of_parameters_is_linear_in_the_regions(name: str, width: int, count: int) -> None:
-    layer = YannLayer(law_of(name), (width, width))
-    assert sum(p.numel() for p in layer.parameters()) == count
-
-
-def test_law_is_kept_in_buffers_that_no_optimizer_sees() -> None:
-    layer = YannLayer(law_of("pendulum"))
-    buffers = {"gains", "offsets", "half_space_A", "half_space_b", "theta_half", "resting"}
-    assert buffers <= dict(layer.named_buffers()).keys()
-    assert all(name.startswith("network.") for name, _ in layer.named_parameters())
-
-
-def test_no_state_dict_key_contains_running() -> None:
-    # Stable-Baselines3 copies those hard at every target update.
-    keys = YannLayer(law_of("pendulum")).state_dict()
-    assert len(keys) > 6
-    assert not [key for key in keys if "running_" in key]
-
-
-@EVERY_LAW
-def test_state_dict_brings_everything_back(name: str) -> None:
-    law = law_of(name)
-    layer = scrambled(YannLayer(law))
-    other = YannLayer(law)
-    theta = box_points(law, 1000, stretch=1.5)
-    assert not th.equal(other(theta), layer(theta))
-    other.load_state_dict(layer.state_dict())
-    assert th.equal(other(theta), layer(theta))
-
-
-def test_layer_does_not_share_memory_with_the_law() -> None:
-    law = law_of("pendulum")
-    layer = YannLayer(law)
-    with th.no_grad():
-        for buffer in layer.buffers():
-            buffer.fill_(7.0)
-    assert law == law_of("pendulum")
-    assert not np.any(law.gains == 7.0)
 
 
 def test_law_without_input_bounds_is_refused() -> None:

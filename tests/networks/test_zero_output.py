@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from sb3_yann.networks import ZeroOutputNetwork, zero_output
 from sb3_yann.networks.zero_output import PairedLinear
+from weights import first_layer, later_layer, later_layers
 
 ACTIVATIONS: dict[str, Callable[[th.Tensor], th.Tensor]] = {
     "tanh": th.tanh,
@@ -134,7 +135,7 @@ def test_first_axis_of_every_parameter_and_buffer_is_the_stack(hidden: tuple[int
 
 def test_networks_of_a_stack_differ() -> None:
     net = ZeroOutputNetwork(3, 1, (8, 8), pinned=pins(False, False))
-    assert not th.any(net.first.nodes[0] == net.first.nodes[1])
+    assert not th.any(first_layer(net)[0] == first_layer(net)[1])
 
 
 # --- training ----------------------------------------------------------------------------------
@@ -176,9 +177,9 @@ def test_relu_network_moves_most_of_every_layer_by_the_second_update() -> None:
 def test_relu_network_keeps_the_gradient_of_relu_away_from_zero() -> None:
     net = ZeroOutputNetwork(1, 1, (1,), activation=th.relu)
     with th.no_grad():
-        net.first.nodes.zero_()
-        net.first.nodes[0, 0, 0, 0] = 1.0
-        net.rest[0].weight.fill_(1.0)
+        first_layer(net).zero_()
+        first_layer(net)[0, 0, 0, 0] = 1.0
+        later_layer(net, 0).fill_(1.0)
     x = th.tensor([[-2.0], [3.0]], requires_grad=True)
     net(x).sum().backward()
     assert x.grad is not None
@@ -210,8 +211,8 @@ def test_units_of_a_layer_differ_after_training(optimizer: str) -> None:
     net = ZeroOutputNetwork(2, 1, (8, 8))
     x = square()
     train(net, OPTIMIZERS[optimizer](net), 50, x, curved(x) + x[:, :1])
-    first = net.first.nodes.detach()[0].sum(0)
-    for weight in (first, net.rest[0].weight.detach()[0]):
+    first = first_layer(net).detach()[0].sum(0)
+    for weight in (first, later_layer(net, 0).detach()[0]):
         apart = th.cdist(weight, weight) + th.eye(8)
         assert apart.min() > 0
 
@@ -236,8 +237,8 @@ def test_stack_computes_what_its_networks_compute_alone() -> None:
     for i in range(3):
         alone = ZeroOutputNetwork(2, 1, (8, 8), n_nodes=3, pinned=stack.pinned[i].bool()).double()
         with th.no_grad():
-            alone.first.nodes.copy_(stack.first.nodes[i : i + 1])
-            for mine, theirs in zip(alone.rest, stack.rest, strict=True):
+            first_layer(alone).copy_(first_layer(stack)[i : i + 1])
+            for mine, theirs in zip(later_layers(alone), later_layers(stack), strict=True):
                 mine.weight.copy_(theirs.weight[i : i + 1])
         rows = index == i
         th.testing.assert_close(stack(x, index)[rows], alone(x[rows]), rtol=1e-12, atol=1e-12)

@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import LinearPlant, feasible_states
 from stable_baselines3 import DDPG, TD3
 
 from general_problems import LOADED, servo, solved
+from sample_plants import LinearPlant, feasible_states
 from sb3_yann import NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.guard.plant_acceptance import predicted_cost
@@ -61,8 +61,8 @@ def test_rates_are_kept_whatever_the_weights(
     box = mpc.theta_min, mpc.theta_max  # inside the domain and outside
     theta = rng.uniform(*box, (5000, mpc.n_theta)).astype(np.float32)
     moved = model.predict(theta)[0] - theta[:, mpc.layout.previous]
-    assert np.all((mpc.du_min <= moved) & (moved <= mpc.du_max))
-    assert np.max(moved / mpc.du_max) > 0.999  # and they are what holds it
+    assert np.all((mpc.rate.du_min <= moved) & (moved <= mpc.rate.du_max))
+    assert np.max(moved / mpc.rate.du_max) > 0.999  # and they are what holds it
 
 
 def test_an_output_at_the_limit_of_its_rate_learns_to_leave_it() -> None:
@@ -146,7 +146,9 @@ class LoadedPlant(gym.Env):
 
 def wrapped(mpc: LinearMPC, reference: float = 0.5) -> gym.Env:
     env = SetPoint(LoadedPlant(), [-1], [1], schedule=lambda step: [reference])
-    env = ObserveDisturbance(env, DisturbanceObserver(LOADED), mpc.d_min, mpc.d_max)
+    env = ObserveDisturbance(
+        env, DisturbanceObserver(LOADED), mpc.disturbances.d_min, mpc.disturbances.d_max
+    )
     return StageCost(PreviousInput(env), mpc)
 
 

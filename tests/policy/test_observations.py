@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import copy
 import pickle
-from functools import cache
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import LinearPlant, two_input_mpc
 from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, RescaleObservation, TimeLimit
 from stable_baselines3 import DDPG, TD3
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
+from observation_samples import FAR, HIGH, LOW, MPC, RANDOM, STEADY, Seen, build, error, law, states
+from sample_plants import LinearPlant
 from sb3_yann import (
     AffineObservation,
     ControlDiagnostics,
@@ -23,46 +22,6 @@ from sb3_yann import (
     NoActionNoise,
     YannPolicy,
 )
-
-MPC = two_input_mpc()
-LOW, HIGH = np.array([-5.0, -5, -5]), np.array([5.0, 6, 7])
-STEADY = np.array([20.0, 0, -7])
-FAR = np.array([1e5, 0, 0])
-RANDOM = AffineObservation(np.random.default_rng(0).normal(size=(3, 5)), [1, 2, 3])
-
-
-@cache
-def law():
-    return MPC.explicit()
-
-
-class Seen(gym.ObservationWrapper):
-    """Shows a function of theta, in float32 unless it is given another type."""
-
-    def __init__(self, show, size: int, start: float = 1.0, dtype: type = np.float32) -> None:
-        super().__init__(TimeLimit(LinearPlant(MPC, start), 20))
-        self.show, self.dtype = show, dtype
-        self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype)
-
-    def observation(self, _):
-        return np.asarray(self.show(self.unwrapped.x), self.dtype)
-
-
-def build(env, observation: AffineObservation, algorithm=DDPG, **kwargs):
-    policy = {"problem": MPC, "observation": observation, "critic_warmup": 0}
-    policy |= kwargs.pop("policy_kwargs", {})
-    return algorithm(YannPolicy, env, policy_kwargs=policy, seed=0, buffer_size=1000, **kwargs)
-
-
-def states(count: int = 5000) -> np.ndarray:
-    return np.random.default_rng(0).uniform(LOW, HIGH, (count, 3))
-
-
-def error(model, observations: np.ndarray, theta: np.ndarray) -> float:
-    """Return the largest distance of `predict` from the law, as a fraction of the input range."""
-    actions, _ = model.predict(observations)
-    return float(np.max(np.abs(actions - law()(theta)) / (MPC.u_max - MPC.u_min)))
-
 
 # What an env may show of x = theta, and the map that undoes it.
 SHOWN = {
@@ -270,106 +229,6 @@ def test_maps_compose_like_functions() -> None:
         RANDOM @ outer
     with pytest.raises(TypeError):
         RANDOM @ 3
-
-
-# --- VecNormalize ---------------------------------------------------------------------------------
-
-
-def normalize(frozen: bool = True, n_envs: int = 1, **kwargs) -> VecNormalize:
-    """Return an env of absolute values, normalized by the statistics of a few steps."""
-    plants = [lambda: Seen(lambda x: x + STEADY, 3)] * n_envs
-    env = VecNormalize(DummyVecEnv(plants), **{"norm_reward": False, "clip_obs": np.inf} | kwargs)
-    env.seed(0)
-    env.reset()
-    for _ in range(30):
-        env.step(np.array([env.action_space.sample() for _ in range(n_envs)]))
-    env.training = not frozen
-    return env
-
-
-ABSOLUTE = AffineObservation.deviation(STEADY)
-
-
-def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> None:
-    env = normalize(n_envs=2)
-    model = build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env))
-    obs = env.normalize_obs((states() + STEADY).astype(np.float32))
-    assert error(model, obs, states()) < 1e-5
-    # The guard's own env is one without a VecNormalize, as the training env is below its own.
-    guard = ImprovementGuard(lambda: Seen(lambda x: x + STEADY, 3), n_starts=5)
-    model.learn(120, callback=[NoActionNoise(), ControlDiagnostics(), guard])
-    seen = law().locate(model.policy.theta(env.normalize_obs(env.get_original_obs())).numpy())
-    assert guard.state.evidence.visits[:, seen].any()
-    assert guard.state.evidence.paired.mpc_costs == pytest.approx(mpc_costs(guard.acceptance.seeds))
-    model.save(tmp_path / "model")
-    loaded = DDPG.load(tmp_path / "model", env=env)
-    np.testing.assert_array_equal(loaded.predict(obs)[0], model.predict(obs)[0])
-
-
-def mpc_costs(seeds) -> list[float]:
-    """Return the cost of the explicit law itself, in float64."""
-    costs = []
-    for seed in seeds:
-        plant, cost = LinearPlant(MPC), 0.0
-        plant.reset(seed=seed)
-        for _ in range(20):
-            cost -= plant.step(law()(plant.x))[1]
-        costs.append(cost)
-    return costs
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: normalize(frozen=False), "still moves its statistics"),
-        (lambda: normalize(norm_reward=True), "normalizes rewards"),
-        (lambda: VecFrameStack(normalize(), 2), "Make VecNormalize the last wrapper"),
-        (lambda: DummyVecEnv([lambda: LinearPlant(MPC)]), "holds no VecNormalize"),
-    ],
-)
-def test_a_vec_normalize_that_cannot_be_undone_is_refused(make, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        AffineObservation.from_vec_normalize(make())
-
-
-@pytest.mark.parametrize(
-    ("make", "observation", "message"),
-    [
-        (lambda: normalize(frozen=False), ABSOLUTE, "still moves its statistics"),
-        (lambda: normalize(norm_reward=True), ABSOLUTE, "normalizes rewards"),
-        (normalize, None, r"AffineObservation\.from_vec_normalize\(venv\)"),
-        (
-            lambda: VecFrameStack(normalize(), 2),
-            AffineObservation.newest_frame(3, 2),
-            "Make VecNormalize the last wrapper",
-        ),
-        (lambda: normalize(clip_obs=3.0), ABSOLUTE, r"clips at clip_obs = 3.*numpy\.inf"),
-    ],
-)
-def test_a_policy_refuses_it_as_well(make, observation, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        build(make(), observation)
-
-
-def test_clipping_beyond_the_box_of_the_law_is_nothing_to_refuse() -> None:
-    env = normalize()
-    folded = ABSOLUTE @ AffineObservation.from_vec_normalize(env)
-    corners = np.array([LOW, HIGH]) + STEADY
-    reach = float(np.abs(env.normalize_obs(corners)).max())
-    env.clip_obs = 1.001 * reach
-    build(env, folded)
-    env.clip_obs = 0.999 * reach
-    with pytest.raises(ValueError, match="clip_obs"):
-        build(env, folded)
-    env.clip_obs = 1e9  # two entries for one of theta: whatever theta is, each may be anything
-    with pytest.raises(ValueError, match="reach inf"):
-        build(env, AffineObservation(np.ones((3, 3))))
-
-
-def test_a_vec_normalize_that_does_nothing_needs_no_map() -> None:
-    env = normalize(norm_obs=False)
-    assert AffineObservation.from_vec_normalize(env) == AffineObservation.identity(3)
-    build(env, None)
 
 
 # --- what is refused ------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import LinearPlant, two_input_mpc
 from gymnasium.wrappers import NormalizeReward, TimeLimit
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.env_util import make_vec_env
@@ -20,6 +19,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
+from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import (
     ActionRepeat,
     AffineObservation,
@@ -66,6 +66,7 @@ def assert_every_action_is_the_law_s(model) -> None:
 
 
 # One start method after the other: each starts two processes that import PyTorch.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 on, if threads run
 @pytest.mark.parametrize("start_method", ["fork", "forkserver", "spawn"])
 def test_all_callbacks_work_with_envs_in_other_processes(start_method) -> None:
@@ -99,6 +100,7 @@ def test_a_wrapper_in_another_process_is_found() -> None:
         env.close()
 
 
+@pytest.mark.slow
 def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> None:
     env = make_vec_env("sb3_yann:CSTR-v0", n_envs=2, vec_env_cls=SubprocVecEnv)
     try:
@@ -111,6 +113,7 @@ def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> 
         env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm) -> None:
     model = build(DummyVecEnv([plant] * 3), algorithm, gradient_steps=-1)

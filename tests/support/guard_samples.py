@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import random
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -21,10 +22,13 @@ from sb3_yann import (
     NoActionNoise,
     YannPolicy,
 )
+from weights import last_layer
 
 LEFT, CENTER, RIGHT = range(3)
 STEPS = 4
 """Steps of an episode."""
+FIRST = 1_000_000
+"""The first of the guard's own seeds."""
 
 
 def slide_mpc() -> LinearMPC:
@@ -102,11 +106,21 @@ def guard_alone(
     return make_guard(None, rule=rule, **kwargs)
 
 
+BLOCK = 3 * STEPS
+"""Steps of a block of `guard_alone`."""
+# One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
+plant = partial(Slide, low=2.0, high=2.8)
+
+
+def still(**kwargs):
+    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
+
+
 @th.no_grad()
 def correct(policy: YannPolicy, region: int, value: float) -> None:
     """Make the actor's input in a region (not the center) the MPC's plus a constant."""
-    policy.actor.mu.network.rest[-1].weight[REGION[region]] = 0.0
-    policy.actor.mu.network.rest[-1].weight[REGION[region], :, -1] = value
+    last_layer(policy)[REGION[region]] = 0.0
+    last_layer(policy)[REGION[region], :, -1] = value
 
 
 def better(policy: YannPolicy) -> None:

@@ -9,17 +9,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-
-if TYPE_CHECKING:
-    from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
-    from sb3_yann.control.law.search_tree import SearchTree
 
 Integers = NDArray[np.int64]
 F = TypeVar("F", bound=Callable[..., Any])
@@ -87,20 +83,29 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
     return dispatcher
 
 
-def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers]:
+def pack(
+    gains: Array,
+    offsets: Array,
+    rows: Array,
+    starts: Integers,
+    bounds: Array,
+    tolerances: tuple[float, float],
+    flags: tuple[bool, bool],
+    tree: Sequence[Array | Integers] = (),
+) -> tuple[Array, Integers]:
     """Return a law as one array of floats and one of whole numbers, for the functions below.
 
-    Without a tree the regions are scanned one by one.
+    ``rows`` are [A b] (q, n + 1) of all regions, each from ``starts`` on; ``bounds`` are u_min and
+    u_max (2, m). ``tolerances`` tell how far outside counts as inside and which slacks tie,
+    ``flags`` whether the input is zero outside and whether no regions overlap. ``tree`` holds the
+    arrays of a search tree; without one the regions are scanned one by one.
     """
-    nodes, leaves = (len(tree.levels), len(tree.leaf_starts) - 1) if tree else (0, 0)
-    p, m, n = law.gains.shape
-    header = [n, m, p, law.n_halfspaces, nodes, leaves]
-    header += [law.infeasible == "zero_input", law.disjoint]
-    rows = np.column_stack([law.A, law.b])
-    floats: list[Any] = [(law.tolerance, law.tie_tolerance), rows, law.gains, law.offsets]
-    floats += [law.u_min, law.u_max, *((tree.normals, tree.levels) if tree else ())]
-    whole: list[Any] = [header, law.starts, [law.n_halfspaces]]
-    whole += [tree.children, tree.leaf_starts, tree.leaf_regions] if tree else []
+    (p, m, n), q = gains.shape, len(rows)
+    normals, levels, *numbers = tree or (np.empty(0), np.empty(0))
+    leaves = len(numbers[1]) - 1 if numbers else 0
+    header = [n, m, p, q, len(levels), leaves, *flags]
+    floats = (np.array(tolerances), rows, gains, offsets, bounds, normals, levels)
+    whole = (header, starts, [q], *numbers)
     return (
         np.concatenate([np.ravel(each) for each in floats]),
         np.concatenate([np.ravel(each) for each in whole]).astype(np.int64),

@@ -59,13 +59,7 @@ class SearchTree:
     leaf_regions: Integers
 
     def checked(self, n_theta: int, n_regions: int) -> SearchTree:
-        """Return the tree if a search of it ends in a leaf with regions that there are.
-
-        Raises
-        ------
-        ValueError
-            If it is not a tree for so many parameters and regions: compiled code does not check.
-        """
+        """Return the tree, or raise ValueError if a search of it may leave it or those regions."""
         nodes, leaves = self.levels.size, self.leaf_starts.size - 1
         numbers = np.arange(nodes)[:, None]
         whole = (self.children, self.leaf_starts, self.leaf_regions)
@@ -88,19 +82,6 @@ class SearchTree:
             raise ValueError(f"its search tree does not fit {n_regions} regions")
         return self
 
-    @property
-    def depth(self) -> int:
-        """The largest number of hyperplanes on the way to a leaf."""
-        depth = np.zeros(len(self.children), dtype=int)
-        for node, children in enumerate(self.children):  # children come after their parents
-            depth[children[children > 0]] = depth[node] + 1
-        return int(depth.max(initial=-1)) + 1
-
-    @property
-    def largest_leaf(self) -> int:
-        """The largest number of regions in a leaf."""
-        return int(np.diff(self.leaf_starts).max())
-
 
 @dataclass(frozen=True)
 class _Polytopes:
@@ -120,9 +101,8 @@ def build_tree(
 ) -> SearchTree:
     """Return a tree for the regions of a :class:`PiecewiseAffine`, in a bounded box of theta.
 
-    It is balanced as well as a few dozen candidates at every node allow. Whether a region lies on
-    one side is seen by its vertices, of which rounding may move some: the result of a search has
-    to be checked by its slack. The draws are seeded, so that a law always gives the same tree.
+    Vertices tell on which side a region lies. Rounding may move some: a search has to check its
+    result by the slack. The draws are seeded: a law always gives the same tree.
     """
     center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
     regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))
@@ -160,13 +140,9 @@ def build_tree(
     )
     if not levels:  # regions that no hyperplane parts
         return tree
-    in_box = tree.normals / half
-    return replace(
-        tree,
-        normals=in_box,
-        levels=tree.levels + in_box @ center,
-        leaf_regions=_often_first(tree, regions, random),
-    )
+    in_box, leaf_regions = tree.normals / half, _often_first(tree, regions, random)
+    in_all = tree.levels + in_box @ center
+    return replace(tree, normals=in_box, levels=in_all, leaf_regions=leaf_regions)
 
 
 def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Generator) -> Integers:
@@ -183,18 +159,8 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
     within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
     all_over, in_each = np.zeros((2, len(tree.leaf_regions)), np.int64)
     for points, hits in ((everywhere, all_over), (within, in_each)):
-        _hits(
-            tree.normals,
-            tree.levels,
-            tree.children,
-            tree.leaf_starts,
-            tree.leaf_regions,
-            regions.A,
-            regions.b,
-            regions.row_starts,
-            points,
-            hits,
-        )
+        half_spaces = regions.A, regions.b, regions.row_starts
+        _hits(*(*vars(tree).values(), *half_spaces, points, hits))
     leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
     order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
     return np.ascontiguousarray(tree.leaf_regions[order])
@@ -256,16 +222,8 @@ def _best_split(
     first, last = regions.row_starts[chosen], regions.row_starts[chosen + 1]
     rows = random.integers(np.tile(first, 2), np.tile(last, 2))
     sides = np.empty((len(rows), len(inside)), np.uint8)
-    _sides(
-        regions.vertices,
-        regions.vertex_starts,
-        regions.middles,
-        regions.radii,
-        inside,
-        regions.A[rows],
-        regions.b[rows],
-        sides,
-    )
+    shapes = regions.vertices, regions.vertex_starts, regions.middles, regions.radii
+    _sides(*shapes, inside, regions.A[rows], regions.b[rows], sides)
     below, above = (sides & 1).sum(axis=1), (sides >> 1).sum(axis=1)
     larger = np.maximum(below, above)
     best = int(np.lexsort((below + above, larger))[0])

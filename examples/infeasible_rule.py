@@ -1,6 +1,6 @@
 """What the law should do where the MPC has no solution: both rules on both plants, untrained.
 
-python examples/outside_rule.py [--episodes 100]
+python examples/infeasible_rule.py [--episodes 100]
 """
 
 from __future__ import annotations

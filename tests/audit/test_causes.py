@@ -1,0 +1,176 @@
+"""The audit of rewards and observations, against every wrapper that changes what they mean."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import wrappers
+
+from audit_samples import (
+    HIGH,
+    LOW,
+    MPC,
+    WRONG,
+    Changed,
+    audited,
+    plant,
+    show_shifted,
+)
+from sample_plants import LinearPlant, asymmetric_pendulum_mpc, two_input_mpc
+from sb3_yann import AffineObservation, NonFiniteWarning
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_reward_or_observation_of_another_meaning_is_named(wrong) -> None:
+    make, cause, wrapper, text = WRONG[wrong]
+    finding = audited(make()).finding
+    assert not finding.matches
+    assert finding.cause == cause
+    assert finding.wrappers == (() if wrapper is None else (wrapper,))
+    assert text in finding.message
+
+
+@pytest.mark.skipif(not hasattr(wrappers, "RepeatAction"), reason="from Gymnasium 1.3 on")
+def test_gymnasium_s_own_repetition_is_named_too() -> None:
+    finding = audited(wrappers.RepeatAction(plant(), 3)).finding
+    assert (finding.cause, finding.wrappers) == ("repeated action", ("RepeatAction",))
+
+
+def test_a_reward_that_comes_late_is_named() -> None:
+    class Late(gym.Wrapper):
+        reward = 0.0
+
+        def step(self, action):
+            observation, reward, *rest = self.env.step(action)
+            reward, self.reward = self.reward, reward
+            return observation, reward, *rest
+
+    assert audited(Late(plant())).finding.cause == "late reward"
+
+
+def test_an_action_that_acts_late_is_named() -> None:
+    class Late(gym.ActionWrapper):
+        held = np.zeros(2)
+
+        def action(self, action):
+            action, self.held = self.held, action
+            return action
+
+    assert audited(Late(plant())).finding.cause == "late action"
+
+
+def test_a_reward_that_is_not_a_number_is_named() -> None:
+    env = wrappers.TransformReward(plant(), lambda reward: np.nan)
+    with pytest.warns(NonFiniteWarning):
+        assert audited(env).finding.cause == "not finite"
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_one_step_that_is_not_finite_is_named_and_left_out_of_the_statistics(what) -> None:
+    class Faulty(gym.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            observation, reward, *rest = self.env.step(action)
+            self.steps += 1
+            if self.steps == 30:
+                observation, reward = (
+                    (observation, np.nan) if what == "reward" else (observation * np.nan, reward)
+                )
+            return observation, reward, *rest
+
+    with pytest.warns(NonFiniteWarning):
+        finding = audited(Faulty(plant())).finding
+    assert (finding.matches, finding.cause) == (False, "not finite")
+    assert f"{'the reward' if what == 'reward' else 'an observation'}" in finding.message
+    assert "of step 30" in finding.message
+    assert (finding.scale, finding.offset) == (pytest.approx(1), 0)
+    assert finding.r2 == pytest.approx(1)
+
+
+# --- what is no mismatch --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [two_input_mpc, asymmetric_pendulum_mpc])
+def test_the_problem_s_own_cost_is_no_mismatch(make, capsys) -> None:
+    audit = audited(plant(make()), make(), verbose=1)
+    assert audit.finding.matches
+    assert audit.finding.cause == ""
+    assert (audit.finding.scale, audit.finding.offset) == (pytest.approx(1, rel=1e-6), 0)
+    assert audit.finding.steps == 100
+    assert "is the cost of the problem in all of 100 steps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
+def test_our_envs_have_no_mismatch(env_id) -> None:
+    audited(env_id, gym.make(env_id).observation_space.problem, strict=True)
+
+
+def test_a_wrapper_that_changes_nothing_is_not_blamed() -> None:
+    env = wrappers.RescaleAction(plant(), LOW, HIGH)
+    assert audited(env).finding.matches
+
+
+def test_the_numbers_that_the_audit_prints_make_the_next_audit_pass() -> None:
+    def env():
+        return wrappers.TransformReward(plant(), lambda reward: 0.37 * reward - 4.2)
+
+    line = audited(env()).finding
+    assert line.scale == pytest.approx(0.37, rel=1e-5)
+    assert line.offset == pytest.approx(-4.2, rel=1e-5)
+    assert line.r2 > 1 - 1e-9
+    policy = {"reward_scale": line.scale, "reward_offset": line.offset}
+    assert audited(env(), policy=policy).finding.matches
+    wrong = audited(plant(), policy=policy).finding
+    assert "not 0.37 * (-cost) -4.2, as the policy assumes" in wrong.message
+    assert '"reward_scale": 1' in wrong.message
+
+
+def test_a_map_to_theta_is_taken_into_account() -> None:
+    policy = {"observation": AffineObservation.deviation([0.3, 0.6, -0.9])}
+    assert audited(show_shifted(plant()), policy=policy).finding.matches
+
+
+def test_penalties_at_violations_and_at_ends_are_no_mismatch() -> None:
+    def penalize(env, theta, action, outcome):
+        observation, reward, _, truncated, info = outcome
+        violation = bool(np.abs(theta).max() > 1.5)
+        over = bool(np.abs(observation).max() < 0.4)
+        return (
+            observation,
+            reward - 1e5 * violation + 50 * over,
+            over,
+            truncated,
+            {
+                **info,
+                "violation": violation,
+            },
+        )
+
+    finding = audited(Changed(plant(), penalize)).finding
+    assert finding.matches
+    assert 10 < finding.steps < 95  # those with a penalty are left out
+
+
+def test_a_penalty_without_a_flag_is_a_mismatch() -> None:
+    def penalize(env, theta, action, outcome):
+        observation, reward, *rest = outcome
+        return observation, reward - 100 * bool(np.abs(theta).max() > 1.5), *rest
+
+    assert audited(Changed(plant(), penalize)).finding.cause == "unknown"
+
+
+@pytest.mark.parametrize("start", [0.0, 1e-3, 0.05, 2.0])
+def test_what_float32_cannot_tell_is_no_mismatch(start) -> None:
+    def absolute(observation):
+        return (env.unwrapped.x + 475).astype(np.float32)
+
+    env = wrappers.TimeLimit(LinearPlant(MPC, start), 20)
+    env = wrappers.TransformObservation(env, absolute, env.observation_space)
+    policy = {"observation": AffineObservation.deviation([475] * 3)}
+    assert audited(env, policy=policy).finding.matches
+
+
+def test_an_env_at_rest_says_nothing_against_the_reward() -> None:
+    assert audited(wrappers.TimeLimit(LinearPlant(MPC, 0.0), 20)).finding.matches

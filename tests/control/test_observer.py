@@ -1,0 +1,84 @@
+"""The disturbance observer estimates what nobody measures, and forgets it at a reset."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from general_problems import LOADED, THERMAL
+from sb3_yann import DisturbanceObserver, LinearModel
+
+
+def test_the_estimate_of_a_constant_disturbance_is_exact_in_the_end() -> None:
+    observer, rng = DisturbanceObserver(LOADED, [0]), np.random.default_rng(0)
+    x, d = np.array([1.0, -1.0]), np.array([0.2])
+    observer.reset(x[:1])
+    for _ in range(200):
+        u = rng.uniform(-1, 1, 1)
+        x = LOADED.step(x, u, d)
+        x_hat, d_hat = observer.update(x[:1], u)
+    np.testing.assert_allclose(x_hat, x, atol=1e-9)
+    np.testing.assert_allclose(d_hat, d, atol=1e-9)
+
+
+def test_the_kalman_gain_is_the_limit_of_the_time_varying_filter() -> None:
+    observer = DisturbanceObserver(
+        LOADED, [0], state_noise=[0.1, 0.2], disturbance_noise=0.3, measurement_noise=0.5
+    )
+    P = np.eye(3)
+    for _ in range(500):
+        P = observer.A @ P @ observer.A.T + np.diag([0.01, 0.04, 0.09])
+        K = P @ observer.seen.T / (observer.seen @ P @ observer.seen.T + 0.25)
+        P = P - K @ observer.seen @ P
+    np.testing.assert_allclose(observer.gain, K, rtol=1e-9)
+
+
+def test_more_disturbance_noise_makes_a_faster_estimate() -> None:
+    slow, fast = (
+        float(np.abs(DisturbanceObserver(LOADED, disturbance_noise=size).gain[2]).max())
+        for size in (0.1, 10.0)
+    )
+    assert fast > slow
+
+
+def test_a_reset_forgets_what_was_estimated() -> None:
+    observer = DisturbanceObserver(LOADED)
+    observer.update([1, 2], [0])
+    x_hat, d_hat = observer.reset([0.5, 0.1])
+    assert (x_hat.tolist(), d_hat.tolist()) == (pytest.approx([0.5, 0.1]), [0.0])
+
+
+@pytest.mark.parametrize(
+    ("model", "kwargs", "message"),
+    [
+        (THERMAL, {}, "no disturbance to estimate: pass its matrix E"),
+        (LinearModel(LOADED.A, LOADED.B, 1.0, E=np.eye(2)), {"measured": [0]}, "at most as many"),
+        (
+            LinearModel([[1.2, 0], [0, 0.5]], [[1], [1]], 1.0, E=[[1], [1]]),
+            {"measured": [1]},
+            "do not see an unstable mode: eigenvalue 1.2",
+        ),
+        (
+            LinearModel([[1, 0], [0, 0.5]], [[1], [1]], 1.0, E=[[0], [0]]),
+            {},
+            r"has rank 2, needed is 3",
+        ),
+        (LOADED, {"gain": np.zeros((3, 2))}, "does not make the error of the estimate decay"),
+        (LOADED, {"gain": np.zeros((2, 2))}, r"gain has shape \(2, 2\), expected \(3, 2\)"),
+        (LOADED, {"measurement_noise": 0}, "measurement_noise = .* standard deviations, above 0"),
+        (LOADED, {"measured": 0}, r"measured = 0 must be a list of indices of states: \[0\]"),
+        (LOADED, {"measured": [5]}, r"measured = \[5\] must be indices of states"),
+    ],
+)
+def test_bad_argument_of_an_observer_is_named(
+    model: LinearModel, kwargs: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        DisturbanceObserver(model, **kwargs)  # type: ignore[arg-type]
+
+
+def test_bad_measurements_are_named() -> None:
+    with pytest.raises(ValueError, match=r"y has shape \(1,\), expected \(2,\)"):
+        DisturbanceObserver(LOADED).update([1], [0])
+    with pytest.raises(ValueError, match="u holds NaN"):
+        DisturbanceObserver(LOADED).update([1, 2], [np.nan])

@@ -1,0 +1,250 @@
+"""Actor and critic in SB3: their networks, rates and optimizers, and the critic's warm-up."""
+
+from __future__ import annotations
+
+import copy
+
+import cloudpickle
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG, TD3
+
+from policy_samples import (
+    CRITICS,
+    POLICIES,
+    build,
+    changed,
+    scalar_mpc,
+    starts,
+    two_inputs,
+    updates,
+    with_full_buffer,
+)
+from sample_plants import LinearPlant
+from sb3_yann import NoActionNoise, YannActor, YannCritic, YannPolicy
+from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, RowAdam
+from weights import network_of
+
+
+@POLICIES
+@CRITICS
+@pytest.mark.parametrize("n_critics", [1, 2])
+def test_actor_and_critic_are_those_of_sb3_with_yann_networks(algorithm, critic, n_critics) -> None:
+    kwargs = {"critic": critic, "n_critics": n_critics, "critic_warmup": 0}
+    model = build(algorithm, policy_kwargs=kwargs)
+    assert isinstance(model.actor, YannActor)
+    assert isinstance(model.critic, YannCritic)
+    network = {"afterstate": AfterstateValue, "state_action": QuadraticStateActionValue}[critic]
+    for each in (model.critic, model.critic_target):
+        assert [type(q) for q in each.q_networks] == [network] * n_critics
+    before = copy.deepcopy(model.policy)
+    model.learn(60, callback=NoActionNoise())
+    for name in ("actor", "actor_target", "critic", "critic_target"):
+        assert changed(getattr(model.policy, name), getattr(before, name)), name
+
+
+@POLICIES
+def test_the_critic_is_an_afterstate_one_by_default(algorithm) -> None:
+    assert isinstance(build(algorithm).critic.qf0, AfterstateValue)
+
+
+def test_ddpg_has_one_critic_and_td3_two() -> None:
+    assert build(DDPG).critic.n_critics == 1
+    assert build(TD3).critic.n_critics == 2
+
+
+def first_step(network) -> float:
+    """Return the length of Adam's first step, which is the learning rate itself."""
+    before = [p.clone() for p in network.parameters()]
+    for p in network.parameters():
+        p.grad = th.ones_like(p)
+    network.optimizer.state.clear()
+    network.optimizer.step()
+    steps = [(a - b).detach() for a, b in zip(before, network.parameters(), strict=True)]
+    np.testing.assert_allclose(steps[-1], float(steps[0].mean()), rtol=1e-2)
+    return float(steps[0].mean())
+
+
+@pytest.mark.parametrize("way", ["as built", "deep copy", "pickle", "saved and loaded"])
+def test_actor_and_critic_step_at_their_own_rates(way, tmp_path) -> None:
+    mpc = scalar_mpc()
+    kwargs = {"problem": mpc, "actor_lr_mult": 0.1, "critic_lr_mult": 0.5, "critic_warmup": 0}
+    model = DDPG(YannPolicy, LinearPlant(mpc), learning_rate=1e-2, policy_kwargs=kwargs)
+    policy = model.policy
+    if way == "deep copy":
+        policy = copy.deepcopy(policy)
+    elif way == "pickle":
+        policy = cloudpickle.loads(cloudpickle.dumps(policy))
+    elif way == "saved and loaded":
+        model.save(tmp_path / "model")
+        policy = DDPG.load(tmp_path / "model").policy
+    assert first_step(policy.actor) == pytest.approx(1e-3, rel=1e-2)
+    assert first_step(policy.critic) == pytest.approx(5e-3, rel=1e-2)
+    assert policy.actor.optimizer.param_groups[0]["lr"] == 1e-2  # SB3's own, untouched
+
+
+def test_rates_given_to_load_are_those_in_use(tmp_path) -> None:
+    model = build(learning_rate=1e-2, policy_kwargs={"critic_warmup": 0})
+    model.save(tmp_path / "model")
+    kwargs = {**model.policy_kwargs, "actor_lr_mult": 0.5}
+    loaded = DDPG.load(tmp_path / "model", custom_objects={"policy_kwargs": kwargs})
+    assert first_step(loaded.actor) == pytest.approx(5e-3, rel=1e-2)
+
+
+def test_the_actors_loss_leaves_the_critic_alone_which_still_learns() -> None:
+    model = build(policy_kwargs={"critic_warmup": 0})
+    critic, theta = model.critic, th.rand(32, model.observation_space.shape[0])
+    actions = th.zeros(32, model.action_space.shape[0], requires_grad=True)
+    q = critic.q1_forward(theta, actions)
+    th.testing.assert_close(q, critic(theta, actions)[0], rtol=0, atol=0)
+    q.sum().backward()
+    assert bool((actions.grad != 0).any())
+    assert all(each.grad is None and each.requires_grad for each in critic.parameters())
+    critic(theta, actions)[0].sum().backward()
+    assert all(each.grad is not None for each in critic.parameters())
+
+
+def test_an_optimizer_of_the_users_choice_is_taken_as_it_is() -> None:
+    assert build().actor.optimizer.defaults["fused"] is True
+    kwargs = {"optimizer_kwargs": {"eps": 1e-5}}
+    chosen = build(policy_kwargs=kwargs).actor.optimizer.defaults
+    assert (chosen["fused"], chosen["eps"]) == (None, 1e-5)
+    kwargs = {"optimizer_class": th.optim.SGD}
+    assert type(build(policy_kwargs=kwargs).actor.optimizer) is th.optim.SGD
+
+
+def test_the_mode_is_switched_for_every_module() -> None:
+    policy = build().policy
+    for mode in (False, True):
+        policy.set_training_mode(mode)
+        for part in (policy.actor, policy.critic):
+            assert {module.training for module in part.modules()} == {mode}
+
+
+@pytest.mark.parametrize("frozen", ["actor", "critic"])
+def test_a_rate_of_zero_freezes_one_of_them(frozen) -> None:
+    mpc = scalar_mpc()
+    kwargs = {"problem": mpc, f"{frozen}_lr_mult": 0.0, "critic_warmup": 0}
+    model = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs=kwargs, seed=0)
+    before = {name: p.clone() for name, p in model.policy.named_parameters()}
+    model.learn(20, callback=NoActionNoise())
+    moved = {
+        name.split(".")[0]
+        for name, p in model.policy.named_parameters()
+        if not th.equal(p, before[name])
+    }
+    assert frozen not in moved
+    assert ("actor" in moved) != (frozen == "actor")
+
+
+def test_constants_are_no_parameters_and_target_updates_leave_them_alone() -> None:
+    model = build()
+    learnt = {name for name, _ in model.actor.named_parameters()}
+    assert all(name.startswith("mu.network.") for name in learnt)
+    learnt = {name.split(".")[1] for name, _ in model.critic.named_parameters()}
+    assert learnt == {"quadratic", "network"}
+    assert not any("running_" in name for name in model.policy.state_dict())
+
+
+@CRITICS
+@pytest.mark.parametrize("policy_delay", [1, 2])
+def test_the_actor_stays_the_mpc_bit_for_bit_until_the_critic_is_warm(policy_delay, critic) -> None:
+    model = with_full_buffer(TD3, two_inputs(), critic=critic, critic_warmup=6)
+    model.policy_delay = policy_delay
+    first, theta = copy.deepcopy(model.policy), th.as_tensor(starts(two_inputs()))
+    law = first.actor(theta)
+    for _ in range(5):
+        updates(model, 1)
+        assert not changed(model.actor, first.actor)
+        assert th.equal(model.actor(theta), law)
+        assert th.equal(model.actor_target(theta), law)
+        assert not model.actor.optimizer.state
+        assert changed(model.critic, first.critic)
+    updates(model, 1)  # the sixth of the critic, and then the actor's first
+    assert changed(model.actor, first.actor)
+    assert not th.equal(model.actor(theta), law)
+    assert {int(state["steps"].max()) for state in model.actor.optimizer.state.values()} == {1}
+    updates(model, 2)  # the first step moves one layer of zeros only
+    assert not th.equal(model.actor_target(theta), law)
+
+
+def test_the_delay_of_td3_is_kept_after_the_warm_up() -> None:
+    model = with_full_buffer(TD3, critic_warmup=5)
+    first = copy.deepcopy(model.actor)
+    updates(model, 5)  # TD3's actor has a turn at every second update only
+    assert not changed(model.actor, first)
+    updates(model, 1)
+    assert changed(model.actor, first)
+
+
+def test_without_a_warm_up_the_actor_steps_at_once() -> None:
+    model = with_full_buffer(critic_warmup=0)
+    first = copy.deepcopy(model.actor)
+    updates(model, 1)
+    assert changed(model.actor, first)
+
+
+@pytest.mark.parametrize("way", ["deep copy", "pickle", "saved and loaded", "parameters"])
+def test_a_warm_up_goes_on_where_it_was(way, tmp_path) -> None:
+    model = with_full_buffer(critic_warmup=5)
+    updates(model, 3)
+    policy = model.policy
+    if way == "deep copy":
+        policy = copy.deepcopy(policy)
+    elif way == "pickle":
+        policy = cloudpickle.loads(cloudpickle.dumps(policy))
+    elif way == "saved and loaded":
+        model.save(tmp_path / "model")
+        policy = DDPG.load(tmp_path / "model").policy
+    else:
+        other = with_full_buffer(critic_warmup=5)
+        other.set_parameters(model.get_parameters())
+        policy = other.policy
+    assert policy.critic_updates == 3
+    model.policy = policy
+    model._create_aliases()
+    first = copy.deepcopy(policy.actor)
+    updates(model, 1)
+    assert not changed(policy.actor, first)
+    updates(model, 1)
+    assert changed(policy.actor, first)
+
+
+def test_a_policy_starts_with_no_update_counted() -> None:
+    assert build().policy.critic_updates == 0
+
+
+def test_beyond_32_regions_those_without_data_do_not_move_not_even_by_momentum() -> None:
+    model = with_full_buffer(DDPG, two_inputs(), critic_warmup=0)
+    assert isinstance(model.actor.optimizer, RowAdam)
+    assert two_inputs().explicit().n_regions > 32
+    updates(model, 5)
+    before = copy.deepcopy(network_of(model))
+    data = model.replay_buffer.sample(3)
+    model.replay_buffer.sample = lambda *_, **__: data
+    updates(model, 1)
+    seen = set(two_inputs().explicit().locate(data.observations.double().numpy()).tolist())
+    for old, new in zip(before.parameters(), network_of(model).parameters(), strict=True):
+        moved = (old != new).flatten(1).any(1).nonzero()[:, 0].tolist()
+        assert moved and set(moved) <= seen
+
+
+def test_an_optimizer_of_ones_own_gets_dense_gradients() -> None:
+    kwargs = {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {}, "critic_warmup": 0}
+    model = with_full_buffer(DDPG, two_inputs(), **kwargs)
+    updates(model, 2)
+    assert not any(each.grad.is_sparse for each in model.actor.parameters())
+
+
+@POLICIES
+@CRITICS
+def test_actor_and_critic_yield_all_their_parameters_in_the_order_of_their_names(
+    algorithm, critic
+) -> None:
+    model = build(algorithm, policy_kwargs={"critic": critic})
+    for module in (model.actor, model.actor_target, model.critic, model.critic_target):
+        named = [each for _, each in module.named_parameters()]
+        found = [*module.parameters()]
+        assert len(found) == len(named) > 2
+        assert all(one is other for one, other in zip(found, named, strict=True))

@@ -1,0 +1,158 @@
+"""Spaces, environments and policy_kwargs that mean nothing are refused by name."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG, PPO, SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from policy_samples import (
+    actions,
+    make_policy,
+    scalar_mpc,
+    unbounded,
+)
+from sample_plants import LinearPlant
+from sb3_yann import LinearModel, LinearMPC, YannPolicy
+
+
+@pytest.mark.parametrize(
+    ("observation_space", "action_space", "error", "message"),
+    [
+        (spaces.Dict({"x": unbounded()}), actions(), TypeError, "observation_space is a Dict"),
+        (spaces.Discrete(3), actions(), TypeError, "observation_space is a Discrete"),
+        (spaces.Box(0, 255, (3, 36, 36), np.uint8), actions(), ValueError, "one dimension"),
+        (unbounded(), spaces.Discrete(2), TypeError, "action_space is a Discrete"),
+        (unbounded(), spaces.MultiDiscrete([2]), TypeError, "action_space is a MultiDiscrete"),
+        (unbounded(), unbounded(), ValueError, "must have finite bounds"),
+        (unbounded(), spaces.Box(-1, 1, (1, 1), np.float32), ValueError, "one dimension"),
+        (unbounded(), actions(-2, 1), ValueError, r"u_min = \[-1.0\]"),
+        (unbounded(), actions(size=2), ValueError, "They must be the same"),
+        (spaces.Box(-1, 1, (2,), np.float32), actions(), ValueError, r"theta of shape \(1,\)"),
+    ],
+)
+def test_spaces_that_do_not_fit_are_named(observation_space, action_space, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make_policy(observation_space, action_space, problem=scalar_mpc())
+
+
+class Heater(gym.Env):
+    """A temperature about its steady state, heated with 0 to 10 V, of which 3 hold it."""
+
+    def __init__(self) -> None:
+        self.observation_space = unbounded()
+        self.action_space = spaces.Box(0, 10, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(-1, 1, 1)
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        reward = -float(self.x @ self.x + 0.1 * (action - 3) @ (action - 3))
+        self.x = 0.9 * self.x + 0.2 * (np.asarray(action, np.float64) - 3)
+        return self.x.astype(np.float32), reward, False, False, {}
+
+
+def heater_mpc(u_min: float, u_max: float) -> LinearMPC:
+    model = LinearModel([[0.9]], [[0.2]], 1.0, u_ss=[3])
+    weights = {"Q": [[1]], "R": [[0.1]], "horizon": 1, "theta_min": -5, "theta_max": 5}
+    return LinearMPC(model, u_min=u_min, u_max=u_max, **weights)
+
+
+def test_an_env_with_absolute_inputs_is_told_the_wrapper_that_fits() -> None:
+    kwargs = {"problem": heater_mpc(-3, 7)}
+    with pytest.raises(ValueError, match=r"takes absolute inputs.*RescaleAction") as caught:
+        DDPG(YannPolicy, Heater(), policy_kwargs=kwargs)
+    line = str(caught.value).partition("env = ")[2].removesuffix(".")
+    env = eval(line, {"gymnasium": gym, "numpy": np, "env": Heater()})
+    model = DDPG(YannPolicy, env, policy_kwargs=kwargs)
+    theta, _ = env.reset(options={})
+    reached = env.step(model.predict(theta)[0])[0]
+    expected = 0.9 * theta + 0.2 * kwargs["problem"].explicit()(theta)
+    assert reached == pytest.approx(expected, abs=1e-6)
+
+
+def test_bounds_that_are_not_deviations_are_warned_of() -> None:
+    kwargs = {"problem": heater_mpc(0, 10)}
+    with pytest.warns(UserWarning, match=r"u_min = \[-3.0\] and u_max = \[7.0\], and wrap"):
+        DDPG(YannPolicy, Heater(), policy_kwargs=kwargs)
+
+
+def test_a_law_without_input_bounds_is_no_policy() -> None:
+    with pytest.raises(ValueError, match="u_min"):
+        make_policy(unbounded(), actions(), problem=scalar_mpc(u_min=None, u_max=None))
+
+
+@pytest.mark.parametrize("algorithm", [SAC, PPO])
+def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
+    mpc = scalar_mpc()
+    with pytest.raises(TypeError, match=algorithm.__name__):
+        algorithm(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc})
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"actor_lr_mult": -1}, ValueError, "actor_lr_mult"),
+        ({"critic_lr_mult": float("nan")}, ValueError, "critic_lr_mult"),
+        ({"gamma": 1.5}, ValueError, "gamma"),
+        ({"hidden": 3}, TypeError, "'hidden'"),
+        ({"actor_lr_mult": "a"}, TypeError, "actor_lr_mult = 'a'"),
+        ({"actor_lr_mult": None}, TypeError, "actor_lr_mult = None"),
+        ({"n_critics": 0}, ValueError, "n_critics = 0"),
+        ({"net_arch": {"pi": [4, 4, 4], "qf": [8, 8]}}, ValueError, r"net_arch\['pi'\]"),
+        ({"net_arch": {"pi": ["a"]}}, ValueError, r"net_arch\['pi'\]"),
+        ({"net_arch": {"vf": [4]}}, ValueError, "net_arch"),
+        ({"activation_fn": th.tanh}, TypeError, "activation_fn"),
+        ({"activation_fn": th.nn.Sigmoid}, ValueError, "activation"),
+        ({"critic": "quadratic"}, ValueError, "critic = 'quadratic'"),
+        ({"critic": None}, ValueError, "critic = None"),
+        ({"prediction_model": 3}, TypeError, "prediction_model = 3"),
+        ({"prediction_model": "f", "critic": "state_action"}, TypeError, "prediction_model = 'f'"),
+        (
+            {"prediction_model": lambda theta, u: theta, "critic": "state_action"},
+            ValueError,
+            "prediction_model is for critic='afterstate'",
+        ),
+        ({"value_scale": 0}, ValueError, "value_scale = 0"),
+        ({"value_scale": -30.0}, ValueError, "value_scale = -30.0"),
+        ({"value_scale": float("nan")}, ValueError, "value_scale = nan"),
+        ({"value_scale": "big"}, TypeError, "value_scale = 'big'"),
+        ({"critic_warmup": -1}, ValueError, "critic_warmup = -1"),
+        ({"critic_warmup": 1.5}, ValueError, r"critic_warmup = 1\.5"),
+        ({"critic_warmup": True}, ValueError, "critic_warmup = True"),
+        ({"max_correction": -0.1}, ValueError, r"max_correction = -0\.1"),
+        ({"max_correction": 1.5}, ValueError, r"max_correction = 1\.5"),
+        ({"max_correction": float("nan")}, ValueError, "max_correction = nan"),
+        ({"max_correction": "x"}, TypeError, "max_correction = 'x'"),
+    ],
+)
+def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make_policy(unbounded(), actions(), problem=scalar_mpc(), **kwargs)
+
+
+def test_a_net_arch_may_leave_out_or_join_actor_and_critic() -> None:
+    policy = make_policy(unbounded(), actions(), problem=scalar_mpc(), net_arch={"pi": [3, 5]})
+    assert policy.net_arch == {"pi": [3, 5], "qf": [64, 64]}
+    policy = make_policy(unbounded(), actions(), problem=scalar_mpc(), net_arch=[7, 7])
+    assert policy.net_arch == {"pi": [7, 7], "qf": [7, 7]}
+
+
+def test_integer_actions_are_refused() -> None:
+    with pytest.raises(TypeError, match="int32"):
+        make_policy(unbounded(), spaces.Box(-1, 1, (1,), np.int32), problem=scalar_mpc())
+
+
+@pytest.mark.parametrize("normalized", ["norm_obs", "norm_reward"])
+def test_a_normalizing_env_is_refused(normalized) -> None:
+    switches = {"norm_obs": False, "norm_reward": False, normalized: True}
+    env = VecNormalize(make_vec_env("sb3_yann:CSTR-v0"), **switches)
+    with pytest.raises(ValueError, match="VecNormalize"):
+        DDPG(YannPolicy, env)

@@ -1,0 +1,199 @@
+"""max_correction, pin_equilibrium, prediction_model and value_scale do what they promise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG
+
+from policy_samples import (
+    CRITICS,
+    POLICIES,
+    build,
+    scalar_mpc,
+    starts,
+    two_inputs,
+    updates,
+    with_full_buffer,
+)
+from sample_plants import two_input_mpc
+from sb3_yann import LinearMPC, YannPolicy
+
+# --- max_correction ----------------------------------------------------------------------------
+
+
+def distances(model, mpc: LinearMPC, states: np.ndarray) -> np.ndarray:
+    """Distances from the MPC in float64 and from the policy that it starts as, (2, batch, m)."""
+    actions, _ = model.predict(states)
+    start, _ = build(mpc=mpc).predict(states)
+    laws = np.array([mpc.explicit()(states), start], dtype=np.float64)
+    return np.abs(actions.astype(np.float64) - laws)
+
+
+def scramble(model) -> None:
+    """Give the actor huge weights."""
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        for parameter in model.actor.parameters():
+            th.nn.init.normal_(parameter, std=1e3)
+
+
+@pytest.mark.parametrize("bound", [0.1, 0.5, 1])
+def test_no_action_is_ever_further_from_the_mpc_than_the_bound(mpc, bound) -> None:
+    model = build(mpc=mpc, policy_kwargs={"max_correction": bound})
+    scramble(model)
+    states = starts(mpc, 10_000, stretch=3)
+    assert 500 < mpc.explicit().in_domain(states).sum() < 9500
+    reach = mpc.u_max - mpc.u_min
+    far = distances(model, mpc, states)
+    assert np.all(far <= bound * reach)  # no tolerance
+    assert np.all(far.max(axis=1) > 0.99 * min(bound, 0.5) * reach)  # it is the bound that acts
+
+
+def test_a_bound_of_zero_is_the_mpc_bit_for_bit(mpc) -> None:
+    model = build(mpc=mpc, policy_kwargs={"max_correction": 0})
+    scramble(model)
+    states = starts(mpc, 10_000, stretch=3)
+    np.testing.assert_array_equal(model.predict(states)[0], build(mpc=mpc).predict(states)[0])
+
+
+@POLICIES
+def test_the_bound_holds_after_training(algorithm) -> None:
+    mpc = two_inputs()
+    kwargs = {"max_correction": 0.1, "critic_warmup": 0, "actor_lr_mult": 10.0}
+    model = with_full_buffer(algorithm, mpc, **kwargs)
+    updates(model, 60)
+    far = distances(model, mpc, starts(mpc, 10_000, stretch=3)) / (mpc.u_max - mpc.u_min)
+    assert 0.09 < far.max()
+    assert far.max() <= 0.1
+
+
+def test_a_bound_survives_saving(tmp_path) -> None:
+    model = build(policy_kwargs={"max_correction": 0.25, "pin_equilibrium": False})
+    scramble(model)
+    model.save(tmp_path / "model")
+    model.policy.save(tmp_path / "policy")
+    states = starts(scalar_mpc())
+    for loaded in (DDPG.load(tmp_path / "model"), YannPolicy.load(tmp_path / "policy")):
+        np.testing.assert_array_equal(loaded.predict(states)[0], model.predict(states)[0])
+
+
+# --- pin_equilibrium ---------------------------------------------------------------------------
+
+
+@POLICIES
+@CRITICS
+@pytest.mark.parametrize("pinned", [True, False])
+def test_training_moves_the_equilibrium_only_where_it_is_not_pinned(
+    algorithm, critic, pinned
+) -> None:
+    mpc = two_inputs()
+    kwargs = {"critic": critic, "pin_equilibrium": pinned, "critic_warmup": 0}
+    model = with_full_buffer(algorithm, mpc, **kwargs)
+    origin = np.zeros((1, 3), np.float32)
+    before, _ = model.predict(origin)
+    updates(model, 20)
+    after, _ = model.predict(origin)
+    assert np.array_equal(after, before) == pinned
+    at_rest = model.policy.scale_action(np.zeros((1, 2), np.float32))
+    with th.no_grad():
+        q = model.critic.q1_forward(th.as_tensor(origin), th.as_tensor(at_rest))
+    assert (abs(float(q)) < 1e-5) == pinned  # u = 0 is an action that float32 rounds
+
+
+# --- prediction_model --------------------------------------------------------------------------
+
+A, B = (th.as_tensor(M.T.copy()) for M in (two_input_mpc().model.A, two_input_mpc().model.B))
+
+
+def linear_prediction(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+    return theta @ A + u @ B
+
+
+class LinearModule(th.nn.Module):
+    """The linear model with parameters of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.A, self.B = th.nn.Parameter(A.clone()), th.nn.Parameter(B.clone())
+
+    def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+        return theta @ self.A + u @ self.B
+
+
+MODELS = pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModule])
+
+
+@POLICIES
+@MODELS
+def test_the_linear_model_given_as_prediction_model_changes_no_more_than_rounding(
+    algorithm, make
+) -> None:
+    mine = with_full_buffer(algorithm, two_inputs(), prediction_model=make(), critic_warmup=3)
+    default = with_full_buffer(algorithm, two_inputs(), critic_warmup=3)
+    updates(default, 10)
+    mine.critic.load_state_dict(default.critic.state_dict(), strict=False)
+    found, data = [], default.replay_buffer.sample(64)
+    for model in (mine, default):
+        (q,) = model.critic(data.observations, data.actions)[:1]
+        model.critic.optimizer.zero_grad()
+        q.square().sum().backward()
+        found.append([q.detach(), *(each.grad for each in model.critic.q_networks[0].parameters())])
+    for one, other in zip(*found, strict=True):
+        assert th.allclose(one, other, rtol=1e-3, atol=1e-4 * float(other.abs().max()))
+
+
+def test_a_module_that_predicts_is_not_trained() -> None:
+    module = LinearModule()
+    model = with_full_buffer(mpc=two_inputs(), prediction_model=module, critic_warmup=0)
+    updates(model, 20)
+    for each in (module, model.critic.qf0.model, model.critic_target.qf0.model):
+        assert th.equal(each.A, A)
+        assert th.equal(each.B, B)
+
+
+@CRITICS
+def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) -> None:
+    if critic == "state_action":
+        kwargs = {"critic": critic}
+    else:
+        kwargs = {"prediction_model": lambda theta, u: 0 * theta + 0 * u.sum(1, keepdim=True)}
+    mpc = two_inputs()
+    model = build(mpc=mpc, policy_kwargs=kwargs)
+    theta, u = starts(mpc), mpc.explicit()(starts(mpc))
+    action = th.as_tensor(model.policy.scale_action(u.astype(np.float32)))
+    with th.no_grad():
+        q = model.critic.q1_forward(th.as_tensor(theta), action).numpy()[:, 0]
+    stage = -mpc.stage_cost(theta, u)  # all there is, where the next state is the origin
+    assert np.allclose(q, stage, rtol=1e-5) == (critic == "afterstate")
+
+
+@pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModule, lambda: bent])
+def test_a_saved_model_brings_its_prediction_model_with_it(make, tmp_path) -> None:
+    model = with_full_buffer(mpc=two_inputs(), prediction_model=make(), critic_warmup=0)
+    updates(model, 5)
+    model.save(tmp_path / "model")
+    model.policy.save(tmp_path / "policy")
+    theta = th.as_tensor(starts(two_inputs()))
+    expected = model.critic(theta, model.actor(theta))[0]
+    for policy in (DDPG.load(tmp_path / "model").policy, YannPolicy.load(tmp_path / "policy")):
+        assert th.equal(policy.critic(theta, policy.actor(theta))[0], expected)
+
+
+def bent(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+    return th.sin(linear_prediction(theta, u))
+
+
+def test_a_saved_model_may_predict_with_a_lambda(tmp_path) -> None:
+    model = build(policy_kwargs={"prediction_model": lambda theta, u: th.sin(1.1 * theta + u)})
+    model.save(tmp_path / "model")
+    theta = th.as_tensor(starts(scalar_mpc()))
+    critic = DDPG.load(tmp_path / "model").critic
+    expected = model.critic(theta, model.actor(theta))[0]
+    assert th.equal(critic(theta, model.actor(theta))[0], expected)
+
+
+def test_value_scale_is_that_of_the_critic_s_network() -> None:
+    assert build().critic.qf0.scale == 30
+    assert build(policy_kwargs={"value_scale": 7.0}).critic.qf0.scale == 7

@@ -1,0 +1,114 @@
+"""A VecNormalize with frozen statistics is folded into the map to theta; others are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+
+from observation_samples import HIGH, LOW, MPC, STEADY, Seen, build, error, law, states
+from sample_plants import LinearPlant
+from sb3_yann import (
+    AffineObservation,
+    ControlDiagnostics,
+    ImprovementGuard,
+    NoActionNoise,
+)
+
+
+def normalize(frozen: bool = True, n_envs: int = 1, **kwargs) -> VecNormalize:
+    """Return an env of absolute values, normalized by the statistics of a few steps."""
+    plants = [lambda: Seen(lambda x: x + STEADY, 3)] * n_envs
+    env = VecNormalize(DummyVecEnv(plants), **{"norm_reward": False, "clip_obs": np.inf} | kwargs)
+    env.seed(0)
+    env.reset()
+    for _ in range(30):
+        env.step(np.array([env.action_space.sample() for _ in range(n_envs)]))
+    env.training = not frozen
+    return env
+
+
+ABSOLUTE = AffineObservation.deviation(STEADY)
+
+
+def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> None:
+    env = normalize(n_envs=2)
+    model = build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env))
+    obs = env.normalize_obs((states() + STEADY).astype(np.float32))
+    assert error(model, obs, states()) < 1e-5
+    # The guard's own env is one without a VecNormalize, as the training env is below its own.
+    guard = ImprovementGuard(lambda: Seen(lambda x: x + STEADY, 3), n_starts=5)
+    model.learn(120, callback=[NoActionNoise(), ControlDiagnostics(), guard])
+    seen = law().locate(model.policy.theta(env.normalize_obs(env.get_original_obs())).numpy())
+    assert guard.state.evidence.visits[:, seen].any()
+    assert guard.state.evidence.paired.mpc_costs == pytest.approx(mpc_costs(guard.acceptance.seeds))
+    model.save(tmp_path / "model")
+    loaded = DDPG.load(tmp_path / "model", env=env)
+    np.testing.assert_array_equal(loaded.predict(obs)[0], model.predict(obs)[0])
+
+
+def mpc_costs(seeds) -> list[float]:
+    """Return the cost of the explicit law itself, in float64."""
+    costs = []
+    for seed in seeds:
+        plant, cost = LinearPlant(MPC), 0.0
+        plant.reset(seed=seed)
+        for _ in range(20):
+            cost -= plant.step(law()(plant.x))[1]
+        costs.append(cost)
+    return costs
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: normalize(frozen=False), "still moves its statistics"),
+        (lambda: normalize(norm_reward=True), "normalizes rewards"),
+        (lambda: VecFrameStack(normalize(), 2), "Make VecNormalize the last wrapper"),
+        (lambda: DummyVecEnv([lambda: LinearPlant(MPC)]), "holds no VecNormalize"),
+    ],
+)
+def test_a_vec_normalize_that_cannot_be_undone_is_refused(make, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        AffineObservation.from_vec_normalize(make())
+
+
+@pytest.mark.parametrize(
+    ("make", "observation", "message"),
+    [
+        (lambda: normalize(frozen=False), ABSOLUTE, "still moves its statistics"),
+        (lambda: normalize(norm_reward=True), ABSOLUTE, "normalizes rewards"),
+        (normalize, None, r"AffineObservation\.from_vec_normalize\(venv\)"),
+        (
+            lambda: VecFrameStack(normalize(), 2),
+            AffineObservation.newest_frame(3, 2),
+            "Make VecNormalize the last wrapper",
+        ),
+        (lambda: normalize(clip_obs=3.0), ABSOLUTE, r"clips at clip_obs = 3.*numpy\.inf"),
+    ],
+)
+def test_a_policy_refuses_it_as_well(make, observation, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(make(), observation)
+
+
+def test_clipping_beyond_the_box_of_the_law_is_nothing_to_refuse() -> None:
+    env = normalize()
+    folded = ABSOLUTE @ AffineObservation.from_vec_normalize(env)
+    corners = np.array([LOW, HIGH]) + STEADY
+    reach = float(np.abs(env.normalize_obs(corners)).max())
+    env.clip_obs = 1.001 * reach
+    build(env, folded)
+    env.clip_obs = 0.999 * reach
+    with pytest.raises(ValueError, match="clip_obs"):
+        build(env, folded)
+    env.clip_obs = 1e9  # two entries for one of theta: whatever theta is, each may be anything
+    with pytest.raises(ValueError, match="reach inf"):
+        build(env, AffineObservation(np.ones((3, 3))))
+
+
+def test_a_vec_normalize_that_does_nothing_needs_no_map() -> None:
+    env = normalize(norm_obs=False)
+    assert AffineObservation.from_vec_normalize(env) == AffineObservation.identity(3)
+    build(env, None)

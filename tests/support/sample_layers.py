@@ -1,0 +1,33 @@
+"""YANN layers with random weights, and a few steps of training."""
+
+from __future__ import annotations
+
+import pytest
+import torch as th
+
+from sample_laws import (
+    PROBLEMS,
+)
+from sb3_yann.networks import YannLayer
+
+EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
+INFEASIBLE = pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
+
+
+def scrambled(layer: YannLayer, size: float = 1.0) -> YannLayer:
+    """The layer with random weights, as after much training."""
+    for parameter in layer.parameters():
+        th.nn.init.normal_(parameter, std=size)
+    return layer
+
+
+def region_of(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
+    return layer.locate(theta)[0]
+
+
+def train(layer: YannLayer, theta: th.Tensor, target: float, steps: int = 20) -> None:
+    optimizer = th.optim.Adam(layer.parameters(), 1e-2)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        (layer(theta) - target).square().mean().backward()
+        optimizer.step()

@@ -1,0 +1,90 @@
+"""Linear plants with the problems they stand for, feasible states, and a record of an episode."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+
+from online_mpc import OnlineMPC
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann_envs import problems
+
+
+class LinearPlant(gym.Env):
+    """The prediction model itself as the plant, with the cost of the MPC, in float64."""
+
+    def __init__(self, mpc: LinearMPC, start: float = 1.0) -> None:
+        self.mpc, self.start = mpc, start
+        n = mpc.n_theta
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (n,), np.float32)
+        self.action_space = gym.spaces.Box(
+            mpc.u_min.astype(np.float32), mpc.u_max.astype(np.float32)
+        )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.start * self.np_random.uniform(-1, 1, self.mpc.n_theta)
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        u = np.asarray(action, dtype=np.float64)
+        reward = -float(self.mpc.stage_cost(self.x, u))
+        self.x = self.mpc.predict(self.x, u)
+        return self.x.astype(np.float32), reward, False, False, {}
+
+
+def two_input_mpc(**changes) -> LinearMPC:
+    """Three states, two inputs, asymmetric bounds on everything."""
+    A = [[1, 0.1, 0], [0, 1, 0.1], [0, 0, 0.9]]
+    B = [[0, 0.1], [0.1, 0], [0, 1]]
+    design = {
+        "Q": np.eye(3),
+        "R": np.diag([0.1, 0.2]),
+        "horizon": 2,
+        "x_min": -5,
+        "x_max": [5, 6, 7],
+        "u_min": [-1, -0.5],
+        "u_max": [2, 0.7],
+    }
+    return LinearMPC(LinearModel(A, B, 0.1), **{**design, **changes})
+
+
+def asymmetric_pendulum_mpc() -> LinearMPC:
+    """The pendulum's problem with a motor that pulls harder to one side."""
+    return dataclasses.replace(problems.clipped_pendulum(), u_min=-1.0, u_max=3.0)
+
+
+def feasible_states(mpc: LinearMPC, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` float32-exact states at which the online QP is feasible, and its inputs."""
+    online, rng = OnlineMPC(mpc), np.random.default_rng(seed)
+    states, inputs = [], []
+    while len(states) < count:
+        theta = rng.uniform(mpc.theta_min, mpc.theta_max).astype(np.float32).astype(np.float64)
+        u = online(theta)
+        if u is not None:
+            states.append(theta)
+            inputs.append(u)
+    return np.array(states), np.array(inputs)
+
+
+class Recorder(gym.Wrapper):
+    """Keeps every observation and the action that met it."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.pairs: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def reset(self, **kwargs):
+        self.last, info = self.env.reset(**kwargs)
+        return self.last, info
+
+    def step(self, action):
+        self.pairs.append((self.last, np.array(action)))
+        self.last, *rest = self.env.step(action)
+        return self.last, *rest
+
+    def recorded(self) -> tuple[np.ndarray, np.ndarray]:
+        observations, actions = zip(*self.pairs, strict=True)
+        return np.array(observations), np.array(actions)

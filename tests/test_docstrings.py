@@ -1,0 +1,147 @@
+"""The examples in the docstrings run; what is public has one, and names its parameters."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import pkgutil
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+PACKAGES = ("sb3_yann", "sb3_yann_envs")
+EXPORTING = (
+    "sb3_yann",
+    "sb3_yann.control",
+    "sb3_yann.networks",
+    "sb3_yann.wrappers",
+    "sb3_yann.evaluation",
+    "sb3_yann_envs",
+)
+MANY = 4
+"""Parameters from which on each is documented."""
+FINDER = doctest.DocTestFinder(exclude_empty=True)
+
+
+def modules() -> Iterator[str]:
+    """Yield the names of all modules of the packages."""
+    for package in PACKAGES:
+        yield package
+        found = pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.")
+        yield from (each.name for each in found)
+
+
+MODULES = [importlib.import_module(name) for name in modules()]
+
+
+def with_examples() -> list[doctest.DocTest]:
+    """Return the docstrings of the packages that hold examples, a module's objects in order."""
+    tests = [each for module in MODULES for each in FINDER.find(module, module.__name__)]
+    return [each for each in tests if each.examples]
+
+
+def exported() -> dict[str, Any]:
+    """Return the classes and functions that the packages export, by their names."""
+    found = {}
+    for package in map(importlib.import_module, EXPORTING):
+        for name in public_names(package):
+            value = getattr(package, name)
+            if inspect.isclass(value) or inspect.isroutine(value):
+                found[f"{package.__name__}.{name}"] = value
+    return found
+
+
+def public_names(module: Any) -> list[str]:
+    """Return ``__all__``, or else what is public and of the module itself."""
+    own = [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_") and getattr(value, "__module__", None) == module.__name__
+    ]
+    return list(getattr(module, "__all__", own))
+
+
+def public_callables() -> dict[str, tuple[Callable[..., Any], str]]:
+    """Return functions, methods and constructors of public modules, each with its docstring."""
+    found: dict[str, tuple[Callable[..., Any], str]] = {}
+    for module in MODULES:
+        if re.search(r"(^|\.)_", module.__name__):
+            continue
+        for name, value in vars(module).items():
+            if name.startswith("_") or getattr(value, "__module__", None) != module.__name__:
+                continue
+            if inspect.isfunction(value):
+                found[f"{module.__name__}.{name}"] = value, value.__doc__ or ""
+            elif inspect.isclass(value):
+                found |= methods(f"{module.__name__}.{name}", value)
+    return found
+
+
+def methods(path: str, owner: type) -> dict[str, tuple[Callable[..., Any], str]]:
+    """Return a class's own public methods, and its constructor with the docstring of the class."""
+    found: dict[str, tuple[Callable[..., Any], str]] = {}
+    for name, value in vars(owner).items():
+        method = value.__func__ if isinstance(value, classmethod | staticmethod) else value
+        if not inspect.isfunction(method) or (name.startswith("_") and name != "__init__"):
+            continue
+        text = method.__doc__ or ""
+        if name == "__init__":
+            text += owner.__doc__ or ""
+        elif inherited(owner, name):
+            continue  # the signature, and with it the documentation, is another library's
+        found[f"{path}.{name}"] = method, text
+    return found
+
+
+def inherited(owner: type, name: str) -> bool:
+    return any(name in vars(base) for base in owner.__mro__[1:])
+
+
+def undocumented(function: Callable[..., Any], text: str) -> list[str]:
+    """Return the parameters that no line of a Parameters or Attributes section begins with."""
+    given = [
+        each.name
+        for each in inspect.signature(function).parameters.values()
+        if each.name not in ("self", "cls") and each.kind not in (each.VAR_KEYWORD,)
+    ]
+    if len(given) < MANY:
+        return []
+    named: set[str] = set()
+    for body in re.findall(
+        r"^(Parameters|Attributes)\n-+\n(.*?)(?=^\w[\w ]*\n-+\n|\Z)",
+        inspect.cleandoc(text),
+        re.MULTILINE | re.DOTALL,
+    ):
+        for line in body[1].splitlines():
+            if not line.startswith(" "):
+                named |= set(re.findall(r"\w+", line.partition(" : ")[0]))
+    return [name for name in given if name not in named]
+
+
+@pytest.mark.parametrize("example", with_examples(), ids=lambda example: example.name)
+def test_the_examples_of_a_docstring_run(example: doctest.DocTest, monkeypatch, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(example)
+    assert found.attempted and not found.failed, "\n" + (example.docstring or "")
+
+
+@pytest.mark.xfail(strict=False, reason="being written")
+@pytest.mark.parametrize("name", exported())
+def test_what_is_exported_has_examples(name: str) -> None:
+    text = inspect.cleandoc(vars(exported()[name]).get("__doc__") or "")
+    assert re.search(r"^Examples\n--------\n", text, re.MULTILINE) and ">>> " in text
+
+
+CALLABLES = public_callables()
+LONG = [
+    name for name, (function, _) in CALLABLES.items() if len(undocumented(function, "")) >= MANY
+]
+
+
+@pytest.mark.xfail(strict=False, reason="being written")
+@pytest.mark.parametrize("name", LONG)
+def test_many_parameters_are_documented_by_name(name: str) -> None:
+    assert undocumented(*CALLABLES[name]) == []
