@@ -33,7 +33,7 @@ def main() -> None:
     before = evaluate(model, "CSTR-v0", TEST_SEEDS)
 
     diagnostics = ControlDiagnostics()
-    guard = ImprovementGuard("CSTR-v0", record="out/guard.csv")
+    guard = ImprovementGuard("CSTR-v0", log_path="out/guard.csv")
     console.print(f"Training for {arguments.episodes} episodes without action noise ...")
     callbacks = [NoActionNoise(), guard, diagnostics]
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)

@@ -39,7 +39,9 @@ def main() -> None:
     console.print(f"The policy starts as {model.policy.problem.explicit()}.")
     before = evaluate(model, "ClippedPendulum-v0", TEST_SEEDS)
     # The way from hanging to swinging leads through worse policies: the guard waits for them.
-    guard = ImprovementGuard("ClippedPendulum-v0", patience=10, wander=True, record="out/guard.csv")
+    guard = ImprovementGuard(
+        "ClippedPendulum-v0", patience=10, keep_if_worse=True, log_path="out/guard.csv"
+    )
     callbacks = [NoActionNoise(), guard, ControlDiagnostics()]
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, "ClippedPendulum-v0", TEST_SEEDS)
