@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from sb3_yann.guard import ImprovementGuard as ImprovementGuard
     from sb3_yann.guard import restore_accepted as restore_accepted
     from sb3_yann.policy import AffineObservation as AffineObservation
+    from sb3_yann.policy import CriticOptions as CriticOptions
     from sb3_yann.policy import NonFiniteWarning as NonFiniteWarning
     from sb3_yann.policy import YannActor as YannActor
     from sb3_yann.policy import YannCritic as YannCritic
@@ -77,6 +78,7 @@ _NAMES = {
     "sb3_yann.guard": ["Decision", "ImprovementGuard", "restore_accepted"],
     "sb3_yann.policy": [
         "AffineObservation",
+        "CriticOptions",
         "NonFiniteWarning",
         "YannActor",
         "YannCritic",

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._validation import as_flag, as_positive, as_whole
 from sb3_yann.audit.causes import Cause, likely_cause, not_finite
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
 from sb3_yann.audit.sample import FEWEST, Array, Sample
-from sb3_yann.policy._checks import as_factor
 from sb3_yann.policy.policies import YannPolicy
 
 
@@ -61,13 +61,9 @@ class CostAudit(BaseCallback):
         self, steps: int = 100, tolerance: float = 1e-3, strict: bool = False, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
-        if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < FEWEST:
-            raise ValueError(f"steps = {steps!r} must be a whole number of at least {FEWEST}.")
-        if as_factor("tolerance", tolerance) == 0:
-            raise ValueError("tolerance = 0 would take rounding for a mismatch; give e.g. 1e-3.")
-        if not isinstance(strict, bool):
-            raise TypeError(f"strict = {strict!r} must be True or False.")
-        self.steps, self.tolerance, self.strict = steps, tolerance, strict
+        self.steps = as_whole("steps", steps, FEWEST, "Fewer say nothing.")
+        self.tolerance = as_positive("tolerance", tolerance, "Rounding is no mismatch.")
+        self.strict = as_flag("strict", strict)
         self.finding: CostFinding | None = None
 
     def _init_callback(self) -> None:
@@ -163,8 +159,8 @@ class CostAudit(BaseCallback):
             first=first,
             blank=~np.any(observations, axis=1),
             rounding=self._rounding(observations),
-            scale=self.policy.reward_scale,
-            offset=self.policy.reward_offset,
+            scale=self.policy.critic_options.reward_scale,
+            offset=self.policy.critic_options.reward_offset,
             stage_cost=problem.stage_cost,
             step=problem.predict,
             gamma=self.model.gamma,
@@ -175,8 +171,8 @@ class CostAudit(BaseCallback):
         digits = observations.dtype if observations.dtype.kind == "f" else np.float64
         size = np.abs(observations).astype(np.float64)
         if (seen := self.policy.observation) is not None:
-            # What a normalization hides of its size is in t0.
-            size = size @ np.abs(seen.T).T + np.abs(seen.t0)
+            # What a normalization hides of its size is in the offset.
+            size = size @ np.abs(seen.matrix).T + np.abs(seen.offset)
         return np.asarray(size * float(np.finfo(digits).eps))
 
     def _env_numbers(self) -> tuple[Any, list[int]]:

@@ -117,7 +117,7 @@ def _in_numbers(line: Line, cause: Cause) -> str:
     if not (cause.scales and line.scale > 0 and line.r2 > 0.99):
         return found
     numbers = f'"reward_scale": {line.scale:.7g}, "reward_offset": {line.offset:.7g}'
-    return f"{found} Where that is on purpose: policy_kwargs={{{numbers}}}."
+    return f'{found} Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.'
 
 
 def suspects(venv: VecEnv) -> tuple[str, ...]:

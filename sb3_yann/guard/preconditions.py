@@ -11,10 +11,10 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_yann._validation import as_between
 from sb3_yann.evaluation.episodes import Episodes, one_env
 from sb3_yann.guard.episodes import Outcome, outcome_of, played
 from sb3_yann.guard.rng import preserve_rng
-from sb3_yann.policy._checks import as_factor
 
 if TYPE_CHECKING:
     from sb3_yann.guard.callback import ImprovementGuard
@@ -96,8 +96,7 @@ def check_whole(name: str, value: Any, least: int) -> None:
 
 def check_between(name: str, value: Any, low: float, high: float) -> None:
     """Raise ValueError or TypeError if an argument is no number within the limits."""
-    if not low <= as_factor(name, value) <= high:
-        raise ValueError(f"{name} = {value!r} must be between {low:g} and {high:g}.")
+    as_between(name, value, low, high)
 
 
 def first_episodes(

@@ -104,22 +104,22 @@ class YannLayer(nn.Module):
             activation=activation,
             pinned=th.as_tensor(at_origin & pinned),
         )
-        self.scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
+        scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
+        change = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
+        self.constants = (scaling, change, np.inf if self.reach is None else self.reach)
+        """For compiled code."""
         self.has_its_law = True
-        self.change_array = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n).
 
-        Theta of float64 reaches the law as it is, and rounded the network. On a processor it is
+        Theta of float64 reaches the law as it is, and rounded the network. On a CPU it is
         compiled code for networks of two hidden layers with tanh, unless theta needs a gradient;
         the operations of torch do the same elsewhere.
         """
         fixed = theta.device.type == "cpu" and not theta.requires_grad
         if fixed and self.has_its_law and self.network.compiles:
-            from sb3_yann.networks._kernels.yann_layer import layer_on_processor  # compiled once
-
-            return layer_on_processor(self, theta)
+            return self._compiled(theta)
         region, inside = self.locate(theta)
         correction = self.network((theta / self.theta_half).to(self.theta_half), region)
         if self.reach is not None:
@@ -132,6 +132,15 @@ class YannLayer(nn.Module):
         if not self.rated:
             return clamp_with_inward_gradient(output)
         return clamp_between_with_inward_gradient(output, *self._within_reach(theta))
+
+    def _compiled(self, theta: th.Tensor) -> th.Tensor:
+        from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
+
+        network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
+        law, weights = self.piecewise_affine.packed, network.weights()
+        return layer_on_cpu(
+            theta, law, self.constants, weights, network.pinned_array, self.row_gradients
+        )
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""

@@ -211,6 +211,7 @@ def test_every_learner_that_is_run_for_longer_has_a_row_of_its_own_after_that_ti
     assert any(run.learner.startswith("YANN-RL") for run in long)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", ["MPC", "optimum", "YANN-RL", "DDPG", "MPC optimum YANN-RL"])
 def test_the_report_does_without(missing, tmp_path) -> None:
     everything = {**reactor(seeds=2), **pendulum()}

@@ -1,4 +1,4 @@
-"""Stacks of zero-output networks on a processor, forward and backward, as compiled loops.
+"""Stacks of zero-output networks on a CPU, forward and backward, as compiled loops.
 
 A batch of some hundred states goes through networks of a few hundred to a few thousand weights: in
 torch's own operations most of the time is their overhead, some fifty times over. Here it is one
@@ -14,9 +14,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann.control.law._kernels import Integers, compiled
-
-Single = NDArray[np.float32]
+from sb3_yann._numba import Integers, Single, compiled
 
 WEIGHTS = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1]"
 """Types of nodes, second, last and pinned, see :func:`network`."""
