@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import operator
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,7 @@ class AfterstateValue(nn.Module):
         scale: float = 30.0,
     ) -> None:
         super().__init__()
+        import_module("sb3_yann.networks.compiled_value")  # see YannLayer
         self.model = _untrained(model) if isinstance(model, nn.Module) else model
         self.gamma, self.scale = gamma, scale
         self.quadratic = QuadraticForm(P)
