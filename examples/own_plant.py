@@ -14,18 +14,9 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
-from sb3_yann import (
-    CostAudit,
-    DisturbanceBounds,
-    ImprovementGuard,
-    LinearModel,
-    LinearMPC,
-    NoActionNoise,
-    Tracking,
-    YannPolicy,
-)
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import save_trajectories, summary_table
+from sb3_yann import CostAudit, ImprovementGuard, NoActionNoise, YannPolicy
+from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
+from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
@@ -57,17 +48,16 @@ def main() -> None:
     log = np.loadtxt("out/log.csv", delimiter=",", skiprows=1)
     x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
     plant = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=[3, 3], d_ss=[0])
-    console.print(plant.report())
     # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
     weights = {"Q": np.diag([1, 1, 0, 0]), "R": 0.5 * np.eye(2), "horizon": 2, "gamma": 0.9}
     wishes = {"tracking": Tracking([0, 1], -4, 4), "disturbances": DisturbanceBounds(-1, 1)}
     limits = {"u_min": 0 - plant.u_ss, "u_max": MAX_VOLTAGE - plant.u_ss}
     limits |= {"theta_min": 0 - plant.x_ss, "theta_max": FULL - plant.x_ss}
     mpc = LinearMPC(plant, **weights, **wishes, **limits)
-    console.print(mpc.report())
+    console.print(plant.report(), mpc.report(), sep="\n")
     make = partial(make_env, mpc)
     # Five per cent of the pumps' range is more than the wear takes; V differs by about ten.
-    policy = {"problem": mpc, "max_correction": 0.05, "value_scale": 10.0}
+    policy = {"problem": mpc, "max_correction": 0.05, "critic": {"value_scale": 10.0}}
     settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed}
     model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
     before = evaluate(model, make, TEST_SEEDS)

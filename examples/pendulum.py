@@ -12,8 +12,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import ControlDiagnostics, ImprovementGuard, NoActionNoise, YannPolicy
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import comparison_table, save_trajectories
+from sb3_yann.evaluation import comparison_table, evaluate, save_trajectories
 from sb3_yann_envs.clipped_pendulum import DT
 
 STEPS = 200  # of one episode

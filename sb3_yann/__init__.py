@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from sb3_yann.guard import StepSize as StepSize
     from sb3_yann.guard import restore_accepted as restore_accepted
     from sb3_yann.policy import AffineObservation as AffineObservation
+    from sb3_yann.policy import CriticOptions as CriticOptions
     from sb3_yann.policy import NonFiniteWarning as NonFiniteWarning
     from sb3_yann.policy import YannActor as YannActor
     from sb3_yann.policy import YannCritic as YannCritic
@@ -85,6 +86,7 @@ _NAMES = {
     ],
     "sb3_yann.policy": [
         "AffineObservation",
+        "CriticOptions",
         "NonFiniteWarning",
         "YannActor",
         "YannCritic",

@@ -63,6 +63,11 @@ class CostFinding:
         Steps that were compared.
     wrappers : tuple of str
         Wrappers of the env that may have to do with it.
+
+    Examples
+    --------
+    >>> CostFinding(True, "", "The reward is minus the cost.", 1.0, 0.0, 1.0, 100, ()).matches
+    True
     """
 
     matches: bool
@@ -117,7 +122,7 @@ def _in_numbers(line: Line, cause: Cause) -> str:
     if not (cause.scales and line.scale > 0 and line.r2 > 0.99):
         return found
     numbers = f'"reward_scale": {line.scale:.7g}, "reward_offset": {line.offset:.7g}'
-    return f"{found} Where that is on purpose: policy_kwargs={{{numbers}}}."
+    return f'{found} Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.'
 
 
 def suspects(venv: VecEnv) -> tuple[str, ...]:

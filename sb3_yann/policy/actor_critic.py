@@ -8,9 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 
@@ -20,45 +18,51 @@ from sb3_yann.networks import (
     AfterstateValue,
     LinearPrediction,
     QuadraticStateActionValue,
+    Ranges,
     YannLayer,
 )
-from sb3_yann.networks.value import PredictionModel
 from sb3_yann.policy._features import SeesTheta, without_entries
 from sb3_yann.policy._finite import what_is_not_finite
+from sb3_yann.policy.critic_options import CriticOptions
 
 
 class YannActor(SeesTheta, Actor):
     """SB3's actor with a :class:`YannLayer` in place of the multi-layer perceptron.
 
-    Parameters are those of SB3's `Actor`; ``problem``, the MPC whose explicit law it starts from;
-    and ``max_correction`` and ``pin_equilibrium`` of :class:`YannPolicy`. ``net_arch`` is the width
-    of each region's network.
+    Parameters
+    ----------
+    problem : LinearMPC
+        The MPC whose explicit law the actor starts from.
+    net_arch : list of int
+        Widths of each region's network.
+    activation_fn : type, default torch.nn.Tanh
+    max_correction, pin_equilibrium
+        As in :class:`YannPolicy`.
+    **sb3_kwargs
+        Other arguments of SB3's `Actor`: spaces and features extractor.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> actor = DDPG("YannPolicy", "CSTR-v0", device="cpu").actor
+    >>> actor(th.zeros(1, 4)).shape
+    torch.Size([1, 1])
     """
 
     mu: YannLayer  # type: ignore[assignment]
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: nn.Module,
-        features_dim: int,
         problem: LinearMPC,
+        *,
+        net_arch: list[int],
         activation_fn: type[nn.Module] = nn.Tanh,
-        normalize_images: bool = True,
         max_correction: float | None = None,
         pin_equilibrium: bool = True,
+        **sb3_kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            [],  # no perceptron is built that would be thrown away
-            features_extractor,
-            features_dim,
-            activation_fn,
-            normalize_images,
-        )
+        # No perceptron is built that would be thrown away.
+        super().__init__(net_arch=[], activation_fn=activation_fn, **sb3_kwargs)
         self.net_arch = net_arch
         self.named = ""
         self.options = {
@@ -121,71 +125,54 @@ class YannActor(SeesTheta, Actor):
 class YannCritic(SeesTheta, ContinuousCritic):
     """SB3's critic with networks that start as the value of the law on the linear plant.
 
-    Parameters are those of SB3's `ContinuousCritic`; ``problem``, the MPC; ``gamma``, the
-    discount of the return that it puts out; and ``critic`` (here ``kind``), ``prediction_model``,
-    ``value_scale``, ``pin_equilibrium``, ``reward_scale`` and ``reward_offset`` of
-    :class:`YannPolicy`.
+    Parameters
+    ----------
+    problem : LinearMPC
+    gamma : float
+        Discount of the return that the critic puts out.
+    options : CriticOptions
+    pin_equilibrium : bool, default True
+        As in :class:`YannPolicy`.
+    net_arch : list of int
+        Widths of each critic's network.
+    activation_fn : type, default torch.nn.Tanh
+    n_critics : int, default 2
+    **sb3_kwargs
+        Other arguments of SB3's `ContinuousCritic`: spaces and features extractor.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> critic = DDPG("YannPolicy", "CSTR-v0", device="cpu").critic
+    >>> critic.q1_forward(th.zeros(1, 4), th.zeros(1, 1)).shape
+    torch.Size([1, 1])
     """
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
         problem: LinearMPC,
         gamma: float,
-        activation_fn: type[nn.Module] = nn.Tanh,
-        normalize_images: bool = True,
-        n_critics: int = 2,
-        share_features_extractor: bool = False,
-        kind: str = "afterstate",
-        prediction_model: PredictionModel | None = None,
-        value_scale: float = 30.0,
+        options: CriticOptions,
         pin_equilibrium: bool = True,
-        reward_scale: float = 1.0,
-        reward_offset: float = 0.0,
+        *,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.Tanh,
+        n_critics: int = 2,
+        **sb3_kwargs: Any,
     ) -> None:
         super().__init__(
-            observation_space,
-            action_space,
-            [],
-            features_extractor,
-            features_dim,
-            activation_fn,
-            normalize_images,
-            n_critics,
-            share_features_extractor,
+            net_arch=[], activation_fn=activation_fn, n_critics=n_critics, **sb3_kwargs
         )
+        self.scale, self.offset = float(options.reward_scale), options.offset_of_return(gamma)
         common: dict[str, Any] = {
-            "theta_half": problem.theta_half,
-            "u_min": problem.u_min,
-            "u_max": problem.u_max,
+            "ranges": Ranges(problem.theta_half, problem.u_min, problem.u_max),
             "hidden": tuple(net_arch),
             "pinned": pin_equilibrium,
         }
-        if prediction_model is None:
-            prediction_model = LinearPrediction(*problem.prediction)
-        self.scale = reward_scale
-        self.offset = reward_offset / (1 - gamma) if reward_offset else 0.0
         self.q_networks = []
         for i in range(n_critics):
-            q_network: nn.Module
-            if kind == "state_action":
-                q_network = QuadraticStateActionValue(
-                    problem.state_action_matrix(gamma), activation=activation_fn(), **common
-                )
-            else:
-                q_network = AfterstateValue(
-                    problem.stage_matrix,
-                    problem.value_matrix(gamma),
-                    prediction_model,
-                    gamma,
-                    activation=activation_fn(),
-                    scale=value_scale,
-                    **common,
-                )
+            common["activation"] = activation_fn()
+            q_network = _initial_value(problem, gamma, options, common)
             self.add_module(f"qf{i}", q_network)
             self.q_networks.append(q_network)
 
@@ -227,3 +214,19 @@ class YannCritic(SeesTheta, ContinuousCritic):
         finally:
             for parameter in trained:
                 parameter.requires_grad_(True)
+
+
+def _initial_value(
+    problem: LinearMPC, gamma: float, options: CriticOptions, common: dict[str, Any]
+) -> nn.Module:
+    if options.kind == "state_action":
+        return QuadraticStateActionValue(problem.state_action_matrix(gamma), **common)
+    model = options.prediction_model
+    return AfterstateValue(
+        problem.stage_matrix,
+        problem.value_matrix(gamma),
+        LinearPrediction(*problem.prediction) if model is None else model,
+        gamma,
+        scale=float(options.value_scale),
+        **common,
+    )

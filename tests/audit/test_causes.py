@@ -120,7 +120,7 @@ def test_the_numbers_that_the_audit_prints_make_the_next_audit_pass() -> None:
     assert line.scale == pytest.approx(0.37, rel=1e-5)
     assert line.offset == pytest.approx(-4.2, rel=1e-5)
     assert line.r2 > 1 - 1e-9
-    policy = {"reward_scale": line.scale, "reward_offset": line.offset}
+    policy = {"critic": {"reward_scale": line.scale, "reward_offset": line.offset}}
     assert audited(env(), policy=policy).finding.matches
     wrong = audited(plant(), policy=policy).finding
     assert "not 0.37 * (-cost) -4.2, as the policy assumes" in wrong.message

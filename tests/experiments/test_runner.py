@@ -78,6 +78,7 @@ def test_a_failing_run_is_reported_and_the_others_are_kept(tmp_path, capfd) -> N
     assert done == [RUNS[1]]
 
 
+@pytest.mark.slow
 def test_workers_are_other_processes_with_one_thread(tmp_path) -> None:
     outcomes = run_all(RUNS, outcome, tmp_path, jobs=2, progress=False)
     assert os.getpid() not in {int(o.extra["pid"]) for o in outcomes.values()}

@@ -102,6 +102,7 @@ def test_the_residual_policy_is_the_mpc_before_training(env_id) -> None:
     np.testing.assert_array_equal(learner.policy.predict(states[0])[0], expected[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ENVS)
 def test_without_noise_the_residual_executes_the_mpc_until_the_actor_moves(env_id) -> None:
     env = recorder(env_id)
@@ -114,6 +115,7 @@ def test_without_noise_the_residual_executes_the_mpc_until_the_actor_moves(env_i
     assert np.any(executed[101:] != expected[101:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ENVS)
 def test_residual_noise_is_a_fraction_of_half_the_input_range(env_id) -> None:
     env = recorder(env_id)

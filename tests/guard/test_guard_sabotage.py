@@ -162,6 +162,7 @@ def test_sabotage_before_a_second_learn_is_rejected_too() -> None:
     assert actor_bits(model.policy) == before
 
 
+@pytest.mark.slow
 @ALGORITHMS
 def test_the_final_model_is_the_accepted_policy_also_when_loaded(algorithm, tmp_path) -> None:
     model, guard = build(algorithm), make_guard(patience=3)

@@ -131,6 +131,7 @@ def test_two_training_envs_side_by_side_count_their_episodes_together() -> None:
     assert guard.state.episodes == 4
 
 
+@pytest.mark.slow
 def test_id_instance_and_factory_are_the_same_simulator() -> None:
     costs = []
     for env in ("Slide-v0", Slide(), Slide, lambda: gym.make("Slide-v0")):

@@ -186,6 +186,7 @@ def test_relu_network_keeps_the_gradient_of_relu_away_from_zero() -> None:
     assert x.grad.tolist() == [[0.0], [1.0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pinned", [False, True])
 @pytest.mark.parametrize("hidden", [(16,), (16, 16)])
 @pytest.mark.parametrize("activation", ["tanh", "softsign", "sin"])

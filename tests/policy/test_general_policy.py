@@ -185,10 +185,10 @@ def test_it_trains_and_loads(tmp_path: Path) -> None:
 def test_the_equilibrium_is_pinned_only_where_there_is_one(name: str, pinned: bool) -> None:
     mpc = solved(name)
     policy = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc}).policy
-    assert policy.actor_options["pin_equilibrium"] is pinned
+    assert policy.pin_equilibrium is pinned
     kwargs = {"problem": mpc, "pin_equilibrium": True}
     policy = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs=kwargs).policy
-    assert policy.actor_options["pin_equilibrium"] is True
+    assert policy.pin_equilibrium is True
 
 
 def test_the_guard_predicts_the_cost_of_a_start_with_its_reference() -> None:

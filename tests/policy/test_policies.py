@@ -111,6 +111,7 @@ def test_a_subclass_of_the_policy_gets_the_discount_as_well() -> None:
     assert model.policy.gamma == 0.8
 
 
+@pytest.mark.slow
 @POLICIES
 @CRITICS
 def test_a_saved_model_goes_on_as_if_it_had_never_been_saved(algorithm, critic, tmp_path) -> None:
@@ -184,9 +185,12 @@ def test_load_accepts_the_same_policy_kwargs_again(tmp_path) -> None:
         TD3.load(tmp_path / "model", policy_kwargs={"problem": scalar_mpc(gamma=0.5)})
 
 
-@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize(
+    "vec_env", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.slow)]
+)
 def test_it_trains_on_several_envs_at_once(vec_env) -> None:
-    env = make_vec_env("sb3_yann:CSTR-v0", n_envs=2, vec_env_cls=vec_env)
+    # From many starts the first inputs are saturated, and nothing is learnt in twenty steps.
+    env = make_vec_env("sb3_yann:CSTR-v0", n_envs=2, vec_env_cls=vec_env, seed=2)
     try:
         model = DDPG(YannPolicy, env, policy_kwargs={"critic_warmup": 0})
         before = copy.deepcopy(model.actor)

@@ -32,6 +32,7 @@ def normalize(frozen: bool = True, n_envs: int = 1, **kwargs) -> VecNormalize:
 ABSOLUTE = AffineObservation.deviation(STEADY)
 
 
+@pytest.mark.slow
 def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> None:
     env = normalize(n_envs=2)
     model = build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env))

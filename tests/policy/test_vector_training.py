@@ -181,7 +181,7 @@ def test_a_time_limit_is_no_end_to_the_critic(algorithm, kind, n_envs) -> None:
         env = normalized(n_envs)
         observation = AffineObservation.from_vec_normalize(env)
     quiet = {"target_policy_noise": 0.0} if algorithm is TD3 else {}
-    policy = {"observation": observation, "reward_scale": 1.0}
+    policy = {"observation": observation, "critic": {"reward_scale": 1.0}}
     model = build(env, algorithm, policy, gradient_steps=0, **quiet)
     model.learn(10 * n_envs * STEPS, callback=NoActionNoise())
     ends = transitions(model, "timeouts")

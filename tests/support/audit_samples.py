@@ -101,7 +101,7 @@ WRONG = {
         lambda: wrappers.TransformReward(plant(), lambda reward: 0.01 * reward),
         "scaled",
         "TransformReward",
-        'policy_kwargs={"reward_scale": 0.01, "reward_offset": 0}',
+        'policy_kwargs={"critic": {"reward_scale": 0.01, "reward_offset": 0}}',
     ),
     "TransformReward: scale and offset": (
         lambda: wrappers.TransformReward(plant(), lambda reward: 0.5 * reward + 10),

@@ -94,19 +94,11 @@ class ProgramUnits:
         gains = np.stack([reach[:m, None] * region.gain[:m] / half for region in regions])
         offsets = np.stack([reach[:m] * region.offset[:m] for region in regions])
         A = np.concatenate([region.A / half for region in regions])
-        return PiecewiseAffine(
-            gains=gains,
-            offsets=offsets - gains @ self.center,
-            A=A,
-            b=np.concatenate([region.b for region in regions]) + A @ self.center,
-            starts=np.cumsum([0, *(len(region.b) for region in regions[:-1])]),
-            u_min=u_min,
-            u_max=u_max,
-            theta_min=self.program.theta_min,
-            theta_max=self.program.theta_max,
-            infeasible=infeasible,
-            disjoint=True,
-        )
+        b = np.concatenate([region.b for region in regions]) + A @ self.center
+        starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
+        ranges = u_min, u_max, self.program.theta_min, self.program.theta_max
+        offsets = offsets - gains @ self.center
+        return PiecewiseAffine(gains, offsets, A, b, starts, *ranges, infeasible, disjoint=True)
 
 
 def _require_box(program: ParametricQP) -> None:

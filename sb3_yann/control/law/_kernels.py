@@ -6,19 +6,12 @@ of a microsecond, a good part of what a whole evaluation takes.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, TypeVar
+from collections.abc import Sequence
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
-
-Integers = NDArray[np.int64]
-F = TypeVar("F", bound=Callable[..., Any])
 
 HEADER = 8
 """Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero input, disjoint."""
@@ -32,55 +25,6 @@ are disjoint, can be as good."""
 
 CLEAR = 1e-6
 """So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
-
-
-def _sources() -> str:
-    """Return a hash of all files with compiled functions, which call each other."""
-    package = Path(__file__).parents[2]
-    files = [*package.glob("control/law/_kernels.py"), *package.glob("control/law/search_tree.py")]
-    files += sorted(package.glob("networks/_kernels/*.py"))
-    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
-
-
-SOURCES = _sources()
-
-
-def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
-    """Return a decorator that compiles a function for the given types, and keeps the machine code.
-
-    With types that are given nothing is ever compiled for others: those are refused. Without any
-    the function is a part of those that call it. With ``fastmath`` sums may be taken in any order,
-    several terms at a time.
-
-    What Python calls returns a plain number or nothing, and writes arrays to those it is given. To
-    return one, numba runs Python code behind Python's back: a Ctrl-C there is a SystemError.
-    """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
-
-    def compile_it(function: F) -> F:
-        if not signatures or numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-            part: F = numba.njit(**options)(function)
-            return part
-        result: F
-        try:
-            result = _compile(numba.njit(**options)(function), signatures, keep=True)
-        except Exception:  # no folder to write to, a full disk, a damaged file
-            result = _compile(numba.njit(**options)(function), signatures, keep=False)
-        return result
-
-    return compile_it
-
-
-def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
-    if keep:
-        dispatcher.enable_caching()
-        # numba looks at the function's own file; what it calls may have changed in another.
-        dispatcher._cache._cache_file._source_stamp = SOURCES
-    for signature in signatures:
-        dispatcher.compile(signature)
-    dispatcher.disable_compile()
-    return dispatcher
 
 
 def pack(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -24,9 +24,11 @@ from sb3_yann._validation import (
     same_fields,
     to_float,
 )
-from sb3_yann.control.law._kernels import law_at, law_of_batch, locate_batch, pack
-from sb3_yann.control.law.search_tree import SearchTree, build_tree
 
+if TYPE_CHECKING:
+    from sb3_yann.control.law.search_tree import SearchTree
+
+# Compiled code, or its machine code, is loaded at the first use of a law: not at an import.
 INFEASIBLE = ("nearest_region", "zero_input")
 SCAN = 4
 """Up to this many regions are asked one by one."""
@@ -154,6 +156,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         points = self._as_theta(theta)
         rows = np.atleast_2d(points)
         inputs = np.empty((len(rows), self.n_inputs))
+        from sb3_yann.control.law._kernels import law_of_batch
+
         law_of_batch(*self.packed, rows, inputs)
         return inputs if points.ndim == 2 else inputs[0]
 
@@ -194,6 +198,8 @@ class PiecewiseAffine(ReadOnlyArrays):
                 tree = {name[5:]: data[name] for name in data.files if name.startswith("tree_")}
             law = cls(**values)
             if tree:
+                from sb3_yann.control.law.search_tree import SearchTree
+
                 law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
             return law
         except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
@@ -224,6 +230,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         points = self._as_theta(theta)
         rows = np.atleast_2d(points)
         region, inside = np.empty(len(rows), np.int64), np.empty(len(rows))
+        from sb3_yann.control.law._kernels import locate_batch
+
         locate_batch(*self.packed, rows, region, inside)
         return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
 
@@ -233,12 +241,16 @@ class PiecewiseAffine(ReadOnlyArrays):
         bounded = np.all(np.isfinite([self.theta_min, self.theta_max]))
         if self.n_regions <= SCAN or self.n_theta > MOST_PARAMETERS or not bounded:
             return None
+        from sb3_yann.control.law.search_tree import build_tree
+
         tree = build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
         return tree if len(tree.levels) else None  # regions that no hyperplane parts
 
     @cached_property
     def packed(self) -> tuple[Array, NDArray[np.int64]]:
         """The law as two arrays for compiled code, see `_kernels.pack`."""
+        from sb3_yann.control.law._kernels import pack
+
         return pack(
             self.gains,
             self.offsets,
@@ -252,6 +264,8 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     @cached_property
     def _at(self) -> Callable[[Any, Array], bool]:
+        from sb3_yann.control.law._kernels import law_at
+
         return partial(law_at, *self.packed)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> PiecewiseAffine:

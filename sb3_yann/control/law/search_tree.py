@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection, QhullError
 
+from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
-from sb3_yann.control.law._kernels import Integers, compiled
 from sb3_yann.control.polyhedra import largest_ball
 
 LEAF = 4
@@ -107,42 +107,45 @@ def build_tree(
     center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
     regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))
     random = np.random.default_rng(0)
-    normals: list[Array] = []
-    levels: list[float] = []
+    tree = _grow(regions, random)
+    if not len(tree.levels):  # regions that no hyperplane parts
+        return tree
+    in_box, leaf_regions = tree.normals / half, _often_first(tree, regions, random)
+    in_all = tree.levels + in_box @ center
+    return replace(tree, normals=in_box, levels=in_all, leaf_regions=leaf_regions)
+
+
+def _grow(regions: _Polytopes, random: np.random.Generator) -> SearchTree:
+    """Return a tree whose nodes are split until few regions, or too many nodes, are left."""
+    p, n = regions.middles.shape
+    rows: list[int] = []
     children: list[list[int]] = []
     leaves: list[Integers] = []
-    everything = np.arange(len(starts), dtype=np.int64)
     # The fullest node first, and of those the oldest: a number, its parent and side.
-    waiting: list[tuple[int, int, Integers, int, int]] = [(-len(starts), 0, everything, -1, 0)]
-    most, order = NODES * len(starts), 0
+    waiting: list[tuple[int, int, Integers, int, int]] = [(-p, 0, np.arange(p), -1, 0)]
+    order = 0
     while waiting:
         _, _, inside, parent, side = heappop(waiting)
-        full = len(levels) >= most or len(inside) <= LEAF
+        full = len(rows) >= NODES * p or len(inside) <= LEAF
         split = None if full else _best_split(regions, inside, random)
         if parent >= 0:
-            children[parent][side] = -1 - len(leaves) if split is None else len(levels)
+            children[parent][side] = -1 - len(leaves) if split is None else len(rows)
         if split is None:
             leaves.append(np.sort(inside))
             continue
         row, *parts = split
         for which, part in enumerate(parts):
             order += 1
-            heappush(waiting, (-len(part), order, part, len(levels), which))
-        normals.append(regions.A[row])
-        levels.append(regions.b[row])
+            heappush(waiting, (-len(part), order, part, len(rows), which))
+        rows.append(row)
         children.append([0, 0])
-    tree = SearchTree(
-        normals=np.array(normals).reshape(-1, len(half)),
-        levels=np.array(levels),
+    return SearchTree(
+        normals=regions.A[rows].reshape(-1, n),
+        levels=regions.b[rows],
         children=np.array(children, dtype=np.int64).reshape(-1, 2),
         leaf_starts=np.cumsum([0, *map(len, leaves)]),
         leaf_regions=np.concatenate(leaves),
     )
-    if not levels:  # regions that no hyperplane parts
-        return tree
-    in_box, leaf_regions = tree.normals / half, _often_first(tree, regions, random)
-    in_all = tree.levels + in_box @ center
-    return replace(tree, normals=in_box, levels=in_all, leaf_regions=leaf_regions)
 
 
 def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Generator) -> Integers:

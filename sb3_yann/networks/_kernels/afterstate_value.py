@@ -1,16 +1,15 @@
-"""The afterstate value on a processor: compiled, and one operation of torch with its gradient."""
+"""The afterstate value on a CPU: compiled, and one operation of torch with its gradient."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 
+from sb3_yann._numba import Single, compiled
 from sb3_yann._validation import Array
-from sb3_yann.control.law._kernels import compiled
 from sb3_yann.networks._kernels.mlp import (
-    Single,
     as_array,
     at_zero,
     first_layers,
@@ -18,9 +17,6 @@ from sb3_yann.networks._kernels.mlp import (
     tanh,
     transposed,
 )
-
-if TYPE_CHECKING:
-    from sb3_yann.networks.value import AfterstateValue
 
 _LINEAR = "float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1]"
 _NODES = "float32[:, :, :, ::1], float32[::1]"
@@ -225,42 +221,44 @@ def _forms_backward(
                 by_nodes[0, node, a, j] = by_matrix[j, a]
 
 
-def value_on_processor(value: AfterstateValue, points: th.Tensor, fixed: bool = False) -> th.Tensor:
-    """Return what ``value(points)`` is, (batch, 1), for points of shape (batch, n + m).
+Constants = tuple[Array, Array, Array, Array, Single, float]
 
-    With ``fixed`` weights there is a gradient by the points alone.
+
+def value_on_cpu(
+    points: th.Tensor, weights: tuple[th.Tensor, ...], constants: Constants
+) -> th.Tensor:
+    """Return an afterstate value (batch, 1), with a gradient by points and weights.
+
+    Parameters
+    ----------
+    points : Tensor, shape (batch, n + m)
+    weights : tuple of Tensor
+        Entries of the quadratic form; nodes, second and last of the network.
+    constants : tuple
+        W, [A B], the scale of the quadratic form, the scaling of :func:`_forms`, which networks
+        are pinned, and the factor of the network.
     """
-    buffers: Any = value._buffers  # a module's tables: its attributes take a microsecond to find
-    modules: Any = value._modules
-    size = len(buffers["W"])
+    size = len(constants[0])
     if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
         raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
-    weights: tuple[th.Tensor, ...] = (
-        modules["quadratic"].entries,
-        *modules["network"].weights(),
-    )
-    if fixed:
-        weights = tuple(weight.detach() for weight in weights)
     if th.is_grad_enabled():
-        q: th.Tensor = _Value.apply(value, points, *weights)  # type: ignore[no-untyped-call]
+        q: th.Tensor = _Value.apply(constants, points, *weights)  # type: ignore[no-untyped-call]
         return q
-    return th.from_numpy(_Pass(value, points, weights).q)
+    return th.from_numpy(_Pass(constants, points, weights).q)
 
 
 class _Pass:
-    """One way forward, and what the way back needs of it.
+    """A forward pass, and what its backward pass needs.
 
     The second layer, nearly all of the arithmetic, is left to torch's products of matrices.
     """
 
     def __init__(
-        self, value: AfterstateValue, points: th.Tensor, weights: tuple[th.Tensor, ...]
+        self, constants: Constants, points: th.Tensor, weights: tuple[th.Tensor, ...]
     ) -> None:
         self.weights = weights
         entries, nodes, second, last = as_array(weights[0], np.float64), *map(as_array, weights[1:])
-        W, AB, self.roots, scaling = value.constants
-        network: Any = value._modules["network"]
-        pinned = network.pinned_array
+        W, AB, self.roots, scaling, pinned, self.factor = constants
         self.first: tuple[Any, ...] = (W, AB, entries * self.roots, scaling, nodes, pinned)
         array = as_array(points, np.float64)
         (batch, size), n, h = array.shape, len(entries), nodes.shape[2]
@@ -271,7 +269,6 @@ class _Pass:
         self.matrix = th.from_numpy(second)[0, :, :-1]
         product = th.mm(th.from_numpy(hidden), self.matrix.T)
         self.hidden, self.layers = product.numpy(), (second, last, pinned)
-        self.factor = value.gamma * value.scale
         self.q: Single = np.empty((batch, 1), np.float32)
         _output(total, self.hidden, *self.layers, self.factor, self.q)
 
@@ -304,10 +301,12 @@ class _Value(th.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, value: AfterstateValue, points: th.Tensor, *weights: th.Tensor
+        ctx: Any, constants: Constants, points: th.Tensor, *weights: th.Tensor
     ) -> th.Tensor:
-        ctx.save_for_backward(*weights)  # who changes them before the way back is told so
-        ctx.done, ctx.dtype = _Pass(value, points, weights), points.dtype
+        ctx.save_for_backward(
+            *weights
+        )  # torch notices weights that change before the backward pass
+        ctx.done, ctx.dtype = _Pass(constants, points, weights), points.dtype
         return th.from_numpy(ctx.done.q)
 
     @staticmethod

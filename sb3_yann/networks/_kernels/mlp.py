@@ -1,4 +1,4 @@
-"""Stacks of zero-output networks on a processor, forward and backward, as compiled loops.
+"""Stacks of zero-output networks on a CPU, forward and backward, as compiled loops.
 
 A batch of some hundred states goes through networks of a few hundred to a few thousand weights: in
 torch's own operations most of the time is their overhead, some fifty times over. Here it is one
@@ -14,9 +14,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann.control.law._kernels import Integers, compiled
-
-Single = NDArray[np.float32]
+from sb3_yann._numba import Integers, Single, compiled
 
 WEIGHTS = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1]"
 """Types of nodes, second, last and pinned, see :func:`network`."""
@@ -37,8 +35,7 @@ def tanh(x: Any) -> Any:
 
     With t = tanh(x / 2) from the eighth convergent of Lambert's continued fraction
     ``t = h / (1 + h^2 / (3 + h^2 / (5 + ...)))`` at h = x / 2, it is ``2 t / (1 + t^2)``. That is
-    arithmetic alone, of which a processor does several at a time; the library's tanh costs more
-    than all the rest.
+    arithmetic alone, several values at a time; the library's tanh costs more than all the rest.
     """
     one, five = np.float32(1), np.float32(5)
     h = np.float32(0.5) * x

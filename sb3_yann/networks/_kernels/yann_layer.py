@@ -1,18 +1,16 @@
-"""The YANN layer on a processor: compiled, and one operation of torch with its gradient."""
+"""The YANN layer on a CPU: compiled, and one operation of torch with its gradient."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 
+from sb3_yann._numba import Integers, Single, compiled
 from sb3_yann._validation import Array
-from sb3_yann.control.law._kernels import Integers, compiled, input_at
-from sb3_yann.networks._kernels.mlp import WEIGHTS, Single, as_array, network, network_backward
-
-if TYPE_CHECKING:
-    from sb3_yann.networks.yann import YannLayer
+from sb3_yann.control.law._kernels import input_at
+from sb3_yann.networks._kernels.mlp import WEIGHTS, as_array, network, network_backward
 
 _KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
 _KEPT += ", float32[:, :, ::1]"
@@ -152,27 +150,37 @@ def _backward(
     network_backward(back, x, used, slot, dense, *matrices, hidden1, hidden2, *found)
 
 
-def layer_on_processor(layer: YannLayer, theta: th.Tensor) -> th.Tensor:
-    """Return what the layer does, (batch, m), for theta (batch, n) without a gradient."""
-    n = layer.piecewise_affine.n_theta
+def layer_on_cpu(
+    theta: th.Tensor,
+    law: tuple[Array, Integers],
+    constants: tuple[Array, Array, float],
+    weights: tuple[th.Tensor, ...],
+    pinned: Single,
+    by_row: bool,
+) -> th.Tensor:
+    """Return the actions (batch, m) of a YANN layer, with a gradient by its weights.
+
+    Parameters
+    ----------
+    theta : Tensor, shape (batch, n)
+    law : pair of ndarray
+        The law, packed.
+    constants : tuple
+        ``scaling``, ``change`` and ``limit``, see :func:`_forward`.
+    weights : tuple of Tensor
+        Nodes, second and last.
+    pinned : ndarray, shape (p,)
+    by_row : bool
+        Whether gradients are sparse, with the rows of the regions in use.
+    """
+    n = law[1][0]
     if theta.dim() != 2 or theta.shape[1] != n:  # compiled code does not look
         raise ValueError(f"theta has shape {tuple(theta.shape)}, expected (batch, {n}).")
-    points = as_array(theta, np.float64)
-    network: Any = layer._modules["network"]
-    weights = network.weights()
+    known = (*law, as_array(theta, np.float64), *constants)
     if th.is_grad_enabled():
-        actions: th.Tensor = _Layer.apply(layer, points, *weights)  # type: ignore[no-untyped-call]
+        actions: th.Tensor = _Layer.apply(known, pinned, by_row, *weights)  # type: ignore[no-untyped-call]
         return actions
-    return th.from_numpy(_actions(_given(layer, points, weights))[0])
-
-
-def _given(layer: YannLayer, theta: Array, weights: tuple[th.Tensor, ...]) -> list[Any]:
-    network: Any = layer._modules["network"]
-    arrays = [as_array(weight) for weight in weights]
-    law = layer.piecewise_affine.packed
-    limit = np.inf if layer.reach is None else layer.reach
-    known = (theta, layer.scaling, layer.change_array, limit)
-    return [*law, *known, *arrays, network.pinned_array]
+    return th.from_numpy(_actions([*known, *map(as_array, weights), pinned])[0])
 
 
 def _actions(given: list[Any]) -> tuple[Single, list[Any]]:
@@ -192,11 +200,15 @@ class _Layer(th.autograd.Function):
     """Differentiable by the weights of the networks, once."""
 
     @staticmethod
-    def forward(ctx: Any, layer: YannLayer, theta: Array, *weights: th.Tensor) -> th.Tensor:
-        given = _given(layer, theta, weights)
+    def forward(
+        ctx: Any, known: tuple[Any, ...], pinned: Single, by_row: bool, *weights: th.Tensor
+    ) -> th.Tensor:
+        given = [*known, *map(as_array, weights), pinned]
         actions, kept = _actions(given)
-        ctx.save_for_backward(*weights)  # who changes them before the way back is told so
-        ctx.given, ctx.kept, ctx.by_row = given[5:], kept, layer.row_gradients
+        ctx.save_for_backward(
+            *weights
+        )  # torch notices weights that change before the backward pass
+        ctx.given, ctx.kept, ctx.by_row = given[5:], kept, by_row
         return th.from_numpy(actions)
 
     @staticmethod
@@ -216,4 +228,4 @@ class _Layer(th.autograd.Function):
                 th.sparse_coo_tensor(rows, by_weight, weight.shape, check_invariants=False)
                 for by_weight, weight in zip(found, weights, strict=True)
             ]
-        return None, None, *found
+        return None, None, None, *found
