@@ -16,8 +16,7 @@ from stable_baselines3 import DDPG
 from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
 from sb3_yann import CostAudit, ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import save_trajectories, summary_table
+from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
@@ -62,7 +61,7 @@ def main() -> None:
     settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed}
     model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
     before = evaluate(model, make, TEST_SEEDS)
-    guard = ImprovementGuard(make, n_starts=50, fresh=25, record="out/own_plant.csv")
+    guard = ImprovementGuard(make, n_starts=50, n_new_starts=25, log_path="out/own_plant.csv")
     callbacks = [NoActionNoise(), CostAudit(verbose=1), guard]
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, make, TEST_SEEDS)

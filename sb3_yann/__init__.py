@@ -42,8 +42,10 @@ if TYPE_CHECKING:
     from sb3_yann.control import Terminal as Terminal
     from sb3_yann.control import Tracking as Tracking
     from sb3_yann.control import identify as identify
+    from sb3_yann.guard import AcceptanceRule as AcceptanceRule
     from sb3_yann.guard import Decision as Decision
     from sb3_yann.guard import ImprovementGuard as ImprovementGuard
+    from sb3_yann.guard import StepSize as StepSize
     from sb3_yann.guard import restore_accepted as restore_accepted
     from sb3_yann.policy import AffineObservation as AffineObservation
     from sb3_yann.policy import CriticOptions as CriticOptions
@@ -75,7 +77,13 @@ _NAMES = {
         "Tracking",
         "identify",
     ],
-    "sb3_yann.guard": ["Decision", "ImprovementGuard", "restore_accepted"],
+    "sb3_yann.guard": [
+        "AcceptanceRule",
+        "Decision",
+        "ImprovementGuard",
+        "StepSize",
+        "restore_accepted",
+    ],
     "sb3_yann.policy": [
         "AffineObservation",
         "CriticOptions",

@@ -189,7 +189,7 @@ def test_a_previous_input_that_is_not_finite_is_refused(value) -> None:
 
 @pytest.mark.parametrize("hold", [np.nan, np.inf, 2.5, "2"])
 def test_a_hold_that_is_no_whole_number_is_refused(hold) -> None:
-    with pytest.raises(ValueError, match="must be a whole number of steps"):
+    with pytest.raises(ValueError, match=r"whole number of at least 1\. It counts steps"):
         SetPoint(Counter(), -1, 1, hold=hold)
 
 

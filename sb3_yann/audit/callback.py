@@ -10,24 +10,21 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_flag, as_positive, as_whole
+from sb3_yann._validation import Array, as_flag, as_positive, as_whole
 from sb3_yann.audit.causes import Cause, likely_cause, not_finite
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
-from sb3_yann.audit.sample import FEWEST, Array, Sample
+from sb3_yann.audit.sample import FEWEST, Sample
 from sb3_yann.policy.policies import YannPolicy
 
 
 class CostAudit(BaseCallback):
     """Checks that the env's reward and observation mean what the problem says, and names what not.
 
-    Actor and critic are exact only where the reward is minus the stage cost of the problem, of the
-    state before the step and the input that was sent (times ``reward_scale`` plus
-    ``reward_offset``, where the policy has them). The first steps of every `learn` are compared;
-    then the callback rests. Steps with ``info["violation"]`` and those by which the env terminates
-    an episode may cost more. Where they differ, it looks for the reason among scaled, shifted,
-    negated, clipped and normalized rewards, costs of another state or action in time, repeated
-    actions, observations and actions in other units or from another zero, and other weights, and
-    asks the env for its wrappers. The law must leave its steady state for it to see anything.
+    Actor and critic are exact only where the reward is minus the stage cost of the problem, scaled
+    and shifted as the policy's :class:`CriticOptions` say. The first steps of every `learn` are
+    compared. Steps with ``info["violation"]``, and those that terminate an episode, may cost more.
+    Where they differ, the audit looks for a likely cause and for wrappers of the env. It sees
+    nothing while the plant rests at its steady state.
 
     Parameters
     ----------
@@ -53,6 +50,15 @@ class CostAudit(BaseCallback):
         If an argument is out of range; when training starts, if the policy is no YannPolicy.
     CostMismatchError
         In training, see ``strict``.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> audit = CostAudit(steps=20)
+    >>> model = DDPG("YannPolicy", "CSTR-v0", seed=0, learning_starts=30, device="cpu")
+    >>> _ = model.learn(25, callback=audit)
+    >>> audit.finding.matches
+    True
     """
 
     model: OffPolicyAlgorithm
@@ -139,7 +145,7 @@ class CostAudit(BaseCallback):
         def theta(name: str) -> Array:
             return np.asarray(self.policy.theta(column(name)).double().cpu().numpy())
 
-        every_env = np.repeat(*self._env_numbers())
+        every_env = np.repeat(np.arange(len(self._records)), [len(each) for each in self._records])
         ended = np.array([each["done"] for each in records], dtype=bool) | lost
         done, env = column("done"), every_env[~lost]
         first = np.r_[True, np.diff(env) != 0][: len(env)]
@@ -174,9 +180,6 @@ class CostAudit(BaseCallback):
             # What a normalization hides of its size is in the offset.
             size = size @ np.abs(seen.matrix).T + np.abs(seen.offset)
         return np.asarray(size * float(np.finfo(digits).eps))
-
-    def _env_numbers(self) -> tuple[Any, list[int]]:
-        return np.arange(len(self._records)), [len(each) for each in self._records]
 
     def _of_the_vec_normalize(self) -> Cause | None:
         """Return what has been set since the policy was built and let it pass."""

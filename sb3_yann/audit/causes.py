@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann.audit.sample import EXACT, Array, Line, Sample
+from sb3_yann._validation import Array
+from sb3_yann.audit.sample import EXACT, Line, Sample
 from sb3_yann.audit.scaling import scaled_entries
 
 LATEST = 3
@@ -19,10 +20,7 @@ MOST_REPEATS = 10
 
 @dataclass(frozen=True)
 class Cause:
-    """A short name, and an explanation with what to do.
-
-    ``scales`` says whether `reward_scale` and `reward_offset` may be what there is to do.
-    """
+    """A short name, an explanation with what to do, and whether options of the reward may help."""
 
     name: str
     explanation: str

@@ -63,6 +63,11 @@ class CostFinding:
         Steps that were compared.
     wrappers : tuple of str
         Wrappers of the env that may have to do with it.
+
+    Examples
+    --------
+    >>> CostFinding(True, "", "The reward is minus the cost.", 1.0, 0.0, 1.0, 100, ()).matches
+    True
     """
 
     matches: bool

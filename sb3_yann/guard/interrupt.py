@@ -60,14 +60,8 @@ class Handler:
 def install(model: BaseAlgorithm, restore: Callable[[], None], frame: FrameType) -> Handler | None:
     """Return the handler for a `learn` that begins; None where there can be or need be none.
 
-    Parameters
-    ----------
-    model : BaseAlgorithm
-        What learns.
-    restore : bound method
-        Restores the accepted policy. It is held weakly.
-    frame : FrameType
-        The caller's: handlers of runs that are over are passed by.
+    ``restore`` is a bound method that restores the accepted policy; it is held weakly. Handlers of
+    runs that are over are passed by; ``frame`` is the caller's.
     """
     before: Any = signal.getsignal(signal.SIGINT)
     while isinstance(before, Handler) and not before.is_needed(frame):

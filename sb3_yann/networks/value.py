@@ -58,9 +58,8 @@ class Ranges:
 class QuadraticForm(nn.Module):
     """``z -> z' M z``, trainable.
 
-    M is trained in scaled entries, ``M = D M^ D`` with ``D = sqrt(|diag M|)`` kept constant: the
-    raw entries of a real plant span many orders of magnitude, and a step of Adam, which is the
-    same for every entry, would flip the sign of the smallest. Those of ``M^`` are about 1.
+    M is trained in scaled entries, ``M = D M^ D`` with constant ``D = sqrt(|diag M|)``. The raw
+    entries span many orders of magnitude, and equal steps of Adam would flip the smallest ones.
 
     Parameters
     ----------
@@ -89,11 +88,8 @@ class QuadraticStateActionValue(nn.Module):
     """``Q(theta, a) = -[theta; u]' M [theta; u] + network``: u now, the law ever after.
 
     The critic of Braniff & Tian, Section 4.2. ``u`` is the input in physical units for an action
-    ``a`` in [-1, 1]. Both parts are zero at ``theta = 0, u = 0``; the network stays so where it
-    is ``pinned``.
-
-    Data of a policy that does not explore say nothing of how Q depends on a: this network makes
-    that up. :class:`AfterstateValue` takes it from the model.
+    ``a`` in [-1, 1]. Without exploration nothing tells this network how Q depends on a;
+    :class:`AfterstateValue` takes that from the model.
 
     Parameters
     ----------
@@ -149,12 +145,9 @@ class QuadraticStateActionValue(nn.Module):
 class AfterstateValue(nn.Module):
     """``Q(theta, a) = -(theta'Q theta + u'Ru + gamma V(f(theta, u)))``, V quadratic plus network.
 
-    At first it is the same function as :class:`QuadraticStateActionValue`, to rounding, where f is
-    the linear model ``A theta + B u``. What is learnt is V alone, over predicted next states, of
-    which even a policy that never explores sees a whole neighborhood of each state. How Q depends
-    on the action follows from the known stage cost and from the model: an error of the model bends
-    the direction of improvement, but not the values that are compared, since V is fitted to the
-    plant's own returns at the states the model predicts.
+    With the linear model for f, it starts as :class:`QuadraticStateActionValue`, to rounding. Only
+    V is learnt, at predicted next states. The stage cost and the model say how Q depends on the
+    action: a model error bends the direction of improvement, not the values that are compared.
 
     Parameters
     ----------
@@ -163,8 +156,8 @@ class AfterstateValue(nn.Module):
     P : ndarray, shape (n, n)
         V is ``theta' P theta`` at first.
     model : callable
-        The prediction ``(theta, u) -> next theta``, of float64 tensors in physical units. Of a
-        module a copy is moved and saved with this one, but it is not trained.
+        ``(theta, u) -> next theta``, of float64 tensors in physical units. A module is copied,
+        moved and saved with this one, but not trained.
     gamma : float
     ranges, hidden, activation, pinned
         As in :class:`QuadraticStateActionValue`.
@@ -282,7 +275,14 @@ class AfterstateValue(nn.Module):
 
 
 class LinearPrediction(nn.Module):
-    """``(theta, u) -> A theta + B u``, from :attr:`LinearMPC.prediction`."""
+    """``(theta, u) -> A theta + B u``, from :attr:`LinearMPC.prediction`.
+
+    Examples
+    --------
+    >>> predict = LinearPrediction(np.eye(1), np.ones((1, 1)))
+    >>> predict(th.ones(1, 1).double(), th.ones(1, 1).double()).tolist()
+    [[2.0]]
+    """
 
     A: th.Tensor
     B: th.Tensor

@@ -24,9 +24,9 @@ class FiniteRows:
     """Stands in for the ``add`` of a replay buffer, and leaves out rows that are not finite.
 
     One row holds a transition of each env; all of it is left out. The row before counts as cut
-    off, so that no n-step return bridges the gap. SB3 samples right after the first row: while
-    there is no other, one whose reward is NaN keeps the place, of which the optimizers take no
-    step. With a buffer goes its stand-in, into copies and pickles too.
+    off, so that no n-step return bridges the gap. SB3 samples right after the first row: until
+    there is another, a row with reward NaN keeps the place, and the optimizers take no step. The
+    stand-in goes with its buffer, into copies and pickles too.
 
     Attributes
     ----------

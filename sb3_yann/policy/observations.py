@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, same_fields
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_whole, same_fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +110,7 @@ class AffineObservation(ReadOnlyArrays):
     def pick(cls, entries: Sequence[int], size: int) -> AffineObservation:
         """Return ``theta[i] = obs[entries[i]]``, of an observation with ``size`` entries.
 
-        This reorders, and leaves out what the law does not take. A law that takes a set-point as
-        part of theta gets it in this way as well.
+        This reorders, and leaves out what the law does not take.
         """
         return cls(np.eye(size)[_as_entries("entries", entries, size)])
 
@@ -138,22 +137,18 @@ class AffineObservation(ReadOnlyArrays):
     def newest_frame(cls, size: int, frames: int) -> AffineObservation:
         """Return ``theta = `` the newest of the last ``frames`` observations of ``size`` entries.
 
-        It comes last both in SB3's `VecFrameStack`, which joins vectors to one of shape
-        ``(frames * size,)``, and in gymnasium's `FrameStackObservation`, of shape (frames, size).
-        (With ``channels_order="first"``, VecFrameStack joins vectors in the same order.)
+        It comes last in SB3's `VecFrameStack` and in gymnasium's `FrameStackObservation`.
         """
-        if frames < 1:
-            raise ValueError(f"frames = {frames} must be at least 1.")
+        as_whole("frames", frames)
         return cls.pick(range((frames - 1) * size, frames * size), frames * size)
 
     @classmethod
     def from_vec_normalize(cls, venv: VecEnv) -> AffineObservation:
         """Return the map that undoes the frozen statistics of a `VecNormalize`.
 
-        It gives what the env below shows. Where that is not theta yet, compose:
+        It gives what the env below shows; for a law in deviations, compose:
         ``AffineObservation.deviation(x_ss) @ AffineObservation.from_vec_normalize(venv)``.
-        The policy also checks that no clipping (``clip_obs``) acts within the box of the law. It
-        takes normalized observations from then on, also where it is loaded without the env.
+        The policy takes normalized observations from then on, also where it is loaded alone.
 
         Raises
         ------

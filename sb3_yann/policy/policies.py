@@ -138,7 +138,7 @@ class YannPolicy(TD3Policy):
     ) -> None:
         algorithm = algorithm_under_construction()
         require_plain_td3(algorithm)
-        require_sb3_kwargs(sb3_kwargs, own=_own_names(type(self)))
+        require_sb3_kwargs(sb3_kwargs, own=_own_names())
         require_box("observation_space", observation_space, flattened=observation is not None)
         require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
@@ -267,9 +267,9 @@ class YannPolicy(TD3Policy):
         }
 
 
-def _own_names(policy: type) -> list[str]:
+def _own_names() -> list[str]:
     """Return the names of the keywords that are not SB3's."""
-    names = [*inspect.signature(policy).parameters]
+    names = [*inspect.signature(YannPolicy).parameters]
     return names[names.index("problem") : -1]
 
 

@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.noise import NormalActionNoise
 
 from guard_samples import (
+    BLOCK,
     REGION,
     RIGHT,
     STEPS,
@@ -19,24 +20,15 @@ from guard_samples import (
     actor_bits,
     build,
     correct,
+    guard_alone,
     make_guard,
     overwrite,
+    still,
     train,
     verdicts,
 )
 from sb3_yann import NoActionNoise, NonFiniteWarning
 from weights import is_mpc, last_layer
-
-BLOCK = 3 * STEPS
-plant = partial(Slide, low=2.0, high=2.8)
-
-
-def guard_alone(**kwargs):
-    return make_guard(None, **({"trial_episodes": 3} | kwargs))
-
-
-def still(**kwargs):
-    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
@@ -146,7 +138,7 @@ def test_what_an_earlier_guard_accepted_is_what_a_plant_alone_begins_with() -> N
 
 
 def test_an_actor_that_diverges_at_every_step_is_one_decision_in_each_episode(tmp_path) -> None:
-    model, guard = still(), guard_alone(record=tmp_path / "guard.csv")
+    model, guard = still(), guard_alone(log_path=tmp_path / "guard.csv")
     train(model, 4 * STEPS, guard, At(range(1, 99), partial(overwrite, value=np.nan)))
     assert len(guard.decisions) == 4
     assert len((tmp_path / "guard.csv").read_text().splitlines()) == 1 + 4
@@ -180,7 +172,7 @@ def test_one_reward_that_is_not_finite_lets_the_guard_alone_go_on_learning(tmp_p
             return observation, np.nan if self.played == 100 else reward, *rest
 
     model = build(env=Faulty(low=2.0, high=2.8))
-    guard = guard_alone(record=tmp_path / "guard.csv")
+    guard = guard_alone(log_path=tmp_path / "guard.csv")
     with pytest.warns(NonFiniteWarning, match="Step 100"):
         train(model, 450, guard)
     assert all(bool(each.isfinite().all()) for each in model.policy.parameters())

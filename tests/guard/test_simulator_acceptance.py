@@ -107,7 +107,7 @@ class Stop(BaseCallback):
 
 
 def test_after_an_interruption_the_accepted_policy_can_be_had() -> None:
-    model, guard = build(learning_rate=0.0), make_guard(every=100)
+    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
     with pytest.raises(KeyboardInterrupt):
         train(model, 20, At([5], better), guard, Stop())
     assert actor_bits(model.policy) != accepted_bits(guard)
@@ -117,7 +117,7 @@ def test_after_an_interruption_the_accepted_policy_can_be_had() -> None:
 
 
 def test_the_accepted_policy_can_be_had_from_a_checkpoint(tmp_path) -> None:
-    model, guard = build(learning_rate=0.0), make_guard(every=100)
+    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
     train(model, 6, At([5], better), guard, CheckpointCallback(5, str(tmp_path), "run"))
     loaded = DDPG.load(tmp_path / "run_5_steps", device="cpu")
     assert not is_mpc(loaded)

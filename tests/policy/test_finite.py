@@ -9,12 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import LinearPlant, Recorder, two_input_mpc
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from general_problems import servo
+from sample_plants import LinearPlant, Recorder, two_input_mpc
 from sb3_yann import AffineObservation, NoActionNoise, NonFiniteWarning, RateLimits, YannPolicy
 from sb3_yann.policy._finite import FiniteRows
 from sb3_yann_envs import problems

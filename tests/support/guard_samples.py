@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import random
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -13,12 +14,21 @@ import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
+from sb3_yann import (
+    AcceptanceRule,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    YannPolicy,
+)
 from weights import last_layer
 
 LEFT, CENTER, RIGHT = range(3)
 STEPS = 4
 """Steps of an episode."""
+FIRST = 1_000_000
+"""The first of the guard's own seeds."""
 
 
 def slide_mpc() -> LinearMPC:
@@ -89,6 +99,23 @@ def make_guard(env: Any = Slide, **kwargs) -> ImprovementGuard:
     return ImprovementGuard(env, **({"n_starts": 10, "patience": 1} | kwargs))
 
 
+def guard_alone(
+    trial_episodes: int = 3, significance: float = 0.05, **kwargs: Any
+) -> ImprovementGuard:
+    rule = AcceptanceRule(trial_episodes=trial_episodes, significance=significance)
+    return make_guard(None, rule=rule, **kwargs)
+
+
+BLOCK = 3 * STEPS
+"""Steps of a block of `guard_alone`."""
+# One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
+plant = partial(Slide, low=2.0, high=2.8)
+
+
+def still(**kwargs):
+    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
+
+
 @th.no_grad()
 def correct(policy: YannPolicy, region: int, value: float) -> None:
     """Make the actor's input in a region (not the center) the MPC's plus a constant."""
@@ -157,7 +184,7 @@ def bits(value: Any) -> Any:
 
 
 def actor_bits(policy: YannPolicy) -> dict[str, Any]:
-    """Return all that a rejection puts back, but the rate, which SB3 sets before every step."""
+    """Return all that is restored, but the rate, which SB3 sets before every step."""
     return {
         "actor": bits(policy.actor.state_dict()),
         "target": bits(policy.actor_target.state_dict()),

@@ -35,8 +35,7 @@ def tanh(x: Any) -> Any:
 
     With t = tanh(x / 2) from the eighth convergent of Lambert's continued fraction
     ``t = h / (1 + h^2 / (3 + h^2 / (5 + ...)))`` at h = x / 2, it is ``2 t / (1 + t^2)``. That is
-    arithmetic alone, of which a processor does several at a time; the library's tanh costs more
-    than all the rest.
+    arithmetic alone, several values at a time; the library's tanh costs more than all the rest.
     """
     one, five = np.float32(1), np.float32(5)
     h = np.float32(0.5) * x

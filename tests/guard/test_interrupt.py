@@ -10,6 +10,7 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from guard_samples import (
+    FIRST,
     STEPS,
     At,
     Slide,
@@ -20,8 +21,7 @@ from guard_samples import (
     make_guard,
     train,
 )
-
-FIRST = 1_000_000
+from weights import is_mpc
 
 
 def ctrl_c(*_) -> None:
@@ -62,14 +62,14 @@ def interrupted(model, steps: int, *callbacks: BaseCallback) -> None:
 
 
 def test_between_two_steps_the_candidate_gives_way_to_what_was_accepted() -> None:
-    model, guard = build(), make_guard(every=100)
+    model, guard = build(), make_guard(eval_every=100)
     interrupted(model, 40, At([5], better), guard, At([17], ctrl_c))
-    assert model.policy.actor.mu.network.is_zero()  # no trial has been
+    assert is_mpc(model)  # no trial has been
 
 
 @pytest.mark.parametrize("part", ["actor", "critic"])
 def test_in_the_midst_of_a_gradient_step_as_well(monkeypatch, part) -> None:
-    model, guard = build(), make_guard(every=100)
+    model, guard = build(), make_guard(eval_every=100)
     optimizer = getattr(model, part).optimizer
     step, taken = optimizer.step, []
 
@@ -86,9 +86,9 @@ def test_in_the_midst_of_a_gradient_step_as_well(monkeypatch, part) -> None:
 @pytest.mark.parametrize("at", [FIRST + 12, FIRST + 10 + 5 + 7], ids=["a trial", "the end"])
 def test_in_a_trial_what_stood_before_it_is_left(at) -> None:
     simulator = partial(CutOff, at, ctrl_c)
-    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=5)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=5)
     interrupted(model, 2 * STEPS, At([1], better), guard)
-    assert model.policy.actor.mu.network.is_zero() == (at == FIRST + 12)
+    assert is_mpc(model) == (at == FIRST + 12)
 
 
 def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_policy() -> None:
@@ -109,7 +109,7 @@ def test_a_handler_of_ones_own_that_raises_nothing_goes_unnoticed() -> None:
     seen = []
     before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
     try:
-        model, guard = build(), make_guard(every=100)
+        model, guard = build(), make_guard(eval_every=100)
         candidate = []
         train(
             model,
@@ -125,7 +125,7 @@ def test_a_handler_of_ones_own_that_raises_nothing_goes_unnoticed() -> None:
 
 def test_learn_again_and_again_and_the_handler_is_the_one_before() -> None:
     before = signal.getsignal(signal.SIGINT)
-    model, guard = build(), make_guard(every=100)
+    model, guard = build(), make_guard(eval_every=100)
     train(model, 8, guard)
     assert signal.getsignal(signal.SIGINT) is before
     interrupted(model, 20, guard, At([7], ctrl_c))
@@ -138,7 +138,7 @@ def test_after_another_error_the_handler_only_passes_on() -> None:
         raise OSError("the plant is gone")
 
     before = signal.getsignal(signal.SIGINT)
-    model, guard = build(learning_rate=0.0), make_guard(every=100)
+    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
     with pytest.raises(OSError, match="gone"):
         train(model, 20, guard, At([5], better), At([6], fail))
     candidate = bits(model.policy.actor.state_dict())
@@ -149,7 +149,7 @@ def test_after_another_error_the_handler_only_passes_on() -> None:
 
 
 def test_a_checkpoint_in_between_holds_no_handler(tmp_path) -> None:
-    model, guard = build(), make_guard(every=100)
+    model, guard = build(), make_guard(eval_every=100)
     interrupted(model, 20, guard, CheckpointCallback(4, str(tmp_path)), At([13], ctrl_c))
     for path in tmp_path.glob("*.zip"):
         again = type(model).load(path)
