@@ -34,17 +34,15 @@ class ImprovementGuard(BaseCallback):
     candidate, also after another exception and in the zips of a CheckpointCallback:
     :func:`restore_accepted` gives it the accepted policy.
 
-    - With a simulator, candidates and the MPC play the same seeded starts. A candidate is refused
-      if its mean cost is above the accepted policy's, if one start costs more than with the MPC by
-      more than the margin, or if an episode is less safe. Single regions may still be accepted.
-      What is to be accepted is confirmed on new starts.
-    - On a plant alone (``env=None``) the training episodes decide, by a one-sided test. Each test
-      errs with probability ``rule.significance``.
-    - A refusal restores actor, target actor and the actor's optimizer bit for bit, at once or when
-      ``patience`` is over. The critic goes on learning.
-    - No random numbers are drawn. Training env and replay buffer stay as they are.
-    - The state travels with the model, as ``model.guard_state``. A guard with the same settings
-      goes on from there; with other settings the accepted policy is tried anew.
+    With a simulator, candidates and the MPC play the same seeded starts. A candidate is refused if
+    its mean cost is above the accepted policy's, if one start costs more than with the MPC by more
+    than the margin, or if an episode is less safe. Single regions may still be accepted. What is to
+    be accepted is confirmed on new starts. On a plant alone (``env=None``) the training episodes
+    decide, by a one-sided test that errs with probability ``rule.significance``.
+
+    A refusal restores actor, target actor and the actor's optimizer bit for bit, at once or when
+    ``patience`` is over. The critic goes on learning. No random numbers are drawn. The state
+    travels with the model, as ``model.guard_state``: a guard with the same settings goes on there.
 
     Parameters
     ----------

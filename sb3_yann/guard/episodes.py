@@ -167,11 +167,8 @@ def play_episodes(
 def play(session: GuardSession, checkpoint: ActorCheckpoint, seeds: Sequence[int]) -> Outcome:
     """Return what comes of a checkpoint from seeded starts. The policy stays as it is.
 
-    Raises
-    ------
-    Unplayable
-        If an action is not finite, or if the env raises an error under this checkpoint, but not
-        under the MPC from the same starts. An error that the MPC meets as well is the env's own.
+    Raise Unplayable if an action is not finite, or if the env raises an error under this
+    checkpoint, but not under the MPC from the same starts: an error of both is the env's own.
     """
     try:
         return outcome_of(session, play_episodes(session, checkpoint, seeds))

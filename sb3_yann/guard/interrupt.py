@@ -1,7 +1,6 @@
-"""Ctrl-C in the midst of `learn`: the model is left with the policy that was accepted last.
+"""Ctrl-C during `learn`: a handler of the signal restores the accepted policy in the main thread.
 
-Nothing of SB3 tells a callback that `learn` ended by an exception. A handler of the signal can: it
-runs in the main thread, between two operations of Python, wherever training is.
+Nothing of SB3 tells a callback that `learn` ended by an exception.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 class Handler:
     """Calls the handler that was there; where that raises, the accepted policy is restored first.
 
-    It knows by itself whether its `learn` is still running: another exception than Ctrl-C ends that
-    without a word. From then on it only passes on, until the guard is gone or learns again.
+    Another exception ends `learn` without a word: from then on the handler only passes on, until
+    the guard is gone or learns again.
     """
 
     def __init__(self, model: BaseAlgorithm, restore: Callable[[], None], before: Any) -> None:

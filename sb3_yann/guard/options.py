@@ -20,10 +20,9 @@ class AcceptanceRule:
     Parameters
     ----------
     margin : float, default 0.01
-        Simulator: what one start may cost more than with the MPC, as a fraction of the MPC's
-        median cost.
+        What one start may cost more than with the MPC, as a fraction of the MPC's median cost.
     by_region : bool, default True
-        Simulator: whether single regions are tried where the whole candidate is refused.
+        Whether single regions are tried where the whole candidate is refused.
     trial_episodes : int, default 10
         Plant alone: training episodes of a block, at least 3.
     significance : float, default 0.05

@@ -13,7 +13,7 @@ from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.preconditions import check_acts_alone
 from sb3_yann.guard.session import GuardSession
-from sb3_yann.guard.state import Decision, GuardState, Verdict
+from sb3_yann.guard.state import GuardState, Verdict
 from sb3_yann.guard.statistics import PlantEpisodes, analyze_covariance, excess_of_an_outlier
 from sb3_yann.policy.policies import YannPolicy
 
@@ -225,20 +225,8 @@ class PlantAcceptance:
             return np.nan if episodes is None else float(episodes.costs.mean())
 
         evidence = _evidence(session)
-        session.decide(
-            Decision(
-                timestep=session.model.num_timesteps,
-                episode=session.state.episodes,
-                verdict=verdict,
-                reason=reason,
-                restored=verdict == "rejected",
-                candidate_cost=cost,
-                accepted_cost=mean(evidence.accepted),
-                mpc_cost=mean(evidence.mpc),
-                worst_start=np.nan,
-                regions=(),
-            )
-        )
+        costs = cost, mean(evidence.accepted), mean(evidence.mpc)
+        session.decide(verdict, reason, verdict == "rejected", costs)
 
 
 def _evidence(session: GuardSession) -> BlockEvidence:

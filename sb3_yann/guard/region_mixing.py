@@ -84,12 +84,15 @@ def _accept_one_by_one(
         if len(starts) == 0 or not state.accepted.changed_regions(candidate)[region]:
             continue
         mixed = state.accepted.with_regions(candidate, [region])
-        known = _same_episodes(starts, candidate, mixed, outcome)
-        trial = evidence.accepted
+        known, trial = starts[:0], evidence.accepted
         if outcome is not None:
+            # The candidate's own episodes, if they meet no region where the mixture is another.
+            other = mixed.changed_regions(candidate)
+            known = starts[~outcome.visits[starts][:, other].any(1)]
             trial = trial.replaced(known, outcome.at(known))
-            if _worse_than_the_mpc_somewhere(evidence, trial, known):
-                continue
+            lost = evidence.paired.lost(trial.costs)[known]
+            if lost.any() or np.any(trial.unsafe[known] > evidence.accepted.unsafe[known]):
+                continue  # whatever the others cost
         others = np.setdiff1d(starts, known)
         try:
             trial = trial.replaced(others, _play_some(session, mixed, others))
@@ -113,27 +116,6 @@ def _play_some(
     if len(starts) == 0:
         return evidence.accepted.at(starts)
     return play(session, checkpoint, [evidence.seeds[i] for i in starts])
-
-
-def _same_episodes(
-    starts: NDArray[np.int64],
-    candidate: ActorCheckpoint,
-    mixed: ActorCheckpoint,
-    outcome: Outcome | None,
-) -> NDArray[np.int64]:
-    """Return the starts whose episodes are the candidate's: they meet no region that differs."""
-    if outcome is None:
-        return starts[:0]
-    differs = outcome.visits[starts][:, mixed.changed_regions(candidate)].any(1)
-    return np.asarray(starts[~differs])
-
-
-def _worse_than_the_mpc_somewhere(
-    evidence: Evidence, trial: Outcome, some: NDArray[np.int64]
-) -> bool:
-    """Return whether some starts alone suffice to refuse, whatever the others cost."""
-    lost = evidence.paired.lost(trial.costs)[some]
-    return bool(lost.any() or np.any(trial.unsafe[some] > evidence.accepted.unsafe[some]))
 
 
 def accepted_regions(

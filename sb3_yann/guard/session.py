@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,7 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.options import StepSize
 from sb3_yann.guard.rng import preserve_rng
-from sb3_yann.guard.state import Decision, GuardState, log_last
+from sb3_yann.guard.state import Decision, GuardState, Verdict, log_last
 from sb3_yann.policy.policies import YannPolicy
 
 Simulator: TypeAlias = str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
@@ -108,36 +109,41 @@ class GuardSession:
         normalize = self.model.get_vec_normalize_env()
         return observations if normalize is None else normalize.normalize_obs(observations)
 
-    def decide(self, decision: Decision) -> None:
-        """Set the step size, and log a decision."""
-        step = self.state.step
-        if decision.verdict == "accepted":
+    def decide(
+        self,
+        verdict: Verdict,
+        reason: str,
+        restored: bool,
+        costs: tuple[float, float, float],
+        worst_start: float = math.nan,
+        regions: tuple[int, ...] = (),
+    ) -> None:
+        """Set the step size, and log a Decision of these fields."""
+        state, step, steps = self.state, self.state.step, self.model.num_timesteps
+        if verdict == "accepted":
             step = min(1.0, step * self.step_size.grow)
-        elif decision.verdict == "rejected" and decision.restored:
+        elif verdict == "rejected" and restored:
             step = max(min(self.step_size.smallest, step), step * self.step_size.shrink)
-        self.state.step = self.policy.actor_step = step
-        self.state.decisions.append(replace(decision, step=step))
-        log_last(self.state.decisions, self.model, self.log_path, self.verbose)
+        state.step = self.policy.actor_step = step
+        decision = Decision(
+            steps, state.episodes, verdict, reason, restored, *costs, worst_start, regions, step
+        )
+        state.decisions.append(decision)
+        log_last(state.decisions, self.model, self.log_path, self.verbose)
 
 
 def restore_accepted(model: BaseAlgorithm) -> None:
     """Give the model the policy that a guard accepted last, bit for bit.
 
     `learn` does so at its end and after Ctrl-C. Call it after another exception, and for a model
-    that was saved during training.
-
-    Raises
-    ------
-    ValueError
-        If no guard has been at work on the model.
+    that was saved during training. A model without a guard is a ValueError.
 
     Examples
     --------
     >>> from stable_baselines3 import DDPG
     >>> from sb3_yann import ImprovementGuard, NoActionNoise, restore_accepted
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> guard = ImprovementGuard("CSTR-v0", n_starts=3)
-    >>> _ = model.learn(1, callback=[NoActionNoise(), guard])
+    >>> _ = model.learn(1, callback=[NoActionNoise(), ImprovementGuard("CSTR-v0", n_starts=3)])
     >>> restore_accepted(model)
     """
     state, policy = getattr(model, "guard_state", None), model.policy

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -24,7 +24,7 @@ from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.preconditions import check_simulator, first_episodes
 from sb3_yann.guard.region_mixing import accept_parts, accept_visited, accepted_regions
 from sb3_yann.guard.session import GuardSession
-from sb3_yann.guard.state import Decision, GuardState
+from sb3_yann.guard.state import GuardState, Verdict
 
 PART: Final = "accepted in part"
 REPLAYED = 5
@@ -43,8 +43,6 @@ class SimulatorAcceptance:
     patience: int
     keep_if_worse: bool
     rule: AcceptanceRule
-    final: ActorCheckpoint | None = field(default=None, init=False)
-    last_trial: int = field(default=0, init=False)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -54,7 +52,7 @@ class SimulatorAcceptance:
     def start(self, session: GuardSession) -> None:
         """Check that the simulator is another env than the training env, and a like one."""
         check_simulator(session, self.name)
-        self.final = None
+        self.final: ActorCheckpoint | None = None
         self.last_trial = -self.eval_every  # a trial always follows the first episode
 
     def still_holds(self, session: GuardSession) -> bool:
@@ -195,20 +193,11 @@ class SimulatorAcceptance:
         restored: bool,
     ) -> None:
         paired = session.state.evidence.paired
-        session.decide(
-            Decision(
-                timestep=session.model.num_timesteps,
-                episode=session.state.episodes,
-                verdict="accepted" if not reason else PART if regions else "rejected",
-                reason=reason,
-                restored=restored,
-                candidate_cost=np.nan if outcome is None else float(outcome.costs.mean()),
-                accepted_cost=float(paired.costs.mean()),
-                mpc_cost=float(paired.mpc_costs.mean()),
-                worst_start=float(np.max(paired.costs - paired.mpc_costs)),
-                regions=tuple(regions),
-            )
-        )
+        verdict: Verdict = "accepted" if not reason else PART if regions else "rejected"
+        cost = np.nan if outcome is None else float(outcome.costs.mean())
+        costs = cost, float(paired.costs.mean()), float(paired.mpc_costs.mean())
+        worst_start = float(np.max(paired.costs - paired.mpc_costs))
+        session.decide(verdict, reason, restored, costs, worst_start, tuple(regions))
 
 
 def name_of(env: Any) -> str:

@@ -36,13 +36,13 @@ class Decision:
     regions : tuple of int
         Regions whose networks were accepted, where it was a part.
     step : float
-        Factor of the actor's learning rate from now on; the guard fills it in.
+        Factor of the actor's learning rate from now on.
 
     Examples
     --------
     >>> from sb3_yann import Decision
-    >>> Decision(4, 1, "rejected", "mean cost 5, accepted 4", True, 5.0, 4.0, 4.0, 0.0, ()).restored
-    True
+    >>> Decision(9, 1, "accepted", "", False, 3.0, 3.0, 4.0, -0.5, (), 1.0).accepted_cost
+    3.0
     """
 
     timestep: int
@@ -55,7 +55,7 @@ class Decision:
     mpc_cost: float
     worst_start: float
     regions: tuple[int, ...]
-    step: float = 1.0
+    step: float
 
 
 NAMES = [each.name for each in fields(Decision)]

@@ -6,6 +6,7 @@ import copy
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -191,6 +192,7 @@ class AfterstateValue(nn.Module):
         scale: float = 30.0,
     ) -> None:
         super().__init__()
+        import_module("sb3_yann.networks._kernels.afterstate_value")  # see YannLayer
         self.model = _untrained(model) if isinstance(model, nn.Module) else model
         self.gamma, self.scale = gamma, scale
         self.quadratic = QuadraticForm(P)

@@ -209,7 +209,7 @@ def test_a_bad_start_is_refused_with_its_reason(options: dict[str, Any], message
         ClippedPendulumEnv().reset(options=options)
 
 
-# --- bad calls and rendering -------------------------------------------------------------------
+# --- bad calls ---------------------------------------------------------------------------------
 
 
 def test_a_step_before_the_first_reset_is_refused() -> None:
@@ -224,31 +224,3 @@ def test_a_step_before_the_first_reset_is_refused() -> None:
 def test_a_bad_action_is_refused(action: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         started().step(action)
-
-
-def test_a_frame_is_a_picture_that_changes_with_the_episode() -> None:
-    env = ClippedPendulumEnv(render_mode="rgb_array")
-    env.reset(seed=0)
-    first = env.render()
-    env.step(act(2.0))
-    second = env.render()
-    assert first is not None and second is not None
-    assert first.shape == (400, 400, 3)
-    assert first.dtype == np.uint8
-    assert (first != second).any()
-
-
-def test_an_unknown_render_mode_is_refused() -> None:
-    with pytest.raises(ValueError, match="render_mode must be None or one of"):
-        ClippedPendulumEnv(render_mode="ansi")
-
-
-def test_rendering_before_the_first_reset_is_refused() -> None:
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before env.render\(\)"):
-        ClippedPendulumEnv(render_mode="rgb_array").render()
-
-
-def test_rendering_without_a_mode_warns_and_returns_nothing() -> None:
-    env = started()
-    with pytest.warns(UserWarning, match="without specifying any render mode"):
-        assert env.render() is None

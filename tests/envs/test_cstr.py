@@ -334,7 +334,7 @@ def test_a_bad_start_is_refused_with_its_reason(options: dict[str, Any], message
         CSTREnv().reset(options=options)
 
 
-# --- bad calls and rendering -------------------------------------------------------------------
+# --- bad calls ---------------------------------------------------------------------------------
 
 
 def test_a_step_before_the_first_reset_is_refused() -> None:
@@ -351,31 +351,3 @@ def test_a_bad_action_is_refused_and_leaves_the_state_alone(action: Any, message
     with pytest.raises(ValueError, match=message):
         env.step(action)
     np.testing.assert_array_equal(env.step(act(1.0))[0], twin.step(act(1.0))[0])
-
-
-def test_a_frame_is_a_picture_that_changes_with_the_episode() -> None:
-    env = CSTREnv(render_mode="rgb_array")
-    env.reset(seed=0)
-    first = env.render()
-    env.step(act(-55.0))
-    second = env.render()
-    assert first is not None and second is not None
-    assert first.shape == (400, 600, 3)
-    assert first.dtype == np.uint8
-    assert (first != second).any()
-
-
-def test_an_unknown_render_mode_is_refused() -> None:
-    with pytest.raises(ValueError, match="render_mode must be None or one of"):
-        CSTREnv(render_mode="ansi")
-
-
-def test_rendering_before_the_first_reset_is_refused() -> None:
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before env.render\(\)"):
-        CSTREnv(render_mode="rgb_array").render()
-
-
-def test_rendering_without_a_mode_warns_and_returns_nothing() -> None:
-    env = started()
-    with pytest.warns(UserWarning, match="without specifying any render mode"):
-        assert env.render() is None

@@ -16,6 +16,7 @@ from guard_samples import (
     RIGHT,
     STEPS,
     At,
+    CutOff,
     Slide,
     accepted_bits,
     actor_bits,
@@ -120,23 +121,13 @@ def test_what_was_accepted_in_an_earlier_learn_can_be_gone_back_to(how, tmp_path
     assert weights(model)[REGION[LEFT]] == 0
 
 
-class Interrupted(Slide):
-    """Ctrl-C, or a fault, at the start with a seed."""
-
-    def __init__(self, at: int, error: type[BaseException], **kwargs) -> None:
-        super().__init__(**kwargs)
-        self.at, self.error = at, error
-
-    def reset(self, *, seed=None, options=None):
-        if seed == self.at:
-            raise self.error("stopped")
-        return super().reset(seed=seed, options=options)
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
 @pytest.mark.parametrize("at", [FIRST + 12, FIRST + 10 + 5 + 7], ids=["a trial", "the end"])
 def test_a_trial_that_is_cut_off_accepts_nothing_and_leaves_the_candidate(error, at) -> None:
-    simulator = partial(Interrupted, at, error)
+    def stop() -> None:
+        raise error("stopped")
+
+    simulator = partial(CutOff, at, stop)
     model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=5)
     with pytest.raises(error):
         train(model, 2 * STEPS, At([1], better), guard)

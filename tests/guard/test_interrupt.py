@@ -13,7 +13,8 @@ from guard_samples import (
     FIRST,
     STEPS,
     At,
-    Slide,
+    CutOff,
+    accepted_bits,
     actor_bits,
     better,
     bits,
@@ -28,28 +29,9 @@ def ctrl_c(*_) -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-class CutOff(Slide):
-    """Does something when an episode begins from one of the seeds."""
-
-    def __init__(self, at: int, act) -> None:
-        super().__init__()
-        self.at, self.act = at, act
-
-    def reset(self, *, seed=None, options=None):
-        if seed == self.at:
-            self.act()
-        return super().reset(seed=seed, options=options)
-
-
 def left(model) -> None:
     """Check that the model is what its guard accepted last, with target and optimizer."""
-    accepted = model.guard_state.accepted
-    expected = {
-        "actor": bits(accepted.actor),
-        "target": bits(accepted.target),
-        "optimizer": bits(accepted.optimizer["state"]),
-    }
-    assert actor_bits(model.policy) == expected
+    assert actor_bits(model.policy) == accepted_bits(model)
     assert model.policy.actor_step == 1.0
 
 

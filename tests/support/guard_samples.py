@@ -82,6 +82,19 @@ class Slide(gym.Env):
         return self.x.astype(np.float32), -cost, False, self.t == STEPS, info
 
 
+class CutOff(Slide):
+    """Does something when an episode begins from one of the seeds."""
+
+    def __init__(self, at: int, act: Callable[[], Any]) -> None:
+        super().__init__()
+        self.at, self.act = at, act
+
+    def reset(self, *, seed=None, options=None):
+        if seed == self.at:
+            self.act()
+        return super().reset(seed=seed, options=options)
+
+
 if "Slide-v0" not in gym.registry:
     gym.register("Slide-v0", entry_point="guard_samples:Slide")
 
@@ -106,8 +119,7 @@ def guard_alone(
     return make_guard(None, rule=rule, **kwargs)
 
 
-BLOCK = 3 * STEPS
-"""Steps of a block of `guard_alone`."""
+BLOCK = 3 * STEPS  # of a guard_alone
 # One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
 plant = partial(Slide, low=2.0, high=2.8)
 
@@ -201,8 +213,9 @@ def critic_bits(policy: YannPolicy) -> dict[str, Any]:
     }
 
 
-def accepted_bits(guard: ImprovementGuard) -> dict[str, Any]:
-    accepted = guard.state.accepted
+def accepted_bits(owner: Any) -> dict[str, Any]:
+    """Return the same of what a guard, or the guard of a model, has accepted."""
+    accepted = (owner.guard_state if hasattr(owner, "guard_state") else owner.state).accepted
     return {
         "actor": bits(accepted.actor),
         "target": bits(accepted.target),
