@@ -12,8 +12,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from sb3_yann import CostAudit, ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import save_trajectories, summary_table
+from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
 
 TEST_SEEDS = range(2000, 2050)  # starts that training never sees
 

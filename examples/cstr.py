@@ -12,8 +12,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from sb3_yann import ControlDiagnostics, ImprovementGuard, NoActionNoise, YannPolicy
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import comparison_table, save_trajectories
+from sb3_yann.evaluation import comparison_table, evaluate, save_trajectories
 from sb3_yann_envs.cstr import DT, TEMPERATURE_LIMIT, X_SS
 
 STEPS = 400  # of one episode
@@ -34,7 +33,7 @@ def main() -> None:
     before = evaluate(model, "CSTR-v0", TEST_SEEDS)
 
     diagnostics = ControlDiagnostics()
-    guard = ImprovementGuard("CSTR-v0", record="out/guard.csv")
+    guard = ImprovementGuard("CSTR-v0", log_path="out/guard.csv")
     console.print(f"Training for {arguments.episodes} episodes without action noise ...")
     callbacks = [NoActionNoise(), guard, diagnostics]
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from sb3_yann.evaluation.episodes import evaluate
+from sb3_yann.evaluation import evaluate
 from sb3_yann_envs import problems
 
 

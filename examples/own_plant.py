@@ -14,9 +14,9 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
-from sb3_yann import CostAudit, ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import save_trajectories, summary_table
+from sb3_yann import CostAudit, ImprovementGuard, NoActionNoise, YannPolicy
+from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
+from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
@@ -30,8 +30,8 @@ def make_env(mpc: LinearMPC) -> gymnasium.Env:
     levels, pumps = box(0 - x_ss, FULL - x_ss, dtype=float), box(mpc.u_min, mpc.u_max, dtype=float)
     env = TransformObservation(env, lambda level: level - x_ss, levels)
     env = TransformAction(env, lambda u: u + u_ss, pumps)
-    env = SetPoint(env, mpc.r_min, mpc.r_max, hold=HOLD)
-    env = MeasuredDisturbance(env, mpc.d_min, mpc.d_max)
+    env = SetPoint(env, mpc.tracking.r_min, mpc.tracking.r_max, hold=HOLD)
+    env = MeasuredDisturbance(env, mpc.disturbances.d_min, mpc.disturbances.d_max)
     return TimeLimit(StageCost(env, mpc), STEPS)
 
 
@@ -48,21 +48,20 @@ def main() -> None:
     log = np.loadtxt("out/log.csv", delimiter=",", skiprows=1)
     x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
     plant = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=[3, 3], d_ss=[0])
-    console.print(plant.report())
     # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
     weights = {"Q": np.diag([1, 1, 0, 0]), "R": 0.5 * np.eye(2), "horizon": 2, "gamma": 0.9}
-    wishes = {"tracked": [0, 1], "r_min": -4, "r_max": 4, "d_min": -1, "d_max": 1}
+    wishes = {"tracking": Tracking([0, 1], -4, 4), "disturbances": DisturbanceBounds(-1, 1)}
     limits = {"u_min": 0 - plant.u_ss, "u_max": MAX_VOLTAGE - plant.u_ss}
     limits |= {"theta_min": 0 - plant.x_ss, "theta_max": FULL - plant.x_ss}
     mpc = LinearMPC(plant, **weights, **wishes, **limits)
-    console.print(mpc.report())
+    console.print(plant.report(), mpc.report(), sep="\n")
     make = partial(make_env, mpc)
     # Five per cent of the pumps' range is more than the wear takes; V differs by about ten.
-    policy = {"problem": mpc, "max_correction": 0.05, "value_scale": 10.0}
+    policy = {"problem": mpc, "max_correction": 0.05, "critic": {"value_scale": 10.0}}
     settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed}
     model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
     before = evaluate(model, make, TEST_SEEDS)
-    guard = ImprovementGuard(make, n_starts=50, fresh=25, record="out/own_plant.csv")
+    guard = ImprovementGuard(make, n_starts=50, n_new_starts=25, log_path="out/own_plant.csv")
     callbacks = [NoActionNoise(), CostAudit(verbose=1), guard]
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, make, TEST_SEEDS)

@@ -12,8 +12,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import ControlDiagnostics, ImprovementGuard, NoActionNoise, YannPolicy
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.evaluation.plots import comparison_table, save_trajectories
+from sb3_yann.evaluation import comparison_table, evaluate, save_trajectories
 from sb3_yann_envs.clipped_pendulum import DT
 
 STEPS = 200  # of one episode
@@ -40,7 +39,9 @@ def main() -> None:
     console.print(f"The policy starts as {model.policy.problem.explicit()}.")
     before = evaluate(model, "ClippedPendulum-v0", TEST_SEEDS)
     # The way from hanging to swinging leads through worse policies: the guard waits for them.
-    guard = ImprovementGuard("ClippedPendulum-v0", patience=10, wander=True, record="out/guard.csv")
+    guard = ImprovementGuard(
+        "ClippedPendulum-v0", patience=10, keep_if_worse=True, log_path="out/guard.csv"
+    )
     callbacks = [NoActionNoise(), guard, ControlDiagnostics()]
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, "ClippedPendulum-v0", TEST_SEEDS)

@@ -55,12 +55,12 @@ class Plant:
 def true_reactor() -> LinearMPC:
     """Return the reactor's MPC with the model that its equations give, not the printed one."""
     model = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
-    return replace(problems.cstr(), model=model, terminal_cost=None)
+    return replace(problems.cstr(), model=model, terminal=None)
 
 
 def printed_pendulum() -> LinearMPC:
     """Return the pendulum's MPC with the printed weight, Q = I: nine regions instead of seven."""
-    return replace(problems.clipped_pendulum(), Q=np.eye(2), terminal_cost=None)
+    return replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=None)
 
 
 _REACTOR = Plant(
@@ -68,7 +68,7 @@ _REACTOR = Plant(
     400,
     problems.cstr,
     optimum.cstr_optimum,
-    guard={"margin": 0.015},
+    guard={"rule": {"margin": 0.015}},
 )
 # The way from a pendulum that hangs to one that swings leads through worse policies.
 _PENDULUM = Plant(
@@ -78,7 +78,7 @@ _PENDULUM = Plant(
     optimum.clipped_pendulum_optimum,
     gradient_steps=2,
     critic_warmup=4000,
-    guard={"fresh": 100, "final": 10_000, "patience": 10, "wander": True},
+    guard={"n_new_starts": 100, "n_final_starts": 10_000, "patience": 10, "keep_if_worse": True},
 )
 PLANTS = {
     "CSTR": _REACTOR,
@@ -89,7 +89,7 @@ PLANTS = {
         _PENDULUM,
         problem=printed_pendulum,
         gradient_steps=4,
-        guard={**_PENDULUM.guard, "final": 1000, "margin": 0.03},
+        guard={**_PENDULUM.guard, "n_final_starts": 1000, "rule": {"margin": 0.03}},
     ),
 }
 

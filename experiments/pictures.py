@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
-from experiments.measures import MPC, OURS
+from experiments.measures import MPC, OPTIMUM, OURS
 from experiments.runner import Outcome, Run
 
 Array = NDArray[np.float64]
@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = "osD^vPX"
+LEVELS, FEW = (MPC, OPTIMUM), (OURS, "DDPG", "residual RL", "cloned MPC, then DDPG")
+"""What the README's picture shows."""
 
 
 def save_pictures(outcomes: Mapping[Run, Outcome], folder: Path) -> dict[str, Path]:
@@ -38,6 +40,48 @@ def save_pictures(outcomes: Mapping[Run, Outcome], folder: Path) -> dict[str, Pa
             saved[plant] = folder / f"results-{words}.png"
             _picture(plant, learners, fixed).savefig(saved[plant], dpi=120)
     return saved
+
+
+def save_in_short(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
+    """Save ``in-short.png``, the README's picture: the first plant with a rival, in two panels."""
+    for plant in dict.fromkeys(run.plant for run in outcomes):
+        of_plant = {run: outcome for run, outcome in outcomes.items() if run.plant == plant}
+        fixed = {run.learner: out for run, out in of_plant.items() if run.learner in LEVELS}
+        found = _learners({run: out for run, out in of_plant.items() if run.learner in FEW})
+        if MPC in fixed and OURS in found and len(found) > 1:
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / "in-short.png"
+            _two_panels(plant, found, fixed).savefig(path, dpi=110)
+            return [path]
+    return []
+
+
+def _two_panels(
+    plant: str, learners: Mapping[str, list[Outcome]], fixed: Mapping[str, Outcome]
+) -> Figure:
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    tests, costs = figure.subplots(1, 2)
+    base = float(fixed[MPC].test_costs[-1].mean())
+    tested = {name: _tests(runs, base) for name, runs in learners.items()}
+    excess = {name: _excess(runs, base) for name, runs in learners.items()}
+    for k, name in enumerate(learners):
+        _band(tests, *tested[name], k, f"{name} ({len(learners[name])} seeds)")
+        _band(costs, *excess[name], k, name)
+    for (name, outcome), style in zip(fixed.items(), STYLES[1:], strict=False):
+        level = float(outcome.test_costs[-1].mean()) / base
+        tests.axhline(level, label=name, color="black", linestyle=style, linewidth=1, zorder=1)
+    costs.axhline(0, color="black", linestyle=STYLES[1], linewidth=1, zorder=1)
+    tests.set_ylim(0.97, 1.04)
+    _scales(None, costs, tested, excess)
+    tests.set(title=f"{plant}: test cost", ylabel="× the MPC's cost")
+    costs.set(title="excess cost of learning", ylabel="in episodes of the MPC")
+    for axes in (tests, costs):
+        axes.set_xlabel("training episodes")
+        axes.grid(alpha=0.3)
+    handles, labels = tests.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    return figure
 
 
 def _learners(outcomes: Mapping[Run, Outcome]) -> dict[str, list[Outcome]]:
@@ -107,14 +151,14 @@ def _band(axes: Axes, x: Array, y: Array, k: int, label: str) -> None:
 
 
 def _scales(
-    curves: Axes,
+    curves: Axes | None,
     costs: Axes,
     tested: Mapping[str, tuple[Array, Array]],
     excess: Mapping[str, tuple[Array, Array]],
 ) -> None:
     """Use logarithmic axes where one learner would flatten the others."""
     medians = np.concatenate([np.median(y, axis=0) for _, y in tested.values()])
-    if np.all(medians > 0) and medians.max() > 5 * medians.min():
+    if curves and np.all(medians > 0) and medians.max() > 5 * medians.min():
         curves.set_yscale("log")
         curves.yaxis.set_major_formatter("{x:g}")
         curves.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.2, 0.6)))

@@ -13,7 +13,7 @@ import sb3_yann
 from experiments.criteria import EPISODES, SEEDS, criteria
 from experiments.markdown import number, table
 from experiments.measures import HELD, OPTIMUM, OURS, Row, plants_of, standing
-from experiments.pictures import save_pictures
+from experiments.pictures import save_in_short, save_pictures
 from experiments.published import paper_table
 from experiments.runner import Outcome, Run
 from experiments.summary import summary
@@ -65,11 +65,11 @@ def write_report(
     ]
     report = folder / "results.md"
     report.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
-    return [report, *pictures.values()]
+    return [report, *pictures.values(), *save_in_short(outcomes, folder)]
 
 
 def in_short(outcomes: Mapping[Run, Outcome]) -> str:
-    """Return the rows that the README quotes as well."""
+    """Return the table that the README quotes as well."""
     longest = max((run.episodes for run in outcomes), default=0)
     return summary(outcomes, min(EPISODES, longest))
 

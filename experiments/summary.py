@@ -1,4 +1,4 @@
-"""The few rows that the README quotes, and how they get there."""
+"""The table that the README quotes, a row for each plant, and how it gets there."""
 
 from __future__ import annotations
 
@@ -6,39 +6,31 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from experiments.markdown import number, table
-from experiments.measures import MPC, OPTIMUM, OURS, Row, plants_of, standing
+from experiments.measures import MPC, OPTIMUM, OURS, Row, Standing, plants_of, standing
 from experiments.runner import Outcome, Run
 
-SHOWN = (
+RIVAL = "DDPG"
+HEADER = (
+    "plant",
     OPTIMUM,
     MPC,
-    OURS,
-    f"{OURS}, guard off",
-    "residual RL",
-    "cloned MPC, then DDPG",
-    "DDPG",
-    "DDPG, best kept",
-)
-HEADER = (
-    "learner",
+    f"**{OURS}**",
+    "worst start",
+    "excess cost",
+    RIVAL,
+    f"excess cost of {RIVAL}",
+    "violations",
     "seeds",
-    "mean cost, median (range)",
-    "worst start against the MPC",
-    "excess cost of learning",
-    "training episodes with violation",
 )
 BEGIN, END = "<!-- results: begin -->\n", "<!-- results: end -->"
 
 
 def summary(outcomes: Mapping[Run, Outcome], episodes: int) -> str:
-    """Return a table of the best known learners for each plant, in Markdown."""
-    parts = []
-    for plant in plants_of(outcomes):
-        at = standing(outcomes, plant, episodes)
-        rows = [_cells(at.row(name)) for name in SHOWN if name in at.learners]
-        if OURS in at.learners:
-            parts.append(f"**{plant}**\n\n{table(HEADER, rows)}")
-    return "\n\n".join(parts)
+    """Return one table with a row for each plant that was learnt, and its legend, in Markdown."""
+    found = [standing(outcomes, plant, episodes) for plant in plants_of(outcomes)]
+    rows = [_cells(at) for at in found if OURS in at.learners]
+    starts = max((len(out.test_costs[-1]) for out in outcomes.values()), default=0)
+    return f"{table(HEADER, rows)}\n\n{_legend(episodes, starts)}" if rows else ""
 
 
 def quote(text: str, readme: Path, first: str = BEGIN, last: str = END) -> bool:
@@ -52,20 +44,46 @@ def quote(text: str, readme: Path, first: str = BEGIN, last: str = END) -> bool:
     return True
 
 
-def _cells(row: Row) -> list[str]:
-    learnt = row.excess is not None
-    mean = number(row.median)
-    if row.seeds > 1:
-        mean += f" ({number(row.low)} to {number(row.high)})"
-    excess = ""
-    if row.excess is not None:
-        median, low, high = (number(value, 0, "+") for value in row.excess)
-        excess = f"{median} ({low} to {high})"
+def _cells(at: Standing) -> list[str]:
+    """Return the row of a plant; a learner that was not run leaves its cells empty."""
+    optimum, mpc, ours, rival = (
+        at.row(name) if name in at.learners else None for name in (OPTIMUM, MPC, OURS, RIVAL)
+    )
     return [
-        f"**{OURS}**" if row.learner == OURS else row.learner,
-        str(row.seeds) if learnt else "",
-        mean,
-        number(row.worst, sign="+") if learnt else "",
-        excess,
-        str(row.unsafe_training) if learnt else "",
+        at.plant,
+        _mean(optimum),
+        _mean(mpc),
+        f"**{_mean(ours)}**",
+        number(ours.worst, sign="+") if ours else "",
+        _excess(ours),
+        _mean(rival),
+        _excess(rival),
+        _of_both(ours, rival, "unsafe_training"),
+        _of_both(ours, rival, "seeds"),
     ]
+
+
+def _mean(row: Row | None) -> str:
+    if row is None:
+        return ""
+    spread = f" ({number(row.low)} to {number(row.high)})" if row.seeds > 1 else ""
+    return number(row.median) + spread
+
+
+def _excess(row: Row | None) -> str:
+    return number(row.excess[0], 0, "+") if row and row.excess else ""
+
+
+def _of_both(ours: Row | None, rival: Row | None, name: str) -> str:
+    return " / ".join(str(getattr(row, name)) for row in (ours, rival) if row)
+
+
+def _legend(episodes: int, starts: int) -> str:
+    return (
+        f"Mean cost of a test episode after {episodes} training episodes, over {starts} starts "
+        "that training and guard never see: the median over the seeds (and the range). "
+        f"*Worst start*: the largest cost above the MPC's over all seeds and starts of {OURS}. "
+        "*Excess cost*: what all training episodes together cost above the MPC from the same "
+        f"starts, median. *Violations* (training episodes beyond a limit) and *seeds* are those of "
+        f"{OURS} / {RIVAL}."
+    )

@@ -17,62 +17,24 @@ import importlib.abc
 import importlib.util
 import sys
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import sb3_yann_envs
-
-if TYPE_CHECKING:
-    from sb3_yann.audit import CostAudit as CostAudit
-    from sb3_yann.audit import CostFinding as CostFinding
-    from sb3_yann.audit import CostMismatchError as CostMismatchError
-    from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
-    from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
-    from sb3_yann.callbacks import NoActionNoise as NoActionNoise
-    from sb3_yann.control import DisturbanceObserver as DisturbanceObserver
-    from sb3_yann.control import ExplicitLimitError as ExplicitLimitError
-    from sb3_yann.control import ExplicitSolutionError as ExplicitSolutionError
-    from sb3_yann.control import Identified as Identified
-    from sb3_yann.control import LinearModel as LinearModel
-    from sb3_yann.control import LinearMPC as LinearMPC
-    from sb3_yann.control import PiecewiseAffine as PiecewiseAffine
-    from sb3_yann.control import identify as identify
-    from sb3_yann.guard import Decision as Decision
-    from sb3_yann.guard import ImprovementGuard as ImprovementGuard
-    from sb3_yann.guard import restore_accepted as restore_accepted
-    from sb3_yann.policy import AffineObservation as AffineObservation
-    from sb3_yann.policy import YannActor as YannActor
-    from sb3_yann.policy import YannCritic as YannCritic
-    from sb3_yann.policy import YannPolicy as YannPolicy
-    from sb3_yann.policy import register_problem as register_problem
-    from sb3_yann_envs import ActionRepeat as ActionRepeat
 
 __version__ = "0.1.0"
 
 _NAMES = {
-    "sb3_yann.audit": ["CostAudit", "CostFinding", "CostMismatchError", "CostMismatchWarning"],
-    "sb3_yann.callbacks": ["ControlDiagnostics", "NoActionNoise"],
-    "sb3_yann.control": [
-        "DisturbanceObserver",
-        "ExplicitLimitError",
-        "ExplicitSolutionError",
-        "Identified",
-        "LinearMPC",
-        "LinearModel",
-        "PiecewiseAffine",
-        "identify",
-    ],
-    "sb3_yann.guard": ["Decision", "ImprovementGuard", "restore_accepted"],
-    "sb3_yann.policy": [
-        "AffineObservation",
-        "YannActor",
-        "YannCritic",
-        "YannPolicy",
-        "register_problem",
-    ],
-    "sb3_yann_envs": ["ActionRepeat"],
+    "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning",
+    "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
+    "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
+    "ExplicitSolutionError Identified LinearMPC LinearModel OutputBounds PiecewiseAffine "
+    "RateLimits SoftBounds Terminal Tracking identify",
+    "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
+    "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "
+    "YannPolicy register_problem",
+    "sb3_yann_envs": "ActionRepeat",
 }
-_HOMES = {name: module for module, names in _NAMES.items() for name in names}
-
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = [*_HOMES]
 
 

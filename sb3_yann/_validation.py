@@ -11,16 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
-def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
-    """Return ``value`` as a read-only float64 array of ``shape``; a letter leaves a size free.
+class NonFiniteWarning(RuntimeWarning):
+    """An observation, a reward, an action or a gradient is not a finite number."""
 
-    Raises
-    ------
-    TypeError
-        If ``value`` does not convert to real numbers.
-    ValueError
-        If the shape is another one or an entry is NaN or infinite.
-    """
+
+def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
+    """Return ``value`` as a finite, read-only float64 array of ``shape``; a letter is any size."""
     array = to_float(name, value)
     if array.ndim != len(shape) or any(
         isinstance(want, int) and got != want for got, want in zip(array.shape, shape, strict=True)
@@ -38,13 +34,7 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
 
 
 def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
-    """Return ``value`` as a symmetric positive (semi-)definite ``(size, size)`` matrix.
-
-    Raises
-    ------
-    ValueError
-        If it is not symmetric, or an eigenvalue is negative (or zero where ``definite``).
-    """
+    """Return ``value`` as a symmetric positive (semi-)definite ``(size, size)`` matrix."""
     matrix = as_array(name, value, (size, size))
     scale = max(float(np.max(np.abs(matrix))), np.finfo(float).tiny)
     if np.max(np.abs(matrix - matrix.T)) > 1e-9 * scale:
@@ -67,14 +57,9 @@ def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = Fal
 def as_bounds(
     name: str, lower: ArrayLike | None, upper: ArrayLike | None, size: int
 ) -> tuple[Array, Array]:
-    """Return lower and upper bounds of shape ``(size,)``; a scalar is for all entries.
+    """Return bounds of shape ``(size,)``, the lower below the upper.
 
-    ``None`` is no bound.
-
-    Raises
-    ------
-    ValueError
-        If the shape is another one, an entry is NaN, or a lower bound is not below its upper bound.
+    A scalar is for all entries; None and infinity are no bound.
     """
     low = _bound(f"{name}_min", lower, size, -np.inf)
     high = _bound(f"{name}_max", upper, size, np.inf)
@@ -87,30 +72,115 @@ def as_bounds(
     return low, high
 
 
-def as_positive(name: str, value: float) -> float:
-    """Return ``value`` as a finite float above zero."""
-    number = _number(name, value)
-    if not (np.isfinite(number) and number > 0):
-        raise ValueError(f"{name} = {value!r} must be a finite number above 0.")
-    return number
+def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -> Array:
+    """Return ``value`` as positive numbers of shape ``(size,)``; a scalar is for all entries."""
+    array = to_float(name, value)
+    array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
+    if np.any(array <= 0):
+        raise ValueError(f"{name} = {array.tolist()} must be above 0 in each entry.{_after(hint)}")
+    return array
 
 
-def as_discount(value: float) -> float:
+def as_outputs(name: str, value: ArrayLike | Sequence[int], n_states: int) -> Array:
+    """Return an output matrix ``(q, n)`` from a matrix or from a list of indices of states."""
+    rows = as_output_rows(name, value, n_states - 1)
+    return as_array(name, np.eye(n_states)[rows] if rows.ndim == 1 else rows, ("q", n_states))
+
+
+def as_output_rows(
+    name: str, value: ArrayLike | Sequence[int], most: float = np.inf
+) -> NDArray[Any]:
+    """Return indices of states ``(q,)``, at most ``most``, or an output matrix ``(q, n)``."""
+    entries = to_float(name, value)
+    if entries.ndim == 0:
+        raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value!r}].")
+    if entries.ndim != 1:
+        return as_array(name, value, ("q", "n"))
+    whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
+    if not whole or np.any(entries < 0) or np.any(entries > most):
+        limit = f"from 0 to {most}" if np.isfinite(most) else "from 0 on"
+        raise ValueError(
+            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers "
+            f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
+        )
+    return entries.astype(int)
+
+
+def as_number(name: str, value: Any, hint: str = "") -> float:
+    """Return ``value`` as a finite float."""
+    return as_between(name, value, -np.inf, np.inf, "()", hint)
+
+
+def as_positive(name: str, value: Any, hint: str = "") -> float:
+    """Return ``value`` as a finite float above 0."""
+    return as_between(name, value, 0, np.inf, "()", hint)
+
+
+def as_discount(value: Any) -> float:
     """Return ``value`` as a discount factor in (0, 1]."""
-    number = _number("gamma", value)
-    if not 0 < number <= 1:
-        raise ValueError(f"gamma = {value!r} must lie in (0, 1].")
-    return number
+    return as_between("gamma", value, 0, 1, "(]")
+
+
+def as_between(
+    name: str, value: Any, low: float, high: float, ends: str = "[]", hint: str = ""
+) -> float:
+    """Return ``value`` as a finite float between ``low`` and ``high``.
+
+    Parameters
+    ----------
+    name : str
+        The argument's name, for the message.
+    value : Any
+        A real number, of Python or numpy. Bools and strings are none (TypeError).
+    low, high : float
+        Limits (ValueError beyond), infinite for none.
+    ends : {"[]", "(]", "[)", "()"}
+        Round where the limit itself is refused.
+    hint : str, optional
+        What to do: a sentence that ends the message.
+    """
+    array = np.asarray(value if np.ndim(value) == 0 else None)
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"{name} = {_short(value)} must be a number.{_after(hint)}")
+    number = float(array)
+    left = number >= low if ends[0] == "[" else number > low
+    right = number <= high if ends[1] == "]" else number < high
+    if left and right and np.isfinite(number):
+        return number
+    if high < np.inf:
+        kind = "be between {} and {}" if ends == "[]" else f"lie in {ends[0]}{{}}, {{}}{ends[1]}"
+        wanted = kind.format(f"{low:g}", f"{high:g}")
+    else:
+        above = f" {'above' if ends[0] == '(' else 'of at least'} {low:g}" if low > -np.inf else ""
+        wanted = f"be a finite number{above}"
+    raise ValueError(f"{name} = {value!r} must {wanted}.{_after(hint)}")
+
+
+def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
+    """Return ``value`` as an int of at least ``least``, else raise ValueError; bools are none."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(
+            f"{name} = {_short(value)} must be a whole number of at least {least}.{_after(hint)}"
+        )
+    return int(value)
+
+
+def as_flag(name: str, value: Any) -> bool:
+    """Return ``value`` as a bool, else raise TypeError: 0 and 1 are none."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} = {_short(value)} must be True or False.")
+    return bool(value)
+
+
+def as_choice(name: str, value: Any, options: Sequence[str]) -> str:
+    """Return ``value`` if it is one of the options, else raise ValueError."""
+    if not isinstance(value, str) or value not in options:
+        raise ValueError(f"{name} = {_short(value)} must be one of {tuple(options)}.")
+    return value
 
 
 def to_float(name: str, value: Any) -> Array:
-    """Return ``value`` as a new float64 array of any shape.
-
-    Raises
-    ------
-    TypeError
-        If it does not convert to real numbers.
-    """
+    """Return ``value`` as a new float64 array of any shape; raise TypeError if it is none."""
     try:
         if np.iscomplexobj(value):
             raise TypeError("it is complex")
@@ -127,6 +197,10 @@ def _short(value: Any) -> str:
     return text if len(text) <= 200 else f"{text[:120]} ... {text[-40:]}"
 
 
+def _after(hint: str) -> str:
+    return hint and f" {hint}"
+
+
 class ReadOnlyArrays:
     """Keeps the arrays of a frozen dataclass read-only in its copies and after unpickling."""
 
@@ -140,13 +214,12 @@ class ReadOnlyArrays:
 
 def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
     """Tell whether the named attributes of two objects are equal, arrays entry by entry."""
-    return all(_same(getattr(one, name), getattr(other, name)) for name in names)
 
+    def same(a: Any, b: Any) -> bool:
+        pairs = zip(a, b, strict=True) if isinstance(a, tuple) else [(a, b)]
+        return all(np.array_equal(x, y) for x, y in pairs)
 
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, tuple):
-        return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
-    return bool(np.array_equal(one, other))
+    return all(same(getattr(one, name), getattr(other, name)) for name in names)
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:
@@ -162,14 +235,13 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
     return _frozen(array)
 
 
-def _number(name: str, value: float) -> float:
-    array = to_float(name, value)
-    if array.size != 1:
-        raise ValueError(f"{name} = {value!r} must be a single number.")
-    return float(array.reshape(()))
-
-
 def _frozen(array: Array) -> Array:
     array[array == 0] = 0.0  # -0.0 equals 0.0 but has other bytes; equal objects share a hash
     array.setflags(write=False)
     return array
+
+
+def half_widths(lower: Array, upper: Array) -> Array:
+    """Return half the width of each range, and 1 where it is infinite: a unit to measure in."""
+    half = (upper - lower) / 2
+    return np.asarray(np.where(np.isfinite(half), half, 1.0))

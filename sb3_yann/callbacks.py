@@ -10,20 +10,27 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import YannPolicy
 
 
 class NoActionNoise(BaseCallback):
     """Lets the policy act alone, from the first step of every `learn` on.
 
-    It takes away the model's action noise, and sets ``learning_starts`` to 0, for which SB3 would
-    play uniformly random actions (again at each later `learn`, and after a load). Both stay
-    off after `learn` returns. TD3's smoothing of the *target* policy is no exploration and stays.
+    It removes the model's action noise, and its random first actions (``learning_starts`` is 0).
+    Both stay off after `learn` returns. TD3's smoothing of the *target* policy stays.
 
     Raises
     ------
     TypeError
         If the model is not an off-policy algorithm.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu").learn(2, callback=NoActionNoise())
+    >>> model.learning_starts
+    0
     """
 
     model: OffPolicyAlgorithm
@@ -37,6 +44,8 @@ class NoActionNoise(BaseCallback):
             )
         self.model.action_noise = None
         self.model.learning_starts = 0
+        if isinstance(self.model.policy, YannPolicy):
+            watch_buffer(self.model)  # another one may have been loaded since
 
     def _on_step(self) -> bool:
         return True
@@ -51,15 +60,20 @@ class ControlDiagnostics(BaseCallback):
       action from the MPC's, as a fraction of the input range (largest over the inputs).
     - ``yann/region``: the region that was in use most often; ``yann/regions_visited``: how many.
     - ``yann/violations``: steps with ``info["violation"]``, since the start of this `learn`.
-    - ``yann/critic_error``: mean over the last finished episode of ``|Q(s, a) - G|`` relative to
-      mean ``|G|``, where G is the discounted return that followed, plus the critic's own value
-      of the last state where the episode was cut off rather than over. It starts above 0 wherever
-      constraints act or the plant is not the linear model.
+    - ``yann/critic_error``: mean of ``|Q(s, a) - G|`` over the last finished episode, relative to
+      that of ``|G|``. G is the discounted return that followed; where the episode was cut off, the
+      critic's value of its last state is added.
 
     Raises
     ------
     TypeError
         If the model's policy is not a YannPolicy.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    >>> _ = model.learn(10, callback=[NoActionNoise(), ControlDiagnostics()])
     """
 
     model: OffPolicyAlgorithm
@@ -88,7 +102,8 @@ class ControlDiagnostics(BaseCallback):
             theta = self.policy.theta(observations)
             law = layer.law(theta).cpu().numpy()
             self._regions.extend(layer.regions(theta).tolist())
-        self._distances.extend(np.max(np.abs(actions - law), axis=1) / 2)
+        distances = np.max(np.abs(actions - law), axis=1) / 2
+        self._distances.extend(distances[np.isfinite(distances)])
         dones, infos = self.locals["dones"], self.locals["infos"]
         self.violations += sum(bool(info.get("violation", False)) for info in infos)
         for i, episode in enumerate(self._episodes):
@@ -106,8 +121,9 @@ class ControlDiagnostics(BaseCallback):
         self._recorded = False
 
     def _record(self) -> None:
-        self.logger.record("yann/distance_from_mpc_mean", float(np.mean(self._distances)))
-        self.logger.record("yann/distance_from_mpc_max", float(np.max(self._distances)))
+        if self._distances:  # the law knows none where an observation is not finite
+            self.logger.record("yann/distance_from_mpc_mean", float(np.mean(self._distances)))
+            self.logger.record("yann/distance_from_mpc_max", float(np.max(self._distances)))
         self.logger.record("yann/region", int(np.bincount(self._regions).argmax()))
         self.logger.record("yann/regions_visited", len(set(self._regions)))
         self.logger.record("yann/violations", self.violations)

@@ -11,6 +11,7 @@ Each appends one part. Wrap in the order of theta, the state innermost::
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -19,10 +20,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_yann._validation import Array, NonFiniteWarning, as_number, as_whole
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 
 Vector = NDArray[np.floating[Any]]
-Array = NDArray[np.float64]
 Schedule = Callable[[int], ArrayLike]
 """The reference after so many steps of an episode."""
 
@@ -31,6 +32,7 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Appends a vector between ``low`` and ``high`` to the observation.
 
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
+    Subclasses say what is observed.
     """
 
     def __init__(
@@ -50,6 +52,11 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"low has shape {self.low.shape} and high {self.high.shape}; give the bounds of "
                 "each appended entry as two vectors of the same length."
             )
+        if np.any(np.isnan([self.low, self.high])):
+            raise ValueError(
+                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers: give "
+                "the bounds of each appended entry."
+            )
         if not np.all(self.low <= self.high):
             raise ValueError(f"low = {self.low.tolist()} exceeds high = {self.high.tolist()}.")
         free = np.full(n_new, np.inf)
@@ -59,9 +66,20 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
             dtype=np.float32,
         )
 
-    def executed(self, action: Vector) -> Array:
-        """Return the input (m,) that an action is: clipped to the bounds of the action space."""
-        return np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode."""
+        observation, info = self.env.reset(**kwargs)  # seeds the generator that draws
+        return self._observe(observation, None, info), info
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Step; the observation is the completed one."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
+        return self._observe(observation, u, info), float(reward), terminated, truncated, info
+
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+        """Return what is observed after an input u (m,), None at the start of an episode."""
+        raise NotImplementedError
 
     def joined(self, *parts: Vector) -> Vector:
         """Return the parts as one observation, float32."""
@@ -78,6 +96,12 @@ class PreviousInput(_Appending):
     initial : array_like, shape (m,), optional
         What counts as the previous input at the start of an episode: zeros by default, the
         operating point.
+
+    Examples
+    --------
+    >>> env = PreviousInput(gym.make("CSTR-v0"))
+    >>> env.reset(seed=0)[0].shape, float(env.step(np.float32([1]))[0][-1])
+    ((5,), 1.0)
     """
 
     def __init__(self, env: gym.Env[Vector, Vector], initial: ArrayLike | None = None) -> None:
@@ -86,18 +110,15 @@ class PreviousInput(_Appending):
         start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
         if start.shape != bounds.shape:
             raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
-        self.initial = self.executed(start)
+        if not np.all(np.isfinite(start)):
+            raise ValueError(
+                f"initial = {start.tolist()} must be finite: give the input that acts before the "
+                "first step, or leave it out for the operating point."
+            )
+        self.initial: Array = np.clip(start, bounds.low, bounds.high)
 
-    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
-        """Start an episode; the previous input is ``initial``."""
-        observation, info = self.env.reset(**kwargs)
-        return self.joined(observation, self.initial), info
-
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Step, and show the input that was played."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        joined = self.joined(observation, self.executed(action))
-        return joined, float(reward), terminated, truncated, info
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+        return self.joined(observation, self.initial if u is None else u)
 
 
 class SetPoint(_Appending):
@@ -116,6 +137,13 @@ class SetPoint(_Appending):
     schedule : callable, optional
         ``schedule(step) -> r`` gives the reference after so many steps of an episode, instead of
         a random one.
+
+    Examples
+    --------
+    >>> plant = gym.make("CSTR-v0")
+    >>> env = SetPoint(plant, 0, 9, schedule=lambda step: step)
+    >>> float(env.reset(seed=0)[0][-1]), float(env.step(np.float32([0]))[0][-1])
+    (0.0, 1.0)
     """
 
     def __init__(
@@ -130,27 +158,19 @@ class SetPoint(_Appending):
         super().__init__(env, low, high)
         if not np.all(np.isfinite([self.low, self.high])):
             raise ValueError("low and high must be finite: references are drawn between them.")
-        if hold is not None and (isinstance(hold, bool) or hold < 1):
-            raise ValueError(f"hold = {hold!r} must be a number of steps of at least 1, or None.")
+        if hold is not None:
+            hint = "It counts steps; None is one reference in each episode."
+            as_whole("hold", hold, hint=hint)
         self.hold, self.schedule = hold, schedule
         self.steps = 0
         self.reference: Array = np.zeros(len(self.low))
 
-    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
-        """Start an episode, with a reference of its own."""
-        observation, info = self.env.reset(**kwargs)  # seeds the generator that draws
-        self.steps = 0
-        self.reference = self._next()
-        return self.joined(observation, self.reference), info
-
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Step, and show the reference that holds from now on."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self.steps += 1
-        if self.schedule is not None or (self.hold and self.steps % self.hold == 0):
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+        self.steps = 0 if u is None else self.steps + 1
+        scheduled, held = self.schedule is not None, self.hold and self.steps % self.hold == 0
+        if u is None or scheduled or held:
             self.reference = self._next()
-        joined = self.joined(observation, self.reference)
-        return joined, float(reward), terminated, truncated, info
+        return self.joined(observation, self.reference)
 
     def _next(self) -> Array:
         if self.schedule is None:
@@ -167,6 +187,9 @@ class SetPoint(_Appending):
 class MeasuredDisturbance(_Appending):
     """Appends a disturbance d (d,) that the env measures and reports in ``info``.
 
+    An entry that is no finite number is named, and the last one that was holds: at first 0, the
+    operating point, or the nearest bound to it.
+
     Parameters
     ----------
     env : gymnasium.Env
@@ -175,6 +198,15 @@ class MeasuredDisturbance(_Appending):
         The box of disturbances, ``d_min`` and ``d_max`` of the problem.
     key : str, default "disturbance"
         The entry of ``info``, after reset and after each step, that holds d.
+
+    Examples
+    --------
+    >>> class Told(gym.Wrapper):
+    ...     def reset(self, **kwargs):
+    ...         return self.env.reset(**kwargs)[0], {"disturbance": 0.25}
+    >>> env = MeasuredDisturbance(Told(gym.make("CSTR-v0")), low=-1, high=1)
+    >>> float(env.reset(seed=0)[0][-1])
+    0.25
     """
 
     def __init__(
@@ -185,18 +217,14 @@ class MeasuredDisturbance(_Appending):
         key: str = "disturbance",
     ) -> None:
         super().__init__(env, low, high)
+        if not isinstance(key, str):
+            raise TypeError(f"key = {key!r} must be a str, the entry of info that holds d.")
         self.key = key
+        self.held: Array = np.clip(np.zeros(self.low.shape), self.low, self.high)
+        self.failing = np.zeros(self.low.shape, dtype=bool)
 
-    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
-        """Start an episode."""
-        observation, info = self.env.reset(**kwargs)
-        return self.joined(observation, self._measured(info)), info
-
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Step, and show what is measured now."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        joined = self.joined(observation, self._measured(info))
-        return joined, float(reward), terminated, truncated, info
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+        return self.joined(observation, self._measured(info))
 
     def _measured(self, info: dict[str, Any]) -> Array:
         if self.key not in info:
@@ -207,7 +235,17 @@ class MeasuredDisturbance(_Appending):
         d = np.atleast_1d(np.asarray(info[self.key], np.float64))
         if d.shape != self.low.shape:
             raise ValueError(f"info[{self.key!r}] has shape {d.shape}, expected {self.low.shape}.")
-        return d
+        failing = ~np.isfinite(d)
+        self.held = np.where(failing, self.held, d)
+        if np.any(failing & ~self.failing):  # once, for a sensor that stays so
+            warnings.warn(
+                f"info[{self.key!r}] = {d.tolist()} is not finite: {self.held.tolist()} holds "
+                "until it is again. Mend the sensor.",
+                NonFiniteWarning,
+                stacklevel=4,
+            )
+        self.failing = failing
+        return self.held
 
 
 class ObserveDisturbance(_Appending):
@@ -225,6 +263,14 @@ class ObserveDisturbance(_Appending):
     low, high : array_like, shape (d,)
         The box of disturbances, ``d_min`` and ``d_max`` of the problem. The estimate is shown
         clipped to it, since the law holds inside it; the observer keeps its own.
+
+    Examples
+    --------
+    >>> from sb3_yann.control import LinearModel
+    >>> model = LinearModel(np.eye(4) / 2, np.ones((4, 1)), dt=1, E=np.ones((4, 1)))
+    >>> env = ObserveDisturbance(gym.make("CSTR-v0"), DisturbanceObserver(model), -1, 1)
+    >>> env.reset(seed=0)[0].shape
+    (5,)
     """
 
     def __init__(
@@ -244,20 +290,10 @@ class ObserveDisturbance(_Appending):
             )
         self.observer = copy.deepcopy(observer)
 
-    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
-        """Start an episode, and the observer from its first measurement."""
-        observation, info = self.env.reset(**kwargs)
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         measured, rest = np.split(observation, [self.observer.n_measured])
-        return self._shown(*self.observer.reset(measured), rest), info
-
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Step, and show the estimates that the new measurement gives."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        measured, rest = np.split(observation, [self.observer.n_measured])
-        estimates = self.observer.update(measured, self.executed(action))
-        return self._shown(*estimates, rest), float(reward), terminated, truncated, info
-
-    def _shown(self, x_hat: Array, d_hat: Array, rest: Vector) -> Vector:
+        observer = self.observer
+        x_hat, d_hat = observer.reset(measured) if u is None else observer.update(measured, u)
         return self.joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
 
 
@@ -275,6 +311,14 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     problem : LinearMPC
     violation_cost : float, default 0
         Added to the cost of a step that reports ``info["violation"]``.
+
+    Examples
+    --------
+    >>> plant = gym.make("CSTR-v0")
+    >>> env = StageCost(plant, plant.observation_space.problem, violation_cost=10)
+    >>> _ = env.reset(seed=0)
+    >>> env.step(np.zeros(1, np.float32))[1] < 0
+    True
     """
 
     def __init__(
@@ -292,7 +336,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"[{', '.join(problem.layout.names)}] has {problem.n_theta} entries. Wrap the "
                 "env so that it shows all of them, in this order."
             )
-        self.problem, self.violation_cost = problem, violation_cost
+        self.problem, self.violation_cost = problem, as_number("violation_cost", violation_cost)
         self.theta: Array = np.zeros(problem.n_theta)
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
@@ -319,7 +363,9 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
             return False
         moved = u - self.theta[mpc.layout.previous]
         rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
-        return bool(np.any((moved < mpc.du_min - rounding) | (moved > mpc.du_max + rounding)))
+        return bool(
+            np.any((moved < mpc.rate.du_min - rounding) | (moved > mpc.rate.du_max + rounding))
+        )
 
 
 def _require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:

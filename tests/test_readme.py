@@ -1,36 +1,78 @@
-"""The README's Python runs as it stands."""
+"""The Python of the README and of the pages runs as it stands, and their links lead somewhere."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
-from sample_plants import LinearPlant
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import LinearModel
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")])
+MOST_LINES = 115
+FOLDERS = ("benchmarks", "docs", "envs", "examples", "experiments", "sb3_yann", "tests")
+
+
+def page(name: str) -> str:
+    """Return a page's text."""
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def blocks(text: str) -> list[str]:
+    """Return the Python blocks of a page."""
+    return re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+
+
+def run(name: str) -> dict[str, object]:
+    """Run the blocks of a page one after the other, with a shorter training; return its names."""
+    code = "\n".join(blocks(page(name)))
+    shortened = code.replace("20_000", "500").replace(", progress_bar=True", "")
+    names: dict[str, object] = {}
+    exec(compile(shortened, name, "exec"), names)
+    return names
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub names them."""
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
 @pytest.mark.slow
 def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    code = "\n".join(re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))
-    shortened = code.replace("20_000", "500").replace(", progress_bar=True", "")
-    assert shortened != code
-    exec(compile(shortened, "README.md", "exec"), {"env": double_integrator()})
-    assert (tmp_path / "law.npz").exists()
+    names = run("README.md")
+    assert (tmp_path / "guard.csv").exists() and (tmp_path / "cstr.zip").exists()
+    state = np.zeros(2, np.float32)
+    model, mpc = names["model"], names["mpc"]
+    np.testing.assert_allclose(model.predict(state)[0], mpc.explicit()(state), atol=1e-5)
 
 
-def test_the_plant_of_the_readme_ends_at_its_reference() -> None:
-    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    tracking_block = next(block for block in blocks if "tracked=" in block)
-    names = {"np": np, "LinearModel": LinearModel, "LinearMPC": LinearMPC}
-    names["plant"] = plant = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
-    exec(compile(tracking_block, "README.md", "exec"), names)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["guard", "policy"])
+def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run(f"docs/{name}.md")
+
+
+def test_the_code_in_the_page_of_the_environments_runs() -> None:
+    run("docs/environments.md")
+
+
+def test_every_page_with_code_is_run_by_a_test() -> None:
+    found = {path.stem for path in PAGES if blocks(path.read_text(encoding="utf-8"))}
+    assert found == {"README", "environments", "guard", "mpc", "policy"}
+
+
+def test_the_tracking_problem_of_the_page_ends_at_its_reference(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run("docs/mpc.md")
+    plant = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
+    assert names["plant"] == plant and (tmp_path / "law.npz").exists()
     law, x, u = names["tracking"].explicit(), np.zeros(2), np.zeros(1)
     for _ in range(300):
         u = law(np.concatenate([x, [0.5], u]))
@@ -38,26 +80,44 @@ def test_the_plant_of_the_readme_ends_at_its_reference() -> None:
     np.testing.assert_allclose(x, [0.5, 0], atol=0.01)
 
 
-def double_integrator() -> gym.Env:
-    """Return the README's plant, as the env that its reader brings."""
-    plant = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
-    return LinearPlant(
-        LinearMPC(
-            plant, Q=[[1, 0], [0, 1]], R=[[0.1]], horizon=1, x_min=-5, x_max=5, u_min=-1, u_max=1
-        )
-    )
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_links_lead_somewhere(path) -> None:
+    text = path.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if target.startswith("https://"):
+            continue
+        file, _, anchor = target.partition("#")
+        found = path if not file else (path.parent / file).resolve()
+        assert found.is_file(), target
+        assert not anchor or anchor in anchors(found.read_text(encoding="utf-8")), target
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_files_that_are_named_exist(path) -> None:
+    for name in re.findall(r"`(\w+/[\w/.-]+)`", path.read_text(encoding="utf-8")):
+        if name.partition("/")[0] in FOLDERS or name.endswith(".py"):
+            assert (ROOT / name).exists() or (ROOT / "sb3_yann" / name).exists(), name
+
+
+def test_the_index_lists_every_page() -> None:
+    index = page("docs/index.md")
+    for path in ROOT.glob("docs/*.md"):
+        assert path.name == "index.md" or f"]({path.name})" in index
+
+
+def test_the_readme_is_one_page() -> None:
+    assert len(README.splitlines()) <= MOST_LINES
 
 
 def test_the_results_it_quotes_are_those_of_the_report() -> None:
-    report = (Path(__file__).parents[1] / "docs" / "results.md").read_text(encoding="utf-8")
-    in_short = report.partition("## In short\n")[2].partition("\n## ")[0]
+    in_short = page("docs/results.md").partition("## In short\n")[2].partition("\n## ")[0]
     quoted = README.partition("<!-- results: begin -->")[2].partition("<!-- results: end -->")[0]
     assert "| **YANN-RL** |" in quoted
     assert quoted.strip() == in_short.strip()
 
 
 def test_the_speed_it_quotes_is_that_of_the_report() -> None:
-    path = Path(__file__).parents[1] / "docs" / "performance.md"
+    path = ROOT / "docs" / "performance.md"
     quoted = README.partition("<!-- speed: begin -->")[2].partition("<!-- speed: end -->")[0]
     report = path.read_text(encoding="utf-8") if path.exists() else ""
     in_short = report.partition("## In short\n")[2].partition("\n## ")[0]

@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from general_problems import servo
 from sample_plants import LinearPlant, two_input_mpc
-from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC
+from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, NonFiniteWarning, RateLimits
 from sb3_yann.wrappers import (
     MeasuredDisturbance,
     ObserveDisturbance,
@@ -103,9 +103,8 @@ def test_the_reward_is_minus_the_stage_cost_where_the_action_was_chosen() -> Non
 
 
 def test_an_input_that_moves_faster_than_its_bounds_is_a_violation() -> None:
-    plain = {"tracked": None, "r_min": None, "r_max": None}
-    mpc = servo(du_min=-0.5, du_max=0.7, **plain)
-    env = StageCost(PreviousInput(LinearPlant(servo(**plain))), mpc)
+    mpc = servo(tracking=None, rate=RateLimits(-0.5, 0.7))
+    env = StageCost(PreviousInput(LinearPlant(servo(tracking=None))), mpc)
     env.reset(seed=0)
     reported = [env.step(np.float32([u]))[4].get("violation", False) for u in (0.7, 0.2, 1, -1)]
     assert reported == [False, False, True, True]
@@ -180,3 +179,42 @@ def test_an_env_whose_observation_is_no_vector_is_named() -> None:
     env.observation_space = DICT
     with pytest.raises(TypeError, match=r"observation_space is Dict.*Box with one dimension"):
         SetPoint(env, [0], [1])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_previous_input_that_is_not_finite_is_refused(value) -> None:
+    with pytest.raises(ValueError, match=r"initial = \[(nan|inf)\] must be finite"):
+        PreviousInput(Counter(), initial=[value])
+
+
+@pytest.mark.parametrize("hold", [np.nan, np.inf, 2.5, "2"])
+def test_a_hold_that_is_no_whole_number_is_refused(hold) -> None:
+    with pytest.raises(ValueError, match=r"whole number of at least 1\. It counts steps"):
+        SetPoint(Counter(), -1, 1, hold=hold)
+
+
+def test_bounds_of_a_disturbance_that_are_nan_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"low = \[nan\] and high = \[1.0\] must be numbers"):
+        MeasuredDisturbance(Counter(), np.nan, 1)
+
+
+def test_a_key_that_is_no_name_is_refused() -> None:
+    with pytest.raises(TypeError, match="key = nan must be a str"):
+        MeasuredDisturbance(Counter(), -1, 1, key=np.nan)
+
+
+def test_a_disturbance_that_is_not_finite_is_named_once_and_the_last_one_holds() -> None:
+    class Fails(gym.Wrapper):
+        def step(self, action):
+            *rest, info = self.env.step(action)
+            if self.unwrapped.steps in (2, 3):
+                info["disturbance"] = np.nan
+            return *rest, info
+
+    env = MeasuredDisturbance(Fails(Counter()), -1, 1)
+    env.reset()
+    assert env.step(np.zeros(1))[0][2] == np.float32(0.1)
+    with pytest.warns(NonFiniteWarning, match=r"info\['disturbance'\] = \[nan\] is not finite"):
+        assert env.step(np.zeros(1))[0][2] == np.float32(0.1)
+    assert env.step(np.zeros(1))[0][2] == np.float32(0.1)
+    assert env.step(np.zeros(1))[0][2] == np.float32(0.4)

@@ -33,6 +33,12 @@ def register_envs() -> None:
 
     Ids that are already registered are left as they are, so the call can be repeated, and a user's
     own registration under the same id wins.
+
+    Examples
+    --------
+    >>> register_envs()
+    >>> gymnasium.spec("CSTR-v0").max_episode_steps
+    400
     """
     for env_id, (entry_point, vector_entry_point, max_episode_steps) in _ENTRY_POINTS.items():
         if env_id not in gymnasium.registry:

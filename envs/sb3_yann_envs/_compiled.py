@@ -10,14 +10,19 @@ import numba
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(function: F) -> F:
-    """Return the function compiled at its first call, with the machine code kept on disk.
+def compiled(signature: str) -> Callable[[F], F]:
+    """Return a decorator that compiles a function for given types, and keeps the machine code.
 
     What it calls must be in the same file: numba does not look at others when it decides whether
-    the machine code is still that of the source.
+    the machine code is still that of the source. It returns numbers, and writes arrays to those it
+    is given: to return one, numba runs Python code, in which a Ctrl-C becomes a SystemError.
     """
-    try:
-        result: Any = numba.njit(cache=True, error_model="numpy")(function)
-    except RuntimeError:  # there is no folder to write to
-        result = numba.njit(error_model="numpy")(function)
-    return cast(F, result)
+
+    def compile_it(function: F) -> F:
+        try:
+            result: Any = numba.njit(signature, cache=True, error_model="numpy")(function)
+        except RuntimeError:  # there is no folder to write to
+            result = numba.njit(signature, error_model="numpy")(function)
+        return cast(F, result)
+
+    return compile_it

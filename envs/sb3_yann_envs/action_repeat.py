@@ -34,6 +34,13 @@ class ActionRepeat(
     ------
     ValueError
         If ``k`` is no whole number of at least 1.
+
+    Examples
+    --------
+    >>> env = ActionRepeat(gymnasium.make("CSTR-v0"), 5)
+    >>> _ = env.reset(seed=0)
+    >>> round(float(env.step(env.action_space.low)[1]), 3)  # five steps
+    -28.025
     """
 
     def __init__(self, env: gymnasium.Env[ObsType, ActType], k: int) -> None:

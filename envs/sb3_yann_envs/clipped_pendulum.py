@@ -141,23 +141,7 @@ class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
 
     ```
 
-    ## Deviations from Braniff & Tian
-
-    - **Weights.** The paper prints the identity as Q of its controller. Gymnasium weighs the speed
-      by 0.1, and only with diag(1, 0.1) does the controller have the seven regions that the paper
-      reports (the identity gives nine). `Q` is therefore diag(1, 0.1), in the reward as in the
-      problem.
-    - **Starts.** The paper says near upright and gives no range. Two of its ten test episodes cost
-      about 127 after training, which is what one swing round costs. The range here was chosen so
-      that 20.5 % of the starts need the swing. At rest the border is at 0.4115 rad, where
-      gravity balances 2 N m.
-    - **Model and simulator.** The printed A and B are the exact zero-order hold of the linearized
-      equations. The simulator integrates with a semi-implicit Euler step of 0.05 s, which has
-      (1.0375, 0.05; 0.75, 1) and (0.0075, 0.15). This mismatch is the paper's and is kept.
-    - **Observation.** The size of the paper's DDPG network shows three inputs, that is cosine and
-      sine of the angle. Here all agents observe the two states.
-    - **Box.** The bound |theta| <= 2 rad belongs to the controller. The environment does not end
-      an episode there.
+    `docs/environments.md` lists the paper's slips, and what was chosen here.
 
     ## Version History
 

@@ -110,6 +110,7 @@ PRINTED_A = constant(
 PRINTED_B = constant([[0.0], [0.0], [0.0], [-0.0007]])
 """Input matrix as printed in the paper, for deviations and one sample."""
 
+_STATE = "UniTuple(float64, 4)"  # which numba returns without running Python code
 _STATE_NAMES = ("C_A deviation", "C_B deviation", "C_S deviation", "T deviation")
 
 
@@ -134,7 +135,7 @@ def dynamics(x: ArrayLike, u: ArrayLike) -> NDArray[np.float64]:
     return np.array(_rates(c_a, c_b, c_s, temperature, transfer))
 
 
-@compiled
+@compiled(f"{_STATE}(float64, float64, float64, float64, float64)")
 def _rates(
     c_a: float, c_b: float, c_s: float, temperature: float, transfer: float
 ) -> tuple[float, float, float, float]:
@@ -159,13 +160,13 @@ def stage_cost(a: Any, b: Any, s: Any, t: Any, u: Any) -> Any:
     return 0.1 * (a * a + b * b + s * s + t * t) + 1e-4 * u * u
 
 
-@compiled
+@compiled("boolean(float64, float64)")
 def is_rich(a: float, b: float) -> bool:
     """Tell whether deviations of C_A and C_B are so large that a step needs `RICH_SUBSTEPS`."""
     return (_A_SS + a) * (_B_SS + b) > RICH
 
 
-@compiled
+@compiled(f"{_STATE}(float64, float64, float64, float64, float64)")
 def advance(
     a: float, b: float, s: float, t: float, transfer: float
 ) -> tuple[float, float, float, float]:
@@ -194,14 +195,14 @@ def advance(
     return a, b, s, t
 
 
-@compiled
-def advance_all(deviations: NDArray[np.float64], transfer: NDArray[np.float64]) -> Any:
-    """Return `advance` of many reactors: deviations of shape (4, n), transfer of shape (n,)."""
-    after = np.empty_like(deviations)
+@compiled("void(float64[:, ::1], float64[::1], float64[:, ::1])")
+def advance_all(
+    deviations: NDArray[np.float64], transfer: NDArray[np.float64], after: NDArray[np.float64]
+) -> None:
+    """Write `advance` of many reactors: deviations of shape (4, n), transfer of shape (n,)."""
     for i in range(len(transfer)):
         a, b, s, t = deviations[0, i], deviations[1, i], deviations[2, i], deviations[3, i]
         after[0, i], after[1, i], after[2, i], after[3, i] = advance(a, b, s, t, transfer[i])
-    return after
 
 
 class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -286,30 +287,7 @@ class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ```
 
-    ## Deviations from Braniff & Tian
-
-    The paper's equations and table do not give its printed A and B. The values above do, to the
-    four printed decimals, except for six entries of A.
-
-    - **Sample time.** Printed as 1/60 s. The frequency factors are per hour, and only 1/60 h
-      reproduces A and B.
-    - **Flow terms.** Printed with C_A in the balance of every species and as a difference of flows.
-      Here each species has its own, F (feed - concentration).
-    - **Density and heat capacity.** Printed as 36 mol/L and 430.91 J/(mol K), a product 4.9 times
-      larger than the 3150 J/(L K) that A and B need.
-    - **Heat of reaction 1.** Printed as -45.6 kJ/mol; A needs -45.4.
-    - **Feed temperature.** Not printed. It follows from the heat balance at 475 K and U = 55.
-    - **Entries of A.** The true A[0, 1], A[0, 3], A[1, 3] and A[3, 2] are -0.0047, -0.0003, -0.0003
-      and 0.0002 where the paper prints 0; A[2, 2] is 0.9990, not 0.9909; and A[3, 3] is 1.0029, not
-      1.0030 (a U of 50 at the steady state would round to the printed value). The true steady state
-      is stable; the printed A has the eigenvalue 1.003. `PRINTED_A` keeps the paper's values,
-      because a controller built on them is what the paper improves.
-    - **Weights.** Q is printed as 0.1 times the 2 x 2 identity, for four states; here 4 x 4.
-    - **Chosen here.** U = 55 at the steady state (so that |u| <= 55 never makes U negative), the
-      feed of S, 400 steps, and the starts. The starts are such that the linear MPC on the printed A
-      and B costs about as much as in the paper: 90 on average over 1,000 starts, none of which
-      violates the limit, where the paper has 94 over ten.
-    - **Limit.** Checked at the end of a sample, since the paper does not say when.
+    `docs/environments.md` lists the paper's slips, and what was chosen here.
 
     ## Version History
 

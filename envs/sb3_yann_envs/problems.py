@@ -17,6 +17,11 @@ def clipped_pendulum() -> LinearMPC:
     Q is diag(1, 0.1), the weights of the environment's own cost. The identity, which the paper
     prints, gives 9 regions and 40 half-spaces instead. Where there is no solution, no torque is
     applied, as by the paper's network: the pendulum then swings through, and is often caught.
+
+    Examples
+    --------
+    >>> clipped_pendulum().explicit()([3.0, 0.0])
+    array([0.])
     """
     model = LinearModel(pendulum.PRINTED_A, pendulum.PRINTED_B, pendulum.DT)
     return LinearMPC(
@@ -37,6 +42,11 @@ def cstr() -> LinearMPC:
 
     The box of -2 to 2 mol/L and -70 to 5 K bounds the parameter only. With predicted
     states bounded as well, as the paper's text has it, there are 79 half-spaces instead of 56.
+
+    Examples
+    --------
+    >>> cstr().explicit().n_halfspaces
+    56
     """
     model = LinearModel(
         reactor.PRINTED_A, reactor.PRINTED_B, reactor.DT, reactor.X_SS, reactor.U_SS

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
@@ -101,12 +100,8 @@ def reactor_frame(
 
 def _figure(width: float, height: float) -> Figure:
     """Return a figure of the given size in inches (at 100 dots each) that pyplot never sees."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise DependencyNotInstalled(
-            "render_mode='rgb_array' draws with Matplotlib: run `pip install matplotlib`."
-        ) from error
+    from matplotlib.figure import Figure
+
     return Figure(figsize=(width, height), dpi=100)
 
 

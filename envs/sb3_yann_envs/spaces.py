@@ -49,6 +49,12 @@ class ProblemBox(_Box):
     problem they carry, because Gymnasium and Stable-Baselines3 use ``==`` to decide whether an
     environment fits a model. Wrappers that build a new space (`FlattenObservation`, frame stacks)
     drop the problem with it.
+
+    Examples
+    --------
+    >>> space = ProblemBox(-1.0, 1.0, (2,), problem="sb3_yann_envs.problems:cstr")
+    >>> space.problem.horizon
+    2
     """
 
     def __init__(

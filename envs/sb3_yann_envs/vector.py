@@ -150,7 +150,9 @@ class CSTRVectorEnv(_VectorEnv):
     def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
         a, b, s, t = self._state
         cost = cstr.stage_cost(a, b, s, t, u)
-        self._state = cstr.advance_all(self._state, cstr.U_SS[0] + u)
+        after = np.empty_like(self._state)
+        cstr.advance_all(self._state, cstr.U_SS[0] + u, after)
+        self._state = after
         terminated = cstr.X_SS[3] + self._state[3] > cstr.TEMPERATURE_LIMIT
         return cost + cstr.PENALTY * terminated, terminated
 

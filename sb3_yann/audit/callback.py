@@ -6,27 +6,25 @@ import warnings
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.audit.causes import Cause, likely_cause
+from sb3_yann._validation import Array, as_flag, as_positive, as_whole
+from sb3_yann.audit.causes import Cause, likely_cause, not_finite
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
-from sb3_yann.audit.sample import FEWEST, Array, Sample
-from sb3_yann.policy._checks import as_factor
+from sb3_yann.audit.sample import FEWEST, Sample
 from sb3_yann.policy.policies import YannPolicy
 
 
 class CostAudit(BaseCallback):
     """Checks that the env's reward and observation mean what the problem says, and names what not.
 
-    Actor and critic are exact only where the reward is minus the stage cost of the problem, of the
-    state before the step and the input that was sent (times ``reward_scale`` plus
-    ``reward_offset``, where the policy has them). The first steps of every `learn` are compared;
-    then the callback rests. Steps with ``info["violation"]`` and those by which the env terminates
-    an episode may cost more. Where they differ, it looks for the reason among scaled, shifted,
-    negated, clipped and normalized rewards, costs of another state or action in time, repeated
-    actions, observations and actions in other units or from another zero, and other weights, and
-    asks the env for its wrappers. The law must leave its steady state for it to see anything.
+    Actor and critic are exact only where the reward is minus the stage cost of the problem, scaled
+    and shifted as the policy's :class:`CriticOptions` say. The first steps of every `learn` are
+    compared. Steps with ``info["violation"]``, and those that terminate an episode, may cost more.
+    Where they differ, the audit looks for a likely cause and for wrappers of the env. It sees
+    nothing while the plant rests at its steady state.
 
     Parameters
     ----------
@@ -52,6 +50,15 @@ class CostAudit(BaseCallback):
         If an argument is out of range; when training starts, if the policy is no YannPolicy.
     CostMismatchError
         In training, see ``strict``.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> audit = CostAudit(steps=20)
+    >>> model = DDPG("YannPolicy", "CSTR-v0", seed=0, learning_starts=30, device="cpu")
+    >>> _ = model.learn(25, callback=audit)
+    >>> audit.finding.matches
+    True
     """
 
     model: OffPolicyAlgorithm
@@ -60,13 +67,9 @@ class CostAudit(BaseCallback):
         self, steps: int = 100, tolerance: float = 1e-3, strict: bool = False, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
-        if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < FEWEST:
-            raise ValueError(f"steps = {steps!r} must be a whole number of at least {FEWEST}.")
-        if as_factor("tolerance", tolerance) == 0:
-            raise ValueError("tolerance = 0 would take rounding for a mismatch; give e.g. 1e-3.")
-        if not isinstance(strict, bool):
-            raise TypeError(f"strict = {strict!r} must be True or False.")
-        self.steps, self.tolerance, self.strict = steps, tolerance, strict
+        self.steps = as_whole("steps", steps, FEWEST, "Fewer say nothing.")
+        self.tolerance = as_positive("tolerance", tolerance, "Rounding is no mismatch.")
+        self.strict = as_flag("strict", strict)
         self.finding: CostFinding | None = None
 
     def _init_callback(self) -> None:
@@ -104,6 +107,7 @@ class CostAudit(BaseCallback):
                     "following": np.array(following),  # copies: an env may write into its arrays
                     "action": np.array(self.locals["actions"][i], dtype=np.float64),
                     "reward": float(rewards[i]),
+                    "step": len(records) + 1,
                     "violation": bool(info.get("violation", False)),
                     "truncated": done and bool(info.get("TimeLimit.truncated", False)),
                     "done": done,
@@ -112,11 +116,14 @@ class CostAudit(BaseCallback):
         self._seen += len(self._records)
 
     def _judge(self) -> None:
-        sample = self._sample()
+        records = [each for of_one_env in self._records for each in of_one_env]
+        lost = np.array([not _is_finite(each) for each in records], dtype=bool)
+        sample = self._sample(records, lost)
         self._records = []
-        if np.count_nonzero(sample.counted) < FEWEST:
+        enough = np.count_nonzero(sample.counted) >= FEWEST
+        if not (enough or lost.any()):
             return
-        cause = self._of_the_vec_normalize()
+        cause = not_finite(lost, records) if lost.any() else self._of_the_vec_normalize()
         if cause is None and sample.is_the_problem_s_cost(self.tolerance):
             self.finding = CostFinding.match(sample)
             if self.verbose:
@@ -129,20 +136,22 @@ class CostAudit(BaseCallback):
             raise CostMismatchError(self.finding.message)
         warnings.warn(self.finding.message, CostMismatchWarning, stacklevel=2)
 
-    def _sample(self) -> Sample:
-        records = [each for of_one_env in self._records for each in of_one_env]
+    def _sample(self, records: list[dict[str, Any]], lost: NDArray[np.bool_]) -> Sample:
+        """Return the records without the lost ones, after which another episode begins."""
 
         def column(name: str) -> Any:
-            return np.array([each[name] for each in records])
+            return np.array([each[name] for each in records])[~lost]
 
         def theta(name: str) -> Array:
             return np.asarray(self.policy.theta(column(name)).double().cpu().numpy())
 
-        done, env = column("done"), np.repeat(*self._env_numbers())
-        first = np.r_[True, np.diff(env) != 0]
-        begins = first | np.r_[False, done[:-1]]
+        every_env = np.repeat(np.arange(len(self._records)), [len(each) for each in self._records])
+        ended = np.array([each["done"] for each in records], dtype=bool) | lost
+        done, env = column("done"), every_env[~lost]
+        first = np.r_[True, np.diff(env) != 0][: len(env)]
+        begins = first | np.r_[True, ended[:-1]][~lost]
         problem = self.policy.problem
-        observations = column("observation").reshape(len(records), -1)
+        observations = column("observation").reshape(len(env), records[0]["observation"].size)
         terminated = done & ~column("truncated")
         return Sample(
             theta=theta("observation"),
@@ -156,8 +165,8 @@ class CostAudit(BaseCallback):
             first=first,
             blank=~np.any(observations, axis=1),
             rounding=self._rounding(observations),
-            scale=self.policy.reward_scale,
-            offset=self.policy.reward_offset,
+            scale=self.policy.critic_options.reward_scale,
+            offset=self.policy.critic_options.reward_offset,
             stage_cost=problem.stage_cost,
             step=problem.predict,
             gamma=self.model.gamma,
@@ -168,12 +177,9 @@ class CostAudit(BaseCallback):
         digits = observations.dtype if observations.dtype.kind == "f" else np.float64
         size = np.abs(observations).astype(np.float64)
         if (seen := self.policy.observation) is not None:
-            # What a normalization hides of its size is in t0.
-            size = size @ np.abs(seen.T).T + np.abs(seen.t0)
+            # What a normalization hides of its size is in the offset.
+            size = size @ np.abs(seen.matrix).T + np.abs(seen.offset)
         return np.asarray(size * float(np.finfo(digits).eps))
-
-    def _env_numbers(self) -> tuple[Any, list[int]]:
-        return np.arange(len(self._records)), [len(each) for each in self._records]
 
     def _of_the_vec_normalize(self) -> Cause | None:
         """Return what has been set since the policy was built and let it pass."""
@@ -193,3 +199,7 @@ class CostAudit(BaseCallback):
                 "at each step. Set venv.training = False.",
             )
         return None
+
+
+def _is_finite(record: dict[str, Any]) -> bool:
+    return all(np.all(np.isfinite(record[each])) for each in ("observation", "following", "reward"))

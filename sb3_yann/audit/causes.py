@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sb3_yann.audit.sample import EXACT, Array, Line, Sample
+from sb3_yann._validation import Array
+from sb3_yann.audit.sample import EXACT, Line, Sample
 from sb3_yann.audit.scaling import scaled_entries
 
 LATEST = 3
@@ -17,10 +20,7 @@ MOST_REPEATS = 10
 
 @dataclass(frozen=True)
 class Cause:
-    """A short name, and an explanation with what to do.
-
-    ``scales`` says whether `reward_scale` and `reward_offset` may be what there is to do.
-    """
+    """A short name, an explanation with what to do, and whether options of the reward may help."""
 
     name: str
     explanation: str
@@ -35,14 +35,23 @@ UNKNOWN = Cause(
 )
 
 
+def not_finite(lost: NDArray[np.bool_], records: Sequence[dict[str, Any]]) -> Cause:
+    """Return that rewards or observations are lost, and which was the first."""
+    first = records[int(np.argmax(lost))]
+    reward = first["reward"]
+    what = "an observation" if np.isfinite(reward) else f"the reward, {reward:g},"
+    return Cause(
+        "not finite",
+        f"in {lost.sum()} of {len(lost)} steps a reward or an observation is not a finite number, "
+        f"first {what} of step {first['step']}: the env or a sensor fails. The steps are left out.",
+    )
+
+
 def likely_cause(sample: Sample, tolerance: float) -> Cause:
     """Return the first explanation that is exact, or else the first within the tolerance.
 
     Near a steady state many explanations are nearly right, hence exact ones go first.
     """
-    for name, values in (("reward", sample.rewards), ("observation", sample.theta)):
-        if not np.all(np.isfinite(values)):
-            return Cause("not finite", f"a {name} is not a finite number: the env fails.")
     if np.ptp(sample.rewards[sample.counted]) <= 1e-9 * np.abs(sample.rewards).max():
         return Cause("constant", f"every reward is {sample.rewards[0]:g}, whatever happens.")
     for width in (EXACT, tolerance):

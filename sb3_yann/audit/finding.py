@@ -63,6 +63,11 @@ class CostFinding:
         Steps that were compared.
     wrappers : tuple of str
         Wrappers of the env that may have to do with it.
+
+    Examples
+    --------
+    >>> CostFinding(True, "", "The reward is minus the cost.", 1.0, 0.0, 1.0, 100, ()).matches
+    True
     """
 
     matches: bool
@@ -84,7 +89,16 @@ class CostFinding:
     @classmethod
     def mismatch(cls, sample: Sample, cause: Cause, venv: VecEnv) -> CostFinding:
         """Return what is wrong, with the wrappers that may have to do with it."""
-        steps, line, wrappers = int(sample.counted.sum()), Line.through(sample), suspects(venv)
+        steps, wrappers = int(sample.counted.sum()), suspects(venv)
+        if steps == 0:  # nothing is finite, to be compared
+            message = f"The rewards cannot be compared. Likely cause: {cause.explanation}"
+            return cls(False, cause.name, message, np.nan, np.nan, np.nan, 0, wrappers)
+        line = Line.through(sample)
+        if cause.name == "not finite":
+            message = f"The rewards cannot all be compared: {cause.explanation}"
+            return cls(
+                False, cause.name, message, line.scale, line.offset, line.r2, steps, wrappers
+            )
         expected = "minus the cost of the problem"
         if (sample.scale, sample.offset) != (1, 0):
             expected = f"{sample.scale:g} * (-cost) {sample.offset:+g}, as the policy assumes"
@@ -108,7 +122,7 @@ def _in_numbers(line: Line, cause: Cause) -> str:
     if not (cause.scales and line.scale > 0 and line.r2 > 0.99):
         return found
     numbers = f'"reward_scale": {line.scale:.7g}, "reward_offset": {line.offset:.7g}'
-    return f"{found} Where that is on purpose: policy_kwargs={{{numbers}}}."
+    return f'{found} Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.'
 
 
 def suspects(venv: VecEnv) -> tuple[str, ...]:

@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from sb3_yann._validation import Array
+
 Mask = NDArray[np.bool_]
 EXACT = 1e-5
 """What rounding to float32 leaves of an agreement, relative to the spread of the rewards."""
@@ -141,7 +142,7 @@ class Line:
         x, y = -sample.cost[sample.counted], sample.rewards[sample.counted]
         if np.ptp(x) <= 1e-12 * np.abs(x).max() or np.ptp(y) <= 1e-12 * np.abs(y).max():
             return cls(0.0, float(y.mean()), 0.0)
-        # Centerd: with a large offset the normal equations would lose what varies.
+        # Centered: with a large offset the normal equations would lose what varies.
         dx, dy = x - x.mean(), y - y.mean()
         scale = float(dx @ dy / (dx @ dx))
         offset = float(y.mean() - scale * x.mean())

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from sb3_yann.audit.sample import Array, Mask, Sample
+from sb3_yann._validation import Array
+from sb3_yann.audit.sample import Mask, Sample
 
 
 @dataclass(frozen=True)

@@ -1,22 +1,38 @@
 """The design side: models, LQR, MPC and its explicit law. float64 numpy, no torch."""
 
-from sb3_yann.control.explicit.solve import ExplicitLimitError, ExplicitSolutionError, ParametricQP
-from sb3_yann.control.identification.identify import Identified, identify
+from sb3_yann.control.explicit.budget import ExplicitLimitError
+from sb3_yann.control.explicit.certificate import ExplicitSolutionError
+from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.model.identify import Identified, identify
 from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.mpc.groups import (
+    DisturbanceBounds,
+    OutputBounds,
+    RateLimits,
+    SoftBounds,
+    Terminal,
+    Tracking,
+)
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
 from sb3_yann.control.observer import DisturbanceObserver
 
 __all__ = [
+    "DisturbanceBounds",
     "DisturbanceObserver",
     "ExplicitLimitError",
     "ExplicitSolutionError",
     "Identified",
     "LinearMPC",
     "LinearModel",
+    "OutputBounds",
     "ParametricQP",
     "PiecewiseAffine",
+    "RateLimits",
+    "SoftBounds",
+    "Terminal",
     "ThetaLayout",
+    "Tracking",
     "identify",
 ]

@@ -2,7 +2,12 @@
 
 Costs are ``sum_k gamma^k (x' Q x + 2 x' N u + u' R u)``, where N, the argument ``cross``, is zero
 unless given. The discount is absorbed by the substitution ``A -> sqrt(gamma) A``,
-``B -> sqrt(gamma) B``, after which the undiscounted equations hold.
+``B -> sqrt(gamma) B``, after which the undiscounted equations hold. The functions take
+
+- ``model``: A (n, n) and B (n, m) in discrete time;
+- ``Q`` (n, n), ``R`` (m, m) and ``cross`` (n, m): weights of the stage cost;
+- ``P`` (n, n): weight of the cost after one step; ``K`` (m, n): gain of the law ``u = -K x``;
+- ``gamma``: discount in (0, 1].
 """
 
 from __future__ import annotations
@@ -11,11 +16,11 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.linear_system import LinearSystem
 
 
 def riccati(
-    model: LinearModel, Q: Array, R: Array, gamma: float = 1.0, cross: Array | None = None
+    model: LinearSystem, Q: Array, R: Array, gamma: float = 1.0, cross: Array | None = None
 ) -> Array:
     """Return P (n, n) with ``x' P x`` the smallest discounted cost from x, without constraints.
 
@@ -24,8 +29,8 @@ def riccati(
     Raises
     ------
     ValueError
-        If a mode that the discount does not make stable cannot be reached by any input, or the
-        cost does not see a mode on the unit circle: no stabilizing solution exists.
+        If no stabilizing solution exists: an unstable mode is uncontrollable under the discount,
+        or a mode on the unit circle carries no cost.
     """
     A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
     try:
@@ -33,15 +38,14 @@ def riccati(
         radius = spectral_radius(A - B @ gain(model, R, P, gamma, cross))
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
-    # SciPy also returns matrices that do not stabilize, where a mode on the unit circle cannot be
-    # reached or has no weight; the closed loop then keeps it there to rounding.
+    # SciPy also returns matrices that do not stabilize a mode on the unit circle.
     if not radius < 1 - 1e-9:
         raise ValueError(_why_no_solution(A, B))
     return np.asarray((P + P.T) / 2)
 
 
 def gain(
-    model: LinearModel, R: Array, P: Array, gamma: float = 1.0, cross: Array | None = None
+    model: LinearSystem, R: Array, P: Array, gamma: float = 1.0, cross: Array | None = None
 ) -> Array:
     """Return K (m, n): ``u = -K x`` minimizes ``2x'Nu + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
     PB = P @ model.B
@@ -51,19 +55,17 @@ def gain(
 
 
 def policy_value(
-    model: LinearModel, Q: Array, R: Array, K: Array, gamma: float, cross: Array | None = None
+    model: LinearSystem, Q: Array, R: Array, K: Array, gamma: float, cross: Array | None = None
 ) -> Array:
-    """Return P (n, n) with ``x' P x`` the discounted cost of the law ``u = -K x``, whatever K is.
+    """Return P (n, n) with ``x' P x`` the discounted cost of the law ``u = -K x``, for any K.
 
-    It solves ``P = Q - NK - K'N' + K'RK + gamma (A - BK)' P (A - BK)``, a Lyapunov equation. For
-    the optimal K of the same discount this is the Riccati solution; for any other K it is the only
-    P that makes the state-action value of :func:`state_action_matrix` satisfy Bellman's equation
-    along the law.
+    It solves ``P = Q - NK - K'N' + K'RK + gamma (A - BK)' P (A - BK)``, a Lyapunov equation. Only
+    this P makes the value of :func:`state_action_matrix` satisfy Bellman's equation along the law.
 
     Raises
     ------
     ValueError
-        If the discounted closed loop is not stable, so that the cost is infinite.
+        If the discounted closed loop is unstable: the cost is infinite.
     """
     closed = np.sqrt(gamma) * (model.A - model.B @ K)
     radius = spectral_radius(closed)
@@ -80,7 +82,7 @@ def policy_value(
     return np.asarray((P + P.T) / 2)
 
 
-def state_action_matrix(model: LinearModel, Q: Array, R: Array, P: Array, gamma: float) -> Array:
+def state_action_matrix(model: LinearSystem, Q: Array, R: Array, P: Array, gamma: float) -> Array:
     """Return M (n+m, n+m) with ``[x; u]' M [x; u] = x'Qx + u'Ru + gamma (Ax+Bu)' P (Ax+Bu)``.
 
     The state-action value of Braniff & Tian, Section 4.2. Their P is that of the undiscounted
@@ -97,7 +99,7 @@ def spectral_radius(matrix: Array) -> float:
 
 
 def _why_no_solution(A: Array, B: Array) -> str:
-    """Say which of the two conditions of the Riccati equation fails (Hautus' test)."""
+    """Return which condition of the Riccati equation fails (Hautus' test)."""
     n = A.shape[0]
     for pole in np.linalg.eigvals(A):
         hautus = np.hstack([pole * np.eye(n) - A, B])
@@ -110,5 +112,5 @@ def _why_no_solution(A: Array, B: Array) -> str:
             )
     return (
         "The Riccati equation has no stabilizing solution: a mode on the unit circle carries no "
-        "weight in Q. Give it a positive weight, use gamma < 1, or pass terminal_cost."
+        "weight in Q. Give it a positive weight, use gamma < 1, or pass a Terminal(cost)."
     )

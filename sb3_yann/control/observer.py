@@ -1,4 +1,4 @@
-"""Estimates a constant disturbance that nothing measures, from the outputs that are measured."""
+"""Estimates an unmeasured constant disturbance from the measured outputs."""
 
 from __future__ import annotations
 
@@ -8,43 +8,52 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, as_array, to_float
+from sb3_yann._validation import Array, as_array, as_outputs, as_positive_vector
 from sb3_yann.control import lqr
 from sb3_yann.control.model.linear_model import LinearModel
-from sb3_yann.control.mpc._arguments import as_outputs
+
+STANDARD = "Give standard deviations, above 0."
 
 
 class DisturbanceObserver:
     """A steady-state Kalman filter for the state and a constant disturbance: offset-free MPC.
 
-    The model is augmented to ``x+ = A x + B u + E d``, ``d+ = d``, ``y = C x``. The estimate
-    ``d_hat`` takes the place of a measured disturbance in the theta of a :class:`LinearMPC` with
-    the same model: its steady-state target then follows the estimate, and tracked outputs that are
-    measured settle without offset (Pannocchia & Rawlings, Disturbance models for offset-free
-    model-predictive control, AIChE J. 49, 2003).
+    The model is augmented to ``x+ = A x + B u + E d``, ``d+ = d``, ``y = C x``. In the theta of a
+    :class:`LinearMPC` with the same model, ``d_hat`` replaces a measured disturbance. Measured
+    tracked outputs then settle without offset (Pannocchia & Rawlings, Disturbance models for
+    offset-free model-predictive control, AIChE J. 49, 2003).
 
-    With as many disturbances as measured outputs the offset goes away for any constant disturbance
-    and any model error that leaves the loop stable; with fewer, only for disturbances that enter
-    as E says. All disturbances of the model are estimated, and the outputs have none of their own.
+    With as many disturbances as measured outputs the offset vanishes for any constant disturbance
+    and any model error that leaves the loop stable. With fewer, E must describe the disturbance.
 
     Parameters
     ----------
     model : LinearModel
         With a disturbance matrix E (n, d), d >= 1.
     measured : array_like, shape (q, n), or list of int, optional
-        C, or the indices of the states that are measured. The default is all states.
+        C, or the indices of the measured states. The default is all states.
     state_noise, disturbance_noise, measurement_noise : array_like or float, default 1
-        Standard deviations, of shapes (n,), (d,) and (q,): how far x and d wander from the model
-        within one sample, and how far y is off. Only their ratios matter: more disturbance noise
-        makes the estimate of d faster and rougher.
+        Standard deviations of shapes (n,), (d,) and (q,), per sample. Only their ratios matter:
+        more disturbance noise makes the estimate of d faster and rougher.
     gain : array_like, shape (n + d, q), optional
         A Luenberger gain to use instead: ``[x; d]`` is corrected by ``gain (y - C x)``.
 
     Raises
     ------
     TypeError, ValueError
-        For arguments of the wrong type or shape, where the measurements do not determine the
-        disturbance, and for a gain that does not make the error decay.
+        For arguments of the wrong type or shape, a disturbance that the measurements do not
+        determine, and a gain with an unstable error.
+
+    Examples
+    --------
+    >>> from sb3_yann.control import LinearModel
+    >>> model = LinearModel([[0.5]], [[1.0]], dt=1, E=[[1.0]])
+    >>> observer, x = DisturbanceObserver(model), 0.0
+    >>> for _ in range(50):  # the plant with d = 2
+    ...     x = 0.5 * x + 2.0
+    ...     x_hat, d_hat = observer.update([x], [0.0])
+    >>> d_hat.round(6).tolist()
+    [2.0]
     """
 
     def __init__(
@@ -69,11 +78,11 @@ class DisturbanceObserver:
         self.seen = np.hstack([self.C, np.zeros((q, d))])
         moves = np.concatenate(
             [
-                _deviations("state_noise", state_noise, n),
-                _deviations("disturbance_noise", disturbance_noise, d),
+                as_positive_vector("state_noise", state_noise, n, STANDARD),
+                as_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD),
             ]
         )
-        errors = _deviations("measurement_noise", measurement_noise, q)
+        errors = as_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
         self.gain = (
             self._kalman_gain(np.diag(moves**2), np.diag(errors**2))
             if gain is None
@@ -104,29 +113,20 @@ class DisturbanceObserver:
         return self.estimate[self.model.n_states :].copy()
 
     def reset(self, y: ArrayLike) -> tuple[Array, Array]:
-        """Start anew from the first measurement y (q,), with no disturbance; return x_hat, d_hat.
-
-        The state is the smallest one that gives y.
-        """
+        """Restart with d_hat = 0 and the smallest x_hat that gives y (q,); return both."""
         start = np.linalg.pinv(self.C) @ as_array("y", y, (self.n_measured,))
         self.estimate = np.concatenate([start, np.zeros(self.model.n_disturbances)])
         return self.x_hat, self.d_hat
 
     def update(self, y: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        """Return x_hat (n,) and d_hat (d,) from y (q,) now and the input u (m,) that led here.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If y or u has another shape, or holds NaN.
-        """
+        """Return x_hat (n,) and d_hat (d,) from y (q,) now and the last input u (m,)."""
         now = as_array("y", y, (self.n_measured,))
         predicted = self.A @ self.estimate + self.B @ as_array("u", u, (self.model.n_inputs,))
         self.estimate = predicted + self.gain @ (now - self.seen @ predicted)
         return self.x_hat, self.d_hat
 
     def _kalman_gain(self, moves: Array, errors: Array) -> Array:
-        """Return the steady-state gain of the filter that corrects after each measurement."""
+        """Return the steady-state gain of the filter."""
         P = linalg.solve_discrete_are(self.A.T, self.seen.T, moves, errors)
         spread = self.seen @ P @ self.seen.T + errors
         return np.asarray(np.linalg.solve(spread, self.seen @ P).T)
@@ -163,11 +163,3 @@ def _rank(matrix: Array) -> int:
         length = np.linalg.norm(matrix, axis=axis, keepdims=True)
         matrix = matrix / np.where(length > 0, length, 1.0)
     return int(np.linalg.matrix_rank(matrix, tol=1e-9))
-
-
-def _deviations(name: str, value: ArrayLike, size: int) -> Array:
-    array = to_float(name, value)
-    array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
-    if np.any(array <= 0):
-        raise ValueError(f"{name} = {array.tolist()} holds standard deviations, above 0.")
-    return array

@@ -10,9 +10,9 @@ from scipy import optimize
 
 from sb3_yann._validation import Array
 
-# DAQP ends up to 1e-6 from the largest ball: below this it must not end so early.
+# DAQP stops up to 1e-6 from the largest ball: smaller balls need tighter settings.
 THIN = 1e-5
-# Of polyhedra with a smaller ball DAQP's own search for redundant rows loses facets.
+# In polyhedra with a smaller ball DAQP's own search for redundant rows loses facets.
 SLIM = 1e-4
 
 
@@ -29,7 +29,7 @@ class Region:
     A : ndarray, shape (q, n)
     b : ndarray, shape (q,)
     inside : ndarray, shape (n,), optional
-        A point well inside, where what found the region knows one.
+        A point well inside, if known.
     """
 
     active_set: tuple[int, ...]
@@ -49,9 +49,9 @@ class Region:
 
 
 def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
-    """Return the point farthest from all rows, or, on one facet, from all others, and how far.
+    """Return center and radius of a bounded polyhedron's largest ball, or of one of its facets.
 
-    The distance is negative for an empty polyhedron or facet. The polyhedron must be bounded.
+    The radius is negative for an empty polyhedron or facet.
     """
     rows = np.empty((len(b), A.shape[1] + 1))
     rows[:, :-1], rows[:, -1] = A, 1.0
@@ -100,7 +100,7 @@ def _minimize(cost: Array, A: Array, b: Array, equal: int | None, **settings: fl
 def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]:
     """Return the rows that bound a polyhedron with a ball of this radius about a point inside.
 
-    Rows that only touch it may be among them. Of rows that say the same there are all.
+    Rows that only touch it may be among them, and duplicate rows are all kept.
     """
     slack = b - A @ inside
     if radius < SLIM:
@@ -116,11 +116,7 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
 
 
 def _rounded(A: Array, slack: Array) -> tuple[Array, Array, float]:
-    """Return a thin polyhedron ``A z <= slack`` in coordinates in which it is round, and a radius.
-
-    They are those of Dikin's ellipsoid about z = 0: it lies in the polyhedron, and becomes the unit
-    ball.
-    """
+    """Return a thin polyhedron ``A z <= slack`` with Dikin's ellipsoid as unit ball, and 1."""
     scaled = A / slack[:, None]
     L = np.linalg.cholesky(scaled.T @ scaled)
     rows = np.linalg.solve(L, A.T).T
@@ -129,7 +125,7 @@ def _rounded(A: Array, slack: Array) -> tuple[Array, Array, float]:
 
 
 def _facets_one_by_one(A: Array, b: Array, radius: float) -> NDArray[np.intp]:
-    """Return the rows beyond which a polyhedron would reach without them."""
+    """Return the rows without which the polyhedron would be larger."""
     bounding = []
     for k in range(len(b)):
         relaxed = b.copy()

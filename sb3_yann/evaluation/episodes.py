@@ -12,9 +12,9 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_yann._validation import Array
 from sb3_yann.control import PiecewiseAffine
 
-Array = NDArray[np.float64]
 LONGEST = 1_000_000
 """Steps after which an episode is taken for one that never ends."""
 
@@ -40,6 +40,12 @@ class Episodes:
     actions : tuple of ndarray, shapes (steps, m)
     terminated : ndarray of bool, shape (episodes,)
         Whether the env ended the episode itself, other than by a time limit.
+
+    Examples
+    --------
+    >>> episodes = evaluate(lambda observation: [0.0], "CSTR-v0", seeds=[0, 1])
+    >>> [len(actions) for actions in episodes.actions]
+    [400, 400]
     """
 
     costs: Array
@@ -63,10 +69,9 @@ def evaluate(
         Something with ``predict(observation, deterministic=True)``, or a function from an
         observation to an action, such as the explicit law.
     env : gymnasium.Env, str or callable
-        Must end its episodes, within a million steps. Of one that is named, or made by a function
-        without arguments, there are as many as seeds: they run side by side, the policy sees them
-        as one batch, and
-        they are closed. One that is given runs its episodes one after the other.
+        Must end its episodes within a million steps. A given env runs them one after the other.
+        An env that is named, or made by a function without arguments, is made for each seed: the
+        episodes run side by side, and the policy sees them as one batch.
     seeds : iterable of int
         ``env.reset(seed=seed)`` starts each episode; the rest of it must follow from that.
     starts : sequence of array_like, optional
@@ -78,6 +83,13 @@ def evaluate(
         If the policy or env is of another kind, or a function makes the same env twice.
     RuntimeError
         If an episode does not end.
+
+    Examples
+    --------
+    >>> import gymnasium
+    >>> law = gymnasium.make("CSTR-v0").observation_space.problem.explicit()
+    >>> bool(evaluate(law, "CSTR-v0", seeds=[0]).costs[0] > 0)
+    True
     """
     seeds = [*seeds]
     options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]

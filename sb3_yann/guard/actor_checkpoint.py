@@ -1,4 +1,4 @@
-"""Copies of an actor, its target and its optimizer, and putting them back, whole or in part."""
+"""Checkpoints of an actor, its target and its optimizer."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Tensors = dict[str, th.Tensor]
 
 @dataclass(frozen=True)
 class ActorCheckpoint:
-    """What makes an actor and its learning go on as if nothing had happened since.
+    """All that an actor needs to act and to go on learning.
 
-    It lies in the main memory, so that a model saved on one device loads on another.
+    It lies in the CPU's memory, so that a model saved on one device loads on another.
     """
 
     actor: Tensors
@@ -42,7 +42,7 @@ class ActorCheckpoint:
         return cls(_copied(actor), _copied(actor), _copied(optimizer))
 
     def restore(self, policy: YannPolicy) -> None:
-        """Put them back, bit for bit."""
+        """Restore actor, target and optimizer, bit for bit."""
         policy.actor.load_state_dict(self.actor)
         policy.actor_target.load_state_dict(self.target)
         policy.actor.optimizer.load_state_dict(copy.deepcopy(self.optimizer))
@@ -61,21 +61,43 @@ class ActorCheckpoint:
             if ".network." in name and not name.endswith("pinned")
         }
 
+    def is_finite(self) -> bool:
+        """Return whether all trainable parameters are finite numbers."""
+        return all(bool(th.isfinite(each).all()) for each in self.networks().values())
+
+    def is_actor_of(self, policy: YannPolicy) -> bool:
+        """Return whether the policy's actor is still that of the checkpoint, bit for bit."""
+        now = policy.actor.state_dict()
+        return all(th.equal(value, now[name].cpu()) for name, value in self.actor.items())
+
+    def has_networks_of(self, other: ActorCheckpoint) -> bool:
+        """Return whether both hold the same networks, whatever their optimizers remember."""
+        networks = other.networks()
+        return all(th.equal(value, networks[name]) for name, value in self.networks().items())
+
+    def changed_regions(self, other: ActorCheckpoint) -> NDArray[np.bool_]:
+        """Return in which regions the networks of both differ, shape (regions,)."""
+        networks = other.networks()
+        different = [
+            (value != networks[name]).flatten(1).any(1) for name, value in self.networks().items()
+        ]
+        return np.asarray(th.stack(different).any(0).numpy())
+
     def with_regions(self, other: ActorCheckpoint, regions: Iterable[int]) -> ActorCheckpoint:
-        """Return a copy that has the networks of some regions, with their moments, from other."""
+        """Return a copy with the networks of some regions, and their moments, from another."""
         index = th.tensor(sorted(regions), dtype=th.long)
         mixed = copy.deepcopy(self)
         for name in ("actor", "target"):
             ours, theirs = getattr(mixed, name), getattr(other, name)
             for key in self.networks():
-                _copy_rows(ours[key], theirs[key], index)
+                ours[key][index] = theirs[key][index]
         ours, theirs = mixed.optimizer["state"], other.optimizer["state"]
         for key, state in theirs.items():
             # A parameter without moments has not been stepped yet: they are zero.
             known = ours.setdefault(key, {k: th.zeros_like(v) for k, v in state.items()})
             for entry, value in state.items():
                 if value.dim() > 0:
-                    _copy_rows(known[entry], value, index)
+                    known[entry][index] = value[index]
                 else:  # the number of steps, which all regions share
                     known[entry].copy_(value)
         return mixed
@@ -87,28 +109,3 @@ def _copied(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _copied(each) for key, each in value.items()}
     return copy.deepcopy(value)
-
-
-def _copy_rows(ours: th.Tensor, theirs: th.Tensor, index: th.Tensor) -> None:
-    ours[index] = theirs[index]
-
-
-def same(checkpoint: ActorCheckpoint, policy: YannPolicy) -> bool:
-    """Return whether the policy's actor is still that of the checkpoint, bit for bit."""
-    now = policy.actor.state_dict()
-    return all(th.equal(value, now[name].cpu()) for name, value in checkpoint.actor.items())
-
-
-def same_networks(one: ActorCheckpoint, other: ActorCheckpoint) -> bool:
-    """Return whether both hold the same actor, whatever its optimizer remembers."""
-    networks = other.networks()
-    return all(th.equal(value, networks[name]) for name, value in one.networks().items())
-
-
-def changed(before: ActorCheckpoint, after: ActorCheckpoint) -> NDArray[np.bool_]:
-    """Return in which regions the network is another one, shape (regions,)."""
-    networks = after.networks()
-    different = [
-        (value != networks[name]).flatten(1).any(1) for name, value in before.networks().items()
-    ]
-    return np.asarray(th.stack(different).any(0).numpy())

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,139 +14,100 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._validation import as_flag, as_whole
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.interrupt import Handler, install
+from sb3_yann.guard.options import AcceptanceRule, StepSize, as_options
 from sb3_yann.guard.plant_acceptance import PlantAcceptance
-from sb3_yann.guard.preconditions import check_between, check_not_nested, check_whole
-from sb3_yann.guard.restoring import restore_accepted
-from sb3_yann.guard.rng import preserve_rng
-from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance
+from sb3_yann.guard.preconditions import check_not_nested
+from sb3_yann.guard.session import GuardSession, Simulator, restore_accepted
+from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, write_csv
+from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import YannPolicy
 
 
 class ImprovementGuard(BaseCallback):
-    """Takes back what does not improve on the MPC, start by start.
+    """Keeps only what is no worse than the MPC; restores the accepted policy otherwise.
 
-    Every few training episodes the present actor is a candidate. It is accepted where it is no
-    worse than the last accepted one. Otherwise it is refused: at once, or when ``patience`` is
-    over, actor, target actor and the actor's optimizer return to the accepted state, bit for bit,
-    while the critic goes on learning. A return shrinks the actor's steps, an acceptance lets them
-    grow again. When `learn` returns, the model *is* the accepted policy. Until then, after an
-    exception, Ctrl-C, and in the zips of a CheckpointCallback, it is a candidate:
-    :func:`restore_accepted` puts the accepted policy in its place.
+    When `learn` returns, or Ctrl-C ends it, the model is the accepted policy. Until then it is a
+    candidate, also after another exception and in the zips of a CheckpointCallback:
+    :func:`restore_accepted` gives it the accepted policy.
 
-    **With a simulator** (``env`` given) the deterministic policy plays seeded episodes there,
-    from the same starts as the accepted policy and the untouched MPC did. It is refused if its
-    mean cost is above the accepted policy's, if one start costs more than with the MPC by more than
-    the margin, or if an episode has more steps with ``info["violation"]`` than the accepted
-    policy's, or is terminated by the env where the accepted policy's is not. Regions that no
-    episode comes through stay as they were. Where the whole is refused, the networks of some
-    regions may still be accepted, under the same conditions. A refused candidate that is better
-    than the MPC on average gets ``patience``. An error of the simulator is a refusal where the MPC
-    meets none from the same starts.
+    With a simulator, candidates and the MPC play the same seeded starts. A candidate is refused if
+    its mean cost is above the accepted policy's, if one start costs more than with the MPC by more
+    than the margin, or if an episode is less safe. Single regions may still be accepted. What is to
+    be accepted is confirmed on new starts. On a plant alone (``env=None``) the training episodes
+    decide, by a one-sided test that errs with probability ``rule.significance``.
 
-    **On a plant alone** (``env=None``) the training episodes decide. The actor learns for
-    ``trial_episodes`` episodes, then rests for as many, of which all are played by one and the same
-    policy. It is accepted if it costs less than the accepted policy did, by a one-sided test of
-    size ``significance`` (:func:`sb3_yann.guard.statistics.probability_of_chance`: an analysis of
-    covariance on the cost that the linear model predicts for each start), and if none of its
-    episodes costs far more than these explain. A violation at any time, a parameter that is no
-    finite number, or a change of the actor while it rests, brings the accepted policy back at once;
-    after a violation the actor rests until that episode is over. The first policy that is accepted
-    is the one that training starts with, and plays the first block: alone, without the noise and
-    the random actions that NoActionNoise takes away. Each test errs with probability
-    ``significance``, so a policy that is worse *can* pass: of ten candidates that are no different
-    one or more does in a quarter of all cases. Nor does the test see what is rare, or what has
-    changed meanwhile: a policy that loses one start in ten by 200, where an episode costs 60, and
-    gains 12 on the others, passes in a third of the cases (it loses none in its block); and as
-    the accepted block is not played again, a plant that has become 10 % cheaper in between lets an
-    unchanged policy pass in two thirds. The simulator's paired episodes have no such chance, but
-    hold for their starts only.
-
-    The guard draws no random numbers and leaves the training env and the buffer alone. Its state
-    is an attribute of the model, ``model.guard_state``, and is saved and loaded with it: another
-    guard with the same settings goes on where the last one stopped, if a few episodes show that
-    the simulator is still the same; with other settings what was accepted is tried anew. Scalars in
-    tensorboard are ``guard/candidate_cost``, ``guard/accepted_cost``, ``guard/mpc_cost``,
-    ``guard/worst_start``, ``guard/step``, ``guard/accepted`` and ``guard/rejected``.
+    A refusal restores actor, target actor and the actor's optimizer bit for bit, at once or when
+    ``patience`` is over. The critic goes on learning. No random numbers are drawn. The state
+    travels with the model, as ``model.guard_state``: a guard with the same settings goes on there.
 
     Parameters
     ----------
     env : str, gymnasium.Env, callable or None
-        The simulator: an id, an env of its own (not the training env), or a function that makes
-        one; the first and the last run all starts side by side. None decides from the training
-        episodes.
+        The simulator: an id, a function that makes an env, or an env other than the training env.
+        The first two play all starts side by side. None is for a plant alone.
     n_starts : int, default 100
         Number of seeded starts.
-    fresh : int, default 50
-        Number of new starts, others each time, on which a policy is tried once more before it is
-        accepted. It loses by one start, as above, or by a mean cost above the MPC's. Then the ten
-        hardest of these starts join the others for good, and the last policy accepted before that
-        passes on all of them is put back, or the MPC. 0 is for none.
-    final : int, optional
-        Number of new starts on which what is accepted is tried in the same way when training ends.
-        The default is ten times ``fresh``; 0 is for none. A policy that loses at least one start
-        in n / 3 passes on n with a probability below 5 % (the rule of three), one of k that are
-        tried in turn with at most k times that. Ten thousand take some seconds where the env is
-        named and steps as arrays; a function that makes one is called for each start.
+    n_new_starts : int, default 50
+        Number of new starts that confirm a policy before it is accepted, 0 for none. Where it loses
+        some, the ten hardest join the known starts, and an earlier policy or the MPC is restored.
+    n_final_starts : int, default 10 * n_new_starts
+        Number of new starts that confirm the accepted policy when training ends.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
-    every : int, default 1
+    eval_every : int, default 1
         Training episodes from one candidate to the next.
-    margin : float, default 0.01
-        What one start may cost more than with the MPC, as a fraction of the MPC's median cost.
-    by_region : bool, default True
-        Whether to try single regions where the whole is refused.
     patience : int, default 5
-        Refusals in a row after which the actor returns. Until then it goes on from where it is, and
-        plays: the critic learns from that. 1 returns after each one.
-    wander : bool, default False
-        Whether that holds for a candidate whose mean cost is above the MPC's as well. By default it
-        returns at once; so it does after a violation, in any case. True where the way to a
-        better policy leads through worse ones, and nothing is at stake but cost.
-    shrink, grow, smallest_step : float, default 0.5, 1.5 and 0.1
-        Factors of the step at a rejection and an acceptance (up to 1), and what it never falls
-        below.
-    trial_episodes : int, default 10
-        Training episodes of a block, on a plant alone.
-    significance : float, default 0.05
-        Size of the test, on a plant alone.
-    record : path-like, optional
-        A CSV file of all decisions, up to date after each one (see :class:`Decision`);
-        ``guard.decisions`` has them too. There are none before the critic's warm-up is over.
+        Refusals in a row until the accepted policy is restored. Until then the candidate plays on.
+    keep_if_worse : bool, default False
+        Whether patience holds where the mean cost is above the MPC's. After a violation there is
+        none in any case.
+    rule : AcceptanceRule or mapping, optional
+        When a candidate counts as no worse.
+    step_size : StepSize or mapping, optional
+        How decisions scale the actor's learning rate.
+    log_path : path-like, optional
+        A CSV file of all decisions, up to date after each one; ``guard.decisions`` has them too.
     verbose : int, default 0
         1 prints each decision.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range; when training starts, if the policy is no YannPolicy, the
-        simulator is the training env or gives costs that are no numbers, the guard is within an
-        EveryNTimesteps or the like, or, on a plant alone, if other actions than the policy's are
-        to be played.
+        If an argument is out of range. When training starts: if the policy is no YannPolicy, the
+        simulator cannot compare policies, or noise acts on a plant alone.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> from sb3_yann import ImprovementGuard, NoActionNoise
+    >>> guard = ImprovementGuard("CSTR-v0", n_starts=3, rule={"margin": 0.02})
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    >>> _ = model.learn(1, callback=[NoActionNoise(), guard])
+    >>> guard.decisions
+    []
     """
 
     model: OffPolicyAlgorithm
+    _handler: Handler | None = None
 
     def __init__(
         self,
-        env: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]] | None,
+        env: Simulator | None,
         *,
         n_starts: int = 100,
-        fresh: int = 50,
-        final: int | None = None,
+        n_new_starts: int = 50,
+        n_final_starts: int | None = None,
         seed: int = 1_000_000,
-        every: int = 1,
-        margin: float = 0.01,
-        by_region: bool = True,
+        eval_every: int = 1,
         patience: int = 5,
-        wander: bool = False,
-        shrink: float = 0.5,
-        grow: float = 1.5,
-        smallest_step: float = 0.1,
-        trial_episodes: int = 10,
-        significance: float = 0.05,
-        record: str | PathLike[str] | None = None,
+        keep_if_worse: bool = False,
+        rule: AcceptanceRule | Mapping[str, Any] = AcceptanceRule(),  # noqa: B008 (frozen)
+        step_size: StepSize | Mapping[str, Any] = StepSize(),  # noqa: B008 (frozen)
+        log_path: str | PathLike[str] | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
@@ -155,38 +116,33 @@ class ImprovementGuard(BaseCallback):
                 f"env = {env!r} must be the id of an environment, a gymnasium.Env, a function that "
                 "makes one, or None to decide from the training episodes."
             )
-        if record is not None and Path(record).is_dir():
-            raise ValueError(f"record = {record!r} is a folder; name a file in it.")
-        for name, value, least in (
-            ("n_starts", n_starts, 1),
-            ("fresh", fresh, 0),
-            ("final", 0 if final is None else final, 0),
-            ("seed", seed, 0),
-            ("every", every, 1),
-            ("patience", patience, 1),
-            ("trial_episodes", trial_episodes, 3),
-        ):
-            check_whole(name, value, least)
-        for name, flag in (("by_region", by_region), ("wander", wander)):
-            if not isinstance(flag, bool):
-                raise TypeError(f"{name} = {flag!r} must be True or False.")
-        for name, factor, low, high in (
-            ("margin", margin, 0.0, np.inf),
-            ("shrink", shrink, 0.0, 1.0),
-            ("grow", grow, 1.0, np.inf),
-            ("smallest_step", smallest_step, 0.0, 1.0),
-            ("significance", significance, 0.0, 0.5),
-        ):
-            check_between(name, factor, low, high)
-        self.shrink, self.grow, self.smallest_step = shrink, grow, smallest_step
-        self.record = None if record is None else Path(record)
-        self.trials: SimulatorAcceptance | PlantAcceptance
+        if log_path is not None and Path(log_path).is_dir():
+            raise ValueError(f"log_path = {log_path!r} is a folder; name a file in it.")
+        as_whole("n_starts", n_starts)
+        as_whole("n_new_starts", n_new_starts, 0)
+        n_final = 10 * n_new_starts if n_final_starts is None else n_final_starts
+        as_whole("n_final_starts", n_final, 0)
+        as_whole("seed", seed, 0)
+        as_whole("eval_every", eval_every)
+        as_whole("patience", patience)
+        as_flag("keep_if_worse", keep_if_worse)
+        rule = as_options("rule", rule, AcceptanceRule)
+        self.env, self.step_size = env, as_options("step_size", step_size, StepSize)
+        self.log_path = None if log_path is None else Path(log_path)
+        self.acceptance: SimulatorAcceptance | PlantAcceptance
         if env is None:
-            self.trials = PlantAcceptance(trial_episodes, significance)
+            self.acceptance = PlantAcceptance(rule)
         else:
-            final = 10 * fresh if final is None else final
-            self.trials = SimulatorAcceptance(
-                env, n_starts, fresh, final, seed, every, margin, by_region, patience, wander
+            seeds = range(seed, seed + n_starts)
+            self.acceptance = SimulatorAcceptance(
+                name_of(env),
+                seeds,
+                n_new_starts,
+                n_final,
+                eval_every,
+                patience,
+                keep_if_worse,
+                rule,
             )
 
     @property
@@ -212,92 +168,56 @@ class ImprovementGuard(BaseCallback):
                 "ImprovementGuard compares a YannPolicy with its MPC; the policy of this model is "
                 f"{type(policy).__name__}."
             )
-        self.policy = policy
-        untrained = policy.actor.mu.network.is_zero()
-        self._mpc = ActorCheckpoint.of(policy) if untrained else None
+        watch_buffer(self.model)
+        self.session = GuardSession(
+            self.model, policy, self.env, self.step_size, self.log_path, self.verbose
+        )
 
     def _on_training_start(self) -> None:
         check_not_nested(self)
-        self.trials.start(self)
+        self.acceptance.start(self.session)
         known = getattr(self.model, "guard_state", None)
-        if known is None or known.settings != self.trials.settings:
+        if known is None or known.settings != self.acceptance.settings:
             self._start_afresh(known)
-        elif not self.trials.still_holds(self):
+        elif not self.acceptance.still_holds(self.session):
             warnings.warn(
-                f"The guard's env {self.trials.settings['env']} does not play the episodes that "
-                "the guard's evidence is from: it is another simulator of that name. The policies "
-                "are tried anew.",
+                f"The guard's env {self.acceptance.settings['env']} does not play the episodes "
+                "that the guard's evidence is from: it is another simulator of that name. The "
+                "policies are tried anew.",
                 stacklevel=2,
             )
             self._start_afresh(known)
-        self.policy.actor_step = self.state.step
-        if self.record is not None:
-            write_csv(self.record, self.decisions)
+        self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
+        self.session.policy.actor_step = self.state.step
+        if self.log_path is not None:
+            write_csv(self.log_path, self.decisions)
 
     def _start_afresh(self, known: GuardState | None) -> None:
         """Gather first evidence; where that fails, leave everything as it was."""
-        present = ActorCheckpoint.of(self.policy)
-        state = GuardState(self.trials.settings, present, evidence=None)
+        present = ActorCheckpoint.of(self.session.policy)
+        state = GuardState(self.acceptance.settings, present, evidence=None)
         if known is not None:  # other starts or another plant: the policies are tried anew
             state.decisions, state.episodes = [*known.decisions], known.episodes
         self.model.guard_state = state  # type: ignore[attr-defined]
         try:
-            self.trials.first_evidence(self, known)
+            self.acceptance.first_evidence(self.session, known)
         except BaseException:
-            present.restore(self.policy)
+            present.restore(self.session.policy)
             self.model.guard_state = known  # type: ignore[attr-defined]
             raise
 
     def _on_rollout_start(self) -> None:
-        self.trials.before_steps(self)
+        self.acceptance.before_steps(self.session)
 
     def _on_step(self) -> bool:
-        self.state.episodes += int(np.sum(self.locals["dones"]))
-        self.trials.step(self)
+        dones = self.locals["dones"]
+        self.state.episodes += int(np.sum(dones))
+        self.acceptance.step(self.session, dones, self.locals["rewards"], self.locals["infos"])
         return True
 
     def _on_training_end(self) -> None:
-        self.trials.end(self)
+        self.session.interrupted = False  # the Zoo ends training after Ctrl-C as well
+        self.acceptance.end(self.session)
         restore_accepted(self.model)
-
-    # What the trials call.
-
-    def accept(self, evidence: Any, checkpoint: ActorCheckpoint | None = None) -> None:
-        """Make the present policy the accepted one; its checkpoint may be at hand already."""
-        self.state.accepted = ActorCheckpoint.of(self.policy) if checkpoint is None else checkpoint
-        self.state.evidence = evidence
-
-    @property
-    def mpc(self) -> ActorCheckpoint:
-        """The MPC itself, with an optimizer as new."""
-        if self._mpc is None:
-            with preserve_rng():  # building an actor draws weights
-                actor = self.policy.make_actor()
-            optimizer = {**self.policy.actor.optimizer.state_dict(), "state": {}}
-            self._mpc = ActorCheckpoint.of_parts(actor.state_dict(), optimizer)
-        return self._mpc
-
-    def decide(self, decision: Decision) -> None:
-        """Set the step, and write a decision to the record, the logger and the screen."""
-        step = self.state.step
-        if decision.verdict == "accepted":
-            step = min(1.0, step * self.grow)
-        elif decision.verdict == "rejected" and decision.returned:
-            step = max(min(self.smallest_step, step), step * self.shrink)
-        self.state.step = self.policy.actor_step = step
-        decision = replace(decision, step=step)
-        self.decisions.append(decision)
-        for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
-            self.logger.record(f"guard/{name}", getattr(decision, name))
-        rejected = sum(each.verdict == "rejected" for each in self.decisions)
-        self.logger.record("guard/rejected", rejected)
-        self.logger.record("guard/accepted", len(self.decisions) - rejected)
-        if self.record is not None:
-            write_csv(self.record, self.decisions)
-        self.logger.dump(self.num_timesteps)  # as EvalCallback does, or the next would replace it
-        if self.verbose:
-            print(
-                f"Episode {decision.episode}: {decision.verdict}"
-                + (f" ({decision.reason})" if decision.reason else "")
-                + f"; mean cost {decision.accepted_cost:.6g}, MPC {decision.mpc_cost:.6g}"
-            )
+        if self._handler is not None:
+            self._handler.remove()

@@ -1,39 +1,35 @@
-"""Episodes of the guard's simulator, and what they say about a policy."""
+"""Episodes of a checkpoint in the guard's simulator, and what they say about it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Final
 
 import numpy as np
-import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann.evaluation.episodes import Episodes, Predictor, evaluate
+from sb3_yann._validation import Array
+from sb3_yann.evaluation.episodes import Episodes, evaluate
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.rng import preserve_rng
-from sb3_yann.guard.statistics import Paired
+from sb3_yann.guard.session import GuardSession
+from sb3_yann.guard.statistics import PairedEpisodes
 
-if TYPE_CHECKING:
-    from sb3_yann.guard.callback import ImprovementGuard
-
-Array = NDArray[np.float64]
+HARDEST = 10
+"""New starts that join those of every later candidate at a time."""
+ROUNDING = 1e-6
+"""Relative difference of mean costs that float32 makes between batches of other sizes."""
+VIOLATES: Final = "violates a limit"
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What came of a policy's episodes, in the order of their seeds.
 
-    Attributes
-    ----------
-    costs : ndarray, shape (episodes,)
-    unsafe : ndarray of int, shape (episodes, 2)
-        Steps with a violation, and whether the env terminated the episode.
-    visits : ndarray of bool, shape (episodes, regions)
-        Through which regions it comes: whatever the networks of the others become, the episode
-        stays as it is.
+    The columns of ``unsafe`` (episodes, 3) are steps with a violation, whether the env terminated
+    the episode, and whether its cost or an observation is not finite. ``visits`` (episodes,
+    regions) tells which regions it comes through: other networks have no effect on it.
     """
 
     costs: Array
@@ -44,7 +40,7 @@ class Outcome:
         """Return some of the episodes."""
         return Outcome(self.costs[index], self.unsafe[index], self.visits[index])
 
-    def and_also(self, other: Outcome) -> Outcome:
+    def extended_by(self, other: Outcome) -> Outcome:
         """Return the episodes of both."""
         return Outcome(
             np.concatenate([self.costs, other.costs]),
@@ -61,27 +57,86 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """The MPC's episodes and the accepted policy's: what a candidate is compared with."""
+class Starts:
+    """Starts, and what came of them under the MPC."""
 
     seeds: tuple[int, ...]
     mpc: Outcome
-    accepted: Outcome
     margin: float
 
+    def at(self, index: Any) -> Starts:
+        """Return some of them."""
+        seeds = tuple(np.array(self.seeds)[index].tolist())
+        return Starts(seeds, self.mpc.at(index), self.margin)
+
+    def joined_with(self, other: Starts) -> Starts:
+        """Return the starts of both."""
+        return Starts((*self.seeds, *other.seeds), self.mpc.extended_by(other.mpc), self.margin)
+
+    def excess(self, outcome: Outcome) -> Array:
+        """Return what each costs more than with the MPC; inf where that cannot be told."""
+        return np.asarray(np.nan_to_num(outcome.costs - self.mpc.costs, nan=np.inf))
+
+    def more_unsafe(self, outcome: Outcome) -> NDArray[np.bool_]:
+        """Return which violate a limit more often than with the MPC, or are terminated."""
+        return np.asarray((outcome.unsafe > self.mpc.unsafe).any(1))
+
+    def lost(self, outcome: Outcome) -> NDArray[np.bool_]:
+        """Return which a policy loses against the MPC."""
+        return (self.excess(outcome) > self.margin) | self.more_unsafe(outcome)
+
+    def mean_is_above(self, outcome: Outcome) -> bool:
+        """Return whether the mean cost is above the MPC's, by more than rounding."""
+        rounding = ROUNDING * np.abs(self.mpc.costs).mean()
+        return not outcome.costs.mean() <= self.mpc.costs.mean() + rounding
+
+    def objection(self, outcome: Outcome) -> str:
+        """Return why a policy is refused on these starts, empty where it is not."""
+        lost, excess = self.lost(outcome), self.excess(outcome)
+        if lost.any():
+            first = self.hardest(outcome)[0]
+            return (
+                f"{lost.sum()} of {len(self.seeds)} new starts lose against the MPC, seed "
+                f"{self.seeds[first]} costs {excess[first]:.4g} more"
+                + (f" and {VIOLATES}" if self.more_unsafe(outcome).any() else "")
+            )
+        if self.mean_is_above(outcome):
+            return (
+                f"mean cost {outcome.costs.mean():.6g} on {len(self.seeds)} new starts, "
+                f"MPC {self.mpc.costs.mean():.6g}"
+            )
+        return ""
+
+    def hardest(self, outcome: Outcome | None) -> NDArray[np.int64]:
+        """Return the places of the hardest of those that cost more than with the MPC.
+
+        The first one where there is no outcome.
+        """
+        if outcome is None:
+            return np.zeros(1, dtype=np.int64)
+        excess, more = self.excess(outcome), self.more_unsafe(outcome)
+        order = np.argsort(np.where(more, -np.inf, -excess), kind="stable")
+        worse = self.lost(outcome)
+        return order[: min(HARDEST, worse.sum() or np.count_nonzero(excess > 0))]
+
+
+@dataclass(frozen=True)
+class Evidence(Starts):
+    """The MPC's episodes and the accepted policy's: what a candidate is compared with."""
+
+    accepted: Outcome
+
     @property
-    def paired(self) -> Paired:
-        """What judges the costs of a candidate from these starts."""
-        return Paired(self.mpc.costs, self.accepted.costs, self.accepted.unsafe, self.margin)
+    def paired(self) -> PairedEpisodes:
+        """The costs that a candidate's are compared with."""
+        return PairedEpisodes(
+            self.mpc.costs, self.accepted.costs, self.accepted.unsafe, self.margin
+        )
 
     @property
     def visits(self) -> NDArray[np.bool_]:
-        """Through which regions the accepted policy's episodes come."""
+        """Regions that the accepted policy's episodes come through."""
         return self.accepted.visits
-
-    def of(self, accepted: Outcome) -> Evidence:
-        """Return what stands for another policy from the same starts."""
-        return Evidence(self.seeds, self.mpc, accepted, self.margin)
 
 
 class Unplayable(Exception):
@@ -90,98 +145,69 @@ class Unplayable(Exception):
 
 @dataclass(frozen=True)
 class _FinitePolicy:
-    policy: Predictor
-    seen: Callable[[Any], Any]
+    session: GuardSession
 
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
-        actions, state = self.policy.predict(self.seen(observation), deterministic=deterministic)
+        seen = self.session.seen(observation)
+        actions, state = self.session.policy.predict(seen, deterministic=deterministic)
         if not np.all(np.isfinite(actions)):  # envs need not put up with it
             raise Unplayable("an action of the actor is not a finite number")
         return actions, state
 
 
-def played(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Episodes:
-    """Return the present policy's episodes; raises Unplayable, or what the env raises."""
-    with preserve_rng():
-        return evaluate(_FinitePolicy(guard.policy, _seen(guard)), env, seeds)
+def play_episodes(
+    session: GuardSession, checkpoint: ActorCheckpoint, seeds: Sequence[int]
+) -> Episodes:
+    """Return a checkpoint's episodes; raise Unplayable, or what the env raises."""
+    assert session.simulator is not None  # a plant alone plays nothing
+    with session.playing(checkpoint), preserve_rng():
+        return evaluate(_FinitePolicy(session), session.simulator, seeds)
 
 
-def play(guard: ImprovementGuard, env: Any, seeds: Sequence[int]) -> Outcome:
-    """Return what comes of the present policy.
+def play(session: GuardSession, checkpoint: ActorCheckpoint, seeds: Sequence[int]) -> Outcome:
+    """Return what comes of a checkpoint from seeded starts. The policy stays as it is.
 
-    Raises
-    ------
-    Unplayable
-        If an action is not finite, or if the env raises an error under this policy, but not under
-        the MPC from the same starts. An error that the MPC meets as well is the env's own.
+    Raise Unplayable if an action is not finite, or if the env raises an error under this
+    checkpoint, but not under the MPC from the same starts: an error of both is the env's own.
     """
     try:
-        return outcome_of(guard, played(guard, env, seeds))
+        return outcome_of(session, play_episodes(session, checkpoint, seeds))
     except Unplayable:
         raise
     except Exception as error:
-        present = ActorCheckpoint.of(guard.policy)
-        guard.mpc.restore(guard.policy)
-        try:
-            played(guard, env, seeds)
-        finally:
-            present.restore(guard.policy)
+        if session.interrupted:  # a simulator has made of it what it can, e.g. in compiled code
+            raise KeyboardInterrupt from error
+        play_episodes(session, session.mpc, seeds)
         reason = f"the simulator failed: {type(error).__name__}: {error}"
         raise Unplayable(reason) from error
 
 
-def outcome_of(guard: ImprovementGuard, episodes: Episodes) -> Outcome:
+def outcome_of(session: GuardSession, episodes: Episodes) -> Outcome:
     """Return what matters of the episodes."""
-    unsafe = np.column_stack([episodes.violations, episodes.terminated]).astype(np.int64)
-    return Outcome(episodes.costs, unsafe, _visits(guard, episodes))
+    finite = [np.all(np.isfinite(each)) for each in episodes.observations]
+    lost = ~(np.isfinite(episodes.costs) & finite)
+    unsafe = np.column_stack([episodes.violations, episodes.terminated, lost]).astype(np.int64)
+    return Outcome(episodes.costs, unsafe, _visits(session, episodes))
 
 
-def evaluate_candidate(guard: ImprovementGuard, env: Any) -> tuple[Outcome | None, str]:
-    """Return the episodes of the present policy and what speaks against it, if anything."""
-    if not finite(guard):
+def evaluate_candidate(
+    session: GuardSession, candidate: ActorCheckpoint
+) -> tuple[Outcome | None, str]:
+    """Return a candidate's episodes from the known starts, and why it is refused, if it is."""
+    if not candidate.is_finite():
         return None, "a parameter of the actor is not a finite number"
-    evidence: Evidence = guard.state.evidence
+    evidence: Evidence = session.state.evidence
     try:
-        outcome = play(guard, env, evidence.seeds)
+        outcome = play(session, candidate, evidence.seeds)
     except Unplayable as error:
         return None, str(error)
     return outcome, evidence.paired.objection(outcome.costs, outcome.unsafe)
 
 
-def finite(guard: ImprovementGuard) -> bool:
-    """Return whether all parameters of the actor are finite numbers."""
-    return all(bool(th.isfinite(each).all()) for each in guard.policy.actor.parameters())
-
-
-@contextmanager
-def all_or_nothing(guard: ImprovementGuard) -> Iterator[ActorCheckpoint]:
-    """Yield the candidate; bring it back, and what was accepted, if it is cut off by an error.
-
-    Or by Ctrl-C: what is under trial stands in the place of what is accepted until it is over.
-    """
-    state, candidate = guard.state, ActorCheckpoint.of(guard.policy)
-    before = state.accepted, state.evidence, [*state.passed]
-    try:
-        yield candidate
-    except BaseException:
-        state.accepted, state.evidence, state.passed = before
-        candidate.restore(guard.policy)
-        raise
-
-
-def _seen(guard: ImprovementGuard) -> Callable[[Any], Any]:
-    """Return what turns an observation of the simulator into one that the policy has learnt from.
-
-    The simulator is an env like the one below a VecNormalize.
-    """
-    normalize = guard.model.get_vec_normalize_env()
-    return (lambda observation: observation) if normalize is None else normalize.normalize_obs
-
-
-def _visits(guard: ImprovementGuard, episodes: Episodes) -> NDArray[np.bool_]:
-    layer, seen = guard.policy.actor.mu, _seen(guard)
+def _visits(session: GuardSession, episodes: Episodes) -> NDArray[np.bool_]:
+    layer = session.policy.actor.mu
     visits = np.zeros((len(episodes.costs), len(layer.gains)), dtype=bool)
     for visited, states in zip(visits, episodes.observations, strict=True):
-        theta = guard.policy.theta(seen(states[:-1]))
+        theta = session.policy.theta(session.seen(states[:-1]))
         visited[layer.regions(theta)] = True
     return visits

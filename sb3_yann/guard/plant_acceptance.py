@@ -3,34 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint, same
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.preconditions import check_acts_alone
-from sb3_yann.guard.state import Decision, GuardState
-from sb3_yann.guard.statistics import PlantEpisodes, compared, excess_of_an_outlier
+from sb3_yann.guard.session import GuardSession
+from sb3_yann.guard.state import GuardState, Verdict
+from sb3_yann.guard.statistics import PlantEpisodes, analyze_covariance, excess_of_an_outlier
+from sb3_yann.policy.policies import YannPolicy
 
-if TYPE_CHECKING:
-    from sb3_yann.guard.callback import ImprovementGuard
-
-Array = NDArray[np.float64]
 LARGEST = 1e9
-"""Parameters beyond this are taken for diverged: the actor's sums could overflow."""
+"""Parameters beyond this count as diverged: the actor's sums could overflow."""
+Phase = Literal["first", "learning", "trial"]
 
 
 @dataclass
-class Evidence:
+class BlockEvidence:
     """Episodes of the MPC, of the accepted policy, and of the block that is being played.
 
-    ``resting`` is the policy that plays a block in which the actor does not learn; ``terminates``
-    says whether an episode of an accepted policy was ended by the env itself.
+    In a "learning" block the actor learns, else it is at rest: it stays the ``resting`` checkpoint.
+    ``terminates`` tells whether the env itself has ended an episode of an accepted policy.
     """
 
-    phase: Literal["first", "learning", "trial"] = "first"
+    phase: Phase = "first"
     mpc: PlantEpisodes | None = None
     accepted: PlantEpisodes | None = None
     costs: list[float] = field(default_factory=list)
@@ -40,179 +40,204 @@ class Evidence:
 
 
 class PlantAcceptance:
-    """Lets the actor learn for a block of episodes, then rest for one that is tested."""
+    """Lets the actor learn for a block of episodes, then rest for a block that is tested."""
 
-    def __init__(self, trial_episodes: int, significance: float) -> None:
-        self.trial_episodes, self.significance = trial_episodes, significance
-        self.settings = {"env": None, "trial_episodes": trial_episodes}
+    def __init__(self, rule: AcceptanceRule) -> None:
+        self.rule = rule
+        self.settings = {"env": None, "trial_episodes": rule.trial_episodes}
 
-    def start(self, guard: ImprovementGuard) -> None:
-        """Begin with the episodes that start now; one that is under way is not counted."""
-        n_envs = guard.training_env.num_envs
-        check_acts_alone(guard)
-        # SB3 goes on in the midst of an episode where its steps are not counted from 0 again.
-        self.costs, self.lengths = np.zeros(n_envs), np.full(n_envs, int(guard.num_timesteps > 0))
+    def start(self, session: GuardSession) -> None:
+        """Begin with the episodes that start now; one that is under way does not count."""
+        check_acts_alone(session.model)
+        n_envs = session.model.n_envs
+        # SB3 goes on amid an episode where its steps are not counted from 0 again.
+        going_on = int(session.model.num_timesteps > 0)
+        self.costs, self.lengths = np.zeros(n_envs), np.full(n_envs, going_on)
         self.violated = np.zeros(n_envs, dtype=bool)
         # Whether the accepted policy has played all of the episode that is under way.
         self.accepted_led = np.zeros(n_envs, dtype=bool)
         self.starts: list[Array] = [np.empty(0)] * n_envs
         self.blocks = np.full(n_envs, -1)
         self.block = 0
+        self.last_restore = "", -1  # why, and after how many episodes
+        self.left_out = 0  # episodes of the first block whose cost is not known
 
-    def still_holds(self, guard: ImprovementGuard) -> bool:
+    def still_holds(self, session: GuardSession) -> bool:
         """Return whether the evidence is there; a plant cannot be played again."""
-        return guard.state.evidence is not None
+        return session.state.evidence is not None
 
-    def first_evidence(self, guard: ImprovementGuard, known: GuardState | None) -> None:
+    def first_evidence(self, session: GuardSession, known: GuardState | None) -> None:
         """Begin with a block of episodes of the present policy, or of what is accepted already."""
-        other = False
-        if known is not None:  # what the present one is, if it is another, nobody has found out
-            other = not same(known.accepted, guard.policy)
-            known.accepted.restore(guard.policy)
-        guard.accept(evidence := Evidence(resting=ActorCheckpoint.of(guard.policy)))
-        if other:
-            self._report(guard, evidence, "rejected", "before training, it is not accepted", np.nan)
+        refused, policy = False, session.policy
+        if known is not None:  # nobody has found out how good another present policy is
+            refused = not known.accepted.is_actor_of(policy)
+            known.accepted.restore(policy)
+        if diverged(policy):  # only the MPC is left
+            refused = True
+            session.mpc.restore(policy)
+        evidence = BlockEvidence(resting=ActorCheckpoint.of(policy))
+        session.state.accept(ActorCheckpoint.of(policy), evidence)
+        if refused:
+            self._report(session, "rejected", "before training, it is not accepted", np.nan)
 
-    def before_steps(self, guard: ImprovementGuard) -> None:
-        """Bring the accepted policy back before a diverged one acts on the plant.
+    def before_steps(self, session: GuardSession) -> None:
+        """Restore the accepted policy before a diverged one acts on the plant.
 
         SB3 calls this after each training of the networks, before the next action.
         """
-        largest = [each.detach().abs().max() for each in guard.policy.actor.parameters()]
-        if not all(bool(each <= LARGEST) for each in largest):  # nor does nan pass
+        if diverged(session.policy):
             reason = "a parameter of the actor is not a finite number, or too large"
-            self._return(guard, guard.state.evidence, reason)
+            self._restore(session, reason)
 
-    def step(self, guard: ImprovementGuard) -> None:
+    def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
         """Count the step; decide where a block is over."""
-        evidence: Evidence = guard.state.evidence
-        self._enrol(guard, evidence)
-        if self.accepted_led.any() and not same(guard.state.accepted, guard.policy):
+        state, evidence = session.state, _evidence(session)
+        self._enroll(session)
+        if self.accepted_led.any() and not state.accepted.is_actor_of(session.policy):
             self.accepted_led[:] = False
-        if evidence.resting is not None and not same(evidence.resting, guard.policy):
-            self._return(guard, evidence, "the actor was changed while it rested")
-        dones, infos = guard.locals["dones"], guard.locals["infos"]
+        if evidence.resting is not None and not evidence.resting.is_actor_of(session.policy):
+            self._restore(session, "the actor was changed while it rested")
         for i, done in enumerate(dones):
-            self.costs[i] -= float(guard.locals["rewards"][i])
+            self.costs[i] -= float(rewards[i])
             self.lengths[i] += 1
-            terminated = bool(done and not infos[i].get("TimeLimit.truncated", False))
-            if infos[i].get("violation", False) or (terminated and not evidence.terminates):
-                self.violated[i] = True
-                if not same(guard.state.accepted, guard.policy):
-                    self._return(guard, evidence, "a limit was violated")
-                elif terminated and self.accepted_led[i]:
-                    evidence.terminates = True
+            self._watch_limits(session, i, bool(done), infos[i])
             if done:
-                if self.blocks[i] == self.block:
-                    evidence.costs.append(float(self.costs[i]))
-                    if evidence.phase != "learning":
-                        evidence.predicted.append(
-                            predicted_cost(guard.policy.problem, self.starts[i], self.lengths[i])
-                        )
-                self.costs[i], self.lengths[i], self.violated[i] = 0.0, 0, False
-                self.blocks[i] = -1
-        if len(evidence.costs) >= self.trial_episodes:
-            self._block_is_over(guard, evidence)
-        # Nor does the actor learn while an episode goes on in which a limit was violated: until
-        # it is over, it is the accepted policy that leads the plant back.
+                self._end_episode(session, i)
+        if len(evidence.costs) >= self.rule.trial_episodes:
+            self._end_block(session)
+        # After a violation the actor rests until the episode is over: the accepted policy leads
+        # the plant back.
         rests = evidence.phase != "learning" or self.violated.any()
-        guard.policy.actor_step = 0.0 if rests else guard.state.step
+        session.policy.actor_step = 0.0 if rests else state.step
 
-    def _enrol(self, guard: ImprovementGuard, evidence: Evidence) -> None:
+    def end(self, session: GuardSession) -> None:
+        """Leave an unfinished block undecided: the accepted policy stays, and learns again."""
+        if _evidence(session).phase != "first":
+            self._begin(session, "learning")
+
+    def _enroll(self, session: GuardSession) -> None:
         """Count episodes that start now as the block's, before anything ends the block.
 
-        The first to start are the ones that count, not the first to end: of several envs side by
-        side, those would be the short episodes.
+        The first to start count, not the first to end: of several envs side by side, those would
+        be the short episodes.
         """
         starting = np.flatnonzero(self.lengths == 0)
         if len(starting) == 0:
             return
         self.accepted_led[starting] = True
-        theta = guard.policy.theta(guard.model._last_obs)  # type: ignore[arg-type]
+        observations = session.model._last_obs
+        theta = session.policy.theta(observations).double().cpu().numpy()  # type: ignore[arg-type]
         for i in starting:  # s_t, before the step
-            self.starts[i] = theta[i].double().cpu().numpy()
-            counted = len(evidence.costs) + np.count_nonzero(self.blocks == self.block)
-            if counted < self.trial_episodes:
+            self.starts[i] = theta[i]
+            if not np.all(np.isfinite(theta[i])):
+                continue  # what it should cost from there is not known
+            counted = len(_evidence(session).costs) + np.count_nonzero(self.blocks == self.block)
+            if counted < self.rule.trial_episodes:
                 self.blocks[i] = self.block
 
-    def end(self, guard: ImprovementGuard) -> None:
-        """Leave an unfinished block undecided: the accepted policy stays, and learns again."""
-        evidence: Evidence = guard.state.evidence
-        if evidence.phase != "first":
-            self._next(guard, evidence, "learning")
+    def _watch_limits(self, session: GuardSession, i: int, done: bool, info: Any) -> None:
+        """Restore the accepted policy if a limit is violated, or the env itself ends an episode."""
+        state, evidence = session.state, _evidence(session)
+        terminated = done and not info.get("TimeLimit.truncated", False)
+        if not (info.get("violation", False) or (terminated and not evidence.terminates)):
+            return
+        self.violated[i] = True
+        if not state.accepted.is_actor_of(session.policy):
+            self._restore(session, "a limit was violated")
+        elif terminated and self.accepted_led[i]:
+            evidence.terminates = True
 
-    def _next(
-        self,
-        guard: ImprovementGuard,
-        evidence: Evidence,
-        phase: Literal["first", "learning", "trial"],
-    ) -> None:
+    def _end_episode(self, session: GuardSession, i: int) -> None:
+        """Add an episode to the block, if it is one of the block's."""
+        evidence = _evidence(session)
+        if self.blocks[i] == self.block:
+            if evidence.phase == "first" and not np.isfinite(self.costs[i]):
+                self._leave_out(i)
+            else:
+                evidence.costs.append(float(self.costs[i]))
+                if evidence.phase != "learning":
+                    problem, steps = session.policy.problem, int(self.lengths[i])
+                    evidence.predicted.append(predicted_cost(problem, self.starts[i], steps))
+        self.costs[i], self.lengths[i], self.violated[i] = 0.0, 0, False
+        self.blocks[i] = -1
+
+    def _leave_out(self, i: int) -> None:
+        """Leave an episode out of the first block; raise ValueError if too many are."""
+        self.left_out += 1
+        if self.left_out >= self.rule.trial_episodes:
+            raise ValueError(
+                f"{self.left_out} episodes of the guard's first block cost what is no finite "
+                f"number, the last {self.costs[i]:g}: no policy can be compared with that. Rewards "
+                "must be finite numbers."
+            )
+
+    def _begin(self, session: GuardSession, phase: Phase) -> None:
+        evidence = _evidence(session)
         evidence.phase = phase
         evidence.costs, evidence.predicted = [], []
-        evidence.resting = None if phase == "learning" else ActorCheckpoint.of(guard.policy)
+        evidence.resting = None if phase == "learning" else ActorCheckpoint.of(session.policy)
         self.block += 1
 
-    def _return(self, guard: ImprovementGuard, evidence: Evidence, reason: str) -> None:
-        """Bring the accepted policy back at once, whatever the block."""
-        guard.state.accepted.restore(guard.policy)
-        self._report(guard, evidence, "rejected", reason, np.nan)
-        self._next(guard, evidence, "first" if evidence.accepted is None else "learning")
+    def _restore(self, session: GuardSession, reason: str) -> None:
+        """Restore the accepted policy at once, whatever the block.
 
-    def _block_is_over(self, guard: ImprovementGuard, evidence: Evidence) -> None:
+        The same reason step after step is one decision in each episode.
+        """
+        state = session.state
+        state.accepted.restore(session.policy)
+        if self.last_restore != (reason, state.episodes):
+            self._report(session, "rejected", reason, np.nan)
+        self.last_restore = reason, state.episodes
+        self._begin(session, "first" if _evidence(session).accepted is None else "learning")
+
+    def _end_block(self, session: GuardSession) -> None:
+        evidence = _evidence(session)
         if evidence.phase == "learning":
-            self._next(guard, evidence, "trial")
+            self._begin(session, "trial")
             return
         played = PlantEpisodes(np.array(evidence.costs), np.array(evidence.predicted))
-        if evidence.phase == "first":
-            if not np.all(np.isfinite(played.costs)):
-                raise ValueError(
-                    f"The episodes of the guard's first block cost {played.costs.tolist()}: "
-                    "no policy can be compared with that. Rewards must be finite numbers."
-                )
+        if evidence.accepted is None:
             evidence.accepted = played
-            if guard.policy.actor.mu.network.is_zero():
+            if session.policy.actor.mu.network.is_zero():
                 evidence.mpc = played
-        elif not same(guard.state.accepted, guard.policy):
-            assert evidence.accepted is not None
-            difference, chance = compared(played, evidence.accepted)
-            reason = f"{difference:+.4g} from the same starts by the linear model, p = {chance:.3g}"
-            beyond = excess_of_an_outlier(played, evidence.accepted)
-            if beyond > 0:
-                reason += f", but one start costs {beyond:.4g} more than it should"
-            if chance < self.significance and not beyond > 0:
-                evidence.accepted = played
-                guard.accept(evidence)
-                self._report(guard, evidence, "accepted", reason, played.costs.mean())
-            else:
-                guard.state.accepted.restore(guard.policy)
-                self._report(guard, evidence, "rejected", reason, played.costs.mean())
-        self._next(guard, evidence, "learning")
+        elif not session.state.accepted.is_actor_of(session.policy):
+            self._judge(session, played, evidence.accepted)
+        self._begin(session, "learning")
 
-    def _report(
-        self,
-        guard: ImprovementGuard,
-        evidence: Evidence,
-        verdict: Literal["accepted", "rejected"],
-        reason: str,
-        cost: float,
-    ) -> None:
+    def _judge(self, session: GuardSession, played: PlantEpisodes, accepted: PlantEpisodes) -> None:
+        """Accept the policy that rested in this block, or restore the accepted one."""
+        difference, chance = analyze_covariance(played, accepted)
+        reason = f"{difference:+.4g} from the same starts by the linear model, p = {chance:.3g}"
+        beyond = excess_of_an_outlier(played, accepted)
+        if beyond > 0:
+            reason += f", but one start costs {beyond:.4g} more than it should"
+        verdict: Verdict = "rejected"
+        if chance < self.rule.significance and not beyond > 0:
+            verdict, evidence = "accepted", _evidence(session)
+            evidence.accepted = played
+            session.state.accept(ActorCheckpoint.of(session.policy), evidence)
+        else:
+            session.state.accepted.restore(session.policy)
+        self._report(session, verdict, reason, float(played.costs.mean()))
+
+    def _report(self, session: GuardSession, verdict: Verdict, reason: str, cost: float) -> None:
         def mean(episodes: PlantEpisodes | None) -> float:
             return np.nan if episodes is None else float(episodes.costs.mean())
 
-        guard.decide(
-            Decision(
-                timestep=guard.num_timesteps,
-                episode=guard.state.episodes,
-                verdict=verdict,
-                reason=reason,
-                returned=verdict == "rejected",
-                candidate_cost=float(cost),
-                accepted_cost=mean(evidence.accepted),
-                mpc_cost=mean(evidence.mpc),
-                worst_start=np.nan,
-                regions=(),
-            )
-        )
+        evidence = _evidence(session)
+        costs = cost, mean(evidence.accepted), mean(evidence.mpc)
+        session.decide(verdict, reason, verdict == "rejected", costs)
+
+
+def _evidence(session: GuardSession) -> BlockEvidence:
+    evidence: BlockEvidence = session.state.evidence
+    return evidence
+
+
+def diverged(policy: YannPolicy) -> bool:
+    """Return whether a parameter of the actor is not a finite number, or too large."""
+    largest = [each.detach().abs().max() for each in policy.actor.parameters()]
+    return not all(bool(each <= LARGEST) for each in largest)  # nor does nan pass
 
 
 def predicted_cost(problem: LinearMPC, start: Array, steps: int) -> float:

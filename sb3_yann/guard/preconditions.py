@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann.evaluation.episodes import Episodes, one_env
-from sb3_yann.guard.episodes import Outcome, outcome_of, played
+from sb3_yann.guard.episodes import Outcome, outcome_of, play_episodes
 from sb3_yann.guard.rng import preserve_rng
-from sb3_yann.policy._checks import as_factor
-
-if TYPE_CHECKING:
-    from sb3_yann.guard.callback import ImprovementGuard
+from sb3_yann.guard.session import GuardSession
 
 
-def check_simulator(
-    simulator: str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]],
-    name: str,
-    training_env: VecEnv,
-) -> None:
+def check_simulator(session: GuardSession, name: str) -> None:
     """Raise ValueError if the simulator is the training env, or an env of another shape."""
+    training_env = session.model.get_env()
+    assert session.simulator is not None and training_env is not None
     training = [env.unwrapped for env in getattr(training_env, "envs", [])]
-    with preserve_rng(), one_env(simulator) as env:
+    with preserve_rng(), one_env(session.simulator) as env:
         if any(env.unwrapped is each for each in training):
             raise ValueError(
                 "The guard's env is the training env, whose episodes its own would interrupt. "
@@ -42,14 +35,13 @@ def check_simulator(
             )
 
 
-def check_acts_alone(guard: ImprovementGuard) -> None:
+def check_acts_alone(model: OffPolicyAlgorithm) -> None:
     """Raise ValueError if anything but the policy would act on the training env.
 
     Without a simulator the training episodes are the evidence: those of random actions would be
     taken for the MPC's.
     """
-    model = guard.model
-    if guard.num_timesteps < model.learning_starts:
+    if model.num_timesteps < model.learning_starts:
         raise ValueError(
             f"learning_starts = {model.learning_starts}: SB3 plays so many actions at random, and "
             "ImprovementGuard(None) takes the training episodes for the policy's own. Pass the "
@@ -62,20 +54,20 @@ def check_acts_alone(guard: ImprovementGuard) -> None:
         )
 
 
-def check_not_nested(guard: ImprovementGuard) -> None:
-    """Raise ValueError if the guard is within a callback that does not tell it of the end."""
+def check_not_nested(guard: BaseCallback) -> None:
+    """Raise ValueError if a callback is within one that does not tell it of the end."""
     event = guard.parent if isinstance(guard.parent, EventCallback) else None
     event = event or _event_above(guard, guard.locals.get("callback"))
     if event is not None:
         raise ValueError(
             f"The guard is within a callback of the class {type(event).__name__}, which passes on "
             "neither each step nor the end of training: the final model might not be an accepted "
-            "one. Pass the guard to learn itself, with every=... for trials less often."
+            "one. Pass the guard to learn itself; eval_every=... makes trials rarer."
         )
 
 
 def _event_above(
-    guard: ImprovementGuard, callback: BaseCallback | None, above: EventCallback | None = None
+    guard: BaseCallback, callback: BaseCallback | None, above: EventCallback | None = None
 ) -> EventCallback | None:
     """Return the EventCallback that the guard is under, among what was passed to learn."""
     if callback is guard:
@@ -88,38 +80,19 @@ def _event_above(
     return next((each for each in found if each is not None), None)
 
 
-def check_whole(name: str, value: Any, least: int) -> None:
-    """Raise ValueError if an argument is no whole number, or less than what is the least."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}.")
+def first_episodes(session: GuardSession, name: str, seeds: Sequence[int]) -> Outcome:
+    """Return what comes of the MPC; raise ValueError if the simulator cannot compare policies.
 
-
-def check_between(name: str, value: Any, low: float, high: float) -> None:
-    """Raise ValueError or TypeError if an argument is no number within the limits."""
-    if not low <= as_factor(name, value) <= high:
-        raise ValueError(f"{name} = {value!r} must be between {low:g} and {high:g}.")
-
-
-def first_episodes(
-    guard: ImprovementGuard, simulator: Any, name: str, seeds: Sequence[int]
-) -> Outcome:
-    """Return what comes of the present policy, the MPC, if the simulator can compare policies.
-
-    By the actor, not the law in float64: the MPC itself is to be no worse to the last bit.
-
-    Raises
-    ------
-    ValueError
-        If a second episode from the same seed costs something else, or a cost is not finite.
+    The actor plays, not the law in float64: the MPC must be no worse than itself to the last bit.
     """
-    mpc = played(guard, simulator, seeds)
+    mpc = play_episodes(session, session.mpc, seeds)
     for seed, cost in zip(seeds, mpc.costs, strict=True):
         if not np.isfinite(cost):
             raise ValueError(
                 f"The MPC's episode of the guard's env {name} from the seed {seed} costs {cost:g}. "
                 "Policies are compared by their costs: rewards must be finite numbers."
             )
-    again = played(guard, simulator, seeds)
+    again = play_episodes(session, session.mpc, seeds)
     for seed, first, second in zip(seeds, mpc.costs, again.costs, strict=True):
         if not np.isclose(first, second, rtol=1e-6, atol=0):
             raise ValueError(
@@ -133,7 +106,7 @@ def first_episodes(
             "ignores its seed. What the guard accepts is compared from this start only.",
             stacklevel=2,
         )
-    return outcome_of(guard, mpc)
+    return outcome_of(session, mpc)
 
 
 def _all_alike(episodes: Episodes) -> bool:

@@ -10,19 +10,16 @@ import numpy as np
 import torch as th
 
 
-def _uses_cuda() -> bool:
-    return bool(th.cuda.is_initialized())  # type: ignore[no-untyped-call]
-
-
 @contextmanager
 def preserve_rng() -> Iterator[None]:
-    """Put back the global random states of python, numpy and torch afterwards.
+    """Restore the global random states of Python, numpy and torch afterwards.
 
-    Older envs seed them in `reset` and draw from them, as does whatever builds a torch module.
+    Older envs seed them in `reset` and draw from them. Building a torch module draws as well.
     """
     python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002
     torch_state = th.get_rng_state()
-    cuda = th.cuda.get_rng_state_all() if _uses_cuda() else []
+    uses_cuda = th.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    cuda = th.cuda.get_rng_state_all() if uses_cuda else []
     try:
         yield
     finally:

@@ -6,16 +6,20 @@ import csv
 import os
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
+
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+
+Verdict = Literal["accepted", "accepted in part", "rejected"]
 
 
 @dataclass(frozen=True)
 class Decision:
     """One decision of the guard.
 
-    Attributes
+    Parameters
     ----------
     timestep, episode : int
         Steps and episodes of training until then.
@@ -23,39 +27,47 @@ class Decision:
         "accepted", "accepted in part" (the networks of some regions only) or "rejected".
     reason : str
         Why not all of it was accepted.
-    returned : bool
-        Whether the actor went back to the accepted state.
+    restored : bool
+        Whether the accepted checkpoint was restored.
     candidate_cost, accepted_cost, mpc_cost : float
-        Mean cost of an episode of the policy that was tried, of the one that is accepted now, and
-        of the MPC, from all starts that are known at that time: new ones that were lost join them.
+        Mean cost of the candidate, the policy accepted now and the MPC, over the known starts.
     worst_start : float
-        Largest excess over the MPC that the accepted policy has on one start, nan if not known.
+        Largest excess of the accepted policy over the MPC on one start, nan if not known.
     regions : tuple of int
-        Regions whose networks were taken over, where it was a part.
+        Regions whose networks were accepted, where it was a part.
     step : float
-        Factor of the actor's learning rate from now on; the guard fills it in.
+        Factor of the actor's learning rate from now on.
+
+    Examples
+    --------
+    >>> from sb3_yann import Decision
+    >>> Decision(9, 1, "accepted", "", False, 3.0, 3.0, 4.0, -0.5, (), 1.0).accepted_cost
+    3.0
     """
 
     timestep: int
     episode: int
-    verdict: Literal["accepted", "accepted in part", "rejected"]
+    verdict: Verdict
     reason: str
-    returned: bool
+    restored: bool
     candidate_cost: float
     accepted_cost: float
     mpc_cost: float
     worst_start: float
     regions: tuple[int, ...]
-    step: float = 1.0
+    step: float
+
+
+NAMES = [each.name for each in fields(Decision)]
 
 
 @dataclass
 class GuardState:
     """All that a stopped run needs to go on; it travels in the model's zip.
 
-    ``passed`` are policies that were accepted, the latest last, with their outcomes on the first of
-    the known starts: what may be gone back to. ``fresh`` counts the new starts that were tried,
-    ``next_start`` is the seed of the next.
+    ``evidence`` is what a candidate is compared with. ``passed`` are earlier accepted checkpoints,
+    the latest last, with their outcomes on the first of the known starts. ``new_starts`` counts the
+    new starts that were played, ``next_start`` is the seed of the next.
     """
 
     settings: dict[str, Any]
@@ -64,10 +76,35 @@ class GuardState:
     step: float = 1.0
     episodes: int = 0
     rejections: int = 0
-    fresh: int = 0
+    new_starts: int = 0
     next_start: int = 0
     passed: list[tuple[ActorCheckpoint, Any]] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
+
+    def accept(self, checkpoint: ActorCheckpoint, evidence: Any) -> None:
+        """Make a checkpoint the accepted one."""
+        self.accepted, self.evidence = checkpoint, evidence
+
+
+def log_last(
+    decisions: list[Decision], model: BaseAlgorithm, path: Path | None, verbose: int
+) -> None:
+    """Write the last decision to the CSV file, to the model's logger and to the screen."""
+    last = decisions[-1]
+    for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
+        model.logger.record(f"guard/{name}", getattr(last, name))
+    rejected = sum(each.verdict == "rejected" for each in decisions)
+    model.logger.record("guard/rejected", rejected)
+    model.logger.record("guard/accepted", len(decisions) - rejected)
+    if path is not None:
+        append_csv(path, decisions)
+    model.logger.dump(model.num_timesteps)  # as EvalCallback does, or the next would replace it
+    if verbose:
+        print(
+            f"Episode {last.episode}: {last.verdict}"
+            + (f" ({last.reason})" if last.reason else "")
+            + f"; mean cost {last.accepted_cost:.6g}, MPC {last.mpc_cost:.6g}"
+        )
 
 
 def write_csv(path: Path, decisions: list[Decision]) -> None:
@@ -75,9 +112,22 @@ def write_csv(path: Path, decisions: list[Decision]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".unfinished")
     with unfinished.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [each.name for each in fields(Decision)])
-        writer.writeheader()
-        for decision in decisions:
-            regions = " ".join(map(str, decision.regions))
-            writer.writerow({**asdict(decision), "regions": regions})
+        csv.DictWriter(file, NAMES).writeheader()
+        _write_rows(file, decisions)
     os.replace(unfinished, path)
+
+
+def append_csv(path: Path, decisions: list[Decision]) -> None:
+    """Append the last decision; writing all of them would take ever longer."""
+    if not path.exists():
+        write_csv(path, decisions)
+        return
+    with path.open("a", newline="", encoding="utf-8") as file:
+        _write_rows(file, decisions[-1:])
+
+
+def _write_rows(file: TextIO, decisions: list[Decision]) -> None:
+    writer = csv.DictWriter(file, NAMES)
+    for decision in decisions:
+        regions = " ".join(map(str, decision.regions))
+        writer.writerow({**asdict(decision), "regions": regions})

@@ -8,24 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-Array = NDArray[np.float64]
+from sb3_yann._validation import Array
+
 OUTLIER = 1e-3
 """Probability that one episode of a policy like the accepted one is taken for far outside."""
+UNSAFE = (
+    "violations",
+    "an episode that the env terminates",
+    "a cost or an observation that is no finite number",
+)
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedEpisodes:
     """Episodes from the same starts, under the MPC and under the accepted policy.
 
-    Attributes
-    ----------
-    mpc_costs, costs : ndarray, shape (starts,)
-        Of the MPC and of the accepted policy.
-    unsafe : ndarray of int, shape (starts, 2)
-        Of the accepted policy: steps with a violation, and whether the env terminated the episode.
-        They are compared one by one: an episode that is cut short has fewer steps to violate in.
-    margin : float
-        By how much one start may cost more than with the MPC, in units of the cost.
+    ``costs`` and ``unsafe`` are the accepted policy's. The columns of ``unsafe`` (starts, up to 3),
+    named in ``UNSAFE``, are compared one by one: an episode that is cut short has fewer steps to
+    violate in. ``margin`` is what one start may cost more than with the MPC.
     """
 
     mpc_costs: Array
@@ -46,8 +46,8 @@ class Paired:
 
         Comparisons are written so that a cost that is not a number is refused.
         """
-        for column, what in enumerate(("violations", "an episode that the env terminates")):
-            more = np.flatnonzero(unsafe[:, column] > self.unsafe[:, column])
+        for what, now, before in zip(UNSAFE, unsafe.T, self.unsafe.T, strict=False):
+            more = np.flatnonzero(now > before)
             if len(more):
                 return f"{len(more)} starts with {what}, the first is number {more[0]}"
         excess = costs - self.mpc_costs
@@ -63,12 +63,8 @@ class Paired:
 class PlantEpisodes:
     """Training episodes played by one and the same policy on the plant.
 
-    Attributes
-    ----------
-    costs : ndarray, shape (episodes,)
-    predicted : ndarray, shape (episodes,)
-        What the MPC would cost from the same start on its own linear model: it explains most of
-        the difference between starts, which is not to be taken for one between policies.
+    ``predicted`` is what the MPC would cost from the same start on its own linear model. It
+    explains most of the difference between starts.
     """
 
     costs: Array
@@ -78,10 +74,9 @@ class PlantEpisodes:
 def excess_of_an_outlier(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
     """Return by how much one of the candidate's episodes costs more than the accepted policy's.
 
-    0 where none is far outside: beyond the upper prediction limit, of size ``OUTLIER`` for all of
-    them together, of the least-squares line of the accepted policy's costs on the predicted ones
-    (e.g. Montgomery, chapter 10). The mean would not show it: a heavy loss raises the
-    scatter as well.
+    0 where none is beyond the upper prediction limit, of size ``OUTLIER`` for all of them together,
+    of the least-squares line of the accepted policy's costs on the predicted ones (e.g. Montgomery,
+    chapter 10). The mean would not show it: a heavy loss raises the scatter as well.
     """
     covariate = _varies(accepted.predicted) and bool(np.all(np.isfinite(candidate.predicted)))
     X, new = (
@@ -103,19 +98,13 @@ def _varies(predicted: Array) -> bool:
     return finite and bool(np.ptp(predicted) > 1e-9 * np.abs(predicted).max())
 
 
-def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
-    """Return the one-sided p-value of "the candidate costs less" against "it does not"."""
-    return compared(candidate, accepted)[1]
-
-
-def compared(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, float]:
+def analyze_covariance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, float]:
     """Return how much more the candidate costs from the same starts, and the one-sided p-value.
 
-    Analysis of covariance: ordinary least squares of the cost on the cost predicted by the linear
-    model and on which policy played; Student's t test of the policy's coefficient. It assumes
-    independent episodes with normal residuals of one variance and one slope for both policies
-    (e.g. Montgomery, *Design and Analysis of Experiments*, chapter 15). Where nothing can be told
-    the difference is nan and p is 1.
+    Ordinary least squares of the cost on the cost that the linear model predicts and on which
+    policy played; Student's t test of the policy's coefficient. It assumes independent episodes
+    with normal residuals of one variance, and one slope for both policies (e.g. Montgomery, *Design
+    and Analysis of Experiments*, chapter 15). Where nothing can be told: nan and p = 1.
     """
     costs = np.concatenate([candidate.costs, accepted.costs])
     if not np.all(np.isfinite(costs)):

@@ -6,6 +6,7 @@ from sb3_yann.networks.value import (
     AfterstateValue,
     LinearPrediction,
     QuadraticStateActionValue,
+    Ranges,
 )
 from sb3_yann.networks.yann import YannLayer
 from sb3_yann.networks.zero_output import ZeroOutputNetwork
@@ -15,6 +16,7 @@ __all__ = [
     "LinearPrediction",
     "PaperYann",
     "QuadraticStateActionValue",
+    "Ranges",
     "RowAdam",
     "YannLayer",
     "ZeroOutputNetwork",

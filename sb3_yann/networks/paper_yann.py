@@ -17,10 +17,9 @@ from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 class PaperYann(nn.Module):
     """theta -> u in physical units, (batch, n) -> (batch, m), zero outside every region.
 
-    Subdomain identification (three layers), all affine laws with both signs, and a two-layer
-    network of ``p h`` nodes run side by side; a layer of ReLUs suppresses what belongs to inactive
-    regions, the last layer adds up the rest. The second layer of the trainable network is dense
-    across regions, as the paper's count demands: its updates are not exclusive to a region.
+    Three layers identify the region, beside all affine laws with both signs and a network of
+    ``p h`` nodes in two layers. A layer of ReLUs suppresses inactive regions; the last layer adds
+    up the rest. The network's second layer is dense across regions, as the paper's count demands.
 
     Parameters
     ----------
@@ -30,6 +29,12 @@ class PaperYann(nn.Module):
         Nodes h for each region and layer.
     scale : float, default 0.01
         Initial weights are uniform in [-scale, scale].
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> PaperYann(problems.cstr().explicit(), width=4)(th.zeros(2, 4)).shape
+    torch.Size([2, 1])
     """
 
     def __init__(self, law: PiecewiseAffine, width: int, scale: float = 0.01) -> None:

@@ -1,4 +1,4 @@
-"""Adam for tables of networks, of which a step moves those with a gradient alone."""
+"""Adam for tables of networks: a step moves only those with a gradient."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ import torch as th
 class RowAdam(th.optim.Optimizer):
     """Adam (Kingma & Ba, 2015) that treats every row of a parameter as a parameter of its own.
 
-    A row is a network's share in a stack of networks. One without a gradient in a step does not
-    move, not even by momentum, and its moments and its count of steps stay as they are: regions
-    without data keep their law, and those with data learn as if each had an optimizer of its own.
-    The cost of a step with sparse gradients is that of the rows in them. With dense gradients, as
-    they come from an accelerator, rows that are zero throughout have no gradient.
+    A row is a network's share in a stack of networks. Without a gradient it does not move, not even
+    by momentum: regions without data keep their law. Sparse gradients cost what their rows cost. In
+    a dense gradient, a row of zeros is none.
 
     Parameters
     ----------
@@ -23,6 +21,15 @@ class RowAdam(th.optim.Optimizer):
     lr : float, default 1e-3
     betas : tuple of float, default (0.9, 0.999)
     eps : float, default 1e-8
+
+    Examples
+    --------
+    >>> table = th.nn.Parameter(th.zeros(2, 3))
+    >>> optimizer = RowAdam([table], lr=0.1)
+    >>> table[1].sum().backward()
+    >>> optimizer.step()
+    >>> table[:, 0].tolist() == [0.0, th.tensor(-0.1).item()]
+    True
     """
 
     def __init__(

@@ -5,26 +5,62 @@ from __future__ import annotations
 import copy
 import operator
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from torch import nn
 
+from sb3_yann._validation import Array, as_bounds, as_positive_vector, half_widths
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
-Array = NDArray[np.float64]
 PredictionModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
 """``(theta, u) -> next theta``: (batch, n), (batch, m) to (batch, n), float64, physical units."""
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """What a value is scaled by: the box of theta and the range of the inputs.
+
+    Parameters
+    ----------
+    theta_half : ndarray, shape (n,)
+        Half the width of the box of theta.
+    u_min, u_max : ndarray, shape (m,)
+        The inputs at action -1 and 1.
+
+    Examples
+    --------
+    >>> Ranges(np.ones(2), u_min=np.zeros(1), u_max=np.ones(1)).u_half
+    array([0.5])
+    """
+
+    theta_half: Array
+    u_min: Array
+    u_max: Array
+
+    def __post_init__(self) -> None:
+        as_positive_vector("theta_half", self.theta_half, len(self.theta_half))
+        as_bounds("u", self.u_min, self.u_max, len(self.u_min))
+
+    @property
+    def u_half(self) -> Array:
+        """Half the ranges of the inputs, (m,)."""
+        return half_widths(self.u_min, self.u_max)
+
+    @property
+    def u_middle(self) -> Array:
+        """The inputs at action 0, (m,)."""
+        return (self.u_max + self.u_min) / 2
 
 
 class QuadraticForm(nn.Module):
     """``z -> z' M z``, trainable.
 
-    M is trained in scaled entries, ``M = D M^ D`` with ``D = sqrt(|diag M|)`` kept constant: the
-    raw entries of a real plant span many orders of magnitude, and a step of Adam, which is the
-    same for every entry, would flip the sign of the smallest. Those of ``M^`` are about 1.
+    M is trained in scaled entries, ``M = D M^ D`` with constant ``D = sqrt(|diag M|)``. The raw
+    entries span many orders of magnitude, and equal steps of Adam would flip the smallest ones.
 
     Parameters
     ----------
@@ -53,24 +89,25 @@ class QuadraticStateActionValue(nn.Module):
     """``Q(theta, a) = -[theta; u]' M [theta; u] + network``: u now, the law ever after.
 
     The critic of Braniff & Tian, Section 4.2. ``u`` is the input in physical units for an action
-    ``a`` in [-1, 1]. Both parts are zero at ``theta = 0, u = 0``; the network stays so where it
-    is ``pinned``.
-
-    Data of a policy that does not explore say nothing of how Q depends on a: this network makes
-    that up. :class:`AfterstateValue` takes it from the model.
+    ``a`` in [-1, 1]. Without exploration nothing tells this network how Q depends on a;
+    :class:`AfterstateValue` takes that from the model.
 
     Parameters
     ----------
     M : ndarray, shape (n + m, n + m)
         From :meth:`LinearMPC.state_action_matrix`.
-    theta_half : ndarray, shape (n,)
-        Half the width of the box of theta, by which the network scales its input.
-    u_min, u_max : ndarray, shape (m,)
-        The inputs at action -1 and 1.
+    ranges : Ranges
     hidden : tuple of int, default (64, 64)
     activation : callable, default torch.tanh
     pinned : bool, default True
         Whether the network's output at the equilibrium stays zero for good.
+
+    Examples
+    --------
+    >>> ranges = Ranges(np.ones(2), u_min=-np.ones(1), u_max=np.ones(1))
+    >>> q = QuadraticStateActionValue(np.eye(3), ranges)
+    >>> q(th.tensor([[1.0, 2.0, 1.0]])).item()
+    -6.0
     """
 
     to_input: th.Tensor
@@ -80,24 +117,20 @@ class QuadraticStateActionValue(nn.Module):
     def __init__(
         self,
         M: Array,
-        theta_half: Array,
-        u_min: Array,
-        u_max: Array,
+        ranges: Ranges,
         hidden: tuple[int, ...] = (64, 64),
         activation: Activation = th.tanh,
         pinned: bool = True,
     ) -> None:
         super().__init__()
-        n, m = len(theta_half), len(u_min)
-        reach = (u_max - u_min) / 2
+        n, m = len(ranges.theta_half), len(ranges.u_min)
         self.quadratic = QuadraticForm(M)
-        constants = {
-            "to_input": np.concatenate([np.ones(n), reach]),
-            "middle": np.concatenate([np.zeros(n), (u_max + u_min) / 2]),
-            "network_scale": 1 / np.concatenate([theta_half, reach]),
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=th.float64))
+        _register(
+            self,
+            to_input=np.concatenate([np.ones(n), ranges.u_half]),
+            middle=np.concatenate([np.zeros(n), ranges.u_middle]),
+            network_scale=1 / np.concatenate([ranges.theta_half, ranges.u_half]),
+        )
         self.network = ZeroOutputNetwork(
             n + m, 1, hidden, activation=activation, pinned=th.tensor([pinned])
         )
@@ -113,12 +146,9 @@ class QuadraticStateActionValue(nn.Module):
 class AfterstateValue(nn.Module):
     """``Q(theta, a) = -(theta'Q theta + u'Ru + gamma V(f(theta, u)))``, V quadratic plus network.
 
-    At first it is the same function as :class:`QuadraticStateActionValue`, to rounding, where f is
-    the linear model ``A theta + B u``. What is learnt is V alone, over predicted next states, of
-    which even a policy that never explores sees a whole neighborhood of each state. How Q depends
-    on the action follows from the known stage cost and from the model: an error of the model bends
-    the direction of improvement, but not the values that are compared, since V is fitted to the
-    plant's own returns at the states the model predicts.
+    With the linear model for f, it starts as :class:`QuadraticStateActionValue`, to rounding. Only
+    V is learnt, at predicted next states. The stage cost and the model say how Q depends on the
+    action: a model error bends the direction of improvement, not the values that are compared.
 
     Parameters
     ----------
@@ -127,13 +157,21 @@ class AfterstateValue(nn.Module):
     P : ndarray, shape (n, n)
         V is ``theta' P theta`` at first.
     model : callable
-        The prediction ``(theta, u) -> next theta``, of float64 tensors in physical units. Of a
-        module a copy is moved and saved with this one, but it is not trained.
+        ``(theta, u) -> next theta``, of float64 tensors in physical units. A module is copied,
+        moved and saved with this one, but not trained.
     gamma : float
-    theta_half, u_min, u_max, hidden, activation, pinned
+    ranges, hidden, activation, pinned
         As in :class:`QuadraticStateActionValue`.
     scale : float, default 30
         The network's output is multiplied by it: its units are those of the cost-to-go.
+
+    Examples
+    --------
+    >>> ranges = Ranges(np.ones(1), u_min=-np.ones(1), u_max=np.ones(1))
+    >>> stays = LinearPrediction(np.eye(1), np.zeros((1, 1)))
+    >>> q = AfterstateValue(np.eye(2), np.eye(1), stays, gamma=0.5, ranges=ranges)
+    >>> q(th.tensor([[2.0, 1.0]])).item()  # -(2 * 2 + 1 * 1 + 0.5 * 2 * 2)
+    -7.0
     """
 
     to_input: th.Tensor
@@ -147,27 +185,25 @@ class AfterstateValue(nn.Module):
         P: Array,
         model: PredictionModel,
         gamma: float,
-        theta_half: Array,
-        u_min: Array,
-        u_max: Array,
+        ranges: Ranges,
         hidden: tuple[int, ...] = (64, 64),
         activation: Activation = th.tanh,
         pinned: bool = True,
         scale: float = 30.0,
     ) -> None:
         super().__init__()
+        import_module("sb3_yann.networks._kernels.afterstate_value")  # see YannLayer
         self.model = _untrained(model) if isinstance(model, nn.Module) else model
         self.gamma, self.scale = gamma, scale
         self.quadratic = QuadraticForm(P)
-        constants = {
-            "W": W,
-            "to_input": (u_max - u_min) / 2,
-            "middle": (u_max + u_min) / 2,
-            "network_scale": 1 / theta_half,
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=th.float64))
-        n, m = len(theta_half), len(u_min)
+        _register(
+            self,
+            W=W,
+            to_input=ranges.u_half,
+            middle=ranges.u_middle,
+            network_scale=1 / ranges.theta_half,
+        )
+        n, m = len(ranges.theta_half), len(ranges.u_min)
         _check_prediction(self.model, n, m)
         self.network = ZeroOutputNetwork(
             n, 1, hidden, activation=activation, pinned=th.tensor([pinned])
@@ -211,11 +247,7 @@ class AfterstateValue(nn.Module):
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
         if self.compiles and theta_and_action.device.type == "cpu":
-            from sb3_yann.networks._kernels.afterstate_value import (
-                value_on_processor,  # compiled once
-            )
-
-            return value_on_processor(self, theta_and_action)
+            return self._compiled(theta_and_action, self._weights())
         theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
         u = action * self.to_input + self.middle
         z = th.cat([theta, u], 1)
@@ -224,9 +256,18 @@ class AfterstateValue(nn.Module):
 
     def compiled_with_fixed_weights(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q where :attr:`compiles`, with a gradient by the rows, but not by the weights."""
-        from sb3_yann.networks._kernels.afterstate_value import value_on_processor
+        return self._compiled(theta_and_action, tuple(each.detach() for each in self._weights()))
 
-        return value_on_processor(self, theta_and_action, fixed=True)
+    def _weights(self) -> tuple[th.Tensor, ...]:
+        modules: Any = self._modules  # an attribute of a module takes a microsecond to find
+        return (modules["quadratic"].entries, *modules["network"].weights())
+
+    def _compiled(self, points: th.Tensor, weights: tuple[th.Tensor, ...]) -> th.Tensor:
+        from sb3_yann.networks._kernels.afterstate_value import value_on_cpu  # compiled once
+
+        network: Any = self._modules["network"]
+        factor = self.gamma * self.scale
+        return value_on_cpu(points, weights, (*self.constants, network.pinned_array, factor))
 
     def value(self, theta: th.Tensor) -> th.Tensor:
         """Return V, the discounted cost to go in float64, shape (batch, 1), for (batch, n)."""
@@ -236,7 +277,14 @@ class AfterstateValue(nn.Module):
 
 
 class LinearPrediction(nn.Module):
-    """``(theta, u) -> A theta + B u``, from :attr:`LinearMPC.prediction`."""
+    """``(theta, u) -> A theta + B u``, from :attr:`LinearMPC.prediction`.
+
+    Examples
+    --------
+    >>> predict = LinearPrediction(np.eye(1), np.ones((1, 1)))
+    >>> predict(th.ones(1, 1).double(), th.ones(1, 1).double()).tolist()
+    [[2.0]]
+    """
 
     A: th.Tensor
     B: th.Tensor
@@ -249,6 +297,11 @@ class LinearPrediction(nn.Module):
     def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
         """Return the predicted next theta, (batch, n)."""
         return theta @ self.A + u @ self.B
+
+
+def _register(module: nn.Module, **constants: Array) -> None:
+    for name, value in constants.items():
+        module.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=th.float64))
 
 
 def _check_prediction(model: PredictionModel, n: int, m: int) -> None:

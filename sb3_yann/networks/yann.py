@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,9 @@ from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 class YannLayer(nn.Module):
     """theta -> input in [-1, 1]: a piecewise affine law, exactly, plus a network per region.
 
-    At first the networks are exactly zero and the layer is the law (to float32 rounding). Only
-    the active region's law and network are computed. In a region that holds the origin the
-    network is zero at the origin for good, so the equilibrium stays where it is; unless it is
-    not ``pinned``.
-
-    Neighboring regions have networks of their own: once trained, the layer may jump where it
-    passes from one region to the next.
+    At first the networks are exactly zero and the layer is the law, to float32 rounding. Only the
+    active region's law and network are computed. Regions have networks of their own: once trained,
+    the layer may jump from one region to the next.
 
     Parameters
     ----------
@@ -36,17 +33,25 @@ class YannLayer(nn.Module):
         The output is never further from the law than this fraction of the input range, whatever
         the networks become. The default is no bound but those of the input.
     pinned : bool, default True
-        Whether training must leave the equilibrium where it is. A law whose steady-state input is
-        wrong has to be free to move it.
+        Whether training must leave the equilibrium where it is: the network of a region with the
+        origin is then zero there for good.
     rate : pair of ndarray, shape (m,), optional
-        ``du_min`` and ``du_max``: the input never moves by more from the previous one, the last m
-        entries of theta, whatever the networks become. The law itself is held to that too, where
-        it has no solution.
+        ``du_min`` and ``du_max``: the input, the law's too, never moves by more from the previous
+        one, the last m entries of theta.
 
     Raises
     ------
     ValueError
         If an input of the law has no bound.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> law = problems.cstr().explicit()
+    >>> layer, theta = YannLayer(law), np.full(4, 0.1)
+    >>> u = layer(th.as_tensor(theta)[None]).detach().numpy()[0] * law.u_max  # from [-1, 1]
+    >>> bool(np.allclose(u, law(theta), atol=1e-5))
+    True
     """
 
     gains: th.Tensor
@@ -69,6 +74,8 @@ class YannLayer(nn.Module):
         rate: tuple[Array, Array] | None = None,
     ) -> None:
         super().__init__()
+        # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
+        import_module("sb3_yann.networks._kernels.yann_layer")
         if not np.all(np.isfinite([law.u_min, law.u_max])):
             raise ValueError(
                 f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
@@ -104,32 +111,42 @@ class YannLayer(nn.Module):
             activation=activation,
             pinned=th.as_tensor(at_origin & pinned),
         )
-        self.scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
+        scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
+        change = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
+        self.constants = (scaling, change, np.inf if self.reach is None else self.reach)
+        """For compiled code."""
         self.has_its_law = True
-        self.change_array = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n).
 
-        Theta of float64 reaches the law as it is, and rounded the network. On a processor it is
-        compiled code for networks of two hidden layers with tanh, unless theta needs a gradient;
-        the operations of torch do the same elsewhere.
+        On a CPU, compiled code computes networks of two hidden layers with tanh, unless theta
+        needs a gradient. The operations of torch do the same elsewhere.
         """
         fixed = theta.device.type == "cpu" and not theta.requires_grad
         if fixed and self.has_its_law and self.network.compiles:
-            from sb3_yann.networks._kernels.yann_layer import layer_on_processor  # compiled once
-
-            return layer_on_processor(self, theta)
+            return self._compiled(theta)
         region, inside = self.locate(theta)
         correction = self.network((theta / self.theta_half).to(self.theta_half), region)
         if self.reach is not None:
             # The bound holds for weights that overflow, or are no numbers, as well.
             correction = correction.nan_to_num(0.0, self.reach, -self.reach)
-            correction = clamp_with_inward_gradient(correction, self.reach)
+            correction = clamp_with_inward_gradient(correction, -self.reach, self.reach)
         output = self._law(theta, region, inside) + correction
-        if not self.rated:
-            return clamp_with_inward_gradient(output)
-        return clamp_between_with_inward_gradient(output, *self._within_reach(theta))
+        # As compiled: where theta is not finite nothing is passed off as an input.
+        output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
+        return clamp_with_inward_gradient(
+            output, *(self._within_reach(theta) if self.rated else ())
+        )
+
+    def _compiled(self, theta: th.Tensor) -> th.Tensor:
+        from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
+
+        network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
+        law, weights = self.piecewise_affine.packed, network.weights()
+        return layer_on_cpu(
+            theta, law, self.constants, weights, network.pinned_array, self.row_gradients
+        )
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
@@ -230,17 +247,11 @@ class _InwardGradientClamp(th.autograd.Function):
         return grad.masked_fill(outward, 0.0), None, None
 
 
-def clamp_with_inward_gradient(x: th.Tensor, limit: float = 1.0) -> th.Tensor:
-    """Return x clamped to [-limit, limit], with a gradient that can still lead back inside.
+def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:
+    """Return x clamped to bounds, numbers or tensors, with a gradient that can still lead inside.
 
     The gradient of `torch.clamp` vanishes beyond the bounds, so a saturated region would never
     learn to leave its bound.
     """
-    clamped: th.Tensor = _InwardGradientClamp.apply(x, -limit, limit)  # type: ignore[no-untyped-call]
-    return clamped
-
-
-def clamp_between_with_inward_gradient(x: th.Tensor, low: th.Tensor, high: th.Tensor) -> th.Tensor:
-    """Return x clamped to bounds of its own shape, and the inward gradient."""
     clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
     return clamped

@@ -1,9 +1,8 @@
 """Networks whose output is exactly zero at first, for any input, and which train all the same.
 
-Braniff & Tian, Theorems 1 and 2. Nodes come in pairs with opposite weights and biases, and each
-pair is summed *before* the activation s: with s(0) = 0 the layer puts out zero. Here the weights
-of a pair are added before they meet the input, so the zero is exact; the sum of two matrix
-products would vanish to rounding only.
+Braniff & Tian, Theorems 1 and 2. Nodes come in pairs with opposite weights and biases, summed
+*before* the activation s: with s(0) = 0 the layer puts out zero. Here the weights of a pair are
+added before they meet the input, so the zero is exact, not to rounding only.
 """
 
 from __future__ import annotations
@@ -130,15 +129,9 @@ def _alive_at_zero(activation: Activation, x: th.Tensor) -> th.Tensor:
 class ZeroOutputNetwork(nn.Module):
     """A stack of networks with one or two hidden layers, exactly zero at first, and trainable.
 
-    The first axis of every parameter is the stack.
-
-    The first layer is a :class:`PairedLinear`. All parameters have moved after the second update:
-    the first moves the first layer, which then feeds the others.
-
-    Where ``pinned``, every layer is ``s(W x + b) - s(b)``. The output at x = 0 then stays zero for
-    good, whatever the parameters become, so training cannot shift the equilibrium; the network is
-    not confined to odd functions, as one without biases would be. The bias of the last layer
-    cancels and never moves; the others act in second order of ``W x``, so at first they hardly do.
+    The first axis of every parameter is the stack; the first layer is a :class:`PairedLinear`.
+    Where ``pinned``, every layer is ``s(W x + b) - s(b)``: the output at x = 0 stays zero whatever
+    the parameters become, and training cannot shift the equilibrium.
 
     Parameters
     ----------
@@ -160,6 +153,12 @@ class ZeroOutputNetwork(nn.Module):
     ------
     ValueError
         If there are not one or two hidden layers, or ``activation(0)`` is not 0.
+
+    Examples
+    --------
+    >>> network = ZeroOutputNetwork(3, 1, hidden=(8, 8))
+    >>> network(th.ones(2, 3)).tolist(), sum(each.numel() for each in network.parameters())
+    ([[0.0], [0.0]], 145)
     """
 
     pinned: th.Tensor
@@ -219,8 +218,8 @@ class ZeroOutputNetwork(nn.Module):
     def compiles(self) -> bool:
         """Whether there is compiled code for such networks where they are now.
 
-        What is traced, exported or compiled by torch needs torch's own operations: it would take
-        the result of compiled code for a constant. So does what is cast to other types on the way.
+        Tracing, export and torch's compiler would take its result for a constant; autocast needs
+        torch's own operations too.
         """
         tracing = th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         if tracing or th.compiler.is_compiling() or th.is_autocast_enabled("cpu"):

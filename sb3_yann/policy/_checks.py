@@ -6,30 +6,68 @@ import warnings
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import nn
 
+from sb3_yann._validation import as_between, as_whole
 from sb3_yann.control import LinearMPC
 from sb3_yann.policy.observations import AffineObservation, require_frozen
 
+SB3_KWARGS = (
+    "n_critics",
+    "features_extractor_class",
+    "features_extractor_kwargs",
+    "normalize_images",
+    "share_features_extractor",
+    "optimizer_class",
+    "optimizer_kwargs",
+)
 
-def require_plain_td3(algorithm: BaseAlgorithm | None, other: dict[str, Any]) -> None:
-    """Raise unless the algorithm is TD3 or DDPG, with keywords that are known."""
+
+def require_plain_td3(algorithm: BaseAlgorithm | None) -> None:
+    """Raise unless the algorithm is TD3 or DDPG."""
     if algorithm is not None and not isinstance(algorithm, TD3):
         raise TypeError(
             f"YannPolicy starts from a deterministic law and works with DDPG and TD3, not with "
             f"{type(algorithm).__name__}. Use e.g. DDPG(YannPolicy, env)."
         )
-    if other:
+
+
+def require_sb3_kwargs(given: dict[str, Any], own: list[str]) -> None:
+    """Raise unless all keywords that are not the policy's ``own`` are SB3's, and make sense."""
+    if unknown := [name for name in given if name not in SB3_KWARGS]:
         raise TypeError(
-            f"YannPolicy takes no {', '.join(map(repr, other))}. Its own policy_kwargs are "
-            "problem, gamma, net_arch, activation_fn, actor_lr_mult, critic_lr_mult, critic, "
-            "prediction_model, value_scale, critic_warmup, max_correction, pin_equilibrium, "
-            "observation, reward_scale and reward_offset."
+            f"YannPolicy takes no {', '.join(map(repr, unknown))}. Its own policy_kwargs are "
+            f"{', '.join(own)}; of SB3's it takes {', '.join(SB3_KWARGS)}. Options of the critic "
+            "go into policy_kwargs={'critic': CriticOptions(...)}."
         )
+    if given.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:
+        raise ValueError(
+            "features_extractor_class would transform the state before it reaches the law; leave "
+            "it at FlattenExtractor."
+        )
+    as_whole("n_critics", given.get("n_critics", 1))
+
+
+def with_fused_adam(given: dict[str, Any]) -> dict[str, Any]:
+    """Return SB3's keywords, with an Adam that takes the same steps in a third of the time."""
+    adam = given.get("optimizer_class", th.optim.Adam) is th.optim.Adam
+    if adam and given.get("optimizer_kwargs") is None:
+        return {**given, "optimizer_kwargs": {"fused": True}}
+    return given
+
+
+def as_activation(value: Any) -> type[nn.Module]:
+    """Return a class of activations."""
+    if not (isinstance(value, type) and issubclass(value, nn.Module)):
+        raise TypeError(f"activation_fn = {value!r} must be a class such as torch.nn.Tanh.")
+    return value
 
 
 def require_undone_normalization(
@@ -64,13 +102,12 @@ def require_undone_normalization(
 
 def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> float:
     """Return the largest entry that matters to theta over the box of the law, inf if not known."""
-    used = np.any(observation.T != 0, axis=0)
-    T = observation.T[:, used]
-    if np.linalg.matrix_rank(T) < T.shape[1]:  # theta does not tell what was observed
+    matrix = observation.matrix[:, np.any(observation.matrix != 0, axis=0)]
+    if np.linalg.matrix_rank(matrix) < matrix.shape[1]:  # theta does not tell what was observed
         return np.inf
-    back = np.linalg.pinv(T)
-    middle = (problem.theta_max + problem.theta_min) / 2 - observation.t0
-    reach = np.abs(back) @ ((problem.theta_max - problem.theta_min) / 2)
+    back = np.linalg.pinv(matrix)
+    middle = (problem.theta_max + problem.theta_min) / 2 - observation.offset
+    reach = np.abs(back) @ problem.theta_half
     return float(np.max(np.abs(back @ middle) + reach))
 
 
@@ -85,7 +122,7 @@ def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) ->
         raise ValueError(
             f"{name} has shape {space.shape}, YannPolicy needs one dimension, (n,). "
             "Wrap the env in gymnasium.wrappers.FlattenObservation, observe the plant's state, or "
-            "pass policy_kwargs={'observation': AffineObservation(T, t0)}."
+            "pass policy_kwargs={'observation': AffineObservation(matrix, offset)}."
         )
 
 
@@ -173,81 +210,27 @@ def _require_theta(
             raise ValueError(
                 f"The observation has shape {shape}, but the law of the problem {takes}. Give the "
                 "policy the problem of this plant, or say how theta follows from an observation: "
-                "policy_kwargs={'observation': AffineObservation(T, t0)}."
+                "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
             )
         return
     if not isinstance(observation, AffineObservation):
         raise TypeError(f"observation = {observation!r} must be an AffineObservation or None.")
     if shape is None or observation.n_obs != np.prod(shape):
         raise ValueError(
-            f"The map to theta has T of shape {observation.T.shape}, but the observation has shape "
-            f"{shape}: T must have as many columns as an observation has entries."
+            f"The map to theta has a matrix of shape {observation.matrix.shape}, but the "
+            f"observation has shape {shape}: give it a column for each entry of an observation."
         )
     if observation.n_theta != problem.n_theta:
         raise ValueError(
-            f"The map to theta has T of shape {observation.T.shape}, but the law of the problem "
-            f"{takes}: T must have {problem.n_theta} rows."
-        )
-
-
-def as_reward(scale: float, offset: float, gamma: float) -> tuple[float, float]:
-    """Return what a reward is in terms of the cost: a factor above 0 and a finite offset."""
-    if as_factor("reward_scale", scale) == 0:
-        raise ValueError("reward_scale = 0 would leave nothing to learn from; give e.g. 1.")
-    if isinstance(offset, bool) or not isinstance(offset, (int, float, np.number)):
-        raise TypeError(f"reward_offset = {offset!r} must be a number.")
-    if not np.isfinite(offset):
-        raise ValueError(f"reward_offset = {offset!r} must be a finite number.")
-    if offset != 0 and not gamma < 1:
-        raise ValueError(
-            f"reward_offset = {offset!r} adds up to no finite value with gamma = {gamma!r}: it "
-            "needs a discount below 1."
-        )
-    return float(scale), float(offset)
-
-
-def as_factor(name: str, value: float) -> float:
-    """Return a factor, a finite float of at least 0."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise TypeError(f"{name} = {value!r} must be a number.")
-    if not (np.isfinite(value) and value >= 0):
-        raise ValueError(f"{name} = {value!r} must be a finite number of at least 0.")
-    return float(value)
-
-
-def require_critic_options(
-    critic: str, prediction_model: object, value_scale: float, critic_warmup: int
-) -> None:
-    """Raise unless these are options of a critic."""
-    if critic not in ("afterstate", "state_action"):
-        raise ValueError(f"critic = {critic!r} must be 'afterstate' or 'state_action'.")
-    if prediction_model is not None and not callable(prediction_model):
-        raise TypeError(
-            f"prediction_model = {prediction_model!r} must be a function of tensors (theta, u) "
-            "that returns the next theta, or None for the linear model."
-        )
-    if prediction_model is not None and critic == "state_action":
-        raise ValueError(
-            "prediction_model is for critic='afterstate'; critic='state_action' predicts nothing."
-        )
-    if as_factor("value_scale", value_scale) == 0:
-        raise ValueError("value_scale = 0 would leave the network without effect; give e.g. 30.")
-    whole = isinstance(critic_warmup, (int, np.integer)) and not isinstance(critic_warmup, bool)
-    if not whole or critic_warmup < 0:
-        raise ValueError(
-            f"critic_warmup = {critic_warmup!r} must be a whole number of updates, 0 for none."
+            f"The map to theta has a matrix of shape {observation.matrix.shape}, but the law of "
+            f"the problem {takes}: give it {problem.n_theta} rows."
         )
 
 
 def as_max_correction(value: float | None) -> float | None:
     """Return the bound on the distance from the MPC, a fraction of the input range."""
-    if value is None:
-        return None
-    if as_factor("max_correction", value) > 1:
-        raise ValueError(
-            f"max_correction = {value!r} is a fraction of the input range, 0 to 1, or None."
-        )
-    return float(value)
+    hint = "It is a fraction of the input range, or None."
+    return None if value is None else as_between("max_correction", value, 0, 1, hint=hint)
 
 
 def as_net_arch(value: dict[str, list[int]] | list[int] | None) -> dict[str, list[int]]:

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
 from sb3_yann.policy.observations import AffineObservation
 
@@ -16,19 +17,31 @@ from sb3_yann.policy.observations import AffineObservation
 class AffineFeatures(BaseFeaturesExtractor):
     """Observations (batch, ...) of any float type to theta (batch, n_theta) in float64."""
 
-    T: th.Tensor
-    t0: th.Tensor
+    matrix: th.Tensor
+    offset: th.Tensor
 
     def __init__(
         self, observation_space: spaces.Space[Any], observation: AffineObservation
     ) -> None:
         super().__init__(observation_space, features_dim=observation.n_theta)
-        self.register_buffer("T", th.as_tensor(observation.T.T.copy()))
-        self.register_buffer("t0", th.as_tensor(observation.t0.copy()))
+        self.register_buffer("matrix", th.as_tensor(observation.matrix.T.copy()))
+        self.register_buffer("offset", th.as_tensor(observation.offset.copy()))
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Return theta."""
-        return th.addmm(self.t0, observations.flatten(1).double(), self.T)
+        return th.addmm(self.offset, observations.flatten(1).double(), self.matrix)
+
+
+def without_entries(
+    theta: th.Tensor, lost: th.Tensor, extractor: BaseFeaturesExtractor | nn.Module
+) -> th.Tensor:
+    """Return theta at the operating point where it depends on entries that are lost.
+
+    ``lost`` (batch, n_obs) names those of the observations.
+    """
+    if isinstance(extractor, AffineFeatures):
+        lost = lost.double() @ (extractor.matrix != 0).double() > 0
+    return theta.masked_fill(lost | ~theta.isfinite(), 0.0)
 
 
 class SeesTheta(BaseModel):

@@ -2,60 +2,69 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 
+from sb3_yann._validation import NonFiniteWarning
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import (
     AfterstateValue,
     LinearPrediction,
     QuadraticStateActionValue,
+    Ranges,
     YannLayer,
 )
-from sb3_yann.networks.value import PredictionModel
-from sb3_yann.policy._features import SeesTheta
+from sb3_yann.policy._features import SeesTheta, without_entries
+from sb3_yann.policy._finite import what_is_not_finite
+from sb3_yann.policy.critic_options import CriticOptions
 
 
 class YannActor(SeesTheta, Actor):
     """SB3's actor with a :class:`YannLayer` in place of the multi-layer perceptron.
 
-    Parameters are those of SB3's `Actor`; ``problem``, the MPC whose explicit law it starts from;
-    and ``max_correction`` and ``pin_equilibrium`` of :class:`YannPolicy`. ``net_arch`` is the width
-    of each region's network.
+    Parameters
+    ----------
+    problem : LinearMPC
+        The MPC whose explicit law the actor starts from.
+    net_arch : list of int
+        Widths of each region's network.
+    activation_fn : type, default torch.nn.Tanh
+    max_correction, pin_equilibrium
+        As in :class:`YannPolicy`.
+    **sb3_kwargs
+        Other arguments of SB3's `Actor`: spaces and features extractor.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> actor = DDPG("YannPolicy", "CSTR-v0", device="cpu").actor
+    >>> actor(th.zeros(1, 4)).shape
+    torch.Size([1, 1])
     """
 
     mu: YannLayer  # type: ignore[assignment]
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: nn.Module,
-        features_dim: int,
         problem: LinearMPC,
+        *,
+        net_arch: list[int],
         activation_fn: type[nn.Module] = nn.Tanh,
-        normalize_images: bool = True,
         max_correction: float | None = None,
         pin_equilibrium: bool = True,
+        **sb3_kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            [],  # no perceptron is built that would be thrown away
-            features_extractor,
-            features_dim,
-            activation_fn,
-            normalize_images,
-        )
+        # No perceptron is built that would be thrown away.
+        super().__init__(net_arch=[], activation_fn=activation_fn, **sb3_kwargs)
         self.net_arch = net_arch
+        self.named = ""
         self.options = {
             "problem": problem,
             "max_correction": max_correction,
@@ -67,8 +76,40 @@ class YannActor(SeesTheta, Actor):
             activation_fn(),
             max_correction=max_correction,
             pinned=pin_equilibrium,
-            rate=(problem.du_min, problem.du_max) if problem.has_rate_bounds else None,
+            rate=(problem.rate.du_min, problem.rate.du_max) if problem.has_rate_bounds else None,
         )
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        """Return the actions in [-1, 1], (batch, m).
+
+        Finite whatever is observed and learnt: where it is not, the law acts alone, at the
+        operating point in those entries of theta that are not known.
+        """
+        modules: Any = self._modules  # an attribute of a module takes a microsecond to find
+        theta = self.extract_features(obs, modules["features_extractor"])
+        actions: th.Tensor = modules["mu"](theta)
+        if th.jit.is_tracing() or th.compiler.is_compiling():  # type: ignore[attr-defined, no-untyped-call]
+            return actions  # no branch that depends on numbers
+        # NaN is all that an action can be beside a number in [-1, 1].
+        total = actions if actions.numel() == 1 else actions.detach().sum()
+        if math.isfinite(total.item()):
+            if self.named and not th.is_grad_enabled():  # the sensor is back, and no batch is it
+                self.named = ""
+            return actions
+        return self._without_what_is_not_finite(obs)
+
+    def _without_what_is_not_finite(self, obs: th.Tensor) -> th.Tensor:
+        lost = ~obs.flatten(1).isfinite()
+        kept = obs.masked_fill(lost.view_as(obs), 0.0)
+        theta = self.extract_features(kept, self.features_extractor)
+        theta = without_entries(theta, lost, self.features_extractor)
+        actions: th.Tensor = self.mu(theta)
+        whole = (~lost.any(1, keepdim=True)) & actions.detach().isfinite().all(1, keepdim=True)
+        said = what_is_not_finite(lost.cpu().numpy())
+        if said != self.named:  # once, for a sensor that stays so
+            warnings.warn(said, NonFiniteWarning, stacklevel=3)
+        self.named = said
+        return th.where(whole, actions, self.mu.law(theta).to(actions))
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
         """Yield the weights, without the search of all modules for them.
@@ -84,71 +125,54 @@ class YannActor(SeesTheta, Actor):
 class YannCritic(SeesTheta, ContinuousCritic):
     """SB3's critic with networks that start as the value of the law on the linear plant.
 
-    Parameters are those of SB3's `ContinuousCritic`; ``problem``, the MPC; ``gamma``, the
-    discount of the return that it puts out; and ``critic`` (here ``kind``), ``prediction_model``,
-    ``value_scale``, ``pin_equilibrium``, ``reward_scale`` and ``reward_offset`` of
-    :class:`YannPolicy`.
+    Parameters
+    ----------
+    problem : LinearMPC
+    gamma : float
+        Discount of the return that the critic puts out.
+    options : CriticOptions
+    pin_equilibrium : bool, default True
+        As in :class:`YannPolicy`.
+    net_arch : list of int
+        Widths of each critic's network.
+    activation_fn : type, default torch.nn.Tanh
+    n_critics : int, default 2
+    **sb3_kwargs
+        Other arguments of SB3's `ContinuousCritic`: spaces and features extractor.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> critic = DDPG("YannPolicy", "CSTR-v0", device="cpu").critic
+    >>> critic.q1_forward(th.zeros(1, 4), th.zeros(1, 1)).shape
+    torch.Size([1, 1])
     """
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
         problem: LinearMPC,
         gamma: float,
-        activation_fn: type[nn.Module] = nn.Tanh,
-        normalize_images: bool = True,
-        n_critics: int = 2,
-        share_features_extractor: bool = False,
-        kind: str = "afterstate",
-        prediction_model: PredictionModel | None = None,
-        value_scale: float = 30.0,
+        options: CriticOptions,
         pin_equilibrium: bool = True,
-        reward_scale: float = 1.0,
-        reward_offset: float = 0.0,
+        *,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.Tanh,
+        n_critics: int = 2,
+        **sb3_kwargs: Any,
     ) -> None:
         super().__init__(
-            observation_space,
-            action_space,
-            [],
-            features_extractor,
-            features_dim,
-            activation_fn,
-            normalize_images,
-            n_critics,
-            share_features_extractor,
+            net_arch=[], activation_fn=activation_fn, n_critics=n_critics, **sb3_kwargs
         )
+        self.scale, self.offset = float(options.reward_scale), options.offset_of_return(gamma)
         common: dict[str, Any] = {
-            "theta_half": (problem.theta_max - problem.theta_min) / 2,
-            "u_min": problem.u_min,
-            "u_max": problem.u_max,
+            "ranges": Ranges(problem.theta_half, problem.u_min, problem.u_max),
             "hidden": tuple(net_arch),
             "pinned": pin_equilibrium,
         }
-        if prediction_model is None:
-            prediction_model = LinearPrediction(*problem.prediction)
-        self.scale = reward_scale
-        self.offset = reward_offset / (1 - gamma) if reward_offset else 0.0
         self.q_networks = []
         for i in range(n_critics):
-            q_network: nn.Module
-            if kind == "state_action":
-                q_network = QuadraticStateActionValue(
-                    problem.state_action_matrix(gamma), activation=activation_fn(), **common
-                )
-            else:
-                q_network = AfterstateValue(
-                    problem.stage_matrix,
-                    problem.value_matrix(gamma),
-                    prediction_model,
-                    gamma,
-                    activation=activation_fn(),
-                    scale=value_scale,
-                    **common,
-                )
+            common["activation"] = activation_fn()
+            q_network = _initial_value(problem, gamma, options, common)
             self.add_module(f"qf{i}", q_network)
             self.q_networks.append(q_network)
 
@@ -183,10 +207,26 @@ class YannCritic(SeesTheta, ContinuousCritic):
             points = th.cat([theta, actions], dim=1)
             return self._in_rewards(q_network.compiled_with_fixed_weights(points))
         trained = [each for each in q_network.parameters() if each.requires_grad]
-        for parameter in trained:
-            parameter.requires_grad_(False)
         try:
+            for parameter in trained:
+                parameter.requires_grad_(False)
             return self._in_rewards(super().q1_forward(obs, actions))
         finally:
             for parameter in trained:
                 parameter.requires_grad_(True)
+
+
+def _initial_value(
+    problem: LinearMPC, gamma: float, options: CriticOptions, common: dict[str, Any]
+) -> nn.Module:
+    if options.kind == "state_action":
+        return QuadraticStateActionValue(problem.state_action_matrix(gamma), **common)
+    model = options.prediction_model
+    return AfterstateValue(
+        problem.stage_matrix,
+        problem.value_matrix(gamma),
+        LinearPrediction(*problem.prediction) if model is None else model,
+        gamma,
+        scale=float(options.value_scale),
+        **common,
+    )

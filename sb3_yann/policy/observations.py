@@ -1,4 +1,4 @@
-"""What an env's observation says of the parameter of the law: ``theta = T obs + t0``."""
+"""What an env's observation says of the parameter of the law, theta: an affine map."""
 
 from __future__ import annotations
 
@@ -11,44 +11,44 @@ from numpy.typing import ArrayLike
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, same_fields
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_whole, same_fields
 
 
-@dataclass(frozen=True, eq=False, init=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class AffineObservation(ReadOnlyArrays):
-    """The map ``theta = T obs + t0`` from an observation to the parameter of the law.
+    """The map ``theta = matrix @ obs + offset`` from an observation to the parameter of the law.
 
-    ``policy_kwargs={"observation": ...}``. An observation of several dimensions is flattened first,
-    in C order. Maps compose like matrices: ``outer @ inner`` applies ``inner`` first, so that an
-    env that shows ``(T - 400) / 20`` as its only entry, for a law about 410, is undone by
-    ``AffineObservation.deviation([410]) @ AffineObservation.normalized([400], [20])``.
-
-    The map is computed in float64, and an observation of dtype float64 keeps all its digits on the
-    way to the law. One of float32, as most are, has been rounded by ``2^-24`` (6e-8) of its own
-    size before: theta then errs by up to ``6e-8 |T| |obs|``. A temperature of 475 K is known to
-    1.5e-5 K, where its deviation would be known to 1e-7 K or better. At the steady state itself,
-    theta is such an error instead of an exact zero.
+    For ``policy_kwargs={"observation": ...}``. It flattens an observation of several dimensions in
+    C order, and computes in float64. Maps compose like matrices: ``outer @ inner`` applies
+    ``inner`` first.
 
     Parameters
     ----------
-    T : array_like, shape (n_theta, n_obs)
-    t0 : array_like, shape (n_theta,), optional
+    matrix : array_like, shape (n_theta, n_obs)
+    offset : array_like, shape (n_theta,), optional
         Zeros if left out.
 
     Raises
     ------
     TypeError, ValueError
         If an array has another shape or holds NaN or infinite entries.
+
+    Examples
+    --------
+    The env shows ``(T - 400) / 20``; the law takes deviations from 410.
+
+    >>> seen = AffineObservation.deviation([410]) @ AffineObservation.normalized([400], [20])
+    >>> seen([0.5])
+    array([0.])
     """
 
-    T: Array
-    t0: Array
+    matrix: Array
+    offset: Array = None  # type: ignore[assignment]
 
-    def __init__(self, T: ArrayLike, t0: ArrayLike | None = None) -> None:
-        matrix = as_array("T", T, ("n_theta", "n_obs"))
-        offset = np.zeros(len(matrix)) if t0 is None else t0
-        object.__setattr__(self, "T", matrix)
-        object.__setattr__(self, "t0", as_array("t0", offset, (len(matrix),)))
+    def __post_init__(self) -> None:
+        matrix = as_array("matrix", self.matrix, ("n_theta", "n_obs"))
+        offset = np.zeros(len(matrix)) if self.offset is None else self.offset
+        vars(self).update(matrix=matrix, offset=as_array("offset", offset, (len(matrix),)))
 
     @classmethod
     def identity(cls, size: int) -> AffineObservation:
@@ -110,8 +110,7 @@ class AffineObservation(ReadOnlyArrays):
     def pick(cls, entries: Sequence[int], size: int) -> AffineObservation:
         """Return ``theta[i] = obs[entries[i]]``, of an observation with ``size`` entries.
 
-        This reorders, and leaves out what the law does not take. A law that takes a set-point as
-        part of theta gets it in this way as well.
+        This reorders, and leaves out what the law does not take.
         """
         return cls(np.eye(size)[_as_entries("entries", entries, size)])
 
@@ -128,32 +127,28 @@ class AffineObservation(ReadOnlyArrays):
                 f"set_points = {set_points} has {len(set_points)} items for {len(entries)} "
                 "entries; write None for an entry without a set-point."
             )
-        T = np.eye(size)[_as_entries("entries", entries, size)]
-        for row, set_point in zip(T, set_points, strict=True):
+        matrix = np.eye(size)[_as_entries("entries", entries, size)]
+        for row, set_point in zip(matrix, set_points, strict=True):
             if set_point is not None:
                 row -= np.eye(size)[_as_entries("set_points", [set_point], size)[0]]
-        return cls(T)
+        return cls(matrix)
 
     @classmethod
     def newest_frame(cls, size: int, frames: int) -> AffineObservation:
         """Return ``theta = `` the newest of the last ``frames`` observations of ``size`` entries.
 
-        It comes last both in SB3's `VecFrameStack`, which joins vectors to one of shape
-        ``(frames * size,)``, and in gymnasium's `FrameStackObservation`, of shape (frames, size).
-        (With ``channels_order="first"``, VecFrameStack joins vectors in the same order.)
+        It comes last in SB3's `VecFrameStack` and in gymnasium's `FrameStackObservation`.
         """
-        if frames < 1:
-            raise ValueError(f"frames = {frames} must be at least 1.")
+        as_whole("frames", frames)
         return cls.pick(range((frames - 1) * size, frames * size), frames * size)
 
     @classmethod
     def from_vec_normalize(cls, venv: VecEnv) -> AffineObservation:
         """Return the map that undoes the frozen statistics of a `VecNormalize`.
 
-        It gives what the env below shows. Where that is not theta yet, compose:
+        It gives what the env below shows; for a law in deviations, compose:
         ``AffineObservation.deviation(x_ss) @ AffineObservation.from_vec_normalize(venv)``.
-        The policy also checks that no clipping (``clip_obs``) acts within the box of the law. It
-        takes normalized observations from then on, also where it is loaded without the env.
+        The policy takes normalized observations from then on, also where it is loaded alone.
 
         Raises
         ------
@@ -180,16 +175,16 @@ class AffineObservation(ReadOnlyArrays):
     @property
     def n_theta(self) -> int:
         """Number of parameters of the law."""
-        return int(self.T.shape[0])
+        return int(self.matrix.shape[0])
 
     @property
     def n_obs(self) -> int:
         """Number of entries of an observation."""
-        return int(self.T.shape[1])
+        return int(self.matrix.shape[1])
 
     def __call__(self, observation: ArrayLike) -> Array:
         """Return theta, (n_theta,) or (batch, n_theta), for (n_obs,) or (batch, n_obs)."""
-        return np.asarray(np.asarray(observation, dtype=np.float64) @ self.T.T + self.t0)
+        return np.asarray(np.asarray(observation, dtype=np.float64) @ self.matrix.T + self.offset)
 
     def __matmul__(self, inner: AffineObservation) -> AffineObservation:
         """Return the map that applies ``inner`` first and this one to what comes out."""
@@ -199,21 +194,23 @@ class AffineObservation(ReadOnlyArrays):
             raise ValueError(
                 f"The inner map puts out {inner.n_theta} entries, the outer one takes {self.n_obs}."
             )
-        return AffineObservation(self.T @ inner.T, self.T @ inner.t0 + self.t0)
+        return AffineObservation(
+            self.matrix @ inner.matrix, self.matrix @ inner.offset + self.offset
+        )
 
     def __eq__(self, other: object) -> bool:
         """Tell whether both maps are the same."""
         if not isinstance(other, AffineObservation):
             return NotImplemented
-        return same_fields(self, other, ("T", "t0"))
+        return same_fields(self, other, ("matrix", "offset"))
 
     def __hash__(self) -> int:
         """Return a hash that equal maps share."""
-        return hash((self.T.tobytes(), self.t0.tobytes()))
+        return hash((self.matrix.tobytes(), self.offset.tobytes()))
 
     def __repr__(self) -> str:
         """Name the matrix and the offset, so that it can be pasted."""
-        return f"AffineObservation(T={self.T.tolist()}, t0={self.t0.tolist()})"
+        return f"AffineObservation(matrix={self.matrix.tolist()}, offset={self.offset.tolist()})"
 
 
 def require_frozen(normalize: VecNormalize) -> None:

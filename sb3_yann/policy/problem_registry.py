@@ -28,6 +28,12 @@ def register_problem(name: str, problem: LinearMPC | Callable[[], LinearMPC] | s
     ------
     TypeError, ValueError
         If the name is empty or holds a colon, or the problem is of another type.
+
+    Examples
+    --------
+    >>> register_problem("my-reactor", "sb3_yann_envs.problems:cstr")
+    >>> resolve_problem("my-reactor", None).model.n_states
+    4
     """
     if not isinstance(name, str) or not name or ":" in name:
         raise ValueError(f"name = {name!r} must be a non-empty string without ':'.")

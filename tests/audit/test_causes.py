@@ -18,9 +18,7 @@ from audit_samples import (
     show_shifted,
 )
 from sample_plants import LinearPlant, asymmetric_pendulum_mpc, two_input_mpc
-from sb3_yann import (
-    AffineObservation,
-)
+from sb3_yann import AffineObservation, NonFiniteWarning
 
 
 @pytest.mark.parametrize("wrong", WRONG)
@@ -64,7 +62,31 @@ def test_an_action_that_acts_late_is_named() -> None:
 
 def test_a_reward_that_is_not_a_number_is_named() -> None:
     env = wrappers.TransformReward(plant(), lambda reward: np.nan)
-    assert audited(env).finding.cause == "not finite"
+    with pytest.warns(NonFiniteWarning):
+        assert audited(env).finding.cause == "not finite"
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_one_step_that_is_not_finite_is_named_and_left_out_of_the_statistics(what) -> None:
+    class Faulty(gym.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            observation, reward, *rest = self.env.step(action)
+            self.steps += 1
+            if self.steps == 30:
+                observation, reward = (
+                    (observation, np.nan) if what == "reward" else (observation * np.nan, reward)
+                )
+            return observation, reward, *rest
+
+    with pytest.warns(NonFiniteWarning):
+        finding = audited(Faulty(plant())).finding
+    assert (finding.matches, finding.cause) == (False, "not finite")
+    assert f"{'the reward' if what == 'reward' else 'an observation'}" in finding.message
+    assert "of step 30" in finding.message
+    assert (finding.scale, finding.offset) == (pytest.approx(1), 0)
+    assert finding.r2 == pytest.approx(1)
 
 
 # --- what is no mismatch --------------------------------------------------------------------------
@@ -98,7 +120,7 @@ def test_the_numbers_that_the_audit_prints_make_the_next_audit_pass() -> None:
     assert line.scale == pytest.approx(0.37, rel=1e-5)
     assert line.offset == pytest.approx(-4.2, rel=1e-5)
     assert line.r2 > 1 - 1e-9
-    policy = {"reward_scale": line.scale, "reward_offset": line.offset}
+    policy = {"critic": {"reward_scale": line.scale, "reward_offset": line.offset}}
     assert audited(env(), policy=policy).finding.matches
     wrong = audited(plant(), policy=policy).finding
     assert "not 0.37 * (-cost) -4.2, as the policy assumes" in wrong.message

@@ -143,7 +143,7 @@ def test_with_equal_discounts_the_critic_is_that_of_the_riccati_solution(
     expected = lqr.state_action_matrix(mpc.model, mpc.Q, mpc.R, P, gamma)
     actual = mpc.state_action_matrix(gamma)
     np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-12 * np.max(expected))
-    np.testing.assert_array_equal(mpc.terminal_cost, P)
+    np.testing.assert_array_equal(mpc.terminal.cost, P)
 
 
 @pytest.mark.filterwarnings("ignore:u_min")  # it says so

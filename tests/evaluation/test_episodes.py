@@ -9,7 +9,7 @@ import torch as th
 from stable_baselines3 import DDPG
 
 from sb3_yann import YannPolicy
-from sb3_yann.evaluation.episodes import Episodes, evaluate
+from sb3_yann.evaluation import Episodes, evaluate
 from sb3_yann_envs import problems
 
 SEEDS = range(3)

@@ -14,10 +14,11 @@ from experiments.__main__ import main
 from experiments.criteria import criteria
 from experiments.markdown import number, table
 from experiments.measures import interval_of, standing
+from experiments.pictures import save_in_short
 from experiments.published import paper_table
 from experiments.results import write_report
 from experiments.runner import Outcome, Run
-from experiments.summary import BEGIN, END, quote
+from experiments.summary import BEGIN, END, quote, summary
 
 MPC_COSTS = np.array([100.0, 300.0])  # mean 200
 OPTIMUM = np.array([90.0, 290.0])  # mean 190
@@ -180,7 +181,7 @@ def test_the_report_is_whole(tmp_path) -> None:
     outcomes[Run("CSTR", "YANN-RL, guard off", 0, 50)] = learned(OPTIMUM)
     outcomes[Run("CSTR", "YANN-RL", 0, 200)] = learned(OPTIMUM, episodes=200)
     paths = write_report(outcomes, tmp_path / "docs", notes=notes)
-    names = ["results.md", "results-cstr.png", "results-pendulum-q-i.png"]
+    names = ["results.md", "results-cstr.png", "results-pendulum-q-i.png", "in-short.png"]
     assert [path.name for path in paths] == names
     assert all(path.stat().st_size > 1000 for path in paths)
     text = paths[0].read_text(encoding="utf-8")
@@ -261,7 +262,39 @@ def test_the_command_reports_what_failed(catalog, tmp_path, capsys) -> None:
     assert main(["--report-only", "--results", "elsewhere"]) == 0
 
 
-def test_the_readme_gets_the_short_tables_between_its_marks(tmp_path) -> None:
+def test_the_short_table_has_a_row_for_each_plant() -> None:
+    header, _, *rows, empty, legend = summary({**reactor(), **pendulum()}, 50).splitlines()
+    assert header.startswith("| plant | optimum | MPC | **YANN-RL** | worst start |")
+    assert rows == [
+        "| CSTR | 190.00 | 200.00 | **191.00 (191.00 to 191.00)** | -9.00 | -20 | "
+        "300.00 (300.00 to 300.00) | +4,000 | 0 / 30 | 10 / 10 |",
+        "| pendulum, Q = I | 15.00 | 100.50 | **15.50 (15.50 to 15.50)** | +0.00 | +0 |  |  | "
+        "0 | 10 |",
+    ]
+    assert empty == "" and "after 50 training episodes, over 2 starts" in legend
+
+
+def test_a_plant_without_our_learner_has_no_row_in_short() -> None:
+    left = {run: out for run, out in reactor().items() if run.learner != "YANN-RL"}
+    assert summary(left, 50) == ""
+
+
+def test_every_learner_of_the_runs_has_a_row_in_a_complete_table(tmp_path) -> None:
+    learners = ("residual RL", "cloned MPC, then DDPG", "DDPG, best kept", "YANN-RL, guard off")
+    more = {Run("CSTR", name, 0, 50): learned(OPTIMUM) for name in learners}
+    report, *_ = write_report({**reactor(), **more}, tmp_path, notes=tmp_path / "none.md")
+    complete = report.read_text(encoding="utf-8").partition("\n## After 50 training episodes\n")[2]
+    for name in ("optimum", "MPC", "**YANN-RL**", "DDPG", *learners):
+        assert f"\n| {name} | " in complete
+
+
+def test_the_picture_of_the_readme_needs_a_rival(tmp_path) -> None:
+    (path,) = save_in_short(reactor(), tmp_path / "new")
+    assert path.name == "in-short.png" and path.stat().st_size > 10_000
+    assert save_in_short(pendulum(), tmp_path) == []
+
+
+def test_the_readme_gets_the_short_table_between_its_marks(tmp_path) -> None:
     readme = tmp_path / "README.md"
     readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n", encoding="utf-8")
     assert quote("| new |", readme)

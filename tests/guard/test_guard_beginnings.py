@@ -10,6 +10,7 @@ import pytest
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
 
 from guard_samples import (
+    FIRST,
     REGION,
     RIGHT,
     STEPS,
@@ -25,8 +26,6 @@ from guard_samples import (
     verdicts,
 )
 from weights import last_layer
-
-FIRST = 1_000_000
 
 
 def test_a_fault_while_the_first_episodes_are_played_leaves_the_next_learn_a_clean_start() -> None:
@@ -76,7 +75,7 @@ def test_new_starts_where_the_mpc_s_cost_is_no_number_are_left_out() -> None:
             observation, reward, *rest = super().step(action)
             return observation, np.nan if self.faulty else reward, *rest
 
-    model, guard = build(gradient_steps=0), make_guard(Faulty, fresh=5)
+    model, guard = build(gradient_steps=0), make_guard(Faulty, n_new_starts=5)
     train(model, STEPS, At([1], better), guard)
     assert verdicts(guard) == ["accepted"]
 
@@ -104,7 +103,7 @@ def test_another_simulator_of_the_same_name_begins_afresh_and_says_so() -> None:
     with pytest.warns(UserWarning, match="it is another simulator of that name"):
         train(model, STEPS, second := make_guard(simulator(1.1)))
     np.testing.assert_allclose(second.state.evidence.paired.costs, 1.1 * costs)
-    assert second.state.settings == first.trials.settings
+    assert second.state.settings == first.acceptance.settings
 
 
 class Legacy(Slide):
@@ -120,7 +119,7 @@ class Legacy(Slide):
 
 def test_a_simulator_that_seeds_the_global_generator_does_not_seed_it_for_others() -> None:
     states = []
-    for callbacks in ([], [make_guard(Legacy, fresh=5)]):
+    for callbacks in ([], [make_guard(Legacy, n_new_starts=5)]):
         model = build(gradient_steps=0)
         moves = [At([1], better), At([STEPS + 1], partial(correct, region=RIGHT, value=0.4))]
         train(model, 3 * STEPS, *moves, *callbacks)
@@ -161,13 +160,13 @@ def test_with_other_settings_the_accepted_policy_the_hard_starts_and_the_count_a
     seen: list[int] = []
     model, values = build(gradient_steps=0), iter([0.3, 0.5])
     moves = At([1, STEPS + 1], lambda policy: correct(policy, RIGHT, next(values)))
-    train(model, 2 * STEPS, moves, first := make_guard(LostLater, fresh=10))
+    train(model, 2 * STEPS, moves, first := make_guard(LostLater, n_new_starts=10))
     hard = set(first.state.evidence.seeds) - set(range(FIRST, FIRST + 10))
     assert hard
     used = first.state.next_start
     correct(model.policy, RIGHT, 1.9)  # what the model has got when the next learn begins
     seen.clear()
-    train(model, STEPS, second := make_guard(LostLater, fresh=10, n_starts=4))
+    train(model, STEPS, second := make_guard(LostLater, n_new_starts=10, n_starts=4))
     assert set(second.state.evidence.seeds) >= hard | set(range(FIRST, FIRST + 4))
     right = last_layer(model)[REGION[RIGHT], 0, -1]
     assert float(right.detach()) == pytest.approx(0.3)

@@ -9,12 +9,14 @@ import pytest
 from stable_baselines3 import DDPG
 
 from guard_samples import (
+    FIRST,
     LAW,
     LEFT,
     REGION,
     RIGHT,
     STEPS,
     At,
+    CutOff,
     Slide,
     accepted_bits,
     actor_bits,
@@ -28,9 +30,6 @@ from guard_samples import (
 from sb3_yann import restore_accepted
 from sb3_yann.evaluation.episodes import evaluate
 from weights import is_mpc, last_layer
-
-FIRST = 1_000_000
-"""The first of the guard's own seeds."""
 
 
 def weights(model) -> np.ndarray:
@@ -60,7 +59,7 @@ def test_what_is_put_back_at_the_end_is_tried_on_all_of_the_new_starts() -> None
     def left_as_well(policy) -> None:
         correct(policy, LEFT, -3.0)
 
-    model, guard = build(gradient_steps=0), make_guard(LateLosses, fresh=20)
+    model, guard = build(gradient_steps=0), make_guard(LateLosses, n_new_starts=20)
     first = At([1], partial(correct, region=RIGHT, value=0.4))
     train(model, 2 * STEPS, first, At([STEPS + 1], left_as_well), guard)
     assert guard.decisions[-1].reason.startswith("at the end, 120 of 200 new starts lose")
@@ -85,7 +84,7 @@ class ALittleWorse(Slide):
 
 def test_a_policy_whose_mean_cost_on_new_starts_is_above_the_mpc_s_is_refused() -> None:
     simulator = partial(ALittleWorse, low=2.0, high=2.8)
-    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=50, patience=5)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=50, patience=5)
     train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     assert "mean cost 4.0375 on 50 new starts, MPC 4" in guard.decisions[0].reason
     assert is_mpc(model)
@@ -107,7 +106,7 @@ def test_what_was_accepted_in_an_earlier_learn_can_be_gone_back_to(how, tmp_path
         correct(policy, LEFT, -2.0)
 
     good = partial(correct, region=RIGHT, value=0.4)
-    model, options = build(gradient_steps=0), {"fresh": 20, "by_region": False}
+    model, options = build(gradient_steps=0), {"n_new_starts": 20, "rule": {"by_region": False}}
     if how == "one learn":
         moves = At([1], good), At([STEPS + 1], spoiled)
         train(model, 2 * STEPS, *moves, guard := make_guard(LaterLeft, **options))
@@ -122,24 +121,14 @@ def test_what_was_accepted_in_an_earlier_learn_can_be_gone_back_to(how, tmp_path
     assert weights(model)[REGION[LEFT]] == 0
 
 
-class Interrupted(Slide):
-    """Ctrl-C, or a fault, at the start with a seed."""
-
-    def __init__(self, at: int, error: type[BaseException], **kwargs) -> None:
-        super().__init__(**kwargs)
-        self.at, self.error = at, error
-
-    def reset(self, *, seed=None, options=None):
-        if seed == self.at:
-            raise self.error("stopped")
-        return super().reset(seed=seed, options=options)
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
 @pytest.mark.parametrize("at", [FIRST + 12, FIRST + 10 + 5 + 7], ids=["a trial", "the end"])
 def test_a_trial_that_is_cut_off_accepts_nothing_and_leaves_the_candidate(error, at) -> None:
-    simulator = partial(Interrupted, at, error)
-    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=5)
+    def stop() -> None:
+        raise error("stopped")
+
+    simulator = partial(CutOff, at, stop)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=5)
     with pytest.raises(error):
         train(model, 2 * STEPS, At([1], better), guard)
     assert weights(model)[REGION[RIGHT]] == 0.5
@@ -161,7 +150,7 @@ class Tripping(Slide):
 
 
 def test_termination_is_refused_where_the_accepted_policy_violates_a_limit() -> None:
-    model, guard = build(gradient_steps=0), make_guard(partial(Tripping, low=2.0), fresh=5)
+    model, guard = build(gradient_steps=0), make_guard(partial(Tripping, low=2.0), n_new_starts=5)
     train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     assert "an episode that the env terminates" in guard.decisions[0].reason
     assert is_mpc(model)
@@ -175,7 +164,7 @@ def test_a_region_that_no_start_comes_through_stays_as_it_was(alone, when) -> No
         if not alone:
             correct(policy, RIGHT, 0.4)
 
-    model, guard = build(gradient_steps=0), make_guard(partial(Slide, low=2.0), fresh=5)
+    model, guard = build(gradient_steps=0), make_guard(partial(Slide, low=2.0), n_new_starts=5)
     if when == "before training":
         sabotage(model.policy)
     train(model, STEPS, At([1], sabotage), guard)
@@ -206,7 +195,7 @@ def test_an_error_of_the_simulator_under_a_candidate_alone_is_a_refusal() -> Non
     train(model, 2 * STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     (decision,) = guard.decisions
     assert decision.reason == "the simulator failed: FloatingPointError: integrator failed"
-    assert decision.returned
+    assert decision.restored
     assert is_mpc(model)
 
 
@@ -215,4 +204,4 @@ def test_after_learn_there_are_as_many_refusals_left_as_patience_says() -> None:
     train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.4)), guard)
     assert guard.state.rejections == 0
     train(model, 2 * STEPS, At([1], partial(correct, region=RIGHT, value=0.3)), guard)
-    assert [each.returned for each in guard.decisions[1:]] == [False, False, True]
+    assert [each.restored for each in guard.decisions[1:]] == [False, False, True]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 
 import numpy as np
@@ -30,7 +31,7 @@ from guard_samples import (
     verdicts,
     worse,
 )
-from sb3_yann import ImprovementGuard
+from sb3_yann import ImprovementGuard, NonFiniteWarning, StepSize
 from sb3_yann.evaluation.episodes import evaluate
 from weights import first_layer, is_mpc, later_layer
 
@@ -64,7 +65,7 @@ def test_a_sabotaged_actor_is_rejected_and_restored_bit_for_bit(algorithm, sabot
         At([step - 1, 4 * STEPS], lambda p: seen.append(bits(p.actor.state_dict()))),
     )
     assert verdicts(guard) == ["accepted", "rejected"]
-    assert guard.decisions[1].returned
+    assert guard.decisions[1].restored
     assert actor_bits(model.policy) == accepted_bits(guard)
     assert bits(model.policy.actor.state_dict()) == seen[0]
 
@@ -142,7 +143,7 @@ def test_equal_costs_neither_refuse_a_policy_before_training_nor_a_candidate(mar
             return observation, -abs(float(self.x[0])) / 3, *rest
 
     for before in (True, False):
-        model, guard = build(gradient_steps=0), make_guard(Indifferent, margin=margin)
+        model, guard = build(gradient_steps=0), make_guard(Indifferent, rule={"margin": margin})
         change = partial(correct, region=LEFT, value=-0.5)
         if before:
             change(model.policy)
@@ -171,7 +172,7 @@ def test_the_final_model_is_the_accepted_policy_also_when_loaded(algorithm, tmp_
     loaded = algorithm.load(tmp_path / "model", device="cpu")
     np.testing.assert_array_equal(loaded.predict(STATES)[0], model.predict(STATES)[0])
     assert bits(loaded.guard_state.accepted.actor) == bits(loaded.policy.actor.state_dict())
-    played = evaluate(model, Slide, guard.trials.seeds)
+    played = evaluate(model, Slide, guard.acceptance.seeds)
     np.testing.assert_allclose(played.costs, guard.state.evidence.paired.costs, atol=1e-6)
     assert np.all(played.costs <= guard.state.evidence.paired.mpc_costs + 1e-2)
 
@@ -190,17 +191,17 @@ def test_a_violation_is_rejected_at_once_though_the_cost_falls_and_patience_is_l
     env = partial(env, low=3.0)
     model = build(env=env(), gradient_steps=0)
     guard = make_guard(partial(Slide, limits=(-1.1, -0.6), low=3.9), patience=5)
-    guard.trials.seeds = range(2)
+    guard.acceptance.seeds = range(2)
     train(model, 2 * STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     assert verdicts(guard) == ["rejected"]
-    assert guard.decisions[0].returned
+    assert guard.decisions[0].restored
     assert "2 starts with violations" in guard.decisions[0].reason
     assert guard.decisions[0].candidate_cost < guard.decisions[0].mpc_cost
     assert is_mpc(model)
 
 
 @pytest.mark.parametrize(
-    ("wander", "values", "returned"),
+    ("keep_if_worse", "values", "restored"),
     [
         (True, [1.8, 1.9, 2.0], [False, False, True]),
         (False, [1.8, 1.9, 2.0], [True, True, True]),  # worse than the MPC
@@ -209,16 +210,16 @@ def test_a_violation_is_rejected_at_once_though_the_cost_falls_and_patience_is_l
     ],
 )
 def test_with_patience_the_actor_goes_on_until_the_last_of_so_many_rejections(
-    wander, values, returned
+    keep_if_worse, values, restored
 ) -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=3, wander=wander)
+    model, guard = build(gradient_steps=0), make_guard(patience=3, keep_if_worse=keep_if_worse)
     left = iter([0.3, *values])
     move = At(range(STEPS, 5 * STEPS, STEPS), lambda p: correct(p, RIGHT, next(left)))
     train(model, 4 * STEPS + 1, move, guard)
     assert guard.decisions[0].verdict == "accepted"
-    assert [each.returned for each in guard.decisions][1:4] == returned
+    assert [each.restored for each in guard.decisions][1:4] == restored
     shrunk = [each.step < 1 for each in guard.decisions][1:4]
-    assert not any(shrunk[i] for i in range(3) if not any(returned[: i + 1]))
+    assert not any(shrunk[i] for i in range(3) if not any(restored[: i + 1]))
 
 
 @pytest.mark.parametrize("sabotage", [worse, randomize, partial(overwrite, value=np.nan)])
@@ -233,18 +234,18 @@ def test_with_the_default_patience_what_is_worse_than_the_mpc_returns_at_once(sa
 
 
 def test_with_patience_left_the_end_returns_all_the_same_and_says_so() -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=5, wander=True)
+    model, guard = build(gradient_steps=0), make_guard(patience=5, keep_if_worse=True)
     train(model, 2 * STEPS, At([1], worse), guard)
-    assert guard.decisions[-1].returned
+    assert guard.decisions[-1].restored
     assert is_mpc(model)
     worse(model.policy)
     train(model, STEPS + 1, guard)  # five more, not what was left
-    assert [each.returned for each in guard.decisions[-2:]] == [False, True]
+    assert [each.restored for each in guard.decisions[-2:]] == [False, True]
 
 
 def test_rejections_shrink_the_step_to_its_floor_and_acceptances_let_it_grow_to_one() -> None:
     model = build(gradient_steps=0)
-    guard = make_guard(shrink=0.3, grow=2.5, smallest_step=0.2, margin=10.0)
+    guard = make_guard(step_size=StepSize(0.3, 2.5, 0.2), rule={"margin": 10.0})
     values = iter([1.8, 1.9, 2.0, 0.3, 0.4, 0.5])
     move = At(range(STEPS, 7 * STEPS, STEPS), lambda p: correct(p, RIGHT, next(values)))
     steps: list[float] = []
@@ -269,7 +270,7 @@ def test_the_step_multiplies_the_actor_s_learning_rate() -> None:
 
 
 def test_candidates_are_tried_every_so_many_episodes_and_at_the_end() -> None:
-    model, guard = build(gradient_steps=0), make_guard(every=3)
+    model, guard = build(gradient_steps=0), make_guard(eval_every=3)
     values = iter(np.linspace(0.1, 0.3, 20))
     train(
         model, 9 * STEPS, At(range(1, 100), lambda p: correct(p, RIGHT, next(values, 0.3))), guard
@@ -283,3 +284,23 @@ def test_while_nothing_has_moved_nothing_is_tried() -> None:
     train(model, 5 * STEPS, guard)
     assert guard.decisions == []
     assert is_mpc(model)
+
+
+@pytest.mark.parametrize("what", ["cost", "observation"])
+def test_a_candidate_with_what_is_not_finite_in_its_episodes_violates_and_returns(what) -> None:
+    class Faulty(Slide):
+        """Half the MPC's input breaks a sensor."""
+
+        def step(self, action):
+            broken = self.x[0] > 1.9 and abs(float(action[0])) < 0.9
+            observation, reward, *rest = super().step(action)
+            if broken and what == "cost":
+                reward = np.nan
+            return observation * (np.nan if broken and what != "cost" else 1), reward, *rest
+
+    model, guard = build(gradient_steps=0), make_guard(Faulty, patience=5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NonFiniteWarning)
+        train(model, STEPS, At([1], better), guard)
+    assert "a cost or an observation that is no finite number" in guard.decisions[0].reason
+    assert guard.decisions[0].restored

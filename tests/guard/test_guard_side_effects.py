@@ -30,7 +30,7 @@ from guard_samples import (
     verdicts,
 )
 from sb3_yann import ImprovementGuard
-from sb3_yann.guard.statistics import Paired
+from sb3_yann.guard.statistics import PairedEpisodes
 from weights import is_mpc
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -56,7 +56,7 @@ def after_training(algorithm, *guards: ImprovementGuard, **kwargs):
 def test_a_run_whose_candidates_are_all_accepted_is_the_run_without_a_guard(
     algorithm, env, monkeypatch
 ) -> None:
-    monkeypatch.setattr(Paired, "objection", lambda *_: "")
+    monkeypatch.setattr(PairedEpisodes, "objection", lambda *_: "")
     guard = make_guard(Slide() if env == "an instance" else env)
     free, expected = after_training(algorithm)
     model, state = after_training(algorithm, guard)
@@ -69,9 +69,9 @@ def test_a_run_whose_candidates_are_all_accepted_is_the_run_without_a_guard(
 def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
     algorithm, monkeypatch
 ) -> None:
-    monkeypatch.setattr(Paired, "objection", lambda *_: "no")
+    monkeypatch.setattr(PairedEpisodes, "objection", lambda *_: "no")
     free, expected = after_training(algorithm)
-    model, state = after_training(algorithm, guard := make_guard(patience=1000, wander=True))
+    model, state = after_training(algorithm, guard := make_guard(patience=1000, keep_if_worse=True))
     assert set(verdicts(guard)) == {"rejected"}
     assert state == expected
     assert is_mpc(model)
@@ -82,7 +82,7 @@ def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
 def test_a_guard_that_rejects_everything_leaves_the_mpc_while_the_critic_learns(
     algorithm, monkeypatch
 ) -> None:
-    monkeypatch.setattr(Paired, "objection", lambda *_: "no")
+    monkeypatch.setattr(PairedEpisodes, "objection", lambda *_: "no")
     fresh = build(algorithm)
     seen: list[bool] = []
     look = At(range(STEPS, 9 * STEPS, STEPS), lambda p: seen.append(is_mpc(p)))
@@ -106,7 +106,8 @@ def test_a_check_moves_no_random_state_and_not_the_training_env(monkeypatch) -> 
         checks.append(before == after)
 
     for name in ("start", "first_evidence", "step", "end"):
-        monkeypatch.setattr(guard.trials, name, partial(unchanged, getattr(guard.trials, name)))
+        method = getattr(guard.acceptance, name)
+        monkeypatch.setattr(guard.acceptance, name, partial(unchanged, method))
     randomize(model.policy)  # the MPC takes its place: that builds an actor
     train(model, 3 * STEPS, guard, At([STEPS], better))
     assert "rejected" in verdicts(guard)

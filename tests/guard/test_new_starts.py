@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from guard_samples import (
+    FIRST,
     LEFT,
     REGION,
     RIGHT,
@@ -25,8 +26,7 @@ from guard_samples import (
 )
 from weights import is_mpc, last_layer
 
-FIRST = 1_000_000
-"""The first of the guard's own seeds."""
+WHOLE = {"by_region": False}
 
 
 class OftenRight(Slide):
@@ -58,7 +58,7 @@ def spoil_left(policy) -> None:
 
 
 def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_lose() -> None:
-    model, guard = build(gradient_steps=0), make_guard(OftenRight, fresh=20)
+    model, guard = build(gradient_steps=0), make_guard(OftenRight, n_new_starts=20)
     train(model, STEPS, At([STEPS], spoil_left), guard)
     decision = guard.decisions[0]
     assert decision.verdict == "accepted in part"
@@ -72,7 +72,7 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
 
 
 def test_without_new_starts_it_passes() -> None:
-    model, guard = build(gradient_steps=0), make_guard(OftenRight, fresh=0)
+    model, guard = build(gradient_steps=0), make_guard(OftenRight, n_new_starts=0)
     train(model, STEPS, At([STEPS], spoil_left), guard)
     assert [each.verdict for each in guard.decisions] == ["accepted"]
     assert guard.state.evidence.seeds == tuple(range(FIRST, FIRST + 10))
@@ -81,38 +81,38 @@ def test_without_new_starts_it_passes() -> None:
 @pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
 def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, seeds) -> None:
     model = build(gradient_steps=0)
-    guard = make_guard(OftenRight, fresh=0, final=final, by_region=False)
+    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=final, rule=WHOLE)
     train(model, STEPS, At([STEPS], spoil_left), guard)
-    assert guard.state.fresh == seeds
+    assert guard.state.new_starts == seeds
     assert is_mpc(model) == (final is not None)
     if final is not None:
         assert guard.decisions[-1].reason.startswith("at the end, 10 of 30 new starts lose")
 
 
-def test_without_by_region_the_whole_of_it_is_put_back() -> None:
-    model, guard = build(gradient_steps=0), make_guard(OftenRight, fresh=20, by_region=False)
+def test_without_by_region_the_whole_of_it_is_refused() -> None:
+    model, guard = build(gradient_steps=0), make_guard(OftenRight, n_new_starts=20, rule=WHOLE)
     before = actor_bits(model.policy)
     train(model, STEPS, At([STEPS], spoil_left), guard)
     (decision,) = guard.decisions
-    assert (decision.verdict, decision.returned) == ("rejected", True)
+    assert (decision.verdict, decision.restored) == ("rejected", True)
     assert actor_bits(model.policy) == accepted_bits(guard) == before
 
 
 def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> None:
     simulator = partial(OftenRight, after=FIRST + 10)
-    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=20, by_region=False)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
     again = At([2 * STEPS], spoil_left)
     train(model, 2 * STEPS, At([STEPS], spoil_left), again, guard)
     first, second = guard.decisions[:2]
     assert "new starts" in first.reason
     assert "new starts" not in second.reason and "costs" in second.reason
-    assert guard.state.fresh == 20  # the second was refused before any other start was asked
+    assert guard.state.new_starts == 20  # the second was refused before any other start was asked
 
 
 def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() -> None:
     # The first twenty new starts show the right only: all of it is accepted.
     simulator = partial(OftenRight, after=FIRST + 30)
-    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=20, by_region=False)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
 
     def a_little_better(policy) -> None:
         correct(policy, RIGHT, 0.4)
@@ -134,7 +134,7 @@ def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() 
 
 def test_of_what_was_accepted_before_the_regions_that_do_not_lose_are_kept() -> None:
     simulator = partial(OftenRight, after=FIRST + 30)
-    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=20)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20)
     second = At([2 * STEPS], lambda policy: correct(policy, RIGHT, 0.1))  # would be no better
     train(model, 2 * STEPS, At([STEPS], spoil_left), second, guard)
     weights = last_layer(model)[:, 0, -1]
@@ -152,16 +152,16 @@ def test_violations_on_new_starts_are_refused_though_they_cost_less() -> None:
             return observation, reward, terminated, truncated, {"violation": violation}
 
     model = build(gradient_steps=0)
-    guard = make_guard(Brittle, fresh=20, by_region=False, patience=5)
+    guard = make_guard(Brittle, n_new_starts=20, rule=WHOLE, patience=5)
     train(model, STEPS, At([STEPS], lambda policy: correct(policy, LEFT, -0.5)), guard)
     (decision,) = guard.decisions
-    assert "violates a limit" in decision.reason and decision.returned
+    assert "violates a limit" in decision.reason and decision.restored
 
 
 def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
     # Only the very last of them shows the left.
     simulator = partial(OftenRight, left_of=1, after=FIRST + 10 + 20 + 199)
-    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=20)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20)
     train(model, STEPS, At([STEPS], spoil_left), guard)
     whole, end = guard.decisions
     assert whole.verdict == "accepted"
@@ -179,18 +179,18 @@ def test_new_starts_are_others_each_time_and_after_a_load(tmp_path) -> None:
             seen.append(seed)
             return super().reset(seed=seed, options=options)
 
-    model, guard = build(gradient_steps=0), make_guard(Counting, fresh=5)
+    model, guard = build(gradient_steps=0), make_guard(Counting, n_new_starts=5)
     train(model, STEPS, At([STEPS], better), guard)
     new = {seed for seed in seen if seed is not None and seed >= FIRST + 10}
     assert new == set(range(FIRST + 10, FIRST + 10 + 5 + 50))
-    assert guard.state.fresh == 55
+    assert guard.state.new_starts == 55
     model.save(tmp_path / "model")
     loaded = type(model).load(tmp_path / "model", env=Slide())
-    assert loaded.guard_state.fresh == 55
+    assert loaded.guard_state.new_starts == 55
 
 
 def test_the_mpc_itself_is_not_tried() -> None:
     env = gym.make("Slide-v0")
-    model, guard = build(gradient_steps=0), make_guard(env.unwrapped, fresh=20)
+    model, guard = build(gradient_steps=0), make_guard(env.unwrapped, n_new_starts=20)
     train(model, 2 * STEPS, guard)
-    assert guard.state.fresh == 0
+    assert guard.state.new_starts == 0

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from guard_samples import (
+    BLOCK,
     MPC,
     REGION,
     RIGHT,
@@ -28,27 +29,17 @@ from guard_samples import (
     build,
     correct,
     critic_bits,
-    make_guard,
+    guard_alone,
     overwrite,
+    plant,
     random_states,
     randomize,
+    still,
     train,
     verdicts,
 )
 from sb3_yann.guard.plant_acceptance import predicted_cost
 from weights import last_layer
-
-BLOCK = 3 * STEPS
-# One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
-plant = partial(Slide, low=2.0, high=2.8)
-
-
-def guard_alone(**kwargs):
-    return make_guard(None, **({"trial_episodes": 3} | kwargs))
-
-
-def still(**kwargs):
-    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
 
 
 class Phases(At):
@@ -135,7 +126,7 @@ def test_a_violation_brings_the_accepted_policy_back_at_once(where) -> None:
     (decision,) = guard.decisions
     assert decision.timestep == step
     assert decision.reason == "a limit was violated"
-    assert decision.returned
+    assert decision.restored
     assert np.isnan(decision.candidate_cost)
     assert guard.state.evidence.phase == "learning"
 

@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.noise import NormalActionNoise
 
 from guard_samples import (
+    BLOCK,
     REGION,
     RIGHT,
     STEPS,
@@ -19,24 +20,15 @@ from guard_samples import (
     actor_bits,
     build,
     correct,
+    guard_alone,
     make_guard,
     overwrite,
+    still,
     train,
     verdicts,
 )
-from sb3_yann import NoActionNoise
-from weights import last_layer
-
-BLOCK = 3 * STEPS
-plant = partial(Slide, low=2.0, high=2.8)
-
-
-def guard_alone(**kwargs):
-    return make_guard(None, **({"trial_episodes": 3} | kwargs))
-
-
-def still(**kwargs):
-    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
+from sb3_yann import NoActionNoise, NonFiniteWarning
+from weights import is_mpc, last_layer
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
@@ -99,7 +91,10 @@ def test_a_cost_of_the_first_block_that_is_no_number_is_an_error() -> None:
             observation, _, *rest = super().step(action)
             return observation, np.nan, *rest
 
-    with pytest.raises(ValueError, match=r"first block cost .*Rewards must be finite numbers"):
+    with (
+        pytest.warns(NonFiniteWarning, match="reward"),
+        pytest.raises(ValueError, match=r"first block cost .*Rewards must be finite numbers"),
+    ):
         train(still(env=Faulty()), BLOCK, guard_alone())
 
 
@@ -140,3 +135,45 @@ def test_what_an_earlier_guard_accepted_is_what_a_plant_alone_begins_with() -> N
     assert guard.decisions[-1].reason.startswith("before training, ")
     weight = last_layer(model)[REGION[RIGHT], 0, -1]
     assert float(weight.detach()) == pytest.approx(0.4)
+
+
+def test_an_actor_that_diverges_at_every_step_is_one_decision_in_each_episode(tmp_path) -> None:
+    model, guard = still(), guard_alone(log_path=tmp_path / "guard.csv")
+    train(model, 4 * STEPS, guard, At(range(1, 99), partial(overwrite, value=np.nan)))
+    assert len(guard.decisions) == 4
+    assert len((tmp_path / "guard.csv").read_text().splitlines()) == 1 + 4
+    assert actor_bits(model.policy) == accepted_bits(guard)
+
+
+def test_a_policy_that_diverged_before_training_gives_way_to_the_mpc_once() -> None:
+    model, guard = still(), guard_alone()
+    overwrite(model.policy, np.nan)
+    train(model, BLOCK, guard)
+    assert [each.reason for each in guard.decisions] == ["before training, it is not accepted"]
+    assert is_mpc(model)
+
+
+def test_one_episode_whose_cost_is_not_known_is_left_out_of_the_first_block() -> None:
+    class Faulty(Slide):
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            return observation, np.nan if self.played == 2 else reward, *rest
+
+    model, guard = still(env=Faulty(low=2.0, high=2.8)), guard_alone()
+    with pytest.warns(NonFiniteWarning, match=r"Step 2: reward\[0\] of env 0 is nan"):
+        train(model, 4 * STEPS, guard)
+    np.testing.assert_allclose(guard.state.evidence.accepted.costs, 4.25)
+
+
+def test_one_reward_that_is_not_finite_lets_the_guard_alone_go_on_learning(tmp_path) -> None:
+    class Faulty(Slide):
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            return observation, np.nan if self.played == 100 else reward, *rest
+
+    model = build(env=Faulty(low=2.0, high=2.8))
+    guard = guard_alone(log_path=tmp_path / "guard.csv")
+    with pytest.warns(NonFiniteWarning, match="Step 100"):
+        train(model, 450, guard)
+    assert all(bool(each.isfinite().all()) for each in model.policy.parameters())
+    assert len(guard.decisions) < 450 / BLOCK

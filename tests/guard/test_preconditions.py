@@ -12,7 +12,7 @@ from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import DDPG
 
 from guard_samples import STEPS, Slide, build, make_guard, train
-from sb3_yann import ImprovementGuard
+from sb3_yann import AcceptanceRule, ImprovementGuard, StepSize
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"env": 3}, TypeError, "env = 3 must be the id of an environment"),
@@ -21,22 +21,26 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"n_starts": 2.5}, ValueError, "n_starts = 2.5 must be a whole number"),
     ({"n_starts": True}, ValueError, "n_starts = True must be a whole number"),
     ({"seed": -1}, ValueError, "seed = -1 must be a whole number of at least 0"),
-    ({"final": -1}, ValueError, "final = -1 must be a whole number of at least 0"),
-    ({"final": True}, ValueError, "final = True must be a whole number"),
-    ({"every": 0}, ValueError, "every = 0 must be"),
-    ({"every": None}, ValueError, "every = None must be"),
+    ({"n_new_starts": -1}, ValueError, "n_new_starts = -1 must be a whole number of at least 0"),
+    ({"n_final_starts": -1}, ValueError, "n_final_starts = -1 must be a whole number of at least"),
+    ({"n_final_starts": True}, ValueError, "n_final_starts = True must be a whole number"),
+    ({"eval_every": 0}, ValueError, "eval_every = 0 must be"),
+    ({"eval_every": None}, ValueError, "eval_every = None must be"),
     ({"patience": 0}, ValueError, "patience = 0 must be"),
-    ({"trial_episodes": 2}, ValueError, "trial_episodes = 2 must be a whole number of at least 3"),
-    ({"margin": -0.1}, ValueError, "margin = -0.1 must be"),
-    ({"margin": np.nan}, ValueError, "margin = nan must be"),
-    ({"margin": "1 %"}, TypeError, "margin = '1 %' must be a number"),
-    ({"shrink": 1.5}, ValueError, "shrink = 1.5 must be between 0 and 1"),
-    ({"grow": 0.9}, ValueError, "grow = 0.9 must be between 1 and inf"),
-    ({"grow": np.inf}, ValueError, "grow = inf must be"),
-    ({"smallest_step": 2}, ValueError, "smallest_step = 2 must be between 0 and 1"),
-    ({"significance": 0.6}, ValueError, "significance = 0.6 must be between 0 and 0.5"),
-    ({"wander": 1}, TypeError, "wander = 1 must be True or False"),
-    ({"by_region": "no"}, TypeError, "by_region = 'no' must be True or False"),
+    ({"keep_if_worse": 1}, TypeError, "keep_if_worse = 1 must be True or False"),
+    ({"rule": {"trial_episodes": 2}}, ValueError, "trial_episodes = 2 must be a whole number of"),
+    ({"rule": {"margin": -0.1}}, ValueError, "margin = -0.1 must be"),
+    ({"rule": {"margin": np.nan}}, ValueError, "margin = nan must be"),
+    ({"rule": {"margin": "1 %"}}, TypeError, "margin = '1 %' must be a number"),
+    ({"rule": {"significance": 0.6}}, ValueError, "significance = 0.6 must be between 0 and 0.5"),
+    ({"rule": {"by_region": "no"}}, TypeError, "by_region = 'no' must be True or False"),
+    ({"rule": 0.01}, TypeError, r"rule = 0.01 must be AcceptanceRule\(\.\.\.\), or a m"),
+    ({"rule": {"fresh": 3}}, TypeError, r"rule = \{'fresh': 3\} must be .*'margin', 'by_region'"),
+    ({"rule": StepSize()}, TypeError, "rule = StepSize.* must be"),
+    ({"step_size": {"shrink": 1.5}}, ValueError, "shrink = 1.5 must be between 0 and 1"),
+    ({"step_size": {"grow": 0.9}}, ValueError, "grow = 0.9 must be a finite number of at least 1"),
+    ({"step_size": {"grow": np.inf}}, ValueError, "grow = inf must be"),
+    ({"step_size": {"smallest": 2}}, ValueError, "smallest = 2 must be between 0 and 1"),
 ]
 
 
@@ -44,6 +48,13 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
 def test_a_bad_argument_is_named_with_its_value(arguments, error, message) -> None:
     with pytest.raises(error, match=message):
         ImprovementGuard(**{"env": None, **arguments})
+
+
+def test_options_are_the_same_from_a_mapping_as_yaml_has_it() -> None:
+    one = ImprovementGuard(Slide, rule={"margin": 0.5}, step_size={"grow": 2.0})
+    other = ImprovementGuard(Slide, rule=AcceptanceRule(margin=0.5), step_size=StepSize(grow=2.0))
+    assert one.acceptance == other.acceptance
+    assert one.step_size == other.step_size
 
 
 def test_an_id_alone_is_enough() -> None:

@@ -59,7 +59,7 @@ def rows(checkpoint: ActorCheckpoint, region: int) -> list[object]:
 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorithm) -> None:
-    model, guard = build(algorithm), make_guard(margin=0.03)
+    model, guard = build(algorithm), make_guard(rule={"margin": 0.03})
     checkpoints: dict[str, ActorCheckpoint] = {}
 
     def change(policy) -> None:
@@ -90,7 +90,7 @@ def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
     model, guard = build(gradient_steps=0), make_guard()
     train(model, STEPS, At([STEPS], half_good), guard)
     assert guard.decisions[0].regions == (REGION[RIGHT],)
-    played = evaluate(model, Slide, guard.trials.seeds)
+    played = evaluate(model, Slide, guard.acceptance.seeds)
     np.testing.assert_allclose(guard.state.evidence.paired.costs, played.costs, atol=1e-5)
     assert guard.decisions[0].accepted_cost == pytest.approx(played.costs.mean())
     assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
@@ -104,7 +104,7 @@ def test_only_the_starts_that_come_through_a_region_are_played_again(
 ) -> None:
     monkeypatch.setattr(guard_regions, "MOST_LOST", most_lost)
     simulator = Slide()
-    model, guard = build(gradient_steps=0), make_guard(simulator, fresh=0)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=0)
     count: list[int] = []
     before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
     train(model, STEPS, At([STEPS], half_good), before, guard, after)
@@ -132,7 +132,7 @@ def test_a_region_that_no_start_comes_through_is_never_taken_over() -> None:
 
 
 def test_without_by_region_the_whole_returns() -> None:
-    model, guard = build(gradient_steps=0), make_guard(by_region=False)
+    model, guard = build(gradient_steps=0), make_guard(rule={"by_region": False})
     train(model, STEPS, At([STEPS], half_good), guard)
     assert verdicts(guard) == ["rejected"]
     assert guard.decisions[0].regions == ()
@@ -149,7 +149,7 @@ def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
 
 
 def test_regions_may_be_taken_over_while_patience_lasts() -> None:
-    model, guard = build(gradient_steps=0), make_guard(patience=2, wander=True)
+    model, guard = build(gradient_steps=0), make_guard(patience=2, keep_if_worse=True)
     seen: list[bytes] = []
     before, after = (
         At([STEPS], lambda policy: seen.append(bits(policy.actor.state_dict()))) for _ in range(2)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import DDPG
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.callbacks import CheckpointCallback
 
 from guard_samples import At, Slide, accepted_bits, actor_bits, better, build, make_guard, train
 from sb3_yann import restore_accepted
@@ -55,10 +55,8 @@ class Endless(Slide):
 
 
 def test_a_policy_whose_episodes_are_terminated_is_refused_however_cheap_they_are() -> None:
-    model, guard = (
-        build(learning_rate=0.0),
-        make_guard(lambda: gym.wrappers.TimeLimit(CutShort(), 4)),
-    )
+    model = build(learning_rate=0.0)
+    guard = make_guard(lambda: gym.wrappers.TimeLimit(CutShort(), 4))
     train(model, 8, At([2], better), guard)
     assert guard.decisions[0].verdict == "rejected"
     assert "an episode that the env terminates" in guard.decisions[0].reason
@@ -99,17 +97,14 @@ def test_an_episode_that_never_ends_is_reported(monkeypatch) -> None:
         train(build(), 4, make_guard(Endless))
 
 
-class Stop(BaseCallback):
-    def _on_step(self) -> bool:
-        if self.n_calls == 6:
-            raise KeyboardInterrupt
-        return True
+def stop(_) -> None:
+    raise KeyboardInterrupt
 
 
 def test_after_an_interruption_the_accepted_policy_can_be_had() -> None:
-    model, guard = build(learning_rate=0.0), make_guard(every=100)
+    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
     with pytest.raises(KeyboardInterrupt):
-        train(model, 20, At([5], better), guard, Stop())
+        train(model, 20, At([5], better), guard, At([6], stop))
     assert actor_bits(model.policy) != accepted_bits(guard)
     restore_accepted(model)
     assert actor_bits(model.policy) == accepted_bits(guard)
@@ -117,7 +112,7 @@ def test_after_an_interruption_the_accepted_policy_can_be_had() -> None:
 
 
 def test_the_accepted_policy_can_be_had_from_a_checkpoint(tmp_path) -> None:
-    model, guard = build(learning_rate=0.0), make_guard(every=100)
+    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
     train(model, 6, At([5], better), guard, CheckpointCallback(5, str(tmp_path), "run"))
     loaded = DDPG.load(tmp_path / "run_5_steps", device="cpu")
     assert not is_mpc(loaded)

@@ -60,7 +60,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
     path = tmp_path / "new" / "guard.csv"
-    guard = make_guard(record=str(path))
+    guard = make_guard(log_path=str(path))
     three_decisions(guard)
     written = rows(path)
     assert [*written[0]] == NAMES
@@ -69,7 +69,7 @@ def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
     assert [row["episode"] for row in written] == ["1", "2", "3"]
     assert [row["timestep"] for row in written] == ["4", "8", "12"]
     assert [row["regions"] for row in written] == [str(REGION[RIGHT]), "", ""]
-    assert [row["returned"] for row in written] == ["True", "True", "False"]
+    assert [row["restored"] for row in written] == ["True", "True", "False"]
     assert "not a finite number" in written[1]["reason"]
     for row, decision in zip(written, guard.decisions, strict=True):
         for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
@@ -78,7 +78,7 @@ def test_the_record_has_a_row_for_each_decision(tmp_path) -> None:
 
 def test_the_record_is_up_to_date_after_each_decision(tmp_path) -> None:
     path = tmp_path / "guard.csv"
-    guard, lengths = make_guard(record=path), []
+    guard, lengths = make_guard(log_path=path), []
     look = At([STEPS, 2 * STEPS, 3 * STEPS], lambda _: lengths.append(len(rows(path))))
     three_decisions(guard, look)
     assert lengths == [1, 2, 3]
@@ -87,7 +87,7 @@ def test_the_record_is_up_to_date_after_each_decision(tmp_path) -> None:
 
 def test_a_record_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch) -> None:
     path = tmp_path / "guard.csv"
-    guard = make_guard(record=path)
+    guard = make_guard(log_path=path)
     three_decisions(guard)
     before = path.read_bytes()
 
@@ -136,7 +136,7 @@ def test_verbose_prints_a_line_for_each_decision_and_silence_is_the_default(caps
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 @pytest.mark.parametrize("place", ["before the guard", "after the guard"])
 def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place, tmp_path) -> None:
-    model, guard = build(algorithm), make_guard(record=tmp_path / "guard.csv")
+    model, guard = build(algorithm), make_guard(log_path=tmp_path / "guard.csv")
     stop = 4 * STEPS
     save = CheckpointCallback(stop, str(tmp_path), "model")
     kept: list[object] = []
@@ -155,9 +155,9 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place,
     assert "rejected" in [each.verdict for each in decisions]
 
     loaded = algorithm.load(tmp_path / f"model_{stop}_steps", env=Slide(), device="cpu")
-    again = make_guard(record=tmp_path / "guard.csv", n_starts=10)
+    again = make_guard(log_path=tmp_path / "guard.csv", n_starts=10)
     seen: list[object] = []
-    again.trials.first_evidence = lambda _: seen.append("afresh")  # type: ignore[method-assign]
+    again.acceptance.first_evidence = lambda _: seen.append("afresh")  # type: ignore[method-assign]
     look = At(
         [1], lambda p: seen.extend([accepted_bits(again), p.actor_step, again.state.episodes])
     )
@@ -172,7 +172,8 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place,
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "change", [{"n_starts": 4}, {"seed": 7}, {"margin": 0.5}, {"env": "Slide-v0"}, {"env": None}]
+    "change",
+    [{"n_starts": 4}, {"seed": 7}, {"rule": {"margin": 0.5}}, {"env": "Slide-v0"}, {"env": None}],
 )
 def test_with_other_settings_the_guard_starts_afresh(change) -> None:
     first, second = make_guard(), make_guard(**change)
@@ -187,16 +188,17 @@ def test_with_other_settings_the_guard_starts_afresh(change) -> None:
 
 def test_what_does_not_concern_the_evidence_may_change_in_between() -> None:
     model = three_decisions(make_guard())
-    second = make_guard(every=2, patience=2, by_region=False, shrink=0.9, record=None)
+    others = {"rule": {"by_region": False}, "step_size": {"shrink": 0.9}, "log_path": None}
+    second = make_guard(eval_every=2, patience=2, **others)
     train(model, 1, second)
     assert len(second.decisions) == 3
 
 
 def test_a_simulator_made_by_a_partial_is_known_again_in_another_process() -> None:
     one, other = (make_guard(partial(partial(Slide, low=0.0), high=2.0)) for _ in range(2))
-    assert one.trials.settings == other.trials.settings
-    assert "0x" not in str(one.trials.settings)
-    assert one.trials.settings != make_guard(partial(Slide, low=0.5)).trials.settings
+    assert one.acceptance.settings == other.acceptance.settings
+    assert "0x" not in str(one.acceptance.settings)
+    assert one.acceptance.settings != make_guard(partial(Slide, low=0.5)).acceptance.settings
 
 
 def test_a_second_learn_goes_on_and_the_step_is_the_one_decided_last() -> None:
@@ -209,11 +211,11 @@ def test_a_second_learn_goes_on_and_the_step_is_the_one_decided_last() -> None:
 
 
 def test_one_guard_may_serve_two_models_one_after_the_other() -> None:
-    guard = make_guard(patience=2, wander=True)
+    guard = make_guard(patience=2, keep_if_worse=True)
     for _ in range(2):
         three_decisions(guard)
         assert verdicts(guard) == ["accepted in part", "rejected", "accepted"]
-        assert [each.returned for each in guard.decisions] == [False, True, False]
+        assert [each.restored for each in guard.decisions] == [False, True, False]
 
 
 def test_a_saved_model_holds_the_guard_s_state_in_main_memory(tmp_path) -> None:

@@ -8,11 +8,16 @@ from scipy import stats
 
 from sb3_yann.guard.statistics import (
     OUTLIER,
-    Paired,
+    PairedEpisodes,
     PlantEpisodes,
+    analyze_covariance,
     excess_of_an_outlier,
-    probability_of_chance,
 )
+
+
+def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
+    return analyze_covariance(candidate, accepted)[1]
+
 
 NONE = np.zeros((3, 2), dtype=np.int64)
 NAN, INF = np.nan, np.inf
@@ -20,7 +25,7 @@ NAN, INF = np.nan, np.inf
 
 def objection(costs, violations=NONE, accepted=(10.0, 20.0, 30.0), margin=1.0) -> str:
     mpc = np.array([10.0, 20.0, 30.0])
-    return Paired(mpc, np.array(accepted), NONE, margin).objection(
+    return PairedEpisodes(mpc, np.array(accepted), NONE, margin).objection(
         np.array(costs, float), violations
     )
 
@@ -59,7 +64,7 @@ def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_co
 
     message = "1 starts with violations, the first is number 2"
     assert message in objection([1, 1, 1], violations(0, 0, 1))
-    paired = Paired(np.ones(3), np.ones(3), violations(0, 2, 0), 1.0)
+    paired = PairedEpisodes(np.ones(3), np.ones(3), violations(0, 2, 0), 1.0)
     assert paired.objection(np.ones(3), violations(0, 2, 0)) == ""
     assert paired.objection(np.ones(3), violations(0, 1, 0)) == ""
     assert "violations" in paired.objection(np.zeros(3), violations(0, 3, 0))
@@ -68,7 +73,7 @@ def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_co
 
 def test_an_episode_that_is_terminated_is_refused_though_it_has_fewer_violations() -> None:
     accepted = np.array([[2, 0], [0, 1]])
-    paired = Paired(np.ones(2), np.ones(2), accepted, 1.0)
+    paired = PairedEpisodes(np.ones(2), np.ones(2), accepted, 1.0)
     assert "the env terminates" in paired.objection(np.zeros(2), np.array([[1, 1], [0, 1]]))
     assert paired.objection(np.zeros(2), accepted) == ""
     assert "violations" in paired.objection(np.zeros(2), np.array([[2, 0], [1, 0]]))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
-from sb3_yann.networks import AfterstateValue, LinearPrediction, QuadraticStateActionValue
+from sb3_yann.networks import AfterstateValue, LinearPrediction, QuadraticStateActionValue, Ranges
 from sb3_yann.networks.value import PredictionModel
 from weights import first_layer, last_layer
 
@@ -28,10 +28,9 @@ def seeded() -> Iterator[None]:
         yield
 
 
-def common(name: str) -> dict[str, Any]:
+def ranges(name: str) -> Ranges:
     mpc = solved(name)
-    half = (mpc.theta_max - mpc.theta_min) / 2
-    return {"theta_half": half, "u_min": mpc.u_min, "u_max": mpc.u_max}
+    return Ranges((mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max)
 
 
 def critic(
@@ -43,7 +42,7 @@ def critic(
         mpc.value_matrix(gamma),
         model or LinearPrediction(mpc.model.A, mpc.model.B),
         gamma,
-        **common(name),
+        ranges(name),
         **changes,
     )
 
@@ -80,7 +79,7 @@ def test_value_is_that_of_the_papers_critic_to_the_rounding_of_float32(
     name: str, gamma: float
 ) -> None:
     rows = random_rows(name, 2000)
-    papers = QuadraticStateActionValue(solved(name).state_action_matrix(gamma), **common(name))
+    papers = QuadraticStateActionValue(solved(name).state_action_matrix(gamma), ranges(name))
     with th.no_grad():
         got, expected = critic(name, gamma)(rows), papers(rows)
     assert got.shape == (2000, 1)

@@ -9,7 +9,13 @@ import pytest
 import torch as th
 
 from sample_laws import box_points, law_of
-from sb3_yann.networks import AfterstateValue, LinearPrediction, YannLayer, ZeroOutputNetwork
+from sb3_yann.networks import (
+    AfterstateValue,
+    LinearPrediction,
+    Ranges,
+    YannLayer,
+    ZeroOutputNetwork,
+)
 from sb3_yann.networks._kernels.mlp import tanh
 from sb3_yann_envs import problems
 from weights import later_layers, network_of
@@ -120,7 +126,7 @@ def test_a_theta_that_is_not_finite_gives_nan_and_spoils_no_other_row() -> None:
     assert th.equal(actions[rest], expected[rest])
 
 
-def test_weights_that_change_before_the_way_back_are_noticed() -> None:
+def test_weights_that_change_before_the_backward_pass_are_noticed() -> None:
     layer = YannLayer(law_of("reactor"))
     actions = layer(box_points(law_of("reactor"), 10))
     shaken(layer, 0.1)
@@ -158,10 +164,9 @@ def test_tanh_is_exact_to_two_units_in_the_last_place_odd_and_bounded() -> None:
 
 def value(pinned: bool, hidden=(64, 64), gamma: float = 0.99) -> AfterstateValue:
     mpc = problems.cstr()
-    return AfterstateValue(
-        mpc.stage_matrix, mpc.value_matrix(gamma), LinearPrediction(*mpc.prediction), gamma,
-        (mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max, hidden, pinned=pinned,
-    )  # fmt: skip
+    ranges = Ranges((mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max)
+    matrices, model = (mpc.stage_matrix, mpc.value_matrix(gamma)), LinearPrediction(*mpc.prediction)
+    return AfterstateValue(*matrices, model, gamma, ranges, hidden, pinned=pinned)
 
 
 @pytest.mark.parametrize("pinned", [True, False])
@@ -301,7 +306,8 @@ def test_weights_that_are_lent_for_a_call_are_used(name: str) -> None:
 def test_matrices_may_come_in_any_order_of_memory() -> None:
     mpc = problems.cstr()
     given = mpc.stage_matrix, mpc.value_matrix(0.99)
-    rest = LinearPrediction(*mpc.prediction), 0.99, mpc.theta_max, mpc.u_min, mpc.u_max
+    ranges = Ranges(mpc.theta_max, mpc.u_min, mpc.u_max)
+    rest = LinearPrediction(*mpc.prediction), 0.99, ranges
     found = [
         AfterstateValue(*map(order, given), *rest)(th.ones(2, 5))
         for order in (np.ascontiguousarray, np.asfortranarray)

@@ -11,7 +11,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
-from sb3_yann.networks import QuadraticStateActionValue, YannLayer
+from sb3_yann.networks import QuadraticStateActionValue, Ranges, YannLayer
 from weights import network_of
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
@@ -27,8 +27,8 @@ def seeded() -> Iterator[None]:
 
 def critic(name: str, gamma: float = 0.99) -> QuadraticStateActionValue:
     mpc = solved(name)
-    half = (mpc.theta_max - mpc.theta_min) / 2
-    return QuadraticStateActionValue(mpc.state_action_matrix(gamma), half, mpc.u_min, mpc.u_max)
+    ranges = Ranges((mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max)
+    return QuadraticStateActionValue(mpc.state_action_matrix(gamma), ranges)
 
 
 def random_rows(name: str, count: int) -> th.Tensor:
@@ -118,7 +118,7 @@ def test_matrix_with_a_zero_on_the_diagonal_is_kept() -> None:
     # A state that neither costs nor acts has a row of zeros.
     M = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.5], [0.0, 0.5, 1.0]])
     one = np.ones(1)
-    value = QuadraticStateActionValue(M, np.ones(2), -one, one)
+    value = QuadraticStateActionValue(M, Ranges(np.ones(2), -one, one))
     np.testing.assert_allclose(value(th.tensor([[5.0, 1.0, 1.0]])).item(), -4.0)
 
 
@@ -227,3 +227,17 @@ def test_state_dict_brings_everything_back() -> None:
     assert not th.equal(other(rows), value(rows))
     other.load_state_dict(value.state_dict())
     assert th.equal(other(rows), value(rows))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((np.zeros(2), -np.ones(1), np.ones(1)), "theta_half"),
+        ((np.ones((2, 1)), -np.ones(1), np.ones(1)), "theta_half has shape"),
+        ((np.ones(2), np.ones(1), np.ones(1)), "u_min must lie below u_max"),
+        ((np.ones(2), -np.ones(1), np.ones(2)), "u_max has shape"),
+    ],
+)
+def test_ranges_that_scale_nothing_are_refused(given, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Ranges(*given)

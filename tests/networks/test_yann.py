@@ -171,7 +171,7 @@ def test_output_far_out_is_within_the_bounds_at_first(name: str, infeasible: str
 @pytest.mark.parametrize("limit", [0.0, 0.1, 1.0, 2.0])
 def test_clamp_alive_is_the_clamp(limit: float) -> None:
     x = th.cat([3 * th.randn(1000), th.tensor([-1.0, 1.0, th.inf, -th.inf, 0.0])])
-    assert th.equal(clamp_with_inward_gradient(x, limit), x.clamp(-limit, limit))
+    assert th.equal(clamp_with_inward_gradient(x, -limit, limit), x.clamp(-limit, limit))
 
 
 def test_clamp_alive_has_a_limit_of_one_by_default() -> None:
@@ -198,7 +198,7 @@ def test_clamp_alive_stops_only_what_would_push_further_out(
     # Descent moves x up where its gradient is negative.
     for gradient, passes in ((-0.7, passes_up), (0.7, passes_down)):
         leaf = th.tensor([limit * x], requires_grad=True)
-        clamp_with_inward_gradient(leaf, limit).backward(th.tensor([gradient]))
+        clamp_with_inward_gradient(leaf, -limit, limit).backward(th.tensor([gradient]))
         assert leaf.grad is not None
         assert leaf.grad.item() == pytest.approx(gradient if passes else 0.0)
 

@@ -61,8 +61,8 @@ def test_rates_are_kept_whatever_the_weights(
     box = mpc.theta_min, mpc.theta_max  # inside the domain and outside
     theta = rng.uniform(*box, (5000, mpc.n_theta)).astype(np.float32)
     moved = model.predict(theta)[0] - theta[:, mpc.layout.previous]
-    assert np.all((mpc.du_min <= moved) & (moved <= mpc.du_max))
-    assert np.max(moved / mpc.du_max) > 0.999  # and they are what holds it
+    assert np.all((mpc.rate.du_min <= moved) & (moved <= mpc.rate.du_max))
+    assert np.max(moved / mpc.rate.du_max) > 0.999  # and they are what holds it
 
 
 def test_an_output_at_the_limit_of_its_rate_learns_to_leave_it() -> None:
@@ -146,7 +146,9 @@ class LoadedPlant(gym.Env):
 
 def wrapped(mpc: LinearMPC, reference: float = 0.5) -> gym.Env:
     env = SetPoint(LoadedPlant(), [-1], [1], schedule=lambda step: [reference])
-    env = ObserveDisturbance(env, DisturbanceObserver(LOADED), mpc.d_min, mpc.d_max)
+    env = ObserveDisturbance(
+        env, DisturbanceObserver(LOADED), mpc.disturbances.d_min, mpc.disturbances.d_max
+    )
     return StageCost(PreviousInput(env), mpc)
 
 
@@ -183,10 +185,10 @@ def test_it_trains_and_loads(tmp_path: Path) -> None:
 def test_the_equilibrium_is_pinned_only_where_there_is_one(name: str, pinned: bool) -> None:
     mpc = solved(name)
     policy = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc}).policy
-    assert policy.actor_options["pin_equilibrium"] is pinned
+    assert policy.pin_equilibrium is pinned
     kwargs = {"problem": mpc, "pin_equilibrium": True}
     policy = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs=kwargs).policy
-    assert policy.actor_options["pin_equilibrium"] is True
+    assert policy.pin_equilibrium is True
 
 
 def test_the_guard_predicts_the_cost_of_a_start_with_its_reference() -> None:

@@ -1,4 +1,4 @@
-"""theta = T obs + t0: exact through SB3, saved with a model, refused where it is wrong."""
+"""Maps from observations to theta: exact through SB3, saved with a model, refused where wrong."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from sample_plants import LinearPlant
 from sb3_yann import (
     AffineObservation,
     ControlDiagnostics,
+    CriticOptions,
     ImprovementGuard,
     NoActionNoise,
     YannPolicy,
@@ -128,7 +129,7 @@ def test_the_map_of_gymnasium_s_rescaling_is_the_one_that_undoes_it() -> None:
 def test_sb3_s_own_critic_loss_is_zero_at_the_start(critic, reward) -> None:
     scale, offset = reward
     show, observation, size = SHOWN["normalized"]
-    kwargs = {"critic": critic, "reward_scale": scale, "reward_offset": offset}
+    kwargs = {"critic": CriticOptions(critic, reward_scale=scale, reward_offset=offset)}
     model = build(Seen(show, size), observation, policy_kwargs=kwargs)
     model.learn(1)  # sets up the logger
     model.replay_buffer.reset()
@@ -160,7 +161,7 @@ def test_sb3_s_own_critic_loss_is_zero_at_the_start(critic, reward) -> None:
 
 def test_both_of_td3_s_critics_are_in_units_of_the_reward() -> None:
     show, observation, size = SHOWN["absolute"]
-    kwargs = {"reward_scale": 2.0, "reward_offset": -1.0}
+    kwargs = {"critic": {"reward_scale": 2.0, "reward_offset": -1.0}}
     model = build(Seen(show, size), observation, TD3, policy_kwargs=kwargs)
     plain = build(Seen(show, size), observation, TD3)
     obs = th.as_tensor(show(states(50)).astype(np.float32))
@@ -175,12 +176,12 @@ def test_both_of_td3_s_critics_are_in_units_of_the_reward() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
-        ({"reward_scale": 0}, ValueError, "reward_scale = 0"),
-        ({"reward_scale": -1.0}, ValueError, r"reward_scale = -1\.0"),
-        ({"reward_scale": None}, TypeError, "reward_scale = None"),
-        ({"reward_offset": "a"}, TypeError, "reward_offset = 'a'"),
-        ({"reward_offset": np.inf}, ValueError, "reward_offset = inf"),
-        ({"reward_offset": 1.0, "gamma": 1.0}, ValueError, "a discount below 1"),
+        ({"critic": {"reward_scale": 0}}, ValueError, "reward_scale = 0"),
+        ({"critic": {"reward_scale": -1.0}}, ValueError, r"reward_scale = -1\.0"),
+        ({"critic": {"reward_scale": None}}, TypeError, "reward_scale = None"),
+        ({"critic": {"reward_offset": "a"}}, TypeError, "reward_offset = 'a'"),
+        ({"critic": {"reward_offset": np.inf}}, ValueError, "reward_offset = inf"),
+        ({"critic": {"reward_offset": 1.0}, "gamma": 1.0}, ValueError, "a discount below 1"),
     ],
 )
 def test_a_reward_that_means_nothing_is_named(kwargs, error, message) -> None:
@@ -193,7 +194,7 @@ def test_a_reward_that_means_nothing_is_named(kwargs, error, message) -> None:
 
 def test_a_map_is_part_of_what_is_saved(tmp_path) -> None:
     show, observation, size = SHOWN["normalized"]
-    kwargs = {"reward_scale": 2.0, "reward_offset": 3.0}
+    kwargs = {"critic": CriticOptions(reward_scale=2.0, reward_offset=3.0)}
     model = build(Seen(show, size), observation, policy_kwargs=kwargs)
     model.learn(50, callback=NoActionNoise())
     model.save(tmp_path / "model")
@@ -215,8 +216,8 @@ def test_maps_compare_by_value_and_stay_read_only_in_copies() -> None:
     for again in (copy.deepcopy(RANDOM), pickle.loads(pickle.dumps(RANDOM))):
         assert again == RANDOM
         assert hash(again) == hash(RANDOM)
-        assert not again.T.flags.writeable
-    assert AffineObservation(RANDOM.T) != RANDOM
+        assert not again.matrix.flags.writeable
+    assert AffineObservation(RANDOM.matrix) != RANDOM
     assert RANDOM != 3
     assert eval(repr(RANDOM)) == RANDOM
 
@@ -239,7 +240,7 @@ def test_maps_compose_like_functions() -> None:
     ("observation", "error", "message"),
     [
         (None, ValueError, r"observation has shape \(4,\).*takes theta of shape \(3,\)"),
-        (AffineObservation.identity(3), ValueError, r"T of shape \(3, 3\).*has shape \(4,\)"),
+        (AffineObservation.identity(3), ValueError, r"matrix of shape \(3, 3\).*has shape \(4,\)"),
         (AffineObservation.identity(4), ValueError, r"takes theta of shape \(3,\).*3 rows"),
         (np.eye(3, 4), TypeError, "must be an AffineObservation"),
     ],
@@ -252,10 +253,10 @@ def test_a_map_that_does_not_fit_is_named(observation, error, message) -> None:
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: AffineObservation([1, 2]), ValueError, r"T has shape \(2,\)"),
-        (lambda: AffineObservation([[1]], [1, 2]), ValueError, "t0 has shape"),
-        (lambda: AffineObservation([["a"]]), TypeError, "T = "),
-        (lambda: AffineObservation([[np.nan]]), ValueError, "T holds NaN"),
+        (lambda: AffineObservation([1, 2]), ValueError, r"matrix has shape \(2,\)"),
+        (lambda: AffineObservation([[1]], [1, 2]), ValueError, "offset has shape"),
+        (lambda: AffineObservation([["a"]]), TypeError, "matrix = "),
+        (lambda: AffineObservation([[np.nan]]), ValueError, "matrix holds NaN"),
         (lambda: AffineObservation.normalized([0], [0]), ValueError, "std"),
         (lambda: AffineObservation.normalized([0, 0], [1]), ValueError, "std has shape"),
         (lambda: AffineObservation.rescaled([1], [0]), ValueError, "must lie below"),

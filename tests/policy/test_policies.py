@@ -61,7 +61,7 @@ def test_the_policy_is_known_by_name(algorithm) -> None:
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 @pytest.mark.parametrize("discounted", [False, True], ids=["paper's MPC", "discounted MPC"])
 def test_sb3_s_own_critic_loss_is_zero_at_the_start(make, gamma, discounted, critic) -> None:
-    mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal_cost=None)
+    mpc = dataclasses.replace(make(), gamma=gamma if discounted else 1.0, terminal=None)
     kwargs = {"critic": critic}
     model = build(mpc=mpc, gamma=gamma, buffer_size=2000, seed=0, policy_kwargs=kwargs)
     model.learn(1)  # sets up the logger

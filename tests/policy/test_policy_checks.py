@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,12 +15,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from policy_samples import (
     actions,
+    build,
     make_policy,
     scalar_mpc,
     unbounded,
 )
 from sample_plants import LinearPlant
-from sb3_yann import LinearModel, LinearMPC, YannPolicy
+from sb3_yann import CriticOptions, LinearModel, LinearMPC, YannPolicy
 
 
 @pytest.mark.parametrize(
@@ -113,17 +116,8 @@ def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
         ({"activation_fn": th.nn.Sigmoid}, ValueError, "activation"),
         ({"critic": "quadratic"}, ValueError, "critic = 'quadratic'"),
         ({"critic": None}, ValueError, "critic = None"),
-        ({"prediction_model": 3}, TypeError, "prediction_model = 3"),
-        ({"prediction_model": "f", "critic": "state_action"}, TypeError, "prediction_model = 'f'"),
-        (
-            {"prediction_model": lambda theta, u: theta, "critic": "state_action"},
-            ValueError,
-            "prediction_model is for critic='afterstate'",
-        ),
-        ({"value_scale": 0}, ValueError, "value_scale = 0"),
-        ({"value_scale": -30.0}, ValueError, "value_scale = -30.0"),
-        ({"value_scale": float("nan")}, ValueError, "value_scale = nan"),
-        ({"value_scale": "big"}, TypeError, "value_scale = 'big'"),
+        ({"prediction_model": None}, TypeError, "'prediction_model'.*CriticOptions"),
+        ({"pin_equilibrium": 1}, TypeError, "pin_equilibrium = 1"),
         ({"critic_warmup": -1}, ValueError, "critic_warmup = -1"),
         ({"critic_warmup": 1.5}, ValueError, r"critic_warmup = 1\.5"),
         ({"critic_warmup": True}, ValueError, "critic_warmup = True"),
@@ -136,6 +130,40 @@ def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
 def test_policy_kwargs_that_mean_nothing_are_named(kwargs, error, message) -> None:
     with pytest.raises(error, match=message):
         make_policy(unbounded(), actions(), problem=scalar_mpc(), **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"kind": "quadratic"}, ValueError, "kind = 'quadratic'"),
+        ({"scale": 3}, TypeError, "critic has no 'scale'.*value_scale"),
+        ({"prediction_model": 3}, TypeError, "prediction_model = 3"),
+        ({"prediction_model": "f", "kind": "state_action"}, TypeError, "prediction_model = 'f'"),
+        (
+            {"prediction_model": lambda theta, u: theta, "kind": "state_action"},
+            ValueError,
+            "prediction_model is for kind='afterstate'",
+        ),
+        ({"value_scale": 0}, ValueError, "value_scale = 0"),
+        ({"value_scale": -30.0}, ValueError, "value_scale = -30.0"),
+        ({"value_scale": float("nan")}, ValueError, "value_scale = nan"),
+        ({"value_scale": "big"}, TypeError, "value_scale = 'big'"),
+    ],
+)
+def test_options_of_a_critic_that_mean_nothing_are_named(options, error, message) -> None:
+    with pytest.raises(error, match=message):
+        make_policy(unbounded(), actions(), problem=scalar_mpc(), critic=options)
+
+
+@pytest.mark.parametrize("critic", [{"reward_scale": 2.0}, CriticOptions(reward_scale=2.0)])
+def test_options_of_a_critic_compare_by_value_when_a_model_is_loaded(critic, tmp_path) -> None:
+    build(policy_kwargs={"critic": critic}).save(tmp_path / "model")
+    for changes in ({}, {"critic": copy.deepcopy(critic)}):
+        kwargs = {"problem": scalar_mpc(), "critic": critic, "n_critics": 1, **changes}
+        loaded = DDPG.load(tmp_path / "model", policy_kwargs=kwargs)
+        assert loaded.policy.critic_options == CriticOptions(reward_scale=2.0)
+    with pytest.raises(ValueError, match="policy kwargs"):
+        DDPG.load(tmp_path / "model", policy_kwargs={**kwargs, "critic": CriticOptions()})
 
 
 def test_a_net_arch_may_leave_out_or_join_actor_and_critic() -> None:

@@ -18,7 +18,7 @@ from policy_samples import (
     with_full_buffer,
 )
 from sample_plants import two_input_mpc
-from sb3_yann import LinearMPC, YannPolicy
+from sb3_yann import CriticOptions, LinearMPC, YannPolicy
 
 # --- max_correction ----------------------------------------------------------------------------
 
@@ -130,7 +130,9 @@ MODELS = pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModul
 def test_the_linear_model_given_as_prediction_model_changes_no_more_than_rounding(
     algorithm, make
 ) -> None:
-    mine = with_full_buffer(algorithm, two_inputs(), prediction_model=make(), critic_warmup=3)
+    mine = with_full_buffer(
+        algorithm, two_inputs(), critic={"prediction_model": make()}, critic_warmup=3
+    )
     default = with_full_buffer(algorithm, two_inputs(), critic_warmup=3)
     updates(default, 10)
     mine.critic.load_state_dict(default.critic.state_dict(), strict=False)
@@ -146,7 +148,7 @@ def test_the_linear_model_given_as_prediction_model_changes_no_more_than_roundin
 
 def test_a_module_that_predicts_is_not_trained() -> None:
     module = LinearModule()
-    model = with_full_buffer(mpc=two_inputs(), prediction_model=module, critic_warmup=0)
+    model = with_full_buffer(mpc=two_inputs(), critic={"prediction_model": module}, critic_warmup=0)
     updates(model, 20)
     for each in (module, model.critic.qf0.model, model.critic_target.qf0.model):
         assert th.equal(each.A, A)
@@ -158,7 +160,8 @@ def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) ->
     if critic == "state_action":
         kwargs = {"critic": critic}
     else:
-        kwargs = {"prediction_model": lambda theta, u: 0 * theta + 0 * u.sum(1, keepdim=True)}
+        options = {"prediction_model": lambda theta, u: 0 * theta + 0 * u.sum(1, keepdim=True)}
+        kwargs = {"critic": options}
     mpc = two_inputs()
     model = build(mpc=mpc, policy_kwargs=kwargs)
     theta, u = starts(mpc), mpc.explicit()(starts(mpc))
@@ -171,7 +174,7 @@ def test_the_critic_learns_with_the_prediction_model_that_it_is_given(critic) ->
 
 @pytest.mark.parametrize("make", [lambda: linear_prediction, LinearModule, lambda: bent])
 def test_a_saved_model_brings_its_prediction_model_with_it(make, tmp_path) -> None:
-    model = with_full_buffer(mpc=two_inputs(), prediction_model=make(), critic_warmup=0)
+    model = with_full_buffer(mpc=two_inputs(), critic={"prediction_model": make()}, critic_warmup=0)
     updates(model, 5)
     model.save(tmp_path / "model")
     model.policy.save(tmp_path / "policy")
@@ -186,7 +189,8 @@ def bent(theta: th.Tensor, u: th.Tensor) -> th.Tensor:
 
 
 def test_a_saved_model_may_predict_with_a_lambda(tmp_path) -> None:
-    model = build(policy_kwargs={"prediction_model": lambda theta, u: th.sin(1.1 * theta + u)})
+    options = CriticOptions(prediction_model=lambda theta, u: th.sin(1.1 * theta + u))
+    model = build(policy_kwargs={"critic": options})
     model.save(tmp_path / "model")
     theta = th.as_tensor(starts(scalar_mpc()))
     critic = DDPG.load(tmp_path / "model").critic
@@ -196,4 +200,4 @@ def test_a_saved_model_may_predict_with_a_lambda(tmp_path) -> None:
 
 def test_value_scale_is_that_of_the_critic_s_network() -> None:
     assert build().critic.qf0.scale == 30
-    assert build(policy_kwargs={"value_scale": 7.0}).critic.qf0.scale == 7
+    assert build(policy_kwargs={"critic": {"value_scale": 7.0}}).critic.qf0.scale == 7

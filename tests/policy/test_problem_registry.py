@@ -32,7 +32,7 @@ def test_a_problem_may_be_an_object_a_name_or_a_reference(reference) -> None:
 
 
 def test_the_given_problem_goes_before_the_one_in_the_space() -> None:
-    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal_cost=None)
+    mpc = dataclasses.replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=None)
     model = DDPG(YannPolicy, "ClippedPendulum-v0", policy_kwargs={"problem": mpc})
     assert model.policy.problem is mpc
 

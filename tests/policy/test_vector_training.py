@@ -33,6 +33,7 @@ from sb3_yann import (
     YannPolicy,
 )
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.session import GuardSession
 
 MPC = two_input_mpc()
 STEPS = 6
@@ -116,17 +117,17 @@ def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm) -> None:
     model = build(DummyVecEnv([plant] * 3), algorithm, gradient_steps=-1)
-    before, guard = copy.deepcopy(model.actor), ImprovementGuard(plant, n_starts=3, every=6)
+    before, guard = copy.deepcopy(model.actor), ImprovementGuard(plant, n_starts=3, eval_every=6)
     tried: list[int] = []
     learnt: list[dict[str, th.Tensor]] = []
-    attempt = guard.trials._try
+    attempt = guard.acceptance.try_candidate
 
-    def note(guard: ImprovementGuard) -> None:
-        tried.append(guard.state.episodes)
-        learnt.append(ActorCheckpoint.of(guard.policy).networks())
-        attempt(guard)
+    def note(session: GuardSession) -> None:
+        tried.append(session.state.episodes)
+        learnt.append(ActorCheckpoint.of(session.policy).networks())
+        attempt(session)
 
-    guard.trials._try = note
+    guard.acceptance.try_candidate = note
     callbacks = [NoActionNoise(), guard, ControlDiagnostics(), CostAudit(60, strict=True)]
     model.learn(3 * STEPS * 6, callback=callbacks)
     assert model._n_updates == 3 * STEPS * 6
@@ -180,7 +181,7 @@ def test_a_time_limit_is_no_end_to_the_critic(algorithm, kind, n_envs) -> None:
         env = normalized(n_envs)
         observation = AffineObservation.from_vec_normalize(env)
     quiet = {"target_policy_noise": 0.0} if algorithm is TD3 else {}
-    policy = {"observation": observation, "reward_scale": 1.0}
+    policy = {"observation": observation, "critic": {"reward_scale": 1.0}}
     model = build(env, algorithm, policy, gradient_steps=0, **quiet)
     model.learn(10 * n_envs * STEPS, callback=NoActionNoise())
     ends = transitions(model, "timeouts")

@@ -74,7 +74,7 @@ def show_shifted(env: gym.Env) -> gym.Env:
     return wrappers.TransformObservation(env, shifted, env.observation_space)
 
 
-OTHER = dataclasses.replace(MPC, Q=np.diag([1, 2, 3]), R=MPC.R / 2, terminal_cost=None)
+OTHER = dataclasses.replace(MPC, Q=np.diag([1, 2, 3]), R=MPC.R / 2, terminal=None)
 LOW, HIGH = MPC.u_min.astype(np.float32), MPC.u_max.astype(np.float32)
 
 # What is done to the env, what it is taken for, the wrapper that is named, what else is said.
@@ -101,7 +101,7 @@ WRONG = {
         lambda: wrappers.TransformReward(plant(), lambda reward: 0.01 * reward),
         "scaled",
         "TransformReward",
-        'policy_kwargs={"reward_scale": 0.01, "reward_offset": 0}',
+        'policy_kwargs={"critic": {"reward_scale": 0.01, "reward_offset": 0}}',
     ),
     "TransformReward: scale and offset": (
         lambda: wrappers.TransformReward(plant(), lambda reward: 0.5 * reward + 10),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import random
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -13,12 +14,21 @@ import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
+from sb3_yann import (
+    AcceptanceRule,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    YannPolicy,
+)
 from weights import last_layer
 
 LEFT, CENTER, RIGHT = range(3)
 STEPS = 4
 """Steps of an episode."""
+FIRST = 1_000_000
+"""The first of the guard's own seeds."""
 
 
 def slide_mpc() -> LinearMPC:
@@ -72,6 +82,19 @@ class Slide(gym.Env):
         return self.x.astype(np.float32), -cost, False, self.t == STEPS, info
 
 
+class CutOff(Slide):
+    """Does something when an episode begins from one of the seeds."""
+
+    def __init__(self, at: int, act: Callable[[], Any]) -> None:
+        super().__init__()
+        self.at, self.act = at, act
+
+    def reset(self, *, seed=None, options=None):
+        if seed == self.at:
+            self.act()
+        return super().reset(seed=seed, options=options)
+
+
 if "Slide-v0" not in gym.registry:
     gym.register("Slide-v0", entry_point="guard_samples:Slide")
 
@@ -87,6 +110,22 @@ def build(algorithm=DDPG, env: Any = None, actor: dict[str, Any] | None = None, 
 
 def make_guard(env: Any = Slide, **kwargs) -> ImprovementGuard:
     return ImprovementGuard(env, **({"n_starts": 10, "patience": 1} | kwargs))
+
+
+def guard_alone(
+    trial_episodes: int = 3, significance: float = 0.05, **kwargs: Any
+) -> ImprovementGuard:
+    rule = AcceptanceRule(trial_episodes=trial_episodes, significance=significance)
+    return make_guard(None, rule=rule, **kwargs)
+
+
+BLOCK = 3 * STEPS  # of a guard_alone
+# One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
+plant = partial(Slide, low=2.0, high=2.8)
+
+
+def still(**kwargs):
+    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
 
 
 @th.no_grad()
@@ -157,7 +196,7 @@ def bits(value: Any) -> Any:
 
 
 def actor_bits(policy: YannPolicy) -> dict[str, Any]:
-    """Return all that a rejection puts back, but the rate, which SB3 sets before every step."""
+    """Return all that is restored, but the rate, which SB3 sets before every step."""
     return {
         "actor": bits(policy.actor.state_dict()),
         "target": bits(policy.actor_target.state_dict()),
@@ -174,8 +213,9 @@ def critic_bits(policy: YannPolicy) -> dict[str, Any]:
     }
 
 
-def accepted_bits(guard: ImprovementGuard) -> dict[str, Any]:
-    accepted = guard.state.accepted
+def accepted_bits(owner: Any) -> dict[str, Any]:
+    """Return the same of what a guard, or the guard of a model, has accepted."""
+    accepted = (owner.guard_state if hasattr(owner, "guard_state") else owner.state).accepted
     return {
         "actor": bits(accepted.actor),
         "target": bits(accepted.target),

@@ -27,14 +27,14 @@ class OnlineMPC:
     def __init__(self, mpc: LinearMPC) -> None:
         self.mpc, model, N = mpc, mpc.model, mpc.horizon
         n, m = model.B.shape
-        self.sizes = [n, len(mpc.tracked), model.E.shape[1]]  # then u_prev, where there is one
+        self.sizes = [n, len(mpc.tracking.C), model.E.shape[1]]  # then u_prev, where there is one
         self.n_previous = len(mpc.theta_min) - sum(self.sizes)
         width = mpc.u_max - mpc.u_min
         self.u_unit = np.where(np.isfinite(width), width / 2, 1.0)
         self.x_unit = np.maximum(np.abs(mpc.theta_min), np.abs(mpc.theta_max))[:n]
         self.soft = {
             name: units
-            for name, units in (("x", mpc.x_soft), ("y", mpc.y_soft))
+            for name, units in (("x", mpc.soft.x), ("y", mpc.soft.y))
             if np.any(units > 0)
         }
         self.unit = np.concatenate(
@@ -62,32 +62,23 @@ class OnlineMPC:
         discounts = mpc.gamma ** np.arange(N)
         weights = [discount * mpc.R for discount in discounts]
         weights += [mpc.gamma**k * mpc.Q for k in range(1, N)]
-        weights += [mpc.gamma**N * mpc.terminal_cost[:n, :n]]
+        weights += [mpc.gamma**N * mpc.terminal.cost[:n, :n]]
         cost = block_diag(*weights, *(np.zeros((1, 1)) for _ in self.soft))
-        if len(mpc.terminal_cost) > n:  # the terminal cost of u_{N-1} - u_s as well
+        if len(mpc.terminal.cost) > n:  # the terminal cost of u_{N-1} - u_s as well
             last, final = slice((N - 1) * m, N * m), slice(self.n_moves - n, self.n_moves)
-            P = mpc.gamma**N * mpc.terminal_cost
+            P = mpc.gamma**N * mpc.terminal.cost
             cost[last, last] += P[n:, n:]
             cost[last, final] += P[n:, :n]
             cost[final, last] += P[:n, n:]
         self.changes = np.zeros((N * m, len(cost)))
         self.changes[:, : N * m] = np.eye(N * m) - np.kron(np.eye(N, k=-1), np.eye(m))
-        rate = np.kron(np.diag(discounts), mpc.S)
+        rate = np.kron(np.diag(discounts), mpc.rate.R_du)
         slack = np.zeros(len(cost))
-        slack[self.n_moves :] = mpc.soft_penalty
+        slack[self.n_moves :] = mpc.soft.penalty
         self.size = np.mean(np.diag(cost)[: self.n_moves] * self.unit[: self.n_moves] ** 2)
         self.cost = cost * self.unit[:, None] / self.size  # times the target: a gradient
         self.rate_gradient = self.unit[:, None] * self.changes.T @ rate / self.size
-        linear = np.zeros(len(cost))
-        q, r = mpc.linear_cost
-        linear[: N * m] = np.kron(discounts, r)
-        linear[N * m : self.n_moves - n] = np.kron(mpc.gamma ** np.arange(1, N), q)
-        if np.any(q) or np.any(r):
-            last, final = slice((N - 1) * m, N * m), slice(self.n_moves - n, self.n_moves)
-            p = mpc.gamma**N * _linear_terminal_cost(mpc)
-            linear[final] += p[:n]
-            linear[last] += p[n:] if len(p) > n else 0
-        self.slack_gradient = (slack + linear * self.unit) / 2 / self.size
+        self.slack_gradient = slack / 2 / self.size
         whole = cost + self.changes.T @ rate @ self.changes + np.diag(slack)
         whole = whole * np.outer(self.unit, self.unit) / self.size
         # Zero along the equality constraints, so the optimum is the same; it makes the Hessian
@@ -103,7 +94,7 @@ class OnlineMPC:
         for k, row in enumerate(states):
             row[:, N * m + k * n : N * m + (k + 1) * n] = np.eye(n)
         rows = []
-        F, g = mpc.terminal_set
+        F, g = mpc.terminal.set
         last = np.zeros((n_theta, len(self.unit)))
         last[:n] = states[-1]
         last[n_theta - self.n_previous :, (N - 1) * m : N * m] = np.eye(m)[: self.n_previous]
@@ -114,12 +105,14 @@ class OnlineMPC:
         if self.n_previous:
             start = np.zeros((N * m, n_theta))
             start[:m, n_theta - m :] = -np.eye(m)
-            rows.append((self.changes, start, np.tile(mpc.du_max, N), np.tile(mpc.du_min, N)))
+            rows.append(
+                (self.changes, start, np.tile(mpc.rate.du_max, N), np.tile(mpc.rate.du_min, N))
+            )
         for row in states:
-            seen = mpc.outputs @ row
-            rows += self._softened("y", seen, mpc.y_max, mpc.y_min, mpc.y_soft)
+            seen = mpc.outputs.C @ row
+            rows += self._softened("y", seen, mpc.outputs.y_max, mpc.outputs.y_min, mpc.soft.y)
             if "x" in self.soft:
-                rows += self._softened("x", row, mpc.x_max, mpc.x_min, mpc.x_soft)
+                rows += self._softened("x", row, mpc.x_max, mpc.x_min, mpc.soft.x)
         A, self.rows_theta, self.rows_upper, self.rows_lower = (
             np.concatenate(part) for part in zip(*rows, strict=True)
         )
@@ -127,7 +120,7 @@ class OnlineMPC:
         length = np.maximum(np.linalg.norm(A, axis=1), 1e-9)
         self.rows_length = length
         self.rows = np.ascontiguousarray(np.vstack([self.steps, A / length[:, None]]))
-        free_x = self.mpc.x_soft > 0
+        free_x = self.mpc.soft.x > 0
         x_max, x_min = np.where(free_x, np.inf, mpc.x_max), np.where(free_x, -np.inf, mpc.x_min)
         slacks = np.ones(len(self.soft))
         upper = [np.tile(mpc.u_max, N), np.tile(x_max, N), np.inf * slacks]
@@ -153,7 +146,7 @@ class OnlineMPC:
         n, m = model.B.shape
         _, r, d, _ = np.split(theta, np.cumsum(self.sizes))
         holds = np.hstack([model.B, model.A - np.eye(n)])
-        shows = np.hstack([np.zeros((len(r), m)), mpc.tracked])
+        shows = np.hstack([np.zeros((len(r), m)), mpc.tracking.C])
         M, right = np.vstack([holds, shows]), np.concatenate([-model.E @ d, r])
         weight = block_diag(mpc.R, mpc.Q)
         kkt = np.block([[weight, M.T], [M, np.zeros((len(M), len(M)))]])
@@ -189,20 +182,3 @@ class OnlineMPC:
             dual_tol=1e-12,
         )
         return np.asarray(z)[:m] * self.u_unit if status == 1 else None
-
-
-def _linear_terminal_cost(mpc: LinearMPC) -> Array:
-    """The gradient at zero of the cost to go, by iteration of the unconstrained plan."""
-    n, m = mpc.model.B.shape
-    (q, r), P, rated = mpc.linear_cost, mpc.terminal_cost, len(mpc.terminal_cost) > n
-    A, B, cross = mpc.model.A, mpc.model.B, np.zeros((n, m))
-    R = mpc.R
-    if rated:
-        A, B = block_diag(A, np.zeros((m, m))), np.vstack([B, np.eye(m)])
-        cross, q, R = np.vstack([cross, -mpc.S]), np.concatenate([q, np.zeros(m)]), mpc.R + mpc.S
-    p = np.zeros(len(q))
-    for _ in range(5000):  # value iteration of the linear part, the quadratic part being stationary
-        curvature = R + mpc.gamma * B.T @ P @ B
-        k = np.linalg.solve(2 * curvature, r + mpc.gamma * B.T @ p)  # the input at zero is -k
-        p = q - 2 * cross @ k + mpc.gamma * A.T @ (p - 2 * P @ B @ k)
-    return p

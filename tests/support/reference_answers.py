@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from online_mpc import OnlineMPC
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import LinearModel, LinearMPC, Terminal
 
 
 def online_answers(mpc: LinearMPC, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -45,5 +45,5 @@ def random_problems(draw: st.DrawFn) -> LinearMPC:
     values |= {f"{prefix}_min": -box, f"{prefix}_max": box}
     if draw(st.booleans()):
         F = rng.normal(size=(int(rng.integers(1, 4)), n))
-        values["terminal_set"] = (F, rng.uniform(0.5, 3, len(F)))
+        values["terminal"] = Terminal(set=(F, rng.uniform(0.5, 3, len(F))))
     return LinearMPC(LinearModel(A, B, 1.0), **values)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import LinearModel, LinearMPC, Terminal
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann_envs import cstr as reactor
 from sb3_yann_envs import problems
@@ -102,7 +102,7 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     "benchmark": benchmark,
     "asymmetric input bounds": lambda: small_mpc(u_min=-0.2, u_max=1.5, x_min=[-5, -1]),
     "two inputs": lambda: small_mpc(TWO_INPUTS, u_min=[-1, -0.4], u_max=[0.5, 2]),
-    "terminal set": lambda: small_mpc(terminal_set=([[1, 1], [-1, -1]], [0.5, 0.7])),
+    "terminal set": lambda: small_mpc(terminal=Terminal(set=([[1, 1], [-1, -1]], [0.5, 0.7]))),
     "discounted": lambda: small_mpc(gamma=0.9),
     "one state": lambda: small_mpc(LinearModel([[1.2]], [[1]], 1.0), horizon=5, x_max=7),
     "one state, two inputs": lambda: small_mpc(LinearModel([[1.2]], [[1, 0.5]], 1.0), horizon=3),
@@ -113,11 +113,11 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     "only one state bounded": lambda: input_bounds_only(x_min=[-np.inf, -2], x_max=[np.inf, 2]),
     "one-sided state bounds": lambda: input_bounds_only(x_min=[-np.inf, -2], x_max=[4, np.inf]),
     "a final state held to 1e-4": lambda: input_bounds_only(
-        horizon=3, terminal_set=([[1, 0], [-1, 0]], [1e-4, 1e-4])
+        horizon=3, terminal=Terminal(set=([[1, 0], [-1, 0]], [1e-4, 1e-4]))
     ),
-    "every state bound twice": lambda: small_mpc(terminal_set=(2 * EYE_ROWS, [10] * 4)),
-    "a constraint that only touches": lambda: small_mpc(terminal_set=([[1, 1]], [10])),
-    "a constraint without a state": lambda: small_mpc(terminal_set=([[0, 0]], [1])),
+    "every state bound twice": lambda: small_mpc(terminal=Terminal(set=(2 * EYE_ROWS, [10] * 4))),
+    "a constraint that only touches": lambda: small_mpc(terminal=Terminal(set=([[1, 1]], [10]))),
+    "a constraint without a state": lambda: small_mpc(terminal=Terminal(set=([[0, 0]], [1]))),
     "inputs that do the same": lambda: small_mpc(SAME_INPUTS),
     "an input without effect": lambda: small_mpc(IDLE_INPUT),
     "coupled inputs": lambda: input_bounds_only(TWO_INPUTS, R=[[1, 0.999], [0.999, 1]]),
@@ -133,7 +133,7 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     "zero input not allowed": lambda: _never_at_rest(),
     "origin outside the box": lambda: small_mpc(theta_min=[2, -3], theta_max=[4, -1]),
     "states without weight": lambda: small_mpc(
-        Q=np.zeros((2, 2)), terminal_cost=np.zeros((2, 2)), x_min=-3, x_max=3
+        Q=np.zeros((2, 2)), terminal=Terminal(np.zeros((2, 2))), x_min=-3, x_max=3
     ),
     "cheap inputs": lambda: input_bounds_only(R=[[1e-8]]),
     "expensive inputs": lambda: input_bounds_only(R=[[1e8]]),

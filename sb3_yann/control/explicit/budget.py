@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from types import TracebackType
 
 from tqdm import tqdm  # type: ignore[import-untyped]
 
@@ -23,6 +22,14 @@ class ExplicitLimitError(RuntimeError):
     ----------
     n_regions : int
         How many regions were found until then, where the solver tells.
+
+    Examples
+    --------
+    >>> try:
+    ...     raise ExplicitLimitError("The law has too many regions.", 100)
+    ... except ExplicitLimitError as error:
+    ...     error.n_regions
+    100
     """
 
     def __init__(self, message: str, n_regions: int) -> None:
@@ -41,12 +48,7 @@ class SolveBudget:
     region_limit : int, optional
         The largest number of regions.
     progress : bool, default False
-        Show a progress bar, which counts regions.
-
-    Raises
-    ------
-    ValueError
-        If a limit is not above zero, or no number.
+        Show a progress bar that counts regions.
     """
 
     time_limit: float | None = None
@@ -54,7 +56,6 @@ class SolveBudget:
     progress: bool = False
 
     def __post_init__(self) -> None:
-        """Check the limits."""
         seconds, regions = self.time_limit, self.region_limit
         if seconds is not None and not (
             isinstance(seconds, int | float) and math.isfinite(seconds) and seconds > 0
@@ -86,21 +87,16 @@ class BudgetTimer:
     The time counts from when this is made.
     """
 
-    def __init__(self, limits: SolveBudget) -> None:
-        self.limits, self.found, self._start = limits, 0, time.monotonic()
+    def __init__(self, budget: SolveBudget) -> None:
+        self.budget, self.found, self._start = budget, 0, time.monotonic()
         self._bar = tqdm(
-            desc="Critical regions", unit=" regions", leave=False, disable=not limits.progress
+            desc="Critical regions", unit=" regions", leave=False, disable=not budget.progress
         )
 
     def __enter__(self) -> BudgetTimer:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Take the progress bar away."""
         self._bar.close()
 
@@ -110,23 +106,17 @@ class BudgetTimer:
         return time.monotonic() - self._start
 
     def count(self, more: int = 1) -> None:
-        """Count regions that were found.
-
-        Raises
-        ------
-        ExplicitLimitError
-            If these are too many, or the time is over.
-        """
+        """Count regions; raise ExplicitLimitError if these are too many, or the time is over."""
         self.found += more
         self._bar.update(more)
-        most = self.limits.region_limit
+        most = self.budget.region_limit
         if most is not None and self.found > most:
             self._stop(f"The law has more than region_limit = {most} regions")
         self.tick()
 
     def tick(self) -> None:
         """Raise ExplicitLimitError if the time is over."""
-        most = self.limits.time_limit
+        most = self.budget.time_limit
         if most is not None and self.seconds > most:
             self._stop(f"The law was not solved in time_limit = {most:g} s")
 

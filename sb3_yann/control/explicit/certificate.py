@@ -17,10 +17,16 @@ LAW, INSIDE = 1e-6, 1e-8
 
 
 class ExplicitSolutionError(RuntimeError):
-    """An explicit solution failed its check: it does not solve the program it came from."""
+    """An explicit solution failed its check: it does not solve the program it came from.
+
+    Examples
+    --------
+    >>> issubclass(ExplicitSolutionError, RuntimeError)
+    True
+    """
 
 
-def check(program: ParametricQP, regions: list[Region], center: Array, half: Array) -> None:
+def certify(program: ParametricQP, regions: list[Region], center: Array, half: Array) -> None:
     """Check the regions of a scaled program without trusting what found them.
 
     - An independent QP is solved at the innermost point of every region.
@@ -38,7 +44,7 @@ def check(program: ParametricQP, regions: list[Region], center: Array, half: Arr
     ExplicitSolutionError
         With a theta that shows what is wrong; center and half take it to the units of the problem.
     """
-    _Check(program, regions, center, half).run()
+    Certificate(program, regions, center, half).check()
 
 
 def _as_bits(active_set: Iterable[int]) -> int:
@@ -52,7 +58,9 @@ def _sets(multipliers: Array) -> list[int]:
     return [int.from_bytes(row.tobytes(), "little") for row in bits]
 
 
-class _Check:
+class Certificate:
+    """The checks of a list of regions, see :func:`certify`."""
+
     def __init__(
         self, program: ParametricQP, regions: list[Region], center: Array, half: Array
     ) -> None:
@@ -65,7 +73,8 @@ class _Check:
             np.concatenate([np.ones(2 * n), program.w[bound]]),
         ])  # fmt: skip
 
-    def run(self) -> None:
+    def check(self) -> None:
+        """Raise ExplicitSolutionError unless all of them pass."""
         if not self.regions:
             self._fail("no region was found", self.center * 0)
         self.A, self.b = (

@@ -33,19 +33,16 @@ class _Found:
     inside: Array
 
 
-def walk(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
+def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     Across a facet where constraint k becomes active, or inactive, lies the region of the active
-    set with k added, or removed, wherever that region has an interior: on the facet the conditions
-    of both are the same. So a region is found by a few small matrix operations. Where that active
-    set has no such region, at the border of the feasible set or where constraints depend on each
-    other, a QP just across the middle of the facet tells what lies there. Last, QPs at random
-    points of the box look for what the walk has not seen.
-
-    Sets of constraints are whole numbers, with bit k for constraint k.
+    set with k added, or removed: on the facet the conditions of both are the same. Where that set
+    has no region, at the border of the feasible set or where constraints depend on each other, a QP
+    just across the middle of the facet tells what lies there. Last, QPs at random points of the box
+    look for what the walk has not seen. Sets of constraints are whole numbers, with bit k for k.
     """
-    found = _Walk(program, watch)
+    found = _Walk(program, timer)
     found.explore(found.seeds(20))
     for _ in range(10):
         missed = set(found.seeds(20 * program.F.shape[1])) - found.seen
@@ -56,24 +53,18 @@ def walk(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
 
 
 class _Walk:
-    def __init__(self, program: ParametricQP, watch: BudgetTimer) -> None:
-        self.program, self.watch = program, watch
+    def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
+        self.program, self.timer = program, timer
         self.conditions = Conditions(program)
         self.found: dict[int, _Found] = {}
         self.seen: set[int] = set()
 
     def regions(self) -> list[Region]:
         kept, n = self.conditions.kept, self.program.F.shape[1]
+        rows = [tuple(int(kept[k]) for k in _members(active)) for active in self.found]
         return [
-            Region(
-                tuple(int(kept[k]) for k in _members(one.active)),
-                one.law[:, :n],
-                one.law[:, n],
-                one.A,
-                one.b,
-                one.inside,
-            )
-            for one in self.found.values()
+            Region(active, one.law[:, :n], one.law[:, n], one.A, one.b, one.inside)
+            for active, one in zip(rows, self.found.values(), strict=True)
         ]
 
     def seeds(self, count: int) -> Iterator[int]:
@@ -117,7 +108,7 @@ class _Walk:
                 facets = [pair for pair, active in left if active is not None]
 
     def _add(self, one: _Found) -> _Found:
-        self.watch.count()
+        self.timer.count()
         self.found[one.active] = one
         return one
 
@@ -130,7 +121,7 @@ class _Walk:
 
     def _across(self, one: _Found, row: int) -> int | None:
         """Return the active set across a facet, None if none is new or feasible there."""
-        self.watch.tick()
+        self.timer.tick()
         middle, distance = largest_ball(one.A, one.b, row)
         if distance <= THINNEST:  # the row only touches the region
             return None

@@ -27,6 +27,13 @@ class ParametricQP:
     theta_min, theta_max : ndarray, shape (n,)
     n_slacks : int, default 0
         How many of the last variables are slacks of soft constraints, and no inputs.
+
+    Examples
+    --------
+    >>> one = np.ones((1, 1))
+    >>> ParametricQP(H=one, F=-one, c=[0], G=one, w=np.ones(1), S=0 * one, theta_min=-one[0],
+    ...              theta_max=one[0]).solve(np.array([0.5]))
+    array([0.5])
     """
 
     H: Array

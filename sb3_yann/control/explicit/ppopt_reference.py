@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,18 +16,20 @@ from sb3_yann.control.explicit.budget import BudgetTimer
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.polyhedra import Region
 
+_PATCHING = threading.RLock()
 
-def ppopt_regions(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
+
+def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     They come from ppopt's combinatorial graph search (Arnström et al.,
-    https://arxiv.org/abs/2404.05511) with GLPK and DAQP. ppopt tells its regions only at the end,
-    so the number of regions is looked at only then.
+    https://arxiv.org/abs/2404.05511), with DAQP for its linear programs too. ppopt tells its
+    regions only at the end, so the number of regions is looked at only then.
     """
     n = program.F.shape[1]
     box_A, box_b = np.vstack([np.eye(n), -np.eye(n)]), np.ones(2 * n)
     if not np.any(program.G):  # nothing binds U, which ppopt does not take
-        watch.count()
+        timer.count()
         return [_unconstrained(program, box_A, box_b)]
 
     # Rows without U bound theta: with them in the constraints ppopt's active sets degenerate.
@@ -32,7 +37,7 @@ def ppopt_regions(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
     from ppopt.mp_solvers import mpqp_combi_graph
     from ppopt.mpqp_program import MPQP_Program
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _solvers(timer) as solver:
         warnings.simplefilter("ignore")  # feasibility was checked, with a clearer message
         problem = MPQP_Program(
             A=program.G[moving],
@@ -43,10 +48,10 @@ def ppopt_regions(program: ParametricQP, watch: BudgetTimer) -> list[Region]:
             A_t=np.vstack([box_A, -program.S[~moving]]),
             b_t=np.concatenate([box_b, program.w[~moving]])[:, None],
             F=program.S[moving],
-            solver=_watched_solver(watch),
+            solver=solver,
         )
         found = mpqp_combi_graph.solve(problem).critical_regions
-    watch.count(len(found))
+    timer.count(len(found))
     rows = _rows_of(program, problem)
     return [
         Region(
@@ -68,16 +73,56 @@ def _unconstrained(program: ParametricQP, box_A: Array, box_b: Array) -> Region:
     return Region((), law[:, :-1], law[:, -1], A, b)
 
 
-def _watched_solver(watch: BudgetTimer) -> Any:
-    """Return ppopt's solvers without Gurobi, which its defaults want, ended at the time limit."""
-    from ppopt.solver import Solver
+@contextmanager
+def _solvers(timer: BudgetTimer) -> Iterator[Any]:
+    """Give ppopt DAQP for all its programs, without Gurobi and GLPK, ended at the time limit.
 
-    class Watched(Solver):  # type: ignore[misc]
-        def solve_lp(self, *args: Any, **kwargs: Any) -> Any:
-            watch.tick()
-            return super().solve_lp(*args, **kwargs)
+    ppopt knows two solvers of linear programs by name, Gurobi and GLPK, and calls them past the
+    solver object too: what it calls for GLPK is replaced meanwhile.
+    """
+    from ppopt import solver
+    from ppopt.solver_interface import solver_interface
 
-    return Watched({"lp": "glpk", "qp": "daqp"})
+    def solve_lp(c: Any, A: Any, b: Any, equal: Any = None, *_: Any) -> Any:
+        timer.tick()
+        return _solve_lp(c, A, b, equal)
+
+    with _PATCHING:
+        shipped = [(module, module.solve_lp_cvxopt) for module in (solver, solver_interface)]
+        try:
+            for module, _ in shipped:
+                module.solve_lp_cvxopt = solve_lp
+            yield solver.Solver({"lp": "glpk", "qp": "daqp"})
+        finally:
+            for module, function in shipped:
+                module.solve_lp_cvxopt = function
+
+
+def _solve_lp(c: Array | None, A: Array, b: Array, equal: list[int] | None) -> Any:
+    """Return ppopt's answer to ``min c'z`` with ``A z <= b`` and equal rows: the point, or None.
+
+    Without a cost it is the shortest feasible point. With one, proximal steps solve the program.
+    """
+    import daqp
+    from ppopt.solver_interface.solver_interface_utils import SolverOutput
+
+    n, rows = A.shape[1], len(b)
+    sense = np.zeros(rows, dtype=np.intc)
+    sense[list(equal or ())] = 5
+    cost = np.zeros(n) if c is None else np.ravel(c).astype(float)
+    any_point = not np.any(cost)
+    settings = {} if any_point else {"eps_prox": 1e-2}
+    point, value, status, _ = daqp.solve(
+        np.eye(n) if any_point else None,
+        cost,
+        np.ascontiguousarray(A, dtype=float),
+        np.ravel(b).astype(float),
+        np.full(rows, -1e30),
+        sense,
+        primal_tol=1e-9,
+        **settings,
+    )
+    return SolverOutput(value, np.asarray(point), None, None, None) if status == 1 else None
 
 
 def _rows_of(program: ParametricQP, problem: Any) -> NDArray[np.intp]:

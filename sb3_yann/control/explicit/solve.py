@@ -7,25 +7,14 @@ from dataclasses import replace
 import numpy as np
 from scipy import optimize
 
-from sb3_yann._validation import Array
-from sb3_yann.control.explicit.budget import BudgetTimer, ExplicitLimitError, SolveBudget
-from sb3_yann.control.explicit.certificate import ExplicitSolutionError, check
+from sb3_yann._validation import Array, as_choice, half_widths
+from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
+from sb3_yann.control.explicit.certificate import ExplicitSolutionError, certify
 from sb3_yann.control.explicit.facet_walk import walk
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
-
-__all__ = [
-    "SOLVERS",
-    "ExplicitLimitError",
-    "ExplicitSolutionError",
-    "ParametricQP",
-    "SolveBudget",
-    "solve_explicit",
-]
-
-SOLVERS = {"walk": walk, "ppopt": ppopt_regions}
 
 
 def solve_explicit(
@@ -34,24 +23,22 @@ def solve_explicit(
     u_max: Array,
     infeasible: str,
     solver: str = "walk",
-    limits: SolveBudget = SolveBudget(),  # noqa: B008 (it is frozen)
+    budget: SolveBudget = SolveBudget(),  # noqa: B008 (it is frozen)
 ) -> PiecewiseAffine:
     """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
 
-    The regions are in the order of their active sets, fewest constraints first, so that a problem
-    always gives the same law.
+    The regions are in the order of their active sets, fewest constraints first.
 
     Parameters
     ----------
     program : ParametricQP
     u_min, u_max : ndarray, shape (m,)
-        The input range, in which the tolerances are measured; infinite where there is none.
+        The input range, in which tolerances are measured; infinite where there is none.
     infeasible : {"nearest_region", "zero_input"}
         See :class:`PiecewiseAffine`.
     solver : {"walk", "ppopt"}
-        Our walk from facet to facet (:mod:`sb3_yann.control.explicit.facet_walk`), or ppopt's
-        combinatorial graph search, which takes tens of times longer above a hundred regions.
-    limits : SolveBudget
+        Our walk from facet to facet, or ppopt's combinatorial graph search, tens of times slower.
+    budget : SolveBudget
         When to give up.
 
     Raises
@@ -63,15 +50,14 @@ def solve_explicit(
     ExplicitSolutionError
         If the solution fails its check.
     """
-    if solver not in SOLVERS:
-        raise ValueError(f"solver = {solver!r} must be one of {tuple(SOLVERS)}.")
+    as_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
-    units = _Units(program, u_min, u_max)
+    units = ProgramUnits(program, u_min, u_max)
     _require_feasible(units.scaled)
-    with BudgetTimer(limits) as watch:
-        regions = _critical_regions(units.scaled, solver, watch)
+    with BudgetTimer(budget) as timer:
+        regions = _critical_regions(units.scaled, solver, timer)
         try:
-            check(units.scaled, regions, units.center, units.half)
+            certify(units.scaled, regions, units.center, units.half)
         except ExplicitSolutionError as error:
             if solver == "walk":
                 raise
@@ -79,13 +65,13 @@ def solve_explicit(
         return units.law(regions, u_min, u_max, infeasible)
 
 
-def _critical_regions(program: ParametricQP, solver: str, watch: BudgetTimer) -> list[Region]:
+def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program whose box is the unit box, sorted."""
-    found = SOLVERS[solver](program, watch)
+    found = walk(program, timer) if solver == "walk" else ppopt_regions(program, timer)
     return sorted(found, key=lambda region: (len(region.active_set), region.active_set))
 
 
-class _Units:
+class ProgramUnits:
     """A program in units of its box and its input range.
 
     Tolerances of solvers are absolute: in these units they mean the same for every plant.
@@ -93,10 +79,9 @@ class _Units:
 
     def __init__(self, program: ParametricQP, u_min: Array, u_max: Array) -> None:
         self.center = (program.theta_max + program.theta_min) / 2
-        self.half = (program.theta_max - program.theta_min) / 2
-        width = (u_max - u_min) / 2
+        self.half = half_widths(program.theta_min, program.theta_max)
         steps = (len(program.c) - program.n_slacks) // len(u_min)
-        reach = np.tile(np.where(np.isfinite(width), width, 1.0), steps)
+        reach = np.tile(half_widths(u_min, u_max), steps)
         self.reach = np.concatenate([reach, np.ones(program.n_slacks)])
         self.program = program
         self.scaled = program.scaled(self.center, self.half, self.reach)
@@ -109,19 +94,11 @@ class _Units:
         gains = np.stack([reach[:m, None] * region.gain[:m] / half for region in regions])
         offsets = np.stack([reach[:m] * region.offset[:m] for region in regions])
         A = np.concatenate([region.A / half for region in regions])
-        return PiecewiseAffine(
-            gains=gains,
-            offsets=offsets - gains @ self.center,
-            A=A,
-            b=np.concatenate([region.b for region in regions]) + A @ self.center,
-            starts=np.cumsum([0, *(len(region.b) for region in regions[:-1])]),
-            u_min=u_min,
-            u_max=u_max,
-            theta_min=self.program.theta_min,
-            theta_max=self.program.theta_max,
-            infeasible=infeasible,
-            disjoint=True,
-        )
+        b = np.concatenate([region.b for region in regions]) + A @ self.center
+        starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
+        ranges = u_min, u_max, self.program.theta_min, self.program.theta_max
+        offsets = offsets - gains @ self.center
+        return PiecewiseAffine(gains, offsets, A, b, starts, *ranges, infeasible, disjoint=True)
 
 
 def _require_box(program: ParametricQP) -> None:

@@ -1,4 +1,4 @@
-"""Whether the inputs of identified data act on the next state, or later."""
+"""Inputs without effect, and input delays, found in the residuals of a fit."""
 
 from __future__ import annotations
 
@@ -9,21 +9,17 @@ from sb3_yann._validation import Array
 from sb3_yann.control.identification.least_squares import Regression
 from sb3_yann.control.identification.logs import Episode
 
-LONGEST = 10
-"""Samples after which an input is no longer looked for in the residuals."""
-CHANCE = 0.01
-"""Probability with which an input without effect passes for one that has an effect."""
-FOLLOWS = 0.25
-"""Correlation of residuals with an earlier input from which on a delay is named. Sensor noise, too,
-leaves some, as the state is then known better with the inputs that led to it."""
+LONGEST = 10  # longest input delay, in samples, that is looked for
+CHANCE = 0.01  # significance level of an input's effect
+FOLLOWS = 0.25  # least correlation of residuals with an earlier input: sensor noise leaves some
 
 
 def input_notes(
     found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]
 ) -> list[str]:
-    """Return, for inputs and disturbances that have no effect or a late one, what is to be done."""
+    """Return notes on inputs and disturbances without effect, or with a delay."""
     n, m, d = sizes
-    names = [f"u[{i}]" for i in range(m)] + [f"d[{i}]" for i in range(d)]
+    names = [f"{k}[{i}]" for k, size in (("u", m), ("d", d)) for i in range(size)]
     delays, notes = _delays(found, episodes, sizes), []
     for j, (name, (lag, correlation)) in enumerate(zip(names, delays, strict=True)):
         idle = _chance(found, n, n + j) > CHANCE
@@ -44,10 +40,7 @@ def input_notes(
 
 
 def _chance(found: Regression, n: int, column: int) -> float:
-    """Return the probability of a column as large as this one where all its entries are zero.
-
-    Hotelling's T-squared test of the whole column: the residuals of the states are correlated.
-    """
+    """Return the p-value of Hotelling's T-squared test that a whole column is zero."""
     floor = np.diag((1e-10 * np.maximum(found.spread[:n], np.finfo(float).tiny)) ** 2)
     effect = found.coefficients[:, column] / max(found.factors[column], np.finfo(float).tiny)
     square = float(effect @ np.linalg.solve(found.covariance + floor, effect))
@@ -60,10 +53,7 @@ def _chance(found: Regression, n: int, column: int) -> float:
 def _delays(
     found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]
 ) -> list[tuple[int, float]]:
-    """Return the lag that the residuals follow most, and how much, 0 where they follow none.
-
-    Each earlier input counts as far as the regressors of the step do not tell it.
-    """
+    """Return each input's lag of largest partial correlation with the residuals, 0 for none."""
     best = [(0, 0.0)] * (sizes[1] + sizes[2])
     for lag in range(1, LONGEST + 1):
         longer = [episode for episode in episodes if len(episode) > lag]
@@ -83,7 +73,7 @@ def _delays(
 
 
 def _correlations(known: Array, residuals: Array, past: Array) -> Array:
-    """Return the largest correlation of each past input with a residual, without what is known."""
+    """Return each past input's largest partial correlation with a residual, given `known`."""
     spread = np.std(known, axis=0)
     basis = np.column_stack([np.ones(len(known)), known / np.where(spread > 0, spread, 1.0)])
     orthonormal = np.linalg.qr(basis)[0]

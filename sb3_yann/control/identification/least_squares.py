@@ -1,4 +1,4 @@
-"""The least-squares step of the identification: coefficients, their errors, and the excitation."""
+"""Least squares on measured steps: coefficients, their standard errors, and the excitation."""
 
 from __future__ import annotations
 
@@ -9,47 +9,28 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.logs import Episode
 
-WEAKEST = 1e-6
-"""Singular values below this part of the largest are a lack of excitation: float32 observations
-move that much by rounding alone."""
+WEAKEST = 1e-6  # least excitation, below which float32 rounding alone may be what moves
 
 
 @dataclass(frozen=True, eq=False)
 class Regression:
     """``x[k+1] = reached + coefficients (z[k] - center)``, with z of states, inputs, disturbances.
 
-    Attributes
-    ----------
-    coefficients, standard_errors : ndarray, shape (n, n+m+d)
-    center : ndarray, shape (n+m+d,)
-    reached : ndarray, shape (n,)
-    spread : ndarray, shape (n+m+d,)
-        Root mean square of each regressor about the center.
-    factors : ndarray, shape (n+m+d,)
-        Standard errors of each column in units of the residuals' standard deviation.
-    covariance : ndarray, shape (n, n)
-        Of the residuals.
-    autocorrelation : ndarray, shape (n,)
-        Of the residuals, one step apart; zero where they are rounding.
-    degrees_of_freedom, steps : int
-    excitation : float
-        Smallest over largest singular value of the regressors in units of their spread.
-    weakest : str
-        The combination of regressors that moved least.
+    Shapes: n states, p regressors.
     """
 
-    coefficients: Array
-    standard_errors: Array
-    center: Array
-    reached: Array
-    spread: Array
-    factors: Array
-    covariance: Array
-    autocorrelation: Array
+    coefficients: Array  # (n, p)
+    standard_errors: Array  # (n, p)
+    center: Array  # (p,)
+    reached: Array  # (n,)
+    spread: Array  # (p,), root mean square of each regressor about the center
+    factors: Array  # (p,), standard errors of each column relative to the residuals' deviation
+    covariance: Array  # (n, n), of the residuals
+    autocorrelation: Array  # (n,), of the residuals, one step apart; zero where they are rounding
     degrees_of_freedom: int
     steps: int
-    excitation: float
-    weakest: str
+    excitation: float  # smallest over largest singular value of the scaled regressors
+    weakest: str  # the combination of regressors that moved least
 
     def predict(self, regressors: Array) -> Array:
         """Return the next states (k, n) for regressors (k, n+m+d)."""
@@ -64,19 +45,14 @@ def regress(
     Parameters
     ----------
     episodes : list of Episode
-    sizes : tuple
+        The measured steps.
+    sizes : tuple of int
         Numbers of states, inputs and disturbances.
     origin : ndarray, shape (n+m+d,), optional
-        The point through which the fit goes; the mean of the data (an offset is fitted) if None.
+        The fit passes through it. The default is the mean of the data: an offset is fitted.
     ridge : float
-        Penalty on the squared coefficients, each in units of the spread of its regressor.
-
-    Raises
-    ------
-    ValueError
-        If there are too few steps or the data do not excite the plant.
+        Penalty on the squared coefficients, each in units of its regressor's spread.
     """
-    n = sizes[0]
     regressors = np.concatenate([episode.regressors for episode in episodes])
     targets = np.concatenate([episode.states[1:] for episode in episodes])
     steps, unknowns = regressors.shape[0], regressors.shape[1] + (origin is None)
@@ -86,22 +62,20 @@ def regress(
             "parameters are needed. Record more, or hold less out (held_out)."
         )
     center = np.mean(regressors, axis=0) if origin is None else origin
-    reached = np.mean(targets, axis=0) if origin is None else origin[:n]
-    centerd = regressors - center
-    spread = np.sqrt(np.mean(centerd**2, axis=0))
+    reached = np.mean(targets, axis=0) if origin is None else origin[: sizes[0]]
+    centered = regressors - center
+    spread = np.sqrt(np.mean(centered**2, axis=0))
     # What is left of a constant after its mean is taken off is rounding, not a signal.
     still = spread <= 1e-10 * np.max(np.abs(regressors), axis=0)
     scale = np.where(still, 1.0, spread)
-    left, sizes_of, right = np.linalg.svd(np.where(still, 0.0, centerd / scale), False)
-    excitation = float(sizes_of[-1] / sizes_of[0]) if sizes_of[0] > 0 else 0.0
-    missing = [v for s, v in zip(sizes_of, right, strict=True) if s <= WEAKEST * sizes_of[0]]
+    left, singular, right = np.linalg.svd(np.where(still, 0.0, centered / scale), False)
+    missing = [v for s, v in zip(singular, right, strict=True) if s <= WEAKEST * singular[0]]
     if missing and ridge == 0:
-        raise ValueError(_not_excited([direction(v / scale, v, sizes) for v in missing]))
-    inverse = right.T * (sizes_of / (sizes_of**2 + ridge)) if ridge else right.T / sizes_of
+        raise ValueError(_not_excited([_direction(v / scale, v, sizes) for v in missing]))
+    inverse = right.T * (singular / (singular**2 + ridge)) if ridge else right.T / singular
     coefficients = ((inverse @ left.T @ (targets - reached)) / scale[:, None]).T
-    residuals = targets - reached - centerd @ coefficients.T
-    freedom = steps - unknowns
-    covariance = residuals.T @ residuals / freedom
+    residuals = targets - reached - centered @ coefficients.T
+    covariance = residuals.T @ residuals / (steps - unknowns)
     factors = np.linalg.norm(inverse, axis=1) / scale
     return Regression(
         coefficients=coefficients,
@@ -112,22 +86,19 @@ def regress(
         factors=factors,
         covariance=covariance,
         autocorrelation=_autocorrelation(residuals, episodes, targets),
-        degrees_of_freedom=freedom,
+        degrees_of_freedom=steps - unknowns,
         steps=steps,
-        excitation=excitation,
-        weakest=direction(right[-1] / scale, right[-1], sizes),
+        excitation=float(singular[-1] / singular[0]) if singular[0] > 0 else 0.0,
+        weakest=_direction(right[-1] / scale, right[-1], sizes),
     )
 
 
-def direction(coefficients: Array, weights: Array, sizes: tuple[int, int, int]) -> str:
-    """Return a combination of states, inputs and disturbances in words, without small terms.
+def _direction(coefficients: Array, weights: Array, sizes: tuple[int, int, int]) -> str:
+    """Return a combination of states, inputs and disturbances in words.
 
-    `coefficients` are those in physical units; `weights`, those in units of each one's spread,
-    say which terms are small.
+    Terms with small `weights`, in units of their spread, are left out.
     """
-    n, m, d = sizes
-    labels = (*(("x", i) for i in range(n)), *(("u", i) for i in range(m)))
-    names = [f"{name}[{i}]" for name, i in (*labels, *(("d", i) for i in range(d)))]
+    names = [f"{k}[{i}]" for k, size in zip("xud", sizes, strict=True) for i in range(size)]
     kept = np.flatnonzero(np.abs(weights) > 0.05 * np.max(np.abs(weights)))
     first = coefficients[kept[np.argmax(np.abs(weights[kept]))]]
     if kept.size == 1:

@@ -1,4 +1,4 @@
-"""Measured episodes as the transitions that a regression takes."""
+"""Measured episodes: checked, cut at gaps, and split into fitted and held-out steps."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, to_float
 
-UNEVEN = 0.1
-"""How far a step may take longer or shorter than dt, in parts of it."""
+UNEVEN = 0.1  # largest deviation of a step's time from dt, relative to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +38,7 @@ def as_episodes(
     actions: ArrayLike | Sequence[ArrayLike],
     disturbances: ArrayLike | Sequence[ArrayLike] | None,
 ) -> tuple[list[Episode], tuple[int, int, int]]:
-    """Return the checked episodes and the sizes (n, m, d).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the arrays are no matrices, do not fit each other, are empty, or hold NaN.
-    """
+    """Return the checked episodes and the sizes (n, m, d)."""
     x, u = _matrices("states", states), _matrices("actions", actions)
     if disturbances is None:
         d: list[Array] = [np.zeros((len(each), 0)) for each in u]
@@ -67,15 +60,7 @@ def as_episodes(
 
 
 def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list[Episode]]:
-    """Return what to fit and what to test: the last of all steps, cutting an episode if need be.
-
-    Raises
-    ------
-    ValueError
-        If ``held_out`` is not a fraction in [0, 1).
-    """
-    if not 0 <= held_out < 1:
-        raise ValueError(f"held_out = {held_out!r} must be a fraction in [0, 1).")
+    """Return what to fit and what to test: the last of all steps, cutting an episode if need be."""
     total = sum(map(len, episodes))
     left = total - max(1, round(held_out * total)) if held_out else total
     fitted, tested = [], []
@@ -90,13 +75,7 @@ def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list
 def without_gaps(
     episodes: list[Episode], time: ArrayLike | Sequence[ArrayLike], dt: float
 ) -> tuple[list[Episode], int]:
-    """Return the episodes cut wherever a step took another time than dt, and the steps left out.
-
-    Raises
-    ------
-    ValueError
-        If the times do not fit the episodes or do not increase, or most steps take another time.
-    """
+    """Return the episodes cut at steps that do not take dt, and the number of these steps."""
     times = _times(time)
     if len(times) != len(episodes):
         raise ValueError(f"time has {len(times)} episodes, states has {len(episodes)}.")

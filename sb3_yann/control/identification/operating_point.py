@@ -1,4 +1,4 @@
-"""Where an identified plant rests, as far as the data tell."""
+"""The steady state of an identified plant, as far as the data determine it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.least_squares import Regression
 
-FAR = 5.0
-"""Spreads from the mean of the data beyond which a model is extrapolated."""
+FAR = 5.0  # spreads from the mean of the data beyond which a model is extrapolated
 SURE = 5.0
 """Standard errors above which a direction does not integrate: more than in other tests, since those
 of an integrator are not normally distributed (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
@@ -20,7 +19,7 @@ of an integrator are not normally distributed (Dickey & Fuller, 1979, J. Am. Sta
 def operating_point(
     found: Regression, sizes: tuple[int, int, int], given: Sequence[Array | None]
 ) -> Array:
-    """Return the state, inputs and disturbances (n+m+d,) where the fitted plant rests."""
+    """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant."""
     n, m, _ = sizes
     x, u, d = np.split(found.center, [n, n + m])
     start = np.concatenate([x if given[0] is None else given[0], u, d])
@@ -38,7 +37,7 @@ def operating_point(
     if given[0] is not None:
         start[inputs] += scale[inputs] * _way(moves[:, inputs], drift, doubt[:, inputs])
         return start
-    if given[1] is None:  # no state holds what integrates, only the inputs do
+    if given[1] is None:  # only the inputs can hold an integrator
         left, _, _, known = _directions(moves[:, states], doubt[:, states])
         free = left[:, ~known].T
         errors = np.sqrt(free**2 @ doubt[:, inputs] ** 2)
@@ -57,10 +56,9 @@ def _directions(moves: Array, doubt: Array) -> tuple[Array, Array, Array, NDArra
 
 
 def _way(moves: Array, drift: Array, doubt: Array) -> Array:
-    """Return the way that ends the drift, along the directions of which the data are sure.
+    """Return the step to the steady state along the directions that the data determine.
 
-    Along the others the plant rests far away if anywhere, or wherever it is. Exact equations would
-    go there, and take along those that are known well.
+    Along the others the steady state is far away, or anywhere: an exact solution would move there.
     """
     left, sizes, right, known = _directions(moves, doubt)
     steps = -(left.T @ drift) / np.where(known, sizes, 1.0)

@@ -6,23 +6,12 @@ of a microsecond, a good part of what a whole evaluation takes.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Sequence
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
-
-if TYPE_CHECKING:
-    from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
-    from sb3_yann.control.law.search_tree import SearchTree
-
-Integers = NDArray[np.int64]
-F = TypeVar("F", bound=Callable[..., Any])
 
 HEADER = 8
 """Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero input, disjoint."""
@@ -38,66 +27,29 @@ CLEAR = 1e-6
 """So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
 
 
-def _sources() -> str:
-    """Return a hash of all files with compiled functions, which call each other."""
-    package = Path(__file__).parents[2]
-    files = [*package.glob("control/law/_kernels.py"), *package.glob("control/law/search_tree.py")]
-    files += sorted(package.glob("networks/_kernels/*.py"))
-    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
-
-
-SOURCES = _sources()
-
-
-def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
-    """Return a decorator that compiles a function for the given types, and keeps the machine code.
-
-    With types that are given nothing is ever compiled for others: those are refused. Without any
-    the function is a part of those that call it. With ``fastmath`` sums may be taken in any order,
-    several terms at a time.
-    """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
-
-    def compile_it(function: F) -> F:
-        if not signatures or numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-            part: F = numba.njit(**options)(function)
-            return part
-        result: F
-        try:
-            result = _compile(numba.njit(**options)(function), signatures, keep=True)
-        except Exception:  # no folder to write to, a full disk, a damaged file
-            result = _compile(numba.njit(**options)(function), signatures, keep=False)
-        return result
-
-    return compile_it
-
-
-def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
-    if keep:
-        dispatcher.enable_caching()
-        # numba looks at the function's own file; what it calls may have changed in another.
-        dispatcher._cache._cache_file._source_stamp = SOURCES
-    for signature in signatures:
-        dispatcher.compile(signature)
-    dispatcher.disable_compile()
-    return dispatcher
-
-
-def pack(law: PiecewiseAffine, tree: SearchTree | None) -> tuple[Array, Integers]:
+def pack(
+    gains: Array,
+    offsets: Array,
+    rows: Array,
+    starts: Integers,
+    bounds: Array,
+    tolerances: tuple[float, float],
+    flags: tuple[bool, bool],
+    tree: Sequence[Array | Integers] = (),
+) -> tuple[Array, Integers]:
     """Return a law as one array of floats and one of whole numbers, for the functions below.
 
-    Without a tree the regions are scanned one by one.
+    ``rows`` are [A b] (q, n + 1) of all regions, each from ``starts`` on; ``bounds`` are u_min and
+    u_max (2, m). ``tolerances`` tell how far outside counts as inside and which slacks tie,
+    ``flags`` whether the input is zero outside and whether no regions overlap. ``tree`` holds the
+    arrays of a search tree; without one the regions are scanned one by one.
     """
-    nodes, leaves = (len(tree.levels), len(tree.leaf_starts) - 1) if tree else (0, 0)
-    p, m, n = law.gains.shape
-    header = [n, m, p, law.n_halfspaces, nodes, leaves]
-    header += [law.infeasible == "zero_input", law.disjoint]
-    rows = np.column_stack([law.A, law.b])
-    floats: list[Any] = [(law.tolerance, law.tie_tolerance), rows, law.gains, law.offsets]
-    floats += [law.u_min, law.u_max, *((tree.normals, tree.levels) if tree else ())]
-    whole: list[Any] = [header, law.starts, [law.n_halfspaces]]
-    whole += [tree.children, tree.leaf_starts, tree.leaf_regions] if tree else []
+    (p, m, n), q = gains.shape, len(rows)
+    normals, levels, *numbers = tree or (np.empty(0), np.empty(0))
+    leaves = len(numbers[1]) - 1 if numbers else 0
+    header = [n, m, p, q, len(levels), leaves, *flags]
+    floats = (np.array(tolerances), rows, gains, offsets, bounds, normals, levels)
+    whole = (header, starts, [q], *numbers)
     return (
         np.concatenate([np.ravel(each) for each in floats]),
         np.concatenate([np.ravel(each) for each in whole]).astype(np.int64),
@@ -255,31 +207,25 @@ def input_at(floats: Array, whole: Integers, theta: Array, out: Array, at: int) 
     return region
 
 
-@compiled("optional(float64[::1])(float64[::1], int64[::1], float64[::1])")
-def law_at(floats: Array, whole: Integers, theta: Array) -> Array | None:
-    """Return the input (m,) at one theta (n,), None where theta is not finite or too long."""
+@compiled("boolean(float64[::1], int64[::1], float64[::1], float64[::1])")
+def law_at(floats: Array, whole: Integers, theta: Array, out: Array) -> bool:
+    """Write the input (m,) at one theta (n,); False where theta is not finite or too long."""
     if len(theta) != whole[0]:
-        return None
-    out = np.empty((1, whole[1]))
-    if input_at(floats, whole, theta.reshape(1, -1), out, 0) < 0:
-        return None
-    u: Array = out[0]
-    return u
+        return False
+    return input_at(floats, whole, theta.reshape(1, -1), out.reshape(1, -1), 0) >= 0
 
 
-@compiled("float64[:, ::1](float64[::1], int64[::1], float64[:, ::1])")
-def law_of_batch(floats: Array, whole: Integers, theta: Array) -> Array:
-    """Return the inputs (batch, m) at the rows of theta (batch, n), all finite."""
-    out = np.empty((len(theta), whole[1]))
+@compiled("void(float64[::1], int64[::1], float64[:, ::1], float64[:, ::1])")
+def law_of_batch(floats: Array, whole: Integers, theta: Array, out: Array) -> None:
+    """Write the inputs (batch, m) at the rows of theta (batch, n), all finite."""
     for i in range(len(theta)):
         input_at(floats, whole, theta, out, i)
-    return out
 
 
-@compiled("Tuple((int64[::1], float64[::1]))(float64[::1], int64[::1], float64[:, ::1])")
-def locate_batch(floats: Array, whole: Integers, theta: Array) -> tuple[Integers, Array]:
-    """Return the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
-    region, inside = np.empty(len(theta), np.int64), np.empty(len(theta))
+@compiled("void(float64[::1], int64[::1], float64[:, ::1], int64[::1], float64[::1])")
+def locate_batch(
+    floats: Array, whole: Integers, theta: Array, region: Integers, inside: Array
+) -> None:
+    """Write the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
     for i in range(len(theta)):
         region[i], inside[i] = _choose(floats, whole, theta, i)
-    return region, inside

@@ -19,6 +19,8 @@ from sb3_yann._validation import (
     ReadOnlyArrays,
     as_array,
     as_bounds,
+    as_choice,
+    as_flag,
     same_fields,
     to_float,
 )
@@ -26,6 +28,7 @@ from sb3_yann._validation import (
 if TYPE_CHECKING:
     from sb3_yann.control.law.search_tree import SearchTree
 
+# Compiled code, or its machine code, is loaded at the first use of a law: not at an import.
 INFEASIBLE = ("nearest_region", "zero_input")
 SCAN = 4
 """Up to this many regions are asked one by one."""
@@ -40,24 +43,21 @@ _COMPILED = ("packed", "_at")
 class PiecewiseAffine(ReadOnlyArrays):
     """The law ``u = gains[i] theta + offsets[i]`` for theta in region i, total and bounded.
 
-    One region is chosen at every theta: the one whose smallest slack ``b - A theta`` over its own
-    half-spaces is largest, the first of them on a tie. Inside the feasible set that is a region
-    which holds theta (on a facet, one of its neighbors, where both laws agree); outside it is the
-    region that theta violates least.
+    The region at theta is the one whose smallest slack ``b - A theta`` is largest, the first of
+    them on a tie: a region that holds theta, or the one that theta violates least. Where the MPC
+    has no solution, ``infeasible`` decides:
 
-    Outside the feasible set, where the MPC has no solution, ``infeasible`` decides:
-
-    - ``"nearest_region"``: the affine law of the chosen region, clipped to the input bounds.
-    - ``"zero_input"``: no deviation of the input (clipped to the bounds), as in Braniff & Tian,
-      where no indicator of a region is active. It jumps at the border of the feasible set.
+    - ``"nearest_region"``: the affine law of that region, clipped to the input bounds.
+    - ``"zero_input"``: no deviation of the input, clipped to the bounds, as in Braniff & Tian. It
+      jumps at the border of the feasible set.
 
     Attributes
     ----------
     gains : ndarray, shape (p, m, n)
     offsets : ndarray, shape (p, m)
     A : ndarray, shape (q, n)
-        Half-spaces ``A theta <= b`` of all regions, region after region. A slack ``b - A theta``
-        is a distance in half-widths of the box: whatever the units of theta, the law is the same.
+        Half-spaces ``A theta <= b`` of all regions, region after region. Slacks are distances in
+        half-widths of the box: the law is the same in all units of theta.
     b : ndarray, shape (q,)
     starts : ndarray of int, shape (p,)
         The first row of each region in ``A``.
@@ -67,9 +67,17 @@ class PiecewiseAffine(ReadOnlyArrays):
         The box for which the law was solved; a network scales its inputs by it.
     infeasible : {"nearest_region", "zero_input"}
     disjoint : bool, default False
-        That no two regions share an interior, as `LinearMPC.explicit` checks of its laws: the
-        search then ends at the first region found to hold theta, several times as fast. It is not
-        checked here; where it is wrong, any of the regions that hold theta may be chosen.
+        That no two regions share an interior: the search then ends at the first region that holds
+        theta, several times as fast. It is not checked here.
+
+    Examples
+    --------
+    >>> law = PiecewiseAffine(
+    ...     gains=[[[-2.0]]], offsets=[[0.0]], A=[[1.0], [-1.0]], b=[1.0, 1.0], starts=[0],
+    ...     u_min=[-1.0], u_max=[1.0], theta_min=[-1.0], theta_max=[1.0],
+    ... )
+    >>> law([0.25]), law([3.0])
+    (array([-0.5]), array([-1.]))
     """
 
     gains: Array
@@ -83,9 +91,6 @@ class PiecewiseAffine(ReadOnlyArrays):
     theta_max: Array
     infeasible: str = "nearest_region"
     disjoint: bool = False
-
-    # To find a region, more than SCAN of them are held in a tree of hyperplanes, built in a moment
-    # when it is first needed; machine code of numba searches it.
 
     # How far outside every region a point may lie, in half-widths of the box, and still count as
     # inside: facets of neighbors agree to rounding only.
@@ -106,10 +111,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         values["theta_min"], values["theta_max"] = as_bounds(
             "theta", self.theta_min, self.theta_max, n
         )
-        if self.infeasible not in INFEASIBLE:
-            raise ValueError(f"infeasible = {self.infeasible!r} must be one of {INFEASIBLE}.")
-        if not isinstance(self.disjoint, bool):
-            raise TypeError(f"disjoint = {self.disjoint!r} must be True or False.")
+        as_choice("infeasible", self.infeasible, INFEASIBLE)
+        as_flag("disjoint", self.disjoint)
         rows = as_array("starts", self.starts, (p,))
         if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):
             raise ValueError(
@@ -142,24 +145,20 @@ class PiecewiseAffine(ReadOnlyArrays):
         return int(self.gains.shape[1])
 
     def __call__(self, theta: ArrayLike) -> Array:
-        """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n).
-
-        Raises
-        ------
-        TypeError, ValueError
-            If theta is not numeric, has another shape or holds NaN or infinite entries.
-        """
+        """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
         if getattr(theta, "ndim", 0) == 1:
+            u = np.empty(len(self.u_min))
             try:
-                u = self._at(theta)
+                if self._at(theta, u):
+                    return u
             except TypeError:  # not float64, which is all that this was compiled for
-                u = None
-            if u is not None:
-                return u
+                pass
+        points = self._as_theta(theta)
+        rows = np.atleast_2d(points)
+        inputs = np.empty((len(rows), self.n_inputs))
         from sb3_yann.control.law._kernels import law_of_batch
 
-        points = self._as_theta(theta)
-        inputs: Array = law_of_batch(*self.packed, np.atleast_2d(points))
+        law_of_batch(*self.packed, rows, inputs)
         return inputs if points.ndim == 2 else inputs[0]
 
     def locate(self, theta: ArrayLike) -> NDArray[np.int64]:
@@ -171,10 +170,7 @@ class PiecewiseAffine(ReadOnlyArrays):
         return np.asarray(self._choose(theta)[1] >= -self.tolerance)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the law to ``path`` as an ``.npz`` file of plain arrays (no pickle).
-
-        With it goes the tree that finds a region, if it has one.
-        """
+        """Write the law, and its search tree, to ``path`` as an ``.npz`` file of plain arrays."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.tree is not None:
             arrays.update({f"tree_{name}": each for name, each in vars(self.tree).items()})
@@ -188,13 +184,7 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> PiecewiseAffine:
-        """Read a law that :meth:`save` wrote.
-
-        Raises
-        ------
-        ValueError
-            If the file is not such a law.
-        """
+        """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
         try:
             data = np.load(path, allow_pickle=False)
             if isinstance(data, np.ndarray):
@@ -237,10 +227,12 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     def _choose(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:
         """Return the region in use and how far inside it each point lies, negative outside."""
+        points = self._as_theta(theta)
+        rows = np.atleast_2d(points)
+        region, inside = np.empty(len(rows), np.int64), np.empty(len(rows))
         from sb3_yann.control.law._kernels import locate_batch
 
-        points = self._as_theta(theta)
-        region, inside = locate_batch(*self.packed, np.atleast_2d(points))
+        locate_batch(*self.packed, rows, region, inside)
         return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
 
     @cached_property
@@ -259,10 +251,19 @@ class PiecewiseAffine(ReadOnlyArrays):
         """The law as two arrays for compiled code, see `_kernels.pack`."""
         from sb3_yann.control.law._kernels import pack
 
-        return pack(self, self.tree)
+        return pack(
+            self.gains,
+            self.offsets,
+            np.column_stack([self.A, self.b]),
+            self.starts,
+            np.stack([self.u_min, self.u_max]),
+            (self.tolerance, self.tie_tolerance),
+            (self.infeasible == "zero_input", self.disjoint),
+            tuple(vars(self.tree).values()) if self.tree else (),
+        )
 
     @cached_property
-    def _at(self) -> Callable[[Any], Array | None]:
+    def _at(self) -> Callable[[Any, Array], bool]:
         from sb3_yann.control.law._kernels import law_at
 
         return partial(law_at, *self.packed)

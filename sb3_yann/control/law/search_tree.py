@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection, QhullError
 
+from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
-from sb3_yann.control.law._kernels import Integers, compiled
 from sb3_yann.control.polyhedra import largest_ball
 
 LEAF = 4
@@ -59,13 +59,7 @@ class SearchTree:
     leaf_regions: Integers
 
     def checked(self, n_theta: int, n_regions: int) -> SearchTree:
-        """Return the tree if a search of it ends in a leaf with regions that there are.
-
-        Raises
-        ------
-        ValueError
-            If it is not a tree for so many parameters and regions: compiled code does not check.
-        """
+        """Return the tree, or raise ValueError if a search of it may leave it or those regions."""
         nodes, leaves = self.levels.size, self.leaf_starts.size - 1
         numbers = np.arange(nodes)[:, None]
         whole = (self.children, self.leaf_starts, self.leaf_regions)
@@ -88,19 +82,6 @@ class SearchTree:
             raise ValueError(f"its search tree does not fit {n_regions} regions")
         return self
 
-    @property
-    def depth(self) -> int:
-        """The largest number of hyperplanes on the way to a leaf."""
-        depth = np.zeros(len(self.children), dtype=int)
-        for node, children in enumerate(self.children):  # children come after their parents
-            depth[children[children > 0]] = depth[node] + 1
-        return int(depth.max(initial=-1)) + 1
-
-    @property
-    def largest_leaf(self) -> int:
-        """The largest number of regions in a leaf."""
-        return int(np.diff(self.leaf_starts).max())
-
 
 @dataclass(frozen=True)
 class _Polytopes:
@@ -120,52 +101,50 @@ def build_tree(
 ) -> SearchTree:
     """Return a tree for the regions of a :class:`PiecewiseAffine`, in a bounded box of theta.
 
-    It is balanced as well as a few dozen candidates at every node allow. Whether a region lies on
-    one side is seen by its vertices, of which rounding may move some: the result of a search has
-    to be checked by its slack. The draws are seeded, so that a law always gives the same tree.
+    Vertices tell on which side a region lies. Rounding may move some: a search has to check its
+    result by the slack. The draws are seeded: a law always gives the same tree.
     """
     center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
     regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))
     random = np.random.default_rng(0)
-    normals: list[Array] = []
-    levels: list[float] = []
+    tree = _grow(regions, random)
+    if not len(tree.levels):  # regions that no hyperplane parts
+        return tree
+    in_box, leaf_regions = tree.normals / half, _often_first(tree, regions, random)
+    in_all = tree.levels + in_box @ center
+    return replace(tree, normals=in_box, levels=in_all, leaf_regions=leaf_regions)
+
+
+def _grow(regions: _Polytopes, random: np.random.Generator) -> SearchTree:
+    """Return a tree whose nodes are split until few regions, or too many nodes, are left."""
+    p, n = regions.middles.shape
+    rows: list[int] = []
     children: list[list[int]] = []
     leaves: list[Integers] = []
-    everything = np.arange(len(starts), dtype=np.int64)
     # The fullest node first, and of those the oldest: a number, its parent and side.
-    waiting: list[tuple[int, int, Integers, int, int]] = [(-len(starts), 0, everything, -1, 0)]
-    most, order = NODES * len(starts), 0
+    waiting: list[tuple[int, int, Integers, int, int]] = [(-p, 0, np.arange(p), -1, 0)]
+    order = 0
     while waiting:
         _, _, inside, parent, side = heappop(waiting)
-        full = len(levels) >= most or len(inside) <= LEAF
+        full = len(rows) >= NODES * p or len(inside) <= LEAF
         split = None if full else _best_split(regions, inside, random)
         if parent >= 0:
-            children[parent][side] = -1 - len(leaves) if split is None else len(levels)
+            children[parent][side] = -1 - len(leaves) if split is None else len(rows)
         if split is None:
             leaves.append(np.sort(inside))
             continue
         row, *parts = split
         for which, part in enumerate(parts):
             order += 1
-            heappush(waiting, (-len(part), order, part, len(levels), which))
-        normals.append(regions.A[row])
-        levels.append(regions.b[row])
+            heappush(waiting, (-len(part), order, part, len(rows), which))
+        rows.append(row)
         children.append([0, 0])
-    tree = SearchTree(
-        normals=np.array(normals).reshape(-1, len(half)),
-        levels=np.array(levels),
+    return SearchTree(
+        normals=regions.A[rows].reshape(-1, n),
+        levels=regions.b[rows],
         children=np.array(children, dtype=np.int64).reshape(-1, 2),
         leaf_starts=np.cumsum([0, *map(len, leaves)]),
         leaf_regions=np.concatenate(leaves),
-    )
-    if not levels:  # regions that no hyperplane parts
-        return tree
-    in_box = tree.normals / half
-    return replace(
-        tree,
-        normals=in_box,
-        levels=tree.levels + in_box @ center,
-        leaf_regions=_often_first(tree, regions, random),
     )
 
 
@@ -181,28 +160,18 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
     first, last = regions.vertex_starts[which], regions.vertex_starts[which + 1]
     corners = regions.vertices[random.integers(first, last, (n + 1, len(which)))]
     within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
-    all_over, in_each = (
-        _hits(
-            tree.normals,
-            tree.levels,
-            tree.children,
-            tree.leaf_starts,
-            tree.leaf_regions,
-            regions.A,
-            regions.b,
-            regions.row_starts,
-            points,
-        )
-        for points in (everywhere, within)
-    )
+    all_over, in_each = np.zeros((2, len(tree.leaf_regions)), np.int64)
+    for points, hits in ((everywhere, all_over), (within, in_each)):
+        half_spaces = regions.A, regions.b, regions.row_starts
+        _hits(*(*vars(tree).values(), *half_spaces, points, hits))
     leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
     order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
     return np.ascontiguousarray(tree.leaf_regions[order])
 
 
 @compiled(
-    "int64[::1](float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
-    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1])"
+    "void(float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1], int64[::1])"
 )
 def _hits(
     normals: Array,
@@ -214,9 +183,9 @@ def _hits(
     b: Array,
     row_starts: Integers,
     points: Array,
-) -> Integers:
-    """Return for each entry of ``leaf_regions`` how many points it is the first one to hold."""
-    hits = np.zeros(len(leaf_regions), np.int64)
+    hits: Integers,
+) -> None:
+    """Count for each entry of ``leaf_regions`` the points that it is the first one to hold."""
     for each in range(len(points)):
         point, node = points[each], 0
         while node >= 0:
@@ -232,7 +201,6 @@ def _hits(
             if inside:
                 hits[k] += 1
                 break
-    return hits
 
 
 def _polytopes(A: Array, b: Array, row_starts: Integers) -> _Polytopes:
@@ -256,15 +224,9 @@ def _best_split(
     chosen = random.choice(inside, min(CANDIDATES, len(inside)), replace=False)
     first, last = regions.row_starts[chosen], regions.row_starts[chosen + 1]
     rows = random.integers(np.tile(first, 2), np.tile(last, 2))
-    sides = _sides(
-        regions.vertices,
-        regions.vertex_starts,
-        regions.middles,
-        regions.radii,
-        inside,
-        regions.A[rows],
-        regions.b[rows],
-    )
+    sides = np.empty((len(rows), len(inside)), np.uint8)
+    shapes = regions.vertices, regions.vertex_starts, regions.middles, regions.radii
+    _sides(*shapes, inside, regions.A[rows], regions.b[rows], sides)
     below, above = (sides & 1).sum(axis=1), (sides >> 1).sum(axis=1)
     larger = np.maximum(below, above)
     best = int(np.lexsort((below + above, larger))[0])
@@ -274,8 +236,8 @@ def _best_split(
 
 
 @compiled(
-    "uint8[:, ::1](float64[:, ::1], int64[::1], float64[:, ::1], float64[::1], int64[::1], "
-    "float64[:, ::1], float64[::1])"
+    "void(float64[:, ::1], int64[::1], float64[:, ::1], float64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1], uint8[:, ::1])"
 )
 def _sides(
     points: Array,
@@ -285,10 +247,10 @@ def _sides(
     inside: Integers,
     normals: Array,
     levels: Array,
-) -> NDArray[np.uint8]:
-    """Return for each hyperplane and region: 1 below it, 2 above it, 3 on both sides."""
+    sides: NDArray[np.uint8],
+) -> None:
+    """Write for each hyperplane and region: 1 below it, 2 above it, 3 on both sides."""
     n = points.shape[1]
-    sides = np.zeros((len(levels), len(inside)), np.uint8)
     for c in range(len(levels)):
         for k in range(len(inside)):
             i = inside[k]
@@ -306,7 +268,6 @@ def _sides(
                 side |= 1 if distance < -OVERLAP else 0
                 side |= 2 if distance > OVERLAP else 0
             sides[c, k] = side if side else 3
-    return sides
 
 
 def vertices(A: Array, b: Array) -> Array:

@@ -1,40 +1,121 @@
-"""Whether a simulator remembers more than the state that it is set to, as a delay does."""
+"""How the state of a simulator is set and read, chosen by trial."""
 
 from __future__ import annotations
 
-from itertools import pairwise
-from typing import TYPE_CHECKING
+from itertools import pairwise, product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, as_array, as_positive_vector
+from sb3_yann.control.linearization.simulator import Simulator
 
-if TYPE_CHECKING:
-    from sb3_yann.control.linearization.simulator import Simulator
-
-LONGEST_DELAY = 20
-"""Samples after which an input is no longer waited for."""
+LONGEST_DELAY = 20  # longest input delay, in samples, that is detected
 ADVICE = (
-    "Make what it remembers part of the state (of a delay, the inputs on their way), have "
-    "set_state set it too, or identify the plant: LinearModel.from_data"
+    "Make them part of the state (of a delay, the inputs on their way), have set_state set them "
+    "too, or identify the plant: LinearModel.from_data"
 )
 
 
-def memory(simulator: Simulator, x: Array, u: Array, other: Array, scale: Array) -> str | None:
-    """Return how a step depends on more than x and u, None if no trial shows that it does.
-
-    Differences from a set state would be wrong without a sign of it. What setting the state leaves
-    alone shows when a step is repeated after other inputs; what it starts anew shows when the
-    plant goes on by itself.
+def connect(
+    simulator: Simulator, x: Array | None, u: Array, scale: ArrayLike | None
+) -> tuple[Array, Array]:
+    """Choose how the state is set and read, by trial; return the state tried and its scale.
 
     Parameters
     ----------
-    x, u : ndarray, shapes (n,) and (m,)
-        A state and an action to try.
-    other : ndarray, shape (m,)
-        Another action.
-    scale : ndarray, shape (n,)
-        How far each state moves in use.
+    simulator : Simulator
+        Its ``setter`` and ``reader`` are set to the first pair that passes.
+    x : ndarray, shape (n,), optional
+        A state to try, NaN where it is not known. The default is that of the reset.
+    u : ndarray, shape (m,)
+        An action to try.
+    scale : array_like, shape (n,), optional
+        Range in which each state moves in use.
+    """
+    begun = {name: simulator.read(name) for name in simulator.readers}
+    tried = []
+    for setter, (reader, start) in product(simulator.setters, begun.items()):
+        if start is None or (x is not None and start.size != x.size):
+            continue
+        simulator.setter, simulator.reader = setter, reader
+        trial = start if x is None else np.where(np.isnan(x), start, x)
+        size = _scale(simulator, trial, scale)
+        failure = _failure(simulator, trial, u, size)
+        if failure is None:
+            return trial, size
+        tried.append(f"set by {setter}, read from {reader}: {failure}")
+    if not tried:
+        sizes = {name: None if v is None else v.shape for name, v in begun.items()}
+        wanted = "" if x is None else f" of shape {x.shape}, like the one given,"
+        tried = [f"a state{wanted} is nowhere to be read: {sizes}"]
+    raise ValueError(
+        "The environment could not be put into a state and read. Tried:\n  - "
+        + "\n  - ".join(tried)
+        + "\nPass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."
+    )
+
+
+def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
+    """Return the scale of each state, shape (n,)."""
+    if scale is not None:
+        return as_positive_vector("scale", as_array("scale", scale, (x.size,)), x.size)
+    size = np.maximum(np.abs(x), 1.0)
+    space = simulator.env.observation_space
+    if getattr(space, "shape", None) == x.shape and hasattr(space, "low"):
+        width = (space.high.astype(np.float64) - space.low) / 2
+        # Gymnasium's way of saying "no bound" is also the largest float32.
+        size = np.where(width < 1e6, width, size)
+    return np.asarray(size)
+
+
+def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | None:
+    """Try the present way to set and read the state; return its fault, None without one."""
+    for other in (x + 0.01 * scale, x - 0.01 * scale):
+        try:
+            seen = [simulator.read() if simulator.put(state) else None for state in (x, other)]
+        except (ValueError, AssertionError, TypeError, KeyError, AttributeError) as error:
+            failure = f"refused ({error})"
+            continue
+        break
+    else:
+        return failure
+    for wanted, got in zip((x, other), seen, strict=True):
+        if got is not None and np.any(np.abs(got - wanted) > 1e-5 * (scale + np.abs(wanted))):
+            return (
+                f"set to {wanted.tolist()} it reads {got.tolist()} (a state that is ignored, or "
+                "an angle that wraps there)"
+            )
+    first, moved, again = (simulator.next_state(state, u) for state in (x, other, x))
+    if not np.all(np.abs(again - first) <= 1e-6 * (scale + np.abs(first))):
+        return (
+            f"two steps from the same state {x.tolist()} end in {first.tolist()} and "
+            f"{again.tolist()}: setting it does not work, or the plant is random or has states "
+            "besides these (then identify it: LinearModel.from_data)"
+        )
+    pushed = simulator.next_state(other, u + 0.1 * _room(simulator, u))
+    if np.array_equal(moved, other) and np.array_equal(pushed, other):
+        return f"no step changes it from {other.tolist()}, whatever the action"
+    if not simulator.resets and np.array_equal(first, moved):
+        return f"the next state is {first.tolist()} from {x.tolist()} and {other.tolist()} alike"
+    return _hidden_state(simulator, x, u, u + 0.5 * _room(simulator, u), scale)
+
+
+def _room(simulator: Simulator, u: Array) -> Array:
+    """Return the way from u to the farther bound of the actions, signed, and at most 1000."""
+    space = simulator.env.action_space
+    up, down = space.high - u, u - space.low
+    return np.asarray(np.where(up >= down, np.minimum(up, 1e3), -np.minimum(down, 1e3)))
+
+
+def _hidden_state(
+    simulator: Simulator, x: Array, u: Array, other: Array, scale: Array
+) -> str | None:
+    """Describe the hidden states that show in steps from x with u and other, None without any.
+
+    They would make differences wrong. A hidden state that setting x leaves alone shows when a step
+    is repeated after other inputs. One that setting x resets shows when the plant goes on by
+    itself.
     """
     first = simulator.next_state(x, u)
     for _ in range(LONGEST_DELAY):

@@ -16,28 +16,12 @@ RATIO = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Jacobian:
-    """A Jacobian and what its differences showed.
+    """A Jacobian (r, c), and what its differences showed."""
 
-    Attributes
-    ----------
-    value : ndarray, shape (r, c)
-        The derivatives; those that are not above their own error are exactly zero.
-    error : ndarray, shape (r, c)
-        Estimated error of each.
-    dropped : float
-        The largest entry that was set to zero for being below its error.
-    steps : ndarray, shape (c,)
-        The longest step in each coordinate.
-    change : ndarray, shape (c,)
-        How much the difference over the longest step is off, as a fraction of the largest entry
-        of the column: how nonlinear the function is within that step. NaN if it has no value there.
-    """
-
-    value: Array
-    error: Array
-    dropped: float
-    steps: Array
-    change: Array
+    value: Array  # (r, c), exactly zero where not above its own error
+    dropped: float  # the largest derivative that was set to zero
+    steps: Array  # (c,), the longest step in each coordinate
+    change: Array  # (c,), error of the longest step relative to its column, NaN without a value
 
 
 class NotDifferentiableError(ValueError):
@@ -55,24 +39,22 @@ def jacobian(
     noise: Array,
     actual: Callable[[Array], Array] = lambda z: z,
 ) -> Jacobian:
-    """Return the derivatives of f at a point, with Richardson's extrapolation and its error.
+    """Return the derivatives of f at a point by Richardson extrapolation.
 
-    The difference over h and the one over h/4 give an extrapolation that is exact up to fourth
-    order in h. Of the extrapolations over ever shorter steps, each entry takes the one that agrees
-    best with its neighbor: Ridders (1982), *Advances in Engineering Software* 4, 75-76. SciPy
-    has such a method too (`scipy.differentiate`, from 1.15 on) but for smooth functions only: a
-    simulator clips and wraps, which has to be noticed rather than averaged.
+    Each entry takes the extrapolation that agrees best with its neighbor over shorter steps:
+    Ridders (1982), *Advances in Engineering Software* 4, 75-76. `scipy.differentiate` would
+    average the kinks and jumps of a simulator that clips or wraps.
 
     Parameters
     ----------
     f : callable
-        Takes an array of shape (c,), returns one of shape (r,); NaN where it has no value.
+        Takes an array of shape (c,), returns one of shape (r,), NaN where it has no value.
     point, steps : ndarray, shape (c,)
-        Where, and the longest step in each coordinate.
+        The point, and the longest step in each coordinate.
     noise : ndarray, shape (r,)
         The error of each value of f (rounding).
     actual : callable, optional
-        The point that f really takes for one it is given, e.g. that in float32.
+        The point at which f is evaluated for a given one, e.g. its float32 rounding.
 
     Raises
     ------
@@ -87,7 +69,6 @@ def jacobian(
     lost = np.abs(value) <= error
     return Jacobian(
         value=np.where(lost, 0.0, value).T,
-        error=error.T,
         dropped=float(np.max(np.abs(value[lost]), initial=0.0)),
         steps=steps,
         change=change,

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_positive, to_float
+from sb3_yann._validation import Array, as_array, as_positive, as_positive_vector, to_float
+from sb3_yann.control.linear_system import LinearSystem, zero_order_hold
+from sb3_yann.control.linearization.connect import connect
 from sb3_yann.control.linearization.finite_differences import (
     Jacobian,
     NotDifferentiableError,
@@ -18,26 +20,19 @@ from sb3_yann.control.linearization.finite_differences import (
 from sb3_yann.control.linearization.simulator import (
     Simulator,
     borrow,
-    connect,
     sample_time,
     to_vector,
 )
-from sb3_yann.control.linearization.steady_state import check_rest, steady_state
-from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.linearization.steady_state import require_steady_state, steady_state
 
 if TYPE_CHECKING:
     from sb3_yann.control.linearization.simulator import Maker
 
-LONGEST = 0.01
-"""The longest step of a difference, in parts of the scale of its coordinate."""
-LONGEST_SINGLE = 0.05
-"""The same where states are read in float32."""
-STEADY = 1e-3
-"""How far a steady state may move in one sample, in parts of its scale."""
-MOVES = 0.01
-"""The same in parts of its own size, from which on a state smaller than 1 is warned of."""
-SHORTER = 64.0
-"""How much shorter steps become where a function has no value next to the point."""
+LONGEST = 0.01  # longest step of a difference, relative to the scale of its coordinate
+LONGEST_SINGLE = 0.05  # the same where states are read in float32
+STEADY = 1e-3  # largest motion of a steady state in one sample, relative to its scale
+MOVES = 0.01  # the same relative to its own size: beyond it, a state smaller than 1 gets a warning
+SHORTER = 64.0  # factor by which steps shrink where a function has no value next to the point
 
 
 def linearize_dynamics(
@@ -47,55 +42,61 @@ def linearize_dynamics(
     dt: float,
     d_ss: ArrayLike | None,
     scale: ArrayLike | None = None,
-) -> LinearModel:
-    """See `LinearModel.from_dynamics`."""
+) -> LinearSystem:
+    """Return the sampled linearization of `LinearModel.from_dynamics`."""
     x, u = as_array("x_ss", x_ss, ("n",)), as_array("u_ss", u_ss, ("m",))
     d = as_array("d_ss", [] if d_ss is None else d_ss, ("d",))
     dt = as_positive("dt", dt)
-    n, inputs = x.size, x.size + u.size
-    names, extra = ("(x, u)", "") if d_ss is None else ("(x, u, d)", f", d_ss = {d.tolist()}")
+    given = {"x": x, "u": u} if d_ss is None else {"x": x, "u": u, "d": d}
+    sizes = (x.size, u.size)
     if not callable(f):
-        raise TypeError(f"f = {f!r} must be a function {names} -> dx/dt.")
+        raise TypeError(f"f = {f!r} must be a function ({', '.join(given)}) -> dx/dt.")
 
     def rate(point: Array) -> Array:
-        parts = (point[:n], point[n:inputs], *([] if d_ss is None else [point[inputs:]]))
-        return np.asarray(f(*parts), dtype=np.float64)
+        parts = np.split(point, np.cumsum(sizes))
+        return np.asarray(f(*parts[: len(given)]), dtype=np.float64)
 
-    arguments = (x, u) if d_ss is None else (x, u, d)
-    called = "f(x_ss, u_ss)" if d_ss is None else "f(x_ss, u_ss, d_ss)"
+    called = f"f({', '.join(f'{name}_ss' for name in given)})"
     point = np.concatenate([x, u, d])
-    size = _dynamics_scale(point, n, scale)
-    drift = dt * np.abs(as_array(called, f(*arguments), (n,)))
-    if np.any(drift > STEADY * size[:n]):
+    size = _dynamics_scale(point, x.size, scale)
+    moved = dt * np.abs(as_array(called, f(*given.values()), (x.size,)))
+    _require_steady_dynamics(given, moved, size, dt, scale is not None)
+    rounding = np.finfo(float).eps * np.maximum(np.abs(x), size[: x.size]) / dt
+    found = _differences(rate, point, LONGEST * size, rounding, sizes)
+    A, B, E = np.split(found.value, np.cumsum(sizes), axis=1)
+    A, B, E = zero_order_hold(A, B, E, dt)
+    notes = (*_idle_inputs(B, 4), *_curvature(found, sizes))
+    return LinearSystem(A, B, dt, x, u, E, d, notes)
+
+
+def _require_steady_dynamics(
+    given: dict[str, Array], moved: Array, size: Array, dt: float, scaled: bool
+) -> None:
+    """Raise if the operating point moves too far in one sample; warn if that is not certain."""
+    x, names = given["x"], ", ".join(given)
+    if np.any(moved > STEADY * size[: x.size]):
+        point = ", ".join(f"{name}_ss = {value.tolist()}" for name, value in given.items())
         raise ValueError(
-            f"x_ss = {x.tolist()}, u_ss = {u.tolist()}{extra} is no steady state: within one "
-            f"sample of {dt:g} the state would move by {drift.tolist()}, with a scale of "
-            f"{size[:n].tolist()}. Solve f{names} = 0 first, e.g. with scipy.optimize.root."
+            f"{point} is no steady state: within one sample of {dt:g} the state would move by "
+            f"{moved.tolist()}, with a scale of {size[: x.size].tolist()}. Solve f({names}) = 0 "
+            "first, e.g. with scipy.optimize.root."
         )
-    if scale is None and np.any((drift > MOVES * np.abs(x)) & (x != 0) & (drift > 1e-8)):
+    if not scaled and np.any((moved > MOVES * np.abs(x)) & (x != 0) & (moved > 1e-8)):
         warnings.warn(
             f"Within one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
-            f"{drift.tolist()}: little beside 1, and much beside itself. Pass scale=..., how far "
+            f"{moved.tolist()}: little beside 1, and much beside itself. Pass scale=..., how far "
             "each state moves in use, to have it checked.",
-            stacklevel=3,
+            stacklevel=4,
         )
-    rounding = np.finfo(float).eps * np.maximum(np.abs(x), size[:n]) / dt
-    found = _differences(rate, point, LONGEST * size, rounding, (n, u.size))
-    A, B, E = np.split(found.value, [n, inputs], axis=1)
-    model = LinearModel.from_continuous(A, B, dt, x, u, E, d)
-    return model.with_notes(*_idle_inputs(model.B), *_curvature(found, (n, u.size)))
 
 
 def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
-    """Return how far each state, input and disturbance moves in use, from what is given of it."""
+    """Return the scale of each state, input and disturbance, completed by their sizes."""
     size: Array = np.maximum(np.abs(point), 1.0)
     if scale is None:
         return size
-    given = to_float("scale", scale)
-    given = as_array("scale", given, (point.size if given.shape == point.shape else n,))
-    if np.any(given <= 0):
-        raise ValueError(f"scale = {given.tolist()} must be above 0 in each entry.")
-    size[: given.size] = given
+    k = point.size if np.shape(scale) == point.shape else n
+    size[:k] = as_positive_vector("scale", as_array("scale", scale, (k,)), k)
     return size
 
 
@@ -107,23 +108,22 @@ def linearize_env(
     set_state: Callable[[Any, Array], object] | None,
     get_state: Callable[[Any], ArrayLike] | None,
     scale: ArrayLike | None,
-) -> LinearModel:
-    """See `LinearModel.from_env`."""
+) -> LinearSystem:
+    """Return the linearized step of `LinearModel.from_env`."""
     borrowed = borrow(env)
     try:
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)
         x, u = _partly_known("state", state), _partly_known("action", action)
-        model = _linearize(simulator, x, u, step_time, scale)
-        return model.with_notes(f"What was stepped: {borrowed.note}.")
+        return _linearize(simulator, x, u, step_time, scale)
     finally:
         borrowed.close()
 
 
 def _linearize(
     simulator: Simulator, x: Array | None, u: Array | None, dt: float, scale: ArrayLike | None
-) -> LinearModel:
-    """Connect to the simulator, find where it rests, and take the differences there."""
+) -> LinearSystem:
+    """Connect to the simulator, find its steady state, and take the differences there."""
     middle, width = _actions(simulator.env.action_space)
     if u is None:
         # With a state to hold, the action is what holds it; with none, that at mid range.
@@ -138,18 +138,19 @@ def _linearize(
     point = steady_state(simulator, np.concatenate([x_start, u_start]), free, scales)
     found = _differentiate(simulator, point, scales)
     if not np.any(free):
-        check_rest(simulator, point, found.value, scales)
+        require_steady_state(simulator, point, found.value, scales)
     A, B = found.value[:, :n], found.value[:, n:]
-    idle = _idle_inputs(B)
-    return LinearModel(A, B, dt, point[:n], point[n:]).with_notes(
-        *idle,
+    notes = (
+        *_idle_inputs(B, 5),
         "Linearized by central differences over one step. The state was set by "
         f"{simulator.setter} and read from {simulator.reader}.",
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
         "for and the others given or taken from the middle of the action space.",
         *_remarks(simulator, point),
         *_curvature(found, (n, u.size)),
+        f"The simulator was {simulator.origin}.",
     )
+    return LinearSystem(A, B, dt, point[:n], point[n:], np.zeros((n, 0)), np.zeros(0), notes)
 
 
 def _actions(space: Any) -> tuple[Array, Array]:
@@ -171,13 +172,7 @@ def _partly_known(name: str, value: ArrayLike | None) -> Array | None:
 
 
 def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian:
-    """Return the Jacobian (n, n+m) of the next state with respect to state and action.
-
-    Raises
-    ------
-    ValueError
-        If an action lies on its bound, or the plant has a kink or a jump at the point.
-    """
+    """Return the Jacobian (n, n+m) of the next state with respect to state and action."""
     space = simulator.env.action_space
     n = scale.size - space.shape[0]
     room = np.minimum(point[n:] - space.low, space.high - point[n:]).astype(np.float64)
@@ -230,8 +225,8 @@ def _differences(
     )
 
 
-def _idle_inputs(B: Array) -> list[str]:
-    """Return, and warn of, the inputs that no entry of B has an effect of."""
+def _idle_inputs(B: Array, stacklevel: int) -> list[str]:
+    """Return a note on inputs without effect, and warn of them."""
     idle = np.flatnonzero(~np.any(B, axis=0))
     if not idle.size:
         return []
@@ -240,32 +235,32 @@ def _idle_inputs(B: Array) -> list[str]:
         "delay of the input, or an actuator, the inputs on their way belong into the state; an "
         "input that really does nothing is to be left out."
     )
-    warnings.warn(note, stacklevel=5)
+    warnings.warn(note, stacklevel=stacklevel)
     return [note]
 
 
 def _remarks(simulator: Simulator, point: Array) -> list[str]:
-    """Return what a user of the model has to know of the environment."""
+    """Return notes on the end of the episode and on the observation."""
     n = point.size - simulator.env.action_space.shape[0]
     simulator.next_state(point[:n], point[n:])
     remarks = []
     if simulator.ended:
         remarks.append("The environment terminates the episode at the operating point.")
     seen, state = to_vector(simulator.observation), simulator.read()
-    if seen is None or state is None or not _same(seen, state):
+    if (
+        seen is None
+        or state is None
+        or seen.shape != state.shape
+        or not np.allclose(seen, state, rtol=1e-5, atol=1e-5)
+    ):
         remarks.append(
             "The observation is not this state. A policy needs a wrapper that makes it so."
         )
     return remarks
 
 
-def _same(one: Array, other: Array) -> bool:
-    """Tell whether two states agree in float32."""
-    return one.shape == other.shape and np.allclose(one, other, rtol=1e-5, atol=1e-5)
-
-
 def _curvature(found: Jacobian, sizes: tuple[int, int]) -> list[str]:
-    """Return notes on entries that were dropped, and where the plant bends soon."""
+    """Return notes on dropped entries, strong nonlinearity, and what has no effect."""
     notes = []
     if found.dropped > 0:
         notes.append(

@@ -6,14 +6,12 @@ import copy
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_positive, to_float
-from sb3_yann.control.linearization.connect import memory
+from sb3_yann._validation import Array, as_positive, to_float
 
 if TYPE_CHECKING:
     import gymnasium
@@ -35,7 +33,7 @@ READERS: dict[str, Reader] = {
 
 @dataclass
 class Borrowed:
-    """An environment to experiment with, and what becomes of the user's."""
+    """An environment for experiments: `private` to them, or `owned` and so closed afterwards."""
 
     env: Any
     note: str
@@ -49,13 +47,7 @@ class Borrowed:
 
 
 def borrow(env: Maker) -> Borrowed:
-    """Return an environment of one's own: made from an id or a function, or a deep copy.
-
-    Raises
-    ------
-    TypeError
-        If it is none, or its actions are not a one-dimensional Box.
-    """
+    """Return an environment made from an id or a function, or a deep copy of the given one."""
     import gymnasium
 
     if isinstance(env, str):
@@ -86,13 +78,7 @@ def borrow(env: Maker) -> Borrowed:
 
 
 def sample_time(env: Any, dt: float | None) -> float:
-    """Return the time of one step: ``dt``, or what the environment is seen to use.
-
-    Raises
-    ------
-    ValueError
-        If none is given and none is found.
-    """
+    """Return the time of one step: ``dt``, or the one that the environment states."""
     if dt is not None:
         return as_positive("dt", dt)
     plant = env.unwrapped
@@ -108,14 +94,10 @@ def sample_time(env: Any, dt: float | None) -> float:
 
 
 class Simulator:
-    """``next_state(x, u)`` of an environment that can be put into a state.
+    """``next_state(x, u)`` of an environment whose state can be set.
 
-    Parameters
-    ----------
-    borrowed : Borrowed
-        The environment; it is reset once here, with a fixed seed unless it is the user's.
-    set_state, get_state : callable, optional
-        See `LinearModel.from_env`.
+    `LinearModel.from_env` documents ``set_state`` and ``get_state``. The environment is reset once
+    here, with a fixed seed unless it is the user's.
     """
 
     def __init__(
@@ -124,11 +106,9 @@ class Simulator:
         set_state: Callable[[Any, Array], object] | None,
         get_state: Callable[[Any], ArrayLike] | None,
     ) -> None:
-        self.env = borrowed.env
-        self.refusal = ""
-        self.ended = False
+        self.env, self.origin = borrowed.env, borrowed.note
+        self.refusal, self.ended, self.over = "", False, False
         self.observation, self.info = self.env.reset(seed=0 if borrowed.private else None)
-        self.over = False
         self.readers = dict(READERS)
         if get_state is not None:
             self.readers = {"get_state": lambda env, observation, info: get_state(env)}
@@ -152,13 +132,7 @@ class Simulator:
         return self.setter == RESET
 
     def put(self, x: Array) -> bool:
-        """Put the environment into the state x; tell whether `read` then returns it already.
-
-        Raises
-        ------
-        ValueError, AssertionError, TypeError
-            Whatever the environment raises for a state that it does not take.
-        """
+        """Put the environment into the state x; tell whether `read` then returns it already."""
         if self.over and not self.resets:
             self.observation, self.info = self.env.reset()
             self.over = False
@@ -209,98 +183,3 @@ def to_vector(value: Any) -> Array | None:
     except TypeError:
         return None
     return array if array.ndim == 1 and array.size and np.all(np.isfinite(array)) else None
-
-
-def connect(
-    simulator: Simulator, x: Array | None, u: Array, scale: ArrayLike | None
-) -> tuple[Array, Array]:
-    """Choose how the state is set and read, by trying it; return the state tried and its scale.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n,), optional
-        A state to try, NaN where it is not known; None takes that of the reset.
-    u : ndarray, shape (m,)
-        An action to try.
-
-    Raises
-    ------
-    ValueError
-        If no way passes the trial; the message says what each failed at.
-    """
-    begun = {name: simulator.read(name) for name in simulator.readers}
-    tried = []
-    for setter, (reader, start) in product(simulator.setters, begun.items()):
-        if start is None or (x is not None and start.size != x.size):
-            continue
-        simulator.setter, simulator.reader = setter, reader
-        trial = start if x is None else np.where(np.isnan(x), start, x)
-        size = _scale(simulator, trial, scale)
-        failure = _failure(simulator, trial, u, size)
-        if failure is None:
-            return trial, size
-        tried.append(f"set by {setter}, read from {reader}: {failure}")
-    if not tried:
-        sizes = {name: None if v is None else v.shape for name, v in begun.items()}
-        wanted = "" if x is None else f" of shape {x.shape}, like the one given,"
-        tried = [f"a state{wanted} is nowhere to be read: {sizes}"]
-    raise ValueError(
-        "The environment could not be put into a state and read. Tried:\n  - "
-        + "\n  - ".join(tried)
-        + "\nPass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."
-    )
-
-
-def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
-    """Return how far each state moves in use, shape (n,)."""
-    if scale is not None:
-        given = as_array("scale", scale, (x.size,))
-        if np.any(given <= 0):
-            raise ValueError(f"scale = {given.tolist()} must be above 0 in each entry.")
-        return given
-    size = np.maximum(np.abs(x), 1.0)
-    space = simulator.env.observation_space
-    if getattr(space, "shape", None) == x.shape and hasattr(space, "low"):
-        width = (space.high.astype(np.float64) - space.low) / 2
-        # Gymnasium's way of saying "no bound" is also the largest float32.
-        size = np.where(width < 1e6, width, size)
-    return np.asarray(size)
-
-
-def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | None:
-    """Try a way to set and read the state; return what is wrong with it, None if nothing is."""
-    for other in (x + 0.01 * scale, x - 0.01 * scale):
-        try:
-            seen = [simulator.read() if simulator.put(state) else None for state in (x, other)]
-        except (ValueError, AssertionError, TypeError, KeyError, AttributeError) as error:
-            failure = f"refused ({error})"
-            continue
-        break
-    else:
-        return failure
-    for wanted, got in zip((x, other), seen, strict=True):
-        if got is not None and np.any(np.abs(got - wanted) > 1e-5 * (scale + np.abs(wanted))):
-            return (
-                f"set to {wanted.tolist()} it reads {got.tolist()} (a state that is ignored, or "
-                "an angle that wraps there)"
-            )
-    first, moved, again = (simulator.next_state(state, u) for state in (x, other, x))
-    if not np.all(np.abs(again - first) <= 1e-6 * (scale + np.abs(first))):
-        return (
-            f"two steps from the same state {x.tolist()} end in {first.tolist()} and "
-            f"{again.tolist()}: setting it does not work, or the plant is random or has states "
-            "besides these (then identify it: LinearModel.from_data)"
-        )
-    pushed = simulator.next_state(other, u + 0.1 * _room(simulator, u))
-    if np.array_equal(moved, other) and np.array_equal(pushed, other):
-        return f"no step changes it from {other.tolist()}, whatever the action"
-    if not simulator.resets and np.array_equal(first, moved):
-        return f"the next state is {first.tolist()} from {x.tolist()} and {other.tolist()} alike"
-    return memory(simulator, x, u, u + 0.5 * _room(simulator, u), scale)
-
-
-def _room(simulator: Simulator, u: Array) -> Array:
-    """Return the way from u to the farther bound of the actions, signed, and at most 1000."""
-    space = simulator.env.action_space
-    up, down = space.high - u, u - space.low
-    return np.asarray(np.where(up >= down, np.minimum(up, 1e3), -np.minimum(down, 1e3)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -10,25 +9,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import (
-    Array,
-    ReadOnlyArrays,
-    as_array,
-    as_positive,
-    same_fields,
-)
+from sb3_yann._validation import Array, as_array, as_positive, same_fields
+from sb3_yann.control.identification.fit import fit_log
+from sb3_yann.control.linear_system import LinearSystem, zero_order_hold
+from sb3_yann.control.linearization.linearize import linearize_dynamics, linearize_env
+from sb3_yann.control.model.report import describe
+from sb3_yann.control.model.statespace import from_control
 
 if TYPE_CHECKING:
     import gymnasium
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class LinearModel(ReadOnlyArrays):
+class LinearModel(LinearSystem):
     """The plant near an operating point: ``x[k+1] = A x[k] + B u[k] + E d[k]``, every ``dt``.
 
     ``x``, ``u`` and the measured disturbances ``d`` are deviations from the operating point
-    ``(x_ss, u_ss, d_ss)``. Arrays are stored as read-only float64. :meth:`report` says in words
-    what the matrices mean.
+    ``(x_ss, u_ss, d_ss)``. Arrays are stored as read-only float64.
 
     Parameters
     ----------
@@ -38,37 +35,31 @@ class LinearModel(ReadOnlyArrays):
         Input matrix in discrete time.
     dt : float
         Sampling time, in the time unit of the plant.
-    x_ss : array_like, shape (n,), optional
-        State at the operating point, zeros if left out.
-    u_ss : array_like, shape (m,), optional
-        Input at the operating point, zeros if left out.
+    x_ss, u_ss : array_like, shapes (n,) and (m,), optional
+        State and input at the operating point, zeros by default.
     E : array_like, shape (n, d), optional
-        Disturbance matrix in discrete time; without it there are no disturbances, d = 0.
+        Disturbance matrix in discrete time. The default is no disturbance, d = 0.
     d_ss : array_like, shape (d,), optional
-        Disturbances at the operating point, zeros if left out.
-
-    Attributes
-    ----------
-    notes : tuple of str
-        What is to be known of how the model was made: what was found, dropped, or doubtful. They
-        are no part of equality, and `dataclasses.replace` drops them with the old matrices.
-    drift : ndarray, shape (n,)
-        How far the plant was found to move in one sample at the operating point, by more than the
-        doubt about it; the model leaves that out. Kept and dropped as the notes are.
+        Disturbances at the operating point, zeros by default.
+    notes : sequence of str, optional
+        Remarks on how the model was made. Equality ignores them, `dataclasses.replace` drops them.
+    drift : array_like, shape (n,), optional
+        Measured motion in one sample at the operating point, which the model leaves out. Zeros
+        where it is within its uncertainty. Ignored and dropped as the notes are.
 
     Raises
     ------
     TypeError, ValueError
         If a matrix has the wrong shape or holds NaN, or ``dt`` is not above zero.
+
+    Examples
+    --------
+    >>> from sb3_yann.control import LinearModel
+    >>> model = LinearModel([[1, 0.1], [0, 1]], [[0], [0.1]], dt=0.1)
+    >>> model.step([1, 0], [2])
+    array([1. , 0.2])
     """
 
-    A: Array
-    B: Array
-    dt: float
-    x_ss: Array
-    u_ss: Array
-    E: Array
-    d_ss: Array
     notes: tuple[str, ...] = field(init=False, repr=False)
     drift: Array = field(init=False, repr=False)
 
@@ -81,34 +72,33 @@ class LinearModel(ReadOnlyArrays):
         u_ss: ArrayLike | None = None,
         E: ArrayLike | None = None,
         d_ss: ArrayLike | None = None,
+        *,
+        notes: Sequence[str] = (),
+        drift: ArrayLike | None = None,
     ) -> None:
-        state = as_array("A", A, ("n", "n"))
-        n = state.shape[0]
-        if n == 0 or state.shape[1] != n:
-            raise ValueError(f"A has shape {state.shape}, expected a square matrix (n, n), n >= 1.")
-        inputs = as_array("B", B, (n, "m"))
-        m = inputs.shape[1]
-        if m == 0:
-            raise ValueError(f"B has shape {inputs.shape}: the model needs at least one input.")
-        disturbances = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
-        d = disturbances.shape[1]
-        if d_ss is not None and np.size(d_ss) and not d:
+        A = as_array("A", A, ("n", "n"))
+        n = A.shape[0]
+        if n == 0 or A.shape[1] != n:
+            raise ValueError(f"A has shape {A.shape}, expected a square matrix (n, n), n >= 1.")
+        B = as_array("B", B, (n, "m"))
+        if B.shape[1] == 0:
+            raise ValueError(f"B has shape {B.shape}: the model needs at least one input.")
+        E = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
+        if d_ss is not None and np.size(d_ss) and not E.size:
             raise ValueError(
                 f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E too."
             )
-        values = {
-            "A": state,
-            "B": inputs,
-            "dt": as_positive("dt", dt),
-            "x_ss": as_array("x_ss", np.zeros(n) if x_ss is None else x_ss, (n,)),
-            "u_ss": as_array("u_ss", np.zeros(m) if u_ss is None else u_ss, (m,)),
-            "E": disturbances,
-            "d_ss": as_array("d_ss", np.zeros(d) if d_ss is None else d_ss, (d,)),
-            "notes": (),
-            "drift": as_array("drift", np.zeros(n), (n,)),
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        super().__init__(
+            A,
+            B,
+            as_positive("dt", dt),
+            _vector("x_ss", x_ss, n),
+            _vector("u_ss", u_ss, B.shape[1]),
+            E,
+            _vector("d_ss", d_ss, E.shape[1]),
+            tuple(notes),
+            _vector("drift", drift, n),
+        )
 
     @classmethod
     def from_continuous(
@@ -121,21 +111,29 @@ class LinearModel(ReadOnlyArrays):
         E: ArrayLike | None = None,
         d_ss: ArrayLike | None = None,
     ) -> LinearModel:
-        """Sample ``dx/dt = A x + B u + E d`` every ``dt``, with u and d held constant in between.
+        """Sample ``dx/dt = A x + B u + E d`` exactly every ``dt``, with a zero-order hold.
 
-        The discretization is exact (matrix exponential, `control.sample_system`).
+        Parameters
+        ----------
+        A, B, E : array_like, shapes (n, n), (n, m) and (n, d)
+            Matrices in continuous time; E is optional.
+        dt : float
+            Sampling time.
+        x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
+            The operating point, zeros by default.
+
+        Examples
+        --------
+        >>> LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], dt=0.5).B.tolist()
+        [[0.125], [0.5]]
         """
-        import control  # brings matplotlib in: only paid for where it is used
+        given = cls(A, B, dt, x_ss, u_ss, E, d_ss)
+        A, B, E = zero_order_hold(given.A, given.B, given.E, given.dt)
+        return cls(A, B, dt, x_ss, u_ss, E, d_ss)
 
-        checked = cls(A, B, dt, x_ss, u_ss, E, d_ss)
-        n, m = checked.B.shape
-        driven = np.hstack([checked.B, checked.E])
-        plant = control.ss(checked.A, driven, np.eye(n), np.zeros(driven.shape))
-        sampled = control.sample_system(plant, checked.dt, method="zoh")
-        return cls(sampled.A, sampled.B[:, :m], dt, x_ss, u_ss, sampled.B[:, m:], d_ss)
-
-    @staticmethod
+    @classmethod
     def from_dynamics(
+        cls,
         f: Callable[..., ArrayLike],
         x_ss: ArrayLike,
         u_ss: ArrayLike,
@@ -143,10 +141,7 @@ class LinearModel(ReadOnlyArrays):
         d_ss: ArrayLike | None = None,
         scale: ArrayLike | None = None,
     ) -> LinearModel:
-        """Linearize ``dx/dt = f(x, u)``, or ``f(x, u, d)``, at a steady state; sample it every dt.
-
-        The Jacobian comes from central differences that check themselves, the sampling from
-        :meth:`from_continuous`.
+        """Linearize ``dx/dt = f(x, u)`` or ``f(x, u, d)`` at a steady state, and sample it.
 
         Parameters
         ----------
@@ -160,22 +155,27 @@ class LinearModel(ReadOnlyArrays):
         d_ss : array_like, shape (d,), optional
             Measured disturbances at the operating point.
         scale : array_like, shape (n,) or (n + m + d,), optional
-            How far each state moves in use, or each state, input and disturbance: sets the step
-            sizes (1 % of it) and how far the operating point may move. The default is the size
-            of each, at least 1: for trace concentrations give their own.
+            Range in which each state, or each state, input and disturbance, moves in use. Steps
+            are 1 % of it. The default is the size of each, at least 1: give trace concentrations
+            their own.
 
         Raises
         ------
         ValueError
             If ``f`` returns another shape or NaN at the operating point, has a kink or a jump
-            there, or the operating point moves by more than 0.1 % of ``scale`` within one sample.
+            there, or the state moves by more than 0.1 % of ``scale`` within one sample.
+
+        Examples
+        --------
+        >>> tank = LinearModel.from_dynamics(lambda x, u: u - x**0.5, [4], [2], dt=1)
+        >>> tank.A.round(3).tolist(), tank.B.round(3).tolist()  # e^(-1/4) and 4 (1 - e^(-1/4))
+        ([[0.779]], [[0.885]])
         """
-        from sb3_yann.control.linearization.linearize import linearize_dynamics
+        return cls(**vars(linearize_dynamics(f, x_ss, u_ss, dt, d_ss, scale)))
 
-        return linearize_dynamics(f, x_ss, u_ss, dt, d_ss, scale)
-
-    @staticmethod
+    @classmethod
     def from_env(
+        cls,
         env: gymnasium.Env[Any, Any] | str | Callable[[], gymnasium.Env[Any, Any]],
         state: ArrayLike | None = None,
         action: ArrayLike | None = None,
@@ -185,68 +185,86 @@ class LinearModel(ReadOnlyArrays):
         get_state: Callable[[Any], ArrayLike] | None = None,
         scale: ArrayLike | None = None,
     ) -> LinearModel:
-        """Linearize one step of a simulator, wrappers and all, by central differences.
+        """Linearize one step of a simulator and its wrappers by central differences.
 
-        An id or a function makes an environment of its own, closed in the end. An environment is
-        deep-copied and left as it is; one that cannot be copied is used itself, without a seed, and
-        needs a reset afterwards, which the notes then say.
+        An environment is deep-copied and stays untouched. One that cannot be copied is used itself
+        and needs a reset afterwards; the notes then say so.
 
         Parameters
         ----------
         env : gymnasium.Env, str or callable
             A single environment with a one-dimensional Box of actions, its id, or its maker.
         state : array_like, shape (n,), optional
-            The operating point, as the environment has it. NaN entries are solved for; all are if
-            it is left out, from the state of a reset on.
+            The operating point in the environment's units. NaN entries are solved for; the default
+            solves for all of them, starting from a reset.
         action : array_like, shape (m,), optional
-            Likewise; the middle of the action space if both are left out.
+            Likewise. The default is the middle of the action space if ``state`` is left out too.
         dt : float, optional
             Time of one step. The default is ``dt``, ``tau`` or ``DT`` of the unwrapped environment,
-            or ``DT`` of its module, never ``render_fps``. Pass it if a wrapper repeats actions.
+            or ``DT`` of its module. Pass it if a wrapper repeats actions.
         set_state : callable, optional
-            ``set_state(env, x)`` puts the environment into the state x. The default tries
-            ``env.reset(options={"state": x})``, then ``env.unwrapped.state = x``, and takes the
-            first that is seen to work.
+            ``set_state(env, x)`` puts the environment into the state x. The default is the first of
+            ``env.reset(options={"state": x})`` and ``env.unwrapped.state = x`` that works.
         get_state : callable, optional
-            ``get_state(env)`` returns the state, shape (n,). The default takes the first of
-            ``info["state"]``, ``env.unwrapped.state`` and the observation that is what was set.
+            ``get_state(env)`` returns the state, shape (n,). The default is the first that works of
+            ``info["state"]``, ``env.unwrapped.state`` and the observation.
         scale : array_like, shape (n,), optional
-            How far each state moves in use: sets the step sizes (at most 1 % of it, 5 % where
-            states are float32) and how far off a given steady state may be (1 %). The default is
-            half the width of the observation space, or the size of the state, at least 1.
+            Range in which each state moves in use. Steps are at most 1 % of it, 5 % for float32
+            states; a given steady state may be 1 % off. The default is half the width of the
+            observation space, or the size of the state, at least 1.
 
         Raises
         ------
         TypeError
             For vectorized environments and other than Box actions.
         ValueError
-            If ``dt`` is not found, the environment cannot be put into a state, a step is not
-            repeatable (noise, hidden states), no steady state is found or the given one is none,
-            the action lies on its bound, or the plant has a kink or a jump at the point.
+            If ``dt`` is unknown, the state cannot be set, steps do not repeat (noise, hidden
+            states), there is no steady state, the action lies on its bound, or the plant has a
+            kink or a jump at the point.
+
+        Examples
+        --------
+        >>> pendulum = LinearModel.from_env("ClippedPendulum-v0")
+        >>> pendulum.dt, pendulum.A.shape, pendulum.B.shape
+        (0.05, (2, 2), (2, 1))
         """
-        from sb3_yann.control.linearization.linearize import linearize_env
+        return cls(**vars(linearize_env(env, state, action, dt, set_state, get_state, scale)))
 
-        return linearize_env(env, state, action, dt, set_state, get_state, scale)
-
-    @staticmethod
+    @classmethod
     def from_data(
+        cls,
         states: ArrayLike | Sequence[ArrayLike],
         actions: ArrayLike | Sequence[ArrayLike],
         *,
         dt: float,
         **options: Any,
     ) -> LinearModel:
-        """Return the model that fits measured episodes best, by least squares.
+        """Return the least-squares model of measured episodes; :meth:`report` states the fit.
 
-        The short form of :func:`sb3_yann.control.identify`, which takes the same options and
-        returns the standard errors and fits too. :meth:`report` tells the fit.
+        Parameters
+        ----------
+        states : array_like, shape (T+1, n), or a sequence of such
+            Each episode's states, before every action and after the last.
+        actions : array_like, shape (T, m), or a sequence of such
+            The inputs as they were executed.
+        dt : float
+            Sampling time.
+        **options
+            As of :func:`sb3_yann.control.identify`, which also returns standard errors.
+
+        Examples
+        --------
+        >>> x, u = np.zeros((101, 1)), np.random.default_rng(0).normal(size=(100, 1))
+        >>> for k in range(100):
+        ...     x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+        >>> LinearModel.from_data(x, u, dt=1).B.round(6).tolist()
+        [[0.5]]
         """
-        from sb3_yann.control.identification.identify import identify
+        return cls(**vars(fit_log(states, actions, dt=dt, **options).system))
 
-        return identify(states, actions, dt=dt, **options).model
-
-    @staticmethod
+    @classmethod
     def from_statespace(
+        cls,
         system: Any,
         dt: float | None = None,
         x_ss: ArrayLike | None = None,
@@ -257,9 +275,8 @@ class LinearModel(ReadOnlyArrays):
     ) -> LinearModel:
         """Take over a `control.StateSpace`: a discrete one as it is, a continuous one sampled.
 
-        The states are kept, since they are what the law depends on; the outputs are not. Where
-        they are not the states (C is not the identity, D not zero), the notes say so, and whether
-        an observer could find the states from them.
+        The outputs are dropped. Where C is not the identity or D not zero, the notes say so, and
+        whether an observer could estimate the states.
 
         Parameters
         ----------
@@ -275,27 +292,17 @@ class LinearModel(ReadOnlyArrays):
         Raises
         ------
         TypeError, ValueError
-            If it is no state space, its time base is not stated, ``dt`` is missing or not that
-            of the system, or there is no such input.
+            If it is no state space, ``dt`` is missing or not the system's, or an input is unknown.
+
+        Examples
+        --------
+        >>> import control
+        >>> lag = control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
+        >>> LinearModel.from_statespace(lag, dt=0.1).A.round(3).tolist()
+        [[0.905]]
         """
-        from sb3_yann.control.model.statespace import take_statespace
-
-        return take_statespace(system, dt, x_ss, u_ss, disturbances, d_ss)
-
-    @property
-    def n_states(self) -> int:
-        """Number of states n."""
-        return int(self.A.shape[0])
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of inputs m."""
-        return int(self.B.shape[1])
-
-    @property
-    def n_disturbances(self) -> int:
-        """Number of measured disturbances d."""
-        return int(self.E.shape[1])
+        A, B, E, step, notes = from_control(system, dt, disturbances)
+        return cls(A, B, step, x_ss, u_ss, E, d_ss, notes=notes)
 
     def step(self, x: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> Array:
         """Return ``A x + B u + E d``; each is a vector or a batch of them, (batch, size)."""
@@ -303,22 +310,8 @@ class LinearModel(ReadOnlyArrays):
         return moved if d is None else moved + np.asarray(d) @ self.E.T
 
     def report(self) -> str:
-        """Return a readable account: poles, reach of the inputs, scaling, sampling, notes."""
-        from sb3_yann.control.model.report import describe
-
+        """Return an account in words: poles, controllability, scaling, sampling and notes."""
         return describe(self)
-
-    def with_notes(self, *notes: str) -> LinearModel:
-        """Return an equal model with these notes after its own."""
-        noted = copy.copy(self)
-        object.__setattr__(noted, "notes", (*self.notes, *notes))
-        return noted
-
-    def with_drift(self, drift: ArrayLike) -> LinearModel:
-        """Return an equal model that is known to leave out this drift (n,)."""
-        known = copy.copy(self)
-        object.__setattr__(known, "drift", as_array("drift", drift, (self.n_states,)))
-        return known
 
     def __eq__(self, other: object) -> bool:
         """Tell whether all matrices, the sampling time and the operating point are equal."""
@@ -329,3 +322,7 @@ class LinearModel(ReadOnlyArrays):
     def __hash__(self) -> int:
         """Return a hash that equal models share."""
         return hash((self.A.tobytes(), self.B.tobytes(), self.dt, self.E.tobytes()))
+
+
+def _vector(name: str, value: ArrayLike | None, size: int) -> Array:
+    return as_array(name, np.zeros(size) if value is None else value, (size,))

@@ -1,4 +1,4 @@
-"""What a linear model says of its plant, in words and numbers."""
+"""The report of a linear model: poles, controllability, scaling and sampling in words."""
 
 from __future__ import annotations
 
@@ -9,25 +9,20 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.linear_system import LinearSystem
 
-ON_CIRCLE = 1e-6
-"""Poles this close to a magnitude of 1 neither grow nor die out."""
-UNREACHED = 1e-6
-HARDLY_REACHED = 1e-3
-"""Directions that the inputs move this much less than the others."""
-DOUBLINGS = 16
-"""Of the horizon over which the reach of the inputs is summed: 65,536 samples."""
-GONE = 0.1
-"""Time constants, in samples, below which a mode counts as a delay: gone within one sample."""
+ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
+UNREACHED, HARDLY_REACHED = 1e-6, 1e-3
+"""Motions of a direction by the inputs, relative to the largest."""
+DOUBLINGS = 16  # doublings of the Gramian's horizon: 65,536 samples
+GONE = 0.1  # time constant, in samples, below which a mode counts as a delay
 SLOW_SAMPLING, FAST_SAMPLING = 1.0, 50.0
-"""Time constants, in samples, below which a mode is sampled too slowly, and above too fast.
+"""Time constants, in samples, below which sampling is too slow, and above too fast.
 
-Åström and Wittenmark (*Computer-Controlled Systems*, on the choice of the sampling period) advise 4
-to 10 samples in the rise time of the closed loop."""
+Åström and Wittenmark (*Computer-Controlled Systems*) advise 4 to 10 samples per rise time."""
 
 
-def describe(model: LinearModel) -> str:
+def describe(model: LinearSystem) -> str:
     """Return the report of `LinearModel.report`."""
     blocks = (
         _head(model),
@@ -41,7 +36,7 @@ def describe(model: LinearModel) -> str:
     return "\n".join(line for block in blocks for line in block)
 
 
-def _head(model: LinearModel) -> list[str]:
+def _head(model: LinearSystem) -> list[str]:
     sizes = ", ".join(
         f"{count} {word}{'s' * (count != 1)}"
         for count, word in (
@@ -56,7 +51,7 @@ def _head(model: LinearModel) -> list[str]:
     return [f"Linear model: {sizes}, sampled every {model.dt:.4g}.", f"Operating point: {point}."]
 
 
-def poles(model: LinearModel) -> Array:
+def poles(model: LinearSystem) -> Array:
     """Return the eigenvalues of A, the largest first, one of each complex pair."""
     values = np.linalg.eigvals(model.A)
     values = values[values.imag >= 0]
@@ -71,7 +66,7 @@ def time_constant(pole: complex) -> float:
     return float(-1 / np.log(size)) if size > 0 else 0.0
 
 
-def _modes(model: LinearModel) -> list[str]:
+def _modes(model: LinearSystem) -> list[str]:
     return [f"{_number(pole)}: {_mode(pole, model.dt)}" for pole in poles(model)]
 
 
@@ -92,7 +87,7 @@ def _mode(pole: complex, dt: float) -> str:
     return words
 
 
-def _stability(model: LinearModel) -> str:
+def _stability(model: LinearSystem) -> str:
     sizes = np.abs(np.linalg.eigvals(model.A))
     growing = int(np.sum(sizes > 1 + ON_CIRCLE))
     largest = f"the largest magnitude of a pole is {np.max(sizes):.6g}"
@@ -103,25 +98,24 @@ def _stability(model: LinearModel) -> str:
     return f"Stable: {largest}."
 
 
-def reach(model: LinearModel) -> tuple[Array, Array]:
-    """Return how far the inputs move the state along independent directions, and these (n, n).
+def reach(model: LinearSystem) -> tuple[Array, Array]:
+    """Return the relative reach of the inputs (n,), largest first, and its directions (n, n).
 
-    They are the principal axes of the controllability Gramian, each state in units of how far it
-    is moved itself, so that units do not count; the largest first, relative to it. The rows of
-    the second are the directions. The rank of ``control.ctrb`` would mislead: with short samples
-    A is near the identity and ``B, AB, ...`` are nearly parallel for any plant. `control.gram`
-    needs slycot and a stable A; here A is scaled down, which changes no reachable subspace.
+    The directions, in rows, are the principal axes of the scaled controllability Gramian. The rank
+    of ``control.ctrb`` would mislead: with short samples ``B, AB, ...`` are nearly parallel.
+    `control.gram` needs slycot and a stable A; here A is scaled down, which keeps the reachable
+    subspace.
     """
     A, B = model.A, model.B / np.maximum(np.linalg.norm(model.B, axis=0), np.finfo(float).tiny)
     radius = np.max(np.abs(np.linalg.eigvals(A)))
     if radius > 0.999:
         A = A * (0.999 / radius)
     gramian, power = B @ B.T, A
-    # Smith's doubling: a sum of positive terms, which units cannot spoil as they do an equation.
+    # Smith's doubling sums positive terms: bad scaling does not spoil it as it does an equation.
     for _ in range(DOUBLINGS):
         gramian, power = gramian + power @ gramian @ power.T, power @ power
     moved = np.sqrt(np.maximum(np.diag(gramian), 0))
-    # What rounding leaves of a state that no input moves is not to be blown up.
+    # A state that no input moves must not be scaled up from its rounding.
     still = moved <= 1e-12 * np.max(moved, initial=0)
     unit = np.where(still, 1.0, moved)
     gramian[still, :] = gramian[:, still] = 0.0
@@ -130,8 +124,8 @@ def reach(model: LinearModel) -> tuple[Array, Array]:
     return sizes / (sizes[0] or 1.0), axes[:, ::-1].T / unit
 
 
-def _reach(model: LinearModel) -> list[str]:
-    """Return how well the inputs reach the states."""
+def _reach(model: LinearSystem) -> list[str]:
+    """Return the lines on controllability."""
     sizes, axes = reach(model)
     rank = int(np.sum(sizes > UNREACHED))
     lines = [f"Controllability: the inputs reach {rank} of {sizes.size} directions of the state."]
@@ -143,8 +137,8 @@ def _reach(model: LinearModel) -> list[str]:
     return lines + [f"  u[{i}] has no effect." for i in idle]
 
 
-def _scaling(model: LinearModel) -> list[str]:
-    """Return how the units fit each other."""
+def _scaling(model: LinearSystem) -> list[str]:
+    """Return the lines on scaling and steady-state gains."""
     _, (factors, _) = linalg.matrix_balance(model.A, permute=False, separate=True)
     spread = np.max(factors) / np.min(factors)
     effects = np.abs(model.B[model.B != 0])
@@ -159,15 +153,15 @@ def _scaling(model: LinearModel) -> list[str]:
     if np.min(np.abs(np.linalg.eigvals(model.A) - 1)) > ON_CIRCLE:
         gain = np.linalg.solve(np.eye(n) - model.A, model.B)
         gain[np.abs(gain) < 1e-9 * np.max(np.abs(gain))] = 0.0
-        # Where the plant is not stable, the state rests there but does not go there.
+        # An unstable plant has this steady state but does not approach it.
         stable = np.all(np.abs(poles(model)) < 1 - ON_CIRCLE)
         verb = "moves the state to" if stable else "would balance the state at"
         lines += [f"  Held at 1, u[{j}] {verb} {_vector(g)}." for j, g in enumerate(gain.T)]
     return lines
 
 
-def _sampling(model: LinearModel) -> list[str]:
-    """Return how the sampling time fits the plant."""
+def _sampling(model: LinearSystem) -> list[str]:
+    """Return the lines on the sampling time."""
     found = poles(model)
     constants = [abs(time_constant(pole)) for pole in found]
     moving = [constant for constant in constants if GONE <= constant < np.inf]

@@ -1,4 +1,4 @@
-"""Models of python-control as the models of this package."""
+"""Matrices in discrete time from a state space of python-control."""
 
 from __future__ import annotations
 
@@ -6,21 +6,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from sb3_yann._validation import as_positive
-from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann._validation import Array, as_array, as_positive
+from sb3_yann.control.linear_system import zero_order_hold
 
 
-def take_statespace(
-    system: Any,
-    dt: float | None,
-    x_ss: ArrayLike | None,
-    u_ss: ArrayLike | None,
-    disturbances: Sequence[int | str],
-    d_ss: ArrayLike | None,
-) -> LinearModel:
-    """See `LinearModel.from_statespace`."""
+def from_control(
+    system: Any, dt: float | None, disturbances: Sequence[int | str]
+) -> tuple[Array, Array, Array, float, list[str]]:
+    """Return A, B, E, the sampling time and notes; see `LinearModel.from_statespace`."""
     import control
 
     if not isinstance(system, control.StateSpace):
@@ -31,11 +25,13 @@ def take_statespace(
     step, continuous = _sample_time(system.dt, dt)
     chosen = [_input(system, each) for each in disturbances]
     inputs = [i for i in range(system.ninputs) if i not in chosen]
-    make = LinearModel.from_continuous if continuous else LinearModel
-    B = np.asarray(system.B)
-    model = make(system.A, B[:, inputs], step, x_ss, u_ss, B[:, chosen], d_ss)
+    A, both = as_array("A", system.A, ("n", "n")), as_array("B", system.B, ("n", "m"))
+    B, E = both[:, inputs], both[:, chosen]
+    if continuous:
+        A, B, E = zero_order_hold(A, B, E, step)
     sampled = "sampled with a zero-order hold" if continuous else "taken as it is, discrete"
-    return model.with_notes(f"From a control.StateSpace, {sampled}.", *_dropped(system, model))
+    notes = [f"From a control.StateSpace, {sampled}.", *_dropped(system, A)]
+    return A, B, E, step, notes
 
 
 def _sample_time(own: float | bool | None, dt: float | None) -> tuple[float, bool]:
@@ -73,17 +69,17 @@ def _input(system: Any, name: int | str) -> int:
     raise ValueError(f"disturbances: {name!r} is no input, neither number nor label, of {labels}.")
 
 
-def _dropped(system: Any, model: LinearModel) -> list[str]:
-    """Return notes on what of the outputs is lost."""
+def _dropped(system: Any, A: Array) -> list[str]:
+    """Return notes on the dropped outputs."""
     import control
 
-    C, n = np.asarray(system.C), model.n_states
+    C, n = np.asarray(system.C), len(A)
     notes = []
     if np.any(system.D):
         notes.append("D is not zero and was dropped: the outputs it feeds are not used.")
     if np.array_equal(C, np.eye(n)):
         return notes
-    rank = int(np.linalg.matrix_rank(control.obsv(model.A, C)))
+    rank = int(np.linalg.matrix_rank(control.obsv(A, C)))
     notes.append(
         "C is not the identity and was dropped: the law depends on the states, not on the outputs "
         "y = C x. Measure the states, or estimate them by an observer"

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control import lqr
-from sb3_yann.control.explicit.solve import ParametricQP
-
-if TYPE_CHECKING:
-    from sb3_yann.control.mpc.linear_mpc import LinearMPC
+from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.mpc._arguments import Bounds
+from sb3_yann.control.mpc.problem import MPCProblem
 
 
 class _Prediction:
     """``theta_k = powers[k] theta + forced[k] U`` for k = 0 ... N."""
 
-    def __init__(self, problem: LinearMPC) -> None:
+    def __init__(self, problem: MPCProblem) -> None:
         A, B = problem.prediction
         n, m, N = problem.n_theta, problem.model.n_inputs, problem.horizon
         self.powers: list[Array] = [np.eye(n)]
@@ -30,7 +28,7 @@ class _Prediction:
             reach[:, k * m : (k + 1) * m] += B
             self.forced.append(reach)
 
-    def rate(self, problem: LinearMPC, k: int) -> tuple[Array, Array]:
+    def rate(self, problem: MPCProblem, k: int) -> tuple[Array, Array]:
         """Return rows (m, N m) and (m, n_theta) for ``u_k - u_{k-1} = rows U + rows theta``."""
         m, N = problem.model.n_inputs, problem.horizon
         inputs, start = np.zeros((m, N * m)), np.zeros((m, problem.n_theta))
@@ -60,6 +58,11 @@ class _Rows:
         self.parts.append((np.hstack([G, soft]), w, S))
         self.names += [name.format(i) for i in range(len(w))]
 
+    def add_bounds(self, name: str, G: Array, bounds: Bounds, S: Array, *softness: Any) -> None:
+        """Add rows for ``low <= G U + S theta <= high``."""
+        self.add(f"{name} at its upper bound", G, bounds[1], -S, *softness)
+        self.add(f"{name} at its lower bound", -G, -bounds[0], S, *softness)
+
     def stacked(self) -> tuple[Array, Array, Array, tuple[str, ...]]:
         """Return G, w, S and the names of the rows that bound something."""
         G, w, S = (np.concatenate(each) for each in zip(*self.parts, strict=True))
@@ -68,79 +71,44 @@ class _Rows:
         return G[bounded], w[bounded], S[bounded], names
 
 
-def condense(problem: LinearMPC) -> tuple[ParametricQP, tuple[str, ...]]:
+def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
     """Return the program in ``(u_0, ..., u_{N-1})`` and slacks, and what each row bounds."""
     prediction = _Prediction(problem)
-    slacks = [
-        kind
-        for kind, softness, bounds in (
-            ("x", problem.x_soft, (problem.x_min, problem.x_max)),
-            ("y", problem.y_soft, (problem.y_min, problem.y_max)),
-        )
-        if np.any((softness > 0) & np.isfinite(bounds).any(axis=0))
-    ]
+    units = {"x": problem.soft.x, "y": problem.soft.y}
+    slacks = [kind for kind, unit in units.items() if np.any(unit)]
     H, F = _cost(problem, prediction)
-    c = _linear_cost(problem, prediction)
     G, w, S, names = _constraints(problem, prediction, slacks)
-    penalty = np.full(len(slacks), problem.soft_penalty)
-    program = ParametricQP(
-        H=linalg.block_diag((H + H.T) / 2, np.diag(2 * penalty)) if slacks else (H + H.T) / 2,
-        F=np.vstack([F, np.zeros((len(slacks), problem.n_theta))]),
-        c=np.concatenate([c, penalty]),
-        G=G,
-        w=w,
-        S=S,
-        theta_min=problem.theta_min,
-        theta_max=problem.theta_max,
-        n_slacks=len(slacks),
-    )
-    return program, names
+    penalty, H = np.full(len(slacks), problem.soft.penalty), (H + H.T) / 2
+    c = np.concatenate([np.zeros(len(H)), penalty])
+    if slacks:
+        H = linalg.block_diag(H, np.diag(2 * penalty))
+        F = np.vstack([F, np.zeros((len(slacks), problem.n_theta))])
+    box = problem.theta_min, problem.theta_max
+    return ParametricQP(H, F, c, G, w, S, *box, n_slacks=len(slacks)), names
 
 
-def _cost(problem: LinearMPC, prediction: _Prediction) -> tuple[Array, Array]:
+def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array]:
     """Return H and F of ``1/2 U'HU + (F theta)'U``, whence the factors 2."""
     N, gamma, errors = problem.horizon, problem.gamma, problem.error_system
-    T, states = errors.T, errors.T[: problem.model.n_states]
+    to_error, states = errors.to_error, errors.to_error[: problem.model.n_states]
     H: Array = np.asarray(2 * np.kron(np.diag(gamma ** np.arange(N)), problem.R), np.float64)
-    F: Array = -H @ np.tile(errors.U, (N, 1))
+    F: Array = -H @ np.tile(errors.to_input, (N, 1))
     for k in range(1, N + 1):
-        coordinates = T if k == N else states
-        weight = gamma**k * (problem.terminal_cost if k == N else problem.Q)
+        coordinates = to_error if k == N else states
+        weight = gamma**k * (problem.terminal.cost if k == N else problem.Q)
         forced, free = coordinates @ prediction.forced[k], coordinates @ prediction.powers[k]
         H = H + 2 * forced.T @ weight @ forced
         F = F + 2 * forced.T @ weight @ free
-    if np.any(problem.S):
+    if np.any(problem.rate.R_du):
         for k in range(N):
             inputs, start = prediction.rate(problem, k)
-            H = H + 2 * gamma**k * inputs.T @ problem.S @ inputs
-            F = F + 2 * gamma**k * inputs.T @ problem.S @ start
+            H = H + 2 * gamma**k * inputs.T @ problem.rate.R_du @ inputs
+            F = F + 2 * gamma**k * inputs.T @ problem.rate.R_du @ start
     return H, F
 
 
-def _linear_cost(problem: LinearMPC, prediction: _Prediction) -> Array:
-    """Return c of ``c'U``, from ``q'e_k + r'v_k`` and the terminal cost that goes with it.
-
-    That is ``p'z_N``: with v = -K z - const the optimal cost to go is quadratic and linear, and its
-    linear part satisfies ``p = q - K'r + gamma (A - BK)'p``.
-    """
-    (q, r), N, gamma = problem.linear_cost, problem.horizon, problem.gamma
-    c: Array = np.zeros(N * len(r))
-    if not (np.any(q) or np.any(r)):
-        return c
-    errors, n = problem.error_system, len(q)
-    model = errors.model
-    K = lqr.gain(model, errors.R, problem.terminal_cost, gamma, errors.cross)
-    wide = np.concatenate([q, np.zeros(len(errors.T) - n)])
-    closed = np.eye(len(K.T)) - gamma * (model.A - model.B @ K).T
-    p = np.linalg.solve(closed, wide - K.T @ r)
-    c = np.kron(gamma ** np.arange(N), r)
-    for k in range(1, N):
-        c = c + gamma**k * (errors.T[:n] @ prediction.forced[k]).T @ q
-    return np.asarray(c + gamma**N * (errors.T @ prediction.forced[N]).T @ p)
-
-
 def _constraints(
-    problem: LinearMPC, prediction: _Prediction, slacks: list[str]
+    problem: MPCProblem, prediction: _Prediction, slacks: list[str]
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
     n, m, N = problem.n_theta, problem.model.n_inputs, problem.horizon
     free, rows = np.zeros((N * m, n)), _Rows(slacks)
@@ -149,25 +117,20 @@ def _constraints(
     rows.add("", -np.eye(N * m), -np.tile(problem.u_min, N), free)
     rows.names = [name.format(side) for side in ("upper", "lower") for name in inputs]
 
-    states = slice(0, problem.model.n_states)
+    states, rate = slice(0, problem.model.n_states), problem.rate
+    x = problem.x_min, problem.x_max
     for k in range(1, N + 1):
         forced, powers = prediction.forced[k][states], prediction.powers[k][states]
-        soft = (problem.x_soft, "x")
-        rows.add("x[{}] at its upper bound", forced, problem.x_max, -powers, *soft)
-        rows.add("x[{}] at its lower bound", -forced, -problem.x_min, powers, *soft)
-    last, upper = problem.terminal_set
+        rows.add_bounds("x[{}]", forced, x, powers, problem.soft.x, "x")
+    last, upper = problem.terminal.set
     rows.add("the terminal set", last @ prediction.forced[N], upper, -last @ prediction.powers[N])
-    if problem.layout.n_previous:
-        for k in range(N):
-            change, start = prediction.rate(problem, k)
-            rows.add("the rate of u[{}] at its upper bound", change, problem.du_max, -start)
-            rows.add("the rate of u[{}] at its lower bound", -change, -problem.du_min, start)
-    for k in range(1, N + 1) if len(problem.outputs) else ():
-        forced = problem.outputs @ prediction.forced[k][states]
-        powers = problem.outputs @ prediction.powers[k][states]
-        soft = (problem.y_soft, "y")
-        rows.add("y[{}] at its upper bound", forced, problem.y_max, -powers, *soft)
-        rows.add("y[{}] at its lower bound", -forced, -problem.y_min, powers, *soft)
+    for k in range(N) if problem.layout.n_previous else ():
+        change, start = prediction.rate(problem, k)
+        rows.add_bounds("the rate of u[{}]", change, (rate.du_min, rate.du_max), start)
+    C, y = problem.outputs.C, (problem.outputs.y_min, problem.outputs.y_max)
+    for k in range(1, N + 1) if len(C) else ():
+        forced, powers = prediction.forced[k][states], prediction.powers[k][states]
+        rows.add_bounds("y[{}]", C @ forced, y, C @ powers, problem.soft.y, "y")
     if slacks:
         zeros = np.zeros((1, N * m))
         for kind in slacks:

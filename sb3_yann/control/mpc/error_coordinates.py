@@ -15,20 +15,19 @@ from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
 @dataclass(frozen=True, eq=False)
 class ErrorSystem(ReadOnlyArrays):
-    """``z = T theta`` and ``v = u - U theta``, with ``z+ = A z + B v`` and a quadratic stage cost.
+    """The problem in ``z = to_error theta`` and ``v = u - to_input theta``: ``z+ = A z + B v``.
 
-    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate of the input has a weight. The
-    reference and the disturbance are constant, so they are modes on the unit circle of
-    ``theta+ = A_bar theta + B_bar u``: no Lyapunov or Riccati equation has a solution there without
-    a discount. In z they are gone.
+    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate has a weight. The stage cost is
+    quadratic there. In theta the constant r and d are modes on the unit circle, where no Lyapunov
+    or Riccati equation has a solution without a discount. In z they are gone.
 
     Attributes
     ----------
     model : LinearModel
         Of z and v.
-    T : ndarray, shape (n_z, n_theta)
-    U : ndarray, shape (m, n_theta)
-        ``u_s = U theta``.
+    to_error : ndarray, shape (n_z, n_theta)
+    to_input : ndarray, shape (m, n_theta)
+        ``u_s = to_input theta``.
     Q : ndarray, shape (n_z, n_z)
     R : ndarray, shape (m, m)
     cross : ndarray, shape (n_z, m), or None
@@ -36,8 +35,8 @@ class ErrorSystem(ReadOnlyArrays):
     """
 
     model: LinearModel
-    T: Array
-    U: Array
+    to_error: Array
+    to_input: Array
     Q: Array
     R: Array
     cross: Array | None
@@ -50,37 +49,36 @@ class ErrorSystem(ReadOnlyArrays):
             k = len(self.Q)
             weight[:k, k:], weight[k:, :k] = self.cross, self.cross.T
         m = len(self.R)
-        to_error = np.block([[self.T, np.zeros((len(self.T), m))], [-self.U, np.eye(m)]])
-        return np.asarray(to_error.T @ weight @ to_error)
+        zeros = np.zeros((len(self.to_error), m))
+        coordinates = np.block([[self.to_error, zeros], [-self.to_input, np.eye(m)]])
+        return np.asarray(coordinates.T @ weight @ coordinates)
 
 
 def error_system(
-    model: LinearModel, parameters: ThetaLayout, steady: SteadyStates, Q: Array, R: Array, S: Array
+    model: LinearModel, layout: ThetaLayout, steady: SteadyStates, Q: Array, R: Array, R_du: Array
 ) -> ErrorSystem:
-    """Return the coordinates of a problem with weights Q (n, n), R (m, m) and S (m, m).
+    """Return the coordinates of a problem with weights Q (n, n), R (m, m) and R_du (m, m).
 
-    The stage cost is ``(x - x_s)'Q(x - x_s) + (u - u_s)'R(u - u_s) + (u - u_prev)'S(u - u_prev)``.
+    The stage cost is ``e'Qe + v'Rv + (u - u_prev)'R_du(u - u_prev)``, with ``e = x - x_s`` and
+    ``v = u - u_s``.
     """
     n, m = model.B.shape
-    T, U = np.zeros((n, parameters.size)), np.zeros((m, parameters.size))
-    T[:, parameters.state] = np.eye(n)
-    T[:, parameters.constant] = -steady.x
-    U[:, parameters.constant] = steady.u
-    if not np.any(S):
+    to_error, to_input = np.zeros((n, layout.size)), np.zeros((m, layout.size))
+    to_error[:, layout.state] = np.eye(n)
+    to_error[:, layout.constant] = -steady.x
+    to_input[:, layout.constant] = steady.u
+    if not np.any(R_du):
         plain = LinearModel(model.A, model.B, model.dt)
-        return ErrorSystem(plain, T, U, Q, R, None)
-    # v_prev+ = v, and (v - v_prev)'S(v - v_prev) couples the two
-    previous = -U
-    previous[:, parameters.previous] = np.eye(m)
+        return ErrorSystem(plain, to_error, to_input, Q, R, None)
+    # v_prev+ = v, and (v - v_prev)'R_du(v - v_prev) couples the two
+    previous = -to_input
+    previous[:, layout.previous] = np.eye(m)
+    A, B = linalg.block_diag(model.A, np.zeros((m, m))), np.vstack([model.B, np.eye(m)])
     return ErrorSystem(
-        model=LinearModel(
-            linalg.block_diag(model.A, np.zeros((m, m))),
-            np.vstack([model.B, np.eye(m)]),
-            model.dt,
-        ),
-        T=np.vstack([T, previous]),
-        U=U,
-        Q=linalg.block_diag(Q, S),
-        R=R + S,
-        cross=np.vstack([np.zeros((n, m)), -S]),
+        model=LinearModel(A, B, model.dt),
+        to_error=np.vstack([to_error, previous]),
+        to_input=to_input,
+        Q=linalg.block_diag(Q, R_du),
+        R=R + R_du,
+        cross=np.vstack([np.zeros((n, m)), -R_du]),
     )

@@ -2,41 +2,40 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, as_array, to_float
-
-if TYPE_CHECKING:
-    from sb3_yann.control.mpc.linear_mpc import LinearMPC
+from sb3_yann.control.mpc._arguments import Given
+from sb3_yann.control.mpc.problem import MPCProblem
 
 TOLERANCE = 1e-9
 """How far beyond a bound a steady state still counts as within, relative to the bound."""
 
 
-def margins(problem: LinearMPC, r: ArrayLike | None, d: ArrayLike | None) -> Array:
+def is_reachable(problem: MPCProblem, r: Given, d: Given) -> NDArray[np.bool_]:
+    """Tell whether the steady state lies within the bounds, see :meth:`LinearMPC.is_reachable`."""
+    return np.asarray(np.all(margins(problem, r, d) >= 0, axis=-1))
+
+
+def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
     """Return the room to each upper and lower bound of x, u and y at the steady state.
 
     The shape is (2 (n + m + q),), or (batch, 2 (n + m + q)) for a batch of r or d; negative
     entries are violations, by more than rounding.
     """
     constant = _constants(problem, r, d)
-    x = constant @ problem.steady_states.x.T
-    value = np.concatenate(
-        [x, constant @ problem.steady_states.u.T, x @ problem.outputs.T], axis=-1
-    )
-    low = np.concatenate([problem.x_min, problem.u_min, problem.y_min])
-    high = np.concatenate([problem.x_max, problem.u_max, problem.y_max])
+    x, u = constant @ problem.steady_states.x.T, constant @ problem.steady_states.u.T
+    outputs = problem.outputs
+    value = np.concatenate([x, u, x @ outputs.C.T], axis=-1)
+    low = np.concatenate([problem.x_min, problem.u_min, outputs.y_min])
+    high = np.concatenate([problem.x_max, problem.u_max, outputs.y_max])
     room = np.concatenate([high - value, value - low], axis=-1)
     bound = np.abs(np.concatenate([high, low]))
     return np.asarray(room + TOLERANCE * np.where(np.isfinite(bound), bound, 0.0))
 
 
-def steady_state(
-    problem: LinearMPC, r: ArrayLike | None, d: ArrayLike | None
-) -> tuple[Array, Array]:
+def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]:
     """Return x_s and u_s, see :meth:`LinearMPC.steady_state`."""
     constant = _constants(problem, r, d)
     if constant.ndim != 1:
@@ -44,12 +43,12 @@ def steady_state(
     room = margins(problem, r, d)
     x, u = problem.steady_states.x @ constant, problem.steady_states.u @ constant
     if np.any(room < 0):
-        sizes = {"x": len(x), "u": len(u), "y": len(problem.outputs)}
+        sizes = {"x": len(x), "u": len(u), "y": len(problem.outputs.C)}
         names = [f"{name}[{i}]" for name, size in sizes.items() for i in range(size)]
         sides = [f"{name} > {name[0]}_max{name[1:]}" for name in names]
         sides += [f"{name} < {name[0]}_min{name[1:]}" for name in names]
         broken = ", ".join(side for side, left in zip(sides, room, strict=True) if left < 0)
-        p = len(problem.tracked)
+        p = len(problem.tracking.C)
         raise ValueError(
             f"The reference r = {constant[:p].tolist()} with d = {constant[p:].tolist()} is not "
             f"reachable: its steady state is x_s = {x.tolist()}, u_s = {u.tolist()}, and {broken}. "
@@ -58,9 +57,9 @@ def steady_state(
     return x, u
 
 
-def _constants(problem: LinearMPC, r: ArrayLike | None, d: ArrayLike | None) -> Array:
+def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:
     """Return [r; d], of shape (p + d,) or (batch, p + d)."""
-    p, n_d = len(problem.tracked), problem.model.n_disturbances
+    p, n_d = len(problem.tracking.C), problem.model.n_disturbances
     parts = []
     for name, value, size in (("r", r, p), ("d", d, n_d)):
         array = to_float(name, np.zeros(size) if value is None else value)

@@ -3,52 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from itertools import chain
 
 import numpy as np
 
 from sb3_yann._validation import Array
+from sb3_yann.control.explicit.solve import ProgramUnits
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.mpc.condensing import condense
-
-if TYPE_CHECKING:
-    from sb3_yann.control.mpc.linear_mpc import LinearMPC
+from sb3_yann.control.mpc.problem import MPCProblem
+from sb3_yann.control.mpc.reachability import is_reachable
 
 LOOP_STEPS = 50
 """Steps of a closed loop on the model."""
 
 
-def report(problem: LinearMPC, samples: int = 500, seed: int = 0) -> str:
+def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: int = 0) -> str:
     """Return the parameters, the size of the law, and sampled shares of the box, as text.
 
     Parameters
     ----------
-    problem : LinearMPC
+    problem : MPCProblem
+    law : PiecewiseAffine
     samples : int, default 500
-        Points drawn uniformly from the box of parameters: a share is good to about
-        ``1 / sqrt(samples)``.
+        Points drawn uniformly from the box of parameters: shares are good to 1 / sqrt(samples).
     seed : int, default 0
 
     Raises
     ------
     ValueError
-        If ``samples`` is below 1, or the law has none (see :meth:`LinearMPC.explicit`).
+        If ``samples`` is below 1.
     """
     if samples < 1:
         raise ValueError(f"samples = {samples!r} must be a number of points of at least 1.")
     rng = np.random.default_rng(seed)
     points = rng.uniform(problem.theta_min, problem.theta_max, (samples, problem.n_theta))
-    feasible = points[problem.explicit().in_domain(points)]
-    lines = [
-        *_parameters(problem),
-        *_size(problem),
-        *_shares(problem, points, feasible),
-        *_active(problem, feasible),
-        *_values(problem, feasible),
-    ]
-    return "\n".join(lines)
+    feasible = points[law.in_domain(points)]
+    parts = _parameters(problem), _size(problem, law), _shares(problem, law, points, feasible)
+    return "\n".join(chain(*parts, _active(problem, feasible), _values(problem, law, feasible)))
 
 
-def _parameters(problem: LinearMPC) -> Iterator[str]:
+def _parameters(problem: MPCProblem) -> Iterator[str]:
     meanings = {
         "x": "state",
         "r": "reference of tracked output",
@@ -62,56 +57,53 @@ def _parameters(problem: LinearMPC) -> Iterator[str]:
         yield f"  {name:<10} {low:>10.4g} to {high:<10.4g} {meanings[kind]} {index}"
 
 
-def _size(problem: LinearMPC) -> Iterator[str]:
-    law = problem.explicit()
+def _size(problem: MPCProblem, law: PiecewiseAffine) -> Iterator[str]:
     yield f"Horizon: {problem.horizon} steps of {problem.model.dt:g}."
     yield f"The law has {law.n_regions} regions and {law.n_halfspaces} half-spaces."
-    rows = len(problem.terminal_set[1])
+    rows = len(problem.terminal.set[1])
     yield f"The terminal set has {rows} half-spaces." if rows else "There is no terminal set."
-    if problem.soft_penalty:
+    if problem.soft.penalty:
         soft = [
             f"{name}[{i}]"
-            for name, units in (("x", problem.x_soft), ("y", problem.y_soft))
+            for name, units in (("x", problem.soft.x), ("y", problem.soft.y))
             for i in np.flatnonzero(units)
         ]
-        yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft_penalty:g}."
+        yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
 
 
-def _shares(problem: LinearMPC, points: Array, feasible: Array) -> Iterator[str]:
+def _shares(
+    problem: MPCProblem, law: PiecewiseAffine, points: Array, feasible: Array
+) -> Iterator[str]:
     yield f"Of {len(points)} random parameters of the box"
     yield f"  {_percent(len(feasible), len(points))} are feasible;"
-    if len(problem.tracked):
+    if len(problem.tracking.C):
         parts = problem.layout
-        reachable = problem.is_reachable(points[:, parts.reference], points[:, parts.disturbance])
+        reachable = is_reachable(problem, points[:, parts.reference], points[:, parts.disturbance])
         yield f"  {_percent(reachable.sum(), len(points))} have a reachable steady state;"
-    kept = _stay_feasible(problem, feasible).sum() if len(feasible) else 0
+    kept = _stay_feasible(problem, law, feasible).sum() if len(feasible) else 0
     yield (
         f"  of the feasible ones, {_percent(kept, len(feasible))} stay feasible for {LOOP_STEPS} "
         "steps in closed loop on the model."
     )
 
 
-def _stay_feasible(problem: LinearMPC, theta: Array) -> Array:
+def _stay_feasible(problem: MPCProblem, law: PiecewiseAffine, theta: Array) -> Array:
     """Tell which rows of theta (batch, n_theta) the closed loop keeps in the domain."""
-    law, kept = problem.explicit(), np.ones(len(theta), dtype=bool)
+    (A, B), kept = problem.prediction, np.ones(len(theta), dtype=bool)
     for _ in range(LOOP_STEPS):
-        theta = problem.predict(theta, law(theta))
+        theta = theta @ A.T + law(theta) @ B.T
         kept &= law.in_domain(theta)
         theta = np.where(kept[:, None], theta, 0.0)  # those that left may grow without bound
     return kept
 
 
-def _active(problem: LinearMPC, feasible: Array) -> Iterator[str]:
+def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
     """Yield which constraints act in the optimal plan, anywhere in the horizon."""
     program, names = condense(problem)
-    center = (problem.theta_max + problem.theta_min) / 2
-    width = (problem.u_max - problem.u_min) / 2
-    steps = (len(program.c) - program.n_slacks) // len(width)
-    reach = np.tile(np.where(np.isfinite(width), width, 1.0), steps)
-    half = problem.theta_max - center
-    scaled = program.scaled(center, half, np.append(reach, np.ones(program.n_slacks)))
+    units = ProgramUnits(program, problem.u_min, problem.u_max)
+    scaled = units.scaled
     counts = dict.fromkeys(names, 0)
-    for theta in (feasible - center) / half:
+    for theta in (feasible - units.center) / units.half:
         U = scaled.solve(theta)
         if U is None:  # on the border of the domain
             continue
@@ -128,10 +120,9 @@ def _active(problem: LinearMPC, feasible: Array) -> Iterator[str]:
         yield f"  never: {', '.join(idle)}"
 
 
-def _values(problem: LinearMPC, feasible: Array) -> Iterator[str]:
-    law, few = problem.explicit(), feasible[:3]
+def _values(problem: MPCProblem, law: PiecewiseAffine, feasible: Array) -> Iterator[str]:
     yield f"The law at a few parameters [{', '.join(problem.layout.names)}]:"
-    for theta in np.vstack([np.zeros((1, problem.n_theta)), few]):
+    for theta in np.vstack([np.zeros((1, problem.n_theta)), feasible[:3]]):
         where = "" if law.in_domain(theta) else " (not feasible)"
         yield f"  {_numbers(theta)} -> u = {_numbers(law(theta))}{where}"
 

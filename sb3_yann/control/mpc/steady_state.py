@@ -30,10 +30,9 @@ def steady_states(
 ) -> SteadyStates:
     """Return the map from reference and disturbance to the steady state with ``C x_s = r``.
 
-    It solves ``(A - I) x_s + B u_s = -E d`` and ``C x_s = r`` (Rawlings, Mayne & Diehl, Model
-    Predictive Control, Section 1.5). Where several steady states do, as with more inputs than
-    outputs, it is the one with the smallest ``x_s'Q x_s + u_s'R u_s``; of those that this leaves,
-    the one of minimum norm in the units given.
+    It solves ``(A - I) x_s + B u_s = -E d`` and ``C x_s = r``. Of several solutions it is the one
+    with the smallest ``x_s'Q x_s + u_s'R u_s``, then that of minimum norm in the units given
+    (Rawlings, Mayne & Diehl, Model Predictive Control, Section 1.5).
 
     Parameters
     ----------

@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy import optimize
 
 from sb3_yann._validation import Array
 from sb3_yann.control import lqr
-
-if TYPE_CHECKING:
-    from sb3_yann.control.mpc.linear_mpc import LinearMPC
+from sb3_yann.control.mpc.problem import MPCProblem
 
 MARGIN = 0.01
 """How far inside the bounds steady states must lie, relative to the bounds."""
 MAX_ROWS, MAX_STEPS = 200, 500
 
+Rows = tuple[Array, Array]
+"""Half-spaces ``F theta <= g``."""
 
-def invariant_set(problem: LinearMPC) -> tuple[Array, Array]:
+
+def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     """Return F (rows, n_theta) and g (rows,): the maximal output admissible set F theta <= g.
 
     From a theta in it the law ``v = -K z``, with K the gain of the terminal cost, keeps all hard
-    bounds of x, u, y and the rate for ever on the model, with r and d constant. Gilbert & Tan,
-    Linear systems with state and control constraints, IEEE Trans. Autom. Control 36 (1991): the
-    bounds after 0, 1, 2 ... steps are added until those of the next step are all redundant, which
-    linear programs tell. In ``x_min`` and ``x_max`` this keeps the law in its domain for ever; a
-    box of states given by ``theta_min`` and ``theta_max`` alone is no bound of the predictions, and
-    may still be left. Soft bounds do not count.
+    bounds of x, u, y and the rate for ever on the model, with r and d constant. Soft bounds do not
+    count, and neither does a box of states given by ``theta_min`` and ``theta_max`` alone.
 
-    r and d never decay; as in Section V there, their steady states must lie inside the bounds by a
-    little, here one percent of each bound, which makes the number of steps finite. The box of r and
-    d is taken for granted, and so are the bounds of ``u_prev``.
+    The bounds after 0, 1, 2 ... steps are added until those of the next step are all redundant, by
+    linear programs. r and d never decay: with steady states inside the bounds by one percent, the
+    number of steps is finite. Their box is taken for granted, and so are the bounds of ``u_prev``.
+    Gilbert & Tan, Linear systems with state and control constraints, IEEE Trans. Autom. Control 36
+    (1991), Section V.
 
     Raises
     ------
@@ -40,45 +37,37 @@ def invariant_set(problem: LinearMPC) -> tuple[Array, Array]:
         of steps is not finite within 500, or there are more than 200 rows.
     """
     errors, parts = problem.error_system, problem.layout
-    K = lqr.gain(errors.model, errors.R, problem.terminal_cost, problem.gamma, errors.cross)
+    K = lqr.gain(errors.model, errors.R, cost, problem.gamma, errors.cross)
     radius = lqr.spectral_radius(errors.model.A - errors.model.B @ K)
     if radius >= 1:
         raise ValueError(
-            "terminal_set='invariant' needs a terminal gain that stabilizes the model, but the "
+            "Terminal(set='invariant') needs a terminal gain that stabilizes the model, but the "
             f"spectral radius of A - BK is {radius:.6g}. Use gamma=1, or the default terminal cost."
         )
-    gain = errors.U - K @ errors.T
-    half = _unit(problem)
+    gain, half = errors.to_input - K @ errors.to_error, problem.theta_half
     rows, bounds = _bounds(problem, gain)
     A, B = problem.prediction
     rows, closed = rows * half, (A + B @ gain) * half / half[:, None]
     steady = rows @ _steady_projection(problem, half)
     if np.any(bounds <= 0):
         raise ValueError(
-            "terminal_set='invariant' needs an operating point with room to every bound, but "
+            "Terminal(set='invariant') needs an operating point with room to every bound, but "
             "theta = 0 lies on or beyond a hard one. Move the bounds or the operating point."
         )
     granted = _granted(problem, half)
-    found = _remove_redundant(rows, bounds, *granted)
+    found = _remove_redundant((rows, bounds), granted)
     if parts.has_constants:
         moving = np.any(np.abs(steady) > 1e-12, axis=1)
         inside = (steady[moving], (1 - MARGIN) * bounds[moving])
         found = np.vstack([found[0], inside[0]]), np.concatenate([found[1], inside[1]])
-    found = _until_nothing_new(rows, bounds, closed, found, granted)
-    F, g = _remove_redundant(*found, *granted)
+    found = _until_nothing_new((rows, bounds), closed, found, granted)
+    F, g = _remove_redundant(found, granted)
     return F / half, g
 
 
-def _until_nothing_new(
-    rows: Array,
-    bounds: Array,
-    closed: Array,
-    found: tuple[Array, Array],
-    granted: tuple[Array, Array],
-) -> tuple[Array, Array]:
+def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -> Rows:
     """Add the bounds of later steps until those of one step say nothing new."""
-    F, g = found
-    later = rows
+    (F, g), (later, bounds) = found, ahead
     for _ in range(MAX_STEPS):
         later = later @ closed
         A, b = np.vstack([F, granted[0]]), np.concatenate([g, granted[1]])
@@ -97,27 +86,27 @@ def _until_nothing_new(
     )
 
 
-def _bounds(problem: LinearMPC, gain: Array) -> tuple[Array, Array]:
+def _bounds(problem: MPCProblem, gain: Array) -> Rows:
     """Return the hard bounds of x, u, y and the rate under ``u = gain theta``: rows and bounds."""
-    parts, size = problem.layout, problem.n_theta
+    parts, size, outputs = problem.layout, problem.n_theta, problem.outputs
     state = np.eye(size)[parts.state]
     values = [(gain, problem.u_min, problem.u_max)]
     for seen, low, high, soft in (
-        (state, problem.x_min, problem.x_max, problem.x_soft),
-        (problem.outputs @ state, problem.y_min, problem.y_max, problem.y_soft),
+        (state, problem.x_min, problem.x_max, problem.soft.x),
+        (outputs.C @ state, outputs.y_min, outputs.y_max, problem.soft.y),
     ):
         hard = soft == 0
         values.append((seen[hard], low[hard], high[hard]))
     if parts.n_previous:
         change = gain - np.eye(size)[parts.previous]
-        values.append((change, problem.du_min, problem.du_max))
+        values.append((change, problem.rate.du_min, problem.rate.du_max))
     rows = np.concatenate([sign * each for each, _, _ in values for sign in (1, -1)])
     bounds = np.concatenate([side for _, low, high in values for side in (high, -low)])
     bounded = np.isfinite(bounds)
     return rows[bounded], bounds[bounded]
 
 
-def _steady_projection(problem: LinearMPC, half: Array) -> Array:
+def _steady_projection(problem: MPCProblem, half: Array) -> Array:
     """Return the map from theta to the theta at rest under the same r and d, in units of half."""
     parts, steady = problem.layout, problem.steady_states
     at_rest = np.zeros((problem.n_theta, problem.n_theta))
@@ -127,7 +116,7 @@ def _steady_projection(problem: LinearMPC, half: Array) -> Array:
     return np.asarray(at_rest / half[:, None] * half)
 
 
-def _granted(problem: LinearMPC, half: Array) -> tuple[Array, Array]:
+def _granted(problem: MPCProblem, half: Array) -> Rows:
     """Return the half-spaces that every predicted theta satisfies anyway."""
     first = problem.layout.constant.start
     eye = np.eye(problem.n_theta)[first:]
@@ -138,15 +127,13 @@ def _granted(problem: LinearMPC, half: Array) -> tuple[Array, Array]:
     return rows[bounded], bounds[bounded]
 
 
-def _remove_redundant(
-    rows: Array, bounds: Array, granted_rows: Array, granted_bounds: Array
-) -> tuple[Array, Array]:
+def _remove_redundant(found: Rows, granted: Rows) -> Rows:
     """Return the half-spaces that the others and the granted ones do not imply."""
-    kept = list(range(len(bounds)))
+    (rows, bounds), kept = found, list(range(len(found[1])))
     for i in range(len(bounds)):
         others = [j for j in kept if j != i]
-        A = np.vstack([rows[others], granted_rows])
-        b = np.concatenate([bounds[others], granted_bounds])
+        A = np.vstack([rows[others], granted[0]])
+        b = np.concatenate([bounds[others], granted[1]])
         if _is_redundant(rows[i], float(bounds[i]), A, b):
             kept = others
     return rows[kept], bounds[kept]
@@ -162,8 +149,3 @@ def _is_redundant(row: Array, bound: float, A: Array, b: Array) -> bool:
     A, b = np.vstack([A, row]), np.append(b, bound + 1)
     best = optimize.linprog(-row, A_ub=A, b_ub=b, bounds=[(None, None)] * len(row))
     return bool(best.status == 0 and -best.fun <= bound + 1e-9)
-
-
-def _unit(problem: LinearMPC) -> Array:
-    half = (problem.theta_max - problem.theta_min) / 2
-    return np.asarray(np.where(np.isfinite(half), half, 1.0))

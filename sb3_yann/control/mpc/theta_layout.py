@@ -19,6 +19,11 @@ class ThetaLayout:
         The measured, or estimated, disturbance d.
     n_previous : int
         The input of the step before, ``u_prev``: all inputs where their rate matters, or none.
+
+    Examples
+    --------
+    >>> ThetaLayout(n_states=2, n_references=1).names
+    ('x[0]', 'x[1]', 'r[0]')
     """
 
     n_states: int

@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from sb3_yann._validation import Array, as_discount
 from sb3_yann.control import lqr
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.mpc.problem import MPCProblem
 
-if TYPE_CHECKING:
-    from sb3_yann.control.mpc.linear_mpc import LinearMPC
 
-
-def value_matrix(problem: LinearMPC, gamma: float) -> Array:
-    """Return P (n_theta, n_theta), see :meth:`LinearMPC.value_matrix`.
-
-    The Lyapunov equation is solved in the error coordinates z, which exist for any discount, and
-    ``z'Pz`` is mapped back by ``z = T theta``.
-    """
+def value_matrix(problem: MPCProblem, law: PiecewiseAffine, gamma: float) -> Array:
+    """Return P (n_theta, n_theta) of :meth:`LinearMPC.value_matrix`, solved for in z."""
     gamma, errors = as_discount(gamma), problem.error_system
-    K = gain_at_rest(problem)
+    K = gain_at_rest(problem, law)
     P = lqr.policy_value(errors.model, errors.Q, errors.R, K, gamma, errors.cross)
-    return np.asarray(errors.T.T @ P @ errors.T)
+    return np.asarray(errors.to_error.T @ P @ errors.to_error)
 
 
-def state_action_matrix(problem: LinearMPC, gamma: float) -> Array:
-    """Return M (n_theta + m, n_theta + m), see :meth:`LinearMPC.state_action_matrix`."""
-    P = problem.value_matrix(gamma)
+def state_action_matrix(problem: MPCProblem, law: PiecewiseAffine, gamma: float) -> Array:
+    """Return M (n_theta + m, n_theta + m) of :meth:`LinearMPC.state_action_matrix`."""
+    P = value_matrix(problem, law, gamma)
     AB = np.hstack(problem.prediction)
     return np.asarray(problem.stage_matrix + gamma * AB.T @ P @ AB)
 
 
-def gain_at_rest(problem: LinearMPC) -> Array:
+def gain_at_rest(problem: MPCProblem, law: PiecewiseAffine) -> Array:
     """Return K (m, n_z) with ``v = -K z`` in the region of the law that holds the origin.
 
     Raises
@@ -40,16 +33,9 @@ def gain_at_rest(problem: LinearMPC) -> Array:
     ValueError
         If the law does not rest at the origin, or, near it, at the steady states of r and d.
     """
-    if any(np.any(part) for part in problem.linear_cost):
-        raise ValueError(
-            "A problem with a linear_cost has no quadratic value about the origin, so no policy "
-            "can start from it. Take the state and input where its law rests as the operating "
-            "point, and leave linear_cost out."
-        )
-    law, errors, parts = problem.explicit(), problem.error_system, problem.layout
+    errors, parts = problem.error_system, problem.layout
     origin = np.zeros(problem.n_theta)
-    width = problem.u_max - problem.u_min
-    unit = np.where(np.isfinite(width), width, 1.0)
+    unit = 2 * problem.u_half
     if not law.in_domain(origin) or np.any(np.abs(law(origin)) > 1e-9 * unit):
         raise ValueError(
             "The law does not rest at the origin: theta = 0 must be feasible with u = 0. "
@@ -61,7 +47,7 @@ def gain_at_rest(problem: LinearMPC) -> Array:
         columns.append(gains[:, parts.previous])
     K = -np.hstack(columns)
     box = np.maximum(np.abs(problem.theta_min), np.abs(problem.theta_max))
-    if np.any(np.abs(gains - (errors.U - K @ errors.T)) @ box > 1e-6 * unit):
+    if np.any(np.abs(gains - (errors.to_input - K @ errors.to_error)) @ box > 1e-6 * unit):
         raise ValueError(
             "The law does not rest at the steady states near theta = 0: a constraint acts there. "
             "Choose an operating point inside the bounds."

@@ -1,16 +1,15 @@
-"""The afterstate value on a processor: compiled, and one operation of torch with its gradient."""
+"""The afterstate value on a CPU: compiled, and one operation of torch with its gradient."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 
+from sb3_yann._numba import Single, compiled
 from sb3_yann._validation import Array
-from sb3_yann.control.law._kernels import compiled
 from sb3_yann.networks._kernels.mlp import (
-    Single,
     as_array,
     at_zero,
     first_layers,
@@ -18,9 +17,6 @@ from sb3_yann.networks._kernels.mlp import (
     tanh,
     transposed,
 )
-
-if TYPE_CHECKING:
-    from sb3_yann.networks.value import AfterstateValue
 
 _LINEAR = "float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1]"
 _NODES = "float32[:, :, :, ::1], float32[::1]"
@@ -35,13 +31,22 @@ def _matrices(weights: Single, pinned: Single) -> tuple[Single, Single]:
     return matrices, at_zero(matrices, used, pinned)
 
 
-@compiled(
-    f"Tuple((float64[::1], {_QUADRATICS}))(float64[:, ::1], {_LINEAR}, {_NODES})", fastmath=True
-)
+@compiled(f"void(float64[:, ::1], {_LINEAR}, {_NODES}, float64[::1], {_QUADRATICS})", fastmath=True)
 def _forms(
-    points: Array, W: Array, AB: Array, M: Array, scaling: Array, nodes: Single, pinned: Single
-) -> tuple[Array, Array, Array, Single, Single]:
-    """Return ``y'W y + z'M z`` (batch,), y, z, the network's input, and its first hidden layer.
+    points: Array,
+    W: Array,
+    AB: Array,
+    M: Array,
+    scaling: Array,
+    nodes: Single,
+    pinned: Single,
+    total: Array,
+    y: Array,
+    z: Array,
+    x: Single,
+    hidden: Single,
+) -> None:
+    """Write ``y'W y + z'M z`` (batch,), y, z, the network's input, and its first hidden layer.
 
     Parameters
     ----------
@@ -52,10 +57,10 @@ def _forms(
         Factors of z for the network; half the ranges of the inputs; their middles.
     nodes : ndarray, shape (1, k, h1, n + 1)
     pinned : ndarray, shape (1,)
+    total, y, z, x, hidden : ndarray
+        What is written; total and z are zero before.
     """
     batch, n, m = len(points), len(M), len(W) - len(M)
-    y, z, total = np.empty((batch, n + m)), np.zeros((batch, n)), np.zeros(batch)
-    x, hidden = np.empty((batch, n), np.float32), np.empty((batch, nodes.shape[2]), np.float32)
     matrices, zero = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
     for row in range(batch):
         for j in range(n):
@@ -77,24 +82,28 @@ def _forms(
                 product += M[i, j] * z[row, j]
             total[row] += z[row, i] * product
         hidden_layer(x, row, matrices, 0, zero, hidden)
-    return total, y, z, x, hidden
 
 
 @compiled(
-    "float32[:, ::1](float64[::1], float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], "
-    "float32[::1], float64)",
+    "void(float64[::1], float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1], "
+    "float64, float32[:, ::1])",
     fastmath=True,
 )
 def _output(
-    total: Array, hidden: Single, second: Single, last: Single, pinned: Single, factor: float
-) -> Single:
-    """Return ``-(total + factor network)`` (batch, 1).
+    total: Array,
+    hidden: Single,
+    second: Single,
+    last: Single,
+    pinned: Single,
+    factor: float,
+    q: Single,
+) -> None:
+    """Write ``q = -(total + factor network)`` (batch, 1).
 
     ``hidden`` (batch, h2) comes as the product of the second layer's weights and becomes what that
     layer puts out. second and last are (1, h2, h1 + 1) and (1, 1, h2 + 1).
     """
     batch, h = hidden.shape
-    q = np.empty((batch, 1), np.float32)
     matrices, zeros = _matrices(second, pinned)
     bias, zero = matrices[0, -1], zeros[0]
     for row in range(batch):
@@ -104,26 +113,31 @@ def _output(
         for a in range(h):
             learnt += last[0, 0, a] * hidden[row, a]
         q[row, 0] = -(total[row] + factor * learnt)
-    return q
 
 
 @compiled(
-    "Tuple((float32[:, ::1], float32[::1], float32[:, :, ::1]))"
-    "(float32[:, ::1], float64, float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], "
-    "float32[::1])",
+    "void(float32[:, ::1], float64, float32[:, ::1], float32[:, :, ::1], float32[:, :, ::1], "
+    "float32[::1], float32[:, ::1], float32[::1], float32[:, :, ::1])",
     fastmath=True,
 )
 def _output_backward(
-    gradient: Single, factor: float, hidden: Single, second: Single, last: Single, pinned: Single
-) -> tuple[Single, Single, Single]:
-    """Return the gradients by the second layer's products (batch, h2), its bias, and last.
+    gradient: Single,
+    factor: float,
+    hidden: Single,
+    second: Single,
+    last: Single,
+    pinned: Single,
+    through: Single,
+    by_bias: Single,
+    by_last: Single,
+) -> None:
+    """Write the gradients by the second layer's products (batch, h2), its bias, and last.
 
-    ``gradient`` (batch, 1) is that of a loss by what :func:`_output` returned.
+    ``gradient`` (batch, 1) is that of a loss by what :func:`_output` wrote. The last two are zero
+    before.
     """
     batch, h = hidden.shape
-    one = np.float32(1)
-    through, by_bias = np.empty((batch, h), np.float32), np.zeros(h, np.float32)
-    by_last, all_back = np.zeros((1, 1, h + 1), np.float32), np.float32(0)
+    one, all_back = np.float32(1), np.float32(0)
     zero = _matrices(second, pinned)[1][0]
     for row in range(batch):
         back = np.float32(-factor * gradient[row, 0])
@@ -135,12 +149,11 @@ def _output_backward(
             through[row, a] = back_a * (one - out * out)
             by_bias[a] += through[row, a] - pinned[0] * back_a * (one - zero[a] * zero[a])
     by_last[0, 0, h] = (one - pinned[0]) * all_back
-    return through, by_bias, by_last
 
 
 @compiled(
-    "Tuple((float32[:, :, :, ::1], float64[:, ::1], float64[:, ::1]))"
-    f"(float32[:, ::1], float32[:, ::1], boolean, boolean, {_QUADRATICS}, {_LINEAR}, {_NODES})",
+    f"void(float32[:, ::1], float32[:, ::1], boolean, boolean, {_QUADRATICS}, {_LINEAR}, {_NODES}, "
+    "float32[:, :, :, ::1], float64[:, ::1], float64[:, ::1])",
     fastmath=True,
 )
 def _forms_backward(
@@ -158,8 +171,11 @@ def _forms_backward(
     scaling: Array,
     nodes: Single,
     pinned: Single,
-) -> tuple[Single, Array, Array]:
-    """Return the gradients by nodes, points (batch, n + m) and M (n, n).
+    by_nodes: Single,
+    by_points: Array,
+    by_M: Array,
+) -> None:
+    """Write the gradients by nodes, points (batch, n + m) and M (n, n), which are zero before.
 
     ``back`` (batch, h1) is the gradient by the first hidden layer. Those by points, or by nodes
     and M, are zeros unless they are asked for.
@@ -169,7 +185,6 @@ def _forms_backward(
     one = np.float32(1)
     matrices, zeros = _matrices(first_layers(nodes, np.zeros(1, np.int64)), pinned)
     matrix, zero = matrices[0], zeros[0]
-    by_points, by_M = np.zeros((batch, n + m)), np.zeros((n, n))
     by_matrix = np.zeros((n + 1, h), np.float32)
     through = np.empty(h, np.float32)
     for row in range(batch):
@@ -200,72 +215,77 @@ def _forms_backward(
                 by_points[row, j] += by_z * AB[i, j]
         for j in range(n, n + m):
             by_points[row, j] *= scaling[j]
-    by_nodes = np.empty((1, k, h, n + 1), np.float32)
     for node in range(k):  # they enter the same sum
         for a in range(h):
             for j in range(n + 1):
                 by_nodes[0, node, a, j] = by_matrix[j, a]
-    return by_nodes, by_points, by_M
 
 
-def value_on_processor(value: AfterstateValue, points: th.Tensor, fixed: bool = False) -> th.Tensor:
-    """Return what ``value(points)`` is, (batch, 1), for points of shape (batch, n + m).
+Constants = tuple[Array, Array, Array, Array, Single, float]
 
-    With ``fixed`` weights there is a gradient by the points alone.
+
+def value_on_cpu(
+    points: th.Tensor, weights: tuple[th.Tensor, ...], constants: Constants
+) -> th.Tensor:
+    """Return an afterstate value (batch, 1), with a gradient by points and weights.
+
+    Parameters
+    ----------
+    points : Tensor, shape (batch, n + m)
+    weights : tuple of Tensor
+        Entries of the quadratic form; nodes, second and last of the network.
+    constants : tuple
+        W, [A B], the scale of the quadratic form, the scaling of :func:`_forms`, which networks
+        are pinned, and the factor of the network.
     """
-    buffers: Any = value._buffers  # a module's tables: its attributes take a microsecond to find
-    modules: Any = value._modules
-    size = len(buffers["W"])
+    size = len(constants[0])
     if points.dim() != 2 or points.shape[1] != size:  # compiled code does not look
         raise ValueError(f"points have shape {tuple(points.shape)}, expected (batch, {size}).")
-    weights: tuple[th.Tensor, ...] = (
-        modules["quadratic"].entries,
-        *modules["network"].weights(),
-    )
-    if fixed:
-        weights = tuple(weight.detach() for weight in weights)
     if th.is_grad_enabled():
-        q: th.Tensor = _Value.apply(value, points, *weights)  # type: ignore[no-untyped-call]
+        q: th.Tensor = _Value.apply(constants, points, *weights)  # type: ignore[no-untyped-call]
         return q
-    return th.from_numpy(_Pass(value, points, weights).q)
+    return th.from_numpy(_Pass(constants, points, weights).q)
 
 
 class _Pass:
-    """One way forward, and what the way back needs of it.
+    """A forward pass, and what its backward pass needs.
 
     The second layer, nearly all of the arithmetic, is left to torch's products of matrices.
     """
 
     def __init__(
-        self, value: AfterstateValue, points: th.Tensor, weights: tuple[th.Tensor, ...]
+        self, constants: Constants, points: th.Tensor, weights: tuple[th.Tensor, ...]
     ) -> None:
         self.weights = weights
         entries, nodes, second, last = as_array(weights[0], np.float64), *map(as_array, weights[1:])
-        W, AB, self.roots, scaling = value.constants
-        network: Any = value._modules["network"]
-        pinned = network.pinned_array
+        W, AB, self.roots, scaling, pinned, self.factor = constants
         self.first: tuple[Any, ...] = (W, AB, entries * self.roots, scaling, nodes, pinned)
         array = as_array(points, np.float64)
-        total, *forms = _forms(array, *self.first)
-        self.forms: tuple[Any, ...] = tuple(forms)
+        (batch, size), n, h = array.shape, len(entries), nodes.shape[2]
+        total, y, z = np.zeros(batch), np.empty((batch, size)), np.zeros((batch, n))
+        x, hidden = np.empty((batch, n), np.float32), np.empty((batch, h), np.float32)
+        self.forms: tuple[Any, ...] = (y, z, x, hidden)
+        _forms(array, *self.first, total, *self.forms)
         self.matrix = th.from_numpy(second)[0, :, :-1]
-        product = th.mm(th.from_numpy(self.forms[-1]), self.matrix.T)
+        product = th.mm(th.from_numpy(hidden), self.matrix.T)
         self.hidden, self.layers = product.numpy(), (second, last, pinned)
-        self.factor = value.gamma * value.scale
-        self.q: Single = _output(total, self.hidden, *self.layers, self.factor)
+        self.q: Single = np.empty((batch, 1), np.float32)
+        _output(total, self.hidden, *self.layers, self.factor, self.q)
 
     def backward(
         self, gradient: Single, of_points: bool, of_weights: bool
     ) -> tuple[th.Tensor | None, ...]:
         """Return the gradients by the points and the weights, as far as they are asked for."""
-        through, by_bias, by_last = _output_backward(
-            gradient, self.factor, self.hidden, *self.layers
-        )
+        last, hidden = self.layers[1], self.hidden
+        through, by_bias = np.empty_like(hidden), np.zeros(hidden.shape[1], np.float32)
+        by_last = np.zeros(last.shape, np.float32)
+        _output_backward(gradient, self.factor, hidden, *self.layers, through, by_bias, by_last)
         product = th.from_numpy(through)
         back = th.mm(product, self.matrix)
-        by_nodes, found, by_M = _forms_backward(
-            gradient, back.numpy(), of_points, of_weights, *self.forms, *self.first
-        )
+        y, M, nodes = self.forms[0], self.first[2], self.first[4]
+        by_nodes, found, by_M = np.zeros_like(nodes), np.zeros_like(y), np.zeros_like(M)
+        given = (*self.forms, *self.first, by_nodes, found, by_M)
+        _forms_backward(gradient, back.numpy(), of_points, of_weights, *given)
         by_points = th.from_numpy(found) if of_points else None
         if not of_weights:
             return by_points, None, None, None, None
@@ -281,10 +301,12 @@ class _Value(th.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, value: AfterstateValue, points: th.Tensor, *weights: th.Tensor
+        ctx: Any, constants: Constants, points: th.Tensor, *weights: th.Tensor
     ) -> th.Tensor:
-        ctx.save_for_backward(*weights)  # who changes them before the way back is told so
-        ctx.done, ctx.dtype = _Pass(value, points, weights), points.dtype
+        ctx.save_for_backward(
+            *weights
+        )  # torch notices weights that change before the backward pass
+        ctx.done, ctx.dtype = _Pass(constants, points, weights), points.dtype
         return th.from_numpy(ctx.done.q)
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Stacks of zero-output networks on a processor, forward and backward, as compiled loops.
+"""Stacks of zero-output networks on a CPU, forward and backward, as compiled loops.
 
 A batch of some hundred states goes through networks of a few hundred to a few thousand weights: in
 torch's own operations most of the time is their overhead, some fifty times over. Here it is one
@@ -14,9 +14,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann.control.law._kernels import Integers, compiled
-
-Single = NDArray[np.float32]
+from sb3_yann._numba import Integers, Single, compiled
 
 WEIGHTS = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float32[::1]"
 """Types of nodes, second, last and pinned, see :func:`network`."""
@@ -37,8 +35,7 @@ def tanh(x: Any) -> Any:
 
     With t = tanh(x / 2) from the eighth convergent of Lambert's continued fraction
     ``t = h / (1 + h^2 / (3 + h^2 / (5 + ...)))`` at h = x / 2, it is ``2 t / (1 + t^2)``. That is
-    arithmetic alone, of which a processor does several at a time; the library's tanh costs more
-    than all the rest.
+    arithmetic alone, several values at a time; the library's tanh costs more than all the rest.
     """
     one, five = np.float32(1), np.float32(5)
     h = np.float32(0.5) * x
@@ -122,8 +119,11 @@ def network(
     second: Single,
     last: Single,
     pinned: Single,
-) -> tuple[Single, Single, Single]:
-    """Return the networks' output (batch, m), and their hidden layers, (batch, h1) and (batch, h2).
+    hidden1: Single,
+    hidden2: Single,
+    out: Single,
+) -> None:
+    """Write the networks' output (batch, m), and their hidden layers, (batch, h1) and (batch, h2).
 
     Parameters
     ----------
@@ -138,13 +138,13 @@ def network(
     last : ndarray, shape (p, m, h2 + 1)
     pinned : ndarray, shape (p,)
         1 where the network stays zero at the origin, else 0.
+    hidden1, hidden2, out : ndarray
+        What is written.
     """
-    batch, m, h1, h2 = len(x), last.shape[1], second.shape[2] - 1, last.shape[2] - 1
+    batch, m, h2 = len(x), last.shape[1], last.shape[2] - 1
     matrices1 = transposed(first_layers(nodes, used), np.arange(len(used)))
     matrices2 = transposed(second, used)
     zero1, zero2 = at_zero(matrices1, used, pinned), at_zero(matrices2, used, pinned)
-    hidden1, hidden2 = np.empty((batch, h1), np.float32), np.empty((batch, h2), np.float32)
-    out = np.empty((batch, m), np.float32)
     for row in range(batch):
         s = slot[row]
         i = used[s]
@@ -155,7 +155,6 @@ def network(
             for j in range(h2):
                 total += last[i, k, j] * hidden2[row, j]
             out[row, k] = total
-    return out, hidden1, hidden2
 
 
 @compiled(fastmath=True)
@@ -204,8 +203,11 @@ def network_backward(
     pinned: Single,
     hidden1: Single,
     hidden2: Single,
-) -> tuple[Single, Single, Single, Single]:
-    """Return the gradients by nodes, second, last, and by x (batch, n).
+    by_nodes: Single,
+    by_second: Single,
+    by_last: Single,
+) -> None:
+    """Write the gradients by nodes, second and last; the last two are zero before.
 
     Of all networks if ``dense``, else of those in use alone, in the order of ``used``. ``back``
     (batch, m) is the gradient by the output; the others are as in :func:`network`.
@@ -214,8 +216,6 @@ def network_backward(
     k, m, h1, h2 = nodes.shape[1], last.shape[1], second.shape[2] - 1, last.shape[2] - 1
     rows = len(pinned) if dense else len(used)
     by_first = np.zeros((rows, h1, n + 1), np.float32)
-    by_second = np.zeros((rows, h2, h1 + 1), np.float32)
-    by_last = np.zeros((rows, m, h2 + 1), np.float32)
     by_x, by_1 = np.empty((batch, n), np.float32), np.empty((batch, h1), np.float32)
     by_2 = np.zeros((batch, h2), np.float32)
     first = first_layers(nodes, used)
@@ -235,10 +235,8 @@ def network_backward(
         own = pinned[i]
         _hidden_backward(by_2, hidden1, hidden2, row, zero2, own, s, second, i, by_second, at, by_1)
         _hidden_backward(by_1, x, hidden1, row, zero1, own, s, first, s, by_first, at, by_x)
-    by_nodes = np.empty((rows, k, h1, n + 1), np.float32)
     for node in range(k):  # they enter the same sum
         for s in range(by_first.shape[0]):
             for a in range(by_first.shape[1]):
                 for j in range(by_first.shape[2]):
                     by_nodes[s, node, a, j] = by_first[s, a, j]
-    return by_nodes, by_second, by_last, by_x

@@ -12,7 +12,7 @@ import general_problems
 import sample_problems
 from reference_answers import online_answers, random_problems, relative_error
 from sample_problems import box_points, half_spaces, input_bounds_only, small_mpc
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import LinearModel, LinearMPC, RateLimits, Terminal
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.control.explicit import solve as module
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
@@ -31,7 +31,7 @@ NAMES = [
 ]
 GENERAL_NAMES = [
     *("servo", "servo with rates", "servo with a weight on the rate", "soft states"),
-    *("invariant with all of it", "linear cost", "two tanks", "two tanks, all parts"),
+    *("invariant with all of it", "two tanks", "two tanks, all parts"),
 ]
 
 
@@ -40,7 +40,7 @@ def problem(name: str) -> LinearMPC:
 
 
 def regions_of(mpc: LinearMPC, solver: str) -> list[Region]:
-    units = module._Units(mpc.condensed(), mpc.u_min, mpc.u_max)
+    units = module.ProgramUnits(mpc.condensed(), mpc.u_min, mpc.u_max)
     return module._critical_regions(units.scaled, solver, BudgetTimer(SolveBudget()))
 
 
@@ -73,7 +73,7 @@ def test_regions_are_those_of_ppopt(name: str) -> None:
 )
 @given(random_problems())
 def test_regions_of_random_problems_are_those_of_ppopt(mpc: LinearMPC) -> None:
-    units = module._Units(mpc.condensed(), mpc.u_min, mpc.u_max)
+    units = module.ProgramUnits(mpc.condensed(), mpc.u_min, mpc.u_max)
     try:
         module._require_feasible(units.scaled)
     except ValueError:
@@ -102,7 +102,7 @@ def staircase(**changes: Any) -> LinearMPC:
 
     The last of the five constraints on the four inputs holds with equality whenever the others do.
     """
-    limits = {"u_min": -1, "u_max": 0.5, "du_min": -0.5, "du_max": 0.5, "horizon": 4}
+    limits = {"u_min": -1, "u_max": 0.5, "rate": RateLimits(-0.5, 0.5), "horizon": 4}
     return input_bounds_only(
         LinearModel([[0.9, 0.4], [0, 0.8]], [[0], [1]], 1.0), **{**limits, **changes}
     )
@@ -142,7 +142,7 @@ def test_constraints_that_depend_on_each_other_share_a_region_without_overlap() 
 
 
 def test_a_region_thinner_than_a_millionth_of_the_box_is_found() -> None:
-    slim = small_mpc(terminal_set=([[1, 0], [-1, 0]], [1e-6, 1e-6]), horizon=3)
+    slim = small_mpc(terminal=Terminal(set=([[1, 0], [-1, 0]], [1e-6, 1e-6])), horizon=3)
     law = slim.explicit()
     radii = [region.ball()[1] for region in regions_of(slim, "walk")]
     assert min(radii) < 1e-6

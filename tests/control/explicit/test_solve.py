@@ -26,7 +26,7 @@ from sample_problems import (
     small_mpc,
     solved,
 )
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import LinearModel, LinearMPC, Terminal
 from sb3_yann.control import lqr
 from sb3_yann_envs import problems
 
@@ -86,7 +86,7 @@ def test_online_qp_itself_agrees_with_a_general_purpose_solver() -> None:
         for k in range(2):
             total += float(x @ mpc.Q @ x) + 0.1 * float(u[k] ** 2)
             x = mpc.model.step(x, u[k : k + 1])
-        return total + float(x @ mpc.terminal_cost @ x)
+        return total + float(x @ mpc.terminal.cost @ x)
 
     best = optimize.minimize(cost, np.zeros(2), bounds=[(-1, 1)] * 2, tol=1e-14)
     assert OnlineMPC(mpc)(theta)[0] == pytest.approx(best.x[0], abs=1e-6)
@@ -94,7 +94,7 @@ def test_online_qp_itself_agrees_with_a_general_purpose_solver() -> None:
 
 def test_one_step_without_state_bounds_is_the_clipped_lqr() -> None:
     mpc = input_bounds_only(horizon=1)
-    gain = lqr.gain(mpc.model, mpc.R, mpc.terminal_cost)
+    gain = lqr.gain(mpc.model, mpc.R, mpc.terminal.cost)
     points = box_points(mpc, 2000)
     np.testing.assert_allclose(
         mpc.explicit()(points), np.clip(-points @ gain.T, -1, 1), rtol=0, atol=1e-13
@@ -104,7 +104,7 @@ def test_one_step_without_state_bounds_is_the_clipped_lqr() -> None:
 @pytest.mark.parametrize("gamma", [1.0, 0.95, 0.8])
 def test_unconstrained_region_has_the_lqr_gain_of_the_same_discount(gamma: float) -> None:
     mpc = input_bounds_only(gamma=gamma)
-    law, K = mpc.explicit(), lqr.gain(mpc.model, mpc.R, mpc.terminal_cost, gamma)
+    law, K = mpc.explicit(), lqr.gain(mpc.model, mpc.R, mpc.terminal.cost, gamma)
     np.testing.assert_allclose(law.gains[law.locate([0, 0])], -K, rtol=1e-11)
 
 
@@ -153,7 +153,7 @@ def test_published_benchmark_has_nine_regions_and_the_published_gains() -> None:
 def test_benchmark_region_with_a_saturated_second_input_is_the_minimizer_by_hand() -> None:
     # With u_1 fixed the cost is a parabola in u_0: independent of any solver.
     mpc = benchmark()
-    A, B, P = mpc.model.A, mpc.model.B, mpc.terminal_cost
+    A, B, P = mpc.model.A, mpc.model.B, mpc.terminal.cost
     curvature = mpc.R + B.T @ (mpc.Q + A.T @ P @ A) @ B
     gain = -np.linalg.solve(curvature, B.T @ (mpc.Q + A.T @ P @ A) @ A)
     offset = -np.linalg.solve(curvature, B.T @ A.T @ P @ B @ [-1.0])
@@ -190,7 +190,7 @@ def test_units_of_states_and_input_change_nothing(units: list[float]) -> None:
 
 
 def test_constraints_that_say_the_same_give_no_more_regions() -> None:
-    twice = small_mpc(terminal_set=(2 * EYE_ROWS, [10] * 4))
+    twice = small_mpc(terminal=Terminal(set=(2 * EYE_ROWS, [10] * 4)))
     assert twice.explicit().n_regions == small_mpc().explicit().n_regions
 
 
@@ -238,8 +238,8 @@ def test_solving_does_not_change_equality() -> None:
         {"u_max": 2},
         {"theta_min": -4},
         {"theta_max": 4},
-        {"terminal_cost": np.eye(2)},
-        {"terminal_set": ([[1, 1]], [3])},
+        {"terminal": Terminal(np.eye(2))},
+        {"terminal": Terminal(set=([[1, 1]], [3]))},
         {"gamma": 0.9},
         {"infeasible": "zero_input"},
     ],
@@ -265,11 +265,11 @@ def test_arrays_of_a_problem_stay_read_only_in_a_copy() -> None:
 
 @pytest.mark.parametrize("entry", [0, 1])
 def test_a_terminal_set_stays_read_only_in_a_copy(entry: int) -> None:
-    twin = copy.deepcopy(small_mpc(terminal_set=([[1, 1]], [3])))
+    twin = copy.deepcopy(small_mpc(terminal=Terminal(set=([[1, 1]], [3]))))
     with pytest.raises(ValueError, match="read-only"):
-        twin.terminal_set[entry][0] = 2
+        twin.terminal.set[entry][0] = 2
 
 
 def test_a_problem_with_one_thing_replaced_is_that_problem() -> None:
-    changed = dataclasses.replace(small_mpc(), Q=np.diag([1, 2]), terminal_cost=None)
+    changed = dataclasses.replace(small_mpc(), Q=np.diag([1, 2]), terminal=None)
     assert changed == small_mpc(Q=np.diag([1, 2]))

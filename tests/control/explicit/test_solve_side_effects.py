@@ -11,6 +11,7 @@ import pytest
 
 from fresh_process import run_python
 from sample_problems import benchmark
+from sb3_yann.control import ExplicitLimitError
 
 NO_GUROBI = """
 import sys
@@ -25,15 +26,17 @@ else:
         if hasattr(gurobipy, name):
             setattr(gurobipy, name, no_licence)
 from sb3_yann_envs import problems
-sys.exit(problems.clipped_pendulum().explicit().n_regions)
+problems.clipped_pendulum().explicit()
+sys.exit(problems.clipped_pendulum().explicit("ppopt").n_regions)
 """
 
 NOT_INSTALLED = """
 import sys
-for name in ("gurobipy", "quadprog"):
+for name in ("gurobipy", "quadprog", "cvxopt"):
     sys.modules[name] = None
 from sb3_yann_envs import problems
-sys.exit(problems.cstr().explicit().n_regions)
+problems.cstr().explicit()
+sys.exit(problems.cstr().explicit("ppopt").n_regions)
 """
 
 FROZEN_LAW = """
@@ -48,11 +51,24 @@ sys.exit(mpc.explicit().n_regions)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "code", [NO_GUROBI, NOT_INSTALLED], ids=["gurobi has no licence", "gurobi is not installed"]
+    "code",
+    [NO_GUROBI, NOT_INSTALLED],
+    ids=["gurobi has no licence", "no other solver is installed"],
 )
 def test_solving_needs_no_gurobi_and_prints_nothing(code: str) -> None:
     done = run_python(code)
     assert (done.returncode, done.stdout, done.stderr) == (7, b"", b"")
+
+
+def test_ppopt_is_left_as_it_was() -> None:
+    from ppopt import solver
+    from ppopt.solver_interface import solver_interface as inner
+
+    shipped = solver.solve_lp_cvxopt, inner.solve_lp_cvxopt
+    with pytest.raises(ExplicitLimitError):
+        benchmark().explicit("ppopt", time_limit=1e-6)
+    assert benchmark().explicit("ppopt").n_regions == 9
+    assert (solver.solve_lp_cvxopt, inner.solve_lp_cvxopt) == shipped
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_yann import Identified, LinearModel, LinearMPC, identify
+from sb3_yann import Identified, LinearModel, LinearMPC, Tracking, identify
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
@@ -208,7 +208,7 @@ def test_law_of_a_model_whose_operating_point_moves_is_warned_of() -> None:
     np.testing.assert_allclose(model.drift, [0.05, 0], atol=1e-3)
     box = {"theta_min": -5, "theta_max": 5, "u_min": -1, "u_max": 1}
     with pytest.warns(UserWarning, match=r"moves by \[0\.0.* will rest beside its references"):
-        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracked=[0], r_min=-1, r_max=1, **box)
+        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracking=Tracking([0], -1, 1), **box)
 
 
 def delayed(steps: int, hold: int = 1, process: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
@@ -319,8 +319,8 @@ BAD_DATA: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"states": X[:1], "actions": U[:0]}, ValueError, "actions of episode 0 has 0 rows"),
     ({"states": X[:5], "actions": U[:4]}, ValueError, "3 steps to fit 4 parameters"),
     ({"disturbances": U[:-1]}, ValueError, "disturbances of episode 0 has 399 rows"),
-    ({"held_out": 1.0}, ValueError, r"held_out = 1\.0 must be a fraction"),
-    ({"ridge": -1}, ValueError, "ridge = -1 must be 0 or"),
+    ({"held_out": 1.0}, ValueError, r"held_out = 1\.0 must lie in \[0, 1\)"),
+    ({"ridge": -1}, ValueError, "ridge = -1 must be a finite number of at least 0"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
     ({"x_ss": [1]}, ValueError, r"x_ss has shape \(1,\), expected \(2,\)"),
     (
@@ -349,5 +349,5 @@ def test_bad_data_are_named(changes: dict[str, Any], error: type[Exception], mes
 
 @pytest.mark.parametrize(("name", "level"), [("C", 0.95), ("A", 1.0), ("A", 0.0)])
 def test_bad_interval_is_named(name: str, level: float) -> None:
-    with pytest.raises(ValueError, match=r"must be 'A', 'B' or 'E'|must lie in \(0, 1\)"):
+    with pytest.raises(ValueError, match=r"must be one of \('A', 'B', 'E'\)|must lie in \(0, 1\)"):
         identify(X, U, dt=1).interval(name, level)

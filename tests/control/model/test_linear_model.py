@@ -122,13 +122,16 @@ def test_a_model_without_disturbances_has_an_empty_matrix_of_them() -> None:
 
 
 def test_notes_are_no_part_of_equality() -> None:
-    noted = MODEL.with_notes("found in the attic")
+    noted = LinearModel(**{**vars(MODEL), "notes": ["found in the attic"]})
     assert (noted, hash(noted), repr(noted)) == (MODEL, hash(MODEL), repr(MODEL))
     assert noted.notes == ("found in the attic",)
 
 
-def test_a_changed_model_loses_the_notes_on_the_old_one() -> None:
-    assert dataclasses.replace(MODEL.with_notes("fits"), dt=1.0).notes == ()
+def test_a_changed_model_loses_the_notes_and_the_drift_of_the_old_one() -> None:
+    noted = LinearModel(**{**vars(MODEL), "notes": ["fits"], "drift": [1, 0]})
+    assert (noted.notes, noted.drift.tolist()) == (("fits",), [1, 0])
+    assert not np.any(dataclasses.replace(noted, dt=1.0).drift)
+    assert dataclasses.replace(noted, dt=1.0).notes == ()
 
 
 @pytest.mark.parametrize("name", ["A", "B", "x_ss", "u_ss", "E", "d_ss"])

@@ -130,7 +130,8 @@ def test_operating_point_and_disturbances_are_told() -> None:
 
 
 def test_notes_end_the_report() -> None:
-    assert of_poles(0.5).with_notes("D was dropped.").report().endswith("\nNote: D was dropped.")
+    noted = LinearModel([[0.5]], [[1]], 0.1, notes=["D was dropped."])
+    assert noted.report().endswith("\nNote: D was dropped.")
 
 
 def test_fit_of_an_identified_model_is_told() -> None:

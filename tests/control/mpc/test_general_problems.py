@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import pickle
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,20 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from general_problems import PROBLEMS, QUADRATIC, RATES, THERMAL, TWO_TANKS, servo, solved
+from general_problems import PROBLEMS, RATED, THERMAL, TWO_TANKS, servo, solved
 from online_mpc import OnlineMPC
 from reference_answers import online_answers, relative_error
 from sample_problems import box_points
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import (
+    DisturbanceBounds,
+    LinearModel,
+    LinearMPC,
+    OutputBounds,
+    RateLimits,
+    SoftBounds,
+    Terminal,
+    Tracking,
+)
 from sb3_yann.control import lqr
 
 
@@ -52,17 +62,16 @@ def random_problems(draw: st.DrawFn) -> LinearMPC:
         "gamma": draw(st.sampled_from([1.0, 0.9])),
         "theta_min": -box,
         "theta_max": box,
-        "d_min": np.full(n_d, -0.2),
-        "d_max": np.full(n_d, 0.3),
+        "disturbances": DisturbanceBounds(np.full(n_d, -0.2), np.full(n_d, 0.3)),
     }
     if draw(st.booleans()):
-        values |= {"tracked": rng.normal(size=(1, n)), "r_min": -0.5, "r_max": 0.8}
+        values["tracking"] = Tracking(rng.normal(size=(1, n)), -0.5, 0.8)
     if draw(st.booleans()) and N * m <= 3:
-        values |= {"du_min": -rng.uniform(0.2, 1, m), "du_max": rng.uniform(0.2, 1, m)}
-        values["S"] = draw(st.sampled_from([0.0, 1.0])) * np.eye(m)
+        limits = -rng.uniform(0.2, 1, m), rng.uniform(0.2, 1, m)
+        values["rate"] = RateLimits(*limits, draw(st.sampled_from([0.0, 1.0])) * np.eye(m))
     if draw(st.booleans()) and N * m <= 2:
-        values |= {"outputs": rng.normal(size=(1, n)), "y_max": 2.0}
-        values |= draw(st.sampled_from([{}, {"y_soft": 1.0, "soft_penalty": 300.0}]))
+        values["outputs"] = OutputBounds(rng.normal(size=(1, n)), y_max=2.0)
+        values["soft"] = draw(st.sampled_from([None, SoftBounds(y=1.0, penalty=300.0)]))
     return LinearMPC(LinearModel(A, B, 1.0, E=rng.normal(size=(n, n_d))), **values)
 
 
@@ -90,7 +99,7 @@ def test_eight_parameters_and_two_inputs() -> None:
 
 
 def test_rates_are_kept_on_every_step_of_a_closed_loop() -> None:
-    mpc = servo(du_min=-0.1, du_max=0.2)
+    mpc = servo(rate=RateLimits(-0.1, 0.2))
     theta = np.array([0.0, 0.0, 0.9, 0.0])
     for _ in range(40):
         u = mpc.explicit()(theta)
@@ -101,13 +110,16 @@ def test_rates_are_kept_on_every_step_of_a_closed_loop() -> None:
 
 def test_a_weight_on_the_rate_makes_the_input_move_less() -> None:
     start = [0.0, 0.0, 0.9]
-    first = [servo(S=weight * np.eye(1)).explicit()([*start, 0.0])[0] for weight in (0.1, 10.0)]
+    first = [
+        servo(rate=RateLimits(R_du=[[weight]])).explicit()([*start, 0.0])[0]
+        for weight in (0.1, 10.0)
+    ]
     assert 0 < first[1] < first[0] / 2
 
 
 def test_a_soft_bound_is_kept_where_the_hard_one_can_be() -> None:
     hard = servo(x_max=[1.5, 0.3], x_min=[-1.5, -0.3], theta_min=-3, theta_max=3)
-    soft = dataclasses.replace(hard, x_soft=[0.0, 1.0], soft_penalty=1e3)
+    soft = dataclasses.replace(hard, soft=SoftBounds([0.0, 1.0], penalty=1e3))
     points = box_points(hard, 2000)
     inside = points[hard.explicit().in_domain(points)]
     error = relative_error(hard, soft.explicit()(inside), hard.explicit()(inside))
@@ -115,7 +127,7 @@ def test_a_soft_bound_is_kept_where_the_hard_one_can_be() -> None:
 
 
 def test_the_law_reaches_beyond_a_soft_bound_without_being_told() -> None:
-    soft = {"x_min": -1.2, "x_max": 1.2, "x_soft": 1, "soft_penalty": 300}
+    soft = {"x_min": -1.2, "x_max": 1.2, "soft": SoftBounds(1, penalty=300)}
     law = servo(**soft).explicit()
     assert law.in_domain([2.0, 0.0, 0.5])
     with pytest.warns(UserWarning, match=r"bounds -1.2 to 1.2 of x\[0\], .* the law ends there"):
@@ -124,12 +136,12 @@ def test_the_law_reaches_beyond_a_soft_bound_without_being_told() -> None:
 
 def test_an_input_that_may_not_rest_is_warned_of() -> None:
     with pytest.warns(UserWarning, match=r"leave out u\[0\] = 0, .* bounds that are absolute"):
-        servo(tracked=None, r_min=None, r_max=None, u_min=0.2)
+        servo(tracking=None, u_min=0.2)
 
 
 def test_a_soft_bound_leaves_a_solution_where_the_hard_one_has_none() -> None:
     hard = servo(x_max=[9.0, 0.3], x_min=[-9.0, -0.3], theta_min=-3, theta_max=3)
-    soft = dataclasses.replace(hard, x_soft=[0.0, 1.0], soft_penalty=1e3)
+    soft = dataclasses.replace(hard, soft=SoftBounds([0.0, 1.0], penalty=1e3))
     points = box_points(hard, 1000)
     assert soft.explicit().in_domain(points).mean() > hard.explicit().in_domain(points).mean() + 0.1
 
@@ -139,9 +151,7 @@ def test_bounded_outputs_are_bounded_states_in_other_words() -> None:
     as_outputs = servo(
         x_min=[-9.0, -np.inf],
         x_max=[9.0, np.inf],
-        outputs=[1],
-        y_min=-0.3,
-        y_max=0.3,
+        outputs=OutputBounds([1], -0.3, 0.3),
         theta_min=-3,
         theta_max=3,
     )
@@ -153,7 +163,7 @@ def test_bounded_outputs_are_bounded_states_in_other_words() -> None:
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9])
-@pytest.mark.parametrize("name", QUADRATIC)
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_value_is_the_cost_of_the_law_on_the_model(name: str, gamma: float) -> None:
     mpc = solved(name)
     law, P = mpc.explicit(), mpc.value_matrix(gamma)
@@ -168,7 +178,7 @@ def test_value_is_the_cost_of_the_law_on_the_model(name: str, gamma: float) -> N
     np.testing.assert_allclose(cost, value, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", QUADRATIC)
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
     mpc, rng = solved(name), np.random.default_rng(0)
     theta, u = box_points(mpc, 50), rng.normal(size=(50, mpc.model.n_inputs))
@@ -184,7 +194,7 @@ def test_stage_matrix_is_the_stage_cost_as_a_form(name: str) -> None:
 
 
 def test_stage_cost_is_the_formula() -> None:
-    mpc = servo(S=[[2.0]])
+    mpc = servo(rate=RateLimits(R_du=[[2.0]]))
     theta, u = np.array([0.3, -0.1, 0.5, 0.2]), np.array([0.4])
     x_s, u_s = mpc.steady_state([0.5])
     e = theta[:2] - x_s
@@ -193,7 +203,8 @@ def test_stage_cost_is_the_formula() -> None:
 
 
 def test_a_weight_on_the_rate_has_the_gain_of_the_augmented_lqr() -> None:
-    mpc = servo(S=[[2.0]], x_min=None, x_max=None, theta_min=-9, theta_max=9, u_min=-90, u_max=90)
+    box = {"x_min": None, "x_max": None, "theta_min": -9, "theta_max": 9}
+    mpc = servo(rate=RateLimits(R_du=[[2.0]]), **box, u_min=-90, u_max=90)
     A, B = THERMAL.A, THERMAL.B
     bigger = LinearModel(
         np.block([[A, np.zeros((2, 1))], [np.zeros((1, 3))]]), np.vstack([B, [[1.0]]]), 1.0
@@ -220,70 +231,118 @@ def test_copies_are_equal_and_bring_the_law(copied: Any) -> None:
 def test_a_problem_with_one_thing_replaced_is_that_problem(name: str) -> None:
     mpc = solved(name)
     assert dataclasses.replace(mpc) == mpc
-    changed = dataclasses.replace(mpc, r_max=mpc.r_max / 2)
-    assert (changed == mpc) == (mpc.r_max.size == 0)
-    assert changed.theta_max[changed.layout.reference].tolist() == (mpc.r_max / 2).tolist()
+    r_max = mpc.tracking.r_max
+    tracking = dataclasses.replace(mpc.tracking, r_max=r_max / 2)
+    changed = dataclasses.replace(mpc, tracking=tracking)
+    assert (changed == mpc) == (r_max.size == 0)
+    assert changed.theta_max[changed.layout.reference].tolist() == (r_max / 2).tolist()
 
 
-BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
-    ({"tracked": [0, 1]}, ValueError, r"no steady state for r\[0\], r\[1\]: .* rank 3.* \(1\) can"),
-    ({"tracked": [2]}, ValueError, r"tracked = \[2\] must be indices of states, .* 0 to 1"),
-    ({"tracked": [0.5]}, ValueError, r"tracked = \[0.5\] must be indices of states"),
-    ({"tracked": [True]}, ValueError, r"tracked = \[True\] must be indices of states"),
-    ({"tracked": [[1, 2, 3]]}, ValueError, r"tracked has shape \(1, 3\), expected \(q, 2\)"),
-    ({"r_min": 2}, ValueError, "r_min must lie below r_max"),
-    ({"r_max": [1, 2]}, ValueError, r"r_max has shape \(2,\), expected \(1,\)"),
-    ({"d_max": 2}, ValueError, "d_min or d_max is given, but there is no E of the model"),
-    ({"y_max": 2}, ValueError, "y_min or y_max is given, but there is no outputs"),
-    ({"du_min": 0, "du_max": 0}, ValueError, "du_min must lie below du_max"),
-    ({"S": [[-1]]}, ValueError, "S must be positive semi-definite"),
-    ({"S": np.eye(2)}, ValueError, r"S has shape \(2, 2\), expected \(1, 1\)"),
-    ({"x_soft": -1, "soft_penalty": 1}, ValueError, "x_soft = .* no entry may be negative"),
-    ({"x_soft": 1}, ValueError, "soft_penalty is missing"),
-    ({"soft_penalty": 1}, ValueError, "soft_penalty = 1, but nothing is soft"),
-    ({"x_soft": 1, "soft_penalty": -1}, ValueError, "soft_penalty = -1 must be a finite number"),
-    ({"linear_cost": 3}, TypeError, r"linear_cost = 3 must be a pair \(q, r\)"),
-    ({"linear_cost": ([1], [1])}, ValueError, r"linear_cost q has shape \(1,\), expected \(2,\)"),
-    ({"terminal_set": "invariants"}, TypeError, "a pair .* or 'invariant', got 'invariants'"),
-    ({"tracked": 0}, ValueError, r"tracked = 0 must be a list of indices of states: \[0\]"),
+BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [
     (
-        {"x_soft": 1, "x_min": None, "x_max": None, "soft_penalty": 1},
+        lambda: {"tracking": Tracking([0, 1])},
         ValueError,
-        "x_soft = 1, but there is no bound to soften: pass x_min",
+        r"no steady state for r\[0\], r\[1\]: .* rank 3.* \(1\) can",
     ),
     (
-        {"y_soft": [1], "outputs": [0], "soft_penalty": 1},
+        lambda: {"tracking": Tracking([2])},
         ValueError,
-        "y_soft = .* no bound to soft",
+        r"Tracking.C = \[2\] must be indices of states, .* 0 to 1",
+    ),
+    (lambda: Tracking([0.5]), ValueError, r"Tracking.C = \[0.5\] must be indices of states"),
+    (lambda: Tracking([True]), ValueError, r"Tracking.C = \[True\] must be indices of states"),
+    (lambda: Tracking([-1]), ValueError, r"Tracking.C = \[-1\] must be indices .* from 0 on"),
+    (
+        lambda: {"tracking": Tracking([[1, 2, 3]])},
+        ValueError,
+        r"Tracking.C has shape \(1, 3\), expected \(q, 2\)",
+    ),
+    (lambda: Tracking([0], r_min=2, r_max=1), ValueError, "r_min must lie below r_max"),
+    (lambda: Tracking([0], r_max=[1, 2]), ValueError, r"r_max has shape \(2,\), expected \(1,\)"),
+    (lambda: Tracking(r_max=1), ValueError, "there is no output in Tracking.C"),
+    (
+        lambda: {"tracking": [0]},
+        TypeError,
+        r"tracking = \[0\] must be a Tracking, e.g. tracking=Tr",
     ),
     (
-        {"x_soft": [1, 1], "x_max": [5, np.inf], "x_min": [-5, -np.inf], "soft_penalty": 1},
+        lambda: {"disturbances": DisturbanceBounds(d_max=2)},
         ValueError,
-        r"x_soft = \[1, 1\] softens entry 1, which has no bound",
+        "d_min or d_max is given, but there is no E of the model",
     ),
-    ({"du_min": 0.1, "du_max": 0.5}, ValueError, r"du_min = 0.1 .* make u\[0\] change in every"),
-    ({"theta_min": [-5, -5, -0.5]}, ValueError, r"theta_min has -0.5 for r\[0\], but r_min is -1"),
-    ({"theta_max": [5, 5, 1, 1], **RATES}, ValueError, r"1 for u_prev\[0\], but u_max is 2"),
+    (
+        lambda: OutputBounds(y_max=2),
+        ValueError,
+        "y_min or y_max is given, but there is no output in OutputBounds.C",
+    ),
+    (lambda: RateLimits(0, 0), ValueError, "du_min must lie below du_max"),
+    (lambda: RateLimits(R_du=[[-1]]), ValueError, "R_du must be positive semi-definite"),
+    (
+        lambda: {"rate": RateLimits(R_du=np.eye(2))},
+        ValueError,
+        r"R_du has shape \(2, 2\), expected \(1, 1\)",
+    ),
+    (lambda: RateLimits(R_du=2), ValueError, r"R_du has shape \(\), expected \(1, 1\)"),
+    (lambda: SoftBounds(-1, penalty=1), ValueError, "SoftBounds.x = .* no entry may be negative"),
+    (lambda: SoftBounds(1), ValueError, "SoftBounds.penalty is missing"),
+    (lambda: SoftBounds(penalty=1), ValueError, "SoftBounds.penalty = 1, but nothing is soft"),
+    (
+        lambda: SoftBounds(1, penalty=-1),
+        ValueError,
+        "SoftBounds.penalty = -1 must be a finite number",
+    ),
+    (lambda: Terminal(set="invariants"), TypeError, "a pair .* or 'invariant', got 'invariants'"),
+    (lambda: Tracking(0), ValueError, r"Tracking.C = 0 must be a list of indices of states: \[0\]"),
+    (
+        lambda: {"soft": SoftBounds(1, penalty=1), "x_min": None, "x_max": None},
+        ValueError,
+        "SoftBounds.x = 1.0, but there is no bound to soften: pass x_min",
+    ),
+    (
+        lambda: {"soft": SoftBounds(y=[1], penalty=1), "outputs": OutputBounds([0])},
+        ValueError,
+        "SoftBounds.y = .* no bound to soft",
+    ),
+    (
+        lambda: {
+            "soft": SoftBounds([1, 1], penalty=1),
+            "x_max": [5, np.inf],
+            "x_min": [-5, -np.inf],
+        },
+        ValueError,
+        r"SoftBounds.x = \[1.0, 1.0\] softens entry 1, which has no bound",
+    ),
+    (lambda: RateLimits(0.1, 0.5), ValueError, r"du_min = 0.1 .* make u\[0\] change in every"),
+    (
+        lambda: {"theta_min": [-5, -5, -0.5]},
+        ValueError,
+        r"theta_min has -0.5 for r\[0\], but r_min is -1",
+    ),
+    (
+        lambda: {"theta_max": [5, 5, 1, 1], **RATED},
+        ValueError,
+        r"1 for u_prev\[0\], but u_max is 2",
+    ),
 ]
 
 
-@pytest.mark.parametrize(("changes", "error", "message"), BAD)
+@pytest.mark.parametrize(("make", "error", "message"), BAD)
 def test_bad_argument_is_named(
-    changes: dict[str, Any], error: type[Exception], message: str
+    make: Callable[[], Any], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        servo(**changes)
+        servo(**make())
 
 
 def test_a_disturbance_that_no_input_can_hold_is_named() -> None:
     model = LinearModel([[1, 0], [0, 0.5]], [[0], [1]], 1.0, E=[[1], [0]])
     with pytest.raises(ValueError, match=r"no steady state for d\[0\]"):
-        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, terminal_cost=np.eye(2))
+        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, terminal=Terminal(np.eye(2)))
 
 
 def test_references_without_a_box_are_named_when_the_law_is_asked_for() -> None:
     with pytest.raises(ValueError, match="where theta holds them, r_min and r_max"):
-        servo(r_min=None).explicit()
+        servo(tracking=Tracking([0], r_max=1)).explicit()
 
 
 def test_a_law_that_is_held_away_from_rest_has_no_value() -> None:
@@ -292,34 +351,11 @@ def test_a_law_that_is_held_away_from_rest_has_no_value() -> None:
         mpc.value_matrix(0.9)
 
 
-def test_a_linear_cost_moves_the_rest_to_the_economic_optimum_and_changes_nothing_else() -> None:
-    # Without a discount: by duality the linear cost is a shift of the operating point.
-    q, r = np.array([0.3, 0]), np.array([-0.2])
-    mpc = servo(tracked=None, r_min=None, r_max=None, linear_cost=(q, r), x_min=None, x_max=None,
-                theta_min=-5, theta_max=5, u_min=-2, u_max=2)  # fmt: skip
-    A, B = mpc.model.A, mpc.model.B
-    M = np.hstack([A - np.eye(2), B])
-    kkt = np.block([[np.diag([2, 2, 0.2]), M.T], [M, np.zeros((2, 2))]])
-    rest = np.linalg.solve(kkt, np.concatenate([-q, -r, np.zeros(2)]))[:3]
-    x_e, u_e = rest[:2], rest[2:]
-    assert np.linalg.norm(rest) > 0.1
-    shifted = servo(tracked=None, r_min=None, r_max=None, x_min=None, x_max=None,
-                    theta_min=-6, theta_max=6, u_min=-2 - u_e, u_max=2 - u_e)  # fmt: skip
-    points = box_points(mpc, 500)
-    np.testing.assert_allclose(
-        mpc.explicit()(points), shifted.explicit()(points - x_e) + u_e, atol=1e-9
-    )
-    with pytest.raises(
-        ValueError, match=r"linear_cost has no quadratic value .* leave linear_cost"
-    ):
-        mpc.value_matrix(0.9)
-
-
 def test_online_qp_itself_agrees_with_a_plan_by_hand() -> None:
     # One step, no bound: u = argmin (u - u_s)^2 0.1 + (x_1 - x_s)'P(x_1 - x_s).
     mpc = servo(horizon=1, x_min=None, x_max=None, theta_min=-1, theta_max=1, u_min=-9, u_max=9)
     x, (x_s, u_s) = np.array([0.2, -0.1]), mpc.steady_state([0.5])
-    P, B = mpc.terminal_cost, mpc.model.B
+    P, B = mpc.terminal.cost, mpc.model.B
     v = -np.linalg.solve(mpc.R + B.T @ P @ B, B.T @ P @ mpc.model.A @ (x - x_s))
     np.testing.assert_allclose(OnlineMPC(mpc)(np.array([*x, 0.5])), u_s + v, rtol=1e-9)
 

@@ -7,6 +7,7 @@ import pytest
 
 from general_problems import servo, solved
 from sample_problems import input_bounds_only, small_mpc
+from sb3_yann import Terminal
 
 
 def test_it_names_every_parameter_with_its_box_and_meaning() -> None:
@@ -25,12 +26,12 @@ def test_it_counts_regions_half_spaces_and_rows_of_the_terminal_set() -> None:
     mpc = solved("invariant")
     law, text = mpc.explicit(), mpc.report(samples=50)
     assert f"{law.n_regions} regions and {law.n_halfspaces} half-spaces" in text
-    assert f"The terminal set has {len(mpc.terminal_set[1])} half-spaces." in text
+    assert f"The terminal set has {len(mpc.terminal.set[1])} half-spaces." in text
     assert "There is no terminal set." in small_mpc().report(samples=10)
 
 
 def test_shares_are_those_of_the_box() -> None:
-    mpc = small_mpc(terminal_set=([[1, 1], [-1, -1]], [0.5, 0.7]))
+    mpc = small_mpc(terminal=Terminal(set=([[1, 1], [-1, -1]], [0.5, 0.7])))
     rng = np.random.default_rng(0)
     points = rng.uniform(mpc.theta_min, mpc.theta_max, (500, 2))
     share = 100 * mpc.explicit().in_domain(points).mean()

@@ -7,7 +7,14 @@ import pytest
 from scipy import optimize
 
 from general_problems import servo, solved, two_tanks
-from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC
+from sb3_yann import (
+    DisturbanceBounds,
+    DisturbanceObserver,
+    LinearModel,
+    LinearMPC,
+    OutputBounds,
+    Tracking,
+)
 
 TRACKING = ["servo", "servo with all of it", "two tanks, all parts", "more inputs than outputs"]
 
@@ -31,7 +38,7 @@ def test_a_hundred_reachable_references_are_reached_without_offset(name: str) ->
     theta = start
     for _ in range(150):
         theta = mpc.predict(theta, mpc.explicit()(theta))
-    reached = theta[:, mpc.layout.state] @ mpc.tracked.T
+    reached = theta[:, mpc.layout.state] @ mpc.tracking.C.T
     assert np.max(np.abs(reached - r)) < 1e-6
 
 
@@ -53,7 +60,7 @@ def test_a_hundred_references_are_reached_under_a_disturbance_nobody_measures(
             u = law(np.clip(theta, mpc.theta_min, mpc.theta_max))
             x = mpc.model.step(x, u, disturbance)
             x_hat, d_hat = observer.update(observer.C @ x, u)
-        worst = max(worst, float(np.max(np.abs(mpc.tracked @ x - reference))))
+        worst = max(worst, float(np.max(np.abs(mpc.tracking.C @ x - reference))))
     assert worst < 1e-6
 
 
@@ -82,7 +89,7 @@ def test_the_steady_state_rests_and_shows_the_reference(name: str) -> None:
     for r, d in zip(*reachable_constants(mpc, 5), strict=True):
         x, u = mpc.steady_state(r, d)
         np.testing.assert_allclose(mpc.model.step(x, u, d), x, atol=1e-12)
-        np.testing.assert_allclose(mpc.tracked @ x, r, atol=1e-12)
+        np.testing.assert_allclose(mpc.tracking.C @ x, r, atol=1e-12)
         theta = np.concatenate([x, r, d, u[: mpc.layout.n_previous]])
         np.testing.assert_allclose(mpc.explicit()(theta), u, atol=1e-9)
 
@@ -98,7 +105,7 @@ def test_of_many_steady_states_it_is_the_cheapest() -> None:
     best = optimize.minimize(
         lambda v: state(v) @ mpc.Q @ state(v) + v @ mpc.R @ v,
         np.zeros(2),
-        constraints={"type": "eq", "fun": lambda v: mpc.tracked @ state(v) - 0.3},
+        constraints={"type": "eq", "fun": lambda v: mpc.tracking.C @ state(v) - 0.3},
         tol=1e-14,
     )
     np.testing.assert_allclose(u, best.x, atol=1e-6)
@@ -106,13 +113,14 @@ def test_of_many_steady_states_it_is_the_cheapest() -> None:
 
 
 def test_units_change_no_steady_state() -> None:
-    plain = two_tanks(tracked=[[1, 1]], r_min=-0.5, r_max=0.5)
+    plain = two_tanks(tracking=Tracking([[1, 1]], -0.5, 0.5))
     unit = np.array([1e6, 1e-6])
     to, back = np.diag(unit), np.diag(1 / unit)
     model = LinearModel(to @ plain.model.A @ back, to @ plain.model.B, 1.0, E=to @ plain.model.E)
     other = LinearMPC(
-        model, Q=back @ back, R=plain.R, horizon=1, tracked=plain.tracked @ back,
-        r_min=-0.5, r_max=0.5, d_min=-0.2, d_max=0.2, x_min=-2 * unit, x_max=2 * unit,
+        model, Q=back @ back, R=plain.R, horizon=1,
+        tracking=Tracking(plain.tracking.C @ back, -0.5, 0.5),
+        disturbances=DisturbanceBounds(-0.2, 0.2), x_min=-2 * unit, x_max=2 * unit,
         u_min=plain.u_min, u_max=plain.u_max,
     )  # fmt: skip
     np.testing.assert_allclose(other.steady_states.u, plain.steady_states.u, rtol=1e-9)
@@ -131,7 +139,7 @@ def test_reachable_is_what_the_bounds_allow() -> None:
     [
         ({"u_max": 0.1}, r"r = \[0.9\] with d = \[\] is not reachable: .*, and u\[0\] > u_max\[0"),
         ({"x_max": 0.5}, r"and x\[0\] > x_max\[0\]. Ask is_reachable"),
-        ({"outputs": [[1, 1]], "y_max": 0.5}, r"and y\[0\] > y_max\[0\]"),
+        ({"outputs": OutputBounds([[1, 1]], y_max=0.5)}, r"and y\[0\] > y_max\[0\]"),
     ],
 )
 def test_an_unreachable_reference_is_named_with_the_bound(
@@ -149,5 +157,5 @@ def test_a_reference_of_another_shape_is_named() -> None:
 
 
 def test_a_regulator_rests_at_the_origin() -> None:
-    x, u = servo(tracked=None, r_min=None, r_max=None).steady_state()
+    x, u = servo(tracking=None).steady_state()
     assert (x.tolist(), u.tolist()) == ([0, 0], [0])

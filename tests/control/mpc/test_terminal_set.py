@@ -5,25 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from general_problems import LOADED, RATES, servo, two_tanks
+from general_problems import INVARIANT_SET, LOADED, RATED, RATES, servo, two_tanks
 from sample_problems import UNSTABLE, input_bounds_only, small_mpc
-from sb3_yann import LinearModel, LinearMPC
+from sb3_yann import LinearModel, LinearMPC, OutputBounds, RateLimits, Terminal
 from sb3_yann.control.mpc import terminal_set as invariant
 
 INVARIANT = {
-    "regulator": lambda: small_mpc(terminal_set="invariant"),
-    "unstable regulator": lambda: small_mpc(UNSTABLE, terminal_set="invariant"),
-    "servo": lambda: servo(terminal_set="invariant"),
-    "tight servo": lambda: servo(
-        x_min=-1.2, x_max=1.2, u_min=-0.3, u_max=0.25, terminal_set="invariant"
-    ),
+    "regulator": lambda: small_mpc(**INVARIANT_SET),
+    "unstable regulator": lambda: small_mpc(UNSTABLE, **INVARIANT_SET),
+    "servo": lambda: servo(**INVARIANT_SET),
+    "tight servo": lambda: servo(x_min=-1.2, x_max=1.2, u_min=-0.3, u_max=0.25, **INVARIANT_SET),
     "unstable servo": lambda: servo(
-        LinearModel([[1.3, 1], [0, 1.1]], [[0], [1]], 1.0), terminal_set="invariant"
+        LinearModel([[1.3, 1], [0, 1.1]], [[0], [1]], 1.0), **INVARIANT_SET
     ),
-    "disturbance and rates": lambda: servo(LOADED, **RATES, terminal_set="invariant"),
-    "weight on the rate": lambda: servo(S=[[2.0]], **RATES, terminal_set="invariant"),
-    "bounded output": lambda: servo(outputs=[[1, 1]], y_max=1.1, terminal_set="invariant"),
-    "two tanks": lambda: two_tanks(terminal_set="invariant"),
+    "disturbance and rates": lambda: servo(LOADED, **RATED, **INVARIANT_SET),
+    "weight on the rate": lambda: servo(rate=RateLimits(**RATES, R_du=[[2.0]]), **INVARIANT_SET),
+    "bounded output": lambda: servo(outputs=OutputBounds([[1, 1]], y_max=1.1), **INVARIANT_SET),
+    "two tanks": lambda: two_tanks(**INVARIANT_SET),
 }
 
 
@@ -44,7 +42,7 @@ def test_without_it_some_do(name: str) -> None:
     mpc = INVARIANT[name]()
     free = np.zeros((0, mpc.n_theta)), np.zeros(0)
     values = {field: getattr(mpc, field) for field in mpc.__dataclass_fields__}
-    mpc = LinearMPC(**{**values, "terminal_set": free})
+    mpc = LinearMPC(**{**values, "terminal": Terminal(mpc.terminal.cost, free)})
     law, rng = mpc.explicit(), np.random.default_rng(0)
     theta = rng.uniform(mpc.theta_min, mpc.theta_max, (2000, mpc.n_theta))
     theta = theta[law.in_domain(theta)]
@@ -57,7 +55,7 @@ def test_without_it_some_do(name: str) -> None:
 @pytest.mark.parametrize("name", INVARIANT)
 def test_the_set_is_invariant_under_its_gain_which_keeps_the_bounds(name: str) -> None:
     mpc = INVARIANT[name]()
-    F, g = mpc.terminal_set
+    F, g = mpc.terminal.set
     rng = np.random.default_rng(0)
     theta = rng.uniform(mpc.theta_min, mpc.theta_max, (20_000, mpc.n_theta))
     theta = theta[np.all(theta @ F.T <= g, axis=1)]
@@ -74,12 +72,10 @@ def test_the_set_is_invariant_under_its_gain_which_keeps_the_bounds(name: str) -
 
 def test_the_set_is_the_largest_one_on_a_plant_with_one_state() -> None:
     # x+ = 0.5 x under any gain near it: the set is where |x| <= 2 and |K x| <= 1.
-    mpc = small_mpc(
-        LinearModel([[0.9]], [[1]], 1.0), x_min=-2, x_max=2, u_max=0.5, terminal_set="invariant"
-    )
+    mpc = small_mpc(LinearModel([[0.9]], [[1]], 1.0), x_min=-2, x_max=2, u_max=0.5, **INVARIANT_SET)
     law = mpc.explicit()
     K = float(law.gains[law.locate([0.0])][0, 0])
-    F, g = mpc.terminal_set
+    F, g = mpc.terminal.set
     upper, lower = min(2, 1 / -K), max(-2, 0.5 / K)
     ends = sorted((g / F[:, 0]).tolist())
     assert ends == pytest.approx([lower, upper])
@@ -87,7 +83,7 @@ def test_the_set_is_the_largest_one_on_a_plant_with_one_state() -> None:
 
 def test_no_half_space_of_the_set_is_implied_by_the_others() -> None:
     mpc = INVARIANT["disturbance and rates"]()
-    F, g = mpc.terminal_set
+    F, g = mpc.terminal.set
     half = (mpc.theta_max - mpc.theta_min) / 2
     for i in range(len(g)):
         others = np.arange(len(g)) != i
@@ -96,7 +92,7 @@ def test_no_half_space_of_the_set_is_implied_by_the_others() -> None:
 
 def test_steady_states_in_the_set_lie_inside_the_bounds_by_a_hundredth() -> None:
     mpc = INVARIANT["tight servo"]()
-    F, g = mpc.terminal_set
+    F, g = mpc.terminal.set
     reference = np.linspace(-1, 1, 2001)
     at_rest = np.array([[*mpc.steady_states.x @ [r], r] for r in reference])
     inside = reference[np.all(at_rest @ F.T <= g + 1e-12, axis=1)]
@@ -108,9 +104,9 @@ def test_steady_states_in_the_set_lie_inside_the_bounds_by_a_hundredth() -> None
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: small_mpc(u_min=0, terminal_set="invariant"), "room to every bound"),
+        (lambda: small_mpc(u_min=0, **INVARIANT_SET), "room to every bound"),
         (
-            lambda: input_bounds_only(UNSTABLE, gamma=0.3, terminal_set="invariant"),
+            lambda: input_bounds_only(UNSTABLE, gamma=0.3, **INVARIANT_SET),
             "spectral radius of A - BK",
         ),
     ],

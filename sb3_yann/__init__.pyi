@@ -1,0 +1,35 @@
+from sb3_yann.audit import CostAudit as CostAudit
+from sb3_yann.audit import CostFinding as CostFinding
+from sb3_yann.audit import CostMismatchError as CostMismatchError
+from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
+from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
+from sb3_yann.callbacks import NoActionNoise as NoActionNoise
+from sb3_yann.control import DisturbanceBounds as DisturbanceBounds
+from sb3_yann.control import DisturbanceObserver as DisturbanceObserver
+from sb3_yann.control import ExplicitLimitError as ExplicitLimitError
+from sb3_yann.control import ExplicitSolutionError as ExplicitSolutionError
+from sb3_yann.control import Identified as Identified
+from sb3_yann.control import LinearModel as LinearModel
+from sb3_yann.control import LinearMPC as LinearMPC
+from sb3_yann.control import OutputBounds as OutputBounds
+from sb3_yann.control import PiecewiseAffine as PiecewiseAffine
+from sb3_yann.control import RateLimits as RateLimits
+from sb3_yann.control import SoftBounds as SoftBounds
+from sb3_yann.control import Terminal as Terminal
+from sb3_yann.control import Tracking as Tracking
+from sb3_yann.control import identify as identify
+from sb3_yann.guard import AcceptanceRule as AcceptanceRule
+from sb3_yann.guard import Decision as Decision
+from sb3_yann.guard import ImprovementGuard as ImprovementGuard
+from sb3_yann.guard import StepSize as StepSize
+from sb3_yann.guard import restore_accepted as restore_accepted
+from sb3_yann.policy import AffineObservation as AffineObservation
+from sb3_yann.policy import CriticOptions as CriticOptions
+from sb3_yann.policy import NonFiniteWarning as NonFiniteWarning
+from sb3_yann.policy import YannActor as YannActor
+from sb3_yann.policy import YannCritic as YannCritic
+from sb3_yann.policy import YannPolicy as YannPolicy
+from sb3_yann.policy import register_problem as register_problem
+from sb3_yann_envs import ActionRepeat as ActionRepeat
+
+__version__: str

@@ -1,0 +1,67 @@
+"""The decorator that compiles, and what tells when kept machine code is out of date."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Integers = NDArray[np.int64]
+Single = NDArray[np.float32]
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def compiled_sources(package: Path) -> list[Path]:
+    """Return this file and all files of a package that hold compiled functions."""
+    held = (each for each in sorted(package.rglob("*.py")) if b"\n@compiled(" in each.read_bytes())
+    return [Path(__file__), *held]
+
+
+def _hash(files: Sequence[Path]) -> str:
+    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
+
+
+SOURCES = _hash(compiled_sources(Path(__file__).parent))
+"""One stamp for all files: their functions call each other."""
+
+
+def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
+    """Return a decorator that compiles a function for the given types, and keeps the machine code.
+
+    A function with signatures refuses other types. A function without any is part of its callers.
+    ``fastmath`` lets sums be taken in any order, several terms at a time.
+
+    What Python calls returns a plain number or nothing, and writes arrays to those it is given. To
+    return an array, numba runs Python code behind Python's back: a Ctrl-C there is a SystemError.
+    """
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
+
+    def compile_it(function: F) -> F:
+        if not signatures or numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+            part: F = numba.njit(**options)(function)
+            return part
+        result: F
+        try:
+            result = _compile(numba.njit(**options)(function), signatures, keep=True)
+        except Exception:  # no folder to write to, a full disk, a damaged file
+            result = _compile(numba.njit(**options)(function), signatures, keep=False)
+        return result
+
+    return compile_it
+
+
+def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
+    if keep:
+        dispatcher.enable_caching()
+        # numba looks at the function's own file; what it calls may have changed in another.
+        dispatcher._cache._cache_file._source_stamp = SOURCES
+    for signature in signatures:
+        dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    return dispatcher

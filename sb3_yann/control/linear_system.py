@@ -1,0 +1,52 @@
+"""The matrices of a linear plant about an operating point, and their sampling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_yann._validation import Array, ReadOnlyArrays
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem(ReadOnlyArrays):
+    """``x[k+1] = A x[k] + B u[k] + E d[k]`` about ``(x_ss, u_ss, d_ss)``: data, not validated.
+
+    Linearization and identification return it; `LinearModel` validates it.
+    """
+
+    A: Array
+    B: Array
+    dt: float
+    x_ss: Array
+    u_ss: Array
+    E: Array
+    d_ss: Array
+    notes: tuple[str, ...] = ()
+    drift: Array | None = None
+
+    @property
+    def n_states(self) -> int:
+        """Number of states n."""
+        return int(self.A.shape[0])
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs m."""
+        return int(self.B.shape[1])
+
+    @property
+    def n_disturbances(self) -> int:
+        """Number of measured disturbances d."""
+        return int(self.E.shape[1])
+
+
+def zero_order_hold(A: Array, B: Array, E: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Return A, B, E of ``dx/dt = A x + B u + E d`` in discrete time, u and d held for ``dt``."""
+    import control  # imports matplotlib: only paid for where it is used
+
+    m, driven = B.shape[1], np.hstack([B, E])
+    plant = control.ss(A, driven, np.eye(len(A)), np.zeros(driven.shape))
+    sampled = control.sample_system(plant, dt, method="zoh")
+    return sampled.A, sampled.B[:, :m], sampled.B[:, m:]

@@ -1,0 +1,130 @@
+"""The data of a linear MPC problem, and the maps that follow from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+
+from sb3_yann._validation import Array, ReadOnlyArrays, half_widths, same_fields
+from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.mpc.error_coordinates import ErrorSystem, error_system
+from sb3_yann.control.mpc.groups import (
+    DisturbanceBounds,
+    OutputBounds,
+    RateLimits,
+    SoftBounds,
+    Terminal,
+    Tracking,
+)
+from sb3_yann.control.mpc.steady_state import SteadyStates, steady_states
+from sb3_yann.control.mpc.theta_layout import ThetaLayout
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MPCProblem(ReadOnlyArrays):
+    """The arguments of a :class:`LinearMPC`, checked: all of them arrays of full shape.
+
+    Nothing is checked here: a :class:`LinearMPC` is the problem whose constructor does.
+    """
+
+    model: LinearModel
+    Q: Array
+    R: Array
+    horizon: int
+    x_min: Array
+    x_max: Array
+    u_min: Array
+    u_max: Array
+    theta_min: Array
+    theta_max: Array
+    gamma: float
+    infeasible: str
+    tracking: Tracking
+    disturbances: DisturbanceBounds
+    rate: RateLimits
+    outputs: OutputBounds
+    soft: SoftBounds
+    terminal: Terminal
+
+    @property
+    def has_rate_bounds(self) -> bool:
+        """Whether the change of an input is bounded."""
+        return self.rate.bounded
+
+    @cached_property
+    def layout(self) -> ThetaLayout:
+        """What theta holds, and where."""
+        return layout_of(self.model, self.tracking, self.rate)
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters of the law."""
+        return self.layout.size
+
+    @cached_property
+    def theta_half(self) -> Array:
+        """The half-widths of the box of theta (n_theta,), 1 where it is unbounded."""
+        return half_widths(self.theta_min, self.theta_max)
+
+    @cached_property
+    def u_half(self) -> Array:
+        """The half-widths of the input range (m,), 1 where it is unbounded."""
+        return half_widths(self.u_min, self.u_max)
+
+    @cached_property
+    def prediction(self) -> tuple[Array, Array]:
+        """A_bar (n_theta, n_theta) and B_bar (n_theta, m): ``theta+ = A_bar theta + B_bar u``."""
+        parts, model = self.layout, self.model
+        A, B = np.eye(parts.size), np.zeros((parts.size, model.n_inputs))
+        A[parts.state, parts.state], A[parts.state, parts.disturbance] = model.A, model.E
+        A[parts.previous, parts.previous] = 0.0
+        B[parts.state] = model.B
+        B[parts.previous] = np.eye(model.n_inputs)[: parts.n_previous]
+        return A, B
+
+    @cached_property
+    def steady_states(self) -> SteadyStates:
+        """The map from r and d to the steady state, within bounds or not."""
+        x_unit = np.maximum(np.abs(self.theta_min), np.abs(self.theta_max))[self.layout.state]
+        x_unit = np.where(np.isfinite(x_unit), x_unit, 1.0)
+        return steady_states(self.model, self.tracking.C, self.Q, self.R, x_unit, self.u_half)
+
+    @cached_property
+    def error_system(self) -> ErrorSystem:
+        """The coordinates about the steady state in which the cost is quadratic."""
+        weights = self.Q, self.R, self.rate.R_du
+        return error_system(self.model, self.layout, self.steady_states, *weights)
+
+    @property
+    def stage_matrix(self) -> Array:
+        """W (n_theta + m, n_theta + m): the stage cost is ``[theta; u]' W [theta; u]``."""
+        return self.error_system.stage_matrix
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether both problems have the same model, weights, bounds and options."""
+        if not isinstance(other, MPCProblem):
+            return NotImplemented
+        return same_fields(self, other, [field.name for field in fields(self)])
+
+    def __hash__(self) -> int:
+        """Return a hash that equal problems share."""
+        return hash((self.model, self.horizon, self.Q.tobytes(), self.R.tobytes()))
+
+    def __repr__(self) -> str:
+        """Name the sizes."""
+        return (
+            f"{type(self).__name__}(states={self.model.n_states}, inputs={self.model.n_inputs}, "
+            f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r})"
+        )
+
+
+def layout_of(model: LinearModel, tracking: Tracking, rate: RateLimits) -> ThetaLayout:
+    """Return what theta holds in a problem with these parts."""
+    return ThetaLayout(
+        n_states=model.n_states,
+        n_references=len(tracking.C),
+        n_disturbances=model.n_disturbances,
+        n_previous=model.n_inputs if np.any(rate.R_du) or rate.bounded else 0,
+    )

@@ -1,0 +1,81 @@
+"""Tables of seeded episodes, before and after training."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sb3_yann.evaluation.episodes import Episodes
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def comparison_table(title: str, before: Episodes, after: Episodes) -> Table:
+    """Return a `rich` table of the cost of each episode before and after, with the mean.
+
+    The episodes must be those of the same seeds. A change for the worse is printed red.
+
+    Examples
+    --------
+    >>> from sb3_yann.evaluation import evaluate
+    >>> none, full = (evaluate(lambda _, u=u: [u], "CSTR-v0", [0, 1]) for u in (0.0, 1.0))
+    >>> comparison_table("no input, full input", none, full).row_count
+    3
+    """
+    table = _table("episode", title)
+    rows = [*zip(before.costs, after.costs, strict=True)]
+    for number, (old, new) in enumerate(rows, start=1):
+        table.add_row(str(number), f"{old:,.2f}", f"{new:,.2f}", _change(new - old))
+    table.add_section()
+    old, new = np.mean(rows, axis=0)
+    percent = f" ({100 * (new - old) / old:+.1f} %)" if old > 0 else ""
+    table.add_row("mean", f"{old:,.2f}", f"{new:,.2f}", _change(new - old) + percent)
+    if before.violations.any() or after.violations.any():
+        table.add_row("violations", str(before.violations.sum()), str(after.violations.sum()), "")
+    return table
+
+
+def summary_table(title: str, before: Episodes, after: Episodes) -> Table:
+    """Return a `rich` table of mean and worst cost and of violations, for many episodes.
+
+    The episodes must be those of the same seeds. The last rows compare them pair by pair: how
+    many cost less or more by more than rounding (1e-6 of the cost), and the largest increase.
+
+    Examples
+    --------
+    >>> from sb3_yann.evaluation import evaluate
+    >>> none, full = (evaluate(lambda _, u=u: [u], "CSTR-v0", [0, 1]) for u in (0.0, 1.0))
+    >>> summary_table("no input, full input", none, full).row_count
+    6
+    """
+    change = after.costs - before.costs
+    same = 1e-6 * np.abs(before.costs)
+    table = _table("", title)
+    for name, of in (("mean", np.mean), ("worst", np.max)):
+        old, new = float(of(before.costs)), float(of(after.costs))
+        percent = f" ({100 * (new - old) / old:+.1f} %)" if old > 0 else ""
+        table.add_row(name, f"{old:,.2f}", f"{new:,.2f}", _change(new - old) + percent)
+    violations = before.violations.sum(), after.violations.sum()
+    table.add_row("violations", *map(str, violations), f"{violations[1] - violations[0]:+d}")
+    table.add_section()
+    for name, count in (("cheaper", change < -same), ("dearer", change > same)):
+        table.add_row(f"{name} episodes", "", f"{count.sum()} of {len(change)}", "")
+    table.add_row("largest increase", "", "", _change(max(change.max(), 0.0)))
+    return table
+
+
+def _table(rows: str, title: str) -> Table:
+    from rich.table import Table  # not before it is used
+
+    table = Table(rows, "before", "after", "change", title=title)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    return table
+
+
+def _change(value: float) -> str:
+    value = round(value, 2) + 0.0  # no "-0.00"
+    color = "red" if value >= 0.005 else "green" if value <= -0.005 else "white"
+    return f"[{color}]{value:+,.2f}[/{color}]"

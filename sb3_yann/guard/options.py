@@ -1,0 +1,89 @@
+"""The guard's little-used settings, in groups that check themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sb3_yann._validation import as_between, as_flag, as_whole
+
+Options = TypeVar("Options", "AcceptanceRule", "StepSize")
+
+
+@dataclass(frozen=True)
+class AcceptanceRule:
+    """When a candidate counts as no worse.
+
+    Parameters
+    ----------
+    margin : float, default 0.01
+        What one start may cost more than with the MPC, as a fraction of the MPC's median cost.
+    by_region : bool, default True
+        Whether single regions are tried where the whole candidate is refused.
+    trial_episodes : int, default 10
+        Plant alone: training episodes of a block, at least 3.
+    significance : float, default 0.05
+        Plant alone: size of the one-sided test.
+
+    Examples
+    --------
+    >>> from sb3_yann import AcceptanceRule
+    >>> AcceptanceRule(margin=0.02, by_region=False).significance
+    0.05
+    """
+
+    margin: float = 0.01
+    by_region: bool = True
+    trial_episodes: int = 10
+    significance: float = 0.05
+
+    def __post_init__(self) -> None:
+        as_between("margin", self.margin, 0, np.inf)
+        as_flag("by_region", self.by_region)
+        as_whole("trial_episodes", self.trial_episodes, 3)
+        as_between("significance", self.significance, 0, 0.5)
+
+
+@dataclass(frozen=True)
+class StepSize:
+    """How decisions scale the actor's learning rate.
+
+    Parameters
+    ----------
+    shrink : float, default 0.5
+        Factor after the accepted policy has been restored.
+    grow : float, default 1.5
+        Factor after an acceptance. The product never exceeds 1.
+    smallest : float, default 0.1
+        The product never falls below this.
+
+    Examples
+    --------
+    >>> from sb3_yann import StepSize
+    >>> StepSize(shrink=0.3).grow
+    1.5
+    """
+
+    shrink: float = 0.5
+    grow: float = 1.5
+    smallest: float = 0.1
+
+    def __post_init__(self) -> None:
+        as_between("shrink", self.shrink, 0, 1)
+        as_between("grow", self.grow, 1, np.inf)
+        as_between("smallest", self.smallest, 0, 1)
+
+
+def as_options(name: str, value: Any, kind: type[Options]) -> Options:
+    """Return ``value`` as options of a kind; a mapping, as YAML gives it, holds their names."""
+    if isinstance(value, kind):
+        return value
+    known = [each.name for each in fields(kind)]
+    if not isinstance(value, Mapping) or not set(value) <= set(known):
+        raise TypeError(
+            f"{name} = {value!r} must be {kind.__name__}(...), or a mapping with some of {known}."
+        )
+    return kind(**value)

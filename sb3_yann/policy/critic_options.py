@@ -1,0 +1,88 @@
+"""What a user may choose of the critic, checked once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from sb3_yann._validation import as_choice, as_number, as_positive
+from sb3_yann.networks.value import PredictionModel
+
+KINDS = ("afterstate", "state_action")
+
+
+@dataclass(frozen=True)
+class CriticOptions:
+    """Options of the critic, for ``policy_kwargs={"critic": ...}``.
+
+    Parameters
+    ----------
+    kind : {"afterstate", "state_action"}, default "afterstate"
+        What is learnt: the value of the predicted next state (:class:`AfterstateValue`), or the
+        paper's function of state and action (:class:`QuadraticStateActionValue`).
+    prediction_model : callable, optional
+        ``(theta, u) -> next theta`` for the afterstate critic, differentiable, of float64 tensors
+        (batch, n) and (batch, m) in physical units. The default is the MPC's ``A theta + B u``.
+    value_scale : float, default 30
+        Factor of the afterstate critic's network: the order of the changes of V to be learnt.
+    reward_scale, reward_offset : float, default 1 and 0
+        The env's reward is ``reward_scale * (-c) + reward_offset`` for the problem's stage cost c.
+        :class:`CostAudit` finds these numbers.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an option is out of range, or the kind of critic has no use for it.
+
+    Examples
+    --------
+    >>> CriticOptions(reward_scale=0.01, value_scale=10.0).kind
+    'afterstate'
+    """
+
+    kind: str = "afterstate"
+    prediction_model: PredictionModel | None = None
+    value_scale: float = 30.0
+    reward_scale: float = 1.0
+    reward_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        as_choice("kind", self.kind, KINDS)
+        if self.prediction_model is not None and not callable(self.prediction_model):
+            raise TypeError(
+                f"prediction_model = {self.prediction_model!r} must be a function of tensors "
+                "(theta, u) that returns the next theta, or None for the linear model."
+            )
+        if self.prediction_model is not None and self.kind == "state_action":
+            raise ValueError(
+                "prediction_model is for kind='afterstate'; kind='state_action' predicts nothing."
+            )
+        as_positive("value_scale", self.value_scale, "It multiplies the network; give e.g. 30.")
+        as_positive("reward_scale", self.reward_scale, "Give 1 for the cost as it is.")
+        as_number("reward_offset", self.reward_offset)
+
+    def offset_of_return(self, gamma: float) -> float:
+        """Return what ``reward_offset`` adds up to; ValueError if that is no finite number."""
+        if self.reward_offset == 0:
+            return 0.0
+        if not gamma < 1:
+            raise ValueError(
+                f"reward_offset = {self.reward_offset!r} adds up to no finite value with gamma = "
+                f"{gamma!r}: it needs a discount below 1."
+            )
+        return float(self.reward_offset) / (1 - gamma)
+
+
+def as_critic_options(critic: str | CriticOptions | Mapping[str, Any]) -> CriticOptions:
+    """Return the options of a critic from its kind, a mapping of some of them, or themselves."""
+    if isinstance(critic, CriticOptions):
+        return critic
+    if not isinstance(critic, Mapping):
+        return CriticOptions(as_choice("critic", critic, KINDS))
+    known = [each.name for each in fields(CriticOptions)]
+    if unknown := [name for name in critic if name not in known]:
+        raise TypeError(
+            f"critic has no {', '.join(map(repr, unknown))}. Its options are {', '.join(known)}."
+        )
+    return CriticOptions(**critic)

@@ -1,0 +1,138 @@
+"""Ctrl-C leaves the accepted policy in the model, wherever it finds the training."""
+
+from __future__ import annotations
+
+import signal
+from functools import partial
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+
+from guard_samples import (
+    FIRST,
+    STEPS,
+    At,
+    CutOff,
+    accepted_bits,
+    actor_bits,
+    better,
+    bits,
+    build,
+    make_guard,
+    train,
+)
+from weights import is_mpc
+
+
+def ctrl_c(*_) -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def left(model) -> None:
+    """Check that the model is what its guard accepted last, with target and optimizer."""
+    assert actor_bits(model.policy) == accepted_bits(model)
+    assert model.policy.actor_step == 1.0
+
+
+def interrupted(model, steps: int, *callbacks: BaseCallback) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        train(model, steps, *callbacks)
+    assert signal.getsignal(signal.SIGINT) is before
+    left(model)
+
+
+def test_between_two_steps_the_candidate_gives_way_to_what_was_accepted() -> None:
+    model, guard = build(), make_guard(eval_every=100)
+    interrupted(model, 40, At([5], better), guard, At([17], ctrl_c))
+    assert is_mpc(model)  # no trial has been
+
+
+@pytest.mark.parametrize("part", ["actor", "critic"])
+def test_in_the_midst_of_a_gradient_step_as_well(monkeypatch, part) -> None:
+    model, guard = build(), make_guard(eval_every=100)
+    optimizer = getattr(model, part).optimizer
+    step, taken = optimizer.step, []
+
+    def cut_off(*args, **kwargs):
+        step(*args, **kwargs)
+        taken.append(1)
+        if len(taken) == 12:
+            ctrl_c()
+
+    monkeypatch.setattr(optimizer, "step", cut_off)
+    interrupted(model, 40, guard)
+
+
+@pytest.mark.parametrize("at", [FIRST + 12, FIRST + 10 + 5 + 7], ids=["a trial", "the end"])
+def test_in_a_trial_what_stood_before_it_is_left(at) -> None:
+    simulator = partial(CutOff, at, ctrl_c)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=5)
+    interrupted(model, 2 * STEPS, At([1], better), guard)
+    assert is_mpc(model) == (at == FIRST + 12)
+
+
+def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_policy() -> None:
+    def act():
+        if len(plays) == 2:  # the MPC has played them twice
+            try:
+                ctrl_c()
+            except KeyboardInterrupt:
+                raise SystemError("returned a result with an exception set") from None
+        plays.append(1)
+
+    plays: list[int] = []
+    model, guard = build(gradient_steps=0), make_guard(partial(CutOff, FIRST, act))
+    interrupted(model, 4 * STEPS, At([1], better), guard)
+
+
+def test_a_handler_of_ones_own_that_raises_nothing_goes_unnoticed() -> None:
+    seen = []
+    before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
+    try:
+        model, guard = build(), make_guard(eval_every=100)
+        candidate = []
+        train(
+            model,
+            20,
+            At([5], better),
+            guard,
+            At([6, 9], lambda policy: (ctrl_c(), candidate.append(actor_bits(policy)))),
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert seen == [1, 1] and candidate[0] != actor_bits(build().policy)
+
+
+def test_learn_again_and_again_and_the_handler_is_the_one_before() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    model, guard = build(), make_guard(eval_every=100)
+    train(model, 8, guard)
+    assert signal.getsignal(signal.SIGINT) is before
+    interrupted(model, 20, guard, At([7], ctrl_c))
+    train(model, 8, guard)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_after_another_error_the_handler_only_passes_on() -> None:
+    def fail(_) -> None:
+        raise OSError("the plant is gone")
+
+    before = signal.getsignal(signal.SIGINT)
+    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
+    with pytest.raises(OSError, match="gone"):
+        train(model, 20, guard, At([5], better), At([6], fail))
+    candidate = bits(model.policy.actor.state_dict())
+    with pytest.raises(KeyboardInterrupt):
+        train(model, 8, At([3], ctrl_c))  # without the guard
+    assert bits(model.policy.actor.state_dict()) == candidate
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_checkpoint_in_between_holds_no_handler(tmp_path) -> None:
+    model, guard = build(), make_guard(eval_every=100)
+    interrupted(model, 20, guard, CheckpointCallback(4, str(tmp_path)), At([13], ctrl_c))
+    for path in tmp_path.glob("*.zip"):
+        again = type(model).load(path)
+        assert np.isfinite(again.predict(np.zeros(1, np.float32))[0]).all()

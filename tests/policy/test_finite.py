@@ -1,0 +1,251 @@
+"""What is no finite number: named at once, not learnt from, and met by the law."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from general_problems import servo
+from sample_plants import LinearPlant, Recorder, two_input_mpc
+from sb3_yann import AffineObservation, NoActionNoise, NonFiniteWarning, RateLimits, YannPolicy
+from sb3_yann.policy._finite import FiniteRows
+from sb3_yann_envs import problems
+
+OPTIONS = {"seed": 0, "device": "cpu", "buffer_size": 1000, "batch_size": 32}
+POLICY = {"critic_warmup": 10, "net_arch": {"pi": [3, 3], "qf": [4, 4]}}
+
+
+class Faulty(gym.Wrapper):
+    """Shows what is not finite at some steps, counted from 1; step 0 is the first reset."""
+
+    def __init__(self, env: gym.Env, at, what: str = "reward", value: float = np.nan) -> None:
+        super().__init__(env)
+        self.at, self.what, self.value, self.steps = at, what, value, 0
+
+    def shown(self, observation):
+        observation = np.array(observation)
+        if self.what == "observation" and self.steps in self.at:
+            observation[1] = self.value
+        return observation
+
+    def reset(self, **kwargs):
+        observation, info = self.env.reset(**kwargs)
+        return self.shown(observation), info
+
+    def step(self, action):
+        observation, reward, *rest = self.env.step(action)
+        self.steps += 1
+        if self.what == "reward" and self.steps in self.at:
+            reward = self.value
+        return self.shown(observation), reward, *rest
+
+
+def pendulum(*args, **kwargs) -> gym.Env:
+    return Faulty(gym.make("ClippedPendulum-v0"), *args, **kwargs)
+
+
+def build(env, algorithm=DDPG, policy=None, **kwargs):
+    return algorithm(YannPolicy, env, policy_kwargs=POLICY | (policy or {}), **(OPTIONS | kwargs))
+
+
+def shaken(model, size: float = 1.0):
+    with th.no_grad():
+        for parameter in model.actor.parameters():
+            parameter.add_(size * th.randn(parameter.shape))
+    return model
+
+
+def is_finite(model) -> bool:
+    return all(bool(each.isfinite().all()) for each in model.policy.parameters())
+
+
+def told(learn, *args, **kwargs) -> list[str]:
+    """Return what is said of numbers that are not finite."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        learn(*args, **kwargs)
+    return [str(each.message) for each in caught if each.category is NonFiniteWarning]
+
+
+def stored(model) -> np.ndarray:
+    buffer = model.replay_buffer
+    rows = slice(0, buffer.size())
+    parts = (buffer.observations, buffer.next_observations, buffer.actions, buffer.rewards)
+    return np.concatenate([part[rows].reshape(buffer.size(), -1) for part in parts], axis=1)
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_one_value_that_is_not_finite_is_named_and_spoils_nothing(what, value, algorithm) -> None:
+    env = Recorder(pendulum([100], what, value))
+    model = build(env, algorithm)
+    said = told(model.learn, 350, callback=NoActionNoise())
+    assert said[-1 if what == "reward" else 0].startswith(f"Step 100: {what}[")
+    assert np.all(np.isfinite(env.recorded()[1]))
+    assert is_finite(model)
+    assert np.all(np.isfinite(stored(model)))
+    assert len(stored(model)) == (349 if what == "reward" else 348)
+    assert int(model.policy.critic_updates) == 350
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_it_is_so_without_any_callback(what) -> None:
+    model = build(pendulum([100], what), learning_starts=20)
+    assert told(model.learn, 150)
+    assert is_finite(model) and np.all(np.isfinite(stored(model)))
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_what_is_not_finite_from_the_first_step_on_is_not_learnt_from(what) -> None:
+    model = build(pendulum(range(4), what), policy={"critic_warmup": 0})
+    networks = th.nn.ModuleList([model.actor, model.critic])
+    before = copy.deepcopy(networks.state_dict())
+    assert told(model.learn, 3, callback=NoActionNoise())
+    assert all(th.equal(value, before[name]) for name, value in networks.state_dict().items())
+    told(model.learn, 20, callback=NoActionNoise(), reset_num_timesteps=False)
+    assert is_finite(model) and np.all(np.isfinite(stored(model)))
+    assert int(model.policy.critic_updates) > 10
+
+
+def test_a_sensor_that_stays_out_is_named_once() -> None:
+    model = build(pendulum(range(20, 80), "observation"))
+    said = told(model.learn, 90, callback=NoActionNoise())
+    assert len([each for each in said if each.startswith("Step")]) == 1
+    assert len([each for each in said if each.startswith("The observation")]) == 1
+    assert model.replay_buffer.add.left_out == 61
+
+
+def test_of_several_envs_the_row_is_left_out() -> None:
+    env = DummyVecEnv([lambda i=i: pendulum([50] if i == 2 else []) for i in range(4)])
+    model = build(env)
+    with pytest.warns(NonFiniteWarning, match=r"reward\[0\] of env 2 is nan.*nor are those"):
+        model.learn(400, callback=NoActionNoise())
+    assert model.replay_buffer.size() == 99
+    assert is_finite(model) and np.all(np.isfinite(stored(model)))
+
+
+def test_no_n_step_return_bridges_the_gap() -> None:
+    model = build(pendulum([50]), n_steps=3)
+    assert isinstance(model.replay_buffer, NStepReplayBuffer)
+    with pytest.warns(NonFiniteWarning):
+        model.learn(100, callback=NoActionNoise())
+    batch = model.replay_buffer._get_samples(np.array([47, 48, 49]))
+    assert batch.discounts[:, 0].tolist() == pytest.approx([0.99**2, 0.99, 0.99**3])
+    assert batch.dones.sum() == 0
+    assert is_finite(model)
+
+
+def test_under_a_frozen_vec_normalize_too() -> None:
+    env = VecNormalize(DummyVecEnv([lambda: pendulum([50], "observation")]), norm_reward=False)
+    env.training, env.clip_obs = False, np.inf
+    model = build(env, policy={"observation": AffineObservation.from_vec_normalize(env)})
+    assert told(model.learn, 100, callback=NoActionNoise())
+    assert is_finite(model) and np.all(np.isfinite(stored(model)))
+
+
+def test_a_saved_copied_or_loaded_buffer_leaves_out_what_is_not_finite(tmp_path) -> None:
+    model = build(pendulum([20, 130, 240]))
+    with pytest.warns(NonFiniteWarning):
+        model.learn(100, callback=NoActionNoise())
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    assert copy.deepcopy(model.replay_buffer).add.buffer() is not model.replay_buffer
+    loaded = DDPG.load(tmp_path / "model", env=model.get_env())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.replay_buffer.add.buffer() is loaded.replay_buffer
+    assert is_finite(loaded)
+    with pytest.warns(NonFiniteWarning, match="2 left out so far"):
+        loaded.learn(100, callback=NoActionNoise(), reset_num_timesteps=False)
+    del loaded.replay_buffer.add  # as a buffer from elsewhere would be
+    with pytest.warns(NonFiniteWarning, match="1 left out so far"):
+        loaded.learn(100, callback=NoActionNoise(), reset_num_timesteps=False)
+    assert isinstance(loaded.replay_buffer.add, FiniteRows)
+    assert loaded.replay_buffer.size() == 297
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_a_reward_too_large_for_float32_is_no_step_of_training(algorithm) -> None:
+    model = build(pendulum([50], value=1e30), algorithm)
+    with pytest.warns(NonFiniteWarning, match=r"gradient of the critic .* this step is not taken"):
+        model.learn(350, callback=NoActionNoise())
+    assert is_finite(model)
+    moments = model.critic.optimizer.state_dict()["state"].values()
+    assert all(bool(each.isfinite().all()) for state in moments for each in state.values())
+    assert model.policy.refused["critic"] > 0
+    assert int(model.policy.critic_updates) == 350 - model.policy.refused["critic"]
+
+
+def test_a_critic_that_is_not_finite_already_is_named_and_leaves_the_actor_alone() -> None:
+    model = build(pendulum([]), policy={"critic_warmup": 0})
+    with th.no_grad():
+        next(model.critic.parameters()).fill_(th.nan)
+    with pytest.warns(NonFiniteWarning, match="weights of the critic are not finite"):
+        model.learn(20, callback=NoActionNoise())
+    assert all(bool(each.isfinite().all()) for each in model.actor.parameters())
+
+
+LOST = np.float32([[np.nan, 0.3], [0.2, np.inf], [np.nan, -np.inf], [0.1, 0.2]])
+
+
+@pytest.mark.parametrize("net_arch", [[3], [3, 3]], ids=["torch", "compiled"])
+@pytest.mark.parametrize("bound", [None, 0.1])
+def test_where_an_observation_is_not_finite_the_law_acts_and_says_so(net_arch, bound) -> None:
+    model = shaken(build(pendulum([]), policy={"net_arch": net_arch, "max_correction": bound}))
+    law = problems.clipped_pendulum().explicit()
+    with pytest.warns(NonFiniteWarning, match=r"not finite in entries \[0, 1\]: the law acts"):
+        actions, _ = model.predict(LOST)
+    known = np.where(np.isfinite(LOST), LOST, 0)[:3].astype(float)
+    np.testing.assert_allclose(actions[:3], law(known), atol=1e-5)
+    np.testing.assert_allclose(actions[3], model.predict(LOST[3])[0], atol=1e-6)
+    with pytest.warns(NonFiniteWarning, match=r"entries \[0\]"):
+        assert np.isfinite(model.predict(LOST[0])[0]).all()
+    with pytest.warns(NonFiniteWarning):
+        assert model.policy(th.as_tensor(LOST)).isfinite().all()
+
+
+@pytest.mark.parametrize("net_arch", [[3], [3, 3]], ids=["torch", "compiled"])
+def test_where_the_networks_are_not_finite_the_law_acts_and_says_so(net_arch) -> None:
+    model = build(pendulum([]), policy={"net_arch": net_arch})
+    before, _ = model.predict(np.float32([[0.1, 0.2], [0.0, -0.3]]))
+    with th.no_grad():
+        for parameter in model.actor.parameters():
+            parameter.fill_(th.nan)
+    with pytest.warns(NonFiniteWarning, match="networks put out what is not finite"):
+        after, _ = model.predict(np.float32([[0.1, 0.2], [0.0, -0.3]]))
+    np.testing.assert_allclose(after, before, atol=1e-6)
+
+
+def test_the_limits_of_the_rate_hold_where_the_state_is_not_known() -> None:
+    mpc = servo(rate=RateLimits(-0.1, 0.1))
+    model = shaken(build(LinearPlant(mpc), policy={"problem": mpc}))
+    observation = np.zeros(mpc.n_theta, np.float32)
+    observation[0], observation[mpc.layout.previous] = np.nan, 0.4
+    with pytest.warns(NonFiniteWarning):
+        action, _ = model.predict(observation)
+    assert np.all(np.abs(action - 0.4) <= 0.1 + 1e-6)
+
+
+def test_an_entry_that_theta_does_not_depend_on_leaves_theta_as_it_is() -> None:
+    mpc = two_input_mpc()
+    seen = AffineObservation(np.eye(3, 4))
+    space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+
+    class More(gym.ObservationWrapper):
+        observation_space = space
+
+        def observation(self, observation):
+            return np.append(observation, np.float32(0))
+
+    model = build(More(LinearPlant(mpc)), policy={"problem": mpc, "observation": seen})
+    with pytest.warns(NonFiniteWarning, match=r"entries \[3\]"):
+        action, _ = model.predict(np.float32([0.1, 0.2, 0.3, np.nan]))
+    np.testing.assert_allclose(action, mpc.explicit()([0.1, 0.2, 0.3]), atol=1e-5)

@@ -1,0 +1,65 @@
+"""Ctrl-C is a KeyboardInterrupt, whatever compiled code is under way."""
+
+from __future__ import annotations
+
+import random
+import signal
+from collections import Counter
+
+import gymnasium
+import numba
+import pytest
+import torch as th
+from numba.core.dispatcher import Dispatcher
+from stable_baselines3 import DDPG
+
+from sb3_yann import NoActionNoise, YannPolicy
+from sb3_yann.control.law import _kernels, search_tree
+from sb3_yann.networks._kernels import afterstate_value, yann_layer
+from sb3_yann_envs import cstr
+
+MODULES = (_kernels, search_tree, yann_layer, afterstate_value, cstr)
+CALLED = {
+    f"{module.__name__}.{name}": function
+    for module in MODULES
+    for name, function in vars(module).items()
+    if isinstance(function, Dispatcher) and not function._can_compile  # others are parts of these
+}
+
+
+@pytest.mark.parametrize("name", CALLED)
+def test_no_compiled_function_that_python_calls_returns_an_array(name) -> None:
+    scalars = numba.types.Number, numba.types.Boolean, numba.types.NoneType
+    for signature in CALLED[name].nopython_signatures:
+        returned = signature.return_type
+        # A tuple of numbers is made without any code of Python; an array is not.
+        parts = returned if isinstance(returned, numba.types.UniTuple) else [returned]
+        assert all(isinstance(each, scalars) for each in parts), returned
+
+
+def test_all_that_is_known_to_be_called_is_looked_at() -> None:
+    names = {name.rpartition(".")[2] for name in CALLED}
+    assert names >= {"law_at", "law_of_batch", "locate_batch", "_hits", "_sides", "_forward"}
+    assert names >= {"_backward", "_forms", "_output", "_output_backward", "_forms_backward"}
+    assert names >= {"_rates", "advance", "advance_all", "is_rich"}
+
+
+def test_ctrl_c_at_any_moment_of_training_is_a_keyboard_interrupt() -> None:
+    draw, raised = random.Random(0), Counter()
+    model = DDPG(YannPolicy, gymnasium.make("CSTR-v0"), seed=0, batch_size=8, learning_starts=10)
+    model.learn(50, callback=NoActionNoise())
+    alarm = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        for _ in range(60):
+            th.set_grad_enabled(True)  # which torch's own no_grad forgets if it is cut off itself
+            model._last_obs = None  # an episode may have been cut off in the midst of a step
+            try:
+                signal.setitimer(signal.ITIMER_REAL, draw.uniform(0.01, 0.04), 1.0)
+                model.learn(10**6, callback=NoActionNoise(), reset_num_timesteps=False)
+            except (KeyboardInterrupt, Exception) as error:
+                raised[type(error).__name__] += 1
+            finally:
+                signal.setitimer(signal.ITIMER_REAL, 0)
+    finally:
+        signal.signal(signal.SIGALRM, alarm)
+    assert raised == {"KeyboardInterrupt": 60}

@@ -1,0 +1,31 @@
+"""The stamp of kept machine code covers every file with compiled functions."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import sb3_yann
+from sb3_yann._numba import compiled_sources
+
+PACKAGE = Path(sb3_yann.__file__).parent
+
+
+def test_the_stamp_covers_every_file_that_imports_the_decorator_and_the_decorator_s_own() -> None:
+    uses = re.compile(r"from sb3_yann\._numba import .*\bcompiled\b")
+    expected = {each for each in PACKAGE.rglob("*.py") if uses.search(each.read_text("utf-8"))}
+    assert len(expected) >= 5
+    assert set(compiled_sources(PACKAGE)) == expected | {PACKAGE / "_numba.py"}
+
+
+def test_a_file_that_moves_or_is_new_is_found(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    moved, plain = tmp_path / "deep" / "moved.py", tmp_path / "plain.py"
+    moved.write_text('"""Doc."""\n@compiled("void()")\ndef f(): ...\n')
+    plain.write_text("def compiled(): ...\n")
+    assert compiled_sources(tmp_path)[1:] == [moved]
+
+
+def test_nothing_else_compiles_in_the_package() -> None:
+    plain = [each for each in PACKAGE.rglob("*.py") if "njit" in each.read_text("utf-8")]
+    assert plain == [PACKAGE / "_numba.py"]

@@ -1,0 +1,62 @@
+"""Checks of numbers, flags and choices: what they take, what they refuse, and what they say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_yann._validation import (
+    as_between,
+    as_choice,
+    as_flag,
+    as_number,
+    as_positive,
+    as_positive_vector,
+    as_whole,
+)
+
+
+@pytest.mark.parametrize("value", [2, 2.0, np.float32(2), np.int64(2), np.array(2.0)])
+def test_numbers_of_python_and_numpy_become_floats(value: Any) -> None:
+    assert (as_number("x", value), type(as_number("x", value))) == (2.0, float)
+
+
+@pytest.mark.parametrize("value", [True, np.True_, "2", None, 2j, [2.0], np.array([2.0])])
+def test_what_is_no_real_number_is_refused_with_a_hint(value: Any) -> None:
+    with pytest.raises(TypeError, match=r"x = .* must be a number\. Give 3\."):
+        as_number("x", value, "Give 3.")
+
+
+BAD: list[tuple[Any, tuple[Any, ...], type[Exception], str]] = [
+    (as_number, (np.nan,), ValueError, "x = nan must be a finite number"),
+    (as_number, (-np.inf,), ValueError, "x = -inf must be a finite number"),
+    (as_positive, (np.inf,), ValueError, "x = inf must be a finite number above 0"),
+    (as_between, (np.inf, 1, np.inf), ValueError, "x = inf must be a finite number of at least 1"),
+    (as_between, (-1, 0, 1), ValueError, "x = -1 must be between 0 and 1"),
+    (as_between, (np.nan, 0, 1), ValueError, "x = nan must be between 0 and 1"),
+    (as_between, (0, 0, 1, "(]"), ValueError, r"x = 0 must lie in \(0, 1\]"),
+    (as_between, (1, 0, 1, "[)"), ValueError, r"x = 1 must lie in \[0, 1\)"),
+    (as_positive_vector, ([1, 0], 2), ValueError, r"\[1\.0, 0\.0\] must be above 0 in each entry"),
+    (as_choice, ("d", ("a", "b")), ValueError, r"x = 'd' must be one of \('a', 'b'\)"),
+    *((as_flag, (x,), TypeError, "x = .* must be True or False") for x in (0, 1, "no", None)),
+    *(
+        (as_whole, (x,), ValueError, "whole number of at least 1")
+        for x in (True, 2.0, "2", None, 0)
+    ),
+]
+
+
+@pytest.mark.parametrize(("check", "given", "error", "message"), BAD)
+def test_what_is_refused_is_named_with_what_was_expected(check, given, error, message) -> None:
+    with pytest.raises(error, match=message):
+        check("x", *given)
+
+
+def test_what_is_allowed_comes_back_as_pythons_own() -> None:
+    assert [as_between("x", x, 0, 1) for x in (0, 1)] == [0, 1]
+    assert as_positive_vector("x", 2, 3).tolist() == [2, 2, 2]
+    assert (as_whole("x", np.int64(3)), type(as_whole("x", np.int64(3)))) == (3, int)
+    assert (as_flag("x", True), as_flag("x", np.False_)) == (True, False)
+    assert as_choice("x", "a", ("a", "b")) == "a"
