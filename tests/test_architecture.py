@@ -163,6 +163,7 @@ def test_the_design_side_loads_neither_torch_nor_stable_baselines3(code: str) ->
         "from stable_baselines3.ddpg import DDPG",
     ],
 )
+@pytest.mark.slow
 def test_the_alias_is_known_in_whichever_order_one_imports(imports: str) -> None:
     code = f"{imports}; print(DDPG.policy_aliases['YannPolicy'].__name__)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

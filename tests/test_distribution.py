@@ -144,6 +144,7 @@ def test_importing_prints_nothing_and_writes_no_file(package: str, tmp_path: Pat
     assert list(folder.rglob("*")) == []
 
 
+@pytest.mark.slow
 def test_an_import_compiles_nothing() -> None:
     program = "import sys, sb3_yann.policy, sb3_yann.guard, sb3_yann.networks; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

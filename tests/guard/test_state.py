@@ -170,6 +170,7 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place,
     assert [row["verdict"] for row in rows(tmp_path / "guard.csv")] == verdicts(again)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [{"n_starts": 4}, {"seed": 7}, {"rule": {"margin": 0.5}}, {"env": "Slide-v0"}, {"env": None}],

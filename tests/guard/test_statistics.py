@@ -116,6 +116,7 @@ def test_with_a_covariate_it_is_the_test_of_the_partial_correlation() -> None:
         assert chance == pytest.approx(expected, rel=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 3.0])
 def test_under_no_difference_it_accepts_as_often_as_its_size_says(slope) -> None:
     rng, trials, size = np.random.default_rng(2), 2000, 0.05
@@ -187,6 +188,7 @@ def test_too_few_episodes_are_an_error() -> None:
         probability_of_chance(episodes([1]), episodes([2]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 3.0])
 def test_an_episode_of_a_policy_like_the_accepted_one_is_seldom_an_outlier(slope) -> None:
     rng, trials, found = np.random.default_rng(6), 2000, 0

@@ -117,6 +117,7 @@ def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str, gamma: 
 # --- the equilibrium ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @EVERY_PROBLEM
 @pytest.mark.parametrize("pinned", [True, False])
 def test_cost_to_go_of_the_origin_is_learnt_only_where_it_is_not_pinned(

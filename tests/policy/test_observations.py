@@ -96,6 +96,7 @@ def test_frames_stacked_by_sb3_start_as_the_law_and_train() -> None:
     model.learn(50, callback=[NoActionNoise(), ControlDiagnostics()])
 
 
+@pytest.mark.slow
 def test_frames_stacked_by_gymnasium_start_as_the_law_and_train(tmp_path) -> None:
     env = FrameStackObservation(Seen(lambda x: x, 3), 4)
     assert env.observation_space.shape == (4, 3)

@@ -32,6 +32,7 @@ from sb3_yann_envs import problems
 ENVS = ("CSTR-v0", "ClippedPendulum-v0")
 
 
+@pytest.mark.slow
 def test_predict_equals_an_independent_online_qp_at_ten_thousand_feasible_states(mpc) -> None:
     model = build(mpc=mpc)
     states, expected = feasible_states(mpc, 10_000)

@@ -117,6 +117,7 @@ def holders(law: PiecewiseAffine, points: np.ndarray, depth: float) -> np.ndarra
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mpc",
     [carts(x_min=-10, x_max=10), carts(theta_min=-10, theta_max=10), staircase()],

@@ -65,6 +65,7 @@ def test_data_of_a_fast_sampled_plant_give_the_matrices_back() -> None:
     np.testing.assert_allclose(model.B, plant.B, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say_under_process_noise() -> None:
     draws = [identify(*record(i, process=0.02)[:2], dt=1, held_out=0) for i in range(200)]
     share = np.mean([coverage(found) for found in draws], axis=0)

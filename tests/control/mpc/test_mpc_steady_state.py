@@ -42,6 +42,7 @@ def test_a_hundred_reachable_references_are_reached_without_offset(name: str) ->
     assert np.max(np.abs(reached - r)) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measured", [None, [0]], ids=["all states", "the tracked output"])
 @pytest.mark.parametrize("name", ["servo with a disturbance", "servo with all of it"])
 def test_a_hundred_references_are_reached_under_a_disturbance_nobody_measures(
