@@ -15,7 +15,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from general_problems import servo
-from sb3_yann import AffineObservation, NoActionNoise, NonFiniteWarning, YannPolicy
+from sb3_yann import AffineObservation, NoActionNoise, NonFiniteWarning, RateLimits, YannPolicy
 from sb3_yann.policy._finite import FiniteRows
 from sb3_yann_envs import problems
 
@@ -225,7 +225,7 @@ def test_where_the_networks_are_not_finite_the_law_acts_and_says_so(net_arch) ->
 
 
 def test_the_limits_of_the_rate_hold_where_the_state_is_not_known() -> None:
-    mpc = servo(du_min=-0.1, du_max=0.1)
+    mpc = servo(rate=RateLimits(-0.1, 0.1))
     model = shaken(build(LinearPlant(mpc), policy={"problem": mpc}))
     observation = np.zeros(mpc.n_theta, np.float32)
     observation[0], observation[mpc.layout.previous] = np.nan, 0.4
