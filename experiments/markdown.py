@@ -13,7 +13,9 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) 
     Parameters
     ----------
     header : sequence of str
+        The cells of the first row.
     rows : iterable of sequence of str
+        The cells of the others.
     texts : int
         How many columns go to the left.
     """
