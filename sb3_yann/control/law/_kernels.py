@@ -19,7 +19,7 @@ ROWS = 2
 """Floats before the packed arrays: how far outside counts as inside, and which slacks tie."""
 
 SURELY_INSIDE = 1e-9
-"""With such a slack, no region that the tree left out, and of disjoint ones no other, is as good."""
+"""With it, no region that the tree left out, and of disjoint ones no other at all, is as good."""
 
 CLEAR = 1e-6
 """So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
