@@ -8,7 +8,7 @@ import numpy as np
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
-    """Return a table in Markdown, with the first ``texts`` columns to the left, others to the right."""
+    """Return a Markdown table; ``texts`` columns go to the left, the others to the right."""
     lines = [header, [*["---"] * texts, *["---:"] * (len(header) - texts)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

@@ -28,8 +28,8 @@ class RowAdam(th.optim.Optimizer):
     >>> optimizer = RowAdam([table], lr=0.1)
     >>> table[1].sum().backward()
     >>> optimizer.step()
-    >>> table[:, 0].tolist() == [0.0, th.tensor(-0.1).item()]
-    True
+    >>> [round(entry, 6) for entry in table[:, 0].tolist()]
+    [0.0, -0.1]
     """
 
     def __init__(
