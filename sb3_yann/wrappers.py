@@ -49,8 +49,8 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
             )
         if not np.all(self.low <= self.high):  # nor is NaN
             raise ValueError(
-                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, and no "
-                "entry of low may exceed that of high."
+                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, "
+                "and no entry of low may exceed that of high."
             )
         free = np.full(n_new, np.inf)
         self.observation_space = spaces.Box(

@@ -118,7 +118,7 @@ class YannPolicy(TD3Policy):
     critic_target: YannCritic
     critic_updates: th.Tensor
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - all of them are policy_kwargs
         self,
         observation_space: spaces.Space[Any],
         action_space: spaces.Box,
