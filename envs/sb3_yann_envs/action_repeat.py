@@ -16,7 +16,7 @@ class ActionRepeat(
     A policy then decides every ``k * dt``, where ``dt`` is the sampling time of the env: the
     LinearModel of its MPC must have the sampling time ``k * dt``, e.g.
     ``LinearModel.from_continuous(A, B, k * dt)``. The reward is about k times the stage cost at the
-    beginning, so weights ``k * Q`` and ``k * R``, or the policy's ``reward_scale=k``, describe it
+    beginning, so weights ``k * Q`` and ``k * R``, or the critic's ``reward_scale=k``, describe it
     the better the less happens within the k steps; :class:`sb3_yann.CostAudit` measures how well.
 
     ``info`` is that of the last step, but ``info["violation"]`` is true if it was true in any of

@@ -37,6 +37,7 @@ def save_trajectories(
     dt : float
         Sampling time, in ``time_unit``.
     time_unit : str
+        Label of the time axis.
     limits : mapping of int to (float, str), optional
         A limit of an entry of the observation, and its label.
     references : mapping of int to int, optional

@@ -179,7 +179,7 @@ class AfterstateValue(nn.Module):
     network_scale: th.Tensor
     W: th.Tensor
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what the value is made of, and its network
         self,
         W: Array,
         P: Array,

@@ -246,6 +246,7 @@ class ZeroOutputNetwork(nn.Module):
         Parameters
         ----------
         x : Tensor, shape (batch, in_features)
+            What goes in.
         index : Tensor of int, shape (batch,), optional
             The network of the stack that each row goes through; None where there is only one.
         """

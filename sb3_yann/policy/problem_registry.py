@@ -22,7 +22,8 @@ def register_problem(name: str, problem: LinearMPC | Callable[[], LinearMPC] | s
     ----------
     name : str
         Without a colon. Registering a name again replaces its problem.
-    problem : LinearMPC, callable without arguments that returns one, or ``"module:attribute"``
+    problem : LinearMPC, callable or str
+        The MPC, a function without arguments that returns it, or ``"module:attribute"``.
 
     Raises
     ------
