@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.budget import BudgetTimer
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, batches
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
 
 Indices = NDArray[np.intp]
@@ -126,14 +126,10 @@ class _Walk:
                 return None
             if active not in self.seen:
                 return active
-            other = self.found.get(active, one)
-            if other is not one and _holds(other, middle) and _holds(other, point):
+            other, ends = self.found.get(active, one), np.stack([middle, point])
+            if other is not one and np.min(other.b - ends @ other.A.T) >= -1e-9:
                 return None
         return None
-
-
-def _holds(one: _Found, point: Array) -> bool:
-    return float(np.min(one.b - one.A @ point)) >= -1e-9
 
 
 def _members(active: int) -> list[int]:
@@ -179,7 +175,7 @@ class Conditions:
             return None
         multipliers = np.asarray(info["lam"])
         active = np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max()))
-        return sum(1 << int(k) for k in active)
+        return as_bits(active)
 
     def regions(self, wave: list[int]) -> Iterator[_Found]:
         """Yield the regions with an interior among those of some active sets."""

@@ -160,7 +160,7 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
     all_over, in_each = np.zeros((2, len(tree.leaf_regions)), np.int64)
     half_spaces = regions.A, regions.b, regions.row_starts
     for points, hits in ((everywhere, all_over), (within, in_each)):
-        _hits(*vars(tree).values(), *half_spaces, points, hits)
+        _hits(*(*vars(tree).values(), *half_spaces, points, hits))
     leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
     order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
     return np.ascontiguousarray(tree.leaf_regions[order])

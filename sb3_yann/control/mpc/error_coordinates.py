@@ -72,5 +72,5 @@ def error_system(
     previous[:, layout.previous] = np.eye(m)
     A, B = linalg.block_diag(model.A, np.zeros((m, m))), np.vstack([model.B, np.eye(m)])
     weights = linalg.block_diag(Q, R_du), R + R_du, np.vstack([np.zeros((n, m)), -R_du])
-    to_error = np.vstack([to_error, previous])
-    return ErrorSystem(LinearModel(A, B, model.dt), to_error, to_input, *weights)
+    to_z = np.vstack([to_error, previous])
+    return ErrorSystem(LinearModel(A, B, model.dt), to_z, to_input, *weights)

@@ -76,7 +76,7 @@ def _why_none(model: LinearModel, C: Array, missed: Array, equations: Array) -> 
     which = [f"r[{i}]" if i < p else f"d[{i - p}]" for i in np.flatnonzero(missed)]
     rank = int(np.linalg.matrix_rank(equations, tol=1e-10))
     return (
-        f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank {rank}, not "
-        f"{model.n_states + p}. Track fewer outputs, or other ones: at most as many as there are "
+        f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank {rank}, "
+        f"not {model.n_states + p}. Track fewer outputs, or other ones: at most as many as there are "
         f"inputs ({model.n_inputs}), each moved by an input at steady state."
     )
