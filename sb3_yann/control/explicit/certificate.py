@@ -167,7 +167,7 @@ class Certificate:
                 return
             at = self.by_set.get(_sets(multipliers[None])[0])
             other = None if at is None else self.regions[at]
-            if other and np.min(other.b - np.stack([point, middle]) @ other.A.T) >= -INSIDE:
+            if other and all(np.min(other.b - other.A @ x) >= -INSIDE for x in (point, middle)):
                 return
             slacks = self._slacks(point)
             if np.max(slacks) < -INSIDE:

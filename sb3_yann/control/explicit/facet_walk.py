@@ -126,8 +126,9 @@ class _Walk:
                 return None
             if active not in self.seen:
                 return active
-            other, ends = self.found.get(active, one), np.stack([middle, point])
-            if other is not one and np.min(other.b - ends @ other.A.T) >= -1e-9:
+            other = self.found.get(active, one)
+            slacks = (np.min(other.b - other.A @ each) for each in (middle, point))
+            if other is not one and min(slacks) >= -1e-9:
                 return None
         return None
 

@@ -80,7 +80,6 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     # So far outside a point still counts as inside: facets of neighbors agree to rounding only.
     tolerance = 1e-8
-
     # Slacks that differ by less, relative to 1 + their size, tie. Outside the feasible set whole
     # areas violate two neighbors alike: rounding must not choose.
     tie_tolerance = 1e-12
