@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import NoReturn
 
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, batches
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
 
 # How far a law may be off, and a point from a region that holds it, in half-widths of the ranges.
@@ -23,11 +23,6 @@ class ExplicitSolutionError(RuntimeError):
     >>> issubclass(ExplicitSolutionError, RuntimeError)
     True
     """
-
-
-def _as_bits(active_set: Iterable[int]) -> int:
-    """Return a set of constraints as a whole number, with bit k for constraint k."""
-    return sum(1 << k for k in active_set)
 
 
 def _sets(multipliers: Array) -> list[int]:
@@ -61,7 +56,7 @@ class Certificate:
         self, program: ParametricQP, regions: list[Region], center: Array, half: Array
     ) -> None:
         self.program, self.regions, self.center, self.half = program, regions, center, half
-        self.by_set = {_as_bits(region.active_set): i for i, region in enumerate(regions)}
+        self.by_set = {as_bits(region.active_set): i for i, region in enumerate(regions)}
         self.outer = np.column_stack(program.theta_rows())
 
     def check(self) -> None:
@@ -151,7 +146,7 @@ class Certificate:
         meant: list[list[int]] = [[] for _ in own]
         for row, which in zip(*(index.tolist() for index in np.nonzero(same)), strict=True):
             meant[row].append(which - first)
-        active = _as_bits(region.active_set)
+        active = as_bits(region.active_set)
         for row, which in enumerate(meant):
             outer = bool(which) and which[0] < 0  # a bound of theta
             if not outer and not any(active ^ (1 << labels[k]) in self.by_set for k in which):
@@ -170,7 +165,7 @@ class Certificate:
                 return
             at = self.by_set.get(_sets(multipliers[None])[0])
             other = None if at is None else self.regions[at]
-            if other and np.min(other.b - np.stack([point, middle]) @ other.A.T) >= -INSIDE:
+            if other and all(np.min(other.b - other.A @ x) >= -INSIDE for x in (point, middle)):
                 return
             slacks = self._slacks(point)
             if np.max(slacks) < -INSIDE:

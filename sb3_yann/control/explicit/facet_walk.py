@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.budget import BudgetTimer
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, batches
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
 
 Indices = NDArray[np.intp]
@@ -127,13 +127,10 @@ class _Walk:
             if active not in self.seen:
                 return active
             other = self.found.get(active, one)
-            if other is not one and _holds(other, middle) and _holds(other, point):
+            slacks = (np.min(other.b - other.A @ each) for each in (middle, point))
+            if other is not one and min(slacks) >= -1e-9:
                 return None
         return None
-
-
-def _holds(one: _Found, point: Array) -> bool:
-    return float(np.min(one.b - one.A @ point)) >= -1e-9
 
 
 def _members(active: int) -> list[int]:
@@ -179,7 +176,7 @@ class Conditions:
             return None
         multipliers = np.asarray(info["lam"])
         active = np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max()))
-        return sum(1 << int(k) for k in active)
+        return as_bits(active)
 
     def regions(self, wave: list[int]) -> Iterator[_Found]:
         """Yield the regions with an interior among those of some active sets."""

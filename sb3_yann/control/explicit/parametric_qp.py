@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 
 
+def as_bits(active_set: Iterable[int]) -> int:
+    """Return a set of constraints as a whole number, with bit k for constraint k."""
+    return sum(1 << int(k) for k in active_set)
+
+
 def batches(sizes: Iterable[int]) -> Iterator[tuple[int, list[int]]]:
     """Yield each size, ascending, with the indices that have it, at most 256 at a time."""
     indices: dict[int, list[int]] = {}

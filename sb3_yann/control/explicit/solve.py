@@ -93,7 +93,7 @@ class ProgramUnits:
 def _require_box(program: ParametricQP) -> None:
     if not np.all(np.isfinite([program.theta_min, program.theta_max])):
         raise ValueError(
-            f"The law needs a bounded box, but theta is within {program.theta_min.tolist()} and "
+            f"The law needs a bounded box of theta, not {program.theta_min.tolist()} to "
             f"{program.theta_max.tolist()}. Pass finite theta_min and theta_max (or x_min and "
             "x_max), and where theta holds them, r_min and r_max, d_min and d_max, u_min and u_max."
         )

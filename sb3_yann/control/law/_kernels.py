@@ -15,14 +15,10 @@ from sb3_yann._validation import Array
 HEADER = 8
 """Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero input, disjoint."""
 
-ROWS = 2
-"""Floats before the packed arrays: how far outside counts as inside, and which slacks tie."""
-
+ROWS = 2  # floats before the packed arrays: how far outside counts as inside, which slacks tie
+CLEAR = 1e-6  # so far from all hyperplanes on its way, what holds a point is in the leaf
 SURELY_INSIDE = 1e-9
 """With it, no region that the tree left out, and of disjoint ones no other at all, is as good."""
-
-CLEAR = 1e-6
-"""So far from all hyperplanes on its way, what holds a point at all is in the leaf."""
 
 
 def pack(

@@ -80,7 +80,6 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     # So far outside a point still counts as inside: facets of neighbors agree to rounding only.
     tolerance = 1e-8
-
     # Slacks that differ by less, relative to 1 + their size, tie. Outside the feasible set whole
     # areas violate two neighbors alike: rounding must not choose.
     tie_tolerance = 1e-12
@@ -185,10 +184,8 @@ class PiecewiseAffine(ReadOnlyArrays):
                 law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
             return law
         except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
-            raise ValueError(
-                f"{fspath(path)} does not hold a PiecewiseAffine ({error}). "
-                "Write it with law.save(path)."
-            ) from None
+            what = f"{fspath(path)} does not hold a PiecewiseAffine ({error})"
+            raise ValueError(f"{what}. Write it with law.save(path).") from None
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""
@@ -196,10 +193,8 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     def __repr__(self) -> str:
         """Name the sizes."""
-        return (
-            f"PiecewiseAffine(regions={self.n_regions}, halfspaces={self.n_halfspaces}, "
-            f"theta={self.n_theta}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
-        )
+        law = f"regions={self.n_regions}, halfspaces={self.n_halfspaces}, theta={self.n_theta}"
+        return f"PiecewiseAffine({law}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
 
     def _choose(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:
         """Return the region in use and how far inside it each point lies, negative outside."""

@@ -18,20 +18,11 @@ from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
 from sb3_yann.control.polyhedra import largest_ball
 
-LEAF = 4
-"""A node with this many regions is not split further."""
-
-NODES = 2
-"""Hyperplanes for each region, at most: long and thin regions make trees grow without bound."""
-
-DRAWS = 64
-"""Random points in the box for each region that tell which regions of a leaf are met most often."""
-
-CANDIDATES = 16
-"""Facets tried at a node, drawn from those of its regions."""
-
-OVERLAP = 1e-8
-"""A region that passes a hyperplane by less, in half-widths of the box, is not on its far side."""
+LEAF = 4  # a node with this many regions is not split further
+NODES = 2  # hyperplanes for each region, at most: thin regions make trees grow without bound
+DRAWS = 64  # random points for each region that tell which regions of a leaf are met most often
+CANDIDATES = 16  # facets tried at a node, drawn from those of its regions
+OVERLAP = 1e-8  # a region that passes a hyperplane by less is not on its far side
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,11 +50,10 @@ class LinearMPC(MPCProblem):
 
     The parameter of the law is ``theta = [x, r, d, u_prev]``, with the parts that the problem uses
     (:attr:`layout`): r with ``tracking``, d where the model has an E, ``u_prev`` with a bound or a
-    weight on the rate. r and d are constant over the horizon. A problem without them is a
-    regulator: ``x_s = 0`` and ``u_s = 0``.
+    weight on the rate. r and d are constant over the horizon.
 
-    All arguments are stored, as arrays of full shape, and `dataclasses.replace` changes some of
-    them. It keeps the stored ``terminal``: replace that by None too, to have it solved anew.
+    `dataclasses.replace` changes some arguments. It keeps the stored ``terminal``: replace that by
+    None too, to have it solved anew.
 
     Parameters
     ----------
@@ -71,12 +70,10 @@ class LinearMPC(MPCProblem):
     u_min, u_max : array_like, shape (m,), or float, optional
         Bounds of the inputs. A policy needs them finite.
     theta_min, theta_max : array_like, shape (n,), or float, optional
-        The box of states for which the problem is solved. The default is ``x_min``, ``x_max``, and
-        half their distance beyond each where they are soft. Alone they leave the predicted states
-        free. Stored with the boxes of r, d and u_prev: (n_theta,).
+        The box of states for which the problem is solved, by default ``x_min``, ``x_max``, and half
+        their distance beyond where they are soft. Stored with those of r, d and u_prev: (n_theta,).
     gamma : float, default 1
-        Discount in (0, 1]. With the learner's, the policy starts as the maximizer of its own critic
-        wherever no constraint acts.
+        Discount in (0, 1]; the learner's makes the policy start as its critic's maximizer.
     infeasible : {"nearest_region", "zero_input"}, default "nearest_region"
         The law where the problem has no solution. See :class:`PiecewiseAffine`.
     tracking : Tracking, optional
