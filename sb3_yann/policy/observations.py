@@ -78,7 +78,8 @@ class AffineObservation(ReadOnlyArrays):
 
         Parameters
         ----------
-        low, high : array_like, shape (n,), in units of theta
+        low, high : array_like, shape (n,)
+            In units of theta.
         to : pair of float, default (-1, 1)
             As ``min_obs`` and ``max_obs`` of `gymnasium.wrappers.RescaleObservation`.
         """
@@ -185,8 +186,8 @@ def require_frozen(normalize: VecNormalize) -> None:
     """Raise if a VecNormalize changes what it has said, or changes the rewards."""
     if normalize.norm_reward:
         raise ValueError(
-            "VecNormalize normalizes rewards: they are not the cost that the critic stands for. Set "
-            "venv.norm_reward = False; CriticOptions(reward_scale=...) takes a constant factor."
+            "VecNormalize normalizes rewards: they are not the cost that the critic stands for. "
+            "Set venv.norm_reward = False; CriticOptions(reward_scale=...) takes a constant factor."
         )
     if normalize.norm_obs and normalize.training:
         raise ValueError(
