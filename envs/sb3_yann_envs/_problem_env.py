@@ -33,7 +33,6 @@ class ProblemEnv(gymnasium.Env[Single, Single]):
     start_low: ClassVar[Array]  # random start
     start_high: ClassVar[Array]
     observation_space: ProblemBox
-    action_space: gymnasium.spaces.Box
     _state: Any = None  # a tuple of floats, once an episode has begun
 
     def __init__(self, render_mode: str | None, states: ProblemBox, max_input: float) -> None:

@@ -266,7 +266,7 @@ class CSTREnv(ProblemEnv):
     start_low, start_high = START_LOW, START_HIGH
 
     def __init__(self, render_mode: str | None = None) -> None:
-        low, high = np.float32([-3, -3, -3, -70]), np.float32([3, 3, 3, 25])
+        low, high = np.array([[-3, -3, -3, -70], [3, 3, 3, 25]], np.float32)
         states = ProblemBox(low, high, problem="sb3_yann_envs.problems:cstr")
         super().__init__(render_mode, states, MAX_INPUT)
 

@@ -66,10 +66,9 @@ class _VectorEnv(VectorEnv[Single, Single, NDArray[Any]]):
         for name, given in (("seed", seeds), ("options['state']", starts)):
             if len(given) != self.num_envs:
                 raise ValueError(f"{name} has {len(given)} entries for {self.num_envs} episodes.")
-        generators = self._generators or [None] * self.num_envs
         self._generators = [
-            seeding.np_random(each)[0] if generator is None or each is not None else generator
-            for generator, each in zip(generators, seeds, strict=True)
+            self._generators[i] if self._generators and each is None else seeding.np_random(each)[0]
+            for i, each in enumerate(seeds)
         ]
         states = [self._start(i, start) for i, start in enumerate(starts)]
         self._state = np.ascontiguousarray(np.array(states).T)

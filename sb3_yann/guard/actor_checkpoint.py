@@ -72,15 +72,13 @@ class ActorCheckpoint:
 
     def has_networks_of(self, other: ActorCheckpoint) -> bool:
         """Return whether both hold the same networks, whatever their optimizers remember."""
-        networks = other.networks()
-        return all(th.equal(value, networks[name]) for name, value in self.networks().items())
+        return not self.changed_regions(other).any()
 
     def changed_regions(self, other: ActorCheckpoint) -> NDArray[np.bool_]:
         """Return in which regions the networks of both differ, shape (regions,)."""
         networks = other.networks()
-        different = [
-            (value != networks[name]).flatten(1).any(1) for name, value in self.networks().items()
-        ]
+        pairs = ((value, networks[name]) for name, value in self.networks().items())
+        different = [(ours != theirs).flatten(1).any(1) for ours, theirs in pairs]
         return np.asarray(th.stack(different).any(0).numpy())
 
     def with_regions(self, other: ActorCheckpoint, regions: Iterable[int]) -> ActorCheckpoint:

@@ -25,11 +25,7 @@ Simulator: TypeAlias = str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
 
 @dataclass
 class GuardSession:
-    """One model under guard, during one `learn`.
-
-    The policy is the candidate, until a checkpoint is restored to it. ``simulator`` is None on a
-    plant alone.
-    """
+    """One model under guard, during one `learn`; ``simulator`` is None on a plant alone."""
 
     model: OffPolicyAlgorithm
     policy: YannPolicy
@@ -61,10 +57,7 @@ class GuardSession:
 
     @contextmanager
     def playing(self, checkpoint: ActorCheckpoint) -> Iterator[YannPolicy]:
-        """Yield the policy with the actor of a checkpoint; its own actor is back afterwards.
-
-        Target and optimizer play no part in an episode and stay as they are.
-        """
+        """Yield the policy with the actor of a checkpoint; its own actor is back afterwards."""
         own = {key: each.clone() for key, each in self.policy.actor.state_dict().items()}
         try:
             self.policy.actor.load_state_dict(checkpoint.actor)
@@ -102,10 +95,7 @@ class GuardSession:
             return not policy.actor.mu.network.is_zero()
 
     def seen(self, observations: Any) -> Any:
-        """Return observations of the simulator as the policy has learned from them.
-
-        The simulator is an env like the one below a VecNormalize.
-        """
+        """Return observations of the simulator, which is below any VecNormalize, normalized."""
         normalize = self.model.get_vec_normalize_env()
         return observations if normalize is None else normalize.normalize_obs(observations)
 
@@ -148,9 +138,7 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     """
     state, policy = getattr(model, "guard_state", None), model.policy
     if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
-        raise ValueError(
-            f"No ImprovementGuard has been at work on this {type(model).__name__}: pass one to "
-            "learn."
-        )
+        name = type(model).__name__
+        raise ValueError(f"No ImprovementGuard has been at work on this {name}: pass one to learn.")
     state.accepted.restore(policy)
     policy.actor_step = 1.0

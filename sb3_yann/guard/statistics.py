@@ -23,9 +23,8 @@ UNSAFE = (
 class PairedEpisodes:
     """Episodes from the same starts, under the MPC and under the accepted policy.
 
-    ``costs`` and ``unsafe`` are the accepted policy's. The columns of ``unsafe`` (starts, up to 3),
-    named in ``UNSAFE``, are compared one by one: an episode that is cut short has fewer steps to
-    violate in. ``margin`` is what one start may cost more than with the MPC.
+    ``costs`` and ``unsafe`` are the accepted policy's. The columns of ``unsafe``, named in
+    ``UNSAFE``, are compared one by one: an episode cut short has fewer steps to violate in.
     """
 
     mpc_costs: Array
@@ -61,11 +60,7 @@ class PairedEpisodes:
 
 @dataclass(frozen=True)
 class PlantEpisodes:
-    """Training episodes played by one and the same policy on the plant.
-
-    ``predicted`` is what the MPC would cost from the same start on its own linear model. It
-    explains most of the difference between starts.
-    """
+    """Training episodes of one policy on the plant; ``predicted`` is the MPC's cost on its model."""
 
     costs: Array
     predicted: Array
