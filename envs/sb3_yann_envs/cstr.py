@@ -44,8 +44,7 @@ _COOLING = 1000 * AREA / (HEAT_CAPACITY * VOLUME)  # m2 K/kJ
 def _steady_state(temperature: float, transfer: float) -> tuple[float, float, float, float]:
     """Return C_A, C_B, C_S and the feed temperature that balance at the given T and U.
 
-    The balances of A and B give ``C_B - C_A = FEED_B - FEED_A``, which leaves a quadratic equation
-    for C_A; that of S is linear; that of the heat then determines the feed temperature.
+    The balances of A and B give ``C_B - C_A = FEED_B - FEED_A`` and a quadratic equation for C_A.
     """
     thermal = GAS_CONSTANT * temperature
     k1 = math.exp(LOG_FREQUENCY_1 - ACTIVATION_1 / thermal)
@@ -242,8 +241,7 @@ class CSTREnv(ProblemEnv):
 
     ## Arguments
 
-    - `render_mode`: None, or `"rgb_array"` for a picture of shape (400, 600, 3) with the history of
-      temperature and input.
+    - `render_mode`: None, or `"rgb_array"` for the history as a picture of shape (400, 600, 3).
 
     ```python
     >>> import gymnasium

@@ -18,10 +18,7 @@ Tensors = dict[str, th.Tensor]
 
 @dataclass(frozen=True)
 class ActorCheckpoint:
-    """All that an actor needs to act and to go on learning.
-
-    It lies in the CPU's memory, so that a model saved on one device loads on another.
-    """
+    """All that an actor needs to act and to go on learning, on the CPU: it loads anywhere."""
 
     actor: Tensors
     target: Tensors

@@ -54,11 +54,9 @@ class PlantAcceptance:
         going_on = int(session.model.num_timesteps > 0)
         self.costs, self.lengths = np.zeros(n_envs), np.full(n_envs, going_on)
         self.violated = np.zeros(n_envs, dtype=bool)
-        # Whether the accepted policy has played all of the episode that is under way.
-        self.accepted_led = np.zeros(n_envs, dtype=bool)
+        self.accepted_led = np.zeros(n_envs, dtype=bool)  # whether for all of the episode so far
         self.starts: list[Array] = [np.empty(0)] * n_envs
-        self.blocks = np.full(n_envs, -1)
-        self.block = 0
+        self.blocks, self.block = np.full(n_envs, -1), 0
         self.last_restore = "", -1  # why, and after how many episodes
         self.left_out = 0  # episodes of the first block whose cost is not known
 
@@ -75,13 +73,13 @@ class PlantAcceptance:
         if diverged(policy):  # only the MPC is left
             refused = True
             session.mpc.restore(policy)
-        evidence = BlockEvidence(resting=ActorCheckpoint.of(policy))
-        session.state.accept(ActorCheckpoint.of(policy), evidence)
+        present = ActorCheckpoint.of(policy)
+        session.state.accept(present, BlockEvidence(resting=present))
         if refused:
             self._report(session, "rejected", "before training, it is not accepted", np.nan)
 
     def before_steps(self, session: GuardSession) -> None:
-        """Restore the accepted policy before one that has diverged in training acts on the plant."""
+        """Restore the accepted policy before one that has diverged acts on the plant."""
         if diverged(session.policy):
             self._restore(session, "a parameter of the actor is not a finite number, or too large")
 
@@ -101,8 +99,7 @@ class PlantAcceptance:
                 self._end_episode(session, i)
         if len(evidence.costs) >= self.rule.trial_episodes:
             self._end_block(session)
-        # After a violation the actor rests until the episode is over: the accepted policy leads
-        # the plant back.
+        # After a violation the actor rests while the accepted policy leads the plant back.
         rests = evidence.phase != "learning" or self.violated.any()
         session.policy.actor_step = 0.0 if rests else state.step
 
@@ -161,7 +158,7 @@ class PlantAcceptance:
         if self.left_out >= self.rule.trial_episodes:
             raise ValueError(
                 f"{self.left_out} episodes of the guard's first block cost no finite number, the "
-                f"last {cost:g}: no policy can be compared with that. Rewards must be finite numbers."
+                f"last {cost:g}. Policies are compared by costs. Rewards must be finite numbers."
             )
 
     def _begin(self, session: GuardSession, phase: Phase) -> None:
@@ -211,12 +208,10 @@ class PlantAcceptance:
         self._report(session, verdict, reason, float(played.costs.mean()))
 
     def _report(self, session: GuardSession, verdict: Verdict, reason: str, cost: float) -> None:
-        def mean(episodes: PlantEpisodes | None) -> float:
-            return np.nan if episodes is None else float(episodes.costs.mean())
-
         evidence = _evidence(session)
-        costs = cost, mean(evidence.accepted), mean(evidence.mpc)
-        session.decide(verdict, reason, verdict == "rejected", costs)
+        known = evidence.accepted, evidence.mpc
+        means = [np.nan if each is None else float(each.costs.mean()) for each in known]
+        session.decide(verdict, reason, verdict == "rejected", (cost, means[0], means[1]))
 
 
 def _evidence(session: GuardSession) -> BlockEvidence:

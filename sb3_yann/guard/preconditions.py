@@ -92,8 +92,8 @@ def first_episodes(session: GuardSession, name: str, seeds: Sequence[int]) -> Ou
         if not np.isclose(first, second, rtol=1e-6, atol=0):
             raise ValueError(
                 f"The MPC played two episodes of the guard's env {name} from the seed {seed}, "
-                f"at costs of {first:g} and {second:g}. Episodes are compared in pairs: all that is "
-                "random in the env must come from self.np_random."
+                f"at costs of {first:g} and {second:g}. Episodes are compared in pairs: all that "
+                "is random in the env must come from self.np_random."
             )
     if len(seeds) > 1 and _all_alike(mpc):
         warnings.warn(

@@ -36,7 +36,7 @@ class GuardSession:
     interrupted: bool = False
     """Whether Ctrl-C has restored the accepted policy, so that nothing else may be restored."""
     before_trial: tuple[ActorCheckpoint, Any, list[Any]] | None = None
-    """What was accepted before the trial that is under way, with its evidence and ``passed``."""
+    """The accepted checkpoint, its evidence and ``passed`` before a trial that is under way."""
 
     def __post_init__(self) -> None:
         if self.policy.actor.mu.network.is_zero():

@@ -60,7 +60,7 @@ class PairedEpisodes:
 
 @dataclass(frozen=True)
 class PlantEpisodes:
-    """Training episodes of one policy on the plant; ``predicted`` is the MPC's cost on its model."""
+    """Training episodes of one policy; ``predicted`` is what the MPC costs on its own model."""
 
     costs: Array
     predicted: Array
@@ -69,9 +69,8 @@ class PlantEpisodes:
 def excess_of_an_outlier(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
     """Return by how much one of the candidate's episodes costs more than the accepted policy's.
 
-    0 where none is beyond the upper prediction limit, of size ``OUTLIER`` for all of them together,
-    of the least-squares line of the accepted policy's costs on the predicted ones (e.g. Montgomery,
-    chapter 10). The mean would not show it: a heavy loss raises the scatter as well.
+    0 where none is beyond the upper prediction limit, of size ``OUTLIER`` for all of them, of the
+    least-squares line of the accepted costs on the predicted ones (e.g. Montgomery, chapter 10).
     """
     covariate = _varies(accepted.predicted) and bool(np.all(np.isfinite(candidate.predicted)))
     X, new = (
