@@ -78,13 +78,12 @@ class ImprovementGuard(BaseCallback):
 
     Examples
     --------
-    >>> from stable_baselines3 import DDPG
-    >>> from sb3_yann import ImprovementGuard, NoActionNoise
-    >>> guard = ImprovementGuard("CSTR-v0", n_starts=3, rule={"margin": 0.02})
-    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> _ = model.learn(1, callback=[NoActionNoise(), guard])
-    >>> guard.decisions
-    []
+    >>> from sb3_yann import ImprovementGuard
+    >>> guard = ImprovementGuard("CSTR-v0", n_new_starts=100, rule={"margin": 0.02})
+    >>> guard.step_size
+    StepSize(shrink=0.5, grow=1.5, smallest=0.1)
+
+    ``model.learn(20_000, callback=[NoActionNoise(), guard])`` trains under guard.
     """
 
     model: OffPolicyAlgorithm

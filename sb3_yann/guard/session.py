@@ -133,7 +133,7 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     >>> from stable_baselines3 import DDPG
     >>> from sb3_yann import ImprovementGuard, NoActionNoise, restore_accepted
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> _ = model.learn(1, callback=[NoActionNoise(), ImprovementGuard("CSTR-v0", n_starts=3)])
+    >>> _ = model.learn(1, callback=[NoActionNoise(), ImprovementGuard(None)])
     >>> restore_accepted(model)
     """
     state, policy = getattr(model, "guard_state", None), model.policy
