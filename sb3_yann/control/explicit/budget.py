@@ -11,8 +11,8 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 from sb3_yann._validation import as_positive, as_whole
 
 _ADVICE = (
-    "Shorten the horizon, leave out bounds that hardly matter, make the box of parameters smaller "
-    "(theta_min, theta_max), or raise the limit."
+    "Their number grows with the horizon and the bounds: shorten the horizon, leave out bounds "
+    "that hardly matter, make theta_min and theta_max narrower, or raise the limit."
 )
 
 

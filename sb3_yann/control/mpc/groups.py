@@ -94,9 +94,8 @@ class OutputBounds(ReadOnlyArrays):
 
     def sized(self, n_states: int) -> OutputBounds:
         """Return it with C as a matrix (q, n)."""
-        return OutputBounds(
-            check.as_outputs("OutputBounds.C", self.C, n_states), self.y_min, self.y_max
-        )
+        C = check.as_outputs("OutputBounds.C", self.C, n_states)
+        return OutputBounds(C, self.y_min, self.y_max)
 
 
 @dataclass(frozen=True, eq=False, init=False)

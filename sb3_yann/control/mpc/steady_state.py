@@ -78,5 +78,5 @@ def _why_none(model: LinearModel, C: Array, missed: Array, equations: Array) -> 
     return (
         f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank {rank}, "
         f"not {model.n_states + p}. Track fewer outputs, or other ones: at most as many as inputs "
-        f"({model.n_inputs}), each moved by an input at steady state."
+        f"({model.n_inputs}) can be tracked, each moved by an input at steady state."
     )
