@@ -33,9 +33,9 @@ class NoActionNoise(BaseCallback):
     def _init_callback(self) -> None:
         # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
         if not isinstance(self.model, OffPolicyAlgorithm):
-            name = type(self.model).__name__
             raise TypeError(
-                f"NoActionNoise needs an off-policy algorithm, DDPG or TD3, not {name}."
+                "NoActionNoise needs an off-policy algorithm, such as DDPG or TD3, not "
+                f"{type(self.model).__name__}."
             )
         self.model.action_noise, self.model.learning_starts = None, 0
         if isinstance(self.model.policy, YannPolicy):

@@ -166,10 +166,10 @@ class CostAudit(BaseCallback):
 
     def _of_the_vec_normalize(self) -> Cause | None:
         """Return what has been set since the policy was built and let it pass."""
-        normalize = self.model.get_vec_normalize_env()
+        if (normalize := self.model.get_vec_normalize_env()) is None:
+            return None
         try:
-            if normalize is not None:
-                require_frozen(normalize)
+            require_frozen(normalize)
         except ValueError as error:
             what = "reward" if normalize.norm_reward else "observation"
             return Cause(f"normalized {what}", str(error))

@@ -79,7 +79,8 @@ class YannLayer(nn.Module):
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
         # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
         register_constants(self, **_constants(law))
-        register_constants(self, th.float32, theta_half=(law.theta_max - law.theta_min) / 2)
+        half = (law.theta_max - law.theta_min) / 2
+        self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
         self.rated = rate is not None
         if rate is not None:
             if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
@@ -214,6 +215,6 @@ class _InwardGradientClamp(th.autograd.Function):
 
 
 def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:
-    """Return x clamped to bounds, numbers or tensors, with a gradient that can lead inside again."""
+    """Return x clamped to numbers or tensors, with a gradient that can still lead inside."""
     clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
     return clamped
