@@ -16,6 +16,8 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
+from sb3_yann._validation import Array
+
 Activation = Callable[[th.Tensor], th.Tensor]
 FEW = 32
 """Stacks of up to this size are multiplied as a whole."""
@@ -112,10 +114,10 @@ class Rows:
         return function(*(table.index_select(0, self.index) for table in tables))
 
 
-def register_constants(module: nn.Module, dtype: th.dtype = th.float64, **values: Any) -> None:
+def register_constants(module: nn.Module, **values: Array) -> None:
     """Give a module buffers: optimizers and SB3's target updates leave them alone."""
     for name, value in values.items():
-        module.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=dtype))
+        module.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=th.float64))
 
 
 def _alive_at_zero(activation: Activation, x: th.Tensor) -> th.Tensor:
