@@ -34,7 +34,8 @@ class NoActionNoise(BaseCallback):
         # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
         if not isinstance(self.model, OffPolicyAlgorithm):
             raise TypeError(
-                f"NoActionNoise is for DDPG and TD3, not for {type(self.model).__name__}."
+                "NoActionNoise needs an off-policy algorithm, such as DDPG or TD3, not "
+                f"{type(self.model).__name__}."
             )
         self.model.action_noise, self.model.learning_starts = None, 0
         if isinstance(self.model.policy, YannPolicy):

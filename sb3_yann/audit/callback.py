@@ -166,8 +166,7 @@ class CostAudit(BaseCallback):
 
     def _of_the_vec_normalize(self) -> Cause | None:
         """Return what has been set since the policy was built and let it pass."""
-        normalize = self.model.get_vec_normalize_env()
-        if normalize is None:
+        if (normalize := self.model.get_vec_normalize_env()) is None:
             return None
         try:
             require_frozen(normalize)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -67,8 +66,6 @@ class YannLayer(nn.Module):
         rate: tuple[Array, Array] | None = None,
     ) -> None:
         super().__init__()
-        # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
-        import_module("sb3_yann.networks._kernels.yann_layer")
         if not np.all(np.isfinite([law.u_min, law.u_max])):
             raise ValueError(
                 f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
@@ -81,8 +78,9 @@ class YannLayer(nn.Module):
         middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
         # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
-        register_constants(self, th.float64, **_constants(law))
-        register_constants(self, th.float32, theta_half=(law.theta_max - law.theta_min) / 2)
+        register_constants(self, **_constants(law))
+        half = (law.theta_max - law.theta_min) / 2
+        self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
         self.rated = rate is not None
         if rate is not None:
             if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
@@ -217,6 +215,6 @@ class _InwardGradientClamp(th.autograd.Function):
 
 
 def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:
-    """Return x clamped to bounds, numbers or tensors, with a gradient that leads inside again."""
+    """Return x clamped to numbers or tensors, with a gradient that can still lead inside."""
     clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
     return clamped
