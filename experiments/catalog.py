@@ -94,7 +94,7 @@ PLANTS = {
 }
 
 
-def yann(  # noqa: PLR0913 (each is one thing that a variant changes)
+def yann(  # noqa: PLR0913 (what the variants vary)
     make_env: Callable[[], Any],
     seed: int,
     plant: Plant,

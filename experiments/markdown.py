@@ -8,7 +8,17 @@ import numpy as np
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
-    """Return a Markdown table; ``texts`` columns go to the left, the others to the right."""
+    """Return a table in Markdown, with the first columns to the left and the others to the right.
+
+    Parameters
+    ----------
+    header : sequence of str
+        The cells of the first row.
+    rows : iterable of sequence of str
+        The cells of the others.
+    texts : int
+        How many columns go to the left.
+    """
     lines = [header, [*["---"] * texts, *["---:"] * (len(header) - texts)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

@@ -147,7 +147,7 @@ def run_all(
     Parameters
     ----------
     runs : iterable of Run
-        What is wanted; a run that is named twice is done once.
+        What is to be done.
     execute : callable
         From a run to its outcome; called in other processes, on one thread each.
     folder : path-like

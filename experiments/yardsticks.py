@@ -188,9 +188,9 @@ def residual_rl(make_env: MakeEnv, seed: int, noise: float = NOISE) -> Learner:
     Parameters
     ----------
     make_env : callable
-        Returns the training env, whose space holds the problem.
+        Makes the training env.
     seed : int
-        Of the learner and of its env.
+        Of networks, noise and env.
     noise : float, default 0.1
         Standard deviation as a fraction of half the input range; with 0 no noise at all is played.
 

@@ -24,6 +24,7 @@ from sb3_yann._validation import Array, NonFiniteWarning, as_number, as_whole
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 
 Vector = NDArray[np.floating[Any]]
+Env = gym.Env[Vector, Vector]
 Schedule = Callable[[int], ArrayLike]
 """The reference after so many steps of an episode."""
 
@@ -32,16 +33,10 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Appends a vector between ``low`` and ``high`` to the observation.
 
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
-    Subclasses say what is observed.
     """
 
     def __init__(
-        self,
-        env: gym.Env[Vector, Vector],
-        low: ArrayLike,
-        high: ArrayLike,
-        n_replaced: int = 0,
-        n_new: int = 0,
+        self, env: Env, low: ArrayLike, high: ArrayLike, n_replaced: int = 0, n_new: int = 0
     ) -> None:
         super().__init__(env)
         inner = _require_vector(self, "observation_space")
@@ -52,13 +47,11 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"low has shape {self.low.shape} and high {self.high.shape}; give the bounds of "
                 "each appended entry as two vectors of the same length."
             )
-        if np.any(np.isnan([self.low, self.high])):
+        if not np.all(self.low <= self.high):  # nor is NaN
             raise ValueError(
-                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers: give "
-                "the bounds of each appended entry."
+                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, and no "
+                "entry of low may exceed that of high."
             )
-        if not np.all(self.low <= self.high):
-            raise ValueError(f"low = {self.low.tolist()} exceeds high = {self.high.tolist()}.")
         free = np.full(n_new, np.inf)
         self.observation_space = spaces.Box(
             np.concatenate([-free, inner.low[n_replaced:], self.low]).astype(np.float32),
@@ -81,9 +74,9 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
         """Return what is observed after an input u (m,), None at the start of an episode."""
         raise NotImplementedError
 
-    def joined(self, *parts: Vector) -> Vector:
-        """Return the parts as one observation, float32."""
-        return np.concatenate(parts).astype(np.float32)
+
+def _joined(*parts: Vector) -> Vector:
+    return np.concatenate(parts).astype(np.float32)
 
 
 class PreviousInput(_Appending):
@@ -91,8 +84,7 @@ class PreviousInput(_Appending):
 
     Parameters
     ----------
-    env : gymnasium.Env
-        With one-dimensional Box spaces.
+    env : gymnasium.Env, with one-dimensional Box spaces
     initial : array_like, shape (m,), optional
         What counts as the previous input at the start of an episode: zeros by default, the
         operating point.
@@ -104,7 +96,7 @@ class PreviousInput(_Appending):
     ((5,), 1.0)
     """
 
-    def __init__(self, env: gym.Env[Vector, Vector], initial: ArrayLike | None = None) -> None:
+    def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
         bounds = _require_vector(env, "action_space")
         super().__init__(env, bounds.low, bounds.high)
         start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
@@ -112,31 +104,27 @@ class PreviousInput(_Appending):
             raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
         if not np.all(np.isfinite(start)):
             raise ValueError(
-                f"initial = {start.tolist()} must be finite: give the input that acts before the "
-                "first step, or leave it out for the operating point."
+                f"initial = {start.tolist()} must be finite: the input that acts before the first "
+                "step, or None for the operating point."
             )
         self.initial: Array = np.clip(start, bounds.low, bounds.high)
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        return self.joined(observation, self.initial if u is None else u)
+        return _joined(observation, self.initial if u is None else u)
 
 
 class SetPoint(_Appending):
-    """Appends the reference r (p,): drawn uniformly, or of a schedule.
-
-    The observation after a step shows the reference that the next action is to follow.
+    """Appends the reference r (p,) for the next action: drawn uniformly, or of a schedule.
 
     Parameters
     ----------
-    env : gymnasium.Env
-        With one-dimensional Box spaces.
+    env : gymnasium.Env, with one-dimensional Box spaces
     low, high : array_like, shape (p,)
         The box of references, ``r_min`` and ``r_max`` of the problem.
     hold : int, optional
         Steps after which another one is drawn. The default is one reference for each episode.
     schedule : callable, optional
-        ``schedule(step) -> r`` gives the reference after so many steps of an episode, instead of
-        a random one.
+        ``schedule(step) -> r`` replaces the random reference after so many steps of an episode.
 
     Examples
     --------
@@ -148,7 +136,7 @@ class SetPoint(_Appending):
 
     def __init__(
         self,
-        env: gym.Env[Vector, Vector],
+        env: Env,
         low: ArrayLike,
         high: ArrayLike,
         *,
@@ -159,10 +147,8 @@ class SetPoint(_Appending):
         if not np.all(np.isfinite([self.low, self.high])):
             raise ValueError("low and high must be finite: references are drawn between them.")
         if hold is not None:
-            hint = "It counts steps; None is one reference in each episode."
-            as_whole("hold", hold, hint=hint)
-        self.hold, self.schedule = hold, schedule
-        self.steps = 0
+            as_whole("hold", hold, hint="It counts steps; None is one reference in each episode.")
+        self.hold, self.schedule, self.steps = hold, schedule, 0
         self.reference: Array = np.zeros(len(self.low))
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
@@ -170,7 +156,7 @@ class SetPoint(_Appending):
         scheduled, held = self.schedule is not None, self.hold and self.steps % self.hold == 0
         if u is None or scheduled or held:
             self.reference = self._next()
-        return self.joined(observation, self.reference)
+        return _joined(observation, self.reference)
 
     def _next(self) -> Array:
         if self.schedule is None:
@@ -192,8 +178,7 @@ class MeasuredDisturbance(_Appending):
 
     Parameters
     ----------
-    env : gymnasium.Env
-        With one-dimensional Box spaces.
+    env : gymnasium.Env, with one-dimensional Box spaces
     low, high : array_like, shape (d,)
         The box of disturbances, ``d_min`` and ``d_max`` of the problem.
     key : str, default "disturbance"
@@ -209,13 +194,7 @@ class MeasuredDisturbance(_Appending):
     0.25
     """
 
-    def __init__(
-        self,
-        env: gym.Env[Vector, Vector],
-        low: ArrayLike,
-        high: ArrayLike,
-        key: str = "disturbance",
-    ) -> None:
+    def __init__(self, env: Env, low: ArrayLike, high: ArrayLike, key: str = "disturbance") -> None:
         super().__init__(env, low, high)
         if not isinstance(key, str):
             raise TypeError(f"key = {key!r} must be a str, the entry of info that holds d.")
@@ -224,13 +203,10 @@ class MeasuredDisturbance(_Appending):
         self.failing = np.zeros(self.low.shape, dtype=bool)
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        return self.joined(observation, self._measured(info))
-
-    def _measured(self, info: dict[str, Any]) -> Array:
         if self.key not in info:
             raise ValueError(
-                f"info has no {self.key!r}, only {sorted(info)}. Name the entry that holds the "
-                "measured disturbance: MeasuredDisturbance(env, low, high, key=...)."
+                f"info has no {self.key!r}, only {sorted(info)}. Pass the name of the entry that "
+                "holds the measured disturbance as key."
             )
         d = np.atleast_1d(np.asarray(info[self.key], np.float64))
         if d.shape != self.low.shape:
@@ -242,10 +218,10 @@ class MeasuredDisturbance(_Appending):
                 f"info[{self.key!r}] = {d.tolist()} is not finite: {self.held.tolist()} holds "
                 "until it is again. Mend the sensor.",
                 NonFiniteWarning,
-                stacklevel=4,
+                stacklevel=3,
             )
         self.failing = failing
-        return self.held
+        return _joined(observation, self.held)
 
 
 class ObserveDisturbance(_Appending):
@@ -256,13 +232,11 @@ class ObserveDisturbance(_Appending):
 
     Parameters
     ----------
-    env : gymnasium.Env
-        With one-dimensional Box spaces.
+    env : gymnasium.Env, with one-dimensional Box spaces
     observer : DisturbanceObserver
         Copied, so that each env has an estimate of its own.
     low, high : array_like, shape (d,)
-        The box of disturbances, ``d_min`` and ``d_max`` of the problem. The estimate is shown
-        clipped to it, since the law holds inside it; the observer keeps its own.
+        ``d_min`` and ``d_max`` of the problem, to which the shown estimate is clipped.
 
     Examples
     --------
@@ -274,11 +248,7 @@ class ObserveDisturbance(_Appending):
     """
 
     def __init__(
-        self,
-        env: gym.Env[Vector, Vector],
-        observer: DisturbanceObserver,
-        low: ArrayLike,
-        high: ArrayLike,
+        self, env: Env, observer: DisturbanceObserver, low: ArrayLike, high: ArrayLike
     ) -> None:
         if not isinstance(observer, DisturbanceObserver):
             raise TypeError(f"observer = {observer!r} must be a DisturbanceObserver.")
@@ -291,18 +261,17 @@ class ObserveDisturbance(_Appending):
         self.observer = copy.deepcopy(observer)
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        measured, rest = np.split(observation, [self.observer.n_measured])
         observer = self.observer
+        measured, rest = np.split(observation, [observer.n_measured])
         x_hat, d_hat = observer.reset(measured) if u is None else observer.update(measured, u)
-        return self.joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
+        return _joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
 
 
 class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Makes the reward minus the stage cost of the problem, for which the critic is exact.
 
-    An env knows no reference, so its own reward cannot be the cost of following one. The cost is
-    that of the observed theta and of the input played there. A step in which the input moves by
-    more than the problem allows reports ``info["violation"]``.
+    The cost is that of the observed theta and of the input played there. A step in which the input
+    moves by more than the problem allows reports ``info["violation"]``.
 
     Parameters
     ----------
@@ -321,20 +290,15 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     True
     """
 
-    def __init__(
-        self,
-        env: gym.Env[Vector, Vector],
-        problem: LinearMPC,
-        violation_cost: float = 0.0,
-    ) -> None:
+    def __init__(self, env: Env, problem: LinearMPC, violation_cost: float = 0.0) -> None:
         super().__init__(env)
         space = _require_vector(env, "observation_space")
         self.inputs = _require_vector(env, "action_space")
+        names = problem.layout.names
         if space.shape != (problem.n_theta,):
             raise ValueError(
-                f"The observation has shape {space.shape}, but theta = "
-                f"[{', '.join(problem.layout.names)}] has {problem.n_theta} entries. Wrap the "
-                "env so that it shows all of them, in this order."
+                f"The observation has shape {space.shape}, but theta = [{', '.join(names)}] has "
+                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order."
             )
         self.problem, self.violation_cost = problem, as_number("violation_cost", violation_cost)
         self.theta: Array = np.zeros(problem.n_theta)
@@ -363,9 +327,8 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
             return False
         moved = u - self.theta[mpc.layout.previous]
         rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
-        return bool(
-            np.any((moved < mpc.rate.du_min - rounding) | (moved > mpc.rate.du_max + rounding))
-        )
+        low, high = mpc.rate.du_min - rounding, mpc.rate.du_max + rounding
+        return bool(np.any((moved < low) | (moved > high)))
 
 
 def _require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:

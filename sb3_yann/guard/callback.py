@@ -94,7 +94,7 @@ class ImprovementGuard(BaseCallback):
     model: OffPolicyAlgorithm
     _handler: Handler | None = None
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
         self,
         env: Simulator | None,
         *,

@@ -28,7 +28,7 @@ class RowAdam(th.optim.Optimizer):
     >>> optimizer = RowAdam([table], lr=0.1)
     >>> table[1].sum().backward()
     >>> optimizer.step()
-    >>> [round(entry, 6) for entry in table[:, 0].tolist()]
+    >>> [round(each, 3) for each in table[:, 0].tolist()]
     [0.0, -0.1]
     """
 

@@ -26,27 +26,6 @@ class ExplicitSolutionError(RuntimeError):
     """
 
 
-def certify(program: ParametricQP, regions: list[Region], center: Array, half: Array) -> None:
-    """Check the regions of a scaled program without trusting what found them.
-
-    - An independent QP is solved at the innermost point of every region.
-    - The law of every region solves the Karush-Kuhn-Tucker (KKT) equations of its active set, and
-      its half-spaces imply their inequalities: then it is optimal in all of the region.
-    - Across each facet where constraint k becomes active, or inactive, lies the region of the
-      active set with k added, or removed: their KKT conditions agree on the facet, so it covers
-      all of its other side. Where there is no such region, a QP just across the middle of the facet
-      must be infeasible, or another region there.
-    - QPs at random points of the box agree with the region there, or are infeasible.
-    - No region lies in another one.
-
-    Raises
-    ------
-    ExplicitSolutionError
-        With a theta that shows what is wrong; center and half take it to the units of the problem.
-    """
-    Certificate(program, regions, center, half).check()
-
-
 def _as_bits(active_set: Iterable[int]) -> int:
     """Return a set of constraints as a whole number, with bit k for constraint k."""
     return sum(1 << k for k in active_set)
@@ -59,7 +38,25 @@ def _sets(multipliers: Array) -> list[int]:
 
 
 class Certificate:
-    """The checks of a list of regions, see :func:`certify`."""
+    """The check of the regions of a scaled program, without trust in what found them.
+
+    - An independent QP is solved at the innermost point of every region.
+    - The law of every region solves the Karush-Kuhn-Tucker (KKT) equations of its active set, and
+      its half-spaces imply their inequalities: then it is optimal in all of the region.
+    - Across each facet where constraint k becomes active, or inactive, lies the region of the
+      active set with k added, or removed: their KKT conditions agree on the facet, so it covers
+      all of its other side. Where there is no such region, a QP just across the middle of the facet
+      must be infeasible, or another region there.
+    - QPs at random points of the box agree with the region there, or are infeasible.
+    - No region lies in another one.
+
+    Parameters
+    ----------
+    program, regions : ParametricQP, list of Region
+        The scaled program, and what was found.
+    center, half : ndarray, shape (n,)
+        Take theta to the units of the problem.
+    """
 
     def __init__(
         self, program: ParametricQP, regions: list[Region], center: Array, half: Array
@@ -74,7 +71,7 @@ class Certificate:
         ])  # fmt: skip
 
     def check(self) -> None:
-        """Raise ExplicitSolutionError unless all of them pass."""
+        """Raise ExplicitSolutionError, with a theta that shows what is wrong, unless all pass."""
         if not self.regions:
             self._fail("no region was found", self.center * 0)
         self.A, self.b = (

@@ -9,7 +9,7 @@ from scipy import optimize
 
 from sb3_yann._validation import Array, as_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
-from sb3_yann.control.explicit.certificate import ExplicitSolutionError, certify
+from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
 from sb3_yann.control.explicit.facet_walk import walk
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
@@ -32,6 +32,7 @@ def solve_explicit(
     Parameters
     ----------
     program : ParametricQP
+        The condensed problem.
     u_min, u_max : ndarray, shape (m,)
         The input range, in which tolerances are measured; infinite where there is none.
     infeasible : {"nearest_region", "zero_input"}
@@ -41,14 +42,7 @@ def solve_explicit(
     budget : SolveBudget
         When to give up.
 
-    Raises
-    ------
-    ValueError
-        If the box of parameters is not bounded, or hardly any parameter in it is feasible.
-    ExplicitLimitError
-        If a limit is reached.
-    ExplicitSolutionError
-        If the solution fails its check.
+    Its errors are those of :meth:`LinearMPC.explicit`.
     """
     as_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
@@ -57,12 +51,12 @@ def solve_explicit(
     with BudgetTimer(budget) as timer:
         regions = _critical_regions(units.scaled, solver, timer)
         try:
-            certify(units.scaled, regions, units.center, units.half)
+            Certificate(units.scaled, regions, units.center, units.half).check()
         except ExplicitSolutionError as error:
             if solver == "walk":
                 raise
             raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
-        return units.law(regions, u_min, u_max, infeasible)
+        return units.law(regions, infeasible)
 
 
 def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> list[Region]:
@@ -83,20 +77,18 @@ class ProgramUnits:
         steps = (len(program.c) - program.n_slacks) // len(u_min)
         reach = np.tile(half_widths(u_min, u_max), steps)
         self.reach = np.concatenate([reach, np.ones(program.n_slacks)])
-        self.program = program
+        self.program, self.input_range = program, (u_min, u_max)
         self.scaled = program.scaled(self.center, self.half, self.reach)
 
-    def law(
-        self, regions: list[Region], u_min: Array, u_max: Array, infeasible: str
-    ) -> PiecewiseAffine:
+    def law(self, regions: list[Region], infeasible: str) -> PiecewiseAffine:
         """Return the law of the first inputs in the units of the problem."""
-        m, reach, half = len(u_min), self.reach, self.half
+        m, reach, half = len(self.input_range[0]), self.reach, self.half
         gains = np.stack([reach[:m, None] * region.gain[:m] / half for region in regions])
         offsets = np.stack([reach[:m] * region.offset[:m] for region in regions])
         A = np.concatenate([region.A / half for region in regions])
         b = np.concatenate([region.b for region in regions]) + A @ self.center
         starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
-        ranges = u_min, u_max, self.program.theta_min, self.program.theta_max
+        ranges = *self.input_range, self.program.theta_min, self.program.theta_max
         offsets = offsets - gains @ self.center
         return PiecewiseAffine(gains, offsets, A, b, starts, *ranges, infeasible, disjoint=True)
 

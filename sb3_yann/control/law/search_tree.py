@@ -103,6 +103,13 @@ def build_tree(
 
     Vertices tell on which side a region lies. Rounding may move some: a search has to check its
     result by the slack. The draws are seeded: a law always gives the same tree.
+
+    Parameters
+    ----------
+    A, b, starts : ndarray, shapes (q, n), (q,) and (p,)
+        The half-spaces of all regions, and the first row of each region.
+    theta_min, theta_max : ndarray, shape (n,)
+        The box.
     """
     center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
     regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))
@@ -173,7 +180,7 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
     "void(float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
     "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1], int64[::1])"
 )
-def _hits(
+def _hits(  # noqa: PLR0913 - a compiled function takes arrays
     normals: Array,
     levels: Array,
     children: Integers,

@@ -56,15 +56,8 @@ def theta_box(
 ) -> Bounds:
     """Return the box of theta: that of the states, and those of r, d and the previous input.
 
-    Parameters
-    ----------
-    layout : ThetaLayout
-    given : pair of array_like or None
-        theta_min and theta_max: a number, (n,) for the states, or (n_theta,) as stored.
-    states : pair of ndarray, shape (n,)
-        The box of the states where none is given.
-    others : sequence of pairs
-        The boxes of r, d and the previous input, from which those given must not differ.
+    What is given is a number, (n,) for the states, or (n_theta,) as stored: it must not differ from
+    the others. None takes the box of states.
     """
     n, parts = layout.n_states, []
     for value, fallback in zip(given, states, strict=True):

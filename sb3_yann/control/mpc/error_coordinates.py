@@ -61,6 +61,11 @@ def error_system(
 
     The stage cost is ``e'Qe + v'Rv + (u - u_prev)'R_du(u - u_prev)``, with ``e = x - x_s`` and
     ``v = u - u_s``.
+
+    Parameters
+    ----------
+    model, layout, steady, Q, R, R_du : LinearModel, ThetaLayout, SteadyStates, ndarray
+        Of the problem.
     """
     n, m = model.B.shape
     to_error, to_input = np.zeros((n, layout.size)), np.zeros((m, layout.size))

@@ -1,8 +1,4 @@
-"""The groups of arguments that a problem may have, each checked as far as it can be alone.
-
-Bounds may be single numbers; a problem stores its groups by :meth:`sized`, with arrays of full
-shape.
-"""
+"""The groups of arguments that a problem may have; `sized` gives their arrays the full shape."""
 
 from __future__ import annotations
 

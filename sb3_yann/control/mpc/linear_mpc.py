@@ -119,7 +119,7 @@ class LinearMPC(MPCProblem):
     array([1.])
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the keywords of a problem
         self,
         model: LinearModel,
         *,

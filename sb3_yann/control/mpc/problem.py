@@ -27,6 +27,15 @@ class MPCProblem(ReadOnlyArrays):
     """The arguments of a :class:`LinearMPC`, checked: all of them arrays of full shape.
 
     Nothing is checked here: a :class:`LinearMPC` is the problem whose constructor does.
+
+    Parameters
+    ----------
+    model, Q, R, horizon, gamma, infeasible : LinearModel, ndarray, int, float, str
+        The model, the weights and the options.
+    x_min, x_max, u_min, u_max, theta_min, theta_max : ndarray
+        The bounds, of shapes (n,), (m,) and (n_theta,).
+    tracking, disturbances, rate, outputs, soft, terminal : groups of arguments
+        Each by its ``sized``.
     """
 
     model: LinearModel

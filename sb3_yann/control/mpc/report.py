@@ -23,11 +23,12 @@ def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: 
 
     Parameters
     ----------
-    problem : MPCProblem
-    law : PiecewiseAffine
+    problem, law : MPCProblem, PiecewiseAffine
+        What is reported.
     samples : int, default 500
         Points drawn uniformly from the box of parameters: shares are good to 1 / sqrt(samples).
     seed : int, default 0
+        Of the draws.
 
     Raises
     ------

@@ -37,9 +37,11 @@ def steady_states(
     Parameters
     ----------
     model : LinearModel
+        n states and m inputs.
     C : ndarray, shape (p, n)
         The tracked outputs; p = 0 for none.
     Q, R : ndarray, shapes (n, n) and (m, m)
+        The weights.
     x_unit, u_unit : ndarray, shapes (n,) and (m,)
         Typical sizes, which make ranks and norms independent of the units of the plant.
 

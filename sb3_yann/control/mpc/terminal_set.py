@@ -24,11 +24,10 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     bounds of x, u, y and the rate for ever on the model, with r and d constant. Soft bounds do not
     count, and neither does a box of states given by ``theta_min`` and ``theta_max`` alone.
 
-    The bounds after 0, 1, 2 ... steps are added until those of the next step are all redundant, by
-    linear programs. r and d never decay: with steady states inside the bounds by one percent, the
-    number of steps is finite. Their box is taken for granted, and so are the bounds of ``u_prev``.
-    Gilbert & Tan, Linear systems with state and control constraints, IEEE Trans. Autom. Control 36
-    (1991), Section V.
+    Bounds of later steps are added until those of the next are all redundant. With steady states
+    inside the bounds by one percent, the number of steps is finite. The box of r and d is taken for
+    granted, and so are the bounds of ``u_prev``. Gilbert & Tan, Linear systems with state and
+    control constraints, IEEE Trans. Autom. Control 36 (1991), Section V.
 
     Raises
     ------

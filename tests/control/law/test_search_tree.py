@@ -165,7 +165,7 @@ def test_a_tree_is_saved_with_its_law_and_copied_with_it(tmp_path: Path, monkeyp
     replace(law).save(tmp_path / "law.npz")  # one that has never been called
     copy = pickle.loads(pickle.dumps(replace(law)))
     law(np.zeros(law.n_theta))
-    monkeypatch.setattr("sb3_yann.control.law.piecewise_affine.build_tree", None)  # not built anew
+    monkeypatch.setattr("sb3_yann.control.law.search_tree.build_tree", None)  # not built anew
     points = in_box(law, 100)
     for other in (PiecewiseAffine.load(tmp_path / "law.npz"), copy):
         assert other == law
