@@ -24,13 +24,12 @@ def input_notes(
     for j, (name, (lag, correlation)) in enumerate(zip(names, delays, strict=True)):
         idle = _chance(found, n, n + j) > CHANCE
         late = (
-            f"the residuals follow {name} of {lag} steps before (correlation {correlation:.2f}): "
+            f"he residuals follow {name} of {lag} steps before (correlation {correlation:.2f}): "
             f"it acts {lag} samples late. Append its last {lag} values to the state of each row."
         )
-        if idle and lag:
-            notes.append(f"{name} has no effect that can be told from 0, and {late}")
-        elif lag:
-            notes.append(late[0].upper() + late[1:])
+        if lag:
+            start = f"{name} has no effect that can be told from 0, and t" if idle else "T"
+            notes.append(start + late)
         elif idle:
             notes.append(
                 f"{name} has no effect on the next state that can be told from 0. Is it delayed by "
