@@ -29,6 +29,11 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
     return _frozen(array)
 
 
+def as_vector(name: str, value: ArrayLike | None, size: int) -> Array:
+    """Return ``value`` as a finite array of shape ``(size,)``, zeros for None."""
+    return as_array(name, np.zeros(size) if value is None else value, (size,))
+
+
 def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
     """Return ``value`` as a symmetric positive (semi-)definite ``(size, size)`` matrix."""
     matrix = as_array(name, value, (size, size))

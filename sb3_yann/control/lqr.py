@@ -1,7 +1,7 @@
 """Discounted linear-quadratic control: value, gain, and the state-action value matrix.
 
-Costs are ``sum_k gamma^k (x' Q x + 2 x' N u + u' R u)``, weighed by Q (n, n), R (m, m) and N (n, m),
-the argument ``cross``, zero by default. With gamma in (0, 1], ``sqrt(gamma) A`` (n, n) and
+Costs are ``sum_k gamma^k (x' Q x + 2 x' N u + u' R u)``, weighed by Q (n, n), R (m, m) and N (n,
+m), the argument ``cross``, zero by default. With gamma in (0, 1], ``sqrt(gamma) A`` (n, n) and
 ``sqrt(gamma) B`` (n, m) of the model obey the undiscounted equations. P (n, n) weighs the state
 after one step; K (m, n) is the gain of the law ``u = -K x``.
 """
@@ -93,8 +93,7 @@ def _why_no_solution(A: Array, B: Array) -> str:
         if abs(pole) > 1 - 1e-9 and smallest < 1e-10 * max(1.0, np.abs(hautus).max()):
             return (
                 f"The model has an unstable mode that no input reaches: eigenvalue {pole:.6g} of "
-                "sqrt(gamma) A is not controllable, so the Riccati equation has no solution. "
-                "Remove the mode from the model, add an input, or use a smaller gamma."
+                "sqrt(gamma) A. Remove the mode from the model, add an input, or lower gamma."
             )
     return (
         "The Riccati equation has no stabilizing solution: a mode on the unit circle carries no "

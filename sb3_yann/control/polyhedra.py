@@ -46,10 +46,7 @@ class Region:
 
 
 def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
-    """Return center and radius of a bounded polyhedron's largest ball, or of one of its facets.
-
-    The radius is negative for an empty polyhedron or facet.
-    """
+    """Return center and radius (negative: none) of a bounded polyhedron or facet's largest ball."""
     rows = np.empty((len(b), A.shape[1] + 1))
     rows[:, :-1], rows[:, -1] = A, 1.0
     if facet is not None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_between, as_positive
+from sb3_yann._validation import Array, as_between, as_positive, as_vector
 from sb3_yann.control.identification.input_delays import input_notes
 from sb3_yann.control.identification.least_squares import Regression, regress
 from sb3_yann.control.identification.logs import Episode, Log, as_episodes, split, without_gaps
@@ -51,7 +51,10 @@ def fit_log(  # noqa: PLR0913 - those of `identify`
     if d_ss is not None and disturbances is None:
         raise ValueError("d_ss is given, but there are no disturbances: pass these as well.")
     point = {"x_ss": (x_ss, n), "u_ss": (u_ss, m), "d_ss": (d_ss, d)}
-    given = [_given(name, *part, offset) for name, part in point.items()]
+    given = [
+        None if value is None and offset else as_vector(name, value, size)
+        for name, (value, size) in point.items()
+    ]
     fitted, tested = split(episodes, as_between("held_out", held_out, 0, 1, "[)"))
     weight = as_between("ridge", ridge, 0, np.inf)
     origin = None if offset else np.concatenate([part for part in given if part is not None])
@@ -65,13 +68,6 @@ def fit_log(  # noqa: PLR0913 - those of `identify`
     if lost:
         notes.append(f"{lost} steps that took another time than dt were left out.")
     return LogFit(replace(system, notes=tuple(notes)), found, fits)
-
-
-def _given(name: str, value: ArrayLike | None, size: int, offset: bool) -> Array | None:
-    """Return a given part of the operating point, None if it is to be found."""
-    if value is None:
-        return None if offset else np.zeros(size)
-    return as_array(name, value, (size,))
 
 
 def _system(
@@ -135,8 +131,8 @@ def _quality(
     if np.any(colored):
         notes.append(
             f"The residuals of neighboring steps are correlated ({_list(found.autocorrelation)}): "
-            "there is sensor noise, which biases A towards zero, or an unmodeled state. The standard "
-            "errors do not tell that."
+            "there is sensor noise, which biases A towards zero, or an unmodeled state. The "
+            "standard errors do not tell that."
         )
     return notes
 

@@ -8,9 +8,11 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.logs import Episode
+from sb3_yann.control.linear_system import combination, names
 
 WEAKEST = 1e-6  # least excitation, below which float32 rounding alone may be what moves
 
+SMALL = 0.05  # relative weight below which a regressor is left out of a combination
 NOT_EXCITED = (
     "What does not move cannot be identified. Add a test signal to each input, independent of the "
     "state (a feedback law alone ties the inputs to it), leave out states that are constant or "
@@ -70,10 +72,11 @@ def regress(
     still = spread <= 1e-10 * np.max(np.abs(regressors), axis=0)
     scale = np.where(still, 1.0, spread)
     left, singular, right = np.linalg.svd(np.where(still, 0.0, centered / scale), False)
+    labels = names(sizes)
     missing = [v for s, v in zip(singular, right, strict=True) if s <= WEAKEST * singular[0]]
     if missing and ridge == 0:
-        still = [f"{_direction(v / scale, v, sizes)} never changes" for v in missing]
-        raise ValueError(f"The data do not excite the plant: {'; '.join(still)}. {NOT_EXCITED}")
+        fixed = [f"{combination(v / scale, v, labels, SMALL, 4)} never changes" for v in missing]
+        raise ValueError(f"The data do not excite the plant: {'; '.join(fixed)}. {NOT_EXCITED}")
     inverse = right.T * (singular / (singular**2 + ridge)) if ridge else right.T / singular
     coefficients = ((inverse @ left.T @ (targets - reached)) / scale[:, None]).T
     residuals = targets - reached - centered @ coefficients.T
@@ -91,19 +94,8 @@ def regress(
         degrees_of_freedom=steps - unknowns,
         steps=steps,
         excitation=float(singular[-1] / singular[0]) if singular[0] > 0 else 0.0,
-        weakest=_direction(right[-1] / scale, right[-1], sizes),
+        weakest=combination(right[-1] / scale, right[-1], labels, SMALL, 4),
     )
-
-
-def _direction(coefficients: Array, weights: Array, sizes: tuple[int, int, int]) -> str:
-    """Return a combination of regressors in words, without the terms of small `weights`."""
-    names = [f"{k}[{i}]" for k, size in zip("xud", sizes, strict=True) for i in range(size)]
-    kept = np.flatnonzero(np.abs(weights) > 0.05 * np.max(np.abs(weights)))
-    first = coefficients[kept[np.argmax(np.abs(weights[kept]))]]
-    if kept.size == 1:
-        return names[int(kept[0])]
-    terms = [f"{coefficients[i] / first:+.4g} {names[i]}" for i in kept]
-    return " ".join(terms).removeprefix("+")
 
 
 def _autocorrelation(residuals: Array, episodes: list[Episode], targets: Array) -> Array:

@@ -100,7 +100,7 @@ def without_gaps(episodes: list[Episode], time: Log, dt: float) -> tuple[list[Ep
 def _times(value: Log) -> list[Array]:
     """Return one vector of times for each episode."""
     if isinstance(value, (list, tuple)) and len(value) > 0 and np.ndim(value[0]) == 1:
-        return [to_float(f"time of episode {i}", part) for i, part in enumerate(value)]  # type: ignore[arg-type]
+        return [to_float(f"time of episode {i}", part) for i, part in enumerate(value)]
     array = to_float("time", value)
     return list(array) if array.ndim == 2 else [array]
 

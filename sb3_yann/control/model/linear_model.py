@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_positive, same_fields
+from sb3_yann._validation import Array, as_array, as_positive, as_vector, same_fields
 from sb3_yann.control.identification.fit import fit_log
+from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.linear_system import LinearSystem, zero_order_hold
 from sb3_yann.control.linearization.linearize import linearize_dynamics, linearize_env
 from sb3_yann.control.model.report import describe
@@ -75,13 +76,9 @@ class LinearModel(LinearSystem):
         E = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
         if d_ss is not None and np.size(d_ss) and not E.size:
             raise ValueError(f"d_ss = {d_ss!r} is given, but no disturbances: pass E too.")
-        dt, x, u = (
-            as_positive("dt", dt),
-            _vector("x_ss", x_ss, n),
-            _vector("u_ss", u_ss, B.shape[1]),
-        )
-        d, drift = _vector("d_ss", d_ss, E.shape[1]), _vector("drift", drift, n)
-        super().__init__(A, B, dt, x, u, E, d, tuple(notes), drift)
+        x, u = as_vector("x_ss", x_ss, n), as_vector("u_ss", u_ss, B.shape[1])
+        d, moved = as_vector("d_ss", d_ss, E.shape[1]), as_vector("drift", drift, n)
+        super().__init__(A, B, as_positive("dt", dt), x, u, E, d, tuple(notes), moved)
 
     @classmethod
     def from_continuous(
@@ -209,8 +206,8 @@ class LinearModel(LinearSystem):
     @classmethod
     def from_data(
         cls,
-        states: ArrayLike | Sequence[ArrayLike],
-        actions: ArrayLike | Sequence[ArrayLike],
+        states: Log,
+        actions: Log,
         *,
         dt: float,
         **options: Any,
@@ -219,10 +216,8 @@ class LinearModel(LinearSystem):
 
         Parameters
         ----------
-        states : array_like, shape (T+1, n), or a sequence of such
-            Each episode's states, before every action and after the last.
-        actions : array_like, shape (T, m), or a sequence of such
-            The inputs as they were executed.
+        states, actions : array_like, shapes (T+1, n) and (T, m), or sequences of such
+            States before every action and after the last, and the inputs as they were executed.
         dt : float
             Sampling time.
         **options
@@ -293,7 +288,3 @@ class LinearModel(LinearSystem):
     def __hash__(self) -> int:
         """Return a hash that equal models share."""
         return hash((self.A.tobytes(), self.B.tobytes(), self.dt, self.E.tobytes()))
-
-
-def _vector(name: str, value: ArrayLike | None, size: int) -> Array:
-    return as_array(name, np.zeros(size) if value is None else value, (size,))
