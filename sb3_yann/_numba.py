@@ -22,12 +22,9 @@ def compiled_sources(package: Path) -> list[Path]:
     return [Path(__file__), *held]
 
 
-def _hash(files: Sequence[Path]) -> str:
-    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
-
-
-SOURCES = _hash(compiled_sources(Path(__file__).parent))
-"""One stamp for all files: their functions call each other."""
+# One stamp for all files: their functions call each other.
+TEXTS = (each.read_bytes() for each in compiled_sources(Path(__file__).parent))
+SOURCES = hashlib.sha256(b"".join(TEXTS)).hexdigest()
 
 
 def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
@@ -42,16 +39,13 @@ def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     options["fastmath"] = {"reassoc", "contract", "nsz"} if fastmath else False
 
-    def compile_it(function: F) -> F:
+    def compile_it(function: F) -> Any:
         if not signatures or numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-            part: F = numba.njit(**options)(function)
-            return part
-        result: F
+            return numba.njit(**options)(function)
         try:
-            result = _compile(numba.njit(**options)(function), signatures, keep=True)
+            return _compile(numba.njit(**options)(function), signatures, keep=True)
         except Exception:  # no folder to write to, a full disk, a damaged file
-            result = _compile(numba.njit(**options)(function), signatures, keep=False)
-        return result
+            return _compile(numba.njit(**options)(function), signatures, keep=False)
 
     return compile_it
 

@@ -23,15 +23,16 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
         isinstance(want, int) and got != want for got, want in zip(array.shape, shape, strict=True)
     ):
         wanted = ", ".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]},"
-        hint = (
-            " Write a matrix as a list of rows, [[...], [...]]."
-            if array.ndim < len(shape) == 2
-            else ""
-        )
+        hint = " Write a matrix as rows, [[...], [...]]." if array.ndim < len(shape) == 2 else ""
         raise ValueError(f"{name} has shape {array.shape}, expected ({wanted}).{hint}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds NaN or infinite entries: {array.tolist()}.")
     return _frozen(array)
+
+
+def as_vector(name: str, value: ArrayLike | None, size: int) -> Array:
+    """Return ``value`` as a finite array of shape ``(size,)``, zeros for None."""
+    return as_array(name, np.zeros(size) if value is None else value, (size,))
 
 
 def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
@@ -43,15 +44,10 @@ def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = Fal
             f"{name} is not symmetric: {matrix.tolist()}. Pass ({name} + {name}.T) / 2."
         )
     smallest = float(np.linalg.eigvalsh(matrix)[0])
-    if definite and smallest <= 0:
-        raise ValueError(
-            f"{name} must be positive definite, its smallest eigenvalue is {smallest:g}. "
-            "Give every input a positive weight."
-        )
-    if smallest < -1e-9 * scale:
-        raise ValueError(
-            f"{name} must be positive semi-definite, its smallest eigenvalue is {smallest:g}."
-        )
+    if smallest < -1e-9 * scale or (definite and smallest <= 0):
+        kind, hint = ("", " Give every input a positive weight.") if definite else ("semi-", "")
+        fault = f"its smallest eigenvalue is {smallest:g}"
+        raise ValueError(f"{name} must be positive {kind}definite, {fault}.{hint}")
     return _frozen((matrix + matrix.T) / 2)
 
 
@@ -66,10 +62,8 @@ def as_bounds(
     high = _bound(f"{name}_max", upper, size, np.inf)
     if np.any(low >= high):
         i = int(np.argmax(low >= high))
-        raise ValueError(
-            f"{name}_min must lie below {name}_max, but entry {i} has "
-            f"{name}_min = {low[i]:g} and {name}_max = {high[i]:g}."
-        )
+        given = f"{name}_min = {low[i]:g} and {name}_max = {high[i]:g}"
+        raise ValueError(f"{name}_min must lie below {name}_max, but entry {i} has {given}.")
     return low, high
 
 
@@ -99,10 +93,9 @@ def as_output_rows(
         return as_array(name, value, ("q", "n"))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
     if not whole or np.any(entries < 0) or np.any(entries > most):
-        limit = f"from 0 to {most}" if np.isfinite(most) else "from 0 on"
         raise ValueError(
-            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers "
-            f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
+            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers from "
+            f"0 to {most}, or an output matrix as a list of rows, [[...], [...]]."
         )
     return entries.astype(int)
 
@@ -229,11 +222,8 @@ def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:
-    if value is None:
-        return _frozen(np.full(size, missing))
-    array = to_float(name, value)
-    if array.ndim == 0:
-        array = np.full(size, float(array))
+    array = to_float(name, missing if value is None else value)
+    array = np.full(size, float(array)) if array.ndim == 0 else array
     if array.shape != (size,):
         raise ValueError(f"{name} has shape {array.shape}, expected ({size},) or a single number.")
     if np.any(np.isnan(array)):

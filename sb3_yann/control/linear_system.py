@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,35 @@ class LinearSystem(ReadOnlyArrays):
     def n_disturbances(self) -> int:
         """Number of measured disturbances d."""
         return int(self.E.shape[1])
+
+
+def names(sizes: Sequence[int]) -> list[str]:
+    """Return ``x[0], ..., u[0], ..., d[0], ...`` for so many states, inputs and disturbances."""
+    return [f"{k}[{i}]" for k, size in zip("xud", sizes, strict=False) for i in range(size)]
+
+
+def combination(
+    coefficients: Array, weights: Array, labels: list[str], least: float, digits: int
+) -> str:
+    """Return a linear combination in words, scaled so that the term of largest weight has 1.
+
+    Parameters
+    ----------
+    coefficients, weights : ndarray, shape (k,)
+        The factors, and what they count for.
+    labels : list of str
+        Names of what is combined.
+    least : float
+        Weight, relative to the largest, below which a term is left out.
+    digits : int
+        Of each factor.
+    """
+    kept = np.flatnonzero(np.abs(weights) > least * np.max(np.abs(weights)))
+    first = coefficients[kept[np.argmax(np.abs(weights[kept]))]]
+    if kept.size == 1:
+        return labels[int(kept[0])]
+    terms = [f"{coefficients[i] / first:+.{digits}g} {labels[i]}" for i in kept]
+    return " ".join(terms).removeprefix("+")
 
 
 def zero_order_hold(A: Array, B: Array, E: Array, dt: float) -> tuple[Array, Array, Array]:

@@ -1,13 +1,9 @@
 """Discounted linear-quadratic control: value, gain, and the state-action value matrix.
 
-Costs are ``sum_k gamma^k (x' Q x + 2 x' N u + u' R u)``, where N, the argument ``cross``, is zero
-unless given. The discount is absorbed by the substitution ``A -> sqrt(gamma) A``,
-``B -> sqrt(gamma) B``, after which the undiscounted equations hold. The functions take
-
-- ``model``: A (n, n) and B (n, m) in discrete time;
-- ``Q`` (n, n), ``R`` (m, m) and ``cross`` (n, m): weights of the stage cost;
-- ``P`` (n, n): weight of the cost after one step; ``K`` (m, n): gain of the law ``u = -K x``;
-- ``gamma``: discount in (0, 1].
+Costs are ``sum_k gamma^k (x' Q x + 2 x' N u + u' R u)``, weighed by Q (n, n), R (m, m) and N (n,
+m), the argument ``cross``, zero by default. With gamma in (0, 1], ``sqrt(gamma) A`` (n, n) and
+``sqrt(gamma) B`` (n, m) of the model obey the undiscounted equations. P (n, n) weighs the state
+after one step; K (m, n) is the gain of the law ``u = -K x``.
 """
 
 from __future__ import annotations
@@ -25,12 +21,7 @@ def riccati(
     """Return P (n, n) with ``x' P x`` the smallest discounted cost from x, without constraints.
 
     It solves ``P = Q + g A'PA - (g A'PB + N) (R + g B'PB)^-1 (g B'PA + N')`` for ``g = gamma``.
-
-    Raises
-    ------
-    ValueError
-        If no stabilizing solution exists: an unstable mode is uncontrollable under the discount,
-        or a mode on the unit circle carries no cost.
+    A model without a stabilizing solution raises ValueError with the reason.
     """
     A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
     try:
@@ -61,17 +52,13 @@ def policy_value(
 
     It solves ``P = Q - NK - K'N' + K'RK + gamma (A - BK)' P (A - BK)``, a Lyapunov equation. Only
     this P makes the value of :func:`state_action_matrix` satisfy Bellman's equation along the law.
-
-    Raises
-    ------
-    ValueError
-        If the discounted closed loop is unstable: the cost is infinite.
+    An unstable discounted closed loop, of infinite cost, raises ValueError.
     """
     closed = np.sqrt(gamma) * (model.A - model.B @ K)
     radius = spectral_radius(closed)
     if radius >= 1:
         raise ValueError(
-            f"The law u = -K x with K = {K.tolist()} has infinite cost: the spectral radius of "
+            f"The law u = -K x, K = {K.tolist()}, has infinite cost: the spectral radius of "
             f"sqrt(gamma) (A - BK) is {radius:.6g}, it must be below 1. Lengthen the horizon, use "
             "the default terminal cost, or a smaller gamma."
         )
@@ -100,15 +87,13 @@ def spectral_radius(matrix: Array) -> float:
 
 def _why_no_solution(A: Array, B: Array) -> str:
     """Return which condition of the Riccati equation fails (Hautus' test)."""
-    n = A.shape[0]
     for pole in np.linalg.eigvals(A):
-        hautus = np.hstack([pole * np.eye(n) - A, B])
+        hautus = np.hstack([pole * np.eye(len(A)) - A, B])
         smallest = np.linalg.svd(hautus, compute_uv=False)[-1]
         if abs(pole) > 1 - 1e-9 and smallest < 1e-10 * max(1.0, np.abs(hautus).max()):
             return (
                 f"The model has an unstable mode that no input reaches: eigenvalue {pole:.6g} of "
-                "sqrt(gamma) A is not controllable, so the Riccati equation has no solution. "
-                "Remove the mode from the model, add an input, or use a smaller gamma."
+                "sqrt(gamma) A. Remove the mode from the model, add an input, or lower gamma."
             )
     return (
         "The Riccati equation has no stabilizing solution: a mode on the unit circle carries no "

@@ -21,10 +21,8 @@ class DisturbanceObserver:
     The model is augmented to ``x+ = A x + B u + E d``, ``d+ = d``, ``y = C x``. In the theta of a
     :class:`LinearMPC` with the same model, ``d_hat`` replaces a measured disturbance. Measured
     tracked outputs then settle without offset (Pannocchia & Rawlings, Disturbance models for
-    offset-free model-predictive control, AIChE J. 49, 2003).
-
-    With as many disturbances as measured outputs the offset vanishes for any constant disturbance
-    and any model error that leaves the loop stable. With fewer, E must describe the disturbance.
+    offset-free model-predictive control, AIChE J. 49, 2003). With fewer disturbances than measured
+    outputs, E must describe the disturbance.
 
     Parameters
     ----------
@@ -40,9 +38,8 @@ class DisturbanceObserver:
 
     Raises
     ------
-    TypeError, ValueError
-        For arguments of the wrong type or shape, a disturbance that the measurements do not
-        determine, and a gain with an unstable error.
+    ValueError
+        For a disturbance that the measurements do not determine, and a gain with unstable error.
 
     Examples
     --------
@@ -76,24 +73,18 @@ class DisturbanceObserver:
         self.A = np.block([[model.A, model.E], [np.zeros((d, n)), np.eye(d)]])
         self.B = np.vstack([model.B, np.zeros((d, model.n_inputs))])
         self.seen = np.hstack([self.C, np.zeros((q, d))])
-        moves = np.concatenate(
-            [
-                as_positive_vector("state_noise", state_noise, n, STANDARD),
-                as_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD),
-            ]
-        )
+        moves = as_positive_vector("state_noise", state_noise, n, STANDARD)
+        drifts = as_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD)
         errors = as_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
-        self.gain = (
-            self._kalman_gain(np.diag(moves**2), np.diag(errors**2))
-            if gain is None
-            else as_array("gain", gain, (n + d, q))
-        )
+        if gain is None:
+            self.gain = self._kalman_gain(np.concatenate([moves, drifts]), errors)
+        else:
+            self.gain = as_array("gain", gain, (n + d, q))
         radius = lqr.spectral_radius((np.eye(n + d) - self.gain @ self.seen) @ self.A)
         if not radius < 1:
             raise ValueError(
-                f"gain = {self.gain.tolist()} does not make the error of the estimate decay: the "
-                f"spectral radius is {radius:.6g}, it must be below 1. Leave the gain out for the "
-                "Kalman filter."
+                f"gain = {self.gain.tolist()} does not make the error of the estimate decay: its "
+                f"spectral radius is {radius:.6g}, not below 1. Leave it out for a Kalman filter."
             )
         self.estimate: Array = np.zeros(n + d)
 
@@ -126,9 +117,10 @@ class DisturbanceObserver:
         return self.x_hat, self.d_hat
 
     def _kalman_gain(self, moves: Array, errors: Array) -> Array:
-        """Return the steady-state gain of the filter."""
-        P = linalg.solve_discrete_are(self.A.T, self.seen.T, moves, errors)
-        spread = self.seen @ P @ self.seen.T + errors
+        """Return the steady-state gain of the filter from the standard deviations."""
+        R = np.diag(errors**2)
+        P = linalg.solve_discrete_are(self.A.T, self.seen.T, np.diag(moves**2), R)
+        spread = self.seen @ P @ self.seen.T + R
         return np.asarray(np.linalg.solve(spread, self.seen @ P).T)
 
 
@@ -136,10 +128,8 @@ def _require_observable(model: LinearModel, C: Array) -> None:
     """Raise unless the augmented model is detectable (Pannocchia & Rawlings 2003, Lemma 1)."""
     n, d, q = model.n_states, model.n_disturbances, len(C)
     if d == 0:
-        raise ValueError(
-            "The model has no disturbance to estimate: pass its matrix E, e.g. E = B for a load "
-            "at the input."
-        )
+        hint = "pass its matrix E, e.g. E = B for a load at the input."
+        raise ValueError(f"The model has no disturbance to estimate: {hint}")
     for pole in np.linalg.eigvals(model.A):
         hautus = np.vstack([pole * np.eye(n) - model.A, C])
         if abs(pole) > 1 - 1e-9 and _rank(hautus) < n:
@@ -147,8 +137,7 @@ def _require_observable(model: LinearModel, C: Array) -> None:
                 f"The measurements do not see an unstable mode: eigenvalue {pole:.6g} of A is not "
                 "observable through C. Measure another output."
             )
-    steady = np.block([[model.A - np.eye(n), model.E], [C, np.zeros((q, d))]])
-    rank = _rank(steady)
+    rank = _rank(np.block([[model.A - np.eye(n), model.E], [C, np.zeros((q, d))]]))
     if rank < n + d:
         raise ValueError(
             f"The {q} measured outputs do not determine the {d} disturbances at steady state: "

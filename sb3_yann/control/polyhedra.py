@@ -24,10 +24,7 @@ class Region:
     ----------
     active_set : tuple of int
         The rows of the program that hold with equality, in ascending order.
-    gain : ndarray, shape (v, n)
-    offset : ndarray, shape (v,)
-    A : ndarray, shape (q, n)
-    b : ndarray, shape (q,)
+    gain, offset, A, b : ndarray, shapes (v, n), (v,), (q, n) and (q,)
     inside : ndarray, shape (n,), optional
         A point well inside, if known.
     """
@@ -49,10 +46,7 @@ class Region:
 
 
 def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
-    """Return center and radius of a bounded polyhedron's largest ball, or of one of its facets.
-
-    The radius is negative for an empty polyhedron or facet.
-    """
+    """Return center and radius (negative: none) of a bounded polyhedron or facet's largest ball."""
     rows = np.empty((len(b), A.shape[1] + 1))
     rows[:, :-1], rows[:, -1] = A, 1.0
     if facet is not None:
@@ -83,15 +77,9 @@ def _minimize(cost: Array, A: Array, b: Array, equal: int | None, **settings: fl
     )
     if status == 1:
         return np.asarray(point)
-    rest = slice(None) if equal is None else np.arange(len(b)) != equal
-    found = optimize.linprog(
-        cost,
-        A_ub=A[rest],
-        b_ub=b[rest],
-        A_eq=None if equal is None else A[[equal]],
-        b_eq=None if equal is None else b[[equal]],
-        bounds=(None, None),
-    )
+    tied = np.arange(len(b)) == equal
+    free, equal_rows = (A[~tied], b[~tied]), (A[tied], b[tied])
+    found = optimize.linprog(cost, *free, *equal_rows, bounds=(None, None))
     if found.x is None:  # an empty facet
         return np.append(np.zeros(len(cost) - 1), -np.inf)
     return np.asarray(found.x)
@@ -109,10 +97,8 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
         A, slack, radius = _rounded(A, slack)
     import daqp
 
-    # DAQP's tolerance is absolute: about the ball, in units of its radius, it means the same for
-    # small and for large polyhedra.
-    redundant = daqp.minrep(np.ascontiguousarray(A), slack / radius)
-    return np.flatnonzero(redundant != 1)
+    # DAQP's tolerance is absolute: in units of the radius it suits small and large polyhedra.
+    return np.flatnonzero(daqp.minrep(np.ascontiguousarray(A), slack / radius) != 1)
 
 
 def _rounded(A: Array, slack: Array) -> tuple[Array, Array, float]:

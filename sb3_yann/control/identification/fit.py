@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_between, as_positive
+from sb3_yann._validation import Array, as_between, as_positive, as_vector
 from sb3_yann.control.identification.input_delays import input_notes
 from sb3_yann.control.identification.least_squares import Regression, regress
-from sb3_yann.control.identification.logs import Episode, as_episodes, split, without_gaps
+from sb3_yann.control.identification.logs import Episode, Log, as_episodes, split, without_gaps
 from sb3_yann.control.identification.operating_point import FAR, operating_point
 from sb3_yann.control.linear_system import LinearSystem
 
@@ -22,26 +22,25 @@ POOR = 50.0  # percent of the longer prediction's fit below which a model is cal
 
 @dataclass(frozen=True, eq=False)
 class LogFit:
-    """A system fitted to a log, its regression, and its fits (n,) in percent to held-out data."""
+    """A system fitted to a log, its regression, and its fits (n,) one and ten steps ahead."""
 
     system: LinearSystem
     regression: Regression
-    one_step_fit: Array
-    ten_step_fit: Array
+    fits: tuple[Array, Array]
 
 
-def fit_log(
-    states: ArrayLike | Sequence[ArrayLike],
-    actions: ArrayLike | Sequence[ArrayLike],
+def fit_log(  # noqa: PLR0913 - those of `identify`
+    states: Log,
+    actions: Log,
     dt: float,
-    disturbances: ArrayLike | Sequence[ArrayLike] | None = None,
+    disturbances: Log | None = None,
     x_ss: ArrayLike | None = None,
     u_ss: ArrayLike | None = None,
     d_ss: ArrayLike | None = None,
     offset: bool = True,
     ridge: float = 0.0,
     held_out: float = 0.2,
-    time: ArrayLike | Sequence[ArrayLike] | None = None,
+    time: Log | None = None,
 ) -> LogFit:
     """Return the least-squares fit to measured episodes; `identify` documents the parameters."""
     episodes, sizes = as_episodes(states, actions, disturbances)
@@ -51,11 +50,11 @@ def fit_log(
     n, m, d = sizes
     if d_ss is not None and disturbances is None:
         raise ValueError("d_ss is given, but there are no disturbances: pass these as well.")
-    given = (
-        _given("x_ss", x_ss, n, offset),
-        _given("u_ss", u_ss, m, offset),
-        _given("d_ss", d_ss, d, offset),
-    )
+    point = {"x_ss": (x_ss, n), "u_ss": (u_ss, m), "d_ss": (d_ss, d)}
+    given = [
+        None if value is None and offset else as_vector(name, value, size)
+        for name, (value, size) in point.items()
+    ]
     fitted, tested = split(episodes, as_between("held_out", held_out, 0, 1, "[)"))
     weight = as_between("ridge", ridge, 0, np.inf)
     origin = None if offset else np.concatenate([part for part in given if part is not None])
@@ -68,14 +67,7 @@ def fit_log(
     notes = [*system.notes, *_quality(found, tested, fits, weight), *late]
     if lost:
         notes.append(f"{lost} steps that took another time than dt were left out.")
-    return LogFit(replace(system, notes=tuple(notes)), found, *fits)
-
-
-def _given(name: str, value: ArrayLike | None, size: int, offset: bool) -> Array | None:
-    """Return a given part of the operating point, None if it is to be found."""
-    if value is None:
-        return None if offset else np.zeros(size)
-    return as_array(name, value, (size,))
+    return LogFit(replace(system, notes=tuple(notes)), found, fits)
 
 
 def _system(
@@ -86,40 +78,33 @@ def _system(
     point = operating_point(found, sizes, given)
     A, B, E = np.split(found.coefficients, [n, n + m], axis=1)
     x, u, d = np.split(point, [n, n + m])
-    notes: tuple[str, ...] = ()
+    notes = []
     drift = found.predict(point[None])[0] - x
     doubt = np.diag(found.covariance) / found.steps
     doubt = np.sqrt(doubt + found.standard_errors**2 @ (point - found.center) ** 2)
     drifts = bool(np.any(np.abs(drift) > 3 * doubt + 1e-9 * (1 + np.abs(x))))
     if drifts:
-        notes += (
-            f"At the operating point the fitted plant moves by {_list(drift)} in one step. The "
-            "model leaves that out.",
-        )
-    away = np.abs(x - found.center[:n]) > FAR * found.spread[:n]
-    if np.any(away):
-        notes += (
-            f"x_ss[{int(np.argmax(away))}] lies far outside the data: the model is extrapolated.",
-        )
-    return LinearSystem(A, B, dt, x, u, E, d, notes, drift if drifts else None)
+        words = f"moves by {_list(drift)} in one step. The model leaves that out."
+        notes.append(f"At the operating point the fitted plant {words}")
+    away = np.flatnonzero(np.abs(x - found.center[:n]) > FAR * found.spread[:n])
+    if away.size:
+        notes.append(f"x_ss[{away[0]}] lies far outside the data: the model is extrapolated.")
+    return LinearSystem(A, B, dt, x, u, E, d, tuple(notes), drift if drifts else None)
 
 
 def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:
     """Return each state's fit (n,) in percent, predicted so many steps ahead."""
     errors, targets = [], []
     for episode in episodes:
-        starts = len(episode) - steps + 1
-        if starts < 1:
-            continue
+        starts = max(len(episode) - steps + 1, 0)
         x = episode.states[:starts]
         for k in range(steps):
             x = found.predict(np.hstack([x, episode.driven[k : k + starts]]))
         errors.append(x - episode.states[steps:])
         targets.append(episode.states[steps:])
-    n = found.reached.size
-    if not errors:
-        return np.full(n, np.nan)
-    target = np.concatenate(targets)
+    target = np.concatenate([*targets, np.zeros((0, found.reached.size))])
+    if not len(target):
+        return np.full(found.reached.size, np.nan)
     moved = np.linalg.norm(target - np.mean(target, axis=0), axis=0)
     missed = np.linalg.norm(np.concatenate(errors), axis=0)
     return np.asarray(100 * (1 - missed / np.where(moved > 0, moved, np.nan)))
@@ -146,8 +131,8 @@ def _quality(
     if np.any(colored):
         notes.append(
             f"The residuals of neighboring steps are correlated ({_list(found.autocorrelation)}): "
-            "there is sensor noise or an unmodeled state. A is biased, towards zero by noise, by "
-            "more than the standard errors tell."
+            "there is sensor noise, which biases A towards zero, or an unmodeled state. The "
+            "standard errors do not tell that."
         )
     return notes
 

@@ -8,6 +8,7 @@ from scipy.special import fdtrc
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.least_squares import Regression
 from sb3_yann.control.identification.logs import Episode
+from sb3_yann.control.linear_system import names
 
 LONGEST = 10  # longest input delay, in samples, that is looked for
 CHANCE = 0.01  # significance level of an input's effect
@@ -18,19 +19,18 @@ def input_notes(
     found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]
 ) -> list[str]:
     """Return notes on inputs and disturbances without effect, or with a delay."""
-    n, m, d = sizes
-    names = [f"{k}[{i}]" for k, size in (("u", m), ("d", d)) for i in range(size)]
+    n = sizes[0]
     delays, notes = _delays(found, episodes, sizes), []
-    for j, (name, (lag, correlation)) in enumerate(zip(names, delays, strict=True)):
-        idle = _chance(found, n, n + j) > CHANCE
+    driven = zip(names(sizes)[n:], delays, strict=True)
+    for column, (name, (lag, correlation)) in enumerate(driven, n):
+        idle = _chance(found, n, column) > CHANCE
         late = (
-            f"the residuals follow {name} of {lag} steps before (correlation {correlation:.2f}): "
+            f"he residuals follow {name} of {lag} steps before (correlation {correlation:.2f}): "
             f"it acts {lag} samples late. Append its last {lag} values to the state of each row."
         )
-        if idle and lag:
-            notes.append(f"{name} has no effect that can be told from 0, and {late}")
-        elif lag:
-            notes.append(late[0].upper() + late[1:])
+        if lag:
+            start = f"{name} has no effect that can be told from 0, and t" if idle else "T"
+            notes.append(start + late)
         elif idle:
             notes.append(
                 f"{name} has no effect on the next state that can be told from 0. Is it delayed by "
@@ -45,8 +45,8 @@ def _chance(found: Regression, n: int, column: int) -> float:
     effect = found.coefficients[:, column] / max(found.factors[column], np.finfo(float).tiny)
     square = float(effect @ np.linalg.solve(found.covariance + floor, effect))
     freedom = found.degrees_of_freedom - n + 1
-    if freedom < 1:
-        return 0.0  # too little is known for a verdict
+    if freedom < 1:  # too little is known for a verdict
+        return 0.0
     return float(fdtrc(n, freedom, square * freedom / (n * found.degrees_of_freedom)))
 
 

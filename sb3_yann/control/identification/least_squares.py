@@ -8,16 +8,21 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.logs import Episode
+from sb3_yann.control.linear_system import combination, names
 
 WEAKEST = 1e-6  # least excitation, below which float32 rounding alone may be what moves
+
+SMALL = 0.05  # relative weight below which a regressor is left out of a combination
+NOT_EXCITED = (
+    "What does not move cannot be identified. Add a test signal to each input, independent of the "
+    "state (a feedback law alone ties the inputs to it), leave out states that are constant or "
+    "sums of others, or pass ridge > 0."
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """``x[k+1] = reached + coefficients (z[k] - center)``, with z of states, inputs, disturbances.
-
-    Shapes: n states, p regressors.
-    """
+    """``x[k+1] = reached + coefficients (z[k] - center)``, n states x, p regressors z."""
 
     coefficients: Array  # (n, p)
     standard_errors: Array  # (n, p)
@@ -44,10 +49,8 @@ def regress(
 
     Parameters
     ----------
-    episodes : list of Episode
-        The measured steps.
-    sizes : tuple of int
-        Numbers of states, inputs and disturbances.
+    episodes, sizes : list of Episode, and tuple of int
+        The measured steps, and the numbers of states, inputs and disturbances.
     origin : ndarray, shape (n+m+d,), optional
         The fit passes through it. The default is the mean of the data: an offset is fitted.
     ridge : float
@@ -58,8 +61,8 @@ def regress(
     steps, unknowns = regressors.shape[0], regressors.shape[1] + (origin is None)
     if steps <= unknowns:
         raise ValueError(
-            f"There are {steps} steps to fit {unknowns} parameters for each state: more steps than "
-            "parameters are needed. Record more, or hold less out (held_out)."
+            f"There are {steps} steps to fit {unknowns} parameters for each state: too few. Record "
+            "more, or hold less out (held_out)."
         )
     center = np.mean(regressors, axis=0) if origin is None else origin
     reached = np.mean(targets, axis=0) if origin is None else origin[: sizes[0]]
@@ -69,9 +72,11 @@ def regress(
     still = spread <= 1e-10 * np.max(np.abs(regressors), axis=0)
     scale = np.where(still, 1.0, spread)
     left, singular, right = np.linalg.svd(np.where(still, 0.0, centered / scale), False)
+    labels = names(sizes)
     missing = [v for s, v in zip(singular, right, strict=True) if s <= WEAKEST * singular[0]]
     if missing and ridge == 0:
-        raise ValueError(_not_excited([_direction(v / scale, v, sizes) for v in missing]))
+        fixed = [f"{combination(v / scale, v, labels, SMALL, 4)} never changes" for v in missing]
+        raise ValueError(f"The data do not excite the plant: {'; '.join(fixed)}. {NOT_EXCITED}")
     inverse = right.T * (singular / (singular**2 + ridge)) if ridge else right.T / singular
     coefficients = ((inverse @ left.T @ (targets - reached)) / scale[:, None]).T
     residuals = targets - reached - centered @ coefficients.T
@@ -89,31 +94,7 @@ def regress(
         degrees_of_freedom=steps - unknowns,
         steps=steps,
         excitation=float(singular[-1] / singular[0]) if singular[0] > 0 else 0.0,
-        weakest=_direction(right[-1] / scale, right[-1], sizes),
-    )
-
-
-def _direction(coefficients: Array, weights: Array, sizes: tuple[int, int, int]) -> str:
-    """Return a combination of states, inputs and disturbances in words.
-
-    Terms with small `weights`, in units of their spread, are left out.
-    """
-    names = [f"{k}[{i}]" for k, size in zip("xud", sizes, strict=True) for i in range(size)]
-    kept = np.flatnonzero(np.abs(weights) > 0.05 * np.max(np.abs(weights)))
-    first = coefficients[kept[np.argmax(np.abs(weights[kept]))]]
-    if kept.size == 1:
-        return names[int(kept[0])]
-    terms = [f"{coefficients[i] / first:+.4g} {names[i]}" for i in kept]
-    return " ".join(terms).removeprefix("+")
-
-
-def _not_excited(missing: list[str]) -> str:
-    return (
-        "The data do not excite the plant: "
-        + "; ".join(f"{words} never changes" for words in missing)
-        + ". What does not move cannot be identified. Add a test signal to each input, independent "
-        "of the state (a feedback law alone ties the inputs to it), leave out states that are "
-        "constant or sums of others, or pass ridge > 0."
+        weakest=combination(right[-1] / scale, right[-1], labels, SMALL, 4),
     )
 
 

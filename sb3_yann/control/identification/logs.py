@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, to_float
 
+Log = ArrayLike | Sequence[ArrayLike]
+"""One array for each episode, or that of a single one."""
 UNEVEN = 0.1  # largest deviation of a step's time from dt, relative to it
 
 
@@ -34,16 +36,12 @@ class Episode:
 
 
 def as_episodes(
-    states: ArrayLike | Sequence[ArrayLike],
-    actions: ArrayLike | Sequence[ArrayLike],
-    disturbances: ArrayLike | Sequence[ArrayLike] | None,
+    states: Log, actions: Log, disturbances: Log | None
 ) -> tuple[list[Episode], tuple[int, int, int]]:
     """Return the checked episodes and the sizes (n, m, d)."""
     x, u = _matrices("states", states), _matrices("actions", actions)
-    if disturbances is None:
-        d: list[Array] = [np.zeros((len(each), 0)) for each in u]
-    else:
-        d = _matrices("disturbances", disturbances)
+    none: list[Array] = [np.zeros((len(each), 0)) for each in u]
+    d = none if disturbances is None else _matrices("disturbances", disturbances)
     for name, parts in (("actions", u), ("disturbances", d)):
         if len(parts) != len(x):
             raise ValueError(f"{name} has {len(parts)} episodes, states has {len(x)}.")
@@ -53,10 +51,8 @@ def as_episodes(
                     f"{name} of episode {i} has {len(part)} rows, states has {len(state)}. "
                     "Expected T >= 1 and T + 1: the states before each action and after the last."
                 )
-    return [
-        Episode(state, np.hstack([inputs, others]))
-        for state, inputs, others in zip(x, u, d, strict=True)
-    ], (x[0].shape[1], u[0].shape[1], d[0].shape[1])
+    episodes = [Episode(parts[0], np.hstack(parts[1:])) for parts in zip(x, u, d, strict=True)]
+    return episodes, (x[0].shape[1], u[0].shape[1], d[0].shape[1])
 
 
 def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list[Episode]]:
@@ -72,9 +68,7 @@ def split(episodes: list[Episode], held_out: float) -> tuple[list[Episode], list
     return fitted, tested
 
 
-def without_gaps(
-    episodes: list[Episode], time: ArrayLike | Sequence[ArrayLike], dt: float
-) -> tuple[list[Episode], int]:
+def without_gaps(episodes: list[Episode], time: Log, dt: float) -> tuple[list[Episode], int]:
     """Return the episodes cut at steps that do not take dt, and the number of these steps."""
     times = _times(time)
     if len(times) != len(episodes):
@@ -82,10 +76,8 @@ def without_gaps(
     parts, lost, spans = [], 0, []
     for i, (episode, instants) in enumerate(zip(episodes, times, strict=True)):
         if instants.shape != (len(episode) + 1,):
-            raise ValueError(
-                f"time of episode {i} has shape {instants.shape}, expected ({len(episode) + 1},): "
-                "one for each row of states."
-            )
+            wanted = f"({len(episode) + 1},): one for each row of states"
+            raise ValueError(f"time of episode {i} has shape {instants.shape}, expected {wanted}.")
         span = np.diff(instants)
         if not np.all(span > 0):
             raise ValueError(
@@ -105,16 +97,15 @@ def without_gaps(
     return parts, lost
 
 
-def _times(value: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
+def _times(value: Log) -> list[Array]:
     """Return one vector of times for each episode."""
-    several = isinstance(value, (list, tuple)) and len(value) > 0 and np.ndim(value[0]) == 1
-    if several:
-        return [to_float(f"time of episode {i}", part) for i, part in enumerate(value)]  # type: ignore[arg-type]
+    if isinstance(value, (list, tuple)) and len(value) > 0 and np.ndim(value[0]) == 1:
+        return [to_float(f"time of episode {i}", part) for i, part in enumerate(value)]
     array = to_float("time", value)
     return list(array) if array.ndim == 2 else [array]
 
 
-def _matrices(name: str, value: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
+def _matrices(name: str, value: Log) -> list[Array]:
     """Return one float64 matrix for each episode, all with the same columns."""
     parts_given = list(value) if isinstance(value, (list, tuple)) else []
     flat = [i for i, part in enumerate(parts_given) if np.shape(part) != () and np.ndim(part) == 1]
@@ -124,11 +115,10 @@ def _matrices(name: str, value: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
             "(rows, columns). Of a single column write values.reshape(-1, 1)."
         )
     several = len(parts_given) > 0 and np.ndim(parts_given[0]) == 2
-    array = None if several else to_float(name, value)
-    if array is not None and array.ndim != 3:
-        parts = [array]
-    else:
+    if several or (array := to_float(name, value)).ndim == 3:
         parts = [to_float(f"{name} of episode {i}", part) for i, part in enumerate(value)]  # type: ignore[arg-type]
+    else:
+        parts = [array]
     for i, part in enumerate(parts):
         if part.ndim != 2 or not part.shape[1] or part.shape[1] != parts[0].shape[1]:
             raise ValueError(

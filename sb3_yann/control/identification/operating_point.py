@@ -12,8 +12,8 @@ from sb3_yann.control.identification.least_squares import Regression
 
 FAR = 5.0  # spreads from the mean of the data beyond which a model is extrapolated
 SURE = 5.0
-"""Standard errors above which a direction does not integrate: more than in other tests, since those
-of an integrator are not normally distributed (Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
+"""Standard errors above which a direction does not integrate: those of an integrator are not normal
+(Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
 
 
 def operating_point(
@@ -56,10 +56,7 @@ def _directions(moves: Array, doubt: Array) -> tuple[Array, Array, Array, NDArra
 
 
 def _way(moves: Array, drift: Array, doubt: Array) -> Array:
-    """Return the step to the steady state along the directions that the data determine.
-
-    Along the others the steady state is far away, or anywhere: an exact solution would move there.
-    """
+    """Return the step to the steady state along the directions that the data determine."""
     left, sizes, right, known = _directions(moves, doubt)
     steps = -(left.T @ drift) / np.where(known, sizes, 1.0)
     return np.asarray(right.T @ np.where(known & (np.abs(steps) <= FAR), steps, 0.0))

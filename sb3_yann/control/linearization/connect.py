@@ -64,8 +64,7 @@ def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
     space = simulator.env.observation_space
     if getattr(space, "shape", None) == x.shape and hasattr(space, "low"):
         width = (space.high.astype(np.float64) - space.low) / 2
-        # Gymnasium's way of saying "no bound" is also the largest float32.
-        size = np.where(width < 1e6, width, size)
+        size = np.where(width < 1e6, width, size)  # "no bound" may be the largest float32
     return np.asarray(size)
 
 
@@ -82,10 +81,8 @@ def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | No
         return failure
     for wanted, got in zip((x, other), seen, strict=True):
         if got is not None and np.any(np.abs(got - wanted) > 1e-5 * (scale + np.abs(wanted))):
-            return (
-                f"set to {wanted.tolist()} it reads {got.tolist()} (a state that is ignored, or "
-                "an angle that wraps there)"
-            )
+            reading = f"set to {wanted.tolist()} it reads {got.tolist()}"
+            return f"{reading} (a state that is ignored, or an angle that wraps there)"
     first, moved, again = (simulator.next_state(state, u) for state in (x, other, x))
     if not np.all(np.abs(again - first) <= 1e-6 * (scale + np.abs(first))):
         return (
@@ -113,9 +110,8 @@ def _hidden_state(
 ) -> str | None:
     """Describe the hidden states that show in steps from x with u and other, None without any.
 
-    They would make differences wrong. A hidden state that setting x leaves alone shows when a step
-    is repeated after other inputs. One that setting x resets shows when the plant goes on by
-    itself.
+    One that setting x leaves alone shows when a step is repeated after other inputs, one that
+    setting x resets when the plant goes on by itself.
     """
     first = simulator.next_state(x, u)
     for _ in range(LONGEST_DELAY):

@@ -24,7 +24,7 @@ class Jacobian:
     change: Array  # (c,), error of the longest step relative to its column, NaN without a value
 
 
-class NotDifferentiableError(ValueError):
+class NotSmoothError(ValueError):
     """The function has a kink, a jump or no value next to the point, in coordinate `column`."""
 
     def __init__(self, column: int, reason: str, no_value: bool = False) -> None:
@@ -42,8 +42,7 @@ def jacobian(
     """Return the derivatives of f at a point by Richardson extrapolation.
 
     Each entry takes the extrapolation that agrees best with its neighbor over shorter steps:
-    Ridders (1982), *Advances in Engineering Software* 4, 75-76. `scipy.differentiate` would
-    average the kinks and jumps of a simulator that clips or wraps.
+    Ridders (1982), *Advances in Engineering Software* 4, 75-76.
 
     Parameters
     ----------
@@ -58,21 +57,16 @@ def jacobian(
 
     Raises
     ------
-    NotDifferentiableError
+    NotSmoothError
         If f has a kink or a jump at the point, or no value next to it.
     """
-    center = f(actual(point))
-    columns = [
-        _column(f, center, actual(point), i, steps[i], noise, actual) for i in range(point.size)
-    ]
+    begin = actual(point)
+    center = f(begin)
+    columns = [_column(f, center, begin, i, steps[i], noise, actual) for i in range(point.size)]
     value, error, change = (np.array(part) for part in zip(*columns, strict=True))
     lost = np.abs(value) <= error
-    return Jacobian(
-        value=np.where(lost, 0.0, value).T,
-        dropped=float(np.max(np.abs(value[lost]), initial=0.0)),
-        steps=steps,
-        change=change,
-    )
+    dropped = float(np.max(np.abs(value[lost]), initial=0.0))
+    return Jacobian(np.where(lost, 0.0, value).T, dropped, steps, change)
 
 
 def _column(
@@ -98,7 +92,7 @@ def _column(
     one, other, span = np.array(ahead), np.array(behind), np.array(spans)[:, None]
     valid = np.all(np.isfinite(one) & np.isfinite(other), axis=1) if spans else np.zeros(0, bool)
     if np.count_nonzero(valid) < 3:
-        raise NotDifferentiableError(i, "it has no finite value on one of its sides", True)
+        raise NotSmoothError(i, "it has no finite value on one of its sides", True)
     far = bool(valid[0])
     one, other, span = one[valid], other[valid], span[valid]
     slope = (one + other) / 2
@@ -108,20 +102,16 @@ def _column(
     steepest = np.max(np.abs(value) + np.abs(kink) / 2)
     floor = np.max(2 * noise / span[0])
     if np.any((np.abs(kink) > 5 * doubt) & (np.abs(kink) > 0.01 * steepest)):
-        raise NotDifferentiableError(i, "its slopes to the two sides differ (a kink)")
+        raise NotSmoothError(i, "its slopes to the two sides differ (a kink)")
     if np.max(error) > max(0.2 * np.max(np.abs(value)), 20 * floor):
-        raise NotDifferentiableError(i, "its slope has no limit for short steps (a jump or noise)")
+        raise NotSmoothError(i, "its slope has no limit for short steps (a jump or noise)")
     scale = np.max(np.abs(value))
     change = np.max(np.abs(slope[0] - value)) / scale if scale > 0 else 0.0
     return value, error, float(change) if far else np.nan
 
 
 def _extrapolated(levels: Array, power: float, rounding: Array) -> tuple[Array, Array]:
-    """Return the limits for short steps, entry by entry, and their errors.
-
-    `levels` has shape (k, r), its error falls by the factor `power` from each to the next;
-    `rounding`, of the same shape, is what rounding does to it.
-    """
+    """Return the limits of the levels (k, r), whose errors fall by `power`, and their errors."""
     limits = (power * levels[1:] - levels[:-1]) / (power - 1)
     errors = np.abs(np.diff(limits, axis=0)) + 2 * rounding[1:-1]
     best = np.argmin(errors, axis=0)

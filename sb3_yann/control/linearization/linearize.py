@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -10,19 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, as_array, as_positive, as_positive_vector, to_float
-from sb3_yann.control.linear_system import LinearSystem, zero_order_hold
+from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
 from sb3_yann.control.linearization.connect import connect
-from sb3_yann.control.linearization.finite_differences import (
-    Jacobian,
-    NotDifferentiableError,
-    jacobian,
-)
-from sb3_yann.control.linearization.simulator import (
-    Simulator,
-    borrow,
-    sample_time,
-    to_vector,
-)
+from sb3_yann.control.linearization.finite_differences import Jacobian, NotSmoothError, jacobian
+from sb3_yann.control.linearization.simulator import Simulator, borrow, sample_time, to_vector
 from sb3_yann.control.linearization.steady_state import require_steady_state, steady_state
 
 if TYPE_CHECKING:
@@ -48,12 +40,12 @@ def linearize_dynamics(
     d = as_array("d_ss", [] if d_ss is None else d_ss, ("d",))
     dt = as_positive("dt", dt)
     given = {"x": x, "u": u} if d_ss is None else {"x": x, "u": u, "d": d}
-    sizes = (x.size, u.size)
+    sizes = (x.size, u.size, d.size)
     if not callable(f):
         raise TypeError(f"f = {f!r} must be a function ({', '.join(given)}) -> dx/dt.")
 
     def rate(point: Array) -> Array:
-        parts = np.split(point, np.cumsum(sizes))
+        parts = np.split(point, np.cumsum(sizes[:2]))
         return np.asarray(f(*parts[: len(given)]), dtype=np.float64)
 
     called = f"f({', '.join(f'{name}_ss' for name in given)})"
@@ -62,10 +54,11 @@ def linearize_dynamics(
     moved = dt * np.abs(as_array(called, f(*given.values()), (x.size,)))
     _require_steady_dynamics(given, moved, size, dt, scale is not None)
     rounding = np.finfo(float).eps * np.maximum(np.abs(x), size[: x.size]) / dt
-    found = _differences(rate, point, LONGEST * size, rounding, sizes)
-    A, B, E = np.split(found.value, np.cumsum(sizes), axis=1)
+    labels = names(sizes)
+    found = _differences(rate, point, LONGEST * size, rounding, labels)
+    A, B, E = np.split(found.value, np.cumsum(sizes[:2]), axis=1)
     A, B, E = zero_order_hold(A, B, E, dt)
-    notes = (*_idle_inputs(B, 4), *_curvature(found, sizes))
+    notes = (*_idle_inputs(B, 4), *_curvature(found, labels))
     return LinearSystem(A, B, dt, x, u, E, d, notes)
 
 
@@ -73,19 +66,18 @@ def _require_steady_dynamics(
     given: dict[str, Array], moved: Array, size: Array, dt: float, scaled: bool
 ) -> None:
     """Raise if the operating point moves too far in one sample; warn if that is not certain."""
-    x, names = given["x"], ", ".join(given)
+    x = given["x"]
     if np.any(moved > STEADY * size[: x.size]):
         point = ", ".join(f"{name}_ss = {value.tolist()}" for name, value in given.items())
         raise ValueError(
-            f"{point} is no steady state: within one sample of {dt:g} the state would move by "
-            f"{moved.tolist()}, with a scale of {size[: x.size].tolist()}. Solve f({names}) = 0 "
-            "first, e.g. with scipy.optimize.root."
+            f"{point} is no steady state: in one sample of {dt:g} the state moves by "
+            f"{moved.tolist()}, with a scale of {size[: x.size].tolist()}. Solve "
+            f"f({', '.join(given)}) = 0 first, e.g. with scipy.optimize.root."
         )
     if not scaled and np.any((moved > MOVES * np.abs(x)) & (x != 0) & (moved > 1e-8)):
         warnings.warn(
-            f"Within one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
-            f"{moved.tolist()}: little beside 1, and much beside itself. Pass scale=..., how far "
-            "each state moves in use, to have it checked.",
+            f"In one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
+            f"{moved.tolist()}, much beside itself. Pass scale=..., how far each state moves.",
             stacklevel=4,
         )
 
@@ -110,14 +102,11 @@ def linearize_env(
     scale: ArrayLike | None,
 ) -> LinearSystem:
     """Return the linearized step of `LinearModel.from_env`."""
-    borrowed = borrow(env)
-    try:
+    with contextlib.closing(borrow(env)) as borrowed:
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)
         x, u = _partly_known("state", state), _partly_known("action", action)
         return _linearize(simulator, x, u, step_time, scale)
-    finally:
-        borrowed.close()
 
 
 def _linearize(
@@ -147,7 +136,7 @@ def _linearize(
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
         "for and the others given or taken from the middle of the action space.",
         *_remarks(simulator, point),
-        *_curvature(found, (n, u.size)),
+        *_curvature(found, names((n, u.size))),
         f"The simulator was {simulator.origin}.",
     )
     return LinearSystem(A, B, dt, point[:n], point[n:], np.zeros((n, 0)), np.zeros(0), notes)
@@ -196,7 +185,7 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian
     spacing = np.finfo(np.float32 if single else np.float64).eps
     rounding = spacing * np.maximum(np.abs(readings[0]), longest[:n])
     longest[n:] = np.minimum(longest[n:], room)
-    return _differences(step, point, longest, rounding, (n, room.size), actual)
+    return _differences(step, point, longest, rounding, names((n, room.size)), actual)
 
 
 def _differences(
@@ -204,7 +193,7 @@ def _differences(
     point: Array,
     steps: Array,
     rounding: Array,
-    sizes: tuple[int, int],
+    labels: list[str],
     actual: Callable[[Array], Array] = lambda z: z,
 ) -> Jacobian:
     """Return the Jacobian; name the coordinate where there is none."""
@@ -212,16 +201,15 @@ def _differences(
     while True:
         try:
             return jacobian(f, point, steps, rounding, actual)
-        except NotDifferentiableError as error:
+        except NotSmoothError as error:
             i, reason = error.column, str(error)
             if not error.no_value or steps[i] <= shortest[i]:
                 break
             steps[i] /= SHORTER
     raise ValueError(
-        f"The plant cannot be linearized at {point.tolist()}: along {_name(i, sizes)}, {reason}, "
-        f"with steps up to {steps[i]:.3g}. Clipping, dry friction and angles that wrap do this, "
-        "and steps that are too long: pass scale=..., how far each state moves in use. Or move "
-        "the operating point off it, or fit data that reach across it: LinearModel.from_data."
+        f"The plant cannot be linearized at {point.tolist()}: along {labels[i]}, {reason}, with "
+        f"steps up to {steps[i]:.3g}. Clipping, dry friction, angles that wrap and too long steps "
+        "do this: pass scale=..., move the operating point, or use LinearModel.from_data."
     )
 
 
@@ -231,9 +219,8 @@ def _idle_inputs(B: Array, stacklevel: int) -> list[str]:
     if not idle.size:
         return []
     note = (
-        f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. If the plant has a "
-        "delay of the input, or an actuator, the inputs on their way belong into the state; an "
-        "input that really does nothing is to be left out."
+        f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. With a delay or an "
+        "actuator, make the inputs on their way part of the state; leave out an idle input."
     )
     warnings.warn(note, stacklevel=stacklevel)
     return [note]
@@ -246,20 +233,15 @@ def _remarks(simulator: Simulator, point: Array) -> list[str]:
     remarks = []
     if simulator.ended:
         remarks.append("The environment terminates the episode at the operating point.")
-    seen, state = to_vector(simulator.observation), simulator.read()
-    if (
-        seen is None
-        or state is None
-        or seen.shape != state.shape
-        or not np.allclose(seen, state, rtol=1e-5, atol=1e-5)
-    ):
-        remarks.append(
-            "The observation is not this state. A policy needs a wrapper that makes it so."
-        )
+    seen: Any = to_vector(simulator.observation)
+    state: Any = simulator.read()
+    if np.shape(seen) != np.shape(state) or not np.allclose(seen, state, rtol=1e-5, atol=1e-5):
+        hint = "A policy needs a wrapper that makes it so."
+        remarks.append(f"The observation is not this state. {hint}")
     return remarks
 
 
-def _curvature(found: Jacobian, sizes: tuple[int, int]) -> list[str]:
+def _curvature(found: Jacobian, labels: list[str]) -> list[str]:
     """Return notes on dropped entries, strong nonlinearity, and what has no effect."""
     notes = []
     if found.dropped > 0:
@@ -272,14 +254,8 @@ def _curvature(found: Jacobian, sizes: tuple[int, int]) -> list[str]:
             what = "it has no value there" if np.isnan(change) else f"slopes differ by {change:.0%}"
             notes.append(
                 f"The plant is not smooth within {found.steps[i]:.3g} of the operating point "
-                f"along {_name(i, sizes)}: {what}."
+                f"along {labels[i]}: {what}."
             )
-        elif not np.any(found.value[:, i]) and not sizes[0] <= i < sum(sizes):
-            notes.append(f"{_name(i, sizes)} has no effect on the next state.")
+        elif not np.any(found.value[:, i]) and not labels[i].startswith("u"):
+            notes.append(f"{labels[i]} has no effect on the next state.")
     return notes
-
-
-def _name(i: int, sizes: tuple[int, int]) -> str:
-    """Return ``x[i]``, ``u[i]`` or ``d[i]`` for a coordinate of the stacked point."""
-    n, m = sizes
-    return f"x[{i}]" if i < n else f"u[{i - n}]" if i < n + m else f"d[{i - n - m}]"

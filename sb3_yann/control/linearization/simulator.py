@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
     Maker = gymnasium.Env[Any, Any] | str | Callable[[], gymnasium.Env[Any, Any]]
 
-Reader = Callable[[Any, Any, dict[str, Any]], Any]
-"""Returns the state from the environment, the observation and the info, None if it is not there."""
+Reader = Callable[[Any, Any, dict[str, Any]], Any]  # of an environment, observation and info
 
 RESET = 'reset(options={"state": x})'
 ATTRIBUTE = "env.unwrapped.state"
@@ -96,8 +95,8 @@ def sample_time(env: Any, dt: float | None) -> float:
 class Simulator:
     """``next_state(x, u)`` of an environment whose state can be set.
 
-    `LinearModel.from_env` documents ``set_state`` and ``get_state``. The environment is reset once
-    here, with a fixed seed unless it is the user's.
+    `LinearModel.from_env` documents ``set_state`` and ``get_state``. A private environment is reset
+    with a fixed seed.
     """
 
     def __init__(
@@ -160,8 +159,7 @@ class Simulator:
         """Return the state one step later, from wherever the environment is."""
         action = self.actual(u).astype(self.env.action_space.dtype)
         self.observation, _, terminated, truncated, self.info = self.env.step(action)
-        self.over = bool(terminated or truncated)
-        self.ended = bool(terminated)
+        self.over, self.ended = bool(terminated or truncated), bool(terminated)
         reached = self.read()
         if reached is None:
             raise ValueError(f"{self.reader} holds no state after a step.")

@@ -59,10 +59,9 @@ def _at_bounds(simulator: Simulator, u: Array, scale: Array) -> str:
 
 
 def require_steady_state(simulator: Simulator, point: Array, jacobian: Array, scale: Array) -> None:
-    """Raise ValueError if a given operating point is far from a steady state.
+    """Raise ValueError if a given operating point is far from the linear model's steady states.
 
-    In a short sample a plant moves little from anywhere. So the distance to the nearest steady
-    state of the linear model counts, by least squares in state and action.
+    Its motion alone tells little: in a short sample a plant hardly moves from anywhere.
     """
     moved = residual(simulator, point, scale)
     n = moved.size

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.special import stdtrit
 
 from sb3_yann._validation import Array, ReadOnlyArrays, as_between, as_choice
 from sb3_yann.control.identification.fit import fit_log
+from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.model.linear_model import LinearModel
 
 
@@ -32,11 +32,10 @@ class Identified(ReadOnlyArrays):
         Of each state's residuals, one step apart. Far from zero, there is measurement noise or an
         unmodeled state, and neither the matrices nor the standard errors hold.
     one_step_fit, ten_step_fit : ndarray, shape (n,)
-        ``100 (1 - |x - predicted| / |x - mean|)`` in percent for each state over the held-out data,
-        predicted one and ten steps ahead. NaN without such data, or for a constant state.
+        ``100 (1 - |x - predicted| / |x - mean|)`` in percent over the held-out data, predicted one
+        and ten steps ahead. NaN without such data, or for a constant state.
     excitation : float
-        Smallest over largest singular value of the states and inputs, each in units of its own
-        spread. Below 1e-6 the data are refused.
+        Smallest over largest singular value of the states and inputs, each in units of its spread.
 
     Examples
     --------
@@ -61,11 +60,7 @@ class Identified(ReadOnlyArrays):
     excitation: float
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
-        """Return the ends of each entry's confidence interval (Student's t).
-
-        ``name`` is "A", "B" or "E". Each true entry for itself lies inside with probability
-        ``level``.
-        """
+        """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E"."""
         name = as_choice("name", name, ("A", "B", "E"))
         level = as_between("level", level, 0, 1, "()")
         value, error = getattr(self.model, name), getattr(self, f"standard_error_{name}")
@@ -73,25 +68,24 @@ class Identified(ReadOnlyArrays):
         return value - width, value + width
 
 
-def identify(
-    states: ArrayLike | Sequence[ArrayLike],
-    actions: ArrayLike | Sequence[ArrayLike],
+def identify(  # noqa: PLR0913 - what a log may bring along
+    states: Log,
+    actions: Log,
     *,
     dt: float,
-    disturbances: ArrayLike | Sequence[ArrayLike] | None = None,
+    disturbances: Log | None = None,
     x_ss: ArrayLike | None = None,
     u_ss: ArrayLike | None = None,
     d_ss: ArrayLike | None = None,
     offset: bool = True,
     ridge: float = 0.0,
     held_out: float = 0.2,
-    time: ArrayLike | Sequence[ArrayLike] | None = None,
+    time: Log | None = None,
 ) -> Identified:
     """Fit ``x[k+1] = A x[k] + B u[k] + E d[k] + c`` to measured episodes by least squares.
 
     The estimate is consistent under process noise, independent from step to step (Ljung, *System
-    Identification*, 2nd ed., section 7.3). Sensor noise biases A towards zero, however long the
-    record is. It shows in the residuals, and the model's notes then say so.
+    Identification*, 2nd ed., section 7.3). Sensor noise biases A towards zero: the notes say so.
 
     Parameters
     ----------
@@ -105,31 +99,22 @@ def identify(
         Measured disturbances, which make E.
     x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
         The operating point. By default, inputs and disturbances take their mean, and the state is
-        the fitted model's steady state. Along integrating directions the state keeps its mean, and
-        the inputs are those that hold it.
+        the fitted model's steady state. An integrating state keeps its mean, which the inputs hold.
     offset : bool, default True
-        Fit c too, so that the operating point need not be an exact steady state. Without it, c is
-        0, and the default operating point is zero.
+        Fit c too. Without it, c is 0, and the default operating point is zero.
     ridge : float, default 0
-        Weight of the squared entries, each in units of the spread of its regressor, relative to
-        that of one step. It makes poorly exciting data usable, but biases towards zero, which the
-        standard errors do not contain.
+        Weight of the squared entries, each in units of the spread of its regressor, relative to one
+        step's. It makes poor excitation usable; the standard errors leave out its bias to zero.
     held_out : float, default 0.2
         Fraction of all steps, the last ones, that tests the fit instead of making the model.
     time : array_like, shape (T+1,), or a sequence of such, optional
         When each row of the states was measured, in the unit of ``dt``. Steps whose time differs
         from ``dt`` by more than 10 % are left out.
 
-    Returns
-    -------
-    Identified
-        The model, its standard errors and its fits.
-
     Raises
     ------
-    TypeError, ValueError
-        For arrays that do not fit each other, hold NaN or are too few, and for data in which some
-        combination of states and inputs does not move: the message names it.
+    ValueError
+        For data in which some combination of states and inputs does not move: the message names it.
 
     Examples
     --------
@@ -145,15 +130,5 @@ def identify(
     model, step = LinearModel(**vars(found.system)), found.regression
     n = model.n_states
     A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)
-    return Identified(
-        model=model,
-        standard_error_A=A,
-        standard_error_B=B,
-        standard_error_E=E,
-        noise_covariance=step.covariance,
-        degrees_of_freedom=step.degrees_of_freedom,
-        residual_autocorrelation=step.autocorrelation,
-        one_step_fit=found.one_step_fit,
-        ten_step_fit=found.ten_step_fit,
-        excitation=step.excitation,
-    )
+    residuals = (step.covariance, step.degrees_of_freedom, step.autocorrelation)
+    return Identified(model, A, B, E, *residuals, *found.fits, step.excitation)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_positive, same_fields
+from sb3_yann._validation import Array, as_array, as_positive, as_vector, same_fields
 from sb3_yann.control.identification.fit import fit_log
+from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.linear_system import LinearSystem, zero_order_hold
 from sb3_yann.control.linearization.linearize import linearize_dynamics, linearize_env
 from sb3_yann.control.model.report import describe
@@ -29,28 +30,17 @@ class LinearModel(LinearSystem):
 
     Parameters
     ----------
-    A : array_like, shape (n, n)
-        State matrix in discrete time.
-    B : array_like, shape (n, m)
-        Input matrix in discrete time.
+    A, B, E : array_like, shapes (n, n), (n, m) and (n, d)
+        Matrices in discrete time. The default of E is no disturbance, d = 0.
     dt : float
         Sampling time, in the time unit of the plant.
-    x_ss, u_ss : array_like, shapes (n,) and (m,), optional
-        State and input at the operating point, zeros by default.
-    E : array_like, shape (n, d), optional
-        Disturbance matrix in discrete time. The default is no disturbance, d = 0.
-    d_ss : array_like, shape (d,), optional
-        Disturbances at the operating point, zeros by default.
+    x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
+        The operating point, zeros by default.
     notes : sequence of str, optional
         Remarks on how the model was made. Equality ignores them, `dataclasses.replace` drops them.
     drift : array_like, shape (n,), optional
         Measured motion in one sample at the operating point, which the model leaves out. Zeros
         where it is within its uncertainty. Ignored and dropped as the notes are.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a matrix has the wrong shape or holds NaN, or ``dt`` is not above zero.
 
     Examples
     --------
@@ -63,7 +53,7 @@ class LinearModel(LinearSystem):
     notes: tuple[str, ...] = field(init=False, repr=False)
     drift: Array = field(init=False, repr=False)
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the matrices of a plant and its operating point
         self,
         A: ArrayLike,
         B: ArrayLike,
@@ -85,20 +75,10 @@ class LinearModel(LinearSystem):
             raise ValueError(f"B has shape {B.shape}: the model needs at least one input.")
         E = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
         if d_ss is not None and np.size(d_ss) and not E.size:
-            raise ValueError(
-                f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E too."
-            )
-        super().__init__(
-            A,
-            B,
-            as_positive("dt", dt),
-            _vector("x_ss", x_ss, n),
-            _vector("u_ss", u_ss, B.shape[1]),
-            E,
-            _vector("d_ss", d_ss, E.shape[1]),
-            tuple(notes),
-            _vector("drift", drift, n),
-        )
+            raise ValueError(f"d_ss = {d_ss!r} is given, but no disturbances: pass E too.")
+        x, u = as_vector("x_ss", x_ss, n), as_vector("u_ss", u_ss, B.shape[1])
+        d, moved = as_vector("d_ss", d_ss, E.shape[1]), as_vector("drift", drift, n)
+        super().__init__(A, B, as_positive("dt", dt), x, u, E, d, tuple(notes), moved)
 
     @classmethod
     def from_continuous(
@@ -146,18 +126,14 @@ class LinearModel(LinearSystem):
         Parameters
         ----------
         f : callable
-            Takes x of shape (n,) and u of shape (m,), with ``d_ss`` also d of shape (d,); returns
-            dx/dt of shape (n,).
-        x_ss, u_ss : array_like, shapes (n,) and (m,)
-            The operating point, a steady state of ``f``.
+            Takes x (n,) and u (m,), with ``d_ss`` also d (d,); returns dx/dt (n,).
+        x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,)
+            The operating point, a steady state of ``f``; d_ss is optional.
         dt : float
             Sampling time.
-        d_ss : array_like, shape (d,), optional
-            Measured disturbances at the operating point.
         scale : array_like, shape (n,) or (n + m + d,), optional
-            Range in which each state, or each state, input and disturbance, moves in use. Steps
-            are 1 % of it. The default is the size of each, at least 1: give trace concentrations
-            their own.
+            Range in which each state, or each state, input and disturbance, moves in use; steps are
+            1 % of it. The default is the size of each, at least 1: too much for a trace.
 
         Raises
         ------
@@ -187,8 +163,8 @@ class LinearModel(LinearSystem):
     ) -> LinearModel:
         """Linearize one step of a simulator and its wrappers by central differences.
 
-        An environment is deep-copied and stays untouched. One that cannot be copied is used itself
-        and needs a reset afterwards; the notes then say so.
+        An environment is deep-copied. One that cannot be copied is used itself and needs a reset
+        afterwards; the notes then say so.
 
         Parameters
         ----------
@@ -215,12 +191,9 @@ class LinearModel(LinearSystem):
 
         Raises
         ------
-        TypeError
-            For vectorized environments and other than Box actions.
-        ValueError
-            If ``dt`` is unknown, the state cannot be set, steps do not repeat (noise, hidden
-            states), there is no steady state, the action lies on its bound, or the plant has a
-            kink or a jump at the point.
+        TypeError, ValueError
+            For vectorized environments, unknown ``dt``, a state that cannot be set, steps that do
+            not repeat (noise, hidden states), no steady state, actions on a bound, kinks and jumps.
 
         Examples
         --------
@@ -233,8 +206,8 @@ class LinearModel(LinearSystem):
     @classmethod
     def from_data(
         cls,
-        states: ArrayLike | Sequence[ArrayLike],
-        actions: ArrayLike | Sequence[ArrayLike],
+        states: Log,
+        actions: Log,
         *,
         dt: float,
         **options: Any,
@@ -243,10 +216,8 @@ class LinearModel(LinearSystem):
 
         Parameters
         ----------
-        states : array_like, shape (T+1, n), or a sequence of such
-            Each episode's states, before every action and after the last.
-        actions : array_like, shape (T, m), or a sequence of such
-            The inputs as they were executed.
+        states, actions : array_like, shapes (T+1, n) and (T, m), or sequences of such
+            States before every action and after the last, and the inputs as they were executed.
         dt : float
             Sampling time.
         **options
@@ -289,11 +260,6 @@ class LinearModel(LinearSystem):
         disturbances : sequence of int or str, optional
             Inputs of the system, by number or label, that are measured disturbances: they make E.
 
-        Raises
-        ------
-        TypeError, ValueError
-            If it is no state space, ``dt`` is missing or not the system's, or an input is unknown.
-
         Examples
         --------
         >>> import control
@@ -322,7 +288,3 @@ class LinearModel(LinearSystem):
     def __hash__(self) -> int:
         """Return a hash that equal models share."""
         return hash((self.A.tobytes(), self.B.tobytes(), self.dt, self.E.tobytes()))
-
-
-def _vector(name: str, value: ArrayLike | None, size: int) -> Array:
-    return as_array(name, np.zeros(size) if value is None else value, (size,))

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.linear_system import LinearSystem
+from sb3_yann.control.linear_system import LinearSystem, combination, names
 
 ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
 UNREACHED, HARDLY_REACHED = 1e-6, 1e-3
@@ -24,27 +21,16 @@ SLOW_SAMPLING, FAST_SAMPLING = 1.0, 50.0
 
 def describe(model: LinearSystem) -> str:
     """Return the report of `LinearModel.report`."""
-    blocks = (
-        _head(model),
-        ["Poles:", *(f"  {line}" for line in _modes(model))],
-        [_stability(model)],
-        _reach(model),
-        _scaling(model),
-        _sampling(model),
-        [f"Note: {note}" for note in model.notes],
-    )
-    return "\n".join(line for block in blocks for line in block)
+    modes = [f"  {_number(pole)}: {_mode(pole, model.dt)}" for pole in poles(model)]
+    lines = [*_head(model), "Poles:", *modes, _stability(model)]
+    lines += [*_reach(model), *_scaling(model), *_sampling(model)]
+    return "\n".join([*lines, *(f"Note: {note}" for note in model.notes)])
 
 
 def _head(model: LinearSystem) -> list[str]:
-    sizes = ", ".join(
-        f"{count} {word}{'s' * (count != 1)}"
-        for count, word in (
-            (model.n_states, "state"),
-            (model.n_inputs, "input"),
-            (model.n_disturbances, "measured disturbance"),
-        )
-    )
+    counts = (model.n_states, model.n_inputs, model.n_disturbances)
+    words = zip(counts, ("state", "input", "measured disturbance"), strict=True)
+    sizes = ", ".join(f"{count} {word}{'s' * (count != 1)}" for count, word in words)
     point = f"x_ss = {_vector(model.x_ss)}, u_ss = {_vector(model.u_ss)}"
     if model.n_disturbances:
         point += f", d_ss = {_vector(model.d_ss)}"
@@ -64,10 +50,6 @@ def time_constant(pole: complex) -> float:
     if abs(size - 1) <= ON_CIRCLE:
         return np.inf
     return float(-1 / np.log(size)) if size > 0 else 0.0
-
-
-def _modes(model: LinearSystem) -> list[str]:
-    return [f"{_number(pole)}: {_mode(pole, model.dt)}" for pole in poles(model)]
 
 
 def _mode(pole: complex, dt: float) -> str:
@@ -101,14 +83,12 @@ def _stability(model: LinearSystem) -> str:
 def reach(model: LinearSystem) -> tuple[Array, Array]:
     """Return the relative reach of the inputs (n,), largest first, and its directions (n, n).
 
-    The directions, in rows, are the principal axes of the scaled controllability Gramian. The rank
-    of ``control.ctrb`` would mislead: with short samples ``B, AB, ...`` are nearly parallel.
-    `control.gram` needs slycot and a stable A; here A is scaled down, which keeps the reachable
-    subspace.
+    The directions, in rows, are the principal axes of the scaled controllability Gramian. In short
+    samples ``B, AB, ...`` are nearly parallel: the rank of ``control.ctrb`` would mislead.
     """
     A, B = model.A, model.B / np.maximum(np.linalg.norm(model.B, axis=0), np.finfo(float).tiny)
     radius = np.max(np.abs(np.linalg.eigvals(A)))
-    if radius > 0.999:
+    if radius > 0.999:  # a smaller A has the same reachable subspace
         A = A * (0.999 / radius)
     gramian, power = B @ B.T, A
     # Smith's doubling sums positive terms: bad scaling does not spoil it as it does an equation.
@@ -127,12 +107,13 @@ def reach(model: LinearSystem) -> tuple[Array, Array]:
 def _reach(model: LinearSystem) -> list[str]:
     """Return the lines on controllability."""
     sizes, axes = reach(model)
+    words = [combination(axis, axis, names([sizes.size]), 1e-3, 3) for axis in axes]
     rank = int(np.sum(sizes > UNREACHED))
     lines = [f"Controllability: the inputs reach {rank} of {sizes.size} directions of the state."]
     if rank < sizes.size:
-        lines += [f"  Nothing moves {_direction(axis)}." for axis in axes[rank:]]
+        lines += [f"  Nothing moves {each}." for each in words[rank:]]
     elif sizes[-1] < HARDLY_REACHED:
-        lines.append(f"  {_direction(axes[-1])} is moved {sizes[-1]:.1e} times as far as the most.")
+        lines.append(f"  {words[-1]} is moved {sizes[-1]:.1e} times as far as the most.")
     idle = np.flatnonzero(~np.any(model.B, axis=0))
     return lines + [f"  u[{i}] has no effect." for i in idle]
 
@@ -142,16 +123,15 @@ def _scaling(model: LinearSystem) -> list[str]:
     _, (factors, _) = linalg.matrix_balance(model.A, permute=False, separate=True)
     spread = np.max(factors) / np.min(factors)
     effects = np.abs(model.B[model.B != 0])
+    advice = " Consider other units." if spread > 1e3 else ""
     lines = []
     if effects.size:
         lines.append(
             f"Scaling: entries of B from {np.min(effects):.2g} to {np.max(effects):.2g}; balancing "
-            f"A would rescale its states by up to {spread:.3g} against each other"
-            + (". Consider other units." if spread > 1e3 else ".")
+            f"A would rescale its states by up to {spread:.3g} against each other.{advice}"
         )
-    n = model.n_states
     if np.min(np.abs(np.linalg.eigvals(model.A) - 1)) > ON_CIRCLE:
-        gain = np.linalg.solve(np.eye(n) - model.A, model.B)
+        gain = np.linalg.solve(np.eye(model.n_states) - model.A, model.B)
         gain[np.abs(gain) < 1e-9 * np.max(np.abs(gain))] = 0.0
         # An unstable plant has this steady state but does not approach it.
         stable = np.all(np.abs(poles(model)) < 1 - ON_CIRCLE)
@@ -169,14 +149,12 @@ def _sampling(model: LinearSystem) -> list[str]:
     period = 2 * np.pi / max(angles) if angles and max(angles) > 1e-9 else np.inf
     if not moving and np.isinf(period):
         return ["Sampling: the plant only integrates or delays: no time scale to compare dt with."]
-    lines = []
+    lines = [f"Sampling: the shortest oscillation takes {period:.3g} samples."]
     if moving:
-        lines.append(
+        lines = [
             f"Sampling: the fastest time constant is {min(moving):.3g} samples, the slowest "
             f"{max(moving):.3g}. A horizon of as many steps sees such a mode change e-fold."
-        )
-    else:
-        lines.append(f"Sampling: the shortest oscillation takes {period:.3g} samples.")
+        ]
     if min(moving, default=np.inf) < SLOW_SAMPLING or period < 6:
         lines.append(
             "  Slow: a mode dies out or swings round within a few samples, where no input can act "
@@ -190,22 +168,9 @@ def _sampling(model: LinearSystem) -> list[str]:
     return lines
 
 
-def _direction(axis: Array) -> str:
-    """Return a combination of states in words."""
-    largest = axis[np.argmax(np.abs(axis))]
-    terms = [
-        f"{value / largest:+.3g} x[{i}]"
-        for i, value in enumerate(axis)
-        if abs(value) > 1e-3 * abs(largest)
-    ]
-    return terms[0].split()[1] if len(terms) == 1 else " ".join(terms).removeprefix("+")
-
-
 def _number(value: complex) -> str:
-    if value.imag == 0:
-        return f"{value.real:.4f}"
-    return f"{value.real:.4f} ± {abs(value.imag):.4f}i"
+    return f"{value.real:.4f}" + (f" ± {abs(value.imag):.4f}i" if value.imag else "")
 
 
-def _vector(values: NDArray[np.floating[Any]]) -> str:
+def _vector(values: Array) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

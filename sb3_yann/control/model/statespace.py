@@ -37,13 +37,12 @@ def from_control(
 def _sample_time(own: float | bool | None, dt: float | None) -> tuple[float, bool]:
     """Return the sampling time, and whether the system is continuous.
 
-    python-control's time bases: 0 is continuous, True discrete without a sampling time, None not
-    stated.
+    python-control's 0 is continuous, True discrete without a sampling time, None not stated.
     """
     if own is None:
         raise ValueError(
-            "system.dt is None: it does not say whether it is continuous or discrete. Make it with "
-            "control.ss(A, B, C, D, 0) or control.ss(A, B, C, D, dt)."
+            "system.dt is None: continuous or discrete? Make it with control.ss(A, B, C, D, 0) or "
+            "control.ss(A, B, C, D, dt)."
         )
     given = None if dt is None else as_positive("dt", dt)
     if own is not True and own > 0:
@@ -80,13 +79,10 @@ def _dropped(system: Any, A: Array) -> list[str]:
     if np.array_equal(C, np.eye(n)):
         return notes
     rank = int(np.linalg.matrix_rank(control.obsv(A, C)))
+    seen = f", which is not possible: the outputs show {rank} of {n} directions of the state"
+    impossible = seen if rank < n else ""
     notes.append(
         "C is not the identity and was dropped: the law depends on the states, not on the outputs "
-        "y = C x. Measure the states, or estimate them by an observer"
-        + (
-            "."
-            if rank == n
-            else f", which is not possible: the outputs show {rank} of {n} directions of the state."
-        )
+        f"y = C x. Measure the states, or estimate them by an observer{impossible}."
     )
     return notes
