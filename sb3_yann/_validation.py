@@ -71,7 +71,9 @@ def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -
     array = to_float(name, value)
     array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
     if np.any(array <= 0):
-        raise ValueError(f"{name} = {array.tolist()} must be above 0 in each entry.{_after(hint)}")
+        raise ValueError(
+            f"{name} = {array.tolist()} must be above 0 in each entry. {hint}".rstrip()
+        )
     return array
 
 
@@ -134,7 +136,7 @@ def as_between(
     """
     array = np.asarray(value if np.ndim(value) == 0 else None)
     if array.dtype.kind not in "iuf":
-        raise TypeError(f"{name} = {_short(value)} must be a number.{_after(hint)}")
+        raise TypeError(f"{name} = {_short(value)} must be a number. {hint}".rstrip())
     number = float(array)
     left = number >= low if ends[0] == "[" else number > low
     right = number <= high if ends[1] == "]" else number < high
@@ -146,14 +148,14 @@ def as_between(
     else:
         above = f" {'above' if ends[0] == '(' else 'of at least'} {low:g}" if low > -np.inf else ""
         wanted = f"be a finite number{above}"
-    raise ValueError(f"{name} = {value!r} must {wanted}.{_after(hint)}")
+    raise ValueError(f"{name} = {value!r} must {wanted}. {hint}".rstrip())
 
 
 def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
     """Return ``value`` as an int of at least ``least``, else raise ValueError; bools are none."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise ValueError(
-            f"{name} = {_short(value)} must be a whole number of at least {least}.{_after(hint)}"
+            f"{name} = {_short(value)} must be a whole number of at least {least}. {hint}".rstrip()
         )
     return int(value)
 
@@ -179,19 +181,14 @@ def to_float(name: str, value: Any) -> Array:
             raise TypeError("it is complex")
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name} = {_short(value)} is not an array of real numbers ({error})."
-        ) from None
+        fault = f"{name} = {_short(value)} is not an array of real numbers ({error})."
+        raise TypeError(fault) from None
 
 
 def _short(value: Any) -> str:
     """Return the representation of a value, without the middle of a long one."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:120]} ... {text[-40:]}"
-
-
-def _after(hint: str) -> str:
-    return hint and f" {hint}"
 
 
 class ReadOnlyArrays:
