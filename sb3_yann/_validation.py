@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -192,7 +193,7 @@ def _short(value: Any) -> str:
 
 
 class ReadOnlyArrays:
-    """Keeps the arrays of a frozen dataclass read-only in its copies and after unpickling."""
+    """A frozen dataclass that compares its arrays, and keeps them read-only when unpickled."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for value in state.values():
@@ -200,6 +201,11 @@ class ReadOnlyArrays:
                 if isinstance(array, np.ndarray):
                     array.setflags(write=False)
         self.__dict__.update(state)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, type(self)):
+            return NotImplemented
+        return same_fields(self, other, [field.name for field in fields(self)])  # type: ignore[arg-type]
 
 
 def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann.policy._finite import watch_buffer
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.policies import YannPolicy, require_yann_policy
 
 
 class NoActionNoise(BaseCallback):
@@ -19,11 +19,6 @@ class NoActionNoise(BaseCallback):
 
     It removes the model's action noise, and its random first actions (``learning_starts`` is 0).
     Both stay off after `learn` returns. TD3's smoothing of the *target* policy stays.
-
-    Raises
-    ------
-    TypeError
-        If the model is not an off-policy algorithm.
 
     Examples
     --------
@@ -39,11 +34,10 @@ class NoActionNoise(BaseCallback):
         # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
         if not isinstance(self.model, OffPolicyAlgorithm):
             raise TypeError(
-                f"NoActionNoise needs an off-policy algorithm such as DDPG or TD3, not "
+                "NoActionNoise needs an off-policy algorithm, such as DDPG or TD3, not "
                 f"{type(self.model).__name__}."
             )
-        self.model.action_noise = None
-        self.model.learning_starts = 0
+        self.model.action_noise, self.model.learning_starts = None, 0
         if isinstance(self.model.policy, YannPolicy):
             watch_buffer(self.model)  # another one may have been loaded since
 
@@ -64,11 +58,6 @@ class ControlDiagnostics(BaseCallback):
       that of ``|G|``. G is the discounted return that followed; where the episode was cut off, the
       critic's value of its last state is added.
 
-    Raises
-    ------
-    TypeError
-        If the model's policy is not a YannPolicy.
-
     Examples
     --------
     >>> from stable_baselines3 import DDPG
@@ -79,18 +68,11 @@ class ControlDiagnostics(BaseCallback):
     model: OffPolicyAlgorithm
 
     def _init_callback(self) -> None:
-        policy = self.model.policy
-        if not isinstance(policy, YannPolicy):
-            raise TypeError(
-                "ControlDiagnostics compares a YannPolicy with its MPC; the policy of this model "
-                f"is {type(policy).__name__}."
-            )
-        self.policy = policy
+        self.policy = require_yann_policy(self.model.policy, "ControlDiagnostics")
         self.violations = 0
         self._forget()
-        self._episodes: list[list[tuple[Any, ...]]] = [
-            [] for _ in range(self.training_env.num_envs)
-        ]
+        n_envs = self.training_env.num_envs
+        self._episodes: list[list[tuple[Any, ...]]] = [[] for _ in range(n_envs)]
 
     def _on_step(self) -> bool:
         if "yann/violations" not in self.logger.name_to_value and self._recorded:

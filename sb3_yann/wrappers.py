@@ -1,12 +1,4 @@
-"""Wrappers that complete an observation to the parameter theta = [x, r, d, u_prev] of a problem.
-
-Each appends one part. Wrap in the order of theta, the state innermost::
-
-    env = SetPoint(env, r_min, r_max)
-    env = ObserveDisturbance(env, observer, d_min, d_max)  # or MeasuredDisturbance
-    env = PreviousInput(env)
-    env = StageCost(env, problem)
-"""
+"""Wrappers that complete an observation to theta = [x, r, d, u_prev], in that order outwards."""
 
 from __future__ import annotations
 
@@ -49,8 +41,8 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
             )
         if not np.all(self.low <= self.high):  # nor is NaN
             raise ValueError(
-                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, and no "
-                "entry of low may exceed that of high."
+                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, and "
+                "no entry of low may exceed that of high."
             )
         free = np.full(n_new, np.inf)
         self.observation_space = spaces.Box(

@@ -13,9 +13,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 def compiled(signature: str) -> Callable[[F], F]:
     """Return a decorator that compiles a function for given types, and keeps the machine code.
 
-    What it calls must be in the same file: numba does not look at others when it decides whether
-    the machine code is still that of the source. It returns numbers, and writes arrays to those it
-    is given: to return one, numba runs Python code, in which a Ctrl-C becomes a SystemError.
+    What it calls must be in the same file: numba looks at no other to tell whether the machine code
+    is up to date. It returns numbers only: to return an array, numba runs Python code, in which a
+    Ctrl-C becomes a SystemError.
     """
 
     def compile_it(function: F) -> F:

@@ -13,16 +13,14 @@ class ActionRepeat(
 ):
     """Holds each action for ``k`` steps of the env, and adds up their rewards.
 
-    A policy then decides every ``k * dt``, where ``dt`` is the sampling time of the env: the
-    LinearModel of its MPC must have the sampling time ``k * dt``, e.g.
-    ``LinearModel.from_continuous(A, B, k * dt)``. The reward is about k times the stage cost at the
-    beginning, so weights ``k * Q`` and ``k * R``, or the policy's ``reward_scale=k``, describe it
-    the better the less happens within the k steps; :class:`sb3_yann.CostAudit` measures how well.
+    A policy then decides every ``k * dt``, where ``dt`` is the sampling time of the env: the model
+    of its MPC must have that sampling time, e.g. ``LinearModel.from_continuous(A, B, k * dt)``. The
+    reward is about that of weights ``k * Q`` and ``k * R``, or of the critic's ``reward_scale=k``;
+    :class:`sb3_yann.CostAudit` measures how well they describe it.
 
-    ``info`` is that of the last step, but ``info["violation"]`` is true if it was true in any of
-    them (`gymnasium.wrappers.RepeatAction`, of Gymnasium 1.3 and later, loses that). An episode
-    that ends, ends at once. A time limit below this wrapper counts steps of the env, one above it
-    counts decisions.
+    ``info`` is that of the last step, but ``info["violation"]`` is true if it was true in any
+    (`gymnasium.wrappers.RepeatAction` loses that). An episode that ends, ends at once. A time limit
+    below this wrapper counts steps of the env, one above it counts decisions.
 
     Parameters
     ----------

@@ -5,18 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sb3_yann_envs._checks import (
-    check_render_mode,
-    clipped_input,
-    constant,
-    not_reset,
-    start_option,
-    warn_no_render_mode,
-)
+from sb3_yann_envs._problem_env import Array, ProblemEnv, constant
 from sb3_yann_envs.rendering import Frame, pendulum_frame
 from sb3_yann_envs.spaces import ProblemBox
 
@@ -50,23 +42,12 @@ PRINTED_A = constant([[1.0188, 0.0503], [0.7547, 1.0188]])
 PRINTED_B = constant([[0.0038], [0.1509]])
 """Input matrix as printed in the paper, for one sample of 0.05 s."""
 
-_STATE_NAMES = ("theta", "theta_dot")
 
+def dynamics(x: ArrayLike, u: ArrayLike) -> Array:
+    """Return the state's time derivative (Braniff & Tian, equation of the clipped pendulum).
 
-def dynamics(x: ArrayLike, u: ArrayLike) -> NDArray[np.float64]:
-    """Return the time derivative of the state in continuous time, without the clipping.
-
-    Parameters
-    ----------
-    x : array_like, shape (2,)
-        Angle from upright in rad, angular speed in rad/s.
-    u : array_like, shape (1,)
-        Torque in N m.
-
-    Returns
-    -------
-    ndarray, shape (2,)
-        Derivatives in rad/s and rad/s2 (Braniff & Tian, equation of the clipped pendulum).
+    `x` is the angle from upright in rad and the speed in rad/s, `u` the torque in N m, shape (1,).
+    Nothing is clipped.
     """
     theta, speed = np.asarray(x, dtype=np.float64)
     (torque,) = np.asarray(u, dtype=np.float64)
@@ -83,16 +64,15 @@ def next_speed(sine: Any, speed: Any, torque: Any) -> Any:
     return speed + (_GRAVITY_GAIN * sine + _TORQUE_GAIN * torque) * DT
 
 
-class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class ClippedPendulumEnv(ProblemEnv):
     """Hold a pendulum upright with a torque too weak to lift it.
 
     ## Description
 
     A rod turns about one end. The goal is to keep it upright, at rest, with little torque. The
-    simulator is that of Gymnasium's `Pendulum-v1`, step for step. Two things differ: the agent
-    observes the state itself instead of cosine and sine of the angle, as a linear controller
-    needs, and an episode starts near upright. From about one start in five the torque of 2 N m
-    cannot hold the rod: it must let go, swing round once and catch the rod from the other side.
+    simulator is that of Gymnasium's `Pendulum-v1`, step for step. But the agent observes the angle
+    itself, as a linear controller needs, and an episode starts near upright. From about one start
+    in five 2 N m cannot hold the rod: it must swing round once and be caught from the other side.
 
     ## Action Space
 
@@ -149,61 +129,38 @@ class ClippedPendulumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    state_names = ("theta", "theta_dot")
+    # The float32 next to pi is 3.14159274 > pi, so an angle that rounds up to it is inside.
+    highest = constant(np.array([math.pi, MAX_SPEED], dtype=np.float32))
+    lowest = constant(-highest)
+    start_high = constant([START_ANGLE, START_SPEED])
+    start_low = constant(-start_high)
 
     def __init__(self, render_mode: str | None = None) -> None:
-        self.render_mode = check_render_mode(render_mode, self)
-        # The float32 next to pi is 3.14159274 > pi, so an angle that rounds up to it is inside.
-        self._bounds = np.array([math.pi, MAX_SPEED], dtype=np.float32)
-        self.observation_space = ProblemBox(
-            -self._bounds, self._bounds, problem="sb3_yann_envs.problems:clipped_pendulum"
-        )
-        self.action_space = gymnasium.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), np.float32)
+        low, high = self.lowest.astype(np.float32), self.highest.astype(np.float32)
+        states = ProblemBox(low, high, problem="sb3_yann_envs.problems:clipped_pendulum")
+        super().__init__(render_mode, states, MAX_TORQUE)
         self._torque = 0.0
-        # The angle is not wrapped inside, as in Gymnasium: wrapping would change its last bits.
-        self._state: tuple[float, float] | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode, from a random state or from ``options["state"]``, shape (2,)."""
-        super().reset(seed=seed)
-        start = start_option(options, -self._bounds, self._bounds, _STATE_NAMES)
-        if start is None:
-            reach = np.array([START_ANGLE, START_SPEED])
-            start = tuple(self.np_random.uniform(-reach, reach).tolist())
-        theta, speed = start
-        self._state = (theta, speed)
+    def _begin(self) -> None:
         self._torque = 0.0
-        state = np.array([wrapped(theta), speed])
-        return state.astype(np.float32), {"state": state}
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Apply a torque for one sample of 0.05 s."""
-        if self._state is None:
-            raise not_reset("step", "the pendulum has no state yet")
+    def _advance(self, u: float) -> tuple[float, bool]:
         theta, speed = self._state
-        torque = clipped_input(action, MAX_TORQUE)
-        cost = stage_cost(theta, speed, torque)
+        cost = stage_cost(theta, speed, u)
         # numpy's sine, not math's: the two differ in the last bit on some machines, and the
         # trajectories are to be Gymnasium's bit for bit (with float64 actions).
-        speed = next_speed(float(np.sin(theta)), speed, torque)
+        speed = next_speed(float(np.sin(theta)), speed, u)
         speed = min(max(speed, -MAX_SPEED), MAX_SPEED)
-        theta += speed * DT
-        self._state = (theta, speed)
-        self._torque = torque
-        state = np.array([wrapped(theta), speed])
-        info = {"cost": cost, "violation": False, "state": state}
-        return state.astype(np.float32), -cost, False, False, info
+        # The angle is not wrapped inside, as in Gymnasium: wrapping would change its last bits.
+        self._state, self._torque = (theta + speed * DT, speed), u
+        return cost, False
 
-    def render(self) -> Frame | None:
-        """Return a picture of shape (400, 400, 3), or None without a render mode."""
-        if self.render_mode is None:
-            warn_no_render_mode(self)
-            return None
-        if self._state is None:
-            raise not_reset("render", "the pendulum has no state yet")
+    def _observed(self) -> Array:
+        theta, speed = self._state
+        return np.array([wrapped(theta), speed])
+
+    def _frame(self) -> Frame:
         return pendulum_frame(self._state[0], self._torque, MAX_TORQUE)
 
 

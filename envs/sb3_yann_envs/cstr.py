@@ -5,19 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sb3_yann_envs._checks import (
-    check_render_mode,
-    clipped_input,
-    constant,
-    not_reset,
-    start_option,
-    warn_no_render_mode,
-)
 from sb3_yann_envs._compiled import compiled
+from sb3_yann_envs._problem_env import Array, ProblemEnv, constant, not_reset
 from sb3_yann_envs.rendering import Frame, reactor_frame
 from sb3_yann_envs.spaces import ProblemBox
 
@@ -49,22 +41,14 @@ _HEATING_2 = REACTION_HEAT_2 / HEAT_CAPACITY  # K L/mol
 _COOLING = 1000 * AREA / (HEAT_CAPACITY * VOLUME)  # m2 K/kJ
 
 
-def _rate_constants(temperature: float) -> tuple[float, float]:
-    """Return the Arrhenius rate constants in L/(mol h) and 1/h."""
-    thermal = GAS_CONSTANT * temperature
-    return (
-        math.exp(LOG_FREQUENCY_1 - ACTIVATION_1 / thermal),
-        math.exp(LOG_FREQUENCY_2 - ACTIVATION_2 / thermal),
-    )
-
-
 def _steady_state(temperature: float, transfer: float) -> tuple[float, float, float, float]:
     """Return C_A, C_B, C_S and the feed temperature that balance at the given T and U.
 
-    The balances of A and B give ``C_B - C_A = FEED_B - FEED_A``, which leaves a quadratic equation
-    for C_A; that of S is linear; that of the heat then determines the feed temperature.
+    The balances of A and B give ``C_B - C_A = FEED_B - FEED_A`` and a quadratic equation for C_A.
     """
-    k1, k2 = _rate_constants(temperature)
+    thermal = GAS_CONSTANT * temperature
+    k1 = math.exp(LOG_FREQUENCY_1 - ACTIVATION_1 / thermal)
+    k2 = math.exp(LOG_FREQUENCY_2 - ACTIVATION_2 / thermal)
     excess = FEED_B - FEED_A
     half = (k1 * excess + DILUTION) / 2
     c_a = (math.sqrt(half**2 + k1 * DILUTION * FEED_A) - half) / k1
@@ -89,14 +73,10 @@ Q = constant(0.1 * np.eye(4))
 R = constant([[1e-4]])
 """Input weight of the stage cost, for the deviation in kJ/(h m2 K)."""
 
-STATE_LOW = constant([-2.0, -2.0, -2.0, -70.0])
-"""Lower bounds that the paper puts on the deviations; no start may lie below them."""
-STATE_HIGH = constant([2.0, 2.0, 2.0, 5.0])
-"""Upper bounds that the paper puts on the deviations; no start may lie above them."""
-START_LOW = constant([-0.05, -0.4, -0.4, -7.5])
-"""Lower bounds of the random starts."""
-START_HIGH = constant([0.05, 0.4, 0.4, 4.0])
-"""Upper bounds of the random starts."""
+# Bounds that the paper puts on the deviations; no start may lie beyond them.
+STATE_LOW, STATE_HIGH = constant([-2.0, -2.0, -2.0, -70.0]), constant([2.0, 2.0, 2.0, 5.0])
+# Bounds of the random starts.
+START_LOW, START_HIGH = constant([-0.05, -0.4, -0.4, -7.5]), constant([0.05, 0.4, 0.4, 4.0])
 
 PRINTED_A = constant(
     [
@@ -111,24 +91,13 @@ PRINTED_B = constant([[0.0], [0.0], [0.0], [-0.0007]])
 """Input matrix as printed in the paper, for deviations and one sample."""
 
 _STATE = "UniTuple(float64, 4)"  # which numba returns without running Python code
-_STATE_NAMES = ("C_A deviation", "C_B deviation", "C_S deviation", "T deviation")
 
 
-def dynamics(x: ArrayLike, u: ArrayLike) -> NDArray[np.float64]:
-    """Return the time derivative of the state in continuous time, in absolute coordinates.
+def dynamics(x: ArrayLike, u: ArrayLike) -> Array:
+    """Return the state's time derivative in mol/(L h) and K/h, by the balances of a stirred tank.
 
-    Parameters
-    ----------
-    x : array_like, shape (4,)
-        C_A, C_B, C_S in mol/L and T in K, not deviations.
-    u : array_like, shape (1,)
-        Heat transfer coefficient U in kJ/(h m2 K), not a deviation.
-
-    Returns
-    -------
-    ndarray, shape (4,)
-        Derivatives in mol/(L h) and K/h. The balances are those of a stirred tank with feed
-        ``DILUTION * (feed - outflow)``; the class docstring says where the paper prints others.
+    `x` is (C_A, C_B, C_S) in mol/L and T in K, `u` the heat transfer coefficient in kJ/(h m2 K),
+    shape (1,). Neither is a deviation.
     """
     c_a, c_b, c_s, temperature = np.asarray(x, dtype=np.float64).tolist()
     (transfer,) = np.asarray(u, dtype=np.float64).tolist()
@@ -140,7 +109,6 @@ def _rates(
     c_a: float, c_b: float, c_s: float, temperature: float, transfer: float
 ) -> tuple[float, float, float, float]:
     """Return `dynamics` on plain floats."""
-    # Not by _rate_constants: eight calls in a step are a tenth of its time.
     thermal = GAS_CONSTANT * temperature
     r1 = np.exp(LOG_FREQUENCY_1 - ACTIVATION_1 / thermal) * c_a * c_b
     r2 = np.exp(LOG_FREQUENCY_2 - ACTIVATION_2 / thermal) * c_s
@@ -196,16 +164,14 @@ def advance(
 
 
 @compiled("void(float64[:, ::1], float64[::1], float64[:, ::1])")
-def advance_all(
-    deviations: NDArray[np.float64], transfer: NDArray[np.float64], after: NDArray[np.float64]
-) -> None:
+def advance_all(deviations: Array, transfer: Array, after: Array) -> None:
     """Write `advance` of many reactors: deviations of shape (4, n), transfer of shape (n,)."""
     for i in range(len(transfer)):
         a, b, s, t = deviations[0, i], deviations[1, i], deviations[2, i], deviations[3, i]
         after[0, i], after[1, i], after[2, i], after[3, i] = advance(a, b, s, t, transfer[i])
 
 
-class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class CSTREnv(ProblemEnv):
     """Bring an exothermic reactor to its steady state without passing 480 K.
 
     ## Description
@@ -249,9 +215,7 @@ class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     | 3   | Temperature T (the limit is at 5.0) | -70.0 | 25.0 | K     |
 
     The bounds hold for every observation, also the one beyond the limit that ends an episode, for
-    any inputs and any start that `reset` accepts. From the random starts the deviations within an
-    episode are much smaller: (-0.05, 0.21), (-0.40, 0.44), (-0.40, 0.40) mol/L and (-17.8, 5.1) K
-    were the extremes under bang-bang inputs.
+    any inputs and any start that `reset` accepts.
 
     ## Rewards
 
@@ -277,8 +241,7 @@ class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Arguments
 
-    - `render_mode`: None, or `"rgb_array"` for a picture of shape (400, 600, 3) with the history of
-      temperature and input.
+    - `render_mode`: None, or `"rgb_array"` for the history as a picture of shape (400, 600, 3).
 
     ```python
     >>> import gymnasium
@@ -295,64 +258,33 @@ class CSTREnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+    state_names = ("C_A deviation", "C_B deviation", "C_S deviation", "T deviation")
+    # A concentration cannot be negative, so the deviation cannot be below minus the steady one.
+    lowest, highest = constant(np.maximum(STATE_LOW, [*-X_SS[:3], -np.inf])), STATE_HIGH
+    start_low, start_high = START_LOW, START_HIGH
 
     def __init__(self, render_mode: str | None = None) -> None:
-        self.render_mode = check_render_mode(render_mode, self)
-        self.observation_space = ProblemBox(
-            np.array([-3.0, -3.0, -3.0, -70.0], dtype=np.float32),
-            np.array([3.0, 3.0, 3.0, 25.0], dtype=np.float32),
-            problem="sb3_yann_envs.problems:cstr",
-        )
-        self.action_space = gymnasium.spaces.Box(-MAX_INPUT, MAX_INPUT, (1,), np.float32)
-        self._deviation: tuple[float, float, float, float] | None = None
+        low, high = np.array([[-3, -3, -3, -70], [3, 3, 3, 25]], np.float32)
+        states = ProblemBox(low, high, problem="sb3_yann_envs.problems:cstr")
+        super().__init__(render_mode, states, MAX_INPUT)
+
+    def _begin(self) -> None:
         self._terminated = False
-        self._temperatures: list[float] = []  # only filled to be drawn
+        self._temperatures = [_T_SS + self._state[3]]  # longer only to be drawn
         self._inputs: list[float] = []
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode, from a random state or from ``options["state"]``, shape (4,)."""
-        super().reset(seed=seed)
-        # A concentration cannot be negative, so the deviation cannot be below minus the steady one.
-        low = np.maximum(STATE_LOW, [*-X_SS[:3], -np.inf])
-        start = start_option(options, low, STATE_HIGH, _STATE_NAMES)
-        if start is None:
-            start = tuple(self.np_random.uniform(START_LOW, START_HIGH).tolist())
-        a, b, s, t = start
-        self._deviation = (a, b, s, t)
-        self._terminated = False
-        self._temperatures, self._inputs = [_T_SS + t], []
-        state = np.array(self._deviation)
-        return state.astype(np.float32), {"state": state}
-
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Hold a heat transfer coefficient for one sample of 1/60 h."""
-        if self._deviation is None:
-            raise not_reset("step", "the reactor has no state yet")
+    def _advance(self, u: float) -> tuple[float, bool]:
         if self._terminated:
             raise not_reset("step", "the reactor passed its temperature limit")
-        u = clipped_input(action, MAX_INPUT)
-        a, b, s, t = self._deviation
+        a, b, s, t = self._state
         cost = stage_cost(a, b, s, t, u)
-        self._deviation = advance(a, b, s, t, _TRANSFER_SS + u)
-        self._terminated = _T_SS + self._deviation[3] > TEMPERATURE_LIMIT
-        if self._terminated:
-            cost += PENALTY
+        self._state = advance(a, b, s, t, _TRANSFER_SS + u)
+        temperature = _T_SS + self._state[3]
+        self._terminated = temperature > TEMPERATURE_LIMIT
         if self.render_mode is not None:
-            self._temperatures.append(_T_SS + self._deviation[3])
+            self._temperatures.append(temperature)
             self._inputs.append(u)
-        state = np.array(self._deviation)
-        info = {"cost": cost, "violation": self._terminated, "state": state}
-        return state.astype(np.float32), -cost, self._terminated, False, info
+        return cost + PENALTY * self._terminated, self._terminated
 
-    def render(self) -> Frame | None:
-        """Return a picture of shape (400, 600, 3), or None without a render mode."""
-        if self.render_mode is None:
-            warn_no_render_mode(self)
-            return None
-        if self._deviation is None:
-            raise not_reset("render", "the reactor has no state yet")
+    def _frame(self) -> Frame:
         return reactor_frame(DT, self._temperatures, self._inputs, TEMPERATURE_LIMIT, MAX_INPUT)

@@ -1,7 +1,6 @@
-"""Frames of the environments, drawn with Matplotlib's Agg canvas.
+"""Frames of the environments, drawn with Matplotlib's Agg canvas and without pyplot.
 
-Only figures that belong to one frame are made: nothing here touches pyplot, its global figure list,
-or its choice of a backend. Matplotlib itself is imported on the first frame.
+Matplotlib is imported on the first frame.
 """
 
 from __future__ import annotations
@@ -22,15 +21,10 @@ _ROD, _INPUT, _LIMIT = "tab:red", "tab:blue", "0.25"
 
 
 def pendulum_frame(theta: float, torque: float, max_torque: float) -> Frame:
-    """Return the picture of a pendulum as an array of shape (400, 400, 3).
+    """Return the picture of a pendulum, shape (400, 400, 3).
 
-    Parameters
-    ----------
-    theta : float
-        Angle from upright in rad, positive counter-clockwise.
-    torque, max_torque : float
-        Torque applied last, and its bound, in N m. The arrow sweeps a right angle at the bound,
-        and points the way the torque turns.
+    The angle from upright is positive counter-clockwise. The arrow points the way the torque turns,
+    and sweeps a right angle at the largest torque.
     """
     figure = _figure(4.0, 4.0)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), aspect="equal", xlim=(-1.3, 1.3), ylim=(-1.3, 1.3))
@@ -56,7 +50,7 @@ def reactor_frame(
     limit: float,
     max_input: float,
 ) -> Frame:
-    """Return the history of a reactor episode as an array of shape (400, 600, 3).
+    """Return the history of a reactor episode, shape (400, 600, 3).
 
     Parameters
     ----------
@@ -66,10 +60,8 @@ def reactor_frame(
         Temperature in K at the start and after each of k steps.
     inputs : sequence of float, length k
         Input deviation of each step in kJ/(h m2 K).
-    limit : float
-        Temperature limit in K, drawn as a dashed line.
-    max_input : float
-        Largest input deviation.
+    limit, max_input : float
+        Temperature limit in K, and largest input deviation.
     """
     figure = _figure(6.0, 4.0)
     figure.set_layout_engine("constrained")
@@ -78,22 +70,14 @@ def reactor_frame(
     upper.plot(hours, temperatures, color=_ROD)
     upper.plot(hours[-1:], temperatures[-1:], "o", color=_ROD)
     upper.axhline(limit, color=_LIMIT, linestyle="--")
-    upper.annotate(
-        f"limit {limit:g} K",
-        (0.01, limit),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 3),
-        textcoords="offset points",
-        color=_LIMIT,
-    )
+    place = (0.01, limit), (0, 3), ("axes fraction", "data"), "offset points"
+    upper.annotate(f"limit {limit:g} K", *place, color=_LIMIT)
     # A fixed floor keeps the axis still while the temperature stays near its steady state.
     upper.set_ylim(min(465.0, min(temperatures) - 1.0), max(limit, *temperatures) + 2.5)
     upper.set_ylabel("temperature (K)")
     lower.stairs(inputs, hours, baseline=None, color=_INPUT)
-    lower.set_ylim(-1.1 * max_input, 1.1 * max_input)
-    lower.set_ylabel("input deviation\n(kJ/(h m² K))")
-    lower.set_xlabel("time (h)")
-    lower.set_xlim(0.0, max(1.0, hours[-1]))
+    lower.set(ylim=(-1.1 * max_input, 1.1 * max_input), xlim=(0.0, max(1.0, hours[-1])))
+    lower.set(ylabel="input deviation\n(kJ/(h m² K))", xlabel="time (h)")
     figure.align_ylabels()
     return _pixels(figure)
 

@@ -21,8 +21,7 @@ class ProblemBox(_Box):
     """A Box that also tells an agent which control problem its environment poses.
 
     A Stable-Baselines3 policy receives the spaces of an environment and nothing else of it. The
-    problem therefore travels on the observation space: through copies, pickles, sub-processes,
-    and the space that Stable-Baselines3 saves with a model.
+    problem therefore travels on the observation space, through copies, pickles and saved models.
 
     Parameters
     ----------
@@ -45,10 +44,9 @@ class ProblemBox(_Box):
 
     Notes
     -----
-    Equality is that of `gymnasium.spaces.Box`: two spaces with equal bounds are equal whatever
-    problem they carry, because Gymnasium and Stable-Baselines3 use ``==`` to decide whether an
-    environment fits a model. Wrappers that build a new space (`FlattenObservation`, frame stacks)
-    drop the problem with it.
+    Spaces with equal bounds are equal whatever problem they carry: Gymnasium and Stable-Baselines3
+    use ``==`` to decide whether an environment fits a model. Wrappers that build a new space
+    (`FlattenObservation`, frame stacks) drop the problem with it.
 
     Examples
     --------
@@ -68,28 +66,19 @@ class ProblemBox(_Box):
         problem: object,
     ) -> None:
         super().__init__(low, high, shape, dtype=dtype, seed=seed)
-        self._reference: str | None = None
-        self._problem: object = None
         if problem is None:
             raise ValueError(
                 "problem must be an object or a reference 'module:attribute', got None. Use "
                 "gymnasium.spaces.Box for an observation without a control problem."
             )
-        if isinstance(problem, str):
-            _split_reference(problem)  # a malformed reference fails here, not in the first agent
-            self._reference = problem
-        else:
-            self._problem = problem
+        self._reference = problem if isinstance(problem, str) else None
+        self._problem = None if isinstance(problem, str) else problem
+        if self._reference is not None:
+            _split_reference(self._reference)  # a malformed one fails here, not in the first agent
 
     @property
     def problem(self) -> object:
-        """The control problem; a reference is resolved on first access and then kept.
-
-        Raises
-        ------
-        ValueError
-            If the module or the attribute that the reference names does not exist.
-        """
+        """The control problem; a reference is resolved on first access and then kept."""
         if self._problem is None and self._reference is not None:
             self._problem = resolve_reference(self._reference)
         return self._problem
@@ -106,8 +95,8 @@ def _split_reference(reference: str) -> tuple[str, str]:
     names = [*module.split("."), attribute]
     if not colon or not all(name.isidentifier() for name in names):
         raise ValueError(
-            f"problem={reference!r} is not a valid reference: write 'module:attribute', "
-            "for example 'my_package.problems:my_problem'."
+            f"problem={reference!r} is not a valid reference: write 'module:attribute', e.g. "
+            "'my_package.problems:my_problem'."
         )
     return module, attribute
 
@@ -115,10 +104,7 @@ def _split_reference(reference: str) -> tuple[str, str]:
 def resolve_reference(reference: str) -> object:
     """Return the object that ``"module:attribute"`` names; a function is called for it.
 
-    Raises
-    ------
-    ValueError
-        If the reference is malformed, or the module or the attribute does not exist.
+    A reference to what does not exist is a ValueError.
     """
     module_name, attribute = _split_reference(reference)
     try:

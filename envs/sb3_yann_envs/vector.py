@@ -1,8 +1,7 @@
 """Many copies of an environment that step as one array: hundreds of episodes in less than a second.
 
-``gymnasium.make_vec("CSTR-v0", num_envs=100)`` makes them, since they are registered so. Each copy
-has a random generator of its own, so that ``reset(seed=[...])`` starts the same episodes as the
-single environment does from the same seeds; they then agree to rounding.
+``gymnasium.make_vec("CSTR-v0", num_envs=100)`` makes them. Each copy has a random generator of its
+own: ``reset(seed=[...])`` starts the episodes that the single environment starts from these seeds.
 """
 
 from __future__ import annotations
@@ -18,41 +17,24 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from sb3_yann_envs import clipped_pendulum, cstr
-from sb3_yann_envs._checks import not_reset
-
-Array = NDArray[np.float64]
+from sb3_yann_envs._problem_env import Array, ProblemEnv, Single, asked_start, not_reset
 
 
-class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
-    """What the vectorized environments share: starts, time limit, and resets at the next step.
-
-    Parameters
-    ----------
-    num_envs : int, default 1
-    max_episode_steps : int, optional
-        Steps after which an episode is truncated; `gymnasium.make_vec` passes the registered ones.
-
-    Attributes
-    ----------
-    metadata : dict
-        ``seeds_each`` says that `reset` takes a seed for each copy.
-    """
+class _VectorEnv(VectorEnv[Single, Single, NDArray[Any]]):
+    """What the vectorized environments share: starts, time limit, and resets at the next step."""
 
     single: ClassVar[type[cstr.CSTREnv | clipped_pendulum.ClippedPendulumEnv]]
     metadata = {
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
-        "seeds_each": True,
+        "seeds_each": True,  # `reset` takes a seed for each copy
     }
 
     def __init__(self, num_envs: int = 1, max_episode_steps: int | None = None) -> None:
         self.num_envs, self.max_episode_steps = num_envs, max_episode_steps
-        self._env = self.single()
+        self._env: ProblemEnv = self.single()
         self.single_observation_space = states = self._env.observation_space
-        self.single_action_space = inputs = self._env.action_space
-        assert isinstance(states, gymnasium.spaces.Box)
-        assert isinstance(inputs, gymnasium.spaces.Box)
-        self._limit = float(inputs.high[0])
+        self.single_action_space = self._env.action_space
         box = gymnasium.spaces.Box(states.low, states.high, dtype=np.float32)
         self.observation_space = batch_space(box, num_envs)  # of a ProblemBox it would be the same
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -65,7 +47,7 @@ class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any
         *,
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Single, dict[str, Any]]:
         """Start all episodes.
 
         Parameters
@@ -75,37 +57,28 @@ class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any
         options : dict, optional
             ``{"state": starts}``, shape (num_envs, n).
         """
-        if seed is None:
-            seeds: list[int | None] = [None] * self.num_envs
-        elif isinstance(seed, int | np.integer):
-            seeds = [int(seed) + i for i in range(self.num_envs)]
+        asked = asked_start(options)
+        starts = [None] * self.num_envs if asked is None else [*asked]
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         else:
             seeds = [*seed]
-        starts = [None] * self.num_envs
-        if options:
-            unknown = sorted(map(str, set(options) - {"state"}))
-            if unknown:
-                raise ValueError(f"options has unknown keys {unknown}; the only key is 'state'.")
-            starts = [*options["state"]]
         for name, given in (("seed", seeds), ("options['state']", starts)):
             if len(given) != self.num_envs:
                 raise ValueError(f"{name} has {len(given)} entries for {self.num_envs} episodes.")
-        if not self._generators:
-            self._generators = [seeding.np_random()[0] for _ in seeds]
         self._generators = [
-            generator if each is None else seeding.np_random(each)[0]
-            for generator, each in zip(self._generators, seeds, strict=True)
+            self._generators[i] if self._generators and each is None else seeding.np_random(each)[0]
+            for i, each in enumerate(seeds)
         ]
         states = [self._start(i, start) for i, start in enumerate(starts)]
         self._state = np.ascontiguousarray(np.array(states).T)
-        self._over[:] = False
-        self._steps[:] = 0
+        self._over[:], self._steps[:] = False, 0
         observed = self._observed()
         return observed.astype(np.float32), {"state": observed, "_state": ~self._over}
 
     def step(
-        self, actions: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        self, actions: Single
+    ) -> tuple[Single, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Step every copy; those whose episode is over start a new one instead, with reward 0."""
         if not self._generators:
             raise not_reset("step", "no episode has begun")
@@ -114,8 +87,8 @@ class _VectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any
             raise ValueError(
                 f"actions must be numbers of shape ({self.num_envs}, 1), got {actions!r}."
             )
-        begun = np.flatnonzero(self._over)
-        cost, terminated = self._advance(np.clip(u[:, 0], -self._limit, self._limit))
+        begun, limit = np.flatnonzero(self._over), self._env.limit
+        cost, terminated = self._advance(np.clip(u[:, 0], -limit, limit))
         self._steps += 1
         for i in begun:
             self._state[:, i] = self._start(i, None)

@@ -12,29 +12,28 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, as_flag, as_positive, as_whole
 from sb3_yann.audit.causes import Cause, likely_cause, not_finite
-from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
+from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning, judged
 from sb3_yann.audit.sample import FEWEST, Sample
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.observations import require_frozen
+from sb3_yann.policy.policies import require_yann_policy
 
 
 class CostAudit(BaseCallback):
     """Checks that the env's reward and observation mean what the problem says, and names what not.
 
-    Actor and critic are exact only where the reward is minus the stage cost of the problem, scaled
-    and shifted as the policy's :class:`CriticOptions` say. The first steps of every `learn` are
-    compared. Steps with ``info["violation"]``, and those that terminate an episode, may cost more.
-    Where they differ, the audit looks for a likely cause and for wrappers of the env. It sees
-    nothing while the plant rests at its steady state.
+    Actor and critic are exact only where the reward is minus the stage cost, scaled and shifted as
+    the policy's :class:`CriticOptions` say. The audit compares the first steps of every `learn`,
+    and names a likely cause and wrappers of the env. Steps with ``info["violation"]``, and those
+    that terminate an episode, may cost more. While the plant rests it sees nothing.
 
     Parameters
     ----------
     steps : int, default 100
         Steps to compare, of all envs together. Fewer than ten say nothing.
     tolerance : float, default 1e-3
-        The largest error of a reward, relative to its own cost or the mean one, whichever is
-        larger, that is not a mismatch.
+        The largest error of a reward that passes, relative to its own or the mean cost.
     strict : bool, default False
-        Whether a mismatch is a :class:`CostMismatchError` that ends training, not a
+        Whether a mismatch ends training with a :class:`CostMismatchError`, instead of a
         :class:`CostMismatchWarning`.
     verbose : int, default 0
         1 prints that the rewards match.
@@ -43,13 +42,6 @@ class CostAudit(BaseCallback):
     ----------
     finding : CostFinding or None
         What was found, once enough steps have been seen.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is out of range; when training starts, if the policy is no YannPolicy.
-    CostMismatchError
-        In training, see ``strict``.
 
     Examples
     --------
@@ -73,14 +65,8 @@ class CostAudit(BaseCallback):
         self.finding: CostFinding | None = None
 
     def _init_callback(self) -> None:
-        policy = self.model.policy
-        if not isinstance(policy, YannPolicy):
-            raise TypeError(
-                "CostAudit compares the rewards with the problem of a YannPolicy; the policy of "
-                f"this model is {type(policy).__name__}."
-            )
-        self.policy, self.finding = policy, None
-        self._seen = 0
+        self.policy = require_yann_policy(self.model.policy, "CostAudit")
+        self.finding, self._seen = None, 0
         self._records: list[list[dict[str, Any]]] = [[] for _ in range(self.training_env.num_envs)]
 
     def _on_step(self) -> bool:
@@ -120,21 +106,18 @@ class CostAudit(BaseCallback):
         lost = np.array([not _is_finite(each) for each in records], dtype=bool)
         sample = self._sample(records, lost)
         self._records = []
-        enough = np.count_nonzero(sample.counted) >= FEWEST
-        if not (enough or lost.any()):
+        if np.count_nonzero(sample.counted) < FEWEST and not lost.any():
             return
         cause = not_finite(lost, records) if lost.any() else self._of_the_vec_normalize()
-        if cause is None and sample.is_the_problem_s_cost(self.tolerance):
-            self.finding = CostFinding.match(sample)
-            if self.verbose:
-                print(f"Cost audit: {self.finding.message}")
-            return
-        if cause is None:
+        if cause is None and not sample.is_the_problem_s_cost(self.tolerance):
             cause = likely_cause(sample, self.tolerance)
-        self.finding = CostFinding.mismatch(sample, cause, self.training_env)
-        if self.strict:
-            raise CostMismatchError(self.finding.message)
-        warnings.warn(self.finding.message, CostMismatchWarning, stacklevel=2)
+        self.finding = judged(sample, cause, self.training_env)
+        if cause is not None:
+            if self.strict:
+                raise CostMismatchError(self.finding.message)
+            warnings.warn(self.finding.message, CostMismatchWarning, stacklevel=2)
+        elif self.verbose:
+            print(f"Cost audit: {self.finding.message}")
 
     def _sample(self, records: list[dict[str, Any]], lost: NDArray[np.bool_]) -> Sample:
         """Return the records without the lost ones, after which another episode begins."""
@@ -147,12 +130,12 @@ class CostAudit(BaseCallback):
 
         every_env = np.repeat(np.arange(len(self._records)), [len(each) for each in self._records])
         ended = np.array([each["done"] for each in records], dtype=bool) | lost
-        done, env = column("done"), every_env[~lost]
+        env = every_env[~lost]
         first = np.r_[True, np.diff(env) != 0][: len(env)]
         begins = first | np.r_[True, ended[:-1]][~lost]
-        problem = self.policy.problem
+        problem, options = self.policy.problem, self.policy.critic_options
         observations = column("observation").reshape(len(env), records[0]["observation"].size)
-        terminated = done & ~column("truncated")
+        terminated = column("done") & ~column("truncated")
         return Sample(
             theta=theta("observation"),
             following=theta("following"),
@@ -165,8 +148,8 @@ class CostAudit(BaseCallback):
             first=first,
             blank=~np.any(observations, axis=1),
             rounding=self._rounding(observations),
-            scale=self.policy.critic_options.reward_scale,
-            offset=self.policy.critic_options.reward_offset,
+            scale=options.reward_scale,
+            offset=options.reward_offset,
             stage_cost=problem.stage_cost,
             step=problem.predict,
             gamma=self.model.gamma,
@@ -183,21 +166,13 @@ class CostAudit(BaseCallback):
 
     def _of_the_vec_normalize(self) -> Cause | None:
         """Return what has been set since the policy was built and let it pass."""
-        normalize = self.model.get_vec_normalize_env()
-        if normalize is None:
+        if (normalize := self.model.get_vec_normalize_env()) is None:
             return None
-        if normalize.norm_reward:
-            return Cause(
-                "normalized reward",
-                "VecNormalize normalizes the rewards that the critic learns from. Set "
-                "venv.norm_reward = False; reward_scale is for a constant factor.",
-            )
-        if normalize.norm_obs and normalize.training:
-            return Cause(
-                "normalized observation",
-                "the statistics of VecNormalize move, so that an observation means another state "
-                "at each step. Set venv.training = False.",
-            )
+        try:
+            require_frozen(normalize)
+        except ValueError as error:
+            what = "reward" if normalize.norm_reward else "observation"
+            return Cause(f"normalized {what}", str(error))
         return None
 
 

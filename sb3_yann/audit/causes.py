@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,7 @@ LATEST = 3
 MOST_REPEATS = 10
 
 
-@dataclass(frozen=True)
-class Cause:
+class Cause(NamedTuple):
     """A short name, an explanation with what to do, and whether options of the reward may help."""
 
     name: str
@@ -29,8 +27,8 @@ class Cause:
 
 UNKNOWN = Cause(
     "unknown",
-    "none of those that the audit knows. Compare the env's reward with problem.stage_cost(theta, u)"
-    " step by step: weights, units, what an observation means.",
+    "none that the audit knows. Compare the env's reward with problem.stage_cost(theta, u) step by "
+    "step: weights, units, what an observation means.",
     scales=True,
 )
 
@@ -56,18 +54,15 @@ def likely_cause(sample: Sample, tolerance: float) -> Cause:
         return Cause("constant", f"every reward is {sample.rewards[0]:g}, whatever happens.")
     for width in (EXACT, tolerance):
         for explain in _EXPLANATIONS:
-            cause = explain(sample, width)
-            if cause is not None:
+            if (cause := explain(sample, width)) is not None:
                 return cause
     return _repeated_action(sample, 20 * tolerance) or UNKNOWN
 
 
 def _straight_line(sample: Sample, tolerance: float) -> Cause | None:
     line = Line.through(sample)
-    if line.scale == 0:
-        return None
     predicted = (sample.offset - line.scale * -sample.cost - line.offset) / sample.scale
-    if not sample.agrees(predicted, tolerance):
+    if line.scale == 0 or not sample.agrees(predicted, tolerance):
         return None
     if line.scale < 0:
         size = "" if abs(line.scale + 1) < 1e-3 else f" (times {-line.scale:.6g})"
@@ -76,19 +71,12 @@ def _straight_line(sample: Sample, tolerance: float) -> Cause | None:
             f"the env returns the cost itself{size} as its reward. The learner would maximize it: "
             "return minus the cost.",
         )
+    found = f"the reward is {line.scale:.6g} times minus the cost"
     if line.offset == 0:
-        return Cause(
-            "scaled",
-            f"the reward is {line.scale:.6g} times minus the cost: a TransformReward, another unit,"
-            " a factor dt, or an action that is repeated.",
-            scales=True,
-        )
-    return Cause(
-        "scaled and shifted",
-        f"the reward is {line.scale:.6g} times minus the cost, plus {line.offset:.6g}: a "
-        "TransformReward, a bonus for each step, or a cost of what is not zero at the origin.",
-        scales=True,
-    )
+        why = "a TransformReward, another unit, a factor dt, or an action that is repeated."
+        return Cause("scaled", f"{found}: {why}", scales=True)
+    why = "a TransformReward, a bonus for each step, or a cost of what is not zero at the origin."
+    return Cause("scaled and shifted", f"{found}, plus {line.offset:.6g}: {why}", scales=True)
 
 
 def _clipped(sample: Sample, tolerance: float) -> Cause | None:
@@ -98,10 +86,8 @@ def _clipped(sample: Sample, tolerance: float) -> Cause | None:
     beyond = (expected < low) | (expected > high)
     # The limits are met by more steps than the one that would set them in any case.
     met = max(np.count_nonzero(seen == low), np.count_nonzero(seen == high))
-    if not beyond[sample.counted].any() or met < 2:
-        return None
     predicted = (sample.offset - np.clip(expected, low, high)) / sample.scale
-    if not sample.agrees(predicted, tolerance):
+    if not beyond[sample.counted].any() or met < 2 or not sample.agrees(predicted, tolerance):
         return None
     return Cause(
         "clipped",
@@ -112,17 +98,17 @@ def _clipped(sample: Sample, tolerance: float) -> Cause | None:
 
 def _timing(sample: Sample, tolerance: float) -> Cause | None:
     for steps in range(1, LATEST + 1):
-        theta, known = sample.theta_after(steps)
+        theta, known = sample.earlier(sample.following, 1 - steps)
         if sample.agrees(sample.stage_cost(theta, sample.u), tolerance, known):
             if steps == 1 and not _observations_are_late(sample):
                 return Cause(
                     "next state",
-                    "the cost is that of the state after the step, c(s', u), where the problem "
-                    "has c(s, u). Compute it before the env steps.",
+                    "the cost is c(s', u), of the state after the step, where the problem has "
+                    "c(s, u). Compute it before the env steps.",
                 )
             return Cause(
                 "delayed observation",
-                f"the cost is that of an observation which comes {steps} step(s) later, as with "
+                f"the cost is that of an observation {steps} step(s) later, as with "
                 "DelayObservation. The law needs the present state: leave the delay out, or put "
                 "the inputs that are under way into the model's state.",
             )
@@ -133,21 +119,13 @@ def _timing(sample: Sample, tolerance: float) -> Cause | None:
 
 
 def _observations_are_late(sample: Sample) -> bool:
-    """Tell whether observations follow an earlier action rather than the one just sent.
-
-    Otherwise a cost at the next state and one at an observation of a step later look alike.
-    """
+    """Tell whether observations follow an earlier action rather than the one just sent."""
     if sample.blank[sample.begins].all():  # what DelayObservation shows at first
         return True
     before, known = sample.earlier(sample.u, 1)
-    if not known.any():
-        return False
-
-    def error(u: Array) -> float:
-        predicted = sample.step(sample.theta, u)
-        return float(np.median(np.linalg.norm(predicted - sample.following, axis=1)))
-
-    return error(before) < error(sample.u)
+    errors = [sample.step(sample.theta, u) - sample.following for u in (before, sample.u)]
+    late, present = np.median(np.linalg.norm(errors, axis=2), axis=1)
+    return bool(known.any() and late < present)
 
 
 def _sticky_action(sample: Sample, tolerance: float) -> Cause | None:
@@ -174,17 +152,15 @@ def _sticky_action(sample: Sample, tolerance: float) -> Cause | None:
     if sample.agrees(sample.stage_cost(sample.theta, before), tolerance, known):
         return Cause(
             "late action",
-            "the cost is that of the action of the step before: the env acts one step late. Put "
-            "the input that is under way into the model's state.",
+            "the cost is that of the previous action: the env acts one step late. Put the input "
+            "that is under way into the model's state.",
         )
     return None
 
 
 def _normalized_reward(sample: Sample, tolerance: float) -> Cause | None:
-    """Run the statistics of `gymnasium.wrappers.NormalizeReward` on minus the cost.
-
-    Its discount is not known: the learner's, its default and a few others are tried.
-    """
+    """Run the statistics of `gymnasium.wrappers.NormalizeReward` on minus the cost."""
+    # Its discount is not known.
     for gamma in dict.fromkeys((sample.gamma, 0.99, 0.9, 0.95, 0.98, 0.995, 0.999, 1.0)):
         if sample.agrees(sample.cost * _running_factors(sample, gamma), tolerance):
             return Cause(
@@ -215,13 +191,12 @@ def _repeated_action(sample: Sample, tolerance: float) -> Cause | None:
     for k in range(2, MOST_REPEATS + 1):
         for cost in _sums(sample, k):
             if sample.agrees(cost, tolerance, whole):
-                return Cause(
-                    "repeated action",
+                why = (
                     f"the reward is about the sum of {k} steps with the same action, as with "
                     "RepeatAction, ActionRepeat or frame skipping. The model of the MPC must have "
-                    f"{k} times the sampling time of the env, and {k} times its weights.",
-                    scales=True,
+                    f"{k} times the sampling time of the env, and {k} times its weights."
                 )
+                return Cause("repeated action", why, scales=True)
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import gymnasium
@@ -13,21 +14,11 @@ from sb3_yann.audit.sample import Line, Sample
 from sb3_yann_envs import ActionRepeat
 
 _SUSPECTS = (
-    "NormalizeReward",
-    "ClipReward",
-    "TransformReward",
-    "DelayObservation",
-    "NormalizeObservation",
-    "RescaleObservation",
-    "FlattenObservation",
-    "TransformObservation",
-    "MaxAndSkipObservation",
-    "StickyAction",
-    "RepeatAction",
-    "RescaleAction",
-    "ClipAction",
-    "TransformAction",
-)
+    "NormalizeReward ClipReward TransformReward DelayObservation NormalizeObservation "
+    "RescaleObservation FlattenObservation TransformObservation MaxAndSkipObservation "
+    "StickyAction RepeatAction RescaleAction ClipAction TransformAction"
+).split()
+"""Special classes come before the general ones that they derive from."""
 _HARMLESS = {"FlattenObservation", "ClipAction"}
 
 
@@ -38,8 +29,7 @@ class CostMismatchWarning(UserWarning):
 class CostMismatchError(RuntimeError):
     """The same as an error, where `CostAudit` is strict.
 
-    It is no ValueError: RL Zoo takes one of those in `learn` for a trial that went astray, and
-    prunes it without a word.
+    It is no ValueError: RL Zoo silently prunes a trial with one.
     """
 
 
@@ -52,13 +42,11 @@ class CostFinding:
     matches : bool
         Whether the reward is what the problem and the policy say.
     cause : str
-        A name for the likely cause, empty where there is no mismatch, "unknown" where there is one
-        without an explanation.
+        The likely cause, "unknown" where there is no explanation, empty where there is no mismatch.
     message : str
         All of it, in words.
     scale, offset, r2 : float
-        The straight line ``reward = scale * (-cost) + offset`` that is nearest, and the share of
-        the variance that it explains.
+        The nearest line ``reward = scale * (-cost) + offset``, and the variance that it explains.
     steps : int
         Steps that were compared.
     wrappers : tuple of str
@@ -79,39 +67,36 @@ class CostFinding:
     steps: int
     wrappers: tuple[str, ...]
 
-    @classmethod
-    def match(cls, sample: Sample) -> CostFinding:
-        """Return that there is nothing to find."""
-        steps, line = int(sample.counted.sum()), Line.through(sample)
-        message = f"The reward is the cost of the problem in all of {steps} steps."
-        return cls(True, "", message, line.scale, line.offset, line.r2, steps, ())
 
-    @classmethod
-    def mismatch(cls, sample: Sample, cause: Cause, venv: VecEnv) -> CostFinding:
-        """Return what is wrong, with the wrappers that may have to do with it."""
-        steps, wrappers = int(sample.counted.sum()), suspects(venv)
-        if steps == 0:  # nothing is finite, to be compared
-            message = f"The rewards cannot be compared. Likely cause: {cause.explanation}"
-            return cls(False, cause.name, message, np.nan, np.nan, np.nan, 0, wrappers)
-        line = Line.through(sample)
-        if cause.name == "not finite":
-            message = f"The rewards cannot all be compared: {cause.explanation}"
-            return cls(
-                False, cause.name, message, line.scale, line.offset, line.r2, steps, wrappers
-            )
-        expected = "minus the cost of the problem"
-        if (sample.scale, sample.offset) != (1, 0):
-            expected = f"{sample.scale:g} * (-cost) {sample.offset:+g}, as the policy assumes"
-        error = np.abs(sample.implied - sample.cost)[sample.counted]
-        parts = [
-            f"The reward is not {expected}: over {steps} steps the two differ by {error.mean():.3g}"
-            f" on average, where the cost is {np.abs(sample.cost[sample.counted]).mean():.3g}.",
-            f"Likely cause: {cause.explanation}",
-            f"Wrappers of the env that may do this: {', '.join(wrappers)}." if wrappers else "",
-            _in_numbers(line, cause),
-        ]
-        message = " ".join(part for part in parts if part)
-        return cls(False, cause.name, message, line.scale, line.offset, line.r2, steps, wrappers)
+def judged(sample: Sample, cause: Cause | None, venv: VecEnv) -> CostFinding:
+    """Return what a cause of a mismatch says, or that there is none."""
+    steps = int(sample.counted.sum())
+    line = Line.through(sample) if steps else Line(np.nan, np.nan, np.nan)
+    if cause is None:
+        message = f"The reward is the cost of the problem in all of {steps} steps."
+        return CostFinding(True, "", message, line.scale, line.offset, line.r2, steps, ())
+    wrappers = _suspects(venv)
+    if cause.name == "not finite":
+        message = f"The rewards cannot all be compared: {cause.explanation}"
+    else:
+        message = " ".join(_in_words(sample, cause, wrappers, line))
+    numbers = line.scale, line.offset, line.r2, steps
+    return CostFinding(False, cause.name, message, *numbers, wrappers)
+
+
+def _in_words(sample: Sample, cause: Cause, wrappers: tuple[str, ...], line: Line) -> Iterator[str]:
+    expected = "minus the cost of the problem"
+    if (sample.scale, sample.offset) != (1, 0):
+        expected = f"{sample.scale:g} * (-cost) {sample.offset:+g}, as the policy assumes"
+    cost, error = sample.cost[sample.counted], (sample.implied - sample.cost)[sample.counted]
+    yield (
+        f"The reward is not {expected}: over {len(cost)} steps the two differ by "
+        f"{np.abs(error).mean():.3g} on average, where the cost is {np.abs(cost).mean():.3g}."
+    )
+    yield f"Likely cause: {cause.explanation}"
+    if wrappers:
+        yield f"Wrappers of the env that may do this: {', '.join(wrappers)}."
+    yield _in_numbers(line, cause)
 
 
 def _in_numbers(line: Line, cause: Cause) -> str:
@@ -125,16 +110,12 @@ def _in_numbers(line: Line, cause: Cause) -> str:
     return f'{found} Where that is on purpose: policy_kwargs={{"critic": {{{numbers}}}}}.'
 
 
-def suspects(venv: VecEnv) -> tuple[str, ...]:
-    """Return the wrappers of the envs that change rewards, observations, actions or time.
-
-    Also those in other processes, and the most special class of each only.
-    """
+def _suspects(venv: VecEnv) -> tuple[str, ...]:
+    """Return the wrappers of the envs that change rewards, observations, actions or time."""
     found: list[type] = []
-    classes = [getattr(gymnasium.wrappers, name, None) for name in _SUSPECTS]
-    for each in (ActionRepeat, *classes):
+    for each in (ActionRepeat, *(getattr(gymnasium.wrappers, name, None) for name in _SUSPECTS)):
         if each is None or any(issubclass(special, each) for special in found):
             continue  # not in this version of Gymnasium, or named already
-        if any(venv.env_is_wrapped(each)):
+        if any(venv.env_is_wrapped(each)):  # in other processes too
             found.append(each)
     return tuple(each.__name__ for each in found if each.__name__ not in _HARMLESS)

@@ -24,30 +24,20 @@ class Sample:
 
     Attributes
     ----------
-    theta, following : ndarray, shape (steps, n)
-        Before and after the step.
-    u : ndarray, shape (steps, m)
-        The input that was sent to the env, in its units.
+    theta, following : ndarray, shape (steps, n), before and after the step
+    u : ndarray, shape (steps, m), as it was sent to the env
     rewards : ndarray, shape (steps,)
     counted : ndarray of bool, shape (steps,)
         False where a violation or an end other than by a time limit may have changed the reward.
     terminated : ndarray of bool, shape (steps,)
-    episode : ndarray of int, shape (steps,)
-        Steps of one episode share a number.
-    begins, first : ndarray of bool, shape (steps,)
-        Whether the step is the first of its episode, and of its env.
-    blank : ndarray of bool, shape (steps,)
-        Whether the observation was zero throughout.
-    rounding : ndarray, shape (steps, n)
-        By how much theta may err because observations are float32.
-    scale, offset : float
-        The reward is taken for ``scale * (-cost) + offset``.
-    stage_cost : callable
-        (steps, n), (steps, m) to (steps,).
-    step : callable
-        The model: (steps, n), (steps, m) to (steps, n).
-    gamma : float
-        The learner's discount.
+    episode : ndarray of int, shape (steps,), a number for each episode
+    begins, first : ndarray of bool, shape (steps,), the first step of an episode, and of an env
+    blank : ndarray of bool, shape (steps,), where the observation was zero throughout
+    rounding : ndarray, shape (steps, n), by how much theta may err, from float32 observations
+    scale, offset : float, for the reward ``scale * (-cost) + offset``
+    stage_cost : callable, (steps, n), (steps, m) to (steps,)
+    step : callable, the model: (steps, n), (steps, m) to (steps, n)
+    gamma : float, the learner's discount
     """
 
     theta: Array
@@ -93,10 +83,6 @@ class Sample:
         index = np.clip(index, 0, len(values) - 1)
         return values[index], inside & (self.episode[index] == self.episode)
 
-    def theta_after(self, steps: int) -> tuple[Array, Mask]:
-        """Return theta so many steps later, 1 or more, and where it is known."""
-        return self.earlier(self.following, 1 - steps)
-
     def is_the_problem_s_cost(self, tolerance: float) -> bool:
         """Tell whether every counted reward is what the problem says."""
         cost, error = np.abs(self.cost), np.abs(self.implied - self.cost)
@@ -107,8 +93,7 @@ class Sample:
     def agrees(self, predicted: Array, tolerance: float, defined: Mask | None = None) -> bool:
         """Tell whether nearly all rewards are minus a predicted cost, where it is defined.
 
-        An error counts in relation to how much the prediction varies, so that a large constant
-        explains nothing.
+        Errors are relative to how much it varies: a large constant explains nothing.
         """
         used = self.counted if defined is None else self.counted & defined
         if np.count_nonzero(used) < max(FEWEST, np.count_nonzero(self.counted) // 2):
@@ -117,20 +102,12 @@ class Sample:
         spread = np.abs(known - np.median(known))
         allowed = tolerance * np.maximum(spread, spread.mean()) + self.rounded[used]
         with np.errstate(invalid="ignore"):
-            right = np.abs(self.implied[used] - known) <= allowed
-        return bool(right.mean() >= 0.98)
+            return bool(np.mean(np.abs(self.implied[used] - known) <= allowed) >= 0.98)
 
 
 @dataclass(frozen=True)
 class Line:
-    """The straight line ``reward = scale * (-cost) + offset`` that is nearest to a sample.
-
-    Attributes
-    ----------
-    scale, offset : float
-    r2 : float
-        The share of the rewards' variance that it explains; 0 where nothing varies.
-    """
+    """The line nearest to ``reward = scale * (-cost) + offset``, and its share of the variance."""
 
     scale: float
     offset: float

@@ -1,7 +1,6 @@
 """Whether a reward is the cost of entries that are scaled or shifted: units, set-points, weights.
 
-The cost is ``z' W z`` of ``z = [theta; u]``. Looked for are ``s`` and ``z0`` for which the rewards
-are minus the cost of ``s * z + z0``, some entries of both being free and the others 1 and 0.
+It looks for ``s`` and ``z0`` with ``reward = -(s z + z0)' W (s z + z0)``, ``z = [theta; u]``.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
 from sb3_yann._validation import Array
@@ -69,8 +67,7 @@ class _Quadratic:
 def scaled_entries(sample: Sample, tolerance: float) -> tuple[str, str] | None:
     """Return the name of what fits and an explanation, None where nothing does."""
     z = np.column_stack([sample.theta, sample.u])
-    W = _matrix(sample)
-    if W is None:
+    if (W := _matrix(sample)) is None:
         return None
     quadratic = _Quadratic(z[sample.counted], W, sample.implied[sample.counted])
     moves = np.ptp(quadratic.z, axis=0) > 0
@@ -90,7 +87,7 @@ def scaled_entries(sample: Sample, tolerance: float) -> tuple[str, str] | None:
         s, z0 = quadratic.fit(scaled, shifted)
         if sample.agrees(quadratic.predicted(s, z0, z), tolerance):
             z0[np.abs(z0) < 1e-5 * np.abs(s)] = 0.0
-            return name, _explanation(name, s, z0, state, W)
+            return name, _explanation(name, s, z0, state)
     return None
 
 
@@ -110,19 +107,13 @@ def _matrix(sample: Sample) -> Array | None:
     return W if np.allclose(np.sum((z @ W) * z, 1) / size, sample.cost / size) else None
 
 
-def _explanation(name: str, s: Array, z0: Array, state: NDArray[np.bool_], W: Array) -> str:
-    theta_s, theta_0 = _listed(s[state]), _listed(z0[state])
-    if name == "shifted observation":
-        return (
-            f"the cost is that of theta = obs + {theta_0}: observations are absolute values, or "
-            'deviations from another point. Pass policy_kwargs={"observation": '
-            f"AffineObservation.deviation({_listed(-z0[state])})}}."
-        )
+def _explanation(name: str, s: Array, z0: Array, state: Mask) -> str:
+    scale, shift = _listed(s[state]), _listed(z0[state])
+    u = f"the input {_listed(s[~state])} * action + {_listed(z0[~state])}"
     if name == "rescaled action":
         return (
-            f"the cost is that of the input {_listed(s[~state])} * action + {_listed(z0[~state])}: "
-            "a RescaleAction, or an R of another size. Build the LinearMPC for the inputs that the "
-            "env takes, with the weight that they have in its reward."
+            f"the cost is that of {u}: a RescaleAction, or an R of another size. Build the "
+            "LinearMPC for the inputs that the env takes, with their weight in its reward."
         )
     if name == "other weights":
         return (
@@ -130,16 +121,15 @@ def _explanation(name: str, s: Array, z0: Array, state: NDArray[np.bool_], W: Ar
             f"{_listed(s[~state] ** 2)} times as much as Q and R of the problem: other weights, or "
             "other units (the square roots of these numbers)."
         )
-    action = (
-        ""
-        if name == "normalized observation"
-        else (f", and that of the input {_listed(s[~state])} * action + {_listed(z0[~state])}")
-    )
-    return (
-        f"the cost is that of theta = {theta_s} * obs + {theta_0}{action}: observations are "
-        'normalized. Pass policy_kwargs={"observation": '
-        f"AffineObservation.normalized(mean={theta_0}, std={theta_s})}}."
-    )
+    if name == "shifted observation":
+        what = f"theta = obs + {shift}: observations are absolute, or deviations from another point"
+        undo = f"deviation({_listed(-z0[state])})"
+    else:
+        what = f"theta = {scale} * obs + {shift}{f', and {u}' if 'action' in name else ''}: "
+        what += "observations are normalized"
+        undo = f"normalized(mean={shift}, std={scale})"
+    undo = f'policy_kwargs={{"observation": AffineObservation.{undo}}}'
+    return f"the cost is that of {what}. Pass {undo}."
 
 
 def _listed(values: Array) -> str:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control import PiecewiseAffine
 
+Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
 LONGEST = 1_000_000
 """Steps after which an episode is taken for one that never ends."""
 
@@ -57,7 +58,7 @@ class Episodes:
 
 def evaluate(
     policy: Predictor | Callable[[Any], Any],
-    env: gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]],
+    env: Source,
     seeds: Iterable[int],
     starts: Sequence[ArrayLike] | None = None,
 ) -> Episodes:
@@ -70,8 +71,8 @@ def evaluate(
         observation to an action, such as the explicit law.
     env : gymnasium.Env, str or callable
         Must end its episodes within a million steps. A given env runs them one after the other.
-        An env that is named, or made by a function without arguments, is made for each seed: the
-        episodes run side by side, and the policy sees them as one batch.
+        A named one, or a function that makes one, is made for each seed: the episodes run side by
+        side, and the policy sees them as one batch.
     seeds : iterable of int
         ``env.reset(seed=seed)`` starts each episode; the rest of it must follow from that.
     starts : sequence of array_like, optional
@@ -79,8 +80,6 @@ def evaluate(
 
     Raises
     ------
-    TypeError, ValueError
-        If the policy or env is of another kind, or a function makes the same env twice.
     RuntimeError
         If an episode does not end.
 
@@ -105,8 +104,8 @@ def evaluate(
             envs = [stack.enter_context(one_env(env)) for _ in seeds]
             if len({id(each.unwrapped) for each in envs}) < len(envs):
                 raise ValueError(
-                    "The function that makes envs returned the same one twice, and their episodes "
-                    "run side by side. Make a new one each time, or pass the env itself."
+                    "The function that makes envs returned the same one twice. Make a new one each "
+                    "time, since episodes run side by side, or pass the env itself."
                 )
             episodes = _side_by_side(act, envs, resets)
     return Episodes(
@@ -119,9 +118,7 @@ def evaluate(
 
 
 @contextmanager
-def one_env(
-    env: gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]],
-) -> Iterator[gym.Env[Any, Any]]:
+def one_env(env: Source) -> Iterator[gym.Env[Any, Any]]:
     """Yield the env that is given, or make the one that is named, and close it afterwards."""
     if isinstance(env, gym.Env):
         yield env

@@ -22,7 +22,7 @@ def save_trajectories(
     limits: Mapping[int, tuple[float, str]] | None = None,
     references: Mapping[int, int] | None = None,
 ) -> Path:
-    """Save a PNG of some states and all inputs over time, one color for each run.
+    """Save a PNG of some states and all inputs over time, a color for each run; return its path.
 
     Parameters
     ----------
@@ -37,15 +37,11 @@ def save_trajectories(
     dt : float
         Sampling time, in ``time_unit``.
     time_unit : str
+        For the label of the axis.
     limits : mapping of int to (float, str), optional
         A limit of an entry of the observation, and its label.
     references : mapping of int to int, optional
         The entry of the observation that is the set-point of another, drawn as a dashed line.
-
-    Returns
-    -------
-    Path
-        Where the picture lies.
 
     Examples
     --------
@@ -79,11 +75,7 @@ def save_trajectories(
 
 
 def _draw(
-    panels: Any,
-    runs: Mapping[str, Episodes],
-    states: Sequence[int],
-    dt: float,
-    references: Mapping[int, int],
+    panels: Any, runs: Mapping[str, Episodes], states: Sequence[int], dt: float, references: Any
 ) -> None:
     for color, (label, episodes) in enumerate(runs.items()):
         style = {"color": f"C{color}", "alpha": 0.7, "linewidth": 1.2}

@@ -29,9 +29,7 @@ def comparison_table(title: str, before: Episodes, after: Episodes) -> Table:
     for number, (old, new) in enumerate(rows, start=1):
         table.add_row(str(number), f"{old:,.2f}", f"{new:,.2f}", _change(new - old))
     table.add_section()
-    old, new = np.mean(rows, axis=0)
-    percent = f" ({100 * (new - old) / old:+.1f} %)" if old > 0 else ""
-    table.add_row("mean", f"{old:,.2f}", f"{new:,.2f}", _change(new - old) + percent)
+    _compare(table, "mean", *np.mean(rows, axis=0))
     if before.violations.any() or after.violations.any():
         table.add_row("violations", str(before.violations.sum()), str(after.violations.sum()), "")
     return table
@@ -54,9 +52,7 @@ def summary_table(title: str, before: Episodes, after: Episodes) -> Table:
     same = 1e-6 * np.abs(before.costs)
     table = _table("", title)
     for name, of in (("mean", np.mean), ("worst", np.max)):
-        old, new = float(of(before.costs)), float(of(after.costs))
-        percent = f" ({100 * (new - old) / old:+.1f} %)" if old > 0 else ""
-        table.add_row(name, f"{old:,.2f}", f"{new:,.2f}", _change(new - old) + percent)
+        _compare(table, name, float(of(before.costs)), float(of(after.costs)))
     violations = before.violations.sum(), after.violations.sum()
     table.add_row("violations", *map(str, violations), f"{violations[1] - violations[0]:+d}")
     table.add_section()
@@ -73,6 +69,11 @@ def _table(rows: str, title: str) -> Table:
     for column in table.columns[1:]:
         column.justify = "right"
     return table
+
+
+def _compare(table: Table, name: str, old: float, new: float) -> None:
+    percent = f" ({100 * (new - old) / old:+.1f} %)" if old > 0 else ""
+    table.add_row(name, f"{old:,.2f}", f"{new:,.2f}", _change(new - old) + percent)
 
 
 def _change(value: float) -> str:

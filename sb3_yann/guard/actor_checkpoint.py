@@ -18,10 +18,7 @@ Tensors = dict[str, th.Tensor]
 
 @dataclass(frozen=True)
 class ActorCheckpoint:
-    """All that an actor needs to act and to go on learning.
-
-    It lies in the CPU's memory, so that a model saved on one device loads on another.
-    """
+    """All that an actor needs to act and to go on learning, on the CPU: it loads anywhere."""
 
     actor: Tensors
     target: Tensors
@@ -72,15 +69,13 @@ class ActorCheckpoint:
 
     def has_networks_of(self, other: ActorCheckpoint) -> bool:
         """Return whether both hold the same networks, whatever their optimizers remember."""
-        networks = other.networks()
-        return all(th.equal(value, networks[name]) for name, value in self.networks().items())
+        return not self.changed_regions(other).any()
 
     def changed_regions(self, other: ActorCheckpoint) -> NDArray[np.bool_]:
         """Return in which regions the networks of both differ, shape (regions,)."""
         networks = other.networks()
-        different = [
-            (value != networks[name]).flatten(1).any(1) for name, value in self.networks().items()
-        ]
+        pairs = ((value, networks[name]) for name, value in self.networks().items())
+        different = [(ours != theirs).flatten(1).any(1) for ours, theirs in pairs]
         return np.asarray(th.stack(different).any(0).numpy())
 
     def with_regions(self, other: ActorCheckpoint, regions: Iterable[int]) -> ActorCheckpoint:

@@ -34,14 +34,10 @@ class ImprovementGuard(BaseCallback):
     candidate, also after another exception and in the zips of a CheckpointCallback:
     :func:`restore_accepted` gives it the accepted policy.
 
-    With a simulator, candidates and the MPC play the same seeded starts. A candidate is refused if
-    its mean cost is above the accepted policy's, if one start costs more than with the MPC by more
-    than the margin, or if an episode is less safe. Single regions may still be accepted. What is to
-    be accepted is confirmed on new starts. On a plant alone (``env=None``) the training episodes
-    decide, by a one-sided test that errs with probability ``rule.significance``.
-
-    A refusal restores actor, target actor and the actor's optimizer bit for bit, at once or when
-    ``patience`` is over. The critic goes on learning. No random numbers are drawn. The state
+    With a simulator, candidates, accepted policy and MPC play the same seeded starts. On a plant
+    alone (``env=None``) the training episodes decide, by a one-sided test. `docs/guard.md` says
+    when a candidate is refused. A refusal restores actor, target actor and the actor's optimizer
+    bit for bit, at once or when ``patience`` is over. No random numbers are drawn. The state
     travels with the model, as ``model.guard_state``: a guard with the same settings goes on there.
 
     Parameters
@@ -82,13 +78,12 @@ class ImprovementGuard(BaseCallback):
 
     Examples
     --------
-    >>> from stable_baselines3 import DDPG
-    >>> from sb3_yann import ImprovementGuard, NoActionNoise
-    >>> guard = ImprovementGuard("CSTR-v0", n_starts=3, rule={"margin": 0.02})
-    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> _ = model.learn(1, callback=[NoActionNoise(), guard])
-    >>> guard.decisions
-    []
+    >>> from sb3_yann import ImprovementGuard
+    >>> guard = ImprovementGuard("CSTR-v0", n_new_starts=100, rule={"margin": 0.02})
+    >>> guard.step_size
+    StepSize(shrink=0.5, grow=1.5, smallest=0.1)
+
+    ``model.learn(20_000, callback=[NoActionNoise(), guard])`` trains under guard.
     """
 
     model: OffPolicyAlgorithm
@@ -134,16 +129,8 @@ class ImprovementGuard(BaseCallback):
             self.acceptance = PlantAcceptance(rule)
         else:
             seeds = range(seed, seed + n_starts)
-            self.acceptance = SimulatorAcceptance(
-                name_of(env),
-                seeds,
-                n_new_starts,
-                n_final,
-                eval_every,
-                patience,
-                keep_if_worse,
-                rule,
-            )
+            counts = n_new_starts, n_final, eval_every, patience
+            self.acceptance = SimulatorAcceptance(name_of(env), seeds, *counts, keep_if_worse, rule)
 
     @property
     def decisions(self) -> list[Decision]:
@@ -155,19 +142,15 @@ class ImprovementGuard(BaseCallback):
         """What has been accepted, and on which evidence."""
         state = getattr(getattr(self, "model", None), "guard_state", None)
         if not isinstance(state, GuardState):
-            raise RuntimeError(
-                "The guard has no state yet: pass it to learn, as callback=guard, before asking."
-            )
+            raise RuntimeError("The guard has no state yet: pass it to learn, as callback=guard.")
         return state
 
     def _init_callback(self) -> None:
         check_not_nested(self)
         policy = self.model.policy
         if not isinstance(policy, YannPolicy):
-            raise TypeError(
-                "ImprovementGuard compares a YannPolicy with its MPC; the policy of this model is "
-                f"{type(policy).__name__}."
-            )
+            name = type(policy).__name__
+            raise TypeError(f"ImprovementGuard compares a YannPolicy with its MPC, not a {name}.")
         watch_buffer(self.model)
         self.session = GuardSession(
             self.model, policy, self.env, self.step_size, self.log_path, self.verbose
@@ -181,9 +164,8 @@ class ImprovementGuard(BaseCallback):
             self._start_afresh(known)
         elif not self.acceptance.still_holds(self.session):
             warnings.warn(
-                f"The guard's env {self.acceptance.settings['env']} does not play the episodes "
-                "that the guard's evidence is from: it is another simulator of that name. The "
-                "policies are tried anew.",
+                f"The guard's env {self.acceptance.settings['env']} does not play the episodes of "
+                "before: it is another simulator of that name. The policies are tried anew.",
                 stacklevel=2,
             )
             self._start_afresh(known)

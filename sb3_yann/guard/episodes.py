@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,7 @@ ROUNDING = 1e-6
 VIOLATES: Final = "violates a limit"
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What came of a policy's episodes, in the order of their seeds.
 
     The columns of ``unsafe`` (episodes, 3) are steps with a violation, whether the env terminated
@@ -38,21 +37,17 @@ class Outcome:
 
     def at(self, index: Any) -> Outcome:
         """Return some of the episodes."""
-        return Outcome(self.costs[index], self.unsafe[index], self.visits[index])
+        return Outcome._make(each[index] for each in self)
 
     def extended_by(self, other: Outcome) -> Outcome:
         """Return the episodes of both."""
-        return Outcome(
-            np.concatenate([self.costs, other.costs]),
-            np.concatenate([self.unsafe, other.unsafe]),
-            np.concatenate([self.visits, other.visits]),
-        )
+        return Outcome._make(map(np.concatenate, zip(self, other, strict=True)))
 
     def replaced(self, index: Any, other: Outcome) -> Outcome:
         """Return a copy with other episodes in some places."""
-        copy = Outcome(self.costs.copy(), self.unsafe.copy(), self.visits.copy())
-        copy.costs[index], copy.unsafe[index] = other.costs, other.unsafe
-        copy.visits[index] = other.visits
+        copy = Outcome._make(each.copy() for each in self)
+        for ours, theirs in zip(copy, other, strict=True):
+            ours[index] = theirs
         return copy
 
 
@@ -95,23 +90,18 @@ class Starts:
         lost, excess = self.lost(outcome), self.excess(outcome)
         if lost.any():
             first = self.hardest(outcome)[0]
+            also = f" and {VIOLATES}" if self.more_unsafe(outcome).any() else ""
             return (
                 f"{lost.sum()} of {len(self.seeds)} new starts lose against the MPC, seed "
-                f"{self.seeds[first]} costs {excess[first]:.4g} more"
-                + (f" and {VIOLATES}" if self.more_unsafe(outcome).any() else "")
+                f"{self.seeds[first]} costs {excess[first]:.4g} more{also}"
             )
         if self.mean_is_above(outcome):
-            return (
-                f"mean cost {outcome.costs.mean():.6g} on {len(self.seeds)} new starts, "
-                f"MPC {self.mpc.costs.mean():.6g}"
-            )
+            mean, mpc = outcome.costs.mean(), self.mpc.costs.mean()
+            return f"mean cost {mean:.6g} on {len(self.seeds)} new starts, MPC {mpc:.6g}"
         return ""
 
     def hardest(self, outcome: Outcome | None) -> NDArray[np.int64]:
-        """Return the places of the hardest of those that cost more than with the MPC.
-
-        The first one where there is no outcome.
-        """
+        """Return the hardest that cost more than with the MPC; the first without an outcome."""
         if outcome is None:
             return np.zeros(1, dtype=np.int64)
         excess, more = self.excess(outcome), self.more_unsafe(outcome)
@@ -129,9 +119,8 @@ class Evidence(Starts):
     @property
     def paired(self) -> PairedEpisodes:
         """The costs that a candidate's are compared with."""
-        return PairedEpisodes(
-            self.mpc.costs, self.accepted.costs, self.accepted.unsafe, self.margin
-        )
+        accepted = self.accepted
+        return PairedEpisodes(self.mpc.costs, accepted.costs, accepted.unsafe, self.margin)
 
     @property
     def visits(self) -> NDArray[np.bool_]:
@@ -178,8 +167,7 @@ def play(session: GuardSession, checkpoint: ActorCheckpoint, seeds: Sequence[int
         if session.interrupted:  # a simulator has made of it what it can, e.g. in compiled code
             raise KeyboardInterrupt from error
         play_episodes(session, session.mpc, seeds)
-        reason = f"the simulator failed: {type(error).__name__}: {error}"
-        raise Unplayable(reason) from error
+        raise Unplayable(f"the simulator failed: {type(error).__name__}: {error}") from error
 
 
 def outcome_of(session: GuardSession, episodes: Episodes) -> Outcome:
@@ -187,7 +175,11 @@ def outcome_of(session: GuardSession, episodes: Episodes) -> Outcome:
     finite = [np.all(np.isfinite(each)) for each in episodes.observations]
     lost = ~(np.isfinite(episodes.costs) & finite)
     unsafe = np.column_stack([episodes.violations, episodes.terminated, lost]).astype(np.int64)
-    return Outcome(episodes.costs, unsafe, _visits(session, episodes))
+    layer = session.policy.actor.mu
+    visits = np.zeros((len(episodes.costs), len(layer.gains)), dtype=bool)
+    for visited, states in zip(visits, episodes.observations, strict=True):
+        visited[layer.regions(session.policy.theta(session.seen(states[:-1])))] = True
+    return Outcome(episodes.costs, unsafe, visits)
 
 
 def evaluate_candidate(
@@ -202,12 +194,3 @@ def evaluate_candidate(
     except Unplayable as error:
         return None, str(error)
     return outcome, evidence.paired.objection(outcome.costs, outcome.unsafe)
-
-
-def _visits(session: GuardSession, episodes: Episodes) -> NDArray[np.bool_]:
-    layer = session.policy.actor.mu
-    visits = np.zeros((len(episodes.costs), len(layer.gains)), dtype=bool)
-    for visited, states in zip(visits, episodes.observations, strict=True):
-        theta = session.policy.theta(session.seen(states[:-1]))
-        visited[layer.regions(theta)] = True
-    return visits

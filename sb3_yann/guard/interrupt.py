@@ -1,7 +1,4 @@
-"""Ctrl-C during `learn`: a handler of the signal restores the accepted policy in the main thread.
-
-Nothing of SB3 tells a callback that `learn` ended by an exception.
-"""
+"""Ctrl-C during `learn`, of which SB3 tells no callback: a handler restores the accepted policy."""
 
 from __future__ import annotations
 
@@ -16,10 +13,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 
 class Handler:
-    """Calls the handler that was there; where that raises, the accepted policy is restored first.
+    """Calls the handler that was there; where that raises, it restores the accepted policy.
 
-    Another exception ends `learn` without a word: from then on the handler only passes on, until
-    the guard is gone or learns again.
+    Once another exception has ended `learn`, it only passes on.
     """
 
     def __init__(self, model: BaseAlgorithm, restore: Callable[[], None], before: Any) -> None:
@@ -50,17 +46,16 @@ class Handler:
 
     def remove(self) -> None:
         """Restore the handler that was there, unless somebody else's handler has come since."""
-        in_main = threading.current_thread() is threading.main_thread()
         present: object = signal.getsignal(signal.SIGINT)
-        if in_main and present is self:
+        if threading.current_thread() is threading.main_thread() and present is self:
             signal.signal(signal.SIGINT, self.before)
 
 
 def install(model: BaseAlgorithm, restore: Callable[[], None], frame: FrameType) -> Handler | None:
     """Return the handler for a `learn` that begins; None where there can be or need be none.
 
-    ``restore`` is a bound method that restores the accepted policy; it is held weakly. Handlers of
-    runs that are over are passed by; ``frame`` is the caller's.
+    ``restore`` is a bound method, held weakly; ``frame`` is the caller's. Handlers of runs that are
+    over are passed by.
     """
     before: Any = signal.getsignal(signal.SIGINT)
     while isinstance(before, Handler) and not before.is_needed(frame):

@@ -17,13 +17,11 @@ MEMORY, MOST_KEPT = 10_000_000, 20
 
 
 def confirm_on_new_starts(session: GuardSession, n_starts: int, by_region: bool) -> str:
-    """Play what is accepted from new starts; where it loses, accept what was accepted before.
+    """Play what is accepted from new starts; return why it was refused, empty where it was not.
 
-    That is the latest earlier checkpoint that passes all of these starts, else the MPC. The
-    hardest starts join those of every later candidate. With ``by_region``, single regions of what
-    lost may still be accepted, and are confirmed on other new starts.
-
-    Returns why it was refused, empty where it was not.
+    The latest earlier checkpoint that passes all of these starts is accepted instead, else the MPC.
+    The hardest starts join those of every later candidate. With ``by_region``, single regions of
+    what lost may still be accepted, and are confirmed on other new starts.
     """
     first, state = "", session.state
     for _ in range(ROUNDS):
@@ -82,8 +80,8 @@ def _new_starts(session: GuardSession, n_starts: int) -> Starts:
     new = new.at(np.flatnonzero(np.isfinite(new.mpc.costs)))
     if not new.seeds:
         raise ValueError(
-            f"The MPC's own cost is not a finite number on any of {n_starts} new starts of the "
-            "guard's env: policies cannot be compared there."
+            f"The MPC's own cost is a finite number on none of {n_starts} new starts of the "
+            "guard's env, so policies cannot be compared there. Its rewards must be finite."
         )
     return new
 
@@ -93,22 +91,24 @@ def _accept_earlier(session: GuardSession, new: Starts, hard: NDArray[np.int64])
     state = session.state
     known = state.evidence.joined_with(new.at(hard))
     for checkpoint, outcome in reversed(state.passed):
-        everywhere = _passes(session, checkpoint, outcome, new, hard)
-        if everywhere is not None:
-            state.accept(checkpoint, Evidence(known.seeds, known.mpc, known.margin, everywhere))
-            keep_passed(session, checkpoint, everywhere)
-            return
+        try:
+            everywhere = _passing(session, checkpoint, outcome, new, hard)
+        except Unplayable:
+            continue
+        state.accept(checkpoint, Evidence(known.seeds, known.mpc, known.margin, everywhere))
+        keep_passed(session, checkpoint, everywhere)
+        return
     state.accept(session.mpc, Evidence(known.seeds, known.mpc, known.margin, known.mpc))
 
 
-def _passes(
+def _passing(
     session: GuardSession,
     checkpoint: ActorCheckpoint,
     outcome: Outcome | None,
     new: Starts,
     hard: NDArray[np.int64],
-) -> Outcome | None:
-    """Return a checkpoint's outcome on the known starts and the hard ones, None where it loses.
+) -> Outcome:
+    """Return a checkpoint's outcome on the known starts and the hard ones; else raise Unplayable.
 
     The hard ones come first: they are few, and most checkpoints lose some. Then come the other new
     ones, and those known ones that its ``outcome`` lacks.
@@ -116,30 +116,27 @@ def _passes(
     known: Evidence = session.state.evidence
     others = np.setdiff1d(np.arange(len(new.seeds)), hard)
     on_hard = _play_unless_lost(session, checkpoint, new.at(hard))
-    if on_hard is None:
-        return None
-    on_others = _play_unless_lost(session, checkpoint, new.at(others))
-    if on_others is None:
-        return None
-    if new.at(np.concatenate([hard, others])).mean_is_above(on_hard.extended_by(on_others)):
-        return None
+    on_new = on_hard.extended_by(_play_unless_lost(session, checkpoint, new.at(others)))
+    _check_mean(new.at(np.concatenate([hard, others])), on_new)
     had = 0 if outcome is None else len(outcome.costs)
-    on_missing = _play_unless_lost(session, checkpoint, known.at(np.arange(had, len(known.seeds))))
-    if on_missing is None:
-        return None
-    on_known = on_missing if outcome is None else outcome.extended_by(on_missing)
+    on_known = _play_unless_lost(session, checkpoint, known.at(np.arange(had, len(known.seeds))))
+    if outcome is not None:
+        on_known = outcome.extended_by(on_known)
     everywhere = on_known.extended_by(on_hard)
-    return None if known.joined_with(new.at(hard)).mean_is_above(everywhere) else everywhere
+    _check_mean(known.joined_with(new.at(hard)), everywhere)
+    return everywhere
 
 
 def _play_unless_lost(
     session: GuardSession, checkpoint: ActorCheckpoint, starts: Starts
-) -> Outcome | None:
-    """Return a checkpoint's outcome, None where it loses one of the starts."""
-    if not starts.seeds:
-        return starts.mpc
-    try:
-        outcome = play(session, checkpoint, starts.seeds)
-    except Unplayable:
-        return None
-    return None if starts.lost(outcome).any() else outcome
+) -> Outcome:
+    """Return a checkpoint's outcome; raise Unplayable where it loses one of the starts."""
+    outcome = play(session, checkpoint, starts.seeds) if starts.seeds else starts.mpc
+    if starts.lost(outcome).any():
+        raise Unplayable("a start is lost")
+    return outcome
+
+
+def _check_mean(starts: Starts, outcome: Outcome) -> None:
+    if starts.mean_is_above(outcome):
+        raise Unplayable("the mean cost is above the MPC's")

@@ -26,8 +26,8 @@ Phase = Literal["first", "learning", "trial"]
 class BlockEvidence:
     """Episodes of the MPC, of the accepted policy, and of the block that is being played.
 
-    In a "learning" block the actor learns, else it is at rest: it stays the ``resting`` checkpoint.
-    ``terminates`` tells whether the env itself has ended an episode of an accepted policy.
+    Outside a "learning" block the actor stays the ``resting`` checkpoint. ``terminates`` tells
+    whether the env itself has ended an episode of an accepted policy.
     """
 
     phase: Phase = "first"
@@ -54,11 +54,9 @@ class PlantAcceptance:
         going_on = int(session.model.num_timesteps > 0)
         self.costs, self.lengths = np.zeros(n_envs), np.full(n_envs, going_on)
         self.violated = np.zeros(n_envs, dtype=bool)
-        # Whether the accepted policy has played all of the episode that is under way.
-        self.accepted_led = np.zeros(n_envs, dtype=bool)
+        self.accepted_led = np.zeros(n_envs, dtype=bool)  # whether for all of the episode so far
         self.starts: list[Array] = [np.empty(0)] * n_envs
-        self.blocks = np.full(n_envs, -1)
-        self.block = 0
+        self.blocks, self.block = np.full(n_envs, -1), 0
         self.last_restore = "", -1  # why, and after how many episodes
         self.left_out = 0  # episodes of the first block whose cost is not known
 
@@ -75,19 +73,15 @@ class PlantAcceptance:
         if diverged(policy):  # only the MPC is left
             refused = True
             session.mpc.restore(policy)
-        evidence = BlockEvidence(resting=ActorCheckpoint.of(policy))
-        session.state.accept(ActorCheckpoint.of(policy), evidence)
+        present = ActorCheckpoint.of(policy)
+        session.state.accept(present, BlockEvidence(resting=present))
         if refused:
             self._report(session, "rejected", "before training, it is not accepted", np.nan)
 
     def before_steps(self, session: GuardSession) -> None:
-        """Restore the accepted policy before a diverged one acts on the plant.
-
-        SB3 calls this after each training of the networks, before the next action.
-        """
+        """Restore the accepted policy before one that has diverged acts on the plant."""
         if diverged(session.policy):
-            reason = "a parameter of the actor is not a finite number, or too large"
-            self._restore(session, reason)
+            self._restore(session, "a parameter of the actor is not a finite number, or too large")
 
     def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
         """Count the step; decide where a block is over."""
@@ -105,8 +99,7 @@ class PlantAcceptance:
                 self._end_episode(session, i)
         if len(evidence.costs) >= self.rule.trial_episodes:
             self._end_block(session)
-        # After a violation the actor rests until the episode is over: the accepted policy leads
-        # the plant back.
+        # After a violation the actor rests while the accepted policy leads the plant back.
         rests = evidence.phase != "learning" or self.violated.any()
         session.policy.actor_step = 0.0 if rests else state.step
 
@@ -118,8 +111,7 @@ class PlantAcceptance:
     def _enroll(self, session: GuardSession) -> None:
         """Count episodes that start now as the block's, before anything ends the block.
 
-        The first to start count, not the first to end: of several envs side by side, those would
-        be the short episodes.
+        The first to end would be the short ones, where several envs are side by side.
         """
         starting = np.flatnonzero(self.lengths == 0)
         if len(starting) == 0:
@@ -129,10 +121,9 @@ class PlantAcceptance:
         theta = session.policy.theta(observations).double().cpu().numpy()  # type: ignore[arg-type]
         for i in starting:  # s_t, before the step
             self.starts[i] = theta[i]
-            if not np.all(np.isfinite(theta[i])):
-                continue  # what it should cost from there is not known
             counted = len(_evidence(session).costs) + np.count_nonzero(self.blocks == self.block)
-            if counted < self.rule.trial_episodes:
+            # Where theta is not finite, nobody knows what it should cost from there.
+            if np.all(np.isfinite(theta[i])) and counted < self.rule.trial_episodes:
                 self.blocks[i] = self.block
 
     def _watch_limits(self, session: GuardSession, i: int, done: bool, info: Any) -> None:
@@ -152,23 +143,22 @@ class PlantAcceptance:
         evidence = _evidence(session)
         if self.blocks[i] == self.block:
             if evidence.phase == "first" and not np.isfinite(self.costs[i]):
-                self._leave_out(i)
+                self._leave_out(self.costs[i])
             else:
                 evidence.costs.append(float(self.costs[i]))
                 if evidence.phase != "learning":
-                    problem, steps = session.policy.problem, int(self.lengths[i])
-                    evidence.predicted.append(predicted_cost(problem, self.starts[i], steps))
+                    problem, start = session.policy.problem, self.starts[i]
+                    evidence.predicted.append(predicted_cost(problem, start, self.lengths[i]))
         self.costs[i], self.lengths[i], self.violated[i] = 0.0, 0, False
         self.blocks[i] = -1
 
-    def _leave_out(self, i: int) -> None:
+    def _leave_out(self, cost: float) -> None:
         """Leave an episode out of the first block; raise ValueError if too many are."""
         self.left_out += 1
         if self.left_out >= self.rule.trial_episodes:
             raise ValueError(
-                f"{self.left_out} episodes of the guard's first block cost what is no finite "
-                f"number, the last {self.costs[i]:g}: no policy can be compared with that. Rewards "
-                "must be finite numbers."
+                f"{self.left_out} episodes of the guard's first block cost no finite number, the "
+                f"last {cost:g}. Policies are compared by costs. Rewards must be finite numbers."
             )
 
     def _begin(self, session: GuardSession, phase: Phase) -> None:
@@ -179,13 +169,10 @@ class PlantAcceptance:
         self.block += 1
 
     def _restore(self, session: GuardSession, reason: str) -> None:
-        """Restore the accepted policy at once, whatever the block.
-
-        The same reason step after step is one decision in each episode.
-        """
+        """Restore the accepted policy at once, whatever the block."""
         state = session.state
         state.accepted.restore(session.policy)
-        if self.last_restore != (reason, state.episodes):
+        if self.last_restore != (reason, state.episodes):  # one decision for it in each episode
             self._report(session, "rejected", reason, np.nan)
         self.last_restore = reason, state.episodes
         self._begin(session, "first" if _evidence(session).accepted is None else "learning")
@@ -221,12 +208,10 @@ class PlantAcceptance:
         self._report(session, verdict, reason, float(played.costs.mean()))
 
     def _report(self, session: GuardSession, verdict: Verdict, reason: str, cost: float) -> None:
-        def mean(episodes: PlantEpisodes | None) -> float:
-            return np.nan if episodes is None else float(episodes.costs.mean())
-
         evidence = _evidence(session)
-        costs = cost, mean(evidence.accepted), mean(evidence.mpc)
-        session.decide(verdict, reason, verdict == "rejected", costs)
+        known = evidence.accepted, evidence.mpc
+        means = [np.nan if each is None else float(each.costs.mean()) for each in known]
+        session.decide(verdict, reason, verdict == "rejected", (cost, means[0], means[1]))
 
 
 def _evidence(session: GuardSession) -> BlockEvidence:

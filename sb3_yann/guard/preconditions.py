@@ -29,29 +29,24 @@ def check_simulator(session: GuardSession, name: str) -> None:
         ours, theirs = env.observation_space.shape, training_env.observation_space.shape
         if ours != theirs or env.action_space != training_env.action_space:
             raise ValueError(
-                f"The guard's env {name} has observations of shape {ours} and "
-                f"{env.action_space}; the training env has {theirs} and "
-                f"{training_env.action_space}. Give the guard a simulator of this plant."
+                f"The guard's env {name} has observations of shape {ours} and {env.action_space}, "
+                f"the training env {theirs} and {training_env.action_space}. "
+                "Give the guard a simulator of this plant."
             )
 
 
 def check_acts_alone(model: OffPolicyAlgorithm) -> None:
-    """Raise ValueError if anything but the policy would act on the training env.
-
-    Without a simulator the training episodes are the evidence: those of random actions would be
-    taken for the MPC's.
-    """
+    """Raise ValueError if anything but the policy, whose episodes are the evidence, would act."""
     if model.num_timesteps < model.learning_starts:
-        raise ValueError(
-            f"learning_starts = {model.learning_starts}: SB3 plays so many actions at random, and "
-            "ImprovementGuard(None) takes the training episodes for the policy's own. Pass the "
-            "callback NoActionNoise() as well, or learning_starts=0."
-        )
-    if model.action_noise is not None:
-        raise ValueError(
-            f"action_noise = {model.action_noise}: ImprovementGuard(None) takes the training "
-            "episodes for the policy's own. Pass the callback NoActionNoise() as well, or none."
-        )
+        cause = f"learning_starts = {model.learning_starts}: SB3 plays so many actions at random"
+    elif model.action_noise is not None:
+        cause = f"action_noise = {model.action_noise} acts as well"
+    else:
+        return
+    raise ValueError(
+        f"{cause}, and ImprovementGuard(None) takes the training episodes for the policy's own. "
+        "Pass the callback NoActionNoise() as well, or learning_starts=0 and no noise."
+    )
 
 
 def check_not_nested(guard: BaseCallback) -> None:
@@ -60,9 +55,9 @@ def check_not_nested(guard: BaseCallback) -> None:
     event = event or _event_above(guard, guard.locals.get("callback"))
     if event is not None:
         raise ValueError(
-            f"The guard is within a callback of the class {type(event).__name__}, which passes on "
-            "neither each step nor the end of training: the final model might not be an accepted "
-            "one. Pass the guard to learn itself; eval_every=... makes trials rarer."
+            f"The guard is within a callback of the class {type(event).__name__}, which does not "
+            "tell it of each step and of the end: the final model might not be an accepted one. "
+            "Pass the guard to learn itself; eval_every=... makes trials rarer."
         )
 
 
@@ -96,9 +91,9 @@ def first_episodes(session: GuardSession, name: str, seeds: Sequence[int]) -> Ou
     for seed, first, second in zip(seeds, mpc.costs, again.costs, strict=True):
         if not np.isclose(first, second, rtol=1e-6, atol=0):
             raise ValueError(
-                f"The MPC played two episodes of the guard's env {name} from the "
-                f"seed {seed}, at costs of {first:g} and {second:g}. Episodes are compared in "
-                "pairs: all that is random in the env must come from self.np_random."
+                f"The MPC played two episodes of the guard's env {name} from the seed {seed}, "
+                f"at costs of {first:g} and {second:g}. Episodes are compared in pairs: all that "
+                "is random in the env must come from self.np_random."
             )
     if len(seeds) > 1 and _all_alike(mpc):
         warnings.warn(

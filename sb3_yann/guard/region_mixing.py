@@ -16,10 +16,7 @@ MOST_LOST = 0.2
 
 
 def accept_visited(session: GuardSession, candidate: ActorCheckpoint, outcome: Outcome) -> None:
-    """Accept the candidate in the regions that its episodes come through.
-
-    They say nothing of the others: there the networks stay those that were accepted before.
-    """
+    """Accept the candidate in those regions that its episodes come through."""
     state, visited = session.state, outcome.visits.any(0)
     if np.any(state.accepted.changed_regions(candidate) & ~visited):
         candidate = state.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
@@ -29,10 +26,7 @@ def accept_visited(session: GuardSession, candidate: ActorCheckpoint, outcome: O
 def accept_parts(
     session: GuardSession, candidate: ActorCheckpoint, outcome: Outcome | None
 ) -> None:
-    """Accept what regions of a refused candidate can be accepted.
-
-    The outcome is the candidate's from the known starts, None where it cannot be played.
-    """
+    """Accept regions of a refused candidate; its outcome is None where it cannot be played."""
     if outcome is not None:
         _accept_all_but_losing(session, candidate, outcome)
     _accept_one_by_one(session, candidate, outcome)
@@ -43,8 +37,8 @@ def _accept_all_but_losing(
 ) -> None:
     """Restore the regions by which few starts lose, until the others can be accepted.
 
-    The losing starts come through the restored region most, the winning ones least. Only the
-    episodes through it are played again.
+    Losing starts come through the restored region most, winning ones least. Only its episodes are
+    played again.
     """
     evidence: Evidence = session.state.evidence
     paired, visited = evidence.paired, (evidence.visits | outcome.visits).any(0)
@@ -73,10 +67,7 @@ def _accept_all_but_losing(
 def _accept_one_by_one(
     session: GuardSession, candidate: ActorCheckpoint, outcome: Outcome | None
 ) -> None:
-    """Accept the regions of the candidate that improve the accepted policy, one by one.
-
-    Only the episodes through a region are played again, unless the candidate's own stand for them.
-    """
+    """Accept the regions of the candidate that improve the accepted policy, one by one."""
     state = session.state
     for region in np.argsort(-state.evidence.visits.sum(0), kind="stable").tolist():
         evidence: Evidence = state.evidence

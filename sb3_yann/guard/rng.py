@@ -12,10 +12,7 @@ import torch as th
 
 @contextmanager
 def preserve_rng() -> Iterator[None]:
-    """Restore the global random states of Python, numpy and torch afterwards.
-
-    Older envs seed them in `reset` and draw from them. Building a torch module draws as well.
-    """
+    """Restore the states of the random generators that older envs and torch modules draw from."""
     python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002
     torch_state = th.get_rng_state()
     uses_cuda = th.cuda.is_initialized()  # type: ignore[no-untyped-call]

@@ -25,11 +25,7 @@ Simulator: TypeAlias = str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
 
 @dataclass
 class GuardSession:
-    """One model under guard, during one `learn`.
-
-    The policy is the candidate, until a checkpoint is restored to it. ``simulator`` is None on a
-    plant alone.
-    """
+    """One model under guard, during one `learn`; ``simulator`` is None on a plant alone."""
 
     model: OffPolicyAlgorithm
     policy: YannPolicy
@@ -40,7 +36,7 @@ class GuardSession:
     interrupted: bool = False
     """Whether Ctrl-C has restored the accepted policy, so that nothing else may be restored."""
     before_trial: tuple[ActorCheckpoint, Any, list[Any]] | None = None
-    """What was accepted before the trial that is under way, with its evidence and ``passed``."""
+    """The accepted checkpoint, its evidence and ``passed`` before a trial that is under way."""
 
     def __post_init__(self) -> None:
         if self.policy.actor.mu.network.is_zero():
@@ -61,10 +57,7 @@ class GuardSession:
 
     @contextmanager
     def playing(self, checkpoint: ActorCheckpoint) -> Iterator[YannPolicy]:
-        """Yield the policy with the actor of a checkpoint; its own actor is back afterwards.
-
-        Target and optimizer play no part in an episode and stay as they are.
-        """
+        """Yield the policy with the actor of a checkpoint; its own actor is back afterwards."""
         own = {key: each.clone() for key, each in self.policy.actor.state_dict().items()}
         try:
             self.policy.actor.load_state_dict(checkpoint.actor)
@@ -102,10 +95,7 @@ class GuardSession:
             return not policy.actor.mu.network.is_zero()
 
     def seen(self, observations: Any) -> Any:
-        """Return observations of the simulator as the policy has learned from them.
-
-        The simulator is an env like the one below a VecNormalize.
-        """
+        """Return observations of the simulator, which is below any VecNormalize, normalized."""
         normalize = self.model.get_vec_normalize_env()
         return observations if normalize is None else normalize.normalize_obs(observations)
 
@@ -143,14 +133,12 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     >>> from stable_baselines3 import DDPG
     >>> from sb3_yann import ImprovementGuard, NoActionNoise, restore_accepted
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> _ = model.learn(1, callback=[NoActionNoise(), ImprovementGuard("CSTR-v0", n_starts=3)])
+    >>> _ = model.learn(1, callback=[NoActionNoise(), ImprovementGuard(None)])
     >>> restore_accepted(model)
     """
     state, policy = getattr(model, "guard_state", None), model.policy
     if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
-        raise ValueError(
-            f"No ImprovementGuard has been at work on this {type(model).__name__}: pass one to "
-            "learn."
-        )
+        name = type(model).__name__
+        raise ValueError(f"No ImprovementGuard has been at work on this {name}: pass one to learn.")
     state.accepted.restore(policy)
     policy.actor_step = 1.0

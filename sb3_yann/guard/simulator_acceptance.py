@@ -56,16 +56,12 @@ class SimulatorAcceptance:
         self.last_trial = -self.eval_every  # a trial always follows the first episode
 
     def still_holds(self, session: GuardSession) -> bool:
-        """Return whether the accepted policy's episodes are still what the evidence says.
-
-        The settings name the simulator; another one may have the same name.
-        """
+        """Return whether some episodes are still what the evidence says: only a name is known."""
         evidence: Evidence | None = session.state.evidence
         if evidence is None:
             return False
-        last = len(evidence.seeds) - 1
-        some = np.unique(np.linspace(0, last, REPLAYED).astype(int))
-        seeds, expected = [evidence.seeds[int(i)] for i in some], evidence.accepted.at(some)
+        some = np.unique(np.linspace(0, len(evidence.seeds) - 1, REPLAYED).astype(int))
+        seeds, expected = evidence.at(some).seeds, evidence.accepted.at(some)
         try:
             again = outcome_of(session, play_episodes(session, session.state.accepted, seeds))
         except Unplayable:
@@ -74,10 +70,9 @@ class SimulatorAcceptance:
         return close and np.array_equal(again.unsafe, expected.unsafe)
 
     def first_evidence(self, session: GuardSession, known: GuardState | None) -> None:
-        """Play the MPC's episodes, and accept what is no worse at the start.
+        """Play the MPC's episodes; accept the present or an earlier run's policy if no worse.
 
-        That may be the policy that a run with other settings accepted, or the present one. The
-        earlier run's hard starts stay.
+        The earlier run's hard starts stay.
         """
         state, present = session.state, ActorCheckpoint.of(session.policy)
         candidates, seeds = [present], (*self.seeds,)
@@ -145,19 +140,15 @@ class SimulatorAcceptance:
         if before.is_actor_of(session.policy):
             return
         candidate = ActorCheckpoint.of(session.policy)
-        if self._plays_alike(session, candidate):
-            return
+        changed = before.changed_regions(candidate)
+        if candidate.is_finite() and not np.any(changed & state.evidence.visits.any(0)):
+            return  # it differs only where no episode of the accepted policy comes through
         with session.all_or_nothing():
             outcome, reason, restored = self._judge(session, candidate)
         if restored:
             state.accepted.restore(session.policy)
         regions = accepted_regions(before, candidate, state.accepted) if reason else []
         self._report(session, outcome, reason, regions, restored)
-
-    def _plays_alike(self, session: GuardSession, candidate: ActorCheckpoint) -> bool:
-        """Return whether it differs only where no episode of the accepted policy comes through."""
-        changed = session.state.accepted.changed_regions(candidate)
-        return candidate.is_finite() and not np.any(changed & session.state.evidence.visits.any(0))
 
     def _judge(
         self, session: GuardSession, candidate: ActorCheckpoint

@@ -6,7 +6,7 @@ import csv
 import os
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -58,16 +58,13 @@ class Decision:
     step: float
 
 
-NAMES = [each.name for each in fields(Decision)]
-
-
 @dataclass
 class GuardState:
     """All that a stopped run needs to go on; it travels in the model's zip.
 
-    ``evidence`` is what a candidate is compared with. ``passed`` are earlier accepted checkpoints,
-    the latest last, with their outcomes on the first of the known starts. ``new_starts`` counts the
-    new starts that were played, ``next_start`` is the seed of the next.
+    ``passed`` are earlier accepted checkpoints, the latest last, with their outcomes on the first
+    of the known starts. ``new_starts`` counts the new starts, ``next_start`` is the seed of the
+    next.
     """
 
     settings: dict[str, Any]
@@ -96,38 +93,29 @@ def log_last(
     rejected = sum(each.verdict == "rejected" for each in decisions)
     model.logger.record("guard/rejected", rejected)
     model.logger.record("guard/accepted", len(decisions) - rejected)
-    if path is not None:
-        append_csv(path, decisions)
+    if path is not None and path.exists():  # writing all of them would take ever longer
+        _write_rows(path, "a", [last])
+    elif path is not None:
+        write_csv(path, decisions)
     model.logger.dump(model.num_timesteps)  # as EvalCallback does, or the next would replace it
     if verbose:
-        print(
-            f"Episode {last.episode}: {last.verdict}"
-            + (f" ({last.reason})" if last.reason else "")
-            + f"; mean cost {last.accepted_cost:.6g}, MPC {last.mpc_cost:.6g}"
-        )
+        reason = f" ({last.reason})" if last.reason else ""
+        costs = f"mean cost {last.accepted_cost:.6g}, MPC {last.mpc_cost:.6g}"
+        print(f"Episode {last.episode}: {last.verdict}{reason}; {costs}")
 
 
 def write_csv(path: Path, decisions: list[Decision]) -> None:
     """Write the decisions, all or none of them."""
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".unfinished")
-    with unfinished.open("w", newline="", encoding="utf-8") as file:
-        csv.DictWriter(file, NAMES).writeheader()
-        _write_rows(file, decisions)
+    _write_rows(unfinished, "w", decisions)
     os.replace(unfinished, path)
 
 
-def append_csv(path: Path, decisions: list[Decision]) -> None:
-    """Append the last decision; writing all of them would take ever longer."""
-    if not path.exists():
-        write_csv(path, decisions)
-        return
-    with path.open("a", newline="", encoding="utf-8") as file:
-        _write_rows(file, decisions[-1:])
-
-
-def _write_rows(file: TextIO, decisions: list[Decision]) -> None:
-    writer = csv.DictWriter(file, NAMES)
-    for decision in decisions:
-        regions = " ".join(map(str, decision.regions))
-        writer.writerow({**asdict(decision), "regions": regions})
+def _write_rows(path: Path, mode: Literal["w", "a"], decisions: list[Decision]) -> None:
+    with path.open(mode, newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [each.name for each in fields(Decision)])
+        if mode == "w":
+            writer.writeheader()
+        for each in decisions:
+            writer.writerow({**asdict(each), "regions": " ".join(map(str, each.regions))})

@@ -23,9 +23,8 @@ UNSAFE = (
 class PairedEpisodes:
     """Episodes from the same starts, under the MPC and under the accepted policy.
 
-    ``costs`` and ``unsafe`` are the accepted policy's. The columns of ``unsafe`` (starts, up to 3),
-    named in ``UNSAFE``, are compared one by one: an episode that is cut short has fewer steps to
-    violate in. ``margin`` is what one start may cost more than with the MPC.
+    ``costs`` and ``unsafe`` are the accepted policy's. The columns of ``unsafe``, named in
+    ``UNSAFE``, are compared one by one: an episode cut short has fewer steps to violate in.
     """
 
     mpc_costs: Array
@@ -61,11 +60,7 @@ class PairedEpisodes:
 
 @dataclass(frozen=True)
 class PlantEpisodes:
-    """Training episodes played by one and the same policy on the plant.
-
-    ``predicted`` is what the MPC would cost from the same start on its own linear model. It
-    explains most of the difference between starts.
-    """
+    """Training episodes of one policy; ``predicted`` is what the MPC costs on its own model."""
 
     costs: Array
     predicted: Array
@@ -74,9 +69,8 @@ class PlantEpisodes:
 def excess_of_an_outlier(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
     """Return by how much one of the candidate's episodes costs more than the accepted policy's.
 
-    0 where none is beyond the upper prediction limit, of size ``OUTLIER`` for all of them together,
-    of the least-squares line of the accepted policy's costs on the predicted ones (e.g. Montgomery,
-    chapter 10). The mean would not show it: a heavy loss raises the scatter as well.
+    0 where none is beyond the upper prediction limit, of size ``OUTLIER`` for all of them, of the
+    least-squares line of the accepted costs on the predicted ones (e.g. Montgomery, chapter 10).
     """
     covariate = _varies(accepted.predicted) and bool(np.all(np.isfinite(candidate.predicted)))
     X, new = (

@@ -14,7 +14,7 @@ import torch as th
 from torch import nn
 
 from sb3_yann._validation import Array, as_bounds, as_positive_vector, half_widths
-from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
+from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
 
 PredictionModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
 """``(theta, u) -> next theta``: (batch, n), (batch, m) to (batch, n), float64, physical units."""
@@ -57,14 +57,10 @@ class Ranges:
 
 
 class QuadraticForm(nn.Module):
-    """``z -> z' M z``, trainable.
+    """``z -> z' M z``, trainable, for M (k, k) in scaled entries: ``M = D M^ D``.
 
-    M is trained in scaled entries, ``M = D M^ D`` with constant ``D = sqrt(|diag M|)``. The raw
-    entries span many orders of magnitude, and equal steps of Adam would flip the smallest ones.
-
-    Parameters
-    ----------
-    M : ndarray, shape (k, k)
+    ``D = sqrt(|diag M|)`` is constant. The raw entries span many orders of magnitude, and equal
+    steps of Adam would flip the smallest ones.
     """
 
     root: th.Tensor
@@ -89,8 +85,7 @@ class QuadraticStateActionValue(nn.Module):
     """``Q(theta, a) = -[theta; u]' M [theta; u] + network``: u now, the law ever after.
 
     The critic of Braniff & Tian, Section 4.2. ``u`` is the input in physical units for an action
-    ``a`` in [-1, 1]. Without exploration nothing tells this network how Q depends on a;
-    :class:`AfterstateValue` takes that from the model.
+    ``a`` in [-1, 1]. Only exploration tells this network how Q depends on a.
 
     Parameters
     ----------
@@ -125,15 +120,14 @@ class QuadraticStateActionValue(nn.Module):
         super().__init__()
         n, m = len(ranges.theta_half), len(ranges.u_min)
         self.quadratic = QuadraticForm(M)
-        _register(
+        register_constants(
             self,
             to_input=np.concatenate([np.ones(n), ranges.u_half]),
             middle=np.concatenate([np.zeros(n), ranges.u_middle]),
             network_scale=1 / np.concatenate([ranges.theta_half, ranges.u_half]),
         )
-        self.network = ZeroOutputNetwork(
-            n + m, 1, hidden, activation=activation, pinned=th.tensor([pinned])
-        )
+        kept = th.tensor([pinned])
+        self.network = ZeroOutputNetwork(n + m, 1, hidden, activation=activation, pinned=kept)
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
@@ -147,8 +141,7 @@ class AfterstateValue(nn.Module):
     """``Q(theta, a) = -(theta'Q theta + u'Ru + gamma V(f(theta, u)))``, V quadratic plus network.
 
     With the linear model for f, it starts as :class:`QuadraticStateActionValue`, to rounding. Only
-    V is learnt, at predicted next states. The stage cost and the model say how Q depends on the
-    action: a model error bends the direction of improvement, not the values that are compared.
+    V is learnt, at predicted next states: stage cost and model say how Q depends on the action.
 
     Parameters
     ----------
@@ -179,7 +172,7 @@ class AfterstateValue(nn.Module):
     network_scale: th.Tensor
     W: th.Tensor
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (a user's options of the critic)
         self,
         W: Array,
         P: Array,
@@ -196,7 +189,7 @@ class AfterstateValue(nn.Module):
         self.model = _untrained(model) if isinstance(model, nn.Module) else model
         self.gamma, self.scale = gamma, scale
         self.quadratic = QuadraticForm(P)
-        _register(
+        register_constants(
             self,
             W=W,
             to_input=ranges.u_half,
@@ -205,9 +198,8 @@ class AfterstateValue(nn.Module):
         )
         n, m = len(ranges.theta_half), len(ranges.u_min)
         _check_prediction(self.model, n, m)
-        self.network = ZeroOutputNetwork(
-            n, 1, hidden, activation=activation, pinned=th.tensor([pinned])
-        )
+        kept = th.tensor([pinned])
+        self.network = ZeroOutputNetwork(n, 1, hidden, activation=activation, pinned=kept)
         self._constants: tuple[Array, Array, Array, Array]
         self._constants_of: tuple[list[Any], tuple[th.Tensor, ...]] = ([], ())
 
@@ -299,11 +291,6 @@ class LinearPrediction(nn.Module):
         return theta @ self.A + u @ self.B
 
 
-def _register(module: nn.Module, **constants: Array) -> None:
-    for name, value in constants.items():
-        module.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=th.float64))
-
-
 def _check_prediction(model: PredictionModel, n: int, m: int) -> None:
     """Raise unless the model returns a next theta for each row that depends on u."""
     batch = n + m + 1  # no other size of the problem, so that a mistaken axis shows
@@ -314,15 +301,15 @@ def _check_prediction(model: PredictionModel, n: int, m: int) -> None:
     if not isinstance(predicted, th.Tensor) or predicted.shape != theta.shape:
         shape = getattr(predicted, "shape", type(predicted).__name__)
         raise ValueError(
-            f"The prediction model returned {shape} for theta of shape ({batch}, {n}) and u of "
-            f"shape ({batch}, {m}); it must return the next theta, shape ({batch}, {n})."
+            f"The prediction model returned {shape} for theta ({batch}, {n}) and u ({batch}, {m}); "
+            f"it must return the next theta, shape ({batch}, {n})."
         )
     if not bool(th.isfinite(predicted).all()):
         raise ValueError(f"The prediction model returned {predicted[0].tolist()} for zeros.")
     if not predicted.requires_grad:
         raise ValueError(
-            "The prediction of the model has no gradient with respect to u, by which the actor "
-            "learns: compute it by operations of torch on u itself, without detach or numpy."
+            "The prediction has no gradient with respect to u, by which the actor learns: compute "
+            "it by operations of torch on u itself, without detach or numpy."
         )
 
 

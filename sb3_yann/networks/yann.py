@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -12,15 +11,14 @@ from torch import nn
 
 from sb3_yann._validation import Array
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
-from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
+from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
 
 
 class YannLayer(nn.Module):
     """theta -> input in [-1, 1]: a piecewise affine law, exactly, plus a network per region.
 
-    At first the networks are exactly zero and the layer is the law, to float32 rounding. Only the
-    active region's law and network are computed. Regions have networks of their own: once trained,
-    the layer may jump from one region to the next.
+    At first the networks are exactly zero and the layer is the law, to float32 rounding. Once
+    trained, it may jump from one region to the next: each has a network of its own.
 
     Parameters
     ----------
@@ -33,16 +31,10 @@ class YannLayer(nn.Module):
         The output is never further from the law than this fraction of the input range, whatever
         the networks become. The default is no bound but those of the input.
     pinned : bool, default True
-        Whether training must leave the equilibrium where it is: the network of a region with the
-        origin is then zero there for good.
+        Whether training leaves the equilibrium where it is: networks stay zero at the origin.
     rate : pair of ndarray, shape (m,), optional
         ``du_min`` and ``du_max``: the input, the law's too, never moves by more from the previous
         one, the last m entries of theta.
-
-    Raises
-    ------
-    ValueError
-        If an input of the law has no bound.
 
     Examples
     --------
@@ -74,8 +66,6 @@ class YannLayer(nn.Module):
         rate: tuple[Array, Array] | None = None,
     ) -> None:
         super().__init__()
-        # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
-        import_module("sb3_yann.networks._kernels.yann_layer")
         if not np.all(np.isfinite([law.u_min, law.u_max])):
             raise ValueError(
                 f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
@@ -88,9 +78,9 @@ class YannLayer(nn.Module):
         middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
         # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
-        for name, value in _constants(law).items():
-            self._constant(name, value)
-        self._constant("theta_half", (law.theta_max - law.theta_min) / 2, th.float32)
+        register_constants(self, **_constants(law))
+        half = (law.theta_max - law.theta_min) / 2
+        self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
         self.rated = rate is not None
         if rate is not None:
             if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
@@ -98,31 +88,21 @@ class YannLayer(nn.Module):
                     f"rate has shape {np.shape(rate)}, expected (2, {law.n_inputs}) and a theta "
                     f"that ends with the {law.n_inputs} previous inputs; it has {law.n_theta}."
                 )
-            self._constant("middle", middle)
-            self._constant("half_range", reach)
             # In both directions a little is left for the rounding of actions and observations.
             room = np.maximum(np.stack([-rate[0], rate[1]]) / reach - 1e-6, 0.0)
-            self._constant("change", room * [[-1.0], [1.0]])
+            change = room * [[-1.0], [1.0]]
+            register_constants(self, middle=middle, half_range=reach, change=change)
         at_origin = np.minimum.reduceat(law.b, law.starts) >= -law.tolerance
-        self.network = ZeroOutputNetwork(
-            law.n_theta,
-            law.n_inputs,
-            hidden,
-            activation=activation,
-            pinned=th.as_tensor(at_origin & pinned),
-        )
+        stay, sizes = th.as_tensor(at_origin & pinned), (law.n_theta, law.n_inputs)
+        self.network = ZeroOutputNetwork(*sizes, hidden, activation=activation, pinned=stay)
         scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
         change = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
+        # For compiled code.
         self.constants = (scaling, change, np.inf if self.reach is None else self.reach)
-        """For compiled code."""
         self.has_its_law = True
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
-        """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n).
-
-        On a CPU, compiled code computes networks of two hidden layers with tanh, unless theta
-        needs a gradient. The operations of torch do the same elsewhere.
-        """
+        """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
         fixed = theta.device.type == "cpu" and not theta.requires_grad
         if fixed and self.has_its_law and self.network.compiles:
             return self._compiled(theta)
@@ -135,28 +115,22 @@ class YannLayer(nn.Module):
         output = self._law(theta, region, inside) + correction
         # As compiled: where theta is not finite nothing is passed off as an input.
         output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
-        return clamp_with_inward_gradient(
-            output, *(self._within_reach(theta) if self.rated else ())
-        )
+        bounds = self._within_reach(theta) if self.rated else (-1.0, 1.0)
+        return clamp_with_inward_gradient(output, *bounds)
 
     def _compiled(self, theta: th.Tensor) -> th.Tensor:
         from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
 
         network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
-        law, weights = self.piecewise_affine.packed, network.weights()
-        return layer_on_cpu(
-            theta, law, self.constants, weights, network.pinned_array, self.row_gradients
-        )
+        law, own = self.piecewise_affine.packed, (network.weights(), network.pinned_array)
+        return layer_on_cpu(theta, law, self.constants, *own, self.row_gradients)
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
         return self._law(theta, *self.locate(theta))
 
     def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
-        """Return the region whose law and network are in use for each row of theta (batch, n).
-
-        The first one for rows that are not finite.
-        """
+        """Return the region in use for each row of theta (batch, n), the first if not finite."""
         if not self.has_its_law:
             by_torch: NDArray[np.int64] = self.locate(theta)[0].cpu().numpy()
             return by_torch
@@ -197,10 +171,6 @@ class YannLayer(nn.Module):
             for name, value in _constants(self.piecewise_affine).items()
         )
 
-    def _constant(self, name: str, value: Array, dtype: th.dtype = th.float64) -> None:
-        # A buffer, not a parameter: optimizers and SB3's target updates leave it alone.
-        self.register_buffer(name, th.as_tensor(np.array(value), dtype=dtype))
-
 
 def _constants(law: PiecewiseAffine) -> dict[str, Array]:
     """Return the law for actions in [-1, 1], as the layer keeps it."""
@@ -216,10 +186,8 @@ def _constants(law: PiecewiseAffine) -> dict[str, Array]:
 
 
 def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
-    """Return (n, q_max p) and (q_max p,): the first half-space of every region, the second, ...
-
-    Regions with fewer than q_max are filled up with half-spaces that never bind.
-    """
+    """Return (n, q_max p) and (q_max p,): the first half-space of every region, the second, ..."""
+    # Regions with fewer than q_max are filled up with half-spaces that never bind.
     counts = np.diff([*law.starts, law.n_halfspaces])
     A = np.zeros((law.n_theta, counts.max(), law.n_regions))
     b = np.full((counts.max(), law.n_regions), np.inf)
@@ -240,18 +208,13 @@ class _InwardGradientClamp(th.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, None, None]:
-        (x,) = ctx.saved_tensors
-        (grad,) = grad_outputs
+        (x,), (grad,) = ctx.saved_tensors, grad_outputs
         # Descent moves x against its gradient.
         outward = ((x >= ctx.high) & (grad < 0)) | ((x <= ctx.low) & (grad > 0))
         return grad.masked_fill(outward, 0.0), None, None
 
 
 def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:
-    """Return x clamped to bounds, numbers or tensors, with a gradient that can still lead inside.
-
-    The gradient of `torch.clamp` vanishes beyond the bounds, so a saturated region would never
-    learn to leave its bound.
-    """
+    """Return x clamped to numbers or tensors, with a gradient that can still lead inside."""
     clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
     return clamped

@@ -1,8 +1,7 @@
 """Networks whose output is exactly zero at first, for any input, and which train all the same.
 
-Braniff & Tian, Theorems 1 and 2. Nodes come in pairs with opposite weights and biases, summed
-*before* the activation s: with s(0) = 0 the layer puts out zero. Here the weights of a pair are
-added before they meet the input, so the zero is exact, not to rounding only.
+Braniff & Tian, Theorems 1 and 2: nodes in pairs of opposite sign, summed before the activation.
+Here their weights are added before they meet the input, so that the zero is exact.
 """
 
 from __future__ import annotations
@@ -17,6 +16,8 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
+from sb3_yann._validation import Array
+
 Activation = Callable[[th.Tensor], th.Tensor]
 FEW = 32
 """Stacks of up to this size are multiplied as a whole."""
@@ -25,9 +26,6 @@ FEW = 32
 class PairedLinear(nn.Module):
     """``x -> sum_j (W_j x + b_j)`` over nodes in pairs of opposite sign: exactly zero at first.
 
-    With ``n_stacked`` it holds that many independent layers in one tensor, and each row of a
-    batch goes through the one that ``index`` names.
-
     Parameters
     ----------
     in_features, out_features : int
@@ -35,7 +33,7 @@ class PairedLinear(nn.Module):
         Nodes summed into each output, at least 2. An odd one out starts with zero weights
         (the corollary to Theorem 1).
     n_stacked : int, default 1
-        Number of independent layers.
+        Number of independent layers in one tensor.
     scale : float, default 0.01
         Initial weights and biases are uniform in [-scale, scale].
     """
@@ -86,8 +84,7 @@ class StackedLinear(nn.Module):
 class Rows:
     """Which layer of a stack each row of a batch goes through; None is for a stack of one.
 
-    For few layers all of them are multiplied, in one product with a vector that is zero but for
-    the layer's own part; a gather of each row's own weights costs the same for any number.
+    Few layers are multiplied as a whole, with one-hot vectors; of many each row gathers its own.
     """
 
     def __init__(self, index: th.Tensor | None, n_stacked: int, dtype: th.dtype) -> None:
@@ -117,9 +114,10 @@ class Rows:
         return function(*(table.index_select(0, self.index) for table in tables))
 
 
-def is_tanh(activation: Activation) -> bool:
-    """Return whether the activation is tanh, by whichever of its names."""
-    return isinstance(activation, nn.Tanh) or activation in (th.tanh, nn.functional.tanh)
+def register_constants(module: nn.Module, **values: Array) -> None:
+    """Give a module buffers: optimizers and SB3's target updates leave them alone."""
+    for name, value in values.items():
+        module.register_buffer(name, th.as_tensor(np.array(value, order="C"), dtype=th.float64))
 
 
 def _alive_at_zero(activation: Activation, x: th.Tensor) -> th.Tensor:
@@ -129,9 +127,8 @@ def _alive_at_zero(activation: Activation, x: th.Tensor) -> th.Tensor:
 class ZeroOutputNetwork(nn.Module):
     """A stack of networks with one or two hidden layers, exactly zero at first, and trainable.
 
-    The first axis of every parameter is the stack; the first layer is a :class:`PairedLinear`.
-    Where ``pinned``, every layer is ``s(W x + b) - s(b)``: the output at x = 0 stays zero whatever
-    the parameters become, and training cannot shift the equilibrium.
+    The first axis of every parameter is the stack. Where ``pinned``, every layer is
+    ``s(W x + b) - s(b)``: the output at x = 0 stays zero, training cannot shift the equilibrium.
 
     Parameters
     ----------
@@ -148,11 +145,6 @@ class ZeroOutputNetwork(nn.Module):
         default is one network that is not pinned.
     scale : float, default 0.01
         Initial weights are uniform in [-scale, scale].
-
-    Raises
-    ------
-    ValueError
-        If there are not one or two hidden layers, or ``activation(0)`` is not 0.
 
     Examples
     --------
@@ -189,17 +181,15 @@ class ZeroOutputNetwork(nn.Module):
         if slope == 0:
             activation = partial(_alive_at_zero, activation)
         pinned = th.zeros(1, dtype=th.bool) if pinned is None else pinned
-        stack = len(pinned)
         self.activation = activation
-        self.first = PairedLinear(
-            in_features, hidden[0], n_nodes=n_nodes, n_stacked=stack, scale=scale
-        )
+        stack: dict[str, Any] = {"n_stacked": len(pinned), "scale": scale}
+        self.first = PairedLinear(in_features, hidden[0], n_nodes=n_nodes, **stack)
         widths = (*hidden, out_features)
-        self.rest = nn.ModuleList(
-            StackedLinear(a, b, n_stacked=stack, scale=scale) for a, b in pairwise(widths)
-        )
+        self.rest = nn.ModuleList(StackedLinear(a, b, **stack) for a, b in pairwise(widths))
         self.register_buffer("pinned", pinned.float()[:, None])
-        self.has_loops = len(hidden) == 2 and is_tanh(activation)
+        names_of_tanh = (th.tanh, nn.functional.tanh)
+        is_tanh = isinstance(activation, nn.Tanh) or activation in names_of_tanh
+        self.has_loops = len(hidden) == 2 and is_tanh
 
     def layers(self) -> list[PairedLinear | StackedLinear]:
         """Return the layers, the first of them paired."""
@@ -216,11 +206,8 @@ class ZeroOutputNetwork(nn.Module):
 
     @property
     def compiles(self) -> bool:
-        """Whether there is compiled code for such networks where they are now.
-
-        Tracing, export and torch's compiler would take its result for a constant; autocast needs
-        torch's own operations too.
-        """
+        """Whether there is compiled code for such networks where they are now."""
+        # Tracing would take its result for a constant; autocast needs torch's own operations.
         tracing = th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         if tracing or th.compiler.is_compiling() or th.is_autocast_enabled("cpu"):
             return False
@@ -241,21 +228,15 @@ class ZeroOutputNetwork(nn.Module):
         return not any(bool(th.any(each != 0)) for each in (self.first.matrix(), *biases))
 
     def forward(self, x: th.Tensor, index: th.Tensor | None = None) -> th.Tensor:
-        """Return (batch, out_features).
+        """Return (batch, out_features) for x (batch, in_features).
 
-        Parameters
-        ----------
-        x : Tensor, shape (batch, in_features)
-        index : Tensor of int, shape (batch,), optional
-            The network of the stack that each row goes through; None where there is only one.
+        ``index`` (batch,) names the network of the stack for each row, None where there is one.
         """
         if len(self.pinned) == 1:
             index = None
         elif index is None:
-            raise ValueError(
-                f"index is None, but there are {len(self.pinned)} networks in the stack: "
-                "pass the number of the network for each row of x."
-            )
+            stack = f"there are {len(self.pinned)} networks in the stack"
+            raise ValueError(f"index is None, but {stack}: pass that of each row of x.")
         rows = Rows(index, len(self.pinned), x.dtype)
         pinned = rows.each(lambda pinned: pinned, self.pinned)
         at_zero = (x == 0).all(-1, keepdim=True) & (pinned > 0)

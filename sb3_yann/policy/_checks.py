@@ -15,27 +15,22 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
-from sb3_yann._validation import as_between, as_whole
+from sb3_yann._validation import as_whole
 from sb3_yann.control import LinearMPC
-from sb3_yann.policy.observations import AffineObservation, require_frozen
+from sb3_yann.policy.observations import AffineObservation, require_frozen, require_outermost
 
 SB3_KWARGS = (
-    "n_critics",
-    "features_extractor_class",
-    "features_extractor_kwargs",
-    "normalize_images",
-    "share_features_extractor",
-    "optimizer_class",
-    "optimizer_kwargs",
-)
+    "n_critics features_extractor_class features_extractor_kwargs normalize_images "
+    "share_features_extractor optimizer_class optimizer_kwargs"
+).split()
 
 
 def require_plain_td3(algorithm: BaseAlgorithm | None) -> None:
     """Raise unless the algorithm is TD3 or DDPG."""
     if algorithm is not None and not isinstance(algorithm, TD3):
+        name = type(algorithm).__name__
         raise TypeError(
-            f"YannPolicy starts from a deterministic law and works with DDPG and TD3, not with "
-            f"{type(algorithm).__name__}. Use e.g. DDPG(YannPolicy, env)."
+            f"YannPolicy works with DDPG and TD3, such as DDPG(YannPolicy, env): not {name}."
         )
 
 
@@ -49,8 +44,7 @@ def require_sb3_kwargs(given: dict[str, Any], own: list[str]) -> None:
         )
     if given.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:
         raise ValueError(
-            "features_extractor_class would transform the state before it reaches the law; leave "
-            "it at FlattenExtractor."
+            "features_extractor_class must stay FlattenExtractor: the law takes theta."
         )
     as_whole("n_critics", given.get("n_critics", 1))
 
@@ -82,21 +76,15 @@ def require_undone_normalization(
         return
     if observation is None:
         raise ValueError(
-            "The VecNormalize normalizes observations, and the law takes the state. Undo it: "
+            "VecNormalize normalizes observations, and the law takes the state. Undo it: "
             "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}."
         )
-    if normalize.observation_space.shape != algorithm.observation_space.shape:
-        raise ValueError(
-            f"The VecNormalize shows {normalize.observation_space.shape}, but the learner sees "
-            f"{algorithm.observation_space.shape}, and SB3 stores the former. Make VecNormalize "
-            "the last wrapper, outside VecFrameStack."
-        )
+    require_outermost(normalize, algorithm.observation_space.shape)
     largest = _largest_observation(problem, observation)
     if largest > normalize.clip_obs:
         raise ValueError(
-            f"The VecNormalize clips at clip_obs = {normalize.clip_obs:g}, but in the box of the "
-            f"law normalized observations reach {largest:.4g}: beyond the clipping the state is "
-            "not known. Set venv.clip_obs = numpy.inf."
+            f"VecNormalize clips at clip_obs = {normalize.clip_obs:g}, but in the box of the law "
+            f"normalized observations reach {largest:.4g}. Set venv.clip_obs = numpy.inf."
         )
 
 
@@ -135,14 +123,11 @@ def require_matching(
     """Raise unless the spaces are those of the law: theta in, inputs between its bounds out."""
     _require_theta(problem, observation_space, observation)
     if not np.issubdtype(action_space.dtype, np.floating):
-        raise TypeError(
-            f"action_space has dtype {action_space.dtype}, but the inputs of an MPC are real: make "
-            "it a Box of numpy.float32."
-        )
+        dtype = action_space.dtype
+        raise TypeError(f"action_space has dtype {dtype}: inputs are real, use numpy.float32.")
     if not action_space.is_bounded():
         raise ValueError(f"action_space = {action_space} must have finite bounds.")
-    law = (problem.u_min, problem.u_max)
-    env = (action_space.low, action_space.high)
+    law, env = (problem.u_min, problem.u_max), (action_space.low, action_space.high)
     reach = np.where(np.isfinite(law[1] - law[0]), law[1] - law[0], 1.0)
     u_ss, given = problem.model.u_ss, action_space.shape == law[0].shape
 
@@ -152,7 +137,7 @@ def require_matching(
 
     if given and same(0 * u_ss):
         return
-    bounds = f"u_min = {law[0].tolist()} and u_max = {law[1].tolist()}"
+    low, high = law[0].tolist(), law[1].tolist()
     advice = (
         "They must be the same: build the LinearMPC with the bounds of the env, as deviations from "
         "u_ss of its model, and leave out wrappers that rescale actions."
@@ -160,22 +145,17 @@ def require_matching(
     if given and same(u_ss):
         advice = (
             f"The env takes absolute inputs, and the MPC deviations from u_ss = {u_ss.tolist()}. "
-            "Before the wrappers that complete the observation, wrap the env: env = "
-            "gymnasium.wrappers.RescaleAction(env, numpy.float32("
-            f"{law[0].tolist()}), numpy.float32({law[1].tolist()}))."
+            "Wrap the env, before its observation is completed, in gymnasium.wrappers."
+            f"RescaleAction(env, numpy.float32({low}), numpy.float32({high}))."
         )
+    space = f"[{env[0].tolist()}, {env[1].tolist()}]"
     raise ValueError(
-        f"The action space is [{env[0].tolist()}, {env[1].tolist()}], but the MPC has {bounds}. "
-        + advice
+        f"The action space is {space}, but the MPC has u_min = {low} and u_max = {high}. {advice}"
     )
 
 
 def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None) -> None:
-    """Warn where the inputs of the plant itself seem to be absolute and are taken for deviations.
-
-    That is where no wrapper changes the actions, the operating point of the model is not zero, and
-    it lies between the bounds of the env.
-    """
+    """Warn where an unwrapped plant seems to take absolute inputs, and the MPC deviations."""
     venv = None if algorithm is None else algorithm.get_env()
     plain = None if venv is None else venv.unwrapped
     if venv is None or not isinstance(plain, DummyVecEnv):
@@ -186,13 +166,12 @@ def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None)
     if getattr(plain.observation_space, "problem", None) is not None:
         return  # they are made for each other
     if np.any(u_ss != 0) and np.all((space.low < u_ss) & (u_ss < space.high)):
+        low, high = (space.low - u_ss).tolist(), (space.high - u_ss).tolist()
         warnings.warn(
-            f"u_min and u_max of the MPC are the bounds of the env's own actions, and its model "
-            f"has the operating point u_ss = {u_ss.tolist()} between them. The MPC counts from "
-            f"u_ss: if the env takes absolute inputs, give it u_min = "
-            f"{(space.low - u_ss).tolist()} and u_max = {(space.high - u_ss).tolist()}, and wrap "
-            "the env in gymnasium.wrappers.RescaleAction with these. If the env takes deviations, "
-            "leave u_ss out of the model.",
+            f"The model's operating point u_ss = {u_ss.tolist()} lies between the bounds of the "
+            f"env's own actions. If the env takes absolute inputs, give the MPC u_min = {low} and "
+            f"u_max = {high}, and wrap the env in gymnasium.wrappers.RescaleAction with these. If "
+            "it takes deviations, leave u_ss out of the model.",
             stacklevel=2,
         )
 
@@ -209,28 +188,19 @@ def _require_theta(
         if shape != (problem.n_theta,):
             raise ValueError(
                 f"The observation has shape {shape}, but the law of the problem {takes}. Give the "
-                "policy the problem of this plant, or say how theta follows from an observation: "
+                "problem of this plant, or the map from an observation to theta: "
                 "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
             )
         return
     if not isinstance(observation, AffineObservation):
         raise TypeError(f"observation = {observation!r} must be an AffineObservation or None.")
+    given = f"The map to theta has a matrix of shape {observation.matrix.shape}, but the"
     if shape is None or observation.n_obs != np.prod(shape):
         raise ValueError(
-            f"The map to theta has a matrix of shape {observation.matrix.shape}, but the "
-            f"observation has shape {shape}: give it a column for each entry of an observation."
+            f"{given} observation has shape {shape}: give it a column for each of its entries."
         )
     if observation.n_theta != problem.n_theta:
-        raise ValueError(
-            f"The map to theta has a matrix of shape {observation.matrix.shape}, but the law of "
-            f"the problem {takes}: give it {problem.n_theta} rows."
-        )
-
-
-def as_max_correction(value: float | None) -> float | None:
-    """Return the bound on the distance from the MPC, a fraction of the input range."""
-    hint = "It is a fraction of the input range, or None."
-    return None if value is None else as_between("max_correction", value, 0, 1, hint=hint)
+        raise ValueError(f"{given} law of the problem {takes}: give it {problem.n_theta} rows.")
 
 
 def as_net_arch(value: dict[str, list[int]] | list[int] | None) -> dict[str, list[int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 import weakref
 from typing import Any
@@ -25,17 +26,11 @@ class FiniteRows:
 
     One row holds a transition of each env; all of it is left out. The row before counts as cut
     off, so that no n-step return bridges the gap. SB3 samples right after the first row: until
-    there is another, a row with reward NaN keeps the place, and the optimizers take no step. The
-    stand-in goes with its buffer, into copies and pickles too.
-
-    Attributes
-    ----------
-    rows, left_out : int
-        Rows that came, and those that were left out.
+    there is another, a row with reward NaN keeps the place, and the optimizers take no step.
     """
 
     def __init__(self, buffer: ReplayBuffer) -> None:
-        self.rows = self.left_out = 0
+        self.rows = self.left_out = 0  # those that came, and those that were left out
         self.keeps_place = False
         self.named: dict[tuple[str, int, int], int] = {}
         self.buffer = weakref.ref(buffer)  # a cycle would keep a large buffer after its time
@@ -69,48 +64,36 @@ class FiniteRows:
             nothing = np.full(np.shape(reward), np.nan)
             type(buffer).add(buffer, s, after, u, nothing, done, infos)
             self.keeps_place = True
-        self._name(found)
-
-    def _name(self, found: dict[tuple[str, int, int], Any]) -> None:
         new = [key for key in found if self.rows - self.named.get(key, -AGAIN) >= AGAIN]
         self.named.update(dict.fromkeys(found, self.rows))
         if new:
             what = ", ".join(f"{name}[{j}] of env {i} is {found[name, i, j]}" for name, i, j in new)
             warnings.warn(
                 f"Step {self.rows}: {what}. The transition is not learnt from"
-                f"{' (nor are those of the other envs)' if self._envs > 1 else ''}; "
+                f"{' (nor are those of the other envs)' if buffer.n_envs > 1 else ''}; "
                 f"{self.left_out} left out so far. Mend the env or the sensor.",
                 NonFiniteWarning,
-                stacklevel=4,
+                stacklevel=3,
             )
-
-    @property
-    def _envs(self) -> int:
-        buffer = self.buffer()
-        return 1 if buffer is None else buffer.n_envs
 
 
 def _not_finite(buffer: ReplayBuffer, parts: tuple[Any, ...]) -> dict[tuple[str, int, int], Any]:
     """Return what is not finite as the buffer would keep it, by name, env and entry."""
-    kept = (buffer.observations, buffer.observations, buffer.actions, buffer.rewards)
     found = {}
-    for name, part, array in zip(
-        ("observation", "observation", "action", "reward"), parts, kept, strict=True
-    ):
+    names = ("observation", "observation", "action", "reward")
+    for name, part in zip(names, parts, strict=True):
+        kept: NDArray[Any] = getattr(buffer, f"{name}s")
         with np.errstate(over="ignore"):
-            values = np.asarray(part).astype(array.dtype).reshape(buffer.n_envs, -1)
+            values = np.asarray(part).astype(kept.dtype).reshape(buffer.n_envs, -1)
         for i, j in zip(*np.nonzero(~np.isfinite(values)), strict=True):
             found[name, int(i), int(j)] = np.asarray(part).reshape(values.shape)[i, j]
     return found
 
 
 def watch_buffer(model: BaseAlgorithm) -> None:
-    """Let the model's replay buffer leave out what is not finite, unless something stands in.
-
-    Where next observations are stored as those of the next row no row can be left out. There the
-    optimizers take no step from a batch that holds one.
-    """
+    """Let the model's replay buffer leave out what is not finite, unless something stands in."""
     buffer = getattr(model, "replay_buffer", None)
+    # With optimize_memory_usage a row is the next one's past too: only its batches are refused.
     if isinstance(buffer, ReplayBuffer) and not buffer.optimize_memory_usage:
         vars(buffer).setdefault("add", FiniteRows(buffer))
 
@@ -118,30 +101,27 @@ def watch_buffer(model: BaseAlgorithm) -> None:
 def finite_gradient(optimizer: th.optim.Optimizer) -> bool:
     """Return whether the gradient and its square, which Adam keeps, are finite in float32."""
     total = 0.0
-    for group in optimizer.param_groups:
-        for parameter in group["params"]:
-            if (gradient := parameter.grad) is not None:
-                values = gradient._values() if gradient.is_sparse else gradient
-                flat = values.reshape(-1)
-                total += float(th.dot(flat, flat))
-    return bool(np.isfinite(total))
+    for parameter in _weights(optimizer):
+        if (gradient := parameter.grad) is not None:
+            flat = (gradient._values() if gradient.is_sparse else gradient).reshape(-1)
+            total += float(th.dot(flat, flat))
+    return math.isfinite(total)
+
+
+def _weights(optimizer: th.optim.Optimizer) -> list[th.Tensor]:
+    return [each for group in optimizer.param_groups for each in group["params"]]
 
 
 def warn_of_refused_step(name: str, optimizer: th.optim.Optimizer, refused: int) -> None:
     """Name a step that is not taken: the first, the tenth, the hundredth, ..."""
     if str(refused).strip("0") != "1":
         return
-    weights = [each for group in optimizer.param_groups for each in group["params"]]
-    lost = not all(bool(each.isfinite().all()) for each in weights)
+    advice = "Look for rewards or values that are huge, and bound or scale them."
+    if not all(bool(each.isfinite().all()) for each in _weights(optimizer)):
+        advice = f"The weights of the {name} are not finite any more: load an earlier save."
     warnings.warn(
         f"The gradient of the {name} is not finite, or too large for float32: this step is not "
-        f"taken ({refused} so far). "
-        + (
-            f"The weights of the {name} are not finite, so it learns nothing more: load an earlier "
-            "save."
-            if lost
-            else "Look for rewards or values that are huge, and bound or scale them."
-        ),
+        f"taken ({refused} so far). {advice}",
         NonFiniteWarning,
         stacklevel=5,
     )
@@ -149,10 +129,7 @@ def warn_of_refused_step(name: str, optimizer: th.optim.Optimizer, refused: int)
 
 def what_is_not_finite(lost: NDArray[np.bool_]) -> str:
     """Say what an actor did without: entries of observations (batch, n), or its networks."""
-    entries = np.flatnonzero(lost.any(0)).tolist()
-    if entries:
-        return (
-            f"The observation is not finite in entries {entries}: the law acts, at the operating "
-            "point in what depends on them."
-        )
+    if entries := np.flatnonzero(lost.any(0)).tolist():
+        where = f"The observation is not finite in entries {entries}"
+        return f"{where}: the law acts, at the operating point in what depends on them."
     return "The actor's networks put out what is not finite: the law acts alone."

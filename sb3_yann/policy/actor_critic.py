@@ -12,15 +12,10 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 
+from sb3_yann import networks
 from sb3_yann._validation import NonFiniteWarning
 from sb3_yann.control import LinearMPC
-from sb3_yann.networks import (
-    AfterstateValue,
-    LinearPrediction,
-    QuadraticStateActionValue,
-    Ranges,
-    YannLayer,
-)
+from sb3_yann.networks import AfterstateValue, YannLayer
 from sb3_yann.policy._features import SeesTheta, without_entries
 from sb3_yann.policy._finite import what_is_not_finite
 from sb3_yann.policy.critic_options import CriticOptions
@@ -70,21 +65,16 @@ class YannActor(SeesTheta, Actor):
             "max_correction": max_correction,
             "pin_equilibrium": pin_equilibrium,
         }
-        self.mu = YannLayer(
+        rate = (problem.rate.du_min, problem.rate.du_max) if problem.has_rate_bounds else None
+        law, widths, options = (
             problem.explicit(),
             tuple(net_arch),
-            activation_fn(),
-            max_correction=max_correction,
-            pinned=pin_equilibrium,
-            rate=(problem.rate.du_min, problem.rate.du_max) if problem.has_rate_bounds else None,
+            (max_correction, pin_equilibrium),
         )
+        self.mu = YannLayer(law, widths, activation_fn(), *options, rate)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
-        """Return the actions in [-1, 1], (batch, m).
-
-        Finite whatever is observed and learnt: where it is not, the law acts alone, at the
-        operating point in those entries of theta that are not known.
-        """
+        """Return the actions in [-1, 1], (batch, m), finite whatever is observed and learnt."""
         modules: Any = self._modules  # an attribute of a module takes a microsecond to find
         theta = self.extract_features(obs, modules["features_extractor"])
         actions: th.Tensor = modules["mu"](theta)
@@ -112,10 +102,7 @@ class YannActor(SeesTheta, Actor):
         return th.where(whole, actions, self.mu.law(theta).to(actions))
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
-        """Yield the weights, without the search of all modules for them.
-
-        SB3's update of the targets asks for them at every step.
-        """
+        """Yield the weights, without the search of all modules for them at every step of SB3."""
         return iter(self.mu.network.weights()) if recurse else super().parameters(recurse)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -160,12 +147,11 @@ class YannCritic(SeesTheta, ContinuousCritic):
         n_critics: int = 2,
         **sb3_kwargs: Any,
     ) -> None:
-        super().__init__(
-            net_arch=[], activation_fn=activation_fn, n_critics=n_critics, **sb3_kwargs
-        )
+        sb3_kwargs |= {"activation_fn": activation_fn, "n_critics": n_critics}
+        super().__init__(net_arch=[], **sb3_kwargs)
         self.scale, self.offset = float(options.reward_scale), options.offset_of_return(gamma)
         common: dict[str, Any] = {
-            "ranges": Ranges(problem.theta_half, problem.u_min, problem.u_max),
+            "ranges": networks.Ranges(problem.theta_half, problem.u_min, problem.u_max),
             "hidden": tuple(net_arch),
             "pinned": pin_equilibrium,
         }
@@ -190,16 +176,10 @@ class YannCritic(SeesTheta, ContinuousCritic):
         return (each for q in networks for each in (q.quadratic.entries, *q.network.weights()))
 
     def _in_rewards(self, q: th.Tensor) -> th.Tensor:
-        if self.scale == 1 and self.offset == 0:
-            return q
-        return self.scale * q + self.offset
+        return q if (self.scale, self.offset) == (1, 0) else self.scale * q + self.offset
 
     def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Return the first critic's Q, (batch, 1), with a gradient by the actions alone.
-
-        SB3 asks for it to improve the actor, and throws the gradient by the critic's parameters
-        away: it is not computed.
-        """
+        """Return the first critic's Q, (batch, 1), with a gradient by the actions alone."""
         q_network = self.q_networks[0]
         if isinstance(q_network, AfterstateValue) and q_network.compiles:
             with th.no_grad():
@@ -220,13 +200,10 @@ def _initial_value(
     problem: LinearMPC, gamma: float, options: CriticOptions, common: dict[str, Any]
 ) -> nn.Module:
     if options.kind == "state_action":
-        return QuadraticStateActionValue(problem.state_action_matrix(gamma), **common)
+        M = problem.state_action_matrix(gamma)
+        return networks.QuadraticStateActionValue(M, **common)
     model = options.prediction_model
-    return AfterstateValue(
-        problem.stage_matrix,
-        problem.value_matrix(gamma),
-        LinearPrediction(*problem.prediction) if model is None else model,
-        gamma,
-        scale=float(options.value_scale),
-        **common,
-    )
+    if model is None:
+        model = networks.LinearPrediction(*problem.prediction)
+    W, P, scale = problem.stage_matrix, problem.value_matrix(gamma), float(options.value_scale)
+    return AfterstateValue(W, P, model, gamma, scale=scale, **common)

@@ -30,11 +30,6 @@ class CriticOptions:
         The env's reward is ``reward_scale * (-c) + reward_offset`` for the problem's stage cost c.
         :class:`CostAudit` finds these numbers.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an option is out of range, or the kind of critic has no use for it.
-
     Examples
     --------
     >>> CriticOptions(reward_scale=0.01, value_scale=10.0).kind
@@ -55,9 +50,7 @@ class CriticOptions:
                 "(theta, u) that returns the next theta, or None for the linear model."
             )
         if self.prediction_model is not None and self.kind == "state_action":
-            raise ValueError(
-                "prediction_model is for kind='afterstate'; kind='state_action' predicts nothing."
-            )
+            raise ValueError("prediction_model is for kind='afterstate', not for 'state_action'.")
         as_positive("value_scale", self.value_scale, "It multiplies the network; give e.g. 30.")
         as_positive("reward_scale", self.reward_scale, "Give 1 for the cost as it is.")
         as_number("reward_offset", self.reward_offset)
@@ -67,10 +60,7 @@ class CriticOptions:
         if self.reward_offset == 0:
             return 0.0
         if not gamma < 1:
-            raise ValueError(
-                f"reward_offset = {self.reward_offset!r} adds up to no finite value with gamma = "
-                f"{gamma!r}: it needs a discount below 1."
-            )
+            raise ValueError(f"reward_offset = {self.reward_offset!r} needs a discount below 1.")
         return float(self.reward_offset) / (1 - gamma)
 
 

@@ -18,20 +18,14 @@ from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_whole, same
 class AffineObservation(ReadOnlyArrays):
     """The map ``theta = matrix @ obs + offset`` from an observation to the parameter of the law.
 
-    For ``policy_kwargs={"observation": ...}``. It flattens an observation of several dimensions in
-    C order, and computes in float64. Maps compose like matrices: ``outer @ inner`` applies
-    ``inner`` first.
+    For ``policy_kwargs={"observation": ...}``. It flattens an observation in C order, and computes
+    in float64. Maps compose like matrices: ``outer @ inner`` applies ``inner`` first.
 
     Parameters
     ----------
     matrix : array_like, shape (n_theta, n_obs)
     offset : array_like, shape (n_theta,), optional
         Zeros if left out.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an array has another shape or holds NaN or infinite entries.
 
     Examples
     --------
@@ -57,13 +51,7 @@ class AffineObservation(ReadOnlyArrays):
 
     @classmethod
     def deviation(cls, x_ss: ArrayLike) -> AffineObservation:
-        """Return ``theta = obs - x_ss``: the env shows absolute values, the law takes deviations.
-
-        Parameters
-        ----------
-        x_ss : array_like, shape (n,)
-            The operating point, `LinearModel.x_ss`.
-        """
+        """Return ``theta = obs - x_ss``, for absolute observations of deviations from x_ss (n,)."""
         steady = as_array("x_ss", x_ss, ("n",))
         return cls(np.eye(len(steady)), -steady)
 
@@ -73,8 +61,8 @@ class AffineObservation(ReadOnlyArrays):
 
         Parameters
         ----------
-        mean, std : array_like, shape (n,)
-            In units of theta; ``std`` is not zero.
+        mean, std : array_like, shape (n,), in units of theta
+            No entry of ``std`` is zero.
         """
         middle = as_array("mean", mean, ("n",))
         spread = as_array("std", std, (len(middle),))
@@ -100,28 +88,21 @@ class AffineObservation(ReadOnlyArrays):
         width = float(to[1]) - float(to[0])
         if np.any(top <= bottom) or not width > 0:
             raise ValueError(
-                f"low = {bottom.tolist()} must lie below high = {top.tolist()}, and to[0] below "
-                f"to[1] in to = {to}."
+                f"low = {bottom.tolist()} must lie below high = {top.tolist()}, and to = {to} rise."
             )
         slope = (top - bottom) / width
         return cls(np.diag(slope), bottom - slope * float(to[0]))
 
     @classmethod
     def pick(cls, entries: Sequence[int], size: int) -> AffineObservation:
-        """Return ``theta[i] = obs[entries[i]]``, of an observation with ``size`` entries.
-
-        This reorders, and leaves out what the law does not take.
-        """
+        """Return ``theta[i] = obs[entries[i]]``, of an observation with ``size`` entries."""
         return cls(np.eye(size)[_as_entries("entries", entries, size)])
 
     @classmethod
     def minus_set_point(
         cls, entries: Sequence[int], set_points: Sequence[int | None], size: int
     ) -> AffineObservation:
-        """Return ``theta[i] = obs[entries[i]] - obs[set_points[i]]``, None for no set-point.
-
-        For a law in deviations from a set-point that is part of the observation.
-        """
+        """Return ``theta[i] = obs[entries[i]] - obs[set_points[i]]``, None for no set-point."""
         if len(set_points) != len(entries):
             raise ValueError(
                 f"set_points = {set_points} has {len(set_points)} items for {len(entries)} "
@@ -146,28 +127,17 @@ class AffineObservation(ReadOnlyArrays):
     def from_vec_normalize(cls, venv: VecEnv) -> AffineObservation:
         """Return the map that undoes the frozen statistics of a `VecNormalize`.
 
-        It gives what the env below shows; for a law in deviations, compose:
+        For a law in deviations compose it:
         ``AffineObservation.deviation(x_ss) @ AffineObservation.from_vec_normalize(venv)``.
         The policy takes normalized observations from then on, also where it is loaded alone.
-
-        Raises
-        ------
-        ValueError
-            If there is no VecNormalize, its statistics still move, it normalizes rewards, or it is
-            not what the learner sees.
         """
         normalize = unwrap_vec_normalize(venv)
         if normalize is None:
             raise ValueError(f"venv = {venv} holds no VecNormalize; wrap it in one, or leave it.")
         require_frozen(normalize)
-        shape = normalize.observation_space.shape
-        if shape is None or shape != venv.observation_space.shape:
-            raise ValueError(
-                f"The VecNormalize shows {shape}, but venv {venv.observation_space.shape}. Make "
-                "VecNormalize the last wrapper, outside VecFrameStack."
-            )
+        require_outermost(normalize, venv.observation_space.shape)
         if not normalize.norm_obs:
-            return cls.identity(int(np.prod(shape)))
+            return cls.identity(int(np.prod(cast(tuple[int, ...], venv.observation_space.shape))))
         statistics = cast(RunningMeanStd, normalize.obs_rms)  # a dict only for a space of dicts
         std = np.sqrt(statistics.var + normalize.epsilon)
         return cls.normalized(np.ravel(statistics.mean), np.ravel(std))
@@ -194,9 +164,8 @@ class AffineObservation(ReadOnlyArrays):
             raise ValueError(
                 f"The inner map puts out {inner.n_theta} entries, the outer one takes {self.n_obs}."
             )
-        return AffineObservation(
-            self.matrix @ inner.matrix, self.matrix @ inner.offset + self.offset
-        )
+        offset = self.matrix @ inner.offset + self.offset
+        return AffineObservation(self.matrix @ inner.matrix, offset)
 
     def __eq__(self, other: object) -> bool:
         """Tell whether both maps are the same."""
@@ -217,13 +186,22 @@ def require_frozen(normalize: VecNormalize) -> None:
     """Raise if a VecNormalize changes what it has said, or changes the rewards."""
     if normalize.norm_reward:
         raise ValueError(
-            "The VecNormalize normalizes rewards: they are not the cost that the critic stands "
-            "for. Pass norm_reward=False; policy_kwargs={'reward_scale': ...} takes care of sizes."
+            "VecNormalize normalizes rewards: they are not the cost that the critic stands for. "
+            "Set venv.norm_reward = False; CriticOptions(reward_scale=...) takes a constant factor."
         )
     if normalize.norm_obs and normalize.training:
         raise ValueError(
-            "The VecNormalize still moves its statistics (training=True), so that one observation "
-            "means another state at each step. Collect them first, then set venv.training = False."
+            "VecNormalize still moves its statistics: one observation means another state at each "
+            "step. Collect them first. Set venv.training = False then."
+        )
+
+
+def require_outermost(normalize: VecNormalize, seen: tuple[int, ...] | None) -> None:
+    """Raise unless the learner sees, in the shape ``seen``, what a VecNormalize shows."""
+    if (shape := normalize.observation_space.shape) is None or shape != seen:
+        raise ValueError(
+            f"VecNormalize shows {shape}, but the learner sees {seen}. Make VecNormalize the last "
+            "wrapper, outside VecFrameStack."
         )
 
 

@@ -11,6 +11,7 @@ import torch as th
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 from stable_baselines3 import TD3
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import TD3Policy
@@ -20,25 +21,9 @@ from sb3_yann._validation import as_between, as_discount, as_flag, as_whole
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.zero_output import FEW
-from sb3_yann.policy._checks import (
-    as_activation,
-    as_max_correction,
-    as_net_arch,
-    require_box,
-    require_matching,
-    require_plain_td3,
-    require_sb3_kwargs,
-    require_undone_normalization,
-    warn_of_absolute_inputs,
-    with_fused_adam,
-)
+from sb3_yann.policy import _checks, _sb3_hooks
 from sb3_yann.policy._features import AffineFeatures
 from sb3_yann.policy._finite import finite_gradient, warn_of_refused_step, watch_buffer
-from sb3_yann.policy._sb3_hooks import (
-    algorithm_under_construction,
-    multiply_learning_rate,
-    restore_learning_rate,
-)
 from sb3_yann.policy.actor_critic import YannActor, YannCritic
 from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
 from sb3_yann.policy.observations import AffineObservation
@@ -53,14 +38,12 @@ class YannPolicy(TD3Policy):
     gradients that are not finite are left out, with a :class:`NonFiniteWarning`; where an
     observation or the actor's networks are not finite, the law acts.
 
-    Pass ``target_policy_noise=0.0`` to TD3: noise on the target policy would teach the critic the
-    value of a noisy controller.
+    Pass ``target_policy_noise=0.0`` to TD3, else the critic learns the value of a noisy controller.
 
     Parameters
     ----------
     observation_space : gymnasium.spaces.Box
         The parameter theta of the law, shape (n_theta,), or what ``observation`` makes theta of.
-        See :mod:`sb3_yann.wrappers`.
     action_space : gymnasium.spaces.Box, shape (m,)
         Its bounds must be ``u_min`` and ``u_max`` of the problem.
     lr_schedule : callable
@@ -71,13 +54,12 @@ class YannPolicy(TD3Policy):
     gamma : float, optional
         Discount of the critic. The default is the algorithm's, 0.99 without an algorithm.
     net_arch : dict or list, optional
-        Widths of one or two hidden layers, ``{"pi": [16, 16], "qf": [64, 64]}`` by default: for
-        each region of the actor, and for each critic.
+        Widths of one or two hidden layers, for each region of the actor and for each critic:
+        ``{"pi": [16, 16], "qf": [64, 64]}`` by default.
     activation_fn : type, default torch.nn.Tanh
         An activation that is 0 at 0.
     actor_lr_mult, critic_lr_mult : float, default 0.1 and 1
-        Learning rates of actor and critic, as multiples of the algorithm's ``learning_rate``; 0
-        freezes.
+        Multiples of the algorithm's ``learning_rate`` for actor and critic; 0 freezes.
     critic : str, CriticOptions or mapping, default "afterstate"
         The kind of critic, or all of its options.
     critic_warmup : int, default 2000
@@ -86,22 +68,19 @@ class YannPolicy(TD3Policy):
         Bound on the distance from the MPC, as a fraction of the input range, 0 to 1: exact,
         whatever is learnt. The default is none.
     pin_equilibrium : bool, optional
-        Whether actor and critic keep their value at ``theta = 0`` for good. The default is False
-        for problems with references or disturbances, else True. Leave it free where the model's
-        steady-state input is not the plant's.
+        Whether actor and critic keep their value at ``theta = 0`` for good: not where the model's
+        steady-state input is wrong. False for problems with references or disturbances, else True.
     observation : AffineObservation, optional
         The map from an observation to theta. The default is the identity.
     **sb3_kwargs
-        ``n_critics``, ``optimizer_class`` and ``optimizer_kwargs``, as in SB3's `TD3Policy`. In
-        place of Adam the actor of more than 32 regions has :class:`RowAdam`. Of SB3's arguments
-        for features only the defaults are taken: theta must reach the law as it is.
+        ``n_critics``, ``optimizer_class`` and ``optimizer_kwargs``, as in SB3's `TD3Policy`. For
+        Adam, the actor of more than 32 regions has :class:`RowAdam`. Arguments for features must
+        keep their defaults: theta must reach the law as it is.
 
     Raises
     ------
-    TypeError
-        If a space is not a Box, the algorithm is not TD3 or DDPG, or a keyword is not known.
-    ValueError
-        If there is no problem, the spaces do not fit it, or the env normalizes.
+    TypeError, ValueError
+        If there is no problem, spaces or algorithm do not fit it, or a keyword is not known.
 
     Examples
     --------
@@ -118,7 +97,7 @@ class YannPolicy(TD3Policy):
     critic_target: YannCritic
     critic_updates: th.Tensor
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (a user's policy_kwargs)
         self,
         observation_space: spaces.Space[Any],
         action_space: spaces.Box,
@@ -136,18 +115,20 @@ class YannPolicy(TD3Policy):
         observation: AffineObservation | None = None,
         **sb3_kwargs: Any,
     ) -> None:
-        algorithm = algorithm_under_construction()
-        require_plain_td3(algorithm)
-        require_sb3_kwargs(sb3_kwargs, own=_own_names())
-        require_box("observation_space", observation_space, flattened=observation is not None)
-        require_box("action_space", action_space)
+        algorithm = _sb3_hooks.algorithm_under_construction()
+        _checks.require_plain_td3(algorithm)
+        names = [*inspect.signature(YannPolicy).parameters]
+        _checks.require_sb3_kwargs(sb3_kwargs, own=names[names.index("problem") : -1])
+        flattened = observation is not None
+        _checks.require_box("observation_space", observation_space, flattened)
+        _checks.require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
         if algorithm is not None and isinstance(problem, str):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             algorithm.policy_kwargs = {**algorithm.policy_kwargs, "problem": self.problem}
-        require_matching(self.problem, observation_space, action_space, observation)
-        warn_of_absolute_inputs(self.problem, algorithm)
-        require_undone_normalization(self.problem, algorithm, observation)
+        _checks.require_matching(self.problem, observation_space, action_space, observation)
+        _checks.warn_of_absolute_inputs(self.problem, algorithm)
+        _checks.require_undone_normalization(self.problem, algorithm, observation)
         self.observation = observation
         self.gamma = as_discount(getattr(algorithm, "gamma", 0.99) if gamma is None else gamma)
         self.lr_mult = {
@@ -156,22 +137,23 @@ class YannPolicy(TD3Policy):
         }
         self.critic_options = as_critic_options(critic)
         self.critic_warmup = as_whole("critic_warmup", critic_warmup, 0, "It counts updates.")
-        self.max_correction = as_max_correction(max_correction)
+        if max_correction is not None:
+            hint = "It is a fraction of the input range, or None."
+            max_correction = as_between("max_correction", max_correction, 0, 1, hint=hint)
+        self.max_correction = max_correction
         if pin_equilibrium is None:
             pin_equilibrium = not self.problem.layout.has_constants
         self.pin_equilibrium = as_flag("pin_equilibrium", pin_equilibrium)
-        self.actor_step = 1.0
-        """Another factor of the actor's learning rate, which an ImprovementGuard sets."""
-        self.refused = {"actor": 0, "critic": 0}
-        """Steps that were not taken, since their gradient was not finite."""
+        self.actor_step = 1.0  # another factor of the learning rate, which an ImprovementGuard sets
+        self.refused = {"actor": 0, "critic": 0}  # steps whose gradient was not finite
         self.batch_is_finite = True
         super().__init__(
             observation_space,
             action_space,
             lr_schedule,
-            net_arch=as_net_arch(net_arch),
-            activation_fn=as_activation(activation_fn),
-            **with_fused_adam(sb3_kwargs),
+            net_arch=_checks.as_net_arch(net_arch),
+            activation_fn=_checks.as_activation(activation_fn),
+            **_checks.with_fused_adam(sb3_kwargs),
         )
         if algorithm is not None:
             watch_buffer(algorithm)
@@ -189,15 +171,13 @@ class YannPolicy(TD3Policy):
         self._attach_hooks()
 
     def _attach_hooks(self) -> None:
-        for optimizer, before in (
-            (self.actor.optimizer, self._before_actor_step),
-            (self.critic.optimizer, self._before_critic_step),
-        ):
-            optimizer.register_step_pre_hook(before)
-            optimizer.register_step_post_hook(restore_learning_rate)
+        self.actor.optimizer.register_step_pre_hook(self._before_actor_step)
+        self.critic.optimizer.register_step_pre_hook(self._before_critic_step)
+        for network in (self.actor, self.critic):
+            network.optimizer.register_step_post_hook(_sb3_hooks.restore_learning_rate)
 
     def _refuses(self, name: str, optimizer: th.optim.Optimizer) -> bool:
-        """Return whether a step must not be taken, for which it has no gradient any more then."""
+        """Return whether a step must not be taken, and take its gradient away then."""
         if finite_gradient(optimizer):
             return False
         self.refused[name] += 1
@@ -211,13 +191,13 @@ class YannPolicy(TD3Policy):
             optimizer.zero_grad()  # no gradient at all: neither parameters nor moments move
         else:
             self._refuses("actor", optimizer)
-        multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
+        _sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
 
     def _before_critic_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
         self.batch_is_finite = not self._refuses("critic", optimizer)
         if self.batch_is_finite:
             self.critic_updates.add_(1)
-        multiply_learning_rate(optimizer, self.lr_mult["critic"])
+        _sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or a pickle; torch drops the hooks of optimizers on the way."""
@@ -239,12 +219,8 @@ class YannPolicy(TD3Policy):
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
         """Return an actor that equals the explicit law, with networks that are zero."""
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return YannActor(
-            self.problem,
-            max_correction=self.max_correction,
-            pin_equilibrium=self.pin_equilibrium,
-            **kwargs,
-        ).to(self.device)
+        kwargs |= {"max_correction": self.max_correction, "pin_equilibrium": self.pin_equilibrium}
+        return YannActor(self.problem, **kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannCritic:
         """Return a critic that is the law's value on the linear model, with networks of zero."""
@@ -267,10 +243,14 @@ class YannPolicy(TD3Policy):
         }
 
 
-def _own_names() -> list[str]:
-    """Return the names of the keywords that are not SB3's."""
-    names = [*inspect.signature(YannPolicy).parameters]
-    return names[names.index("problem") : -1]
+def require_yann_policy(policy: BasePolicy, who: str) -> YannPolicy:
+    """Return the policy of a model, else raise TypeError in the name of a callback."""
+    if not isinstance(policy, YannPolicy):
+        name = type(policy).__name__
+        raise TypeError(
+            f"{who} compares a YannPolicy with its MPC; the policy of this model is {name}."
+        )
+    return policy
 
 
 # DDPG shares this table, so DDPG("YannPolicy", env) works as well.

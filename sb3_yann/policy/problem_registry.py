@@ -22,12 +22,8 @@ def register_problem(name: str, problem: LinearMPC | Callable[[], LinearMPC] | s
     ----------
     name : str
         Without a colon. Registering a name again replaces its problem.
-    problem : LinearMPC, callable without arguments that returns one, or ``"module:attribute"``
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the name is empty or holds a colon, or the problem is of another type.
+    problem : LinearMPC, callable or str
+        The problem, a function without arguments that returns it, or ``"module:attribute"``.
 
     Examples
     --------
@@ -38,23 +34,13 @@ def register_problem(name: str, problem: LinearMPC | Callable[[], LinearMPC] | s
     if not isinstance(name, str) or not name or ":" in name:
         raise ValueError(f"name = {name!r} must be a non-empty string without ':'.")
     if not (isinstance(problem, LinearMPC | str) or inspect.isroutine(problem)):
-        raise TypeError(
-            f"problem = {problem!r} must be a LinearMPC, a function that returns one, or a "
-            '"module:attribute" string.'
-        )
+        wanted = 'a LinearMPC, a function that returns one, or "module:attribute"'
+        raise TypeError(f"problem = {problem!r} must be {wanted}.")
     _registered[name] = problem
 
 
 def resolve_problem(problem: LinearMPC | str | None, observation_space: Any) -> LinearMPC:
-    """Return the LinearMPC that is meant: given, named, or carried by the observation space.
-
-    Raises
-    ------
-    TypeError
-        If what is meant is not a LinearMPC.
-    ValueError
-        If there is none, or a name or reference cannot be found.
-    """
+    """Return the LinearMPC that is meant: given, named, or carried by the observation space."""
     if problem is None:
         problem = getattr(observation_space, "problem", None)
     if problem is None:
@@ -63,21 +49,18 @@ def resolve_problem(problem: LinearMPC | str | None, observation_space: Any) -> 
             'Pass policy_kwargs={"problem": mpc} with a LinearMPC, a registered name '
             f'({", ".join(sorted(_registered))}) or "module:attribute".'
         )
-    found = _look_up(problem) if isinstance(problem, str) else problem
+    found: Any = problem
+    if isinstance(found, str) and ":" not in found:
+        if found not in _registered:
+            raise ValueError(
+                f"No problem is registered as {found!r}; there are {sorted(_registered)}. Call "
+                'sb3_yann.register_problem, or refer to it as "module:attribute".'
+            )
+        found = _registered[found]
+    if isinstance(found, str):
+        found = resolve_reference(found)
     if inspect.isroutine(found):
         found = found()
     if not isinstance(found, LinearMPC):
         raise TypeError(f"problem = {problem!r} is {found!r}, expected a LinearMPC.")
     return found
-
-
-def _look_up(name: str) -> Any:
-    found: Any = name
-    if ":" not in name:
-        if name not in _registered:
-            raise ValueError(
-                f"No problem is registered as {name!r}; there are {sorted(_registered)}. Call "
-                'sb3_yann.register_problem, or refer to it as "module:attribute".'
-            )
-        found = _registered[name]
-    return resolve_reference(found) if isinstance(found, str) else found

@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.image import imread
 from rich.console import Console
 
-from sb3_yann.evaluation.episodes import Episodes
-from sb3_yann.evaluation.plots import comparison_table, save_trajectories
+from sb3_yann.evaluation import Episodes, comparison_table, save_trajectories
 
 
 def fake(costs: list[float]) -> Episodes:

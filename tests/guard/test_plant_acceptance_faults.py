@@ -165,6 +165,7 @@ def test_one_episode_whose_cost_is_not_known_is_left_out_of_the_first_block() ->
     np.testing.assert_allclose(guard.state.evidence.accepted.costs, 4.25)
 
 
+@pytest.mark.slow
 def test_one_reward_that_is_not_finite_lets_the_guard_alone_go_on_learning(tmp_path) -> None:
     class Faulty(Slide):
         def step(self, action):

@@ -82,6 +82,7 @@ def stored(model) -> np.ndarray:
     return np.concatenate([part[rows].reshape(buffer.size(), -1) for part in parts], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["reward", "observation"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
+from typing import NoReturn
 
 from tqdm import tqdm  # type: ignore[import-untyped]
 
+from sb3_yann._validation import as_positive, as_whole
+
 _ADVICE = (
-    "Their number grows fastest with the horizon and with the number of bounds: shorten the "
-    "horizon, leave out bounds that hardly matter, make the box of parameters smaller (theta_min, "
-    "theta_max), or raise the limit."
+    "Their number grows with the horizon and the bounds: shorten the horizon, leave out bounds "
+    "that hardly matter, make theta_min and theta_max narrower, or raise the limit."
 )
 
 
@@ -56,36 +57,20 @@ class SolveBudget:
     progress: bool = False
 
     def __post_init__(self) -> None:
-        seconds, regions = self.time_limit, self.region_limit
-        if seconds is not None and not (
-            isinstance(seconds, int | float) and math.isfinite(seconds) and seconds > 0
-        ):
-            raise ValueError(
-                f"time_limit = {seconds!r} must be a number of seconds above 0, or None for no "
-                "limit."
-            )
-        if regions is not None and not (
-            isinstance(regions, int) and not isinstance(regions, bool) and regions > 0
-        ):
-            raise ValueError(
-                f"region_limit = {regions!r} must be a whole number above 0, or None for no limit."
-            )
+        if self.time_limit is not None:
+            as_positive("time_limit", self.time_limit, "It is in seconds; None is no limit.")
+        if self.region_limit is not None:
+            as_whole("region_limit", self.region_limit, hint="None is no limit.")
 
     def require(self, n_regions: int) -> None:
         """Raise ExplicitLimitError if a law that is there has too many regions."""
         if self.region_limit is not None and n_regions > self.region_limit:
-            raise ExplicitLimitError(
-                f"The law has {n_regions} regions, more than region_limit = {self.region_limit}. "
-                f"{_ADVICE}",
-                n_regions,
-            )
+            more = f"{n_regions} regions, more than region_limit = {self.region_limit}"
+            raise ExplicitLimitError(f"The law has {more}. {_ADVICE}", n_regions)
 
 
 class BudgetTimer:
-    """Counts the regions of one search, shows them, and ends it at its limits.
-
-    The time counts from when this is made.
-    """
+    """Counts the regions and, from now on, the time of one search, and ends it at its limits."""
 
     def __init__(self, budget: SolveBudget) -> None:
         self.budget, self.found, self._start = budget, 0, time.monotonic()
@@ -97,13 +82,7 @@ class BudgetTimer:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Take the progress bar away."""
         self._bar.close()
-
-    @property
-    def seconds(self) -> float:
-        """How long the search has taken."""
-        return time.monotonic() - self._start
 
     def count(self, more: int = 1) -> None:
         """Count regions; raise ExplicitLimitError if these are too many, or the time is over."""
@@ -117,11 +96,9 @@ class BudgetTimer:
     def tick(self) -> None:
         """Raise ExplicitLimitError if the time is over."""
         most = self.budget.time_limit
-        if most is not None and self.seconds > most:
+        if most is not None and time.monotonic() - self._start > most:
             self._stop(f"The law was not solved in time_limit = {most:g} s")
 
-    def _stop(self, what: str) -> None:
-        raise ExplicitLimitError(
-            f"{what}: {self.found} were found in {self.seconds:.1f} s. {_ADVICE}",
-            self.found,
-        )
+    def _stop(self, what: str) -> NoReturn:
+        found = f"{self.found} regions were found in {time.monotonic() - self._start:.1f} s"
+        raise ExplicitLimitError(f"{what}: {found}. {_ADVICE}", self.found)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from typing import NoReturn
 
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
 
-# All in half-widths of the box, or of the input range: how far a law may be off, and how far a
-# point may be from a region that holds it.
+# How far a law may be off, and a point from a region that holds it, in half-widths of the ranges.
 LAW, INSIDE = 1e-6, 1e-8
 
 
@@ -24,11 +23,6 @@ class ExplicitSolutionError(RuntimeError):
     >>> issubclass(ExplicitSolutionError, RuntimeError)
     True
     """
-
-
-def _as_bits(active_set: Iterable[int]) -> int:
-    """Return a set of constraints as a whole number, with bit k for constraint k."""
-    return sum(1 << k for k in active_set)
 
 
 def _sets(multipliers: Array) -> list[int]:
@@ -62,13 +56,8 @@ class Certificate:
         self, program: ParametricQP, regions: list[Region], center: Array, half: Array
     ) -> None:
         self.program, self.regions, self.center, self.half = program, regions, center, half
-        self.by_set = {_as_bits(region.active_set): i for i, region in enumerate(regions)}
-        n = program.F.shape[1]
-        bound = ~np.any(program.G, axis=1) & np.any(program.S, axis=1)
-        self.outer = np.column_stack([
-            np.vstack([np.eye(n), -np.eye(n), -program.S[bound]]),
-            np.concatenate([np.ones(2 * n), program.w[bound]]),
-        ])  # fmt: skip
+        self.by_set = {as_bits(region.active_set): i for i, region in enumerate(regions)}
+        self.outer = np.column_stack(program.theta_rows())
 
     def check(self) -> None:
         """Raise ExplicitSolutionError, with a theta that shows what is wrong, unless all pass."""
@@ -83,27 +72,21 @@ class Certificate:
             U = self.program.solve(inside)
             if U is None or np.max(np.abs(U - region.gain @ inside - region.offset)) > LAW:
                 self._fail(f"the law of region {i} is not optimal inside it", inside)
-        for i, law, rows, labels in self._conditions():
+        for i, law, rows, labels in list(self._conditions()):
             self._require_law(i, law, balls[i][0])
             self._require_implied(i, rows, *balls[i])
             self._require_neighbors(i, rows, labels)
         self._require_agreement()
         self._require_no_doubles(balls)
 
-    def _conditions(self) -> list[tuple[int, Array, Array, list[int]]]:
-        """Return the KKT conditions of each region: its law, and rows [A b] with labels."""
-        sizes: dict[int, list[int]] = {}
-        for i, region in enumerate(self.regions):
-            sizes.setdefault(len(region.active_set), []).append(i)
-        found = []
-        for size, members in sorted(sizes.items()):
-            for start in range(0, len(members), 256):
-                found += self._conditions_of(members[start : start + 256], size)
-        return found
+    def _conditions(self) -> Iterator[tuple[int, Array, Array, list[int]]]:
+        """Yield the KKT conditions of each region: its law, and rows [A b] with labels."""
+        for size, members in batches(len(region.active_set) for region in self.regions):
+            yield from self._conditions_of(members, size)
 
     def _conditions_of(
         self, members: list[int], size: int
-    ) -> list[tuple[int, Array, Array, list[int]]]:
+    ) -> Iterator[tuple[int, Array, Array, list[int]]]:
         program, (v, n) = self.program, self.program.F.shape
         active = np.array([self.regions[i].active_set for i in members], dtype=int)
         active, limit = active.reshape(len(members), size), np.column_stack([program.S, program.w])
@@ -130,10 +113,8 @@ class Certificate:
         rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
         rows[fixed, :n] = 0.0
         binding = rows[:, :, n] < np.abs(rows[:, :, :n]).sum(axis=2)
-        return [
-            (i, laws[k], rows[k, binding[k]], [int(label) for label in np.flatnonzero(binding[k])])
-            for k, i in enumerate(members)
-        ]
+        for k, i in enumerate(members):
+            yield i, laws[k], rows[k, binding[k]], np.flatnonzero(binding[k]).tolist()
 
     def _require_law(self, i: int, law: Array, inside: Array) -> None:
         region = self.regions[i]
@@ -165,11 +146,10 @@ class Certificate:
         meant: list[list[int]] = [[] for _ in own]
         for row, which in zip(*(index.tolist() for index in np.nonzero(same)), strict=True):
             meant[row].append(which - first)
-        active = _as_bits(region.active_set)
+        active = as_bits(region.active_set)
         for row, which in enumerate(meant):
-            if which and which[0] < 0:
-                continue  # a bound of theta
-            if not any(active ^ (1 << labels[k]) in self.by_set for k in which):
+            outer = bool(which) and which[0] < 0  # a bound of theta
+            if not outer and not any(active ^ (1 << labels[k]) in self.by_set for k in which):
                 self._look_across(region, row)
 
     def _look_across(self, region: Region, row: int) -> None:
@@ -183,8 +163,9 @@ class Certificate:
             U, multipliers = self.program.solve_with_multipliers(point)
             if U is None:
                 return
-            other = self._of_multipliers(point, multipliers)
-            if other is not None and np.min(other.b - other.A @ middle) >= -INSIDE:
+            at = self.by_set.get(_sets(multipliers[None])[0])
+            other = None if at is None else self.regions[at]
+            if other and all(np.min(other.b - other.A @ x) >= -INSIDE for x in (point, middle)):
                 return
             slacks = self._slacks(point)
             if np.max(slacks) < -INSIDE:
@@ -226,14 +207,6 @@ class Certificate:
             self._fail("no region covers a feasible parameter", point)
         if np.max(np.abs(U - region.gain @ point - region.offset)) > LAW:
             self._fail(f"the law of region {nearest} violates the KKT conditions", point)
-
-    def _of_multipliers(self, point: Array, multipliers: Array) -> Region | None:
-        """Return the region of the constraints with multipliers, if it holds a point."""
-        index = self.by_set.get(_sets(multipliers[None])[0])
-        if index is None:
-            return None
-        region = self.regions[index]
-        return region if (region.b - region.A @ point).min() >= -INSIDE else None
 
     def _require_no_doubles(self, balls: list[tuple[Array, float]]) -> None:
         """Raise if a region lies in another: both have then the same law, whatever their sets."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.budget import BudgetTimer
-from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
 from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
 
 Indices = NDArray[np.intp]
@@ -23,7 +23,7 @@ OUTER, SHARED = -1, -2
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A critical region, its law ``U = law [theta; 1]`` and what constraint each row stands for."""
+    """A critical region, its law ``U = law [theta; 1]`` and the constraint of each row."""
 
     active: int
     law: Array
@@ -37,10 +37,9 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     Across a facet where constraint k becomes active, or inactive, lies the region of the active
-    set with k added, or removed: on the facet the conditions of both are the same. Where that set
-    has no region, at the border of the feasible set or where constraints depend on each other, a QP
-    just across the middle of the facet tells what lies there. Last, QPs at random points of the box
-    look for what the walk has not seen. Sets of constraints are whole numbers, with bit k for k.
+    set with k added, or removed. Where that set has no region, a QP just across the middle of the
+    facet tells what lies there. Last, QPs at random points of the box look for what the walk has
+    not seen. Sets of constraints are whole numbers, with bit k for k.
     """
     found = _Walk(program, timer)
     found.explore(found.seeds(20))
@@ -60,10 +59,10 @@ class _Walk:
         self.seen: set[int] = set()
 
     def regions(self) -> list[Region]:
-        kept, n = self.conditions.kept, self.program.F.shape[1]
-        rows = [tuple(int(kept[k]) for k in _members(active)) for active in self.found]
+        kept = self.conditions.kept
+        rows = [tuple(kept[_members(active)].tolist()) for active in self.found]
         return [
-            Region(active, one.law[:, :n], one.law[:, n], one.A, one.b, one.inside)
+            Region(active, one.law[:, :-1], one.law[:, -1], one.A, one.b, one.inside)
             for active, one in zip(rows, self.found.values(), strict=True)
         ]
 
@@ -96,28 +95,22 @@ class _Walk:
         facets: list[tuple[_Found, int]] = []
         while ahead:
             self.seen.update(ahead)
-            new = [self._add(one) for one in self.conditions.regions(ahead)]
-            facets += [(one, row) for one in new for row in range(len(one.labels))]
-            following = {
-                one.active ^ (1 << label) for one in new for label in one.labels if label >= 0
-            }
+            following = set()
+            for one in self.conditions.regions(ahead):
+                self.timer.count()
+                self.found[one.active] = one
+                facets += [(one, row) for row in range(len(one.labels))]
+                following |= {one.active ^ (1 << label) for label in one.labels if label >= 0}
             ahead = sorted(following - self.seen)
             if not ahead:  # what the flips have left open
                 left = [(pair, self._across(*pair)) for pair in facets if self._open(*pair)]
                 ahead = sorted({active for _, active in left if active is not None})
                 facets = [pair for pair, active in left if active is not None]
 
-    def _add(self, one: _Found) -> _Found:
-        self.timer.count()
-        self.found[one.active] = one
-        return one
-
     def _open(self, one: _Found, row: int) -> bool:
         """Tell whether it is not known what lies across a facet."""
         label = one.labels[row]
-        if label >= 0:
-            return one.active ^ (1 << label) not in self.found
-        return label == SHARED
+        return label == SHARED or (label >= 0 and one.active ^ (1 << label) not in self.found)
 
     def _across(self, one: _Found, row: int) -> int | None:
         """Return the active set across a facet, None if none is new or feasible there."""
@@ -134,13 +127,10 @@ class _Walk:
             if active not in self.seen:
                 return active
             other = self.found.get(active, one)
-            if other is not one and _holds(other, middle) and _holds(other, point):
+            slacks = (np.min(other.b - other.A @ each) for each in (middle, point))
+            if other is not one and min(slacks) >= -1e-9:
                 return None
         return None
-
-
-def _holds(one: _Found, point: Array) -> bool:
-    return float(np.min(one.b - one.A @ point)) >= -1e-9
 
 
 def _members(active: int) -> list[int]:
@@ -155,12 +145,8 @@ class Conditions:
     """
 
     def __init__(self, program: ParametricQP) -> None:
-        n = program.F.shape[1]
-        self.program = program
         moving = np.flatnonzero(np.any(program.G, axis=1))
-        bound = ~np.any(program.G, axis=1) & np.any(program.S, axis=1)
-        self.outer_A = np.vstack([np.eye(n), -np.eye(n), -program.S[bound]])
-        self.outer_b = np.concatenate([np.ones(2 * n), program.w[bound]])
+        self.outer_A, self.outer_b = program.theta_rows()
         self.kept = moving[_irredundant(program, moving, self.outer_A, self.outer_b)]
         L = np.linalg.cholesky(program.H)
         self.back = np.linalg.inv(L).T
@@ -169,18 +155,14 @@ class Conditions:
         # The slack that each constraint has where none is active.
         self.D = np.column_stack([program.S, program.w])[self.kept] + self.N @ self.Y
         v, rows = len(self.back), len(self.kept)
-        # Where constraints that depend on each other are all tight, over a whole region, several
-        # active sets have the same law. Of these count those that are right when each constraint
-        # is moved out a little, by a different amount: they share the region among them.
+        # Where constraints that depend on each other are all tight over a region, several active
+        # sets have its law. Those count that are right with each constraint moved out a little.
         self.apart = np.random.default_rng(0).uniform(0.5, 1.5, rows)
         self._shortest = (np.eye(v), np.zeros(v), self.N)
         self._options = (np.full(rows, -1e30), np.zeros(rows, dtype=np.intc))
 
     def active_at(self, theta: Array, apart: float = 0.0) -> int | None:
-        """Return DAQP's working set at theta, None where nothing is feasible.
-
-        With the constraints moved apart by so much, see ``__init__``.
-        """
+        """Return DAQP's working set at theta with constraints moved apart, None if infeasible."""
         if np.any(self.outer_A @ theta > self.outer_b + 1e-11):
             return None
         if len(self.kept) == 0:
@@ -194,18 +176,13 @@ class Conditions:
             return None
         multipliers = np.asarray(info["lam"])
         active = np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max()))
-        return sum(1 << int(k) for k in active)
+        return as_bits(active)
 
     def regions(self, wave: list[int]) -> Iterator[_Found]:
         """Yield the regions with an interior among those of some active sets."""
-        sizes: dict[int, list[int]] = {}
-        for active in wave:
-            sizes.setdefault(active.bit_count(), []).append(active)
-        for size, members in sorted(sizes.items()):
-            if size > self.N.shape[1]:
-                continue
-            for start in range(0, len(members), 256):
-                yield from self._regions(members[start : start + 256], size)
+        for size, members in batches(active.bit_count() for active in wave):
+            if size <= self.N.shape[1]:
+                yield from self._regions([wave[i] for i in members], size)
 
     def _regions(self, members: list[int], size: int) -> Iterator[_Found]:
         index = np.array([_members(active) for active in members], dtype=int)
@@ -261,10 +238,9 @@ class Conditions:
             first = np.argmax(same, axis=1)
             keep = np.flatnonzero(first == np.arange(len(rows)))
             for k in keep:
-                twins = np.flatnonzero(same[k])
+                twins = [labels[twin] for twin in np.flatnonzero(same[k])]
                 if len(twins) > 1:
-                    outer = any(labels[twin] == OUTER for twin in twins)
-                    labels[k] = OUTER if outer else SHARED
+                    labels[k] = OUTER if OUTER in twins else SHARED
             A, b, labels = A[keep], b[keep], [labels[k] for k in keep]
         return _Found(active, law, A, b, labels, inside)
 

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+
+
+def as_bits(active_set: Iterable[int]) -> int:
+    """Return a set of constraints as a whole number, with bit k for constraint k."""
+    return sum(1 << int(k) for k in active_set)
+
+
+def batches(sizes: Iterable[int]) -> Iterator[tuple[int, list[int]]]:
+    """Yield each size, ascending, with the indices that have it, at most 256 at a time."""
+    indices: dict[int, list[int]] = {}
+    for i, size in enumerate(sizes):
+        indices.setdefault(size, []).append(i)
+    for size, members in sorted(indices.items()):
+        for start in range(0, len(members), 256):
+            yield size, members[start : start + 256]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +84,16 @@ class ParametricQP:
     @cached_property
     def _arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc]]:
         """What DAQP asks for at every theta: H, G, the rows without U, no bounds, no options."""
-        rows = len(self.w)
-        return (
-            np.ascontiguousarray(self.H),
-            np.ascontiguousarray(self.G),
-            np.flatnonzero(~np.any(self.G, axis=1)),
-            np.full(rows, -1e30),
-            np.zeros(rows, dtype=np.intc),
-        )
+        H, G, rows = np.ascontiguousarray(self.H), np.ascontiguousarray(self.G), len(self.w)
+        fixed = np.flatnonzero(~np.any(G, axis=1))
+        return H, G, fixed, np.full(rows, -1e30), np.zeros(rows, dtype=np.intc)
+
+    def theta_rows(self) -> tuple[Array, Array]:
+        """Return A and b of the bounds of theta alone, for a program whose box is the unit box."""
+        eye = np.eye(self.F.shape[1])
+        bound = ~np.any(self.G, axis=1) & np.any(self.S, axis=1)
+        b = np.concatenate([np.ones(2 * len(eye)), self.w[bound]])
+        return np.vstack([eye, -eye, -self.S[bound]]), b
 
     def scaled(self, center: Array, half: Array, reach: Array) -> ParametricQP:
         """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows."""
@@ -83,7 +101,8 @@ class ParametricQP:
         G, S = self.G * reach, self.S * half
         length = np.linalg.norm(np.hstack([G, S]), axis=1)
         length[length == 0] = 1.0
-        return ParametricQP(
+        return replace(
+            self,
             H=self.H * np.outer(reach, reach) / size,
             F=self.F * np.outer(reach, half) / size,
             c=(self.c + self.F @ center) * reach / size,
@@ -92,5 +111,4 @@ class ParametricQP:
             S=S / length[:, None],
             theta_min=(self.theta_min - center) / half,
             theta_max=(self.theta_max - center) / half,
-            n_slacks=self.n_slacks,
         )

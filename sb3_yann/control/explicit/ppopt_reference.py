@@ -23,17 +23,16 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     They come from ppopt's combinatorial graph search (Arnström et al.,
-    https://arxiv.org/abs/2404.05511), with DAQP for its linear programs too. ppopt tells its
-    regions only at the end, so the number of regions is looked at only then.
+    https://arxiv.org/abs/2404.05511), with DAQP for its linear programs too. Their number is
+    known only at the end.
     """
-    n = program.F.shape[1]
-    box_A, box_b = np.vstack([np.eye(n), -np.eye(n)]), np.ones(2 * n)
     if not np.any(program.G):  # nothing binds U, which ppopt does not take
         timer.count()
-        return [_unconstrained(program, box_A, box_b)]
+        return [_unconstrained(program)]
 
     # Rows without U bound theta: with them in the constraints ppopt's active sets degenerate.
     moving = np.any(program.G, axis=1) | ~np.any(program.S, axis=1)
+    theta_A, theta_b = program.theta_rows()
     from ppopt.mp_solvers import mpqp_combi_graph
     from ppopt.mpqp_program import MPQP_Program
 
@@ -45,8 +44,8 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
             c=program.c[:, None],
             H=program.F,
             Q=program.H,
-            A_t=np.vstack([box_A, -program.S[~moving]]),
-            b_t=np.concatenate([box_b, program.w[~moving]])[:, None],
+            A_t=theta_A,
+            b_t=theta_b[:, None],
             F=program.S[moving],
             solver=solver,
         )
@@ -65,21 +64,14 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     ]
 
 
-def _unconstrained(program: ParametricQP, box_A: Array, box_b: Array) -> Region:
+def _unconstrained(program: ParametricQP) -> Region:
     law: Array = -np.linalg.solve(program.H, np.column_stack([program.F, program.c])).astype(float)
-    A, b = np.vstack([box_A, -program.S]), np.concatenate([box_b, program.w])
-    length = np.linalg.norm(A, axis=1)
-    A, b = A[length > 0] / length[length > 0, None], b[length > 0] / length[length > 0]
-    return Region((), law[:, :-1], law[:, -1], A, b)
+    return Region((), law[:, :-1], law[:, -1], *program.theta_rows())
 
 
 @contextmanager
 def _solvers(timer: BudgetTimer) -> Iterator[Any]:
-    """Give ppopt DAQP for all its programs, without Gurobi and GLPK, ended at the time limit.
-
-    ppopt knows two solvers of linear programs by name, Gurobi and GLPK, and calls them past the
-    solver object too: what it calls for GLPK is replaced meanwhile.
-    """
+    """Give ppopt DAQP in place of GLPK, which it also calls past its solver object."""
     from ppopt import solver
     from ppopt.solver_interface import solver_interface
 
@@ -99,10 +91,7 @@ def _solvers(timer: BudgetTimer) -> Iterator[Any]:
 
 
 def _solve_lp(c: Array | None, A: Array, b: Array, equal: list[int] | None) -> Any:
-    """Return ppopt's answer to ``min c'z`` with ``A z <= b`` and equal rows: the point, or None.
-
-    Without a cost it is the shortest feasible point. With one, proximal steps solve the program.
-    """
+    """Return ppopt's answer to ``min c'z``, or the shortest z, with ``A z <= b`` and equal rows."""
     import daqp
     from ppopt.solver_interface.solver_interface_utils import SolverOutput
 
@@ -110,17 +99,11 @@ def _solve_lp(c: Array | None, A: Array, b: Array, equal: list[int] | None) -> A
     sense = np.zeros(rows, dtype=np.intc)
     sense[list(equal or ())] = 5
     cost = np.zeros(n) if c is None else np.ravel(c).astype(float)
-    any_point = not np.any(cost)
-    settings = {} if any_point else {"eps_prox": 1e-2}
+    # With a cost, proximal steps solve the linear program.
+    H, settings = (None, {"eps_prox": 1e-2}) if np.any(cost) else (np.eye(n), {})
+    A, b = np.ascontiguousarray(A, dtype=float), np.ravel(b).astype(float)
     point, value, status, _ = daqp.solve(
-        np.eye(n) if any_point else None,
-        cost,
-        np.ascontiguousarray(A, dtype=float),
-        np.ravel(b).astype(float),
-        np.full(rows, -1e30),
-        sense,
-        primal_tol=1e-9,
-        **settings,
+        H, cost, A, b, np.full(rows, -1e30), sense, primal_tol=1e-9, **settings
     )
     return SolverOutput(value, np.asarray(point), None, None, None) if status == 1 else None
 

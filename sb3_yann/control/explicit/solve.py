@@ -32,13 +32,13 @@ def solve_explicit(
     Parameters
     ----------
     program : ParametricQP
-        The condensed problem.
+        In the units of the plant.
     u_min, u_max : ndarray, shape (m,)
         The input range, in which tolerances are measured; infinite where there is none.
     infeasible : {"nearest_region", "zero_input"}
         See :class:`PiecewiseAffine`.
     solver : {"walk", "ppopt"}
-        Our walk from facet to facet, or ppopt's combinatorial graph search, tens of times slower.
+        Our walk from facet to facet, or ppopt, tens of times slower.
     budget : SolveBudget
         When to give up.
 
@@ -66,10 +66,7 @@ def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) ->
 
 
 class ProgramUnits:
-    """A program in units of its box and its input range.
-
-    Tolerances of solvers are absolute: in these units they mean the same for every plant.
-    """
+    """A program in units of its box and its input range, where tolerances suit every plant."""
 
     def __init__(self, program: ParametricQP, u_min: Array, u_max: Array) -> None:
         self.center = (program.theta_max + program.theta_min) / 2
@@ -96,10 +93,9 @@ class ProgramUnits:
 def _require_box(program: ParametricQP) -> None:
     if not np.all(np.isfinite([program.theta_min, program.theta_max])):
         raise ValueError(
-            "The law is computed over a bounded box of parameters, but theta_min = "
-            f"{program.theta_min.tolist()} and theta_max = {program.theta_max.tolist()}. Pass "
-            "finite theta_min and theta_max (or x_min and x_max), and where theta holds them, "
-            "r_min and r_max, d_min and d_max, u_min and u_max."
+            f"The law needs a bounded box of theta, not {program.theta_min.tolist()} to "
+            f"{program.theta_max.tolist()}. Pass finite theta_min and theta_max (or x_min and "
+            "x_max), and where theta holds them, r_min and r_max, d_min and d_max, u_min and u_max."
         )
 
 
@@ -117,7 +113,6 @@ def _require_feasible(program: ParametricQP) -> None:
     ball = optimize.linprog(cost, A_ub=rows, b_ub=program.w, bounds=bounds)
     if ball.status != 0 or ball.x[-1] < 1e-9:
         raise ValueError(
-            "The MPC problem is infeasible: no theta in its box (theta_min, theta_max) has inputs "
-            "that keep every bound with room to spare. Widen x_min/x_max, u_min/u_max or the "
-            "terminal set."
+            "The MPC problem is infeasible: no theta in its box has inputs that keep every bound "
+            "with room to spare. Widen x_min/x_max, u_min/u_max or the terminal set."
         )

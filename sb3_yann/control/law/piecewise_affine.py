@@ -14,29 +14,16 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import (
-    Array,
-    ReadOnlyArrays,
-    as_array,
-    as_bounds,
-    as_choice,
-    as_flag,
-    same_fields,
-    to_float,
-)
+from sb3_yann import _validation as check
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array
 
 if TYPE_CHECKING:
     from sb3_yann.control.law.search_tree import SearchTree
 
-# Compiled code, or its machine code, is loaded at the first use of a law: not at an import.
+# Compiled code is loaded at the first use of a law: not at an import.
 INFEASIBLE = ("nearest_region", "zero_input")
-SCAN = 4
-"""Up to this many regions are asked one by one."""
-
-MOST_PARAMETERS = 10
-"""Of more, the regions have too many vertices for a tree."""
-
-_COMPILED = ("packed", "_at")
+SCAN, MOST_PARAMETERS = 4, 10
+"""Few regions are asked one by one. With more parameters regions have too many vertices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +43,7 @@ class PiecewiseAffine(ReadOnlyArrays):
     gains : ndarray, shape (p, m, n)
     offsets : ndarray, shape (p, m)
     A : ndarray, shape (q, n)
-        Half-spaces ``A theta <= b`` of all regions, region after region. Slacks are distances in
-        half-widths of the box: the law is the same in all units of theta.
+        Half-spaces ``A theta <= b``, region after region. Slacks are in half-widths of the box.
     b : ndarray, shape (q,)
     starts : ndarray of int, shape (p,)
         The first row of each region in ``A``.
@@ -67,8 +53,8 @@ class PiecewiseAffine(ReadOnlyArrays):
         The box for which the law was solved; a network scales its inputs by it.
     infeasible : {"nearest_region", "zero_input"}
     disjoint : bool, default False
-        That no two regions share an interior: the search then ends at the first region that holds
-        theta, several times as fast. It is not checked here.
+        That no two regions share an interior, which is not checked. The search then ends at the
+        first region that holds theta.
 
     Examples
     --------
@@ -92,12 +78,10 @@ class PiecewiseAffine(ReadOnlyArrays):
     infeasible: str = "nearest_region"
     disjoint: bool = False
 
-    # How far outside every region a point may lie, in half-widths of the box, and still count as
-    # inside: facets of neighbors agree to rounding only.
+    # So far outside a point still counts as inside: facets of neighbors agree to rounding only.
     tolerance = 1e-8
-
     # Slacks that differ by less, relative to 1 + their size, tie. Outside the feasible set whole
-    # areas violate two regions alike, at a border that these share: rounding must not choose.
+    # areas violate two neighbors alike: rounding must not choose.
     tie_tolerance = 1e-12
 
     def __post_init__(self) -> None:
@@ -107,12 +91,12 @@ class PiecewiseAffine(ReadOnlyArrays):
         A = as_array("A", self.A, ("q", n))
         values = {"gains": gains, "A": A, "b": as_array("b", self.b, (len(A),))}
         values["offsets"] = as_array("offsets", self.offsets, (p, m))
-        values["u_min"], values["u_max"] = as_bounds("u", self.u_min, self.u_max, m)
-        values["theta_min"], values["theta_max"] = as_bounds(
-            "theta", self.theta_min, self.theta_max, n
-        )
-        as_choice("infeasible", self.infeasible, INFEASIBLE)
-        as_flag("disjoint", self.disjoint)
+        for name, size in (("u", m), ("theta", n)):
+            low, high = f"{name}_min", f"{name}_max"
+            bounds = check.as_bounds(name, getattr(self, low), getattr(self, high), size)
+            values[low], values[high] = bounds
+        check.as_choice("infeasible", self.infeasible, INFEASIBLE)
+        check.as_flag("disjoint", self.disjoint)
         rows = as_array("starts", self.starts, (p,))
         if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):
             raise ValueError(
@@ -151,13 +135,12 @@ class PiecewiseAffine(ReadOnlyArrays):
             try:
                 if self._at(theta, u):
                     return u
-            except TypeError:  # not float64, which is all that this was compiled for
+            except TypeError:  # not float64
                 pass
-        points = self._as_theta(theta)
-        rows = np.atleast_2d(points)
-        inputs = np.empty((len(rows), self.n_inputs))
         from sb3_yann.control.law._kernels import law_of_batch
 
+        points, rows = self._as_theta(theta)
+        inputs = np.empty((len(rows), self.n_inputs))
         law_of_batch(*self.packed, rows, inputs)
         return inputs if points.ndim == 2 else inputs[0]
 
@@ -191,10 +174,8 @@ class PiecewiseAffine(ReadOnlyArrays):
                 raise ValueError("it is a single array")
             with data:
                 values = {field.name: data[field.name] for field in fields(cls)}
-                values |= {
-                    "infeasible": str(data["infeasible"]),
-                    "disjoint": bool(data["disjoint"]),
-                }
+                for name, kind in (("infeasible", str), ("disjoint", bool)):
+                    values[name] = kind(values[name])
                 tree = {name[5:]: data[name] for name in data.files if name.startswith("tree_")}
             law = cls(**values)
             if tree:
@@ -203,16 +184,8 @@ class PiecewiseAffine(ReadOnlyArrays):
                 law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
             return law
         except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
-            raise ValueError(
-                f"{fspath(path)} does not hold a PiecewiseAffine ({error}). "
-                "Write it with law.save(path)."
-            ) from None
-
-    def __eq__(self, other: object) -> bool:
-        """Tell whether both laws have the same regions, gains and options."""
-        if not isinstance(other, PiecewiseAffine):
-            return NotImplemented
-        return same_fields(self, other, [field.name for field in fields(self)])
+            what = f"{fspath(path)} does not hold a PiecewiseAffine ({error})"
+            raise ValueError(f"{what}. Write it with law.save(path).") from None
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""
@@ -220,18 +193,15 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     def __repr__(self) -> str:
         """Name the sizes."""
-        return (
-            f"PiecewiseAffine(regions={self.n_regions}, halfspaces={self.n_halfspaces}, "
-            f"theta={self.n_theta}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
-        )
+        law = f"regions={self.n_regions}, halfspaces={self.n_halfspaces}, theta={self.n_theta}"
+        return f"PiecewiseAffine({law}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
 
     def _choose(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:
         """Return the region in use and how far inside it each point lies, negative outside."""
-        points = self._as_theta(theta)
-        rows = np.atleast_2d(points)
-        region, inside = np.empty(len(rows), np.int64), np.empty(len(rows))
         from sb3_yann.control.law._kernels import locate_batch
 
+        points, rows = self._as_theta(theta)
+        region, inside = np.empty(len(rows), np.int64), np.empty(len(rows))
         locate_batch(*self.packed, rows, region, inside)
         return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
 
@@ -251,16 +221,11 @@ class PiecewiseAffine(ReadOnlyArrays):
         """The law as two arrays for compiled code, see `_kernels.pack`."""
         from sb3_yann.control.law._kernels import pack
 
-        return pack(
-            self.gains,
-            self.offsets,
-            np.column_stack([self.A, self.b]),
-            self.starts,
-            np.stack([self.u_min, self.u_max]),
-            (self.tolerance, self.tie_tolerance),
-            (self.infeasible == "zero_input", self.disjoint),
-            tuple(vars(self.tree).values()) if self.tree else (),
-        )
+        rows, bounds = np.column_stack([self.A, self.b]), np.stack([self.u_min, self.u_max])
+        tolerances = self.tolerance, self.tie_tolerance
+        flags = self.infeasible == "zero_input", self.disjoint
+        tree = tuple(vars(self.tree).values()) if self.tree else ()
+        return pack(self.gains, self.offsets, rows, self.starts, bounds, tolerances, flags, tree)
 
     @cached_property
     def _at(self) -> Callable[[Any, Array], bool]:
@@ -268,28 +233,23 @@ class PiecewiseAffine(ReadOnlyArrays):
 
         return partial(law_at, *self.packed)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> PiecewiseAffine:
-        """Return the law itself, of which nothing can change."""
+    def __deepcopy__(self, memo: object = None) -> PiecewiseAffine:
+        """Return the law itself: nothing of it can change."""
         return self
 
-    def __copy__(self) -> PiecewiseAffine:
-        """Return the law itself."""
-        return self
+    __copy__ = __deepcopy__
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what was compiled for this process; the tree goes along, as in :meth:`save`."""
         _ = self.tree
-        return {name: value for name, value in self.__dict__.items() if name not in _COMPILED}
+        return {name: each for name, each in vars(self).items() if name not in ("packed", "_at")}
 
-    def _as_theta(self, theta: ArrayLike) -> Array:
-        points = to_float("theta", theta)
+    def _as_theta(self, theta: ArrayLike) -> tuple[Array, Array]:
+        """Return theta as checked numbers, and as contiguous rows of a batch."""
+        points = check.to_float("theta", theta)
         if points.ndim not in (1, 2) or points.shape[-1] != self.n_theta:
-            raise ValueError(
-                f"theta has shape {points.shape}, expected ({self.n_theta},) "
-                f"or (batch, {self.n_theta})."
-            )
+            wanted = f"({self.n_theta},) or (batch, {self.n_theta})"
+            raise ValueError(f"theta has shape {points.shape}, expected {wanted}.")
         if not np.all(np.isfinite(points)):
             raise ValueError("theta holds NaN or infinite entries; the law is defined for numbers.")
-        if points.flags.c_contiguous and points.flags.writeable:
-            return points
-        return points.copy(order="C")
+        return points, np.ascontiguousarray(np.atleast_2d(points))

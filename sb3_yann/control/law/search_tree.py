@@ -18,21 +18,11 @@ from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
 from sb3_yann.control.polyhedra import largest_ball
 
-LEAF = 4
-"""A node with this many regions is not split further."""
-
-NODES = 2
-"""Hyperplanes for each region, at most: where regions are long and thin, every hyperplane cuts some
-of them, and trees down to the last region grow without bound."""
-
-DRAWS = 64
-"""Random points in the box for each region that tell which regions of a leaf are met most often."""
-
-CANDIDATES = 16
-"""Facets tried at a node, drawn from those of its regions."""
-
-OVERLAP = 1e-8
-"""A region that passes a hyperplane by less, in half-widths of the box, is not on its far side."""
+LEAF = 4  # a node with this many regions is not split further
+NODES = 2  # hyperplanes for each region, at most: thin regions make trees grow without bound
+DRAWS = 64  # random points for each region that tell which regions of a leaf are met most often
+CANDIDATES = 16  # facets tried at a node, drawn from those of its regions
+OVERLAP = 1e-8  # a region that passes a hyperplane by less is not on its far side
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +39,6 @@ class SearchTree:
     leaf_starts : ndarray of int, shape (leaves + 1,)
         Where each leaf begins in ``leaf_regions``.
     leaf_regions : ndarray of int
-        Those first in which most points of the leaf lie.
     """
 
     normals: Array
@@ -61,18 +50,18 @@ class SearchTree:
     def checked(self, n_theta: int, n_regions: int) -> SearchTree:
         """Return the tree, or raise ValueError if a search of it may leave it or those regions."""
         nodes, leaves = self.levels.size, self.leaf_starts.size - 1
-        numbers = np.arange(nodes)[:, None]
-        whole = (self.children, self.leaf_starts, self.leaf_regions)
+        numbers, children = np.arange(nodes)[:, None], self.children
+        whole = (children, self.leaf_starts, self.leaf_regions)
         sound = (
             all(each.dtype.kind == "i" for each in whole)
             and self.leaf_starts.ndim == self.leaf_regions.ndim == 1
             and leaves > 0
             and self.levels.shape == (nodes,)
             and self.normals.shape == (nodes, n_theta)
-            and self.children.shape == (nodes, 2)
+            and children.shape == (nodes, 2)
             and nodes > 0
-            and np.all((self.children > numbers) | (self.children < 0))
-            and np.all((self.children < nodes) & (self.children >= -leaves))
+            and np.all(((children > numbers) & (children < nodes)) | (children < 0))
+            and np.all(children >= -leaves)
             and self.leaf_starts[0] == 0
             and np.all(np.diff(self.leaf_starts) >= 0)
             and self.leaf_starts[-1] == len(self.leaf_regions)
@@ -99,17 +88,10 @@ class _Polytopes:
 def build_tree(
     A: Array, b: Array, starts: Integers, theta_min: Array, theta_max: Array
 ) -> SearchTree:
-    """Return a tree for the regions of a :class:`PiecewiseAffine`, in a bounded box of theta.
+    """Return a tree for the regions of a :class:`PiecewiseAffine`, the same for the same law.
 
     Vertices tell on which side a region lies. Rounding may move some: a search has to check its
-    result by the slack. The draws are seeded: a law always gives the same tree.
-
-    Parameters
-    ----------
-    A, b, starts : ndarray, shapes (q, n), (q,) and (p,)
-        The half-spaces of all regions, and the first row of each region.
-    theta_min, theta_max : ndarray, shape (n,)
-        The box.
+    result by the slack.
     """
     center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
     regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))
@@ -158,8 +140,7 @@ def _grow(regions: _Polytopes, random: np.random.Generator) -> SearchTree:
 def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Generator) -> Integers:
     """Return the regions of all leaves, in each of them those first that hold most of its points.
 
-    First by points drawn all over the box, then by some drawn in each region: in a large box a
-    small region may have none of the former.
+    Points are drawn all over the box, and for small regions in each of them.
     """
     p, n = regions.middles.shape
     everywhere = random.uniform(-1, 1, (DRAWS * p, n))
@@ -168,8 +149,8 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
     corners = regions.vertices[random.integers(first, last, (n + 1, len(which)))]
     within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
     all_over, in_each = np.zeros((2, len(tree.leaf_regions)), np.int64)
+    half_spaces = regions.A, regions.b, regions.row_starts
     for points, hits in ((everywhere, all_over), (within, in_each)):
-        half_spaces = regions.A, regions.b, regions.row_starts
         _hits(*(*vars(tree).values(), *half_spaces, points, hits))
     leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
     order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
@@ -180,7 +161,7 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
     "void(float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
     "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1], int64[::1])"
 )
-def _hits(  # noqa: PLR0913 - a compiled function takes arrays
+def _hits(  # noqa: PLR0913 (compiled: plain arrays)
     normals: Array,
     levels: Array,
     children: Integers,
@@ -227,7 +208,7 @@ def _polytopes(A: Array, b: Array, row_starts: Integers) -> _Polytopes:
 def _best_split(
     regions: _Polytopes, inside: Integers, random: np.random.Generator
 ) -> tuple[int, Integers, Integers] | None:
-    """Return a row of A and the regions on either side, None where no row parts them well."""
+    """Return a row of A and the regions on either side, None where no row parts them."""
     chosen = random.choice(inside, min(CANDIDATES, len(inside)), replace=False)
     first, last = regions.row_starts[chosen], regions.row_starts[chosen + 1]
     rows = random.integers(np.tile(first, 2), np.tile(last, 2))
@@ -286,9 +267,8 @@ def vertices(A: Array, b: Array) -> Array:
     rows = np.vstack([A, np.eye(n), -np.eye(n)])
     bounds = np.concatenate([b, np.ones(2 * n)])
     if n == 1:
-        upper = np.min(bounds[rows[:, 0] > 0] / rows[rows[:, 0] > 0, 0])
-        lower = np.max(bounds[rows[:, 0] < 0] / rows[rows[:, 0] < 0, 0])
-        return np.array([[lower], [upper]])
+        up, ends = rows[:, 0] > 0, bounds / np.where(rows[:, 0] == 0, np.inf, rows[:, 0])
+        return np.array([[np.max(ends[rows[:, 0] < 0])], [np.min(ends[up])]])
     inner, _ = largest_ball(rows, bounds)
     try:
         found = HalfspaceIntersection(np.column_stack([rows, -bounds]), inner).intersections

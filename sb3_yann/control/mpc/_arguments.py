@@ -8,15 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_bounds, to_float
+from sb3_yann._validation import Array, as_array, as_bounds, as_whole, to_float
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
-DRIFT = 1e-3
-"""How far a model's operating point may move in a sample without a warning, in parts of the box."""
-
-BEYOND = 0.5
-"""How far the box of theta reaches beyond soft bounds by default, in parts of their width."""
+DRIFT, BEYOND = 1e-3, 0.5
+"""In widths: the drift in a sample that warns; how far theta's box reaches beyond soft bounds."""
 
 Bounds = tuple[Array, Array]
 Given = ArrayLike | None
@@ -26,9 +23,7 @@ def as_horizon(value: int) -> int:
     """Return the number of predicted steps, a whole number of at least 1."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TypeError(f"horizon = {value!r} must be a whole number of steps.")
-    if value < 1:
-        raise ValueError(f"horizon = {value} must be at least 1.")
-    return int(value)
+    return as_whole("horizon", value)
 
 
 def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
@@ -38,11 +33,8 @@ def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
         units = np.where(bounded, given, 0.0) if np.any(bounded) else np.full(size, float(given))
     units = as_array(name, units, (size,))
     if np.any(given > 0) and not np.any(units[bounded] > 0):
-        what = name[-1]
-        raise ValueError(
-            f"{name} = {given.tolist()}, but there is no bound to soften: pass {what}_min or "
-            f"{what}_max."
-        )
+        wanted = f"pass {name[-1]}_min or {name[-1]}_max"
+        raise ValueError(f"{name} = {given.tolist()}, but there is no bound to soften: {wanted}.")
     if np.any(units[~bounded] > 0):
         i = int(np.argmax((units > 0) & ~bounded))
         raise ValueError(
@@ -54,10 +46,18 @@ def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
 def theta_box(
     layout: ThetaLayout, given: tuple[Given, Given], states: Bounds, others: Sequence[Bounds]
 ) -> Bounds:
-    """Return the box of theta: that of the states, and those of r, d and the previous input.
+    """Return the box of theta.
 
-    What is given is a number, (n,) for the states, or (n_theta,) as stored: it must not differ from
-    the others. None takes the box of states.
+    Parameters
+    ----------
+    layout : ThetaLayout
+        The parts of theta.
+    given : pair of array_like or None
+        theta_min and theta_max: a number, (n,) for the states, or (n_theta,) as stored.
+    states : pair of ndarray, shape (n,)
+        The box of the states where none is given.
+    others : sequence of pairs
+        The boxes of r, d and the previous input, from which those given must not differ.
     """
     n, parts = layout.n_states, []
     for value, fallback in zip(given, states, strict=True):
@@ -72,11 +72,9 @@ def theta_box(
 
 
 def _require_same_rest(name: str, given: Given, stored: Array, layout: ThetaLayout) -> None:
-    """Raise where a box given for all of theta differs from that of r, d and u_prev.
-
-    A box that a problem has stored is read-only: of it `dataclasses.replace` means the states.
-    """
+    """Raise where a box given for all of theta differs from that of r, d and u_prev."""
     box = None if given is None else to_float(name, given)
+    # `dataclasses.replace` passes the stored box, which is read-only, and means the states.
     taken_over = isinstance(given, np.ndarray) and not given.flags.writeable
     if box is None or box.shape != stored.shape or taken_over:
         return
@@ -85,9 +83,8 @@ def _require_same_rest(name: str, given: Given, stored: Array, layout: ThetaLayo
             part = layout.names[i].partition("[")[0].replace("u_prev", "u")
             side = name.partition("_")[2]
             raise ValueError(
-                f"{name} has {box[i]:g} for {layout.names[i]}, but {part}_{side} is "
-                f"{stored[i]:g}. Pass {name} of the {layout.n_states} states only, and give the "
-                "rest by its own bounds."
+                f"{name} has {box[i]:g} for {layout.names[i]}, but {part}_{side} is {stored[i]:g}. "
+                f"Pass {name} of the {layout.n_states} states only; the rest has its own bounds."
             )
 
 
@@ -102,9 +99,8 @@ def warn_of_no_rest(low: Array, high: Array) -> None:
     """Warn of inputs that cannot rest at the operating point."""
     for i in np.flatnonzero((low > 0) | (high < 0)):
         warnings.warn(
-            f"u_min = {low[i]:g} and u_max = {high[i]:g} leave out u[{i}] = 0, the input at the "
-            "operating point: the law cannot rest there. All is in deviations: take u_ss of the "
-            "model off bounds that are absolute.",
+            f"u_min = {low[i]:g} and u_max = {high[i]:g} leave out u[{i}] = 0, the operating point:"
+            " the law cannot rest there. Take u_ss of the model off bounds that are absolute.",
             stacklevel=3,
         )
 
@@ -115,10 +111,9 @@ def warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:
     size = np.where(np.isfinite(width), width, np.maximum(np.abs(model.x_ss), 1.0))
     if np.any(np.abs(model.drift) > DRIFT * size):
         warnings.warn(
-            f"The operating point of the model, x_ss = {model.x_ss.tolist()} with u_ss = "
-            f"{model.u_ss.tolist()}, is no steady state: there the plant moves by "
-            f"{model.drift.tolist()} in one sample, which the model leaves out, and the law will "
-            "rest beside its references. Identify it with an x_ss and u_ss at which it rests.",
+            f"x_ss = {model.x_ss.tolist()} with u_ss = {model.u_ss.tolist()} is no steady state: "
+            f"there the plant moves by {model.drift.tolist()} in one sample, and the law will rest "
+            "beside its references. Identify it with an x_ss and u_ss at which it rests.",
             stacklevel=3,
         )
 
@@ -130,8 +125,8 @@ def warn_of_unused_softness(softness: Array, bounds: Bounds, box: Bounds) -> Non
     if np.any(unused):
         i = int(np.argmax(unused))
         warnings.warn(
-            f"SoftBounds.x softens the bounds {lower[i]:g} to {upper[i]:g} of x[{i}], but "
-            f"theta_min = {low[i]:g} and theta_max = {high[i]:g} do not exceed them: the law ends "
-            "there. Give theta_min and theta_max the states from which it is to come back.",
+            f"SoftBounds.x softens the bounds {lower[i]:g} to {upper[i]:g} of x[{i}], but theta_min"
+            f" = {low[i]:g} and theta_max = {high[i]:g} do not exceed them: the law ends there. "
+            "Give theta_min and theta_max the states from which it is to come back.",
             stacklevel=3,
         )

@@ -33,10 +33,8 @@ class _Prediction:
         m, N = problem.model.n_inputs, problem.horizon
         inputs, start = np.zeros((m, N * m)), np.zeros((m, problem.n_theta))
         inputs[:, k * m : (k + 1) * m] = np.eye(m)
-        if k > 0:
-            inputs[:, (k - 1) * m : k * m] = -np.eye(m)
-        else:
-            start[:, problem.layout.previous] = -np.eye(m)
+        before = inputs[:, (k - 1) * m : k * m] if k > 0 else start[:, problem.layout.previous]
+        before[:] = -np.eye(m)
         return inputs, start
 
 
@@ -74,8 +72,7 @@ class _Rows:
 def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
     """Return the program in ``(u_0, ..., u_{N-1})`` and slacks, and what each row bounds."""
     prediction = _Prediction(problem)
-    units = {"x": problem.soft.x, "y": problem.soft.y}
-    slacks = [kind for kind, unit in units.items() if np.any(unit)]
+    slacks = [kind for kind in "xy" if np.any(getattr(problem.soft, kind))]
     H, F = _cost(problem, prediction)
     G, w, S, names = _constraints(problem, prediction, slacks)
     penalty, H = np.full(len(slacks), problem.soft.penalty), (H + H.T) / 2
@@ -97,13 +94,13 @@ def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array]:
         coordinates = to_error if k == N else states
         weight = gamma**k * (problem.terminal.cost if k == N else problem.Q)
         forced, free = coordinates @ prediction.forced[k], coordinates @ prediction.powers[k]
-        H = H + 2 * forced.T @ weight @ forced
-        F = F + 2 * forced.T @ weight @ free
+        weighted = 2 * forced.T @ weight
+        H, F = H + weighted @ forced, F + weighted @ free
     if np.any(problem.rate.R_du):
         for k in range(N):
             inputs, start = prediction.rate(problem, k)
-            H = H + 2 * gamma**k * inputs.T @ problem.rate.R_du @ inputs
-            F = F + 2 * gamma**k * inputs.T @ problem.rate.R_du @ start
+            weighted = 2 * gamma**k * inputs.T @ problem.rate.R_du
+            H, F = H + weighted @ inputs, F + weighted @ start
     return H, F
 
 
@@ -131,9 +128,7 @@ def _constraints(
     for k in range(1, N + 1) if len(C) else ():
         forced, powers = prediction.forced[k][states], prediction.powers[k][states]
         rows.add_bounds("y[{}]", C @ forced, y, C @ powers, problem.soft.y, "y")
-    if slacks:
-        zeros = np.zeros((1, N * m))
-        for kind in slacks:
-            unused = f"no violation of the soft bounds of {kind}"
-            rows.add(unused, zeros, np.zeros(1), np.zeros((1, n)), np.ones(1), kind)
+    for kind in slacks:
+        none = np.zeros((1, N * m)), np.zeros(1), np.zeros((1, n))
+        rows.add(f"no violation of the soft bounds of {kind}", *none, np.ones(1), kind)
     return rows.stacked()

@@ -17,14 +17,12 @@ from sb3_yann.control.mpc.theta_layout import ThetaLayout
 class ErrorSystem(ReadOnlyArrays):
     """The problem in ``z = to_error theta`` and ``v = u - to_input theta``: ``z+ = A z + B v``.
 
-    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate has a weight. The stage cost is
-    quadratic there. In theta the constant r and d are modes on the unit circle, where no Lyapunov
-    or Riccati equation has a solution without a discount. In z they are gone.
+    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate has a weight. The constant r and
+    d, modes on the unit circle that no Riccati equation without discount allows, are gone.
 
     Attributes
     ----------
     model : LinearModel
-        Of z and v.
     to_error : ndarray, shape (n_z, n_theta)
     to_input : ndarray, shape (m, n_theta)
         ``u_s = to_input theta``.
@@ -48,9 +46,8 @@ class ErrorSystem(ReadOnlyArrays):
         if self.cross is not None:
             k = len(self.Q)
             weight[:k, k:], weight[k:, :k] = self.cross, self.cross.T
-        m = len(self.R)
-        zeros = np.zeros((len(self.to_error), m))
-        coordinates = np.block([[self.to_error, zeros], [-self.to_input, np.eye(m)]])
+        zeros, eye = np.zeros((len(self.to_error), len(self.R))), np.eye(len(self.R))
+        coordinates = np.block([[self.to_error, zeros], [-self.to_input, eye]])
         return np.asarray(coordinates.T @ weight @ coordinates)
 
 
@@ -79,11 +76,6 @@ def error_system(
     previous = -to_input
     previous[:, layout.previous] = np.eye(m)
     A, B = linalg.block_diag(model.A, np.zeros((m, m))), np.vstack([model.B, np.eye(m)])
-    return ErrorSystem(
-        model=LinearModel(A, B, model.dt),
-        to_error=np.vstack([to_error, previous]),
-        to_input=to_input,
-        Q=linalg.block_diag(Q, R_du),
-        R=R + R_du,
-        cross=np.vstack([np.zeros((n, m)), -R_du]),
-    )
+    weights = linalg.block_diag(Q, R_du), R + R_du, np.vstack([np.zeros((n, m)), -R_du])
+    to_z = np.vstack([to_error, previous])
+    return ErrorSystem(LinearModel(A, B, model.dt), to_z, to_input, *weights)

@@ -1,42 +1,19 @@
-"""The groups of arguments that a problem may have; `sized` gives their arrays the full shape."""
+"""The groups of arguments of a problem. Each checks itself; `sized` gives its arrays full shape."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import (
-    Array,
-    ReadOnlyArrays,
-    as_array,
-    as_bounds,
-    as_output_rows,
-    as_outputs,
-    as_positive,
-    as_symmetric,
-    same_fields,
-    to_float,
-)
+from sb3_yann import _validation as check
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_bounds, as_symmetric, to_float
 from sb3_yann.control.mpc._arguments import Bounds, Given, as_softness
 
 Outputs = ArrayLike | Sequence[int]
 HalfSpaces = tuple[ArrayLike, ArrayLike]
-
-
-class _Group(ReadOnlyArrays):
-    """A group stores read-only arrays, and equals one with the same."""
-
-    _store = ReadOnlyArrays.__setstate__
-
-    def __eq__(self, other: object) -> bool:
-        if type(other) is not type(self):
-            return NotImplemented
-        return same_fields(self, other, [field.name for field in fields(self)])  # type: ignore[arg-type]
-
-    __hash__ = None  # type: ignore[assignment]
 
 
 def _loose(name: str, lower: Given, upper: Given) -> Bounds:
@@ -55,8 +32,15 @@ def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> B
     return as_bounds(name, low, high, size)
 
 
+def _outputs(name: str, C: Outputs, symbol: str, lower: Given, upper: Given) -> dict[str, Array]:
+    """Return the fields of a group of outputs ``C x`` with bounds."""
+    rows = check.as_output_rows(name, C)
+    low, high = _bounds(symbol, lower, upper, len(rows), f"output in {name}")
+    return {"C": rows, f"{symbol}_min": low, f"{symbol}_max": high}
+
+
 @dataclass(frozen=True, eq=False, init=False)
-class Tracking(_Group):
+class Tracking(ReadOnlyArrays):
     """The outputs ``C x`` that follow a reference r, and the box of r, in deviations.
 
     Parameters
@@ -77,17 +61,15 @@ class Tracking(_Group):
     r_max: Array
 
     def __init__(self, C: Outputs = (), r_min: Given = None, r_max: Given = None) -> None:
-        rows = as_output_rows("Tracking.C", C)
-        low, high = _bounds("r", r_min, r_max, len(rows), "output in Tracking.C")
-        self._store({"C": rows, "r_min": low, "r_max": high})
+        self.__setstate__(_outputs("Tracking.C", C, "r", r_min, r_max))
 
     def sized(self, n_states: int) -> Tracking:
         """Return it with C as a matrix (p, n)."""
-        return Tracking(as_outputs("Tracking.C", self.C, n_states), self.r_min, self.r_max)
+        return Tracking(check.as_outputs("Tracking.C", self.C, n_states), self.r_min, self.r_max)
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class OutputBounds(_Group):
+class OutputBounds(ReadOnlyArrays):
     """Bounds of outputs ``C x`` that the predictions keep.
 
     Parameters
@@ -108,17 +90,16 @@ class OutputBounds(_Group):
     y_max: Array
 
     def __init__(self, C: Outputs = (), y_min: Given = None, y_max: Given = None) -> None:
-        rows = as_output_rows("OutputBounds.C", C)
-        low, high = _bounds("y", y_min, y_max, len(rows), "output in OutputBounds.C")
-        self._store({"C": rows, "y_min": low, "y_max": high})
+        self.__setstate__(_outputs("OutputBounds.C", C, "y", y_min, y_max))
 
     def sized(self, n_states: int) -> OutputBounds:
         """Return it with C as a matrix (q, n)."""
-        return OutputBounds(as_outputs("OutputBounds.C", self.C, n_states), self.y_min, self.y_max)
+        C = check.as_outputs("OutputBounds.C", self.C, n_states)
+        return OutputBounds(C, self.y_min, self.y_max)
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class DisturbanceBounds(_Group):
+class DisturbanceBounds(ReadOnlyArrays):
     """The box of the disturbance d of a model with a matrix E.
 
     Parameters
@@ -136,17 +117,16 @@ class DisturbanceBounds(_Group):
     d_max: Array
 
     def __init__(self, d_min: Given = None, d_max: Given = None) -> None:
-        low, high = _loose("d", d_min, d_max)
-        self._store({"d_min": low, "d_max": high})
+        self.__setstate__(dict(zip(("d_min", "d_max"), _loose("d", d_min, d_max), strict=True)))
 
     def sized(self, n_disturbances: int) -> DisturbanceBounds:
         """Return it with bounds of shape (d,)."""
-        low, high = _bounds("d", self.d_min, self.d_max, n_disturbances, "E of the model")
-        return DisturbanceBounds(low, high)
+        bounds = _bounds("d", self.d_min, self.d_max, n_disturbances, "E of the model")
+        return DisturbanceBounds(*bounds)
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class RateLimits(_Group):
+class RateLimits(ReadOnlyArrays):
     """Bounds and weight of the change of the inputs from one sample to the next.
 
     Parameters
@@ -173,10 +153,8 @@ class RateLimits(_Group):
                 f"du_min = {low.tolist()} and du_max = {high.tolist()} make u[{i}] change in every "
                 "sample: du_min must be at most 0, and du_max at least 0."
             )
-        weight = to_float("R_du", np.zeros((0, 0)) if R_du is None else R_du)
-        if weight.size:
-            weight = as_symmetric("R_du", weight, len(np.atleast_1d(weight)))
-        self._store({"du_min": low, "du_max": high, "R_du": weight})
+        weight = _square("R_du", np.zeros((0, 0)) if R_du is None else R_du)
+        self.__setstate__({"du_min": low, "du_max": high, "R_du": weight})
 
     @property
     def bounded(self) -> bool:
@@ -191,12 +169,11 @@ class RateLimits(_Group):
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class SoftBounds(_Group):
+class SoftBounds(ReadOnlyArrays):
     """Which bounds of states and outputs may be broken, and at what cost.
 
-    The largest violation s, in units, costs ``penalty (s + s^2)``: an exact penalty, with the
-    square that keeps the program strictly convex. Soft bounds of the states share one slack over
-    the horizon, those of the outputs another.
+    The largest violation s, in units, costs ``penalty (s + s^2)``, an exact penalty. Soft bounds of
+    the states share one slack over the horizon, those of the outputs another.
 
     Parameters
     ----------
@@ -235,8 +212,8 @@ class SoftBounds(_Group):
             )
         if penalty and not soft:
             raise ValueError(f"SoftBounds.penalty = {penalty!r}, but nothing is soft: pass x or y.")
-        cost = as_positive("SoftBounds.penalty", penalty) if soft and penalty is not None else 0.0
-        self._store({**units, "penalty": cost})
+        cost = check.as_positive("SoftBounds.penalty", penalty) if soft else 0.0
+        self.__setstate__({**units, "penalty": cost})
 
     def sized(self, x: Bounds, y: Bounds) -> SoftBounds:
         """Return it with an entry for each bound of the states and of the outputs."""
@@ -245,7 +222,7 @@ class SoftBounds(_Group):
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Terminal(_Group):
+class Terminal(ReadOnlyArrays):
     """The cost and the set of the last predicted state.
 
     Parameters
@@ -269,12 +246,16 @@ class Terminal(_Group):
     set: tuple[Array, Array]
 
     def __init__(self, cost: Given = None, set: HalfSpaces | str | None = None) -> None:
-        if cost is not None:
-            matrix = to_float("Terminal.cost", cost)
-            cost = as_symmetric("Terminal.cost", matrix, len(np.atleast_1d(matrix)))
+        cost = None if cost is None else _square("Terminal.cost", cost)
         if set is not None and not (isinstance(set, str) and set == "invariant"):
             set = _half_spaces(set)
-        self._store({"cost": cost, "set": set})
+        self.__setstate__({"cost": cost, "set": set})
+
+
+def _square(name: str, value: ArrayLike) -> Array:
+    """Return a symmetric matrix of any size; one without entries says nothing."""
+    matrix = to_float(name, value)
+    return as_symmetric(name, matrix, len(np.atleast_1d(matrix))) if matrix.size else matrix
 
 
 def _half_spaces(value: HalfSpaces | str) -> tuple[Array, Array]:
@@ -282,9 +263,7 @@ def _half_spaces(value: HalfSpaces | str) -> tuple[Array, Array]:
         F, g = () if isinstance(value, str) else value  # type: ignore[misc]
     except (TypeError, ValueError):
         got = repr(value) if isinstance(value, str) else type(value).__name__
-        raise TypeError(
-            "Terminal.set must be a pair (F, g) of arrays for F x_N <= g, or 'invariant', "
-            f"got {got}."
-        ) from None
+        wanted = "Terminal.set must be a pair (F, g) of arrays for F x_N <= g, or 'invariant'"
+        raise TypeError(f"{wanted}, got {got}.") from None
     rows = as_array("Terminal.set F", F, ("rows", "columns"))
     return rows, as_array("Terminal.set g", g, (len(rows),))

@@ -8,31 +8,18 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import (
-    Array,
-    as_array,
-    as_bounds,
-    as_choice,
-    as_discount,
-    as_symmetric,
-)
+from sb3_yann import _validation as check
+from sb3_yann._validation import Array, as_array, as_bounds, as_symmetric
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.budget import SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import solve_explicit
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
 from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability
 from sb3_yann.control.mpc import value as quadratic_value
-from sb3_yann.control.mpc._arguments import (
-    Given,
-    as_horizon,
-    softened_box,
-    theta_box,
-    warn_of_drift,
-    warn_of_no_rest,
-    warn_of_unused_softness,
-)
+from sb3_yann.control.mpc._arguments import Given
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
@@ -63,11 +50,10 @@ class LinearMPC(MPCProblem):
 
     The parameter of the law is ``theta = [x, r, d, u_prev]``, with the parts that the problem uses
     (:attr:`layout`): r with ``tracking``, d where the model has an E, ``u_prev`` with a bound or a
-    weight on the rate. r and d are constant over the horizon. A problem without them is a
-    regulator: ``x_s = 0`` and ``u_s = 0``.
+    weight on the rate. r and d are constant over the horizon.
 
-    All arguments are stored, as arrays of full shape, and `dataclasses.replace` changes some of
-    them. It keeps the stored ``terminal``: replace that by None too, to have it solved anew.
+    `dataclasses.replace` changes some arguments. It keeps the stored ``terminal``: replace that by
+    None too, to have it solved anew.
 
     Parameters
     ----------
@@ -84,12 +70,10 @@ class LinearMPC(MPCProblem):
     u_min, u_max : array_like, shape (m,), or float, optional
         Bounds of the inputs. A policy needs them finite.
     theta_min, theta_max : array_like, shape (n,), or float, optional
-        The box of states for which the problem is solved. The default is ``x_min``, ``x_max``, and
-        half their distance beyond each where they are soft. Alone they leave the predicted states
-        free. Stored with the boxes of r, d and u_prev: (n_theta,).
+        The box of states for which the problem is solved, by default ``x_min``, ``x_max``, and half
+        their distance beyond where they are soft. Stored with those of r, d and u_prev: (n_theta,).
     gamma : float, default 1
-        Discount in (0, 1]. With the learner's, the policy starts as the maximizer of its own critic
-        wherever no constraint acts.
+        Discount in (0, 1]; the learner's makes the policy start as its critic's maximizer.
     infeasible : {"nearest_region", "zero_input"}, default "nearest_region"
         The law where the problem has no solution. See :class:`PiecewiseAffine`.
     tracking : Tracking, optional
@@ -119,7 +103,7 @@ class LinearMPC(MPCProblem):
     array([1.])
     """
 
-    def __init__(  # noqa: PLR0913 - the keywords of a problem
+    def __init__(  # noqa: PLR0913 (the user's arguments)
         self,
         model: LinearModel,
         *,
@@ -144,29 +128,29 @@ class LinearMPC(MPCProblem):
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         n, m = model.n_states, model.n_inputs
-        horizon, gamma = as_horizon(horizon), as_discount(gamma)
-        infeasible = as_choice("infeasible", infeasible, INFEASIBLE)
+        horizon, gamma = arguments.as_horizon(horizon), check.as_discount(gamma)
+        infeasible = check.as_choice("infeasible", infeasible, INFEASIBLE)
         Q, R = as_symmetric("Q", Q, n), as_symmetric("R", R, m, definite=True)
         x, u = as_bounds("x", x_min, x_max, n), as_bounds("u", u_min, u_max, m)
         tracking = _as_group("tracking", tracking, Tracking).sized(n)
-        disturbances = _as_group("disturbances", disturbances, DisturbanceBounds)
-        disturbances = disturbances.sized(model.n_disturbances)
+        d = _as_group("disturbances", disturbances, DisturbanceBounds).sized(model.n_disturbances)
         rate = _as_group("rate", rate, RateLimits).sized(m)
         outputs = _as_group("outputs", outputs, OutputBounds).sized(n)
         soft = _as_group("soft", soft, SoftBounds).sized(x, (outputs.y_min, outputs.y_max))
         terminal = _as_group("terminal", terminal, Terminal)
         layout = layout_of(model, tracking, rate)
-        rest = [(tracking.r_min, tracking.r_max), (disturbances.d_min, disturbances.d_max)]
+        rest = [(tracking.r_min, tracking.r_max), (d.d_min, d.d_max)]
         rest += [u] if layout.n_previous else []
-        theta = theta_box(layout, (theta_min, theta_max), softened_box(x, soft.x), rest)
+        fallback = arguments.softened_box(x, soft.x)
+        theta = arguments.theta_box(layout, (theta_min, theta_max), fallback, rest)
         states = theta[0][:n], theta[1][:n]
         if not layout.has_constants:  # otherwise there are other places to rest
-            warn_of_no_rest(*u)
-        warn_of_unused_softness(soft.x, x, states)
-        warn_of_drift(model, *states)
+            arguments.warn_of_no_rest(*u)
+        arguments.warn_of_unused_softness(soft.x, x, states)
+        arguments.warn_of_drift(model, *states)
         checked = (
             model, Q, R, horizon, *x, *u, *theta, gamma, infeasible,
-            tracking, disturbances, rate, outputs, soft,
+            tracking, d, rate, outputs, soft,
         )  # fmt: skip
         super().__init__(*checked, _completed(MPCProblem(*checked, terminal)))
 
@@ -178,7 +162,7 @@ class LinearMPC(MPCProblem):
     def is_reachable(self, r: Given = None, d: Given = None) -> NDArray[np.bool_]:
         """Tell whether the steady state for r (p,) and d (d,) lies within the bounds of x, u and y.
 
-        Of both a batch of rows may be given; None is zero. Soft bounds count too.
+        Both may be batches; None is zero. Soft bounds count too.
         """
         return reachability.is_reachable(self, r, d)
 
@@ -207,23 +191,20 @@ class LinearMPC(MPCProblem):
     def value_matrix(self, gamma: float) -> Array:
         """Return P (n_theta, n_theta): ``theta' P theta`` is the cost of the law from theta on.
 
-        It is exact for any ``gamma``, wherever the linear plant stays in the region of the law that
-        holds the origin and r and d stay as they are: the cost of the gain of that region, which is
-        the smallest cost where both discounts agree.
+        It is exact for any ``gamma``, while the linear plant stays in the region of the law that
+        holds the origin and r and d are constant; where both discounts agree, no cost is smaller.
 
         Raises
         ------
         ValueError
-            If the law does not stabilize the model under this discount, or does not rest at the
-            origin.
+            If the law is unstable under this discount, or does not rest at the origin.
         """
         return quadratic_value.value_matrix(self, self.explicit(), gamma)
 
     def state_action_matrix(self, gamma: float) -> Array:
-        """Return M: ``[theta; u]' M [theta; u]`` is the cost of u now and the law ever after.
+        """Return M (n_theta + m, n_theta + m): ``[theta; u]' M [theta; u]`` is the cost of u now.
 
-        Its shape is (n_theta + m, n_theta + m). It holds where :meth:`value_matrix` does, and
-        raises its errors.
+        The law follows. It holds where :meth:`value_matrix` does, and raises its errors.
         """
         return quadratic_value.state_action_matrix(self, self.explicit(), gamma)
 
@@ -240,11 +221,11 @@ class LinearMPC(MPCProblem):
         Parameters
         ----------
         solver : {"walk", "ppopt"}, default "walk"
-            A walk over the regions from facet to facet, or ppopt, the many times slower reference.
+            A walk from facet to facet, or ppopt, the many times slower reference.
         time_limit : float, optional
             Seconds after which to give up. A law that was kept takes none.
         region_limit : int, optional
-            The most regions that the law may have. ppopt tells their number only at its end.
+            The most regions that the law may have. ppopt tells them only at its end.
         progress : bool, default False
             Show how many regions were found so far.
 
@@ -259,9 +240,8 @@ class LinearMPC(MPCProblem):
         """
         budget = SolveBudget(time_limit, region_limit, progress)
         if solver not in self._laws:
-            self._laws[solver] = solve_explicit(
-                self.condensed(), self.u_min, self.u_max, self.infeasible, solver, budget
-            )
+            program, limits = self.condensed(), (self.u_min, self.u_max)
+            self._laws[solver] = solve_explicit(program, *limits, self.infeasible, solver, budget)
         budget.require(self._laws[solver].n_regions)
         return self._laws[solver]
 
@@ -281,16 +261,14 @@ class LinearMPC(MPCProblem):
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:
     """Return a group of arguments; None is one that says nothing."""
     if value is not None and not isinstance(value, kind):
-        raise TypeError(
-            f"{name} = {value!r} must be a {kind.__name__}, e.g. {name}={kind.__name__}(...)."
-        )
+        wanted = f"a {kind.__name__}, e.g. {name}={kind.__name__}(...)"
+        raise TypeError(f"{name} = {value!r} must be {wanted}.")
     return kind() if value is None else value
 
 
 def _completed(problem: MPCProblem) -> Terminal:
     """Return the terminal cost and set of a problem, solved where they are left to it."""
-    errors, given = problem.error_system, vars(problem.terminal)
-    cost, half_spaces = given["cost"], given["set"]
+    errors, (cost, half_spaces) = problem.error_system, vars(problem.terminal).values()
     if cost is None:
         cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
     cost = as_symmetric("Terminal.cost", cost, len(errors.Q))

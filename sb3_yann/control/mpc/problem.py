@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from sb3_yann._validation import Array, ReadOnlyArrays, half_widths, same_fields
+from sb3_yann._validation import Array, ReadOnlyArrays, half_widths
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.error_coordinates import ErrorSystem, error_system
 from sb3_yann.control.mpc.groups import (
@@ -24,19 +24,7 @@ from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MPCProblem(ReadOnlyArrays):
-    """The arguments of a :class:`LinearMPC`, checked: all of them arrays of full shape.
-
-    Nothing is checked here: a :class:`LinearMPC` is the problem whose constructor does.
-
-    Parameters
-    ----------
-    model, Q, R, horizon, gamma, infeasible : LinearModel, ndarray, int, float, str
-        The model, the weights and the options.
-    x_min, x_max, u_min, u_max, theta_min, theta_max : ndarray
-        The bounds, of shapes (n,), (m,) and (n_theta,).
-    tracking, disturbances, rate, outputs, soft, terminal : groups of arguments
-        Each by its ``sized``.
-    """
+    """The arguments of a :class:`LinearMPC`, whose constructor has checked them."""
 
     model: LinearModel
     Q: Array
@@ -64,7 +52,7 @@ class MPCProblem(ReadOnlyArrays):
 
     @cached_property
     def layout(self) -> ThetaLayout:
-        """What theta holds, and where."""
+        """What theta holds."""
         return layout_of(self.model, self.tracking, self.rate)
 
     @property
@@ -111,29 +99,18 @@ class MPCProblem(ReadOnlyArrays):
         """W (n_theta + m, n_theta + m): the stage cost is ``[theta; u]' W [theta; u]``."""
         return self.error_system.stage_matrix
 
-    def __eq__(self, other: object) -> bool:
-        """Tell whether both problems have the same model, weights, bounds and options."""
-        if not isinstance(other, MPCProblem):
-            return NotImplemented
-        return same_fields(self, other, [field.name for field in fields(self)])
-
     def __hash__(self) -> int:
         """Return a hash that equal problems share."""
         return hash((self.model, self.horizon, self.Q.tobytes(), self.R.tobytes()))
 
     def __repr__(self) -> str:
         """Name the sizes."""
-        return (
-            f"{type(self).__name__}(states={self.model.n_states}, inputs={self.model.n_inputs}, "
-            f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r})"
-        )
+        sizes = f"states={self.model.n_states}, inputs={self.model.n_inputs}"
+        options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
+        return f"{type(self).__name__}({sizes}, {options})"
 
 
 def layout_of(model: LinearModel, tracking: Tracking, rate: RateLimits) -> ThetaLayout:
     """Return what theta holds in a problem with these parts."""
-    return ThetaLayout(
-        n_states=model.n_states,
-        n_references=len(tracking.C),
-        n_disturbances=model.n_disturbances,
-        n_previous=model.n_inputs if np.any(rate.R_du) or rate.bounded else 0,
-    )
+    previous = model.n_inputs if np.any(rate.R_du) or rate.bounded else 0
+    return ThetaLayout(model.n_states, len(tracking.C), model.n_disturbances, previous)

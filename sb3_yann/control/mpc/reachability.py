@@ -19,11 +19,7 @@ def is_reachable(problem: MPCProblem, r: Given, d: Given) -> NDArray[np.bool_]:
 
 
 def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
-    """Return the room to each upper and lower bound of x, u and y at the steady state.
-
-    The shape is (2 (n + m + q),), or (batch, 2 (n + m + q)) for a batch of r or d; negative
-    entries are violations, by more than rounding.
-    """
+    """Return the room to the upper and lower bounds of x, u and y, negative for violations."""
     constant = _constants(problem, r, d)
     x, u = constant @ problem.steady_states.x.T, constant @ problem.steady_states.u.T
     outputs = problem.outputs
@@ -44,9 +40,12 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
     x, u = problem.steady_states.x @ constant, problem.steady_states.u @ constant
     if np.any(room < 0):
         sizes = {"x": len(x), "u": len(u), "y": len(problem.outputs.C)}
-        names = [f"{name}[{i}]" for name, size in sizes.items() for i in range(size)]
-        sides = [f"{name} > {name[0]}_max{name[1:]}" for name in names]
-        sides += [f"{name} < {name[0]}_min{name[1:]}" for name in names]
+        names = [(name, f"[{i}]") for name, size in sizes.items() for i in range(size)]
+        sides = [
+            f"{a}{i} {side} {a}_{end}{i}"
+            for side, end in ((">", "max"), ("<", "min"))
+            for a, i in names
+        ]
         broken = ", ".join(side for side, left in zip(sides, room, strict=True) if left < 0)
         p = len(problem.tracking.C)
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What a problem and its law are, in words for whoever has to sign them off."""
+"""A problem and its law in words, for whoever has to sign them off."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from itertools import chain
 
 import numpy as np
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, as_whole
 from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.problem import MPCProblem
 from sb3_yann.control.mpc.reachability import is_reachable
 
-LOOP_STEPS = 50
-"""Steps of a closed loop on the model."""
+LOOP_STEPS = 50  # of a closed loop on the model
 
 
 def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: int = 0) -> str:
@@ -23,20 +22,16 @@ def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: 
 
     Parameters
     ----------
-    problem, law : MPCProblem, PiecewiseAffine
-        What is reported.
+    problem : MPCProblem
+        With a bounded box of parameters.
+    law : PiecewiseAffine
+        The problem's.
     samples : int, default 500
         Points drawn uniformly from the box of parameters: shares are good to 1 / sqrt(samples).
     seed : int, default 0
         Of the draws.
-
-    Raises
-    ------
-    ValueError
-        If ``samples`` is below 1.
     """
-    if samples < 1:
-        raise ValueError(f"samples = {samples!r} must be a number of points of at least 1.")
+    as_whole("samples", samples)
     rng = np.random.default_rng(seed)
     points = rng.uniform(problem.theta_min, problem.theta_max, (samples, problem.n_theta))
     feasible = points[law.in_domain(points)]
@@ -45,9 +40,8 @@ def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: 
 
 
 def _parameters(problem: MPCProblem) -> Iterator[str]:
-    meanings = {
-        "x": "state",
-        "r": "reference of tracked output",
+    meanings = {"x": "state", "r": "reference of tracked output"}
+    meanings |= {
         "d": "disturbance, constant over the horizon",
         "u_prev": "input of the step before",
     }
@@ -64,11 +58,8 @@ def _size(problem: MPCProblem, law: PiecewiseAffine) -> Iterator[str]:
     rows = len(problem.terminal.set[1])
     yield f"The terminal set has {rows} half-spaces." if rows else "There is no terminal set."
     if problem.soft.penalty:
-        soft = [
-            f"{name}[{i}]"
-            for name, units in (("x", problem.soft.x), ("y", problem.soft.y))
-            for i in np.flatnonzero(units)
-        ]
+        groups = ("x", problem.soft.x), ("y", problem.soft.y)
+        soft = [f"{name}[{i}]" for name, units in groups for i in np.flatnonzero(units)]
         yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
 
 
@@ -82,10 +73,8 @@ def _shares(
         reachable = is_reachable(problem, points[:, parts.reference], points[:, parts.disturbance])
         yield f"  {_percent(reachable.sum(), len(points))} have a reachable steady state;"
     kept = _stay_feasible(problem, law, feasible).sum() if len(feasible) else 0
-    yield (
-        f"  of the feasible ones, {_percent(kept, len(feasible))} stay feasible for {LOOP_STEPS} "
-        "steps in closed loop on the model."
-    )
+    kept_share = f"  of the feasible ones, {_percent(kept, len(feasible))} stay feasible"
+    yield f"{kept_share} for {LOOP_STEPS} steps in closed loop on the model."
 
 
 def _stay_feasible(problem: MPCProblem, law: PiecewiseAffine, theta: Array) -> Array:
@@ -102,8 +91,7 @@ def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
     """Yield which constraints act in the optimal plan, anywhere in the horizon."""
     program, names = condense(problem)
     units = ProgramUnits(program, problem.u_min, problem.u_max)
-    scaled = units.scaled
-    counts = dict.fromkeys(names, 0)
+    scaled, counts = units.scaled, dict.fromkeys(names, 0)
     for theta in (feasible - units.center) / units.half:
         U = scaled.solve(theta)
         if U is None:  # on the border of the domain

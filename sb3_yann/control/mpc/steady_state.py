@@ -13,13 +13,7 @@ from sb3_yann.control.model.linear_model import LinearModel
 
 @dataclass(frozen=True, eq=False)
 class SteadyStates(ReadOnlyArrays):
-    """``x_s = x [r; d]`` and ``u_s = u [r; d]``.
-
-    Attributes
-    ----------
-    x : ndarray, shape (n, p + d)
-    u : ndarray, shape (m, p + d)
-    """
+    """``x_s = x [r; d]`` and ``u_s = u [r; d]``, of shapes (n, p + d) and (m, p + d)."""
 
     x: Array
     u: Array
@@ -37,11 +31,11 @@ def steady_states(
     Parameters
     ----------
     model : LinearModel
-        n states and m inputs.
+        With its E, if it has disturbances.
     C : ndarray, shape (p, n)
         The tracked outputs; p = 0 for none.
     Q, R : ndarray, shapes (n, n) and (m, m)
-        The weights.
+        The weights that choose among several solutions.
     x_unit, u_unit : ndarray, shapes (n,) and (m,)
         Typical sizes, which make ranks and norms independent of the units of the plant.
 
@@ -71,9 +65,8 @@ def steady_states(
     free = linalg.null_space(equations, rcond=1e-10)
     weight = linalg.block_diag(Q, R) * np.outer(unit, unit)
     curvature = free.T @ weight @ free
-    solution = solution - free @ np.linalg.pinv(curvature, rcond=1e-12, hermitian=True) @ (
-        free.T @ weight @ solution
-    )
+    inverse = np.linalg.pinv(curvature, rcond=1e-12, hermitian=True)
+    solution = solution - free @ inverse @ (free.T @ weight @ solution)
     solution = solution * unit[:, None]
     return SteadyStates(solution[:n], solution[n:])
 
@@ -84,8 +77,6 @@ def _why_none(model: LinearModel, C: Array, missed: Array, equations: Array) -> 
     rank = int(np.linalg.matrix_rank(equations, tol=1e-10))
     return (
         f"There is no steady state for {', '.join(which)}: [[A - I, B], [C, 0]] has rank {rank}, "
-        f"and the {model.n_states} states and {p} tracked outputs ask for "
-        f"{model.n_states + p}. At most as many outputs as there are inputs "
-        f"({model.n_inputs}) can be tracked, and each must be moved by an input at steady state. "
-        "Track fewer outputs, or other ones."
+        f"not {model.n_states + p}. Track fewer outputs, or other ones: at most as many as inputs "
+        f"({model.n_inputs}) can be tracked, each moved by an input at steady state."
     )

@@ -12,28 +12,23 @@ from sb3_yann.control.mpc.problem import MPCProblem
 MARGIN = 0.01
 """How far inside the bounds steady states must lie, relative to the bounds."""
 MAX_ROWS, MAX_STEPS = 200, 500
-
-Rows = tuple[Array, Array]
-"""Half-spaces ``F theta <= g``."""
+Rows = tuple[Array, Array]  # half-spaces F theta <= g
 
 
 def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     """Return F (rows, n_theta) and g (rows,): the maximal output admissible set F theta <= g.
 
     From a theta in it the law ``v = -K z``, with K the gain of the terminal cost, keeps all hard
-    bounds of x, u, y and the rate for ever on the model, with r and d constant. Soft bounds do not
-    count, and neither does a box of states given by ``theta_min`` and ``theta_max`` alone.
-
-    Bounds of later steps are added until those of the next are all redundant. With steady states
-    inside the bounds by one percent, the number of steps is finite. The box of r and d is taken for
-    granted, and so are the bounds of ``u_prev``. Gilbert & Tan, Linear systems with state and
-    control constraints, IEEE Trans. Autom. Control 36 (1991), Section V.
+    bounds of x, u, y and the rate for ever on the model, with r and d constant. The boxes of r, d
+    and ``u_prev`` are taken for granted, that of the states is no bound. Steady states lie inside
+    by one percent: the number of steps is finite (Gilbert & Tan, Linear systems with state and
+    control constraints, IEEE Trans. Autom. Control 36 (1991), Section V).
 
     Raises
     ------
     ValueError
-        If the gain does not stabilize the model, the origin is not inside all bounds, the number
-        of steps is not finite within 500, or there are more than 200 rows.
+        If the gain does not stabilize the model, the origin is not inside all bounds, or 500 steps
+        or 200 rows are not enough.
     """
     errors, parts = problem.error_system, problem.layout
     K = lqr.gain(errors.model, errors.R, cost, problem.gamma, errors.cross)
@@ -89,13 +84,10 @@ def _bounds(problem: MPCProblem, gain: Array) -> Rows:
     """Return the hard bounds of x, u, y and the rate under ``u = gain theta``: rows and bounds."""
     parts, size, outputs = problem.layout, problem.n_theta, problem.outputs
     state = np.eye(size)[parts.state]
+    x, y = problem.soft.x == 0, problem.soft.y == 0  # those that are hard
     values = [(gain, problem.u_min, problem.u_max)]
-    for seen, low, high, soft in (
-        (state, problem.x_min, problem.x_max, problem.soft.x),
-        (outputs.C @ state, outputs.y_min, outputs.y_max, problem.soft.y),
-    ):
-        hard = soft == 0
-        values.append((seen[hard], low[hard], high[hard]))
+    values.append((state[x], problem.x_min[x], problem.x_max[x]))
+    values.append(((outputs.C @ state)[y], outputs.y_min[y], outputs.y_max[y]))
     if parts.n_previous:
         change = gain - np.eye(size)[parts.previous]
         values.append((change, problem.rate.du_min, problem.rate.du_max))
@@ -118,8 +110,7 @@ def _steady_projection(problem: MPCProblem, half: Array) -> Array:
 def _granted(problem: MPCProblem, half: Array) -> Rows:
     """Return the half-spaces that every predicted theta satisfies anyway."""
     first = problem.layout.constant.start
-    eye = np.eye(problem.n_theta)[first:]
-    rows = np.vstack([eye, -eye])
+    rows = np.vstack([np.eye(problem.n_theta)[first:], -np.eye(problem.n_theta)[first:]])
     bounds = np.concatenate([problem.theta_max[first:], -problem.theta_min[first:]])
     bounds = bounds / np.tile(half[first:], 2)
     bounded = np.isfinite(bounds)

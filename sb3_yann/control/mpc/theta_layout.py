@@ -7,18 +7,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ThetaLayout:
-    """The layout of ``theta = [x, r, d, u_prev]``, of which a problem has the parts that it uses.
+    """The layout of ``theta = [x, r, d, u_prev]`` with the parts that a problem uses.
 
     Attributes
     ----------
-    n_states : int
-        The state x.
-    n_references : int
-        The reference r of the tracked outputs.
-    n_disturbances : int
-        The measured, or estimated, disturbance d.
+    n_states, n_references, n_disturbances : int
+        Numbers of states x, tracked outputs r, and measured or estimated disturbances d.
     n_previous : int
-        The input of the step before, ``u_prev``: all inputs where their rate matters, or none.
+        The inputs of the step before, ``u_prev``: all where their rate matters, or none.
 
     Examples
     --------
@@ -69,10 +65,6 @@ class ThetaLayout:
     @property
     def names(self) -> tuple[str, ...]:
         """A name for each entry, such as ``x[0]``, ``r[0]``, ``d[0]`` or ``u_prev[0]``."""
-        counts = {
-            "x": self.n_states,
-            "r": self.n_references,
-            "d": self.n_disturbances,
-            "u_prev": self.n_previous,
-        }
-        return tuple(f"{name}[{i}]" for name, count in counts.items() for i in range(count))
+        sizes = self.n_states, self.n_references, self.n_disturbances, self.n_previous
+        parts = zip(("x", "r", "d", "u_prev"), sizes, strict=True)
+        return tuple(f"{name}[{i}]" for name, size in parts for i in range(size))

@@ -20,8 +20,7 @@ def value_matrix(problem: MPCProblem, law: PiecewiseAffine, gamma: float) -> Arr
 
 def state_action_matrix(problem: MPCProblem, law: PiecewiseAffine, gamma: float) -> Array:
     """Return M (n_theta + m, n_theta + m) of :meth:`LinearMPC.state_action_matrix`."""
-    P = value_matrix(problem, law, gamma)
-    AB = np.hstack(problem.prediction)
+    P, AB = value_matrix(problem, law, gamma), np.hstack(problem.prediction)
     return np.asarray(problem.stage_matrix + gamma * AB.T @ P @ AB)
 
 
@@ -34,18 +33,15 @@ def gain_at_rest(problem: MPCProblem, law: PiecewiseAffine) -> Array:
         If the law does not rest at the origin, or, near it, at the steady states of r and d.
     """
     errors, parts = problem.error_system, problem.layout
-    origin = np.zeros(problem.n_theta)
-    unit = 2 * problem.u_half
+    origin, unit = np.zeros(problem.n_theta), 2 * problem.u_half
     if not law.in_domain(origin) or np.any(np.abs(law(origin)) > 1e-9 * unit):
         raise ValueError(
             "The law does not rest at the origin: theta = 0 must be feasible with u = 0. "
             "Choose an operating point inside the bounds, and boxes of parameters that hold 0."
         )
     gains = law.gains[law.locate(origin)]
-    columns = [gains[:, parts.state]]
-    if errors.cross is not None:
-        columns.append(gains[:, parts.previous])
-    K = -np.hstack(columns)
+    previous = slice(0, 0) if errors.cross is None else parts.previous
+    K = -np.hstack([gains[:, parts.state], gains[:, previous]])
     box = np.maximum(np.abs(problem.theta_min), np.abs(problem.theta_max))
     if np.any(np.abs(gains - (errors.to_input - K @ errors.to_error)) @ box > 1e-6 * unit):
         raise ValueError(

@@ -303,9 +303,8 @@ class _Value(th.autograd.Function):
     def forward(
         ctx: Any, constants: Constants, points: th.Tensor, *weights: th.Tensor
     ) -> th.Tensor:
-        ctx.save_for_backward(
-            *weights
-        )  # torch notices weights that change before the backward pass
+        # torch notices weights that change before the backward pass
+        ctx.save_for_backward(*weights)
         ctx.done, ctx.dtype = _Pass(constants, points, weights), points.dtype
         return th.from_numpy(ctx.done.q)
 

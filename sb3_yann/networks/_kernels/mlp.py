@@ -1,9 +1,6 @@
 """Stacks of zero-output networks on a CPU, forward and backward, as compiled loops.
 
-A batch of some hundred states goes through networks of a few hundred to a few thousand weights: in
-torch's own operations most of the time is their overhead, some fifty times over. Here it is one
-call each way, and only the networks in use are ever read or written, so that the cost does not
-grow with their number.
+One call each way, without torch's overhead; only the networks in use are read or written.
 """
 
 from __future__ import annotations
@@ -34,8 +31,7 @@ def tanh(x: Any) -> Any:
     """Return tanh in float32 to two units in the last place: exact at 0, odd, 1 beyond 10.
 
     With t = tanh(x / 2) from the eighth convergent of Lambert's continued fraction
-    ``t = h / (1 + h^2 / (3 + h^2 / (5 + ...)))`` at h = x / 2, it is ``2 t / (1 + t^2)``. That is
-    arithmetic alone, several values at a time; the library's tanh costs more than all the rest.
+    ``t = h / (1 + h^2 / (3 + h^2 / (5 + ...)))`` at h = x / 2, it is ``2 t / (1 + t^2)``.
     """
     one, five = np.float32(1), np.float32(5)
     h = np.float32(0.5) * x
@@ -97,8 +93,7 @@ def at_zero(matrices: Single, used: Integers, pinned: Single) -> Single:
 def hidden_layer(x: Single, row: int, matrices: Single, s: int, zero: Single, out: Single) -> None:
     """Write ``s(W x + b) - s(b)`` to a row of out, for that of x.
 
-    The matrix, (inputs + 1, outputs), and s(b) are number s of several. (Slices would be passed
-    more plainly, and take as long as all that is done with them: numba counts who refers to each.)
+    The matrix, (inputs + 1, outputs), and s(b) are number s of several: slices would be slow.
     """
     inputs, outputs = matrices.shape[1] - 1, matrices.shape[2]
     for a in range(outputs):

@@ -205,9 +205,8 @@ class _Layer(th.autograd.Function):
     ) -> th.Tensor:
         given = [*known, *map(as_array, weights), pinned]
         actions, kept = _actions(given)
-        ctx.save_for_backward(
-            *weights
-        )  # torch notices weights that change before the backward pass
+        # torch notices weights that change before the backward pass
+        ctx.save_for_backward(*weights)
         ctx.given, ctx.kept, ctx.by_row = given[5:], kept, by_row
         return th.from_numpy(actions)
 

@@ -67,5 +67,5 @@ def test_the_same_seed_gives_the_same_text() -> None:
 
 
 def test_a_number_of_samples_below_one_is_an_error() -> None:
-    with pytest.raises(ValueError, match="samples = 0 must be a number of points"):
+    with pytest.raises(ValueError, match="samples = 0 must be a whole number of at least 1"):
         solved("servo").report(samples=0)
