@@ -205,17 +205,13 @@ class ReadOnlyArrays:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, type(self)):
             return NotImplemented
-        return same_fields(self, other, [field.name for field in fields(self)])  # type: ignore[arg-type]
+        names = [field.name for field in fields(self) if field.compare]  # type: ignore[arg-type]
+        return all(_same(getattr(self, name), getattr(other, name)) for name in names)
 
 
-def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
-    """Tell whether the named attributes of two objects are equal, arrays entry by entry."""
-
-    def same(a: Any, b: Any) -> bool:
-        pairs = zip(a, b, strict=True) if isinstance(a, tuple) else [(a, b)]
-        return all(np.array_equal(x, y) for x, y in pairs)
-
-    return all(same(getattr(one, name), getattr(other, name)) for name in names)
+def _same(one: Any, other: Any) -> bool:
+    pairs = zip(one, other, strict=True) if isinstance(one, tuple) else [(one, other)]
+    return all(np.array_equal(x, y) for x, y in pairs)
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:

@@ -21,8 +21,8 @@ def operating_point(
 ) -> Array:
     """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant."""
     n, m, _ = sizes
-    known = zip(given, np.split(found.center, [n, n + m]), strict=True)
-    start = np.concatenate([mean if value is None else value for value, mean in known])
+    means = zip(given, np.split(found.center, [n, n + m]), strict=True)
+    start = np.concatenate([mean if value is None else value for value, mean in means])
     # The state gives way, or the inputs where the state is given; nothing where both are.
     if given[0] is not None and given[1] is not None:
         return start

@@ -57,6 +57,7 @@ class Identified(ReadOnlyArrays):
     one_step_fit: Array
     ten_step_fit: Array
     excitation: float
+    __eq__, __hash__ = object.__eq__, object.__hash__  # fits may be NaN
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
         """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E"."""
