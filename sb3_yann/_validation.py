@@ -72,7 +72,9 @@ def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -
     array = to_float(name, value)
     array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
     if np.any(array <= 0):
-        raise ValueError(f"{name} = {array.tolist()} must be above 0 in each entry.{_after(hint)}")
+        raise ValueError(
+            f"{name} = {array.tolist()} must be above 0 in each entry. {hint}".rstrip()
+        )
     return array
 
 
@@ -135,7 +137,7 @@ def as_between(
     """
     array = np.asarray(value if np.ndim(value) == 0 else None)
     if array.dtype.kind not in "iuf":
-        raise TypeError(f"{name} = {_short(value)} must be a number.{_after(hint)}")
+        raise TypeError(f"{name} = {_short(value)} must be a number. {hint}".rstrip())
     number = float(array)
     left = number >= low if ends[0] == "[" else number > low
     right = number <= high if ends[1] == "]" else number < high
@@ -147,14 +149,14 @@ def as_between(
     else:
         above = f" {'above' if ends[0] == '(' else 'of at least'} {low:g}" if low > -np.inf else ""
         wanted = f"be a finite number{above}"
-    raise ValueError(f"{name} = {value!r} must {wanted}.{_after(hint)}")
+    raise ValueError(f"{name} = {value!r} must {wanted}. {hint}".rstrip())
 
 
 def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
     """Return ``value`` as an int of at least ``least``, else raise ValueError; bools are none."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise ValueError(
-            f"{name} = {_short(value)} must be a whole number of at least {least}.{_after(hint)}"
+            f"{name} = {_short(value)} must be a whole number of at least {least}. {hint}".rstrip()
         )
     return int(value)
 
@@ -180,19 +182,14 @@ def to_float(name: str, value: Any) -> Array:
             raise TypeError("it is complex")
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name} = {_short(value)} is not an array of real numbers ({error})."
-        ) from None
+        fault = f"{name} = {_short(value)} is not an array of real numbers ({error})."
+        raise TypeError(fault) from None
 
 
 def _short(value: Any) -> str:
     """Return the representation of a value, without the middle of a long one."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:120]} ... {text[-40:]}"
-
-
-def _after(hint: str) -> str:
-    return hint and f" {hint}"
 
 
 class ReadOnlyArrays:
@@ -208,17 +205,13 @@ class ReadOnlyArrays:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, type(self)):
             return NotImplemented
-        return same_fields(self, other, [field.name for field in fields(self)])  # type: ignore[arg-type]
+        names = [field.name for field in fields(self) if field.compare]  # type: ignore[arg-type]
+        return all(_same(getattr(self, name), getattr(other, name)) for name in names)
 
 
-def same_fields(one: Any, other: Any, names: Sequence[str]) -> bool:
-    """Tell whether the named attributes of two objects are equal, arrays entry by entry."""
-
-    def same(a: Any, b: Any) -> bool:
-        pairs = zip(a, b, strict=True) if isinstance(a, tuple) else [(a, b)]
-        return all(np.array_equal(x, y) for x, y in pairs)
-
-    return all(same(getattr(one, name), getattr(other, name)) for name in names)
+def _same(one: Any, other: Any) -> bool:
+    pairs = zip(one, other, strict=True) if isinstance(one, tuple) else [(one, other)]
+    return all(np.array_equal(x, y) for x, y in pairs)
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:

@@ -128,7 +128,6 @@ def test_the_examples_of_a_docstring_run(example: doctest.DocTest, monkeypatch, 
     assert found.attempted and not found.failed, "\n" + (example.docstring or "")
 
 
-@pytest.mark.xfail(strict=False, reason="being written")
 @pytest.mark.parametrize("name", exported())
 def test_what_is_exported_has_examples(name: str) -> None:
     text = inspect.cleandoc(vars(exported()[name]).get("__doc__") or "")
@@ -141,7 +140,6 @@ LONG = [
 ]
 
 
-@pytest.mark.xfail(strict=False, reason="being written")
 @pytest.mark.parametrize("name", LONG)
 def test_many_parameters_are_documented_by_name(name: str) -> None:
     assert undocumented(*CALLABLES[name]) == []

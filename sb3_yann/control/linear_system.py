@@ -48,28 +48,12 @@ def names(sizes: Sequence[int]) -> list[str]:
     return [f"{k}[{i}]" for k, size in zip("xud", sizes, strict=False) for i in range(size)]
 
 
-def combination(
-    coefficients: Array, weights: Array, labels: list[str], least: float, digits: int
-) -> str:
-    """Return a linear combination in words, scaled so that the term of largest weight has 1.
-
-    Parameters
-    ----------
-    coefficients, weights : ndarray, shape (k,)
-        The factors, and what they count for.
-    labels : list of str
-        Names of what is combined.
-    least : float
-        Weight, relative to the largest, below which a term is left out.
-    digits : int
-        Of each factor.
-    """
-    kept = np.flatnonzero(np.abs(weights) > least * np.max(np.abs(weights)))
-    first = coefficients[kept[np.argmax(np.abs(weights[kept]))]]
+def combination(factors: Array, labels: Sequence[str], digits: int) -> str:
+    """Return a linear combination in words, without the terms of factor 0."""
+    kept = np.flatnonzero(factors)
     if kept.size == 1:
         return labels[int(kept[0])]
-    terms = [f"{coefficients[i] / first:+.{digits}g} {labels[i]}" for i in kept]
-    return " ".join(terms).removeprefix("+")
+    return " ".join(f"{factors[i]:+.{digits}g} {labels[i]}" for i in kept).removeprefix("+")
 
 
 def zero_order_hold(A: Array, B: Array, E: Array, dt: float) -> tuple[Array, Array, Array]:

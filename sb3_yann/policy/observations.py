@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_whole, same_fields
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,12 +166,6 @@ class AffineObservation(ReadOnlyArrays):
             )
         offset = self.matrix @ inner.offset + self.offset
         return AffineObservation(self.matrix @ inner.matrix, offset)
-
-    def __eq__(self, other: object) -> bool:
-        """Tell whether both maps are the same."""
-        if not isinstance(other, AffineObservation):
-            return NotImplemented
-        return same_fields(self, other, ("matrix", "offset"))
 
     def __hash__(self) -> int:
         """Return a hash that equal maps share."""

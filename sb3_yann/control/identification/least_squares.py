@@ -75,7 +75,7 @@ def regress(
     labels = names(sizes)
     missing = [v for s, v in zip(singular, right, strict=True) if s <= WEAKEST * singular[0]]
     if missing and ridge == 0:
-        fixed = [f"{combination(v / scale, v, labels, SMALL, 4)} never changes" for v in missing]
+        fixed = [f"{_direction(v, scale, labels)} never changes" for v in missing]
         raise ValueError(f"The data do not excite the plant: {'; '.join(fixed)}. {NOT_EXCITED}")
     inverse = right.T * (singular / (singular**2 + ridge)) if ridge else right.T / singular
     coefficients = ((inverse @ left.T @ (targets - reached)) / scale[:, None]).T
@@ -94,8 +94,15 @@ def regress(
         degrees_of_freedom=steps - unknowns,
         steps=steps,
         excitation=float(singular[-1] / singular[0]) if singular[0] > 0 else 0.0,
-        weakest=combination(right[-1] / scale, right[-1], labels, SMALL, 4),
+        weakest=_direction(right[-1], scale, labels),
     )
+
+
+def _direction(weights: Array, scale: Array, labels: list[str]) -> str:
+    """Return a combination of the scaled regressors in words, without terms of small weight."""
+    largest, factors = np.argmax(np.abs(weights)), weights / scale
+    small = np.abs(weights) <= SMALL * np.abs(weights[largest])
+    return combination(np.where(small, 0.0, factors / factors[largest]), labels, 4)
 
 
 def _autocorrelation(residuals: Array, episodes: list[Episode], targets: Array) -> Array:

@@ -21,11 +21,8 @@ def operating_point(
 ) -> Array:
     """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant."""
     n, m, _ = sizes
-    x, u, d = np.split(found.center, [n, n + m])
-    start = np.concatenate([x if given[0] is None else given[0], u, d])
-    for place, value in ((slice(n, n + m), given[1]), (slice(n + m, None), given[2])):
-        if value is not None:
-            start[place] = value
+    means = zip(given, np.split(found.center, [n, n + m]), strict=True)
+    start = np.concatenate([mean if value is None else value for value, mean in means])
     # The state gives way, or the inputs where the state is given; nothing where both are.
     if given[0] is not None and given[1] is not None:
         return start

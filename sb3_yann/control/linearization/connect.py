@@ -11,6 +11,7 @@ from sb3_yann._validation import Array, as_array, as_positive_vector
 from sb3_yann.control.linearization.simulator import Simulator
 
 LONGEST_DELAY = 20  # longest input delay, in samples, that is detected
+HIDDEN = "the plant has states besides these, which setting this one"
 ADVICE = (
     "Make them part of the state (of a delay, the inputs on their way), have set_state set them "
     "too, or identify the plant: LinearModel.from_data"
@@ -49,10 +50,10 @@ def connect(
         sizes = {name: None if v is None else v.shape for name, v in begun.items()}
         wanted = "" if x is None else f" of shape {x.shape}, like the one given,"
         tried = [f"a state{wanted} is nowhere to be read: {sizes}"]
+    ways = "".join(f"\n  - {each}" for each in tried)
     raise ValueError(
-        "The environment could not be put into a state and read. Tried:\n  - "
-        + "\n  - ".join(tried)
-        + "\nPass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."
+        f"The environment could not be put into a state and read. Tried:{ways}\n"
+        "Pass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."
     )
 
 
@@ -87,8 +88,8 @@ def _failure(simulator: Simulator, x: Array, u: Array, scale: Array) -> str | No
     if not np.all(np.abs(again - first) <= 1e-6 * (scale + np.abs(first))):
         return (
             f"two steps from the same state {x.tolist()} end in {first.tolist()} and "
-            f"{again.tolist()}: setting it does not work, or the plant is random or has states "
-            "besides these (then identify it: LinearModel.from_data)"
+            f"{again.tolist()}: setting it fails, or the plant is random or has states besides "
+            "these (then identify it: LinearModel.from_data)"
         )
     pushed = simulator.next_state(other, u + 0.1 * _room(simulator, u))
     if np.array_equal(moved, other) and np.array_equal(pushed, other):
@@ -120,8 +121,8 @@ def _hidden_state(
     if np.any(np.abs(again - first) > 1e-6 * (scale + np.abs(first))):
         return (
             f"the step from {x.tolist()} with the action {u.tolist()} ends in {first.tolist()}, "
-            f"and after other actions in {again.tolist()}: the plant has states besides these, "
-            f"which setting this one leaves alone (a delay of the input, an actuator). {ADVICE}"
+            f"and after other actions in {again.tolist()}: {HIDDEN} leaves alone (a delay of the "
+            f"input, an actuator). {ADVICE}"
         )
     for before, after in _trajectory(simulator, x, other, 10 * scale):
         reached = simulator.next_state(before, other)
@@ -130,9 +131,8 @@ def _hidden_state(
         if np.any(np.abs(reached - after) > doubt):
             return (
                 f"going on from {before.tolist()}, the action {other.tolist()} leads to "
-                f"{after.tolist()}, and set there to {reached.tolist()}: the plant has states "
-                "besides these, which setting this one starts anew (a delay of the input, an "
-                f"actuator, a clock). {ADVICE}"
+                f"{after.tolist()}, and set there to {reached.tolist()}: {HIDDEN} starts anew "
+                f"(a delay of the input, an actuator, a clock). {ADVICE}"
             )
     return None
 

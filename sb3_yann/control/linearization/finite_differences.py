@@ -9,9 +9,8 @@ import numpy as np
 
 from sb3_yann._validation import Array
 
-LEVELS = 6
-RATIO = 4.0
-"""Each point is approached with `LEVELS` steps, each this much shorter than the one before."""
+LEVELS, RATIO = 6, 4.0
+"""Number of steps that approach a point, and how much shorter each is than the one before."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,11 +38,11 @@ def steady_state(
     n = moved.size
     if not np.max(np.abs(moved)) <= SOLVED:
         reason = simulator.refusal if np.any(np.isnan(moved)) else f"{(moved * scale[:n]).tolist()}"
+        stuck = _at_bounds(simulator, point[n:], scale[n:])
         raise ValueError(
             f"No steady state was found. The best is state = {point[:n].tolist()}, action = "
-            f"{point[n:].tolist()}, which moves in one step by {reason}."
-            f"{_at_bounds(simulator, point[n:], scale[n:])} Leave more entries free (NaN), or "
-            "start closer to it."
+            f"{point[n:].tolist()}, which moves in one step by {reason}.{stuck} Leave more entries "
+            "free (NaN), or start closer to it."
         )
     return point
 
@@ -71,8 +71,7 @@ def require_steady_state(simulator: Simulator, point: Array, jacobian: Array, sc
     if np.max(np.abs(way)) > AWAY or np.max(np.abs(left)) > MOVED:
         raise ValueError(
             f"state = {point[:n].tolist()}, action = {point[n:].tolist()} is no steady state: one "
-            f"step moves it by {(moved * scale[:n]).tolist()}. Leave one of the two out, or set "
-            "entries to NaN, to have them solved for."
+            f"step moves it by {(moved * scale[:n]).tolist()}. Set entries to NaN to be solved for."
         )
 
 

@@ -29,8 +29,7 @@ class Identified(ReadOnlyArrays):
     degrees_of_freedom : int
         Fitted steps minus the parameters of each row.
     residual_autocorrelation : ndarray, shape (n,)
-        Of each state's residuals, one step apart. Far from zero, there is measurement noise or an
-        unmodeled state, and neither the matrices nor the standard errors hold.
+        One step apart. Far from zero, measurement noise or an unmodeled state spoils the model.
     one_step_fit, ten_step_fit : ndarray, shape (n,)
         ``100 (1 - |x - predicted| / |x - mean|)`` in percent over the held-out data, predicted one
         and ten steps ahead. NaN without such data, or for a constant state.
@@ -58,6 +57,7 @@ class Identified(ReadOnlyArrays):
     one_step_fit: Array
     ten_step_fit: Array
     excitation: float
+    __eq__, __hash__ = object.__eq__, object.__hash__  # fits may be NaN
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
         """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E"."""

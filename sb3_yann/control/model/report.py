@@ -107,7 +107,9 @@ def reach(model: LinearSystem) -> tuple[Array, Array]:
 def _reach(model: LinearSystem) -> list[str]:
     """Return the lines on controllability."""
     sizes, axes = reach(model)
-    words = [combination(axis, axis, names([sizes.size]), 1e-3, 3) for axis in axes]
+    axes = np.array([axis / axis[np.argmax(np.abs(axis))] for axis in axes])
+    axes[np.abs(axes) <= 1e-3] = 0.0
+    words = [combination(axis, names([sizes.size]), 3) for axis in axes]
     rank = int(np.sum(sizes > UNREACHED))
     lines = [f"Controllability: the inputs reach {rank} of {sizes.size} directions of the state."]
     if rank < sizes.size:
