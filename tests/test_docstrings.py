@@ -130,7 +130,9 @@ def test_the_examples_of_a_docstring_run(example: doctest.DocTest, monkeypatch, 
 
 @pytest.mark.parametrize("name", exported())
 def test_what_is_exported_has_examples(name: str) -> None:
-    text = inspect.cleandoc(vars(exported()[name]).get("__doc__") or "")
+    value = exported()[name]
+    own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+    text = inspect.cleandoc(own or "")
     assert re.search(r"^Examples\n--------\n", text, re.MULTILINE) and ">>> " in text
 
 
