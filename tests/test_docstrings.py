@@ -136,7 +136,7 @@ def is_raised(thing: Any) -> bool:
 @pytest.mark.parametrize("name", [k for k, thing in exported().items() if not is_raised(thing)])
 def test_what_is_exported_has_examples(name: str) -> None:
     thing = exported()[name]
-    own = vars(thing)["__doc__"] if isinstance(thing, type) else thing.__doc__
+    own = vars(thing).get("__doc__") if isinstance(thing, type) else thing.__doc__
     text = inspect.cleandoc(own or "")
     assert re.search(r"^Examples\n--------\n", text, re.MULTILINE) and ">>> " in text
 

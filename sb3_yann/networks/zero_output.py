@@ -66,7 +66,13 @@ class PairedLinear(nn.Module):
 
 
 class StackedLinear(nn.Module):
-    """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names."""
+    """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names.
+
+    Parameters
+    ----------
+    in_features, out_features, n_stacked, scale
+        As in :class:`PairedLinear`.
+    """
 
     def __init__(
         self, in_features: int, out_features: int, *, n_stacked: int = 1, scale: float = 0.01

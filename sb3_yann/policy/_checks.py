@@ -145,7 +145,7 @@ def require_matching(
     if given and same(u_ss):
         advice = (
             f"The env takes absolute inputs, and the MPC deviations from u_ss = {u_ss.tolist()}. "
-            "Wrap the env, before its observation is completed, in gymnasium.wrappers."
+            "Before its observation is completed, wrap it: env = gymnasium.wrappers."
             f"RescaleAction(env, numpy.float32({low}), numpy.float32({high}))."
         )
     space = f"[{env[0].tolist()}, {env[1].tolist()}]"

@@ -32,7 +32,7 @@ from weights import network_of
 @pytest.mark.parametrize("n_critics", [1, 2])
 def test_actor_and_critic_are_those_of_sb3_with_yann_networks(algorithm, critic, n_critics) -> None:
     kwargs = {"critic": critic, "n_critics": n_critics, "critic_warmup": 0}
-    model = build(algorithm, policy_kwargs=kwargs)
+    model = build(algorithm, policy_kwargs=kwargs, seed=0)
     assert isinstance(model.actor, YannActor)
     assert isinstance(model.critic, YannCritic)
     network = {"afterstate": AfterstateValue, "state_action": QuadraticStateActionValue}[critic]
