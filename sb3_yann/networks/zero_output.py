@@ -66,7 +66,16 @@ class PairedLinear(nn.Module):
 
 
 class StackedLinear(nn.Module):
-    """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names."""
+    """``x -> W x`` and ``b``, for the layer of a stack that ``index`` names.
+
+    Parameters
+    ----------
+    in_features, out_features : int
+    n_stacked : int, default 1
+        Number of independent layers in one tensor.
+    scale : float, default 0.01
+        Initial weights are uniform in [-scale, scale]; biases start at zero.
+    """
 
     def __init__(
         self, in_features: int, out_features: int, *, n_stacked: int = 1, scale: float = 0.01
