@@ -124,7 +124,13 @@ def _rates(
 
 
 def stage_cost(a: Any, b: Any, s: Any, t: Any, u: Any) -> Any:
-    """Return the stage cost of deviations and input, without the penalty."""
+    """Return the stage cost of deviations and input, without the penalty.
+
+    Parameters
+    ----------
+    a, b, s, t, u : float or ndarray, shape (num_envs,)
+        Deviations of C_A, C_B and C_S in mol/L, of T in K and of U in kJ/(h m2 K).
+    """
     return 0.1 * (a * a + b * b + s * s + t * t) + 1e-4 * u * u
 
 

@@ -112,7 +112,14 @@ class Starts:
 
 @dataclass(frozen=True)
 class Evidence(Starts):
-    """The MPC's episodes and the accepted policy's: what a candidate is compared with."""
+    """The MPC's episodes and the accepted policy's: what a candidate is compared with.
+
+    Attributes
+    ----------
+    seeds : tuple of int, the known starts
+    mpc, accepted : Outcome, what came of the MPC and of the accepted policy
+    margin : float, what one start may cost more than with the MPC
+    """
 
     accepted: Outcome
 

@@ -26,8 +26,14 @@ Phase = Literal["first", "learning", "trial"]
 class BlockEvidence:
     """Episodes of the MPC, of the accepted policy, and of the block that is being played.
 
-    Outside a "learning" block the actor stays the ``resting`` checkpoint. ``terminates`` tells
-    whether the env itself has ended an episode of an accepted policy.
+    Attributes
+    ----------
+    phase : str, "first", "learning" or "trial"; the actor learns in the second only
+    mpc, accepted : PlantEpisodes or None, those of the MPC and of the accepted policy, if known
+    costs : list of float, those of the block's episodes so far
+    predicted : list of float, what the MPC costs on its own model; empty while the actor learns
+    resting : ActorCheckpoint or None, what the actor stays in this block, None while it learns
+    terminates : bool, whether the env itself has ended an episode of an accepted policy
     """
 
     phase: Phase = "first"
@@ -84,7 +90,17 @@ class PlantAcceptance:
             self._restore(session, "a parameter of the actor is not a finite number, or too large")
 
     def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
-        """Count the step; decide where a block is over."""
+        """Count the step; decide where a block is over.
+
+        Parameters
+        ----------
+        session : GuardSession
+            The model under guard.
+        dones, rewards : ndarray, shape (n_envs,)
+            Whether each episode ends here, and the rewards of the step.
+        infos : sequence of dict
+            The info of each env.
+        """
         state, evidence = session.state, _evidence(session)
         self._enroll(session)
         if self.accepted_led.any() and not state.accepted.is_actor_of(session.policy):

@@ -25,7 +25,17 @@ Simulator: TypeAlias = str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
 
 @dataclass
 class GuardSession:
-    """One model under guard, during one `learn`; ``simulator`` is None on a plant alone."""
+    """One model under guard, during one `learn`.
+
+    Attributes
+    ----------
+    model : OffPolicyAlgorithm, in training
+    policy : YannPolicy, the model's
+    simulator : gymnasium.Env, str, callable or None, where candidates play; None on a plant alone
+    step_size, log_path, verbose : StepSize, Path or None and int, as in :class:`ImprovementGuard`
+    interrupted : bool, whether Ctrl-C has restored the accepted policy: nothing else may be then
+    before_trial : tuple or None, what was accepted, its evidence and ``passed`` before a trial
+    """
 
     model: OffPolicyAlgorithm
     policy: YannPolicy
@@ -34,9 +44,7 @@ class GuardSession:
     log_path: Path | None
     verbose: int
     interrupted: bool = False
-    """Whether Ctrl-C has restored the accepted policy, so that nothing else may be restored."""
     before_trial: tuple[ActorCheckpoint, Any, list[Any]] | None = None
-    """The accepted checkpoint, its evidence and ``passed`` before a trial that is under way."""
 
     def __post_init__(self) -> None:
         if self.policy.actor.mu.network.is_zero():
@@ -108,7 +116,15 @@ class GuardSession:
         worst_start: float = math.nan,
         regions: tuple[int, ...] = (),
     ) -> None:
-        """Set the step size, and log a Decision of these fields."""
+        """Set the step size, and log a Decision.
+
+        Parameters
+        ----------
+        verdict, reason, restored, worst_start, regions
+            Fields of the :class:`Decision`.
+        costs : triple of float
+            Mean costs of the candidate, the policy accepted now and the MPC.
+        """
         state, step, steps = self.state, self.state.step, self.model.num_timesteps
         if verdict == "accepted":
             step = min(1.0, step * self.step_size.grow)

@@ -33,7 +33,15 @@ REPLAYED = 5
 
 @dataclass
 class SimulatorAcceptance:
-    """Plays each candidate from the same seeded starts, and confirms it on new ones."""
+    """Plays each candidate from the same seeded starts, and confirms it on new ones.
+
+    Attributes
+    ----------
+    name : str, that of the simulator
+    seeds : range, the seeded starts
+    n_new_starts, n_final_starts, eval_every, patience : int, as in :class:`ImprovementGuard`
+    keep_if_worse, rule : bool and AcceptanceRule, likewise
+    """
 
     name: str
     seeds: range
@@ -108,7 +116,13 @@ class SimulatorAcceptance:
         """Do nothing: the training env may meet any candidate."""
 
     def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
-        """Try the policy where an episode has ended and it is time."""
+        """Try the policy where an episode has ended and it is time.
+
+        Parameters
+        ----------
+        session, dones, rewards, infos
+            As in `PlantAcceptance.step`; the last two are not used.
+        """
         episodes = session.state.episodes
         if np.any(dones) and episodes - self.last_trial >= self.eval_every:
             self.last_trial = episodes

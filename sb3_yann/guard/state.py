@@ -62,9 +62,17 @@ class Decision:
 class GuardState:
     """All that a stopped run needs to go on; it travels in the model's zip.
 
-    ``passed`` are earlier accepted checkpoints, the latest last, with their outcomes on the first
-    of the known starts. ``new_starts`` counts the new starts, ``next_start`` is the seed of the
-    next.
+    Attributes
+    ----------
+    settings : dict, what the evidence depends on
+    accepted : ActorCheckpoint, the one accepted last
+    evidence : Evidence, BlockEvidence or None, what candidates are compared with
+    step : float, factor of the actor's learning rate
+    episodes, rejections : int, training episodes so far, and refusals in a row
+    new_starts, next_start : int, number of new starts so far, and the seed of the next
+    passed : list of (ActorCheckpoint, Outcome or None), the latest last
+        Earlier accepted checkpoints, with their outcomes on the first of the known starts.
+    decisions : list of Decision, all so far
     """
 
     settings: dict[str, Any]
@@ -86,7 +94,15 @@ class GuardState:
 def log_last(
     decisions: list[Decision], model: BaseAlgorithm, path: Path | None, verbose: int
 ) -> None:
-    """Write the last decision to the CSV file, to the model's logger and to the screen."""
+    """Write the last decision to the CSV file, to the model's logger and to the screen.
+
+    Parameters
+    ----------
+    decisions, model : list of Decision and BaseAlgorithm
+        All decisions so far, and the model whose logger is used.
+    path, verbose : Path or None and int
+        The CSV file, if any, and whether to print.
+    """
     last = decisions[-1]
     for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
         model.logger.record(f"guard/{name}", getattr(last, name))

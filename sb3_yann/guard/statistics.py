@@ -23,8 +23,13 @@ UNSAFE = (
 class PairedEpisodes:
     """Episodes from the same starts, under the MPC and under the accepted policy.
 
-    ``costs`` and ``unsafe`` are the accepted policy's. The columns of ``unsafe``, named in
-    ``UNSAFE``, are compared one by one: an episode cut short has fewer steps to violate in.
+    Attributes
+    ----------
+    mpc_costs, costs : ndarray, shape (episodes,), those of the MPC and of the accepted policy
+    unsafe : ndarray of int, shape (episodes, 3), the accepted policy's
+        The columns, named in ``UNSAFE``, are compared one by one: an episode cut short has fewer
+        steps to violate in.
+    margin : float, what one start may cost more than with the MPC
     """
 
     mpc_costs: Array

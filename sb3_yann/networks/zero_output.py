@@ -70,8 +70,11 @@ class StackedLinear(nn.Module):
 
     Parameters
     ----------
-    in_features, out_features, n_stacked, scale
-        As in :class:`PairedLinear`.
+    in_features, out_features : int
+    n_stacked : int, default 1
+        Number of independent layers in one tensor.
+    scale : float, default 0.01
+        Initial weights are uniform in [-scale, scale]; biases start at zero.
     """
 
     def __init__(
