@@ -15,6 +15,14 @@ class LinearSystem(ReadOnlyArrays):
     """``x[k+1] = A x[k] + B u[k] + E d[k]`` about ``(x_ss, u_ss, d_ss)``: data, not validated.
 
     Linearization and identification return it; `LinearModel` validates it.
+
+    Attributes
+    ----------
+    A, B, E, dt : ndarray, shapes (n, n), (n, m) and (n, d), and float
+        The matrices in discrete time, and the sampling time.
+    x_ss, u_ss, d_ss : ndarray, shapes (n,), (m,) and (d,)
+    notes, drift : tuple of str, and ndarray, shape (n,), optional
+        Remarks, and the measured motion in one sample at the operating point.
     """
 
     A: Array
@@ -57,7 +65,13 @@ def combination(factors: Array, labels: Sequence[str], digits: int) -> str:
 
 
 def zero_order_hold(A: Array, B: Array, E: Array, dt: float) -> tuple[Array, Array, Array]:
-    """Return A, B, E of ``dx/dt = A x + B u + E d`` in discrete time, u and d held for ``dt``."""
+    """Return A, B, E of ``dx/dt = A x + B u + E d`` in discrete time, u and d held for ``dt``.
+
+    Parameters
+    ----------
+    A, B, E, dt : ndarray, shapes (n, n), (n, m) and (n, d), and float
+        The matrices in continuous time, and the sampling time.
+    """
     import control  # imports matplotlib: only paid for where it is used
 
     m, driven = B.shape[1], np.hstack([B, E])

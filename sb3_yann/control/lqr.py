@@ -1,9 +1,7 @@
 """Discounted linear-quadratic control: value, gain, and the state-action value matrix.
 
-Costs are ``sum_k gamma^k (x' Q x + 2 x' N u + u' R u)``, weighed by Q (n, n), R (m, m) and N (n,
-m), the argument ``cross``, zero by default. With gamma in (0, 1], ``sqrt(gamma) A`` (n, n) and
-``sqrt(gamma) B`` (n, m) of the model obey the undiscounted equations. P (n, n) weighs the state
-after one step; K (m, n) is the gain of the law ``u = -K x``.
+Costs are ``sum_k gamma^k (x' Q x + 2 x' N u + u' R u)``. With ``sqrt(gamma) A`` and
+``sqrt(gamma) B`` in place of A and B, the undiscounted equations hold.
 """
 
 from __future__ import annotations
@@ -22,6 +20,13 @@ def riccati(
 
     It solves ``P = Q + g A'PA - (g A'PB + N) (R + g B'PB)^-1 (g B'PA + N')`` for ``g = gamma``.
     A model without a stabilizing solution raises ValueError with the reason.
+
+    Parameters
+    ----------
+    model, gamma : LinearSystem, and float
+        A (n, n) and B (n, m), and the discount in (0, 1].
+    Q, R, cross : ndarray, shapes (n, n), (m, m) and (n, m)
+        Weights Q, R and N of the cost; N is 0 by default.
     """
     A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
     try:
@@ -38,7 +43,15 @@ def riccati(
 def gain(
     model: LinearSystem, R: Array, P: Array, gamma: float = 1.0, cross: Array | None = None
 ) -> Array:
-    """Return K (m, n): ``u = -K x`` minimizes ``2x'Nu + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``."""
+    """Return K (m, n): ``u = -K x`` minimizes ``2x'Nu + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)``.
+
+    Parameters
+    ----------
+    model, gamma : LinearSystem, and float
+        A (n, n) and B (n, m), and the discount in (0, 1].
+    R, P, cross : ndarray, shapes (m, m), (n, n) and (n, m)
+        Weights of the input and of the state after one step, and N, 0 by default.
+    """
     PB = P @ model.B
     factor = linalg.cho_factor(R + gamma * model.B.T @ PB)
     slope = gamma * PB.T @ model.A
@@ -53,6 +66,13 @@ def policy_value(
     It solves ``P = Q - NK - K'N' + K'RK + gamma (A - BK)' P (A - BK)``, a Lyapunov equation. Only
     this P makes the value of :func:`state_action_matrix` satisfy Bellman's equation along the law.
     An unstable discounted closed loop, of infinite cost, raises ValueError.
+
+    Parameters
+    ----------
+    model, gamma : LinearSystem, and float
+        A (n, n) and B (n, m), and the discount in (0, 1].
+    Q, R, K, cross : ndarray, shapes (n, n), (m, m), (m, n) and (n, m)
+        Weights Q and R of the cost, the gain of the law, and N, 0 by default.
     """
     closed = np.sqrt(gamma) * (model.A - model.B @ K)
     radius = spectral_radius(closed)
@@ -75,6 +95,13 @@ def state_action_matrix(model: LinearSystem, Q: Array, R: Array, P: Array, gamma
     The state-action value of Braniff & Tian, Section 4.2. Their P is that of the undiscounted
     Riccati equation, which does not satisfy Bellman's equation for gamma < 1: pass that of
     :func:`policy_value`.
+
+    Parameters
+    ----------
+    model, gamma : LinearSystem, and float
+        A (n, n) and B (n, m), and the discount in (0, 1].
+    Q, R, P : ndarray, shapes (n, n), (m, m) and (n, n)
+        Weights of the state, of the input, and of the state after one step.
     """
     AB = np.hstack([model.A, model.B])
     return np.asarray(linalg.block_diag(Q, R) + gamma * AB.T @ P @ AB)

@@ -89,6 +89,11 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
     """Return the rows that bound a polyhedron with a ball of this radius about a point inside.
 
     Rows that only touch it may be among them, and duplicate rows are all kept.
+
+    Parameters
+    ----------
+    A, b, inside, radius : ndarray, shapes (q, n), (q,) and (n,), and float
+        The polyhedron, bounded, and the center and radius of the ball.
     """
     slack = b - A @ inside
     if radius < SLIM:

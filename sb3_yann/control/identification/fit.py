@@ -42,7 +42,15 @@ def fit_log(  # noqa: PLR0913 - those of `identify`
     held_out: float = 0.2,
     time: Log | None = None,
 ) -> LogFit:
-    """Return the least-squares fit to measured episodes; `identify` documents the parameters."""
+    """Return the least-squares fit to measured episodes.
+
+    Parameters
+    ----------
+    states, actions, disturbances, time : array_like, or sequence of such
+        Episodes, of shapes (T+1, n), (T, m), (T, d) and (T+1,).
+    dt, x_ss, u_ss, d_ss, offset, ridge, held_out : float, array_like, bool
+        As of `identify`: sampling time, operating point (n,), (m,) and (d,), and options.
+    """
     episodes, sizes = as_episodes(states, actions, disturbances)
     dt, lost = as_positive("dt", dt), 0
     if time is not None:

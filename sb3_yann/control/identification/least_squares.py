@@ -22,20 +22,33 @@ NOT_EXCITED = (
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """``x[k+1] = reached + coefficients (z[k] - center)``, n states x, p regressors z."""
+    """``x[k+1] = reached + coefficients (z[k] - center)``, n states x, p regressors z.
 
-    coefficients: Array  # (n, p)
-    standard_errors: Array  # (n, p)
-    center: Array  # (p,)
-    reached: Array  # (n,)
-    spread: Array  # (p,), root mean square of each regressor about the center
-    factors: Array  # (p,), standard errors of each column relative to the residuals' deviation
-    covariance: Array  # (n, n), of the residuals
-    autocorrelation: Array  # (n,), of the residuals, one step apart; zero where they are rounding
+    Attributes
+    ----------
+    coefficients, standard_errors : ndarray, shape (n, p)
+    center, reached : ndarray, shapes (p,) and (n,)
+    spread, factors : ndarray, shape (p,)
+        Root mean square about the center; a column's standard errors over the residuals' deviation.
+    covariance, autocorrelation : ndarray, shapes (n, n) and (n,)
+        Of the residuals; the latter one step apart, zero where they are rounding.
+    degrees_of_freedom, steps : int
+    excitation, weakest : float and str
+        Smallest over largest singular value of the scaled regressors; what moved least.
+    """
+
+    coefficients: Array
+    standard_errors: Array
+    center: Array
+    reached: Array
+    spread: Array
+    factors: Array
+    covariance: Array
+    autocorrelation: Array
     degrees_of_freedom: int
     steps: int
-    excitation: float  # smallest over largest singular value of the scaled regressors
-    weakest: str  # the combination of regressors that moved least
+    excitation: float
+    weakest: str
 
     def predict(self, regressors: Array) -> Array:
         """Return the next states (k, n) for regressors (k, n+m+d)."""

@@ -92,6 +92,11 @@ def build_tree(
 
     Vertices tell on which side a region lies. Rounding may move some: a search has to check its
     result by the slack.
+
+    Parameters
+    ----------
+    A, b, starts, theta_min, theta_max : ndarray, shapes (q, n), (q,), (p,), (n,) and (n,)
+        The half-spaces of the law, the first row of each region, and the box, bounded.
     """
     center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
     regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))

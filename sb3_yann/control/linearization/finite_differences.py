@@ -15,12 +15,20 @@ LEVELS, RATIO = 6, 4.0
 
 @dataclass(frozen=True, eq=False)
 class Jacobian:
-    """A Jacobian (r, c), and what its differences showed."""
+    """A Jacobian, and what its differences showed.
 
-    value: Array  # (r, c), exactly zero where not above its own error
-    dropped: float  # the largest derivative that was set to zero
-    steps: Array  # (c,), the longest step in each coordinate
-    change: Array  # (c,), error of the longest step relative to its column, NaN without a value
+    Attributes
+    ----------
+    value, dropped : ndarray, shape (r, c), and float
+        Exactly zero where not above its own error, and the largest derivative set to zero.
+    steps, change : ndarray, shape (c,)
+        The longest steps, and their errors relative to the column, NaN without a value.
+    """
+
+    value: Array
+    dropped: float
+    steps: Array
+    change: Array
 
 
 class NotSmoothError(ValueError):

@@ -35,7 +35,15 @@ def linearize_dynamics(
     d_ss: ArrayLike | None,
     scale: ArrayLike | None = None,
 ) -> LinearSystem:
-    """Return the sampled linearization of `LinearModel.from_dynamics`."""
+    """Return the sampled linearization of `LinearModel.from_dynamics`.
+
+    Parameters
+    ----------
+    f, dt : callable, and float
+        Returns dx/dt (n,) for x and u, with ``d_ss`` also d; the sampling time.
+    x_ss, u_ss, d_ss, scale : array_like, shapes (n,), (m,), (d,), and (n,) or (n + m + d,)
+        A steady state of f, and the range of each entry. d_ss and scale may be None.
+    """
     x, u = as_array("x_ss", x_ss, ("n",)), as_array("u_ss", u_ss, ("m",))
     d = as_array("d_ss", [] if d_ss is None else d_ss, ("d",))
     dt = as_positive("dt", dt)
@@ -101,7 +109,15 @@ def linearize_env(
     get_state: Callable[[Any], ArrayLike] | None,
     scale: ArrayLike | None,
 ) -> LinearSystem:
-    """Return the linearized step of `LinearModel.from_env`."""
+    """Return the linearized step of `LinearModel.from_env`, which documents what None stands for.
+
+    Parameters
+    ----------
+    env, dt, set_state, get_state : Maker, float or None, callable or None
+        The simulator, the time of one step, and what sets and returns the state (n,).
+    state, action, scale : array_like, shapes (n,), (m,) and (n,), or None
+        The operating point, NaN where it is to be solved for, and the range of each state.
+    """
     with contextlib.closing(borrow(env)) as borrowed:
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)

@@ -32,7 +32,14 @@ READERS: dict[str, Reader] = {
 
 @dataclass
 class Borrowed:
-    """An environment for experiments: `private` to them, or `owned` and so closed afterwards."""
+    """An environment for experiments: `private` to them, or `owned` and so closed afterwards.
+
+    Attributes
+    ----------
+    env, note : gymnasium.Env and str
+        The environment, and where it comes from.
+    private, owned : bool
+    """
 
     env: Any
     note: str

@@ -62,6 +62,13 @@ def require_steady_state(simulator: Simulator, point: Array, jacobian: Array, sc
     """Raise ValueError if a given operating point is far from the linear model's steady states.
 
     Its motion alone tells little: in a short sample a plant hardly moves from anywhere.
+
+    Parameters
+    ----------
+    simulator, jacobian : Simulator, and ndarray, shape (n, n+m)
+        What is stepped, and the derivatives of its next state at the point.
+    point, scale : ndarray, shape (n+m,)
+        State and action, and the range in which each moves in use.
     """
     moved = residual(simulator, point, scale)
     n = moved.size

@@ -24,7 +24,17 @@ from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MPCProblem(ReadOnlyArrays):
-    """The arguments of a :class:`LinearMPC`, whose constructor has checked them."""
+    """The arguments of a :class:`LinearMPC`, whose constructor has checked them.
+
+    Attributes
+    ----------
+    model, Q, R : LinearModel, and ndarray, shapes (n, n) and (m, m)
+    horizon, gamma, infeasible : int, float and str
+    x_min, x_max, u_min, u_max, theta_min, theta_max : ndarray, shapes (n,), (m,) and (n_theta,)
+        Infinite where there is no bound.
+    tracking, disturbances, rate, outputs, soft, terminal : Tracking, DisturbanceBounds, ...
+        Never None, and in the sizes of the model.
+    """
 
     model: LinearModel
     Q: Array
