@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from sb3_yann._validation import Array
 from sb3_yann.control import ParametricQP, PiecewiseAffine
 from sb3_yann.control.polyhedra import largest_ball
 
-Array = NDArray[np.float64]
 PPOPT = "ppopt evaluate, as shipped"
 NO_OVERLAP = "ppopt evaluate, overlap flag off"
 POINT_LOCATION = "ppopt PointLocation (numba), as shipped"

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sb3_yann._validation import Array
 from sb3_yann.control import LinearModel, LinearMPC, PiecewiseAffine
 from sb3_yann_envs import problems
-
-Array = NDArray[np.float64]
 
 
 @dataclass(eq=False)

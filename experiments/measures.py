@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import bootstrap, trim_mean
 
 from experiments.runner import Outcome, Run
-
-Array = NDArray[np.float64]
+from sb3_yann._validation import Array
 
 OURS, MPC, OPTIMUM = "YANN-RL", "MPC", "optimum"
 FIRST = (OPTIMUM, MPC, "LQR", OURS)

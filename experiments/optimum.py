@@ -18,16 +18,16 @@ from functools import partial
 import gymnasium
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann_envs import clipped_pendulum as pendulum
 from sb3_yann_envs import cstr as reactor
 from sb3_yann_envs import problems
 
-Array = NDArray[np.float64]
 Policy = Callable[[int, Tensor], Tensor]  # step and states (k, n) -> inputs (k,)
 
 STEP_SIZES = 0.5 ** torch.arange(12, dtype=torch.float64)[:, None, None]

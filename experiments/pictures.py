@@ -12,12 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
-from numpy.typing import NDArray
 
 from experiments.measures import MPC, OPTIMUM, OURS
 from experiments.runner import Outcome, Run
-
-Array = NDArray[np.float64]
+from sb3_yann._validation import Array
 
 # Okabe and Ito's colors, told apart with any color vision; ours is always the first.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -195,12 +195,16 @@ def _short(value: Any) -> str:
 class ReadOnlyArrays:
     """A frozen dataclass that compares its arrays, and keeps them read-only when unpickled."""
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        for value in state.values():
+    def _store(self, **values: Any) -> None:
+        """Set fields, for a constructor that takes more than it keeps; arrays become read-only."""
+        for value in values.values():
             for array in value if isinstance(value, tuple) else (value,):
                 if isinstance(array, np.ndarray):
                     array.setflags(write=False)
-        self.__dict__.update(state)
+        vars(self).update(values)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._store(**state)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, type(self)):
@@ -210,8 +214,9 @@ class ReadOnlyArrays:
 
 
 def _same(one: Any, other: Any) -> bool:
-    pairs = zip(one, other, strict=True) if isinstance(one, tuple) else [(one, other)]
-    return all(np.array_equal(x, y) for x, y in pairs)
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return bool(np.array_equal(one, other))
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:

@@ -30,7 +30,8 @@ FLOORS = [
     {"sb3_yann"},
 ]
 """Each floor may import from those before it: control -> networks -> twin -> the parts for
-Stable-Baselines3 -> export. `sb3_yann` itself, which only names what there is, comes last."""
+Stable-Baselines3 -> export. Rooms to come (twin, commissioning, export) have their floor already.
+`sb3_yann` itself, which only names what there is, comes last."""
 
 FORBIDDEN = {
     "sb3_yann._validation": {"torch", "stable_baselines3", "gymnasium"},

@@ -13,6 +13,7 @@ import torch as th
 from numba.core.dispatcher import Dispatcher
 from stable_baselines3 import DDPG
 
+from fresh_process import run_python
 from sb3_yann import NoActionNoise, YannPolicy
 from sb3_yann.control.law import _kernels, search_tree
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
@@ -42,6 +43,20 @@ def test_all_that_is_known_to_be_called_is_looked_at() -> None:
     assert names >= {"law_at", "law_of_batch", "locate_batch", "_hits", "_sides", "_forward"}
     assert names >= {"_backward", "_forms", "_output", "_output_backward", "_forms_backward"}
     assert names >= {"_rates", "advance", "advance_all", "is_rich"}
+
+
+@pytest.mark.parametrize("critic", ["afterstate", "state_action"])
+def test_compiled_code_is_loaded_when_a_policy_is_built(critic) -> None:
+    # In learn a Ctrl-C while numba begins would break it for the whole process.
+    program = f"""
+import sys, sb3_yann
+from stable_baselines3 import DDPG
+DDPG("YannPolicy", "CSTR-v0", device="cpu", policy_kwargs={{"critic": "{critic}"}})
+print(*sys.modules)
+"""
+    loaded = run_python(program).stdout.decode().split()
+    assert "sb3_yann.networks._kernels.yann_layer" in loaded
+    assert ("sb3_yann.networks._kernels.afterstate_value" in loaded) == (critic == "afterstate")
 
 
 def test_ctrl_c_at_any_moment_of_training_is_a_keyboard_interrupt() -> None:

@@ -1,4 +1,4 @@
-"""Compiled functions for what is stepped millions of times."""
+"""Compiled functions of the envs, which do without `sb3_yann` and so without its `_numba`."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from sb3_yann.guard.session import GuardSession, Simulator, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, write_csv
 from sb3_yann.policy._finite import watch_buffer
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.policies import require_yann_policy
 
 
 class ImprovementGuard(BaseCallback):
@@ -147,10 +147,7 @@ class ImprovementGuard(BaseCallback):
 
     def _init_callback(self) -> None:
         check_not_nested(self)
-        policy = self.model.policy
-        if not isinstance(policy, YannPolicy):
-            name = type(policy).__name__
-            raise TypeError(f"ImprovementGuard compares a YannPolicy with its MPC, not a {name}.")
+        policy = require_yann_policy(self.model.policy, "ImprovementGuard")
         watch_buffer(self.model)
         self.session = GuardSession(
             self.model, policy, self.env, self.step_size, self.log_path, self.verbose

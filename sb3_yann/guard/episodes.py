@@ -73,7 +73,7 @@ class Starts:
         return np.asarray(np.nan_to_num(outcome.costs - self.mpc.costs, nan=np.inf))
 
     def more_unsafe(self, outcome: Outcome) -> NDArray[np.bool_]:
-        """Return which violate a limit more often than with the MPC, or are terminated."""
+        """Return which break a limit, end early or are not finite, more often than with the MPC."""
         return np.asarray((outcome.unsafe > self.mpc.unsafe).any(1))
 
     def lost(self, outcome: Outcome) -> NDArray[np.bool_]:

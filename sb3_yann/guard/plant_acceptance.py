@@ -1,4 +1,4 @@
-"""Decisions by the training episodes alone, for a plant without a simulator."""
+"""Accepts or refuses a candidate by the training episodes alone: a plant without a simulator."""
 
 from __future__ import annotations
 

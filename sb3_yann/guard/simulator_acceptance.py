@@ -1,4 +1,7 @@
-"""Decisions by paired episodes in a simulator."""
+"""Accepts or refuses a candidate by paired episodes in a simulator.
+
+`_judge` decides; `statistics.PairedEpisodes.objection` says why a candidate is refused.
+"""
 
 from __future__ import annotations
 

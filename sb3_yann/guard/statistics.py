@@ -1,4 +1,4 @@
-"""When a policy counts as no worse: in paired episodes of a simulator, or on a plant alone."""
+"""Why a candidate is refused: in paired episodes of a simulator, or on a plant alone."""
 
 from __future__ import annotations
 

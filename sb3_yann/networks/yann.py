@@ -1,7 +1,11 @@
-"""The YANN layer: the active region's affine law plus that region's own trainable network."""
+"""The YANN layer: the active region's affine law plus that region's own trainable network.
+
+It puts out actions in [-1, 1], which stand for ``u_min`` and ``u_max`` of the law.
+"""
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -66,6 +70,8 @@ class YannLayer(nn.Module):
         rate: tuple[Array, Array] | None = None,
     ) -> None:
         super().__init__()
+        # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
+        import_module("sb3_yann.networks._kernels.yann_layer")
         if not np.all(np.isfinite([law.u_min, law.u_max])):
             raise ValueError(
                 f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "

@@ -1,4 +1,7 @@
-"""The YANN actor and critic, in the places of those of Stable-Baselines3's TD3 and DDPG."""
+"""The YANN actor and critic, in the places of those of Stable-Baselines3's TD3 and DDPG.
+
+Actions are in [-1, 1]. Stable-Baselines3 gives them units, in its `unscale_action`.
+"""
 
 from __future__ import annotations
 

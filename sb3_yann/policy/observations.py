@@ -42,7 +42,7 @@ class AffineObservation(ReadOnlyArrays):
     def __post_init__(self) -> None:
         matrix = as_array("matrix", self.matrix, ("n_theta", "n_obs"))
         offset = np.zeros(len(matrix)) if self.offset is None else self.offset
-        vars(self).update(matrix=matrix, offset=as_array("offset", offset, (len(matrix),)))
+        self._store(matrix=matrix, offset=as_array("offset", offset, (len(matrix),)))
 
     @classmethod
     def identity(cls, size: int) -> AffineObservation:

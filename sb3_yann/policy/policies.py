@@ -248,7 +248,8 @@ def require_yann_policy(policy: BasePolicy, who: str) -> YannPolicy:
     if not isinstance(policy, YannPolicy):
         name = type(policy).__name__
         raise TypeError(
-            f"{who} compares a YannPolicy with its MPC; the policy of this model is {name}."
+            f"{who} needs a YannPolicy; the policy of this model is {name}. Build it as "
+            'DDPG("YannPolicy", env).'
         )
     return policy
 

@@ -95,7 +95,7 @@ def test_a_simulator_of_another_shape_is_refused(env) -> None:
 
 
 def test_a_policy_without_an_mpc_is_refused() -> None:
-    with pytest.raises(TypeError, match=r"compares a YannPolicy with its MPC.*TD3Policy"):
+    with pytest.raises(TypeError, match=r"needs a YannPolicy.*TD3Policy"):
         train(DDPG("MlpPolicy", Slide()), STEPS, make_guard())
 
 

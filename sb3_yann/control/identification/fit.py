@@ -29,7 +29,7 @@ class LogFit:
     fits: tuple[Array, Array]
 
 
-def fit_log(  # noqa: PLR0913 - those of `identify`
+def fit_log(  # noqa: PLR0913 (those of `identify`)
     states: Log,
     actions: Log,
     dt: float,

@@ -105,8 +105,7 @@ class PiecewiseAffine(ReadOnlyArrays):
             )
         starts = rows.astype(np.int64)
         starts.setflags(write=False)
-        for name, value in {**values, "starts": starts}.items():
-            object.__setattr__(self, name, value)
+        self._store(**values, starts=starts)
 
     @property
     def n_regions(self) -> int:

@@ -68,7 +68,7 @@ class Identified(ReadOnlyArrays):
         return value - width, value + width
 
 
-def identify(  # noqa: PLR0913 - what a log may bring along
+def identify(  # noqa: PLR0913 (what a log may bring along)
     states: Log,
     actions: Log,
     *,

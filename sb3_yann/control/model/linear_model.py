@@ -53,7 +53,7 @@ class LinearModel(LinearSystem):
     notes: tuple[str, ...] = field(init=False, repr=False, compare=False)
     drift: Array = field(init=False, repr=False, compare=False)
 
-    def __init__(  # noqa: PLR0913 - the matrices of a plant and its operating point
+    def __init__(  # noqa: PLR0913 (the matrices of a plant and its operating point)
         self,
         A: ArrayLike,
         B: ArrayLike,

@@ -61,7 +61,7 @@ class Tracking(ReadOnlyArrays):
     r_max: Array
 
     def __init__(self, C: Outputs = (), r_min: Given = None, r_max: Given = None) -> None:
-        self.__setstate__(_outputs("Tracking.C", C, "r", r_min, r_max))
+        self._store(**_outputs("Tracking.C", C, "r", r_min, r_max))
 
     def sized(self, n_states: int) -> Tracking:
         """Return it with C as a matrix (p, n)."""
@@ -90,7 +90,7 @@ class OutputBounds(ReadOnlyArrays):
     y_max: Array
 
     def __init__(self, C: Outputs = (), y_min: Given = None, y_max: Given = None) -> None:
-        self.__setstate__(_outputs("OutputBounds.C", C, "y", y_min, y_max))
+        self._store(**_outputs("OutputBounds.C", C, "y", y_min, y_max))
 
     def sized(self, n_states: int) -> OutputBounds:
         """Return it with C as a matrix (q, n)."""
@@ -117,7 +117,8 @@ class DisturbanceBounds(ReadOnlyArrays):
     d_max: Array
 
     def __init__(self, d_min: Given = None, d_max: Given = None) -> None:
-        self.__setstate__(dict(zip(("d_min", "d_max"), _loose("d", d_min, d_max), strict=True)))
+        low, high = _loose("d", d_min, d_max)
+        self._store(d_min=low, d_max=high)
 
     def sized(self, n_disturbances: int) -> DisturbanceBounds:
         """Return it with bounds of shape (d,)."""
@@ -154,7 +155,7 @@ class RateLimits(ReadOnlyArrays):
                 "sample: du_min must be at most 0, and du_max at least 0."
             )
         weight = _square("R_du", np.zeros((0, 0)) if R_du is None else R_du)
-        self.__setstate__({"du_min": low, "du_max": high, "R_du": weight})
+        self._store(du_min=low, du_max=high, R_du=weight)
 
     @property
     def bounded(self) -> bool:
@@ -213,7 +214,7 @@ class SoftBounds(ReadOnlyArrays):
         if penalty and not soft:
             raise ValueError(f"SoftBounds.penalty = {penalty!r}, but nothing is soft: pass x or y.")
         cost = check.as_positive("SoftBounds.penalty", penalty) if soft else 0.0
-        self.__setstate__({**units, "penalty": cost})
+        self._store(**units, penalty=cost)
 
     def sized(self, x: Bounds, y: Bounds) -> SoftBounds:
         """Return it with an entry for each bound of the states and of the outputs."""
@@ -249,7 +250,7 @@ class Terminal(ReadOnlyArrays):
         cost = None if cost is None else _square("Terminal.cost", cost)
         if set is not None and not (isinstance(set, str) and set == "invariant"):
             set = _half_spaces(set)
-        self.__setstate__({"cost": cost, "set": set})
+        self._store(cost=cost, set=set)
 
 
 def _square(name: str, value: ArrayLike) -> Array:

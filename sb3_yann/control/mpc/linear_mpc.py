@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -268,7 +268,9 @@ def _as_group(name: str, value: G | None, kind: type[G]) -> G:
 
 def _completed(problem: MPCProblem) -> Terminal:
     """Return the terminal cost and set of a problem, solved where they are left to it."""
-    errors, (cost, half_spaces) = problem.error_system, vars(problem.terminal).values()
+    errors = problem.error_system
+    cost: Any = problem.terminal.cost
+    half_spaces: Any = problem.terminal.set
     if cost is None:
         cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
     cost = as_symmetric("Terminal.cost", cost, len(errors.Q))
