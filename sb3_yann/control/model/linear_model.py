@@ -75,7 +75,7 @@ class LinearModel(LinearSystem):
             raise ValueError(f"B has shape {B.shape}: the model needs at least one input.")
         E = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
         if d_ss is not None and np.size(d_ss) and not E.size:
-            raise ValueError(f"d_ss = {d_ss!r} is given, but no disturbances: pass E too.")
+            raise ValueError(f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E.")
         x, u = as_vector("x_ss", x_ss, n), as_vector("u_ss", u_ss, B.shape[1])
         d, moved = as_vector("d_ss", d_ss, E.shape[1]), as_vector("drift", drift, n)
         super().__init__(A, B, as_positive("dt", dt), x, u, E, d, tuple(notes), moved)
