@@ -95,9 +95,10 @@ def as_output_rows(
         return as_array(name, value, ("q", "n"))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
     if not whole or np.any(entries < 0) or np.any(entries > most):
+        limit = f"from 0 to {most}" if np.isfinite(most) else "from 0 on"
         raise ValueError(
-            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers from "
-            f"0 to {most}, or an output matrix as a list of rows, [[...], [...]]."
+            f"{name} = {np.asarray(value).tolist()} must be indices of states, whole numbers "
+            f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
         )
     return entries.astype(int)
 
