@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import random
-import signal
-from collections import Counter
-
-import gymnasium
 import numba
 import pytest
-import torch as th
 from numba.core.dispatcher import Dispatcher
-from stable_baselines3 import DDPG
 
 from fresh_process import run_python
-from sb3_yann import NoActionNoise, YannPolicy
 from sb3_yann.control.law import _kernels, search_tree
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
 from sb3_yann_envs import cstr
@@ -50,7 +42,6 @@ def test_compiled_code_is_loaded_when_a_policy_is_built(critic) -> None:
     # In learn a Ctrl-C while numba begins would break it for the whole process.
     program = f"""
 import sys, sb3_yann
-from stable_baselines3 import DDPG
 DDPG("YannPolicy", "CSTR-v0", device="cpu", policy_kwargs={{"critic": "{critic}"}})
 print(*sys.modules)
 """
@@ -59,22 +50,29 @@ print(*sys.modules)
     assert ("sb3_yann.networks._kernels.afterstate_value" in loaded) == (critic == "afterstate")
 
 
-def test_ctrl_c_at_any_moment_of_training_is_a_keyboard_interrupt() -> None:
-    draw, raised = random.Random(0), Counter()
-    model = DDPG(YannPolicy, gymnasium.make("CSTR-v0"), seed=0, batch_size=8, learning_starts=10)
-    model.learn(50, callback=NoActionNoise())
-    alarm = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+INTERRUPTED = """
+import collections, random, signal
+import gymnasium, torch as th
+
+th.set_num_threads(1)
+draw, raised = random.Random(0), collections.Counter()
+model = DDPG(YannPolicy, gymnasium.make("CSTR-v0"), seed=0, batch_size=8, learning_starts=10)
+model.learn(50, callback=NoActionNoise())
+signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+for _ in range(60):
+    th.set_grad_enabled(True)  # which torch's own no_grad forgets if it is cut off itself
+    model._last_obs = None  # an episode may have been cut off in the midst of a step
     try:
-        for _ in range(60):
-            th.set_grad_enabled(True)  # which torch's own no_grad forgets if it is cut off itself
-            model._last_obs = None  # an episode may have been cut off in the midst of a step
-            try:
-                signal.setitimer(signal.ITIMER_REAL, draw.uniform(0.01, 0.04), 1.0)
-                model.learn(10**6, callback=NoActionNoise(), reset_num_timesteps=False)
-            except (KeyboardInterrupt, Exception) as error:
-                raised[type(error).__name__] += 1
-            finally:
-                signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_REAL, draw.uniform(0.01, 0.04), 1.0)
+        model.learn(10**6, callback=NoActionNoise(), reset_num_timesteps=False)
+    except (KeyboardInterrupt, Exception) as error:
+        raised[type(error).__name__] += 1
     finally:
-        signal.signal(signal.SIGALRM, alarm)
-    assert raised == {"KeyboardInterrupt": 60}
+        signal.setitimer(signal.ITIMER_REAL, 0)
+print(dict(raised))
+"""
+
+
+def test_ctrl_c_at_any_moment_of_training_is_a_keyboard_interrupt() -> None:
+    # In a process of its own: what ran before in this one may have taken the signal away.
+    assert run_python(INTERRUPTED, timeout=200).stdout.decode() == "{'KeyboardInterrupt': 60}\n"

@@ -7,8 +7,14 @@ import subprocess
 import sys
 
 
-def run_python(code: str, *args: str, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
+def run_python(
+    code: str, *args: str, stdin: bytes = b"", timeout: float | None = None
+) -> subprocess.CompletedProcess[bytes]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     return subprocess.run(
-        [sys.executable, "-c", code, *args], input=stdin, capture_output=True, env=environment
+        [sys.executable, "-c", code, *args],
+        input=stdin,
+        capture_output=True,
+        env=environment,
+        timeout=timeout,
     )
