@@ -42,10 +42,13 @@ def test_compiled_code_is_loaded_when_a_policy_is_built(critic) -> None:
     # In learn a Ctrl-C while numba begins would break it for the whole process.
     program = f"""
 import sys, sb3_yann
+from stable_baselines3 import DDPG
 DDPG("YannPolicy", "CSTR-v0", device="cpu", policy_kwargs={{"critic": "{critic}"}})
 print(*sys.modules)
 """
-    loaded = run_python(program).stdout.decode().split()
+    done = run_python(program)
+    loaded = done.stdout.decode().split()
+    assert loaded, done.stderr.decode()
     assert "sb3_yann.networks._kernels.yann_layer" in loaded
     assert ("sb3_yann.networks._kernels.afterstate_value" in loaded) == (critic == "afterstate")
 
@@ -53,6 +56,8 @@ print(*sys.modules)
 INTERRUPTED = """
 import collections, random, signal
 import gymnasium, torch as th
+from stable_baselines3 import DDPG
+from sb3_yann import NoActionNoise, YannPolicy
 
 th.set_num_threads(1)
 draw, raised = random.Random(0), collections.Counter()
@@ -75,4 +80,5 @@ print(dict(raised))
 
 def test_ctrl_c_at_any_moment_of_training_is_a_keyboard_interrupt() -> None:
     # In a process of its own: what ran before in this one may have taken the signal away.
-    assert run_python(INTERRUPTED, timeout=200).stdout.decode() == "{'KeyboardInterrupt': 60}\n"
+    done = run_python(INTERRUPTED, timeout=200)
+    assert done.stdout.decode() == "{'KeyboardInterrupt': 60}\n", done.stderr.decode()
