@@ -255,6 +255,12 @@ class ObserveDisturbance(_Appending):
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         observer = self.observer
         measured, rest = np.split(observation, [observer.n_measured])
+        if not (known := np.isfinite(measured)).all():
+            at = f"The measurement {measured.tolist()} is not finite: the observer predicts it."
+            warnings.warn(at, NonFiniteWarning, stacklevel=4)
+            state = 0 * observer.estimate
+            state = state if u is None else observer.A @ observer.estimate + observer.B @ u
+            measured = np.where(known, measured, observer.seen @ state)
         x_hat, d_hat = observer.reset(measured) if u is None else observer.update(measured, u)
         return _joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
 

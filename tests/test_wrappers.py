@@ -218,3 +218,20 @@ def test_a_disturbance_that_is_not_finite_is_named_once_and_the_last_one_holds()
         assert env.step(np.zeros(1))[0][2] == np.float32(0.1)
     assert env.step(np.zeros(1))[0][2] == np.float32(0.1)
     assert env.step(np.zeros(1))[0][2] == np.float32(0.4)
+
+
+def test_a_measurement_that_is_not_finite_is_named_and_predicted() -> None:
+    class Fails(gym.Wrapper):
+        def step(self, action):
+            observation, *rest = self.env.step(action)
+            return observation * (np.nan if self.unwrapped.steps == 2 else 1), *rest
+
+    model = LinearModel(np.eye(2) / 2, [[1.0], [0.0]], dt=1, E=np.eye(2))
+    env = ObserveDisturbance(Fails(Counter()), DisturbanceObserver(model), [-1, -1], [1, 1])
+    env.reset()
+    env.step(np.zeros(1))
+    before = env.observer.estimate.copy()
+    with pytest.warns(NonFiniteWarning, match=r"\[nan, nan\] is not finite"):
+        observation = env.step(np.zeros(1))[0]
+    np.testing.assert_allclose(env.observer.estimate, env.observer.A @ before)
+    assert np.all(np.isfinite(observation))

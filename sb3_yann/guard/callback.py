@@ -88,6 +88,7 @@ class ImprovementGuard(BaseCallback):
 
     model: OffPolicyAlgorithm
     _handler: Handler | None = None
+    _has_begun = False
 
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
         self,
@@ -155,6 +156,7 @@ class ImprovementGuard(BaseCallback):
 
     def _on_training_start(self) -> None:
         check_not_nested(self)
+        self._has_begun = False
         self.acceptance.start(self.session)
         known = getattr(self.model, "guard_state", None)
         if known is None or known.settings != self.acceptance.settings:
@@ -167,7 +169,7 @@ class ImprovementGuard(BaseCallback):
             )
             self._start_afresh(known)
         self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
-        self.session.policy.actor_step = self.state.step
+        self.session.policy.actor_step, self._has_begun = self.state.step, True
         if self.log_path is not None:
             write_csv(self.log_path, self.decisions)
 
@@ -195,7 +197,10 @@ class ImprovementGuard(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        self.session.interrupted = False  # the Zoo ends training after Ctrl-C as well
+        # The Zoo ends training after Ctrl-C as well, also before there is anything accepted.
+        if not self._has_begun:
+            return
+        self.session.interrupted = False
         self.acceptance.end(self.session)
         restore_accepted(self.model)
         if self._handler is not None:

@@ -211,6 +211,8 @@ class PlantAcceptance:
         """Accept the policy that rested in this block, or restore the accepted one."""
         difference, chance = analyze_covariance(played, accepted)
         reason = f"{difference:+.4g} from the same starts by the linear model, p = {chance:.3g}"
+        if lost := np.count_nonzero(~np.isfinite(played.costs)):
+            reason = f"{lost} of {len(played.costs)} episodes cost no finite number"
         beyond = excess_of_an_outlier(played, accepted)
         if beyond > 0:
             reason += f", but one start costs {beyond:.4g} more than it should"

@@ -65,7 +65,7 @@ class FiniteRows:
             type(buffer).add(buffer, s, after, u, nothing, done, infos)
             self.keeps_place = True
         new = [key for key in found if self.rows - self.named.get(key, -AGAIN) >= AGAIN]
-        self.named.update(dict.fromkeys(found, self.rows))
+        self.named.update(dict.fromkeys(new, self.rows))
         if new:
             what = ", ".join(f"{name}[{j}] of env {i} is {found[name, i, j]}" for name, i, j in new)
             warnings.warn(

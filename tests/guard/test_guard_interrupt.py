@@ -136,3 +136,13 @@ def test_a_checkpoint_in_between_holds_no_handler(tmp_path) -> None:
     for path in tmp_path.glob("*.zip"):
         again = type(model).load(path)
         assert np.isfinite(again.predict(np.zeros(1, np.float32))[0]).all()
+
+
+@pytest.mark.parametrize("where", ["start", "first_evidence"])
+def test_before_anything_is_accepted_the_end_of_training_is_none(monkeypatch, where) -> None:
+    model, guard = build(), make_guard()
+    monkeypatch.setattr(guard.acceptance, where, ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        train(model, 8, guard)
+    guard.on_training_end()  # as RL Zoo does after Ctrl-C, before it saves the model
+    assert is_mpc(model)

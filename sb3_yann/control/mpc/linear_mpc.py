@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -260,8 +261,10 @@ class LinearMPC(MPCProblem):
 
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:
     """Return a group of arguments; None is one that says nothing."""
+    if isinstance(value, Mapping):
+        value = kind(**value)
     if value is not None and not isinstance(value, kind):
-        wanted = f"a {kind.__name__}, e.g. {name}={kind.__name__}(...)"
+        wanted = f"of the class {kind.__name__}: {name}={kind.__name__}(...)"
         raise TypeError(f"{name} = {value!r} must be {wanted}.")
     return kind() if value is None else value
 

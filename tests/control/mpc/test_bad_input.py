@@ -117,7 +117,7 @@ BAD_PROBLEMS: list[tuple[dict[str, Any], type[Exception], str]] = [
         ValueError,
         "infeasible = .* must be one of",
     ),
-    ({"terminal": np.eye(2)}, TypeError, "(?s)terminal = .* must be a Terminal"),
+    ({"terminal": np.eye(2)}, TypeError, "(?s)terminal = .* must be of the class Terminal"),
 ]
 
 BAD_TERMINALS: list[tuple[dict[str, Any], type[Exception], str]] = [

@@ -263,7 +263,7 @@ BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [
     (
         lambda: {"tracking": [0]},
         TypeError,
-        r"tracking = \[0\] must be a Tracking, e.g. tracking=Tr",
+        r"tracking = \[0\] must be of the class Tracking: tracking=Tr",
     ),
     (
         lambda: {"disturbances": DisturbanceBounds(d_max=2)},
