@@ -25,6 +25,14 @@ from guard_samples import (
 from weights import is_mpc
 
 
+@pytest.fixture(autouse=True)
+def heeded():
+    """Python's own handler: a shell starts what runs in its background with the signal ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def ctrl_c(*_) -> None:
     signal.raise_signal(signal.SIGINT)
 
