@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 
@@ -66,13 +66,13 @@ def _two_panels(
     for k, name in enumerate(learners):
         _band(tests, *tested[name], k, f"{name} ({len(learners[name])} seeds)")
         _band(costs, *excess[name], k, name)
-    for (name, outcome), style in zip(fixed.items(), STYLES[1:], strict=False):
-        level = float(outcome.test_costs[-1].mean()) / base
+    levels = {name: float(out.test_costs[-1].mean()) / base for name, out in fixed.items()}
+    for (name, level), style in zip(levels.items(), STYLES[1:], strict=False):
         tests.axhline(level, label=name, color="black", linestyle=style, linewidth=1, zorder=1)
     costs.axhline(0, color="black", linestyle=STYLES[1], linewidth=1, zorder=1)
-    tests.set_ylim(0.97, 1.04)
+    cut = _cut_above(tests, tested, [*levels.values()])
     _scales(None, costs, tested, excess)
-    tests.set(title=f"{plant}: test cost", ylabel="× the MPC's cost")
+    tests.set(title=f"{plant}: test cost{cut}", ylabel="× the MPC's cost")
     costs.set(title="excess cost of learning", ylabel="in episodes of the MPC")
     for axes in (tests, costs):
         axes.set_xlabel("training episodes")
@@ -146,6 +146,21 @@ def _band(axes: Axes, x: Array, y: Array, k: int, label: str) -> None:
     marker = {"marker": MARKERS[k % len(MARKERS)], "markersize": 4, "markevery": 0.12}
     axes.plot(x, middle, label=label, color=color, linestyle=style, zorder=9 - k, **marker)
     axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+
+
+def _cut_above(
+    axes: Axes, tested: Mapping[str, tuple[Array, Array]], levels: Sequence[float]
+) -> str:
+    """Show what lies around our curve and the levels; return what the title says of the rest."""
+    bands = {name: np.quantile(y, [0.25, 0.75], axis=0) for name, (_, y) in tested.items()}
+    lowest = min(*levels, *(float(band.min()) for band in bands.values()))
+    highest = max(*levels, float(bands[OURS].max()))
+    room = (highest - lowest) or 0.1
+    # Rounded to a tenth of the room, so that the title gives the very number.
+    top = round(highest + 1.7 * room, 1 - int(np.floor(np.log10(room))))
+    axes.set_ylim(lowest - 0.3 * room, top)
+    hidden = any(band.max() > top for band in bands.values())
+    return f" (cut at {top:g})" if hidden else ""
 
 
 def _scales(

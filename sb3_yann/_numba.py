@@ -23,8 +23,9 @@ def compiled_sources(package: Path) -> list[Path]:
 
 
 # One stamp for all files: their functions call each other.
-TEXTS = (each.read_bytes() for each in compiled_sources(Path(__file__).parent))
-SOURCES = hashlib.sha256(b"".join(TEXTS)).hexdigest()
+SOURCES = hashlib.sha256(
+    b"".join(each.read_bytes() for each in compiled_sources(Path(__file__).parent))
+).hexdigest()
 
 
 def compiled(*signatures: str, fastmath: bool = False) -> Callable[[F], F]:

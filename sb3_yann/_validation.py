@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Options = TypeVar("Options")
 
 
 class NonFiniteWarning(RuntimeWarning):
@@ -136,10 +137,11 @@ def as_between(
     hint : str, optional
         What to do: a sentence that ends the message.
     """
-    array = np.asarray(value if np.ndim(value) == 0 else None)
-    if array.dtype.kind not in "iuf":
+    value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    kinds = (int, float, np.integer, np.floating)
+    if isinstance(value, bool) or not isinstance(value, kinds):
         raise TypeError(f"{name} = {_short(value)} must be a number. {hint}".rstrip())
-    number = float(array)
+    number = float(value)
     left = number >= low if ends[0] == "[" else number > low
     right = number <= high if ends[1] == "]" else number < high
     if left and right and np.isfinite(number):
@@ -174,6 +176,23 @@ def as_choice(name: str, value: Any, options: Sequence[str]) -> str:
     if not isinstance(value, str) or value not in options:
         raise ValueError(f"{name} = {_short(value)} must be one of {tuple(options)}.")
     return value
+
+
+def as_options(name: str, value: Any, kind: type[Options]) -> Options:
+    """Return a group of options; a mapping, as YAML gives it, holds some of their names.
+
+    Raise TypeError for anything else, and for other names.
+    """
+    if isinstance(value, kind):
+        return value
+    known = [each.name for each in fields(kind)]  # type: ignore[arg-type]
+    if not isinstance(value, Mapping):
+        wanted = f"of the class {kind.__name__}: {name}={kind.__name__}(...), or a mapping"
+        raise TypeError(f"{name} = {_short(value)} must be {wanted}.")
+    if unknown := [each for each in value if each not in known]:
+        unknown_names = ", ".join(map(repr, unknown))
+        raise TypeError(f"{name} has no {unknown_names}. Its options are {', '.join(known)}.")
+    return kind(**value)
 
 
 def to_float(name: str, value: Any) -> Array:

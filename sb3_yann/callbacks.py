@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,7 @@ class ControlDiagnostics(BaseCallback):
 
     def _init_callback(self) -> None:
         self.policy = require_yann_policy(self.model.policy, "ControlDiagnostics")
+        watch_buffer(self.model)
         self.violations = 0
         self._forget()
         n_envs = self.training_env.num_envs
@@ -83,9 +85,11 @@ class ControlDiagnostics(BaseCallback):
         with th.no_grad():
             theta = self.policy.theta(observations)
             law = layer.law(theta).cpu().numpy()
-            self._regions.extend(layer.regions(theta).tolist())
+            regions = layer.regions(theta)
         distances = np.max(np.abs(actions - law), axis=1) / 2
-        self._distances.extend(distances[np.isfinite(distances)])
+        known = np.isfinite(distances)  # the law knows none where an observation is not finite
+        self._regions.extend(regions[known].tolist())
+        self._distances.extend(distances[known])
         dones, infos = self.locals["dones"], self.locals["infos"]
         self.violations += sum(bool(info.get("violation", False)) for info in infos)
         for i, episode in enumerate(self._episodes):
@@ -103,10 +107,10 @@ class ControlDiagnostics(BaseCallback):
         self._recorded = False
 
     def _record(self) -> None:
-        if self._distances:  # the law knows none where an observation is not finite
+        if self._distances:
             self.logger.record("yann/distance_from_mpc_mean", float(np.mean(self._distances)))
             self.logger.record("yann/distance_from_mpc_max", float(np.max(self._distances)))
-        self.logger.record("yann/region", int(np.bincount(self._regions).argmax()))
+            self.logger.record("yann/region", int(np.bincount(self._regions).argmax()))
         self.logger.record("yann/regions_visited", len(set(self._regions)))
         self.logger.record("yann/violations", self.violations)
         self._recorded = True
@@ -123,7 +127,8 @@ class ControlDiagnostics(BaseCallback):
             returns[t] = value = rewards[t] + self.model.gamma * value
         error = np.abs(self._value(observations, actions) - returns)
         size = max(float(np.abs(returns).mean()), 1e-30)
-        self.logger.record("yann/critic_error", float(error.mean()) / size)
+        if math.isfinite(found := float(error.mean()) / size):
+            self.logger.record("yann/critic_error", found)
 
     def _value(self, observations: Any, actions: Any) -> NDArray[np.float32]:
         """Return the first critic's Q, shape (batch,)."""

@@ -251,16 +251,19 @@ class ObserveDisturbance(_Appending):
                 f"{observer.model.n_disturbances} disturbances."
             )
         self.observer = copy.deepcopy(observer)
+        self.failing: NDArray[np.bool_] = np.zeros(observer.n_measured, dtype=bool)
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         observer = self.observer
-        measured, rest = np.split(observation, [observer.n_measured])
-        if not (known := np.isfinite(measured)).all():
+        measured, rest = np.split(observation.copy(), [observer.n_measured])
+        failing = ~np.isfinite(measured)
+        if np.any(failing & ~self.failing):  # once, for a sensor that stays so
             at = f"The measurement {measured.tolist()} is not finite: the observer predicts it."
             warnings.warn(at, NonFiniteWarning, stacklevel=4)
-            state = 0 * observer.estimate
-            state = state if u is None else observer.A @ observer.estimate + observer.B @ u
-            measured = np.where(known, measured, observer.seen @ state)
+        self.failing = failing
+        if failing.any():
+            expected = np.zeros(len(failing)) if u is None else observer.expected(u)
+            measured[failing] = expected[failing]
         x_hat, d_hat = observer.reset(measured) if u is None else observer.update(measured, u)
         return _joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
 

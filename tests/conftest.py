@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 import torch as th
 
@@ -11,9 +13,11 @@ from sb3_yann_envs import problems
 
 
 @pytest.fixture(autouse=True)
-def same_initial_weights() -> None:
-    """Seed torch: a test must not depend on which tests ran before it."""
-    th.manual_seed(0)
+def same_initial_weights() -> Iterator[None]:
+    """Seed torch, and undo it: nothing may depend on which tests ran before."""
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        yield
 
 
 PROBLEMS = {

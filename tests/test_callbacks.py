@@ -10,8 +10,8 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG, PPO, TD3
 from stable_baselines3.common.noise import NormalActionNoise
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from event_files import scalars
 from sample_plants import Recorder
 from sb3_yann import ControlDiagnostics, NoActionNoise, YannPolicy
 from weights import last_layer, unpin
@@ -103,12 +103,6 @@ def test_an_on_policy_algorithm_is_refused() -> None:
 def test_diagnostics_need_a_yann_policy() -> None:
     with pytest.raises(TypeError, match="TD3Policy"):
         DDPG("MlpPolicy", "Pendulum-v1").learn(8, callback=ControlDiagnostics())
-
-
-def scalars(folder) -> dict[str, list[float]]:
-    (run,) = folder.iterdir()
-    events = EventAccumulator(str(run)).Reload()
-    return {tag: [e.value for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
 
 
 def test_tensorboard_shows_distance_regions_violations_and_critic_error(tmp_path) -> None:

@@ -37,6 +37,7 @@ def test_all_that_is_known_to_be_called_is_looked_at() -> None:
     assert names >= {"_rates", "advance", "advance_all", "is_rich"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("critic", ["afterstate", "state_action"])
 def test_compiled_code_is_loaded_when_a_policy_is_built(critic) -> None:
     # In learn a Ctrl-C while numba begins would break it for the whole process.
@@ -80,6 +81,7 @@ print(dict(raised))
 """
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_any_moment_of_training_is_a_keyboard_interrupt() -> None:
     done = run_python(INTERRUPTED, timeout=200)
     assert done.stdout.decode() == "{'KeyboardInterrupt': 60}\n", done.stderr.decode()

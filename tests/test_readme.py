@@ -31,6 +31,9 @@ def run(name: str) -> dict[str, object]:
     """Run the blocks of a page one after the other, with a shorter training; return its names."""
     code = "\n".join(blocks(page(name)))
     shortened = code.replace("20_000", "500").replace(", progress_bar=True", "")
+    # A number that nothing here knows would train in full.
+    steps = re.findall(r"\.learn\(\s*(?:total_timesteps\s*=\s*)?([^\s,)]*)", shortened)
+    assert set(steps) <= {"500"}, f"{name}: learn is called with {steps}"
     names: dict[str, object] = {}
     exec(compile(shortened, name, "exec"), names)
     return names

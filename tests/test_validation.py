@@ -45,6 +45,8 @@ BAD: list[tuple[Any, tuple[Any, ...], type[Exception], str]] = [
         (as_whole, (x,), ValueError, "whole number of at least 1")
         for x in (True, 2.0, "2", None, 0)
     ),
+    (as_between, ([[1], [1, 2]], 0, 2), TypeError, r"x = \[\[1\], \[1, 2\]\] must be a number"),
+    (as_between, (10**30, 0, 2), ValueError, "x = 10{30} must be between 0 and 2"),
 ]
 
 

@@ -21,7 +21,7 @@ def compiled(signature: str) -> Callable[[F], F]:
     def compile_it(function: F) -> F:
         try:
             result: Any = numba.njit(signature, cache=True, error_model="numpy")(function)
-        except RuntimeError:  # there is no folder to write to
+        except Exception:  # no folder to write to, a full disk, a damaged file
             result = numba.njit(signature, error_model="numpy")(function)
         return cast(F, result)
 

@@ -129,6 +129,8 @@ def asked_start(options: Mapping[str, Any] | None) -> Any:
     unknown = sorted(map(str, set(options) - {"state"}))
     if unknown:
         raise ValueError(f"options has unknown keys {unknown}; the only key is 'state'.")
+    if options["state"] is None:
+        raise ValueError("options['state'] is None: leave it out for a random start.")
     return options["state"]
 
 

@@ -14,6 +14,7 @@ from sb3_yann._validation import Array, as_flag, as_positive, as_whole
 from sb3_yann.audit.causes import Cause, likely_cause, not_finite
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning, judged
 from sb3_yann.audit.sample import FEWEST, Sample
+from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import require_frozen
 from sb3_yann.policy.policies import require_yann_policy
 
@@ -66,6 +67,7 @@ class CostAudit(BaseCallback):
 
     def _init_callback(self) -> None:
         self.policy = require_yann_policy(self.model.policy, "CostAudit")
+        watch_buffer(self.model)
         self.finding, self._seen = None, 0
         self._records: list[list[dict[str, Any]]] = [[] for _ in range(self.training_env.num_envs)]
 
@@ -103,14 +105,19 @@ class CostAudit(BaseCallback):
 
     def _judge(self) -> None:
         records = [each for of_one_env in self._records for each in of_one_env]
+        if not records:  # no step was taken
+            return
         lost = np.array([not _is_finite(each) for each in records], dtype=bool)
         sample = self._sample(records, lost)
         self._records = []
-        if np.count_nonzero(sample.counted) < FEWEST and not lost.any():
+        enough = np.count_nonzero(sample.counted) >= FEWEST
+        if not enough and not lost.any():
             return
-        cause = not_finite(lost, records) if lost.any() else self._of_the_vec_normalize()
-        if cause is None and not sample.is_the_problem_s_cost(self.tolerance):
+        cause = self._of_the_vec_normalize()
+        if cause is None and enough and not sample.is_the_problem_s_cost(self.tolerance):
             cause = likely_cause(sample, self.tolerance)
+        if lost.any():
+            cause = not_finite(lost, records, cause)
         self.finding = judged(sample, cause, self.training_env)
         if cause is not None:
             if self.strict:

@@ -33,15 +33,18 @@ UNKNOWN = Cause(
 )
 
 
-def not_finite(lost: NDArray[np.bool_], records: Sequence[dict[str, Any]]) -> Cause:
-    """Return that rewards or observations are lost, and which was the first."""
+def not_finite(
+    lost: NDArray[np.bool_], records: Sequence[dict[str, Any]], other: Cause | None = None
+) -> Cause:
+    """Return that rewards or observations are lost, which was the first, and what else is wrong."""
     first = records[int(np.argmax(lost))]
     reward = first["reward"]
     what = "an observation" if np.isfinite(reward) else f"the reward, {reward:g},"
     return Cause(
         "not finite",
         f"in {lost.sum()} of {len(lost)} steps a reward or an observation is not a finite number, "
-        f"first {what} of step {first['step']}: the env or a sensor fails. The steps are left out.",
+        f"first {what} of step {first['step']}: the env or a sensor fails. The steps are left out."
+        + ("" if other is None else f" In the others, {other.name}: {other.explanation}"),
     )
 
 

@@ -64,7 +64,8 @@ def policy_value(
     """Return P (n, n) with ``x' P x`` the discounted cost of the law ``u = -K x``, for any K.
 
     It solves ``P = Q - NK - K'N' + K'RK + gamma (A - BK)' P (A - BK)``, a Lyapunov equation. Only
-    this P makes the value of :func:`state_action_matrix` satisfy Bellman's equation along the law.
+    this P makes the value ``x'Qx + u'Ru + gamma (Ax + Bu)' P (Ax + Bu)`` of Braniff & Tian, Section
+    4.2, satisfy Bellman's equation along the law; theirs, without a discount, does for gamma = 1.
     An unstable discounted closed loop, of infinite cost, raises ValueError.
 
     Parameters
@@ -87,24 +88,6 @@ def policy_value(
         stage = stage - cross @ K - K.T @ cross.T
     P = linalg.solve_discrete_lyapunov(closed.T, stage)
     return np.asarray((P + P.T) / 2)
-
-
-def state_action_matrix(model: LinearSystem, Q: Array, R: Array, P: Array, gamma: float) -> Array:
-    """Return M (n+m, n+m) with ``[x; u]' M [x; u] = x'Qx + u'Ru + gamma (Ax+Bu)' P (Ax+Bu)``.
-
-    The state-action value of Braniff & Tian, Section 4.2. Their P is that of the undiscounted
-    Riccati equation, which does not satisfy Bellman's equation for gamma < 1: pass that of
-    :func:`policy_value`.
-
-    Parameters
-    ----------
-    model, gamma : LinearSystem, and float
-        A (n, n) and B (n, m), and the discount in (0, 1].
-    Q, R, P : ndarray, shapes (n, n), (m, m) and (n, n)
-        Weights of the state, of the input, and of the state after one step.
-    """
-    AB = np.hstack([model.A, model.B])
-    return np.asarray(linalg.block_diag(Q, R) + gamma * AB.T @ P @ AB)
 
 
 def spectral_radius(matrix: Array) -> float:

@@ -112,9 +112,18 @@ class DisturbanceObserver:
     def update(self, y: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         """Return x_hat (n,) and d_hat (d,) from y (q,) now and the last input u (m,)."""
         now = as_array("y", y, (self.n_measured,))
-        predicted = self.A @ self.estimate + self.B @ as_array("u", u, (self.model.n_inputs,))
+        predicted = self._after(u)
         self.estimate = predicted + self.gain @ (now - self.seen @ predicted)
         return self.x_hat, self.d_hat
+
+    def expected(self, u: ArrayLike) -> Array:
+        """Return the outputs y (q,) that the estimate makes expect after the input u (m,)."""
+        return np.asarray(self.seen @ self._after(u))
+
+    def _after(self, u: ArrayLike) -> Array:
+        return np.asarray(
+            self.A @ self.estimate + self.B @ as_array("u", u, (self.model.n_inputs,))
+        )
 
     def _kalman_gain(self, moves: Array, errors: Array) -> Array:
         """Return the steady-state gain of the filter from the standard deviations."""

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from sb3_yann.policy.policies import YannPolicy
 
 Tensors = dict[str, th.Tensor]
+LARGEST = 1e9
+"""Parameters beyond this count as diverged: the actor's sums could overflow."""
+DIVERGED = "a parameter of the actor is not a finite number, or too large"
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,9 @@ class ActorCheckpoint:
             if ".network." in name and not name.endswith("pinned")
         }
 
-    def is_finite(self) -> bool:
-        """Return whether all trainable parameters are finite numbers."""
-        return all(bool(th.isfinite(each).all()) for each in self.networks().values())
+    def has_diverged(self) -> bool:
+        """Return whether a trainable parameter is not a finite number, or too large."""
+        return diverged(self.networks().values())
 
     def is_actor_of(self, policy: YannPolicy) -> bool:
         """Return whether the policy's actor is still that of the checkpoint, bit for bit."""
@@ -96,6 +99,12 @@ class ActorCheckpoint:
                 else:  # the number of steps, which all regions share
                     known[entry].copy_(value)
         return mixed
+
+
+def diverged(parameters: Iterable[th.Tensor]) -> bool:
+    """Return whether a parameter is not a finite number, or too large."""
+    largest = [each.detach().abs().max() for each in parameters]
+    return not all(bool(each <= LARGEST) for each in largest)  # nor does nan pass
 
 
 def _copied(value: Any) -> Any:

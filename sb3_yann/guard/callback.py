@@ -14,13 +14,14 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_flag, as_whole
+from sb3_yann._validation import as_flag, as_options, as_whole
+from sb3_yann.evaluation.episodes import Source
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.interrupt import Handler, install
-from sb3_yann.guard.options import AcceptanceRule, StepSize, as_options
+from sb3_yann.guard.options import AcceptanceRule, StepSize
 from sb3_yann.guard.plant_acceptance import PlantAcceptance
 from sb3_yann.guard.preconditions import check_not_nested
-from sb3_yann.guard.session import GuardSession, Simulator, restore_accepted
+from sb3_yann.guard.session import GuardSession, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, write_csv
 from sb3_yann.policy._finite import watch_buffer
@@ -92,7 +93,7 @@ class ImprovementGuard(BaseCallback):
 
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
         self,
-        env: Simulator | None,
+        env: Source | None,
         *,
         n_starts: int = 100,
         n_new_starts: int = 50,
@@ -201,7 +202,9 @@ class ImprovementGuard(BaseCallback):
         if not self._has_begun:
             return
         self.session.interrupted = False
-        self.acceptance.end(self.session)
-        restore_accepted(self.model)
-        if self._handler is not None:
-            self._handler.remove()
+        try:
+            self.acceptance.end(self.session)
+        finally:
+            restore_accepted(self.model)
+            if self._handler is not None:
+                self._handler.remove()

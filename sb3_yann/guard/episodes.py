@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.evaluation.episodes import Episodes, evaluate
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
 from sb3_yann.guard.statistics import PairedEpisodes
@@ -146,7 +146,7 @@ class _FinitePolicy:
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
         seen = self.session.seen(observation)
         actions, state = self.session.policy.predict(seen, deterministic=deterministic)
-        if not np.all(np.isfinite(actions)):  # envs need not put up with it
+        if not np.all(np.isfinite(actions)):  # of a subclass: the actor itself puts out no NaN
             raise Unplayable("an action of the actor is not a finite number")
         return actions, state
 
@@ -193,8 +193,8 @@ def evaluate_candidate(
     session: GuardSession, candidate: ActorCheckpoint
 ) -> tuple[Outcome | None, str]:
     """Return a candidate's episodes from the known starts, and why it is refused, if it is."""
-    if not candidate.is_finite():
-        return None, "a parameter of the actor is not a finite number"
+    if candidate.has_diverged():
+        return None, DIVERGED
     evidence: Evidence = session.state.evidence
     try:
         outcome = play(session, candidate, evidence.seeds)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass
 
 import numpy as np
 
 from sb3_yann._validation import as_between, as_flag, as_whole
-
-Options = TypeVar("Options", "AcceptanceRule", "StepSize")
 
 
 @dataclass(frozen=True)
@@ -75,15 +71,3 @@ class StepSize:
         as_between("shrink", self.shrink, 0, 1)
         as_between("grow", self.grow, 1, np.inf)
         as_between("smallest", self.smallest, 0, 1)
-
-
-def as_options(name: str, value: Any, kind: type[Options]) -> Options:
-    """Return ``value`` as options of a kind; a mapping, as YAML gives it, holds their names."""
-    if isinstance(value, kind):
-        return value
-    known = [each.name for each in fields(kind)]
-    if not isinstance(value, Mapping) or not set(value) <= set(known):
-        raise TypeError(
-            f"{name} = {value!r} must be {kind.__name__}(...), or a mapping with some of {known}."
-        )
-    return kind(**value)

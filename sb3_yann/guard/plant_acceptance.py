@@ -9,16 +9,13 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint, diverged
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.preconditions import check_acts_alone
 from sb3_yann.guard.session import GuardSession
 from sb3_yann.guard.state import GuardState, Verdict
 from sb3_yann.guard.statistics import PlantEpisodes, analyze_covariance, excess_of_an_outlier
-from sb3_yann.policy.policies import YannPolicy
 
-LARGEST = 1e9
-"""Parameters beyond this count as diverged: the actor's sums could overflow."""
 Phase = Literal["first", "learning", "trial"]
 
 
@@ -68,7 +65,12 @@ class PlantAcceptance:
 
     def still_holds(self, session: GuardSession) -> bool:
         """Return whether the evidence is there; a plant cannot be played again."""
-        return session.state.evidence is not None
+        evidence = session.state.evidence
+        if evidence is None:
+            return False
+        if evidence.phase == "trial" and session.state.accepted.is_actor_of(session.policy):
+            self._begin(session, "learning")  # Ctrl-C has ended the trial
+        return True
 
     def first_evidence(self, session: GuardSession, known: GuardState | None) -> None:
         """Begin with a block of episodes of the present policy, or of what is accepted already."""
@@ -76,7 +78,7 @@ class PlantAcceptance:
         if known is not None:  # nobody has found out how good another present policy is
             refused = not known.accepted.is_actor_of(policy)
             known.accepted.restore(policy)
-        if diverged(policy):  # only the MPC is left
+        if diverged(policy.actor.parameters()):  # only the MPC is left
             refused = True
             session.mpc.restore(policy)
         present = ActorCheckpoint.of(policy)
@@ -86,8 +88,8 @@ class PlantAcceptance:
 
     def before_steps(self, session: GuardSession) -> None:
         """Restore the accepted policy before one that has diverged acts on the plant."""
-        if diverged(session.policy):
-            self._restore(session, "a parameter of the actor is not a finite number, or too large")
+        if diverged(session.policy.actor.parameters()):
+            self._restore(session, DIVERGED)
 
     def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
         """Count the step; decide where a block is over.
@@ -235,12 +237,6 @@ class PlantAcceptance:
 def _evidence(session: GuardSession) -> BlockEvidence:
     evidence: BlockEvidence = session.state.evidence
     return evidence
-
-
-def diverged(policy: YannPolicy) -> bool:
-    """Return whether a parameter of the actor is not a finite number, or too large."""
-    largest = [each.detach().abs().max() for each in policy.actor.parameters()]
-    return not all(bool(each <= LARGEST) for each in largest)  # nor does nan pass
 
 
 def predicted_cost(problem: LinearMPC, start: Array, steps: int) -> float:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann.evaluation.episodes import Source
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.options import StepSize
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.state import Decision, GuardState, Verdict, log_last
 from sb3_yann.policy.policies import YannPolicy
-
-Simulator: TypeAlias = str | gym.Env[Any, Any] | Callable[[], gym.Env[Any, Any]]
 
 
 @dataclass
@@ -39,7 +37,7 @@ class GuardSession:
 
     model: OffPolicyAlgorithm
     policy: YannPolicy
-    simulator: Simulator | None
+    simulator: Source | None
     step_size: StepSize
     log_path: Path | None
     verbose: int
@@ -70,6 +68,8 @@ class GuardSession:
         try:
             self.policy.actor.load_state_dict(checkpoint.actor)
             yield self.policy
+            if self.interrupted:  # and a simulator has swallowed it
+                raise KeyboardInterrupt
         finally:
             if not self.interrupted:
                 self.policy.actor.load_state_dict(own)

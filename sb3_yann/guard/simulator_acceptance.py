@@ -158,7 +158,7 @@ class SimulatorAcceptance:
             return
         candidate = ActorCheckpoint.of(session.policy)
         changed = before.changed_regions(candidate)
-        if candidate.is_finite() and not np.any(changed & state.evidence.visits.any(0)):
+        if not candidate.has_diverged() and not np.any(changed & state.evidence.visits.any(0)):
             return  # it differs only where no episode of the accepted policy comes through
         with session.all_or_nothing():
             outcome, reason, restored = self._judge(session, candidate)

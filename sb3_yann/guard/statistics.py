@@ -50,7 +50,7 @@ class PairedEpisodes:
 
         Comparisons are written so that a cost that is not a number is refused.
         """
-        for what, now, before in zip(UNSAFE, unsafe.T, self.unsafe.T, strict=False):
+        for what, now, before in zip(UNSAFE, unsafe.T, self.unsafe.T, strict=True):
             more = np.flatnonzero(now > before)
             if len(more):
                 return f"{len(more)} starts with {what}, the first is number {more[0]}"

@@ -13,7 +13,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_yann._validation import Array, as_bounds, as_positive_vector, half_widths
+from sb3_yann._validation import Array, as_array, as_bounds, as_positive_vector
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
 
 PredictionModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
@@ -44,11 +44,13 @@ class Ranges:
     def __post_init__(self) -> None:
         as_positive_vector("theta_half", self.theta_half, len(self.theta_half))
         as_bounds("u", self.u_min, self.u_max, len(self.u_min))
+        for name in ("u_min", "u_max"):
+            as_array(name, getattr(self, name), ("m",))  # finite
 
     @property
     def u_half(self) -> Array:
         """Half the ranges of the inputs, (m,)."""
-        return half_widths(self.u_min, self.u_max)
+        return (self.u_max - self.u_min) / 2
 
     @property
     def u_middle(self) -> Array:

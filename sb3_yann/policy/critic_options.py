@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
-from sb3_yann._validation import as_choice, as_number, as_positive
+from sb3_yann._validation import as_choice, as_number, as_options, as_positive
 from sb3_yann.networks.value import PredictionModel
 
 KINDS = ("afterstate", "state_action")
@@ -66,13 +66,6 @@ class CriticOptions:
 
 def as_critic_options(critic: str | CriticOptions | Mapping[str, Any]) -> CriticOptions:
     """Return the options of a critic from its kind, a mapping of some of them, or themselves."""
-    if isinstance(critic, CriticOptions):
-        return critic
-    if not isinstance(critic, Mapping):
-        return CriticOptions(as_choice("critic", critic, KINDS))
-    known = [each.name for each in fields(CriticOptions)]
-    if unknown := [name for name in critic if name not in known]:
-        raise TypeError(
-            f"critic has no {', '.join(map(repr, unknown))}. Its options are {', '.join(known)}."
-        )
-    return CriticOptions(**critic)
+    if isinstance(critic, CriticOptions | Mapping):
+        return as_options("critic", critic, CriticOptions)
+    return CriticOptions(as_choice("critic", critic, KINDS))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import wrappers
@@ -22,6 +23,7 @@ from sb3_yann import (
     CostMismatchError,
     CostMismatchWarning,
     NoActionNoise,
+    NonFiniteWarning,
     YannPolicy,
 )
 
@@ -76,6 +78,27 @@ def test_a_frozen_vec_normalize_is_seen_through() -> None:
     assert audited(env, policy=policy).finding.matches
     forgotten = {"observation": AffineObservation.identity(3)}
     assert audited(env, policy=forgotten).finding.cause == "normalized observation"
+
+
+def test_one_step_that_is_lost_does_not_hide_what_is_wrong_in_the_others() -> None:
+    class Fails(gym.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            self.steps += 1
+            return observation, np.nan if self.steps == 7 else -reward, *rest
+
+    with pytest.warns(NonFiniteWarning):
+        finding = audited(Fails(plant())).finding
+    assert finding.cause == "not finite" and "In the others, sign flipped: " in finding.message
+
+
+def test_a_run_without_steps_is_not_judged() -> None:
+    audit = CostAudit()
+    audit.init_callback(DDPG(YannPolicy, plant(), policy_kwargs={"problem": MPC}))
+    audit.on_training_end()
+    assert audit.finding is None
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -15,27 +10,14 @@ from benchmarks.criteria import criteria
 from benchmarks.problems import double_integrator
 from benchmarks.records import Figure, Figures
 from benchmarks.timing import Stopwatch, Task
+from fresh_process import run_module
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann_envs import problems
-
-ROOT = Path(__file__).parents[2]
-
-
-def run(folder: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", *arguments],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 @pytest.mark.slow
 def test_the_quick_form_runs_to_its_report(tmp_path) -> None:
-    run(tmp_path, "benchmarks", "--quick")
+    run_module(tmp_path, "benchmarks", "--quick")
     folder = tmp_path / "out" / "bench-quick"
     report = (folder / "performance.md").read_text(encoding="utf-8")
     for heading in ("In short", "The law in numpy, one point", "Exactness", "Memory"):
@@ -44,6 +26,7 @@ def test_the_quick_form_runs_to_its_report(tmp_path) -> None:
     assert (folder / "performance.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_devices_are_compared_where_there_are_no_learners_and_no_solvers(tmp_path) -> None:
     problems.cstr().explicit().save(tmp_path / "law.npz")
     absent = ("stable_baselines3", "ppopt", "daqp", "control", "cvxopt", "gymnasium", "rich")
@@ -54,7 +37,7 @@ def test_the_devices_are_compared_where_there_are_no_learners_and_no_solvers(tmp
         "from benchmarks import gpu; gpu.BATCHES = (1, 8); sys.exit(gpu.main(['law.npz']))"
     )
     (tmp_path / "alone.py").write_text(code)
-    assert "7 regions" in run(tmp_path, "alone")
+    assert "7 regions" in run_module(tmp_path, "alone")
 
 
 def test_regions_that_overlap_and_gaps_between_them_are_counted() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import optimize
+from scipy import linalg, optimize
 
 from sample_problems import DOUBLE_INTEGRATOR, input_bounds_only
 from sb3_yann import LinearModel, LinearMPC
@@ -140,7 +140,8 @@ def test_with_equal_discounts_the_critic_is_that_of_the_riccati_solution(
 ) -> None:
     mpc = discounted(MPCS[name](), gamma)
     P = lqr.riccati(mpc.model, mpc.Q, mpc.R, gamma)
-    expected = lqr.state_action_matrix(mpc.model, mpc.Q, mpc.R, P, gamma)
+    AB = np.hstack([mpc.model.A, mpc.model.B])
+    expected = linalg.block_diag(mpc.Q, mpc.R) + gamma * AB.T @ P @ AB
     actual = mpc.state_action_matrix(gamma)
     np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-12 * np.max(expected))
     np.testing.assert_array_equal(mpc.terminal.cost, P)

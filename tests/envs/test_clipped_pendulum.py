@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import copy
-import random
 from typing import Any
 
 import control
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from numpy.typing import NDArray
 
-from sb3_yann_envs import ProblemBox, clipped_pendulum
+from sb3_yann_envs import clipped_pendulum
 from sb3_yann_envs.clipped_pendulum import ClippedPendulumEnv
 
 
@@ -121,12 +118,6 @@ def test_the_constants_cannot_be_overwritten(name: str) -> None:
 # --- spaces ------------------------------------------------------------------------------------
 
 
-def test_the_observation_space_refers_to_the_problem() -> None:
-    space = ClippedPendulumEnv().observation_space
-    assert isinstance(space, ProblemBox)
-    assert "sb3_yann_envs.problems:clipped_pendulum" in repr(space)
-
-
 @pytest.mark.parametrize(
     "theta", [np.pi, -np.pi, np.nextafter(np.pi, 0.0), np.nextafter(-np.pi, 0.0), np.float32(np.pi)]
 )
@@ -172,27 +163,6 @@ def test_random_starts_fill_their_box() -> None:
     assert (np.ptp(starts, axis=0) / (2 * reach) > 0.97).all()
 
 
-def test_a_seed_reproduces_an_episode() -> None:
-    def episode() -> list[NDArray[np.float32]]:
-        env = ClippedPendulumEnv()
-        observations = [env.reset(seed=5)[0]]
-        observations += [env.step(act(np.sin(k)))[0] for k in range(50)]
-        return [*observations, env.reset()[0]]
-
-    np.testing.assert_array_equal(episode(), episode())
-
-
-def test_the_global_random_states_are_untouched() -> None:
-    python, legacy = random.getstate(), copy.deepcopy(np.random.get_state())  # noqa: NPY002
-    env = ClippedPendulumEnv()
-    env.reset(seed=1)
-    env.step(act(1.0))
-    env.reset()
-    assert random.getstate() == python
-    for now, before in zip(np.random.get_state(), legacy, strict=True):  # noqa: NPY002
-        np.testing.assert_array_equal(now, before)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -210,11 +180,6 @@ def test_a_bad_start_is_refused_with_its_reason(options: dict[str, Any], message
 
 
 # --- bad calls ---------------------------------------------------------------------------------
-
-
-def test_a_step_before_the_first_reset_is_refused() -> None:
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"env.reset\(\) before env.step\(\)"):
-        ClippedPendulumEnv().step(act(0.0))
 
 
 @pytest.mark.parametrize(

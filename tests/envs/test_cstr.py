@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import random
 from typing import Any
 
 import control
@@ -13,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from sb3_yann_envs import ProblemBox, cstr
+from sb3_yann_envs import cstr
 from sb3_yann_envs.cstr import CSTREnv
 
 # Entries of the printed A that the true equations do not have, with the true values.
@@ -226,12 +224,6 @@ def test_a_terminated_episode_cannot_be_continued() -> None:
 # --- spaces ------------------------------------------------------------------------------------
 
 
-def test_the_observation_space_refers_to_the_problem() -> None:
-    space = CSTREnv().observation_space
-    assert isinstance(space, ProblemBox)
-    assert "sb3_yann_envs.problems:cstr" in repr(space)
-
-
 def test_bang_bang_inputs_from_the_corners_of_the_allowed_starts_stay_in_the_space() -> None:
     rng = np.random.default_rng(0)
     env = CSTREnv()
@@ -277,27 +269,6 @@ def test_random_starts_fill_their_box() -> None:
     assert (covered > 0.97).all()
 
 
-def test_a_seed_reproduces_an_episode() -> None:
-    def episode() -> list[NDArray[np.float32]]:
-        env = CSTREnv()
-        observations = [env.reset(seed=5)[0]]
-        observations += [env.step(act(10.0 * np.sin(k)))[0] for k in range(50)]
-        return [*observations, env.reset()[0]]
-
-    np.testing.assert_array_equal(episode(), episode())
-
-
-def test_the_global_random_states_are_untouched() -> None:
-    python, legacy = random.getstate(), copy.deepcopy(np.random.get_state())  # noqa: NPY002
-    env = CSTREnv()
-    env.reset(seed=1)
-    env.step(act(1.0))
-    env.reset()
-    assert random.getstate() == python
-    for now, before in zip(np.random.get_state(), legacy, strict=True):  # noqa: NPY002
-        np.testing.assert_array_equal(now, before)
-
-
 def test_a_chosen_start_is_taken_exactly() -> None:
     start = [0.01, -0.2, 0.3, -1.7]
     observation, info = CSTREnv().reset(options={"state": start})
@@ -335,11 +306,6 @@ def test_a_bad_start_is_refused_with_its_reason(options: dict[str, Any], message
 
 
 # --- bad calls ---------------------------------------------------------------------------------
-
-
-def test_a_step_before_the_first_reset_is_refused() -> None:
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"env.reset\(\) before env.step\(\)"):
-        CSTREnv().step(act(0.0))
 
 
 @pytest.mark.parametrize(

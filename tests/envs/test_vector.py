@@ -116,6 +116,9 @@ def test_what_does_not_fit_is_refused() -> None:
         env.reset(options={"state": [[0, 0, 0, 0], [0, 0, 0, 9]]})
     with pytest.raises(ValueError, match="unknown keys"):
         env.reset(options={"start": [[0, 0, 0, 0]] * 2})
+    for either in (env, gymnasium.make("CSTR-v0")):
+        with pytest.raises(ValueError, match=r"\['state'\] is None: leave it out"):
+            either.reset(options={"state": None})
     env.reset(seed=0)
     for wrong in (np.zeros(2), np.full((2, 1), np.nan)):
         with pytest.raises(ValueError, match=r"actions must be numbers of shape \(2, 1\)"):

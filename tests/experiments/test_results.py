@@ -8,13 +8,14 @@ import types
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import experiments
 from experiments.__main__ import main
 from experiments.criteria import criteria
 from experiments.markdown import number, table
-from experiments.measures import interval_of, standing
-from experiments.pictures import save_in_short
+from experiments.measures import OURS, interval_of, standing
+from experiments.pictures import _cut_above, save_in_short
 from experiments.published import paper_table
 from experiments.results import write_report
 from experiments.runner import Outcome, Run
@@ -292,6 +293,15 @@ def test_the_picture_of_the_readme_needs_a_rival(tmp_path) -> None:
     (path,) = save_in_short(reactor(), tmp_path / "new")
     assert path.name == "in-short.png" and path.stat().st_size > 10_000
     assert save_in_short(pendulum(), tmp_path) == []
+
+
+def test_the_picture_of_the_readme_says_where_it_cuts_a_rival_off() -> None:
+    axes, x = Figure().subplots(), np.array([0.0, 10.0])
+    curves = {OURS: (x, np.array([[1.0, 0.8]])), "DDPG": (x, np.array([[1.5, 1.1]]))}
+    assert _cut_above(axes, curves, [1.0, 0.7]) == ""
+    np.testing.assert_allclose(axes.get_ylim(), [0.61, 1.51])
+    curves["TD3"] = x, np.array([[1.6, 1.1]])
+    assert _cut_above(axes, curves, [1.0, 0.7]) == " (cut at 1.51)"
 
 
 def test_the_readme_gets_the_short_table_between_its_marks(tmp_path) -> None:

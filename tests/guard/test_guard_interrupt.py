@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from guard_samples import (
+    BLOCK,
     FIRST,
+    RIGHT,
     STEPS,
     At,
     CutOff,
@@ -19,9 +22,13 @@ from guard_samples import (
     better,
     bits,
     build,
+    correct,
+    guard_alone,
     make_guard,
+    still,
     train,
 )
+from sb3_yann.guard.interrupt import Handler
 from weights import is_mpc
 
 
@@ -95,6 +102,41 @@ def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_polic
     interrupted(model, 4 * STEPS, At([1], better), guard)
 
 
+def test_a_simulator_that_swallows_it_ends_the_training_all_the_same() -> None:
+    def act():
+        plays.append(1)
+        if len(plays) == 3:  # the candidate's turn
+            with suppress(KeyboardInterrupt):
+                ctrl_c()
+
+    plays: list[int] = []
+    model, guard = build(gradient_steps=0), make_guard(partial(CutOff, FIRST, act))
+    interrupted(model, 4 * STEPS, At([1], better), guard)
+    assert is_mpc(model) and len(plays) == 3
+
+
+def test_where_the_end_of_training_fails_the_accepted_policy_is_left(monkeypatch) -> None:
+    def fail(_) -> None:
+        raise OSError("the simulator is gone")
+
+    before = signal.getsignal(signal.SIGINT)
+    model, guard = build(gradient_steps=0), make_guard(eval_every=100)
+    monkeypatch.setattr(guard.acceptance, "end", fail)
+    with pytest.raises(OSError, match="gone"):
+        train(model, 8, At([5], better), guard)
+    left(model)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_on_a_plant_alone_a_trial_that_was_cut_off_is_no_refusal() -> None:
+    model, guard = still(), guard_alone()
+    moves = At([BLOCK + 1], partial(correct, region=RIGHT, value=0.5))
+    interrupted(model, 4 * BLOCK, moves, guard, At([2 * BLOCK + 2], ctrl_c))
+    assert guard.state.evidence.phase == "trial" and guard.decisions == []
+    train(model, BLOCK, again := guard_alone(), reset_num_timesteps=False)
+    assert again.decisions == [] and again.state.step == 1.0
+
+
 def test_a_handler_of_ones_own_that_raises_nothing_goes_unnoticed() -> None:
     seen = []
     before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
@@ -141,8 +183,13 @@ def test_after_another_error_the_handler_only_passes_on() -> None:
 def test_a_checkpoint_in_between_holds_no_handler(tmp_path) -> None:
     model, guard = build(), make_guard(eval_every=100)
     interrupted(model, 20, guard, CheckpointCallback(4, str(tmp_path)), At([13], ctrl_c))
-    for path in tmp_path.glob("*.zip"):
+    paths = sorted(tmp_path.glob("*.zip"))
+    assert len(paths) == 3
+    handler = signal.getsignal(signal.SIGINT)
+    for path in paths:
         again = type(model).load(path)
+        assert signal.getsignal(signal.SIGINT) is handler
+        assert not any(isinstance(each, Handler) for each in vars(again).values())
         assert np.isfinite(again.predict(np.zeros(1, np.float32))[0]).all()
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import CheckpointCallback
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from event_files import scalars
 from guard_samples import (
     LEFT,
     REGION,
@@ -102,12 +102,6 @@ def test_a_record_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch) -> None
     with pytest.raises(OSError, match="full"):
         record.write_csv(path, guard.decisions[:1])
     assert path.read_bytes() == before
-
-
-def scalars(folder: Path) -> dict[str, list[float]]:
-    (run,) = folder.iterdir()
-    events = EventAccumulator(str(run)).Reload()
-    return {tag: [e.value for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
 
 
 def test_tensorboard_shows_every_decision_the_last_one_too(tmp_path) -> None:

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
-from numpy.typing import NDArray
 from scipy import linalg
 
-from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
+from sample_laws import (
+    PROBLEMS,
+    box_points,
+    in_physical_units,
+    law_of,
+    random_rows,
+    solved,
+    to_action,
+)
 from sb3_yann.networks import AfterstateValue, LinearPrediction, QuadraticStateActionValue, Ranges
 from sb3_yann.networks.value import PredictionModel
 from weights import first_layer, last_layer
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
-
-
-@pytest.fixture(autouse=True)
-def seeded() -> Iterator[None]:
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        yield
 
 
 def ranges(name: str) -> Ranges:
@@ -45,18 +44,6 @@ def critic(
         ranges(name),
         **changes,
     )
-
-
-def random_rows(name: str, count: int) -> th.Tensor:
-    """Rows [theta, a] over the box and all actions."""
-    theta = box_points(law_of(name), count)
-    return th.cat([theta, 2 * th.rand(count, law_of(name).n_inputs) - 1], dim=1)
-
-
-def in_physical_units(name: str, rows: th.Tensor) -> tuple[NDArray[np.float64], ...]:
-    law = law_of(name)
-    theta, action = np.split(rows.double().numpy(), [law.n_theta], axis=1)
-    return theta, (law.u_max + law.u_min) / 2 + action * (law.u_max - law.u_min) / 2
 
 
 def train(value: AfterstateValue, rows: th.Tensor, target: th.Tensor, steps: int) -> float:

@@ -17,13 +17,6 @@ from sb3_yann.networks.paper_yann import PaperYann
 EVERY_LAW = pytest.mark.parametrize("name", PROBLEMS)
 
 
-@pytest.fixture(autouse=True)
-def seeded() -> Iterator[None]:
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        yield
-
-
 @pytest.fixture
 def float64() -> Iterator[None]:
     before = th.get_default_dtype()

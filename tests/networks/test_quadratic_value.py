@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import torch as th
-from numpy.typing import NDArray
 
-from sample_laws import PROBLEMS, box_points, law_of, solved, to_action
+from sample_laws import (
+    PROBLEMS,
+    box_points,
+    in_physical_units,
+    law_of,
+    random_rows,
+    solved,
+    to_action,
+)
 from sb3_yann.networks import QuadraticStateActionValue, Ranges, YannLayer
 from weights import network_of
 
@@ -18,30 +24,10 @@ GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
 
 
-@pytest.fixture(autouse=True)
-def seeded() -> Iterator[None]:
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        yield
-
-
 def critic(name: str, gamma: float = 0.99) -> QuadraticStateActionValue:
     mpc = solved(name)
     ranges = Ranges((mpc.theta_max - mpc.theta_min) / 2, mpc.u_min, mpc.u_max)
     return QuadraticStateActionValue(mpc.state_action_matrix(gamma), ranges)
-
-
-def random_rows(name: str, count: int) -> th.Tensor:
-    """Rows [theta, a] over the box and all actions."""
-    theta = box_points(law_of(name), count)
-    return th.cat([theta, 2 * th.rand(count, law_of(name).n_inputs) - 1], dim=1)
-
-
-def in_physical_units(name: str, rows: th.Tensor) -> NDArray[np.float64]:
-    law = law_of(name)
-    theta, action = np.split(rows.double().numpy(), [law.n_theta], axis=1)
-    u = (law.u_max + law.u_min) / 2 + action * (law.u_max - law.u_min) / 2
-    return np.hstack([theta, u])
 
 
 def at_rest(name: str) -> th.Tensor:
@@ -72,7 +58,7 @@ def matrix(value: QuadraticStateActionValue) -> th.Tensor:
 @EVERY_PROBLEM
 def test_value_is_the_quadratic_form_to_the_rounding_of_float32(name: str, gamma: float) -> None:
     rows = random_rows(name, 2000)
-    z = in_physical_units(name, rows)
+    z = np.hstack(in_physical_units(name, rows))
     exact = -np.einsum("bi,ij,bj->b", z, solved(name).state_action_matrix(gamma), z)[:, None]
     with th.no_grad():
         got = critic(name, gamma)(rows)
@@ -98,7 +84,7 @@ def test_bellmans_equation_holds_along_the_law(name: str, gamma: float) -> None:
     value, actor = critic(name, gamma), YannLayer(law)
     with th.no_grad():
         action = actor(start)
-        x, u = np.split(in_physical_units(name, th.cat([start, action], 1)), [law.n_theta], axis=1)
+        x, u = in_physical_units(name, th.cat([start, action], 1))
         following = th.as_tensor(x @ mpc.model.A.T + u @ mpc.model.B.T, dtype=th.float32)
         now = value(th.cat([start, action], 1)).double().numpy()
         then = value(th.cat([following, actor(following)], 1)).double().numpy()
@@ -205,7 +191,7 @@ def test_gradient_of_the_action_is_that_of_the_quadratic_form(name: str) -> None
     rows = random_rows(name, 256).requires_grad_()
     critic(name)(rows).sum().backward()
     assert rows.grad is not None
-    z = in_physical_units(name, rows.detach())
+    z = np.hstack(in_physical_units(name, rows.detach()))
     slope = -2 * z @ solved(name).state_action_matrix(0.99)
     scale = np.concatenate([np.ones(law.n_theta), (law.u_max - law.u_min) / 2])
     np.testing.assert_allclose(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch as th
@@ -22,14 +20,6 @@ from sb3_yann.control import PiecewiseAffine
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import clamp_with_inward_gradient
 from weights import last_layer
-
-
-@pytest.fixture(autouse=True)
-def seeded() -> Iterator[None]:
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        yield
-
 
 # --- the law -----------------------------------------------------------------------------------
 

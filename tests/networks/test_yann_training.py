@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -17,14 +16,6 @@ from sample_laws import (
 from sample_layers import EVERY_LAW, INFEASIBLE, region_of, scrambled, train
 from sb3_yann.networks import YannLayer
 from weights import network_of
-
-
-@pytest.fixture(autouse=True)
-def seeded() -> Iterator[None]:
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        yield
-
 
 # --- training ----------------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch as th
@@ -27,13 +27,6 @@ OPTIMIZERS: dict[str, Callable[[ZeroOutputNetwork], th.optim.Optimizer]] = {
     "sgd": lambda net: th.optim.SGD(net.parameters(), 0.1),
     "adam": lambda net: th.optim.Adam(net.parameters(), 1e-3),
 }
-
-
-@pytest.fixture(autouse=True)
-def seeded() -> Iterator[None]:
-    with th.random.fork_rng(devices=[]):
-        th.manual_seed(0)
-        yield
 
 
 def pins(*flags: bool) -> th.Tensor:

@@ -1,10 +1,13 @@
-"""Runs a few lines in a Python process of their own, with the import path of this one."""
+"""Runs lines or a module in a Python process of their own, with the import path of this one."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
 
 
 def run_python(
@@ -18,3 +21,17 @@ def run_python(
         env=environment,
         timeout=timeout,
     )
+
+
+def run_module(folder: Path, module: str, *arguments: str) -> str:
+    """Run ``python -m module`` in a folder, and return what it printed."""
+    done = subprocess.run(
+        [sys.executable, "-m", module, *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        # The root comes first: `tests` has folders of the same names as what is run.
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout

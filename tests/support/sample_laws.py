@@ -74,6 +74,19 @@ def box_points(law: PiecewiseAffine, count: int, stretch: float = 1.0, seed: int
     return th.as_tensor(points, dtype=th.float32)
 
 
+def random_rows(name: str, count: int) -> th.Tensor:
+    """Rows [theta, a] over the box and all actions."""
+    theta = box_points(law_of(name), count)
+    return th.cat([theta, 2 * th.rand(count, law_of(name).n_inputs) - 1], dim=1)
+
+
+def in_physical_units(name: str, rows: th.Tensor) -> tuple[Array, Array]:
+    """Such rows as parameters and inputs, in float64."""
+    law = law_of(name)
+    theta, action = np.split(rows.double().numpy(), [law.n_theta], axis=1)
+    return theta, (law.u_max + law.u_min) / 2 + action * (law.u_max - law.u_min) / 2
+
+
 def smallest_slack(law: PiecewiseAffine, theta: th.Tensor) -> Array:
     """How far each point lies inside each region (count, p), negative outside."""
     slack = law.b - theta.double().numpy() @ law.A.T

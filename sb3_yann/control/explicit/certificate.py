@@ -72,7 +72,7 @@ class Certificate:
             U = self.program.solve(inside)
             if U is None or np.max(np.abs(U - region.gain @ inside - region.offset)) > LAW:
                 self._fail(f"the law of region {i} is not optimal inside it", inside)
-        for i, law, rows, labels in list(self._conditions()):
+        for i, law, rows, labels in self._conditions():
             self._require_law(i, law, balls[i][0])
             self._require_implied(i, rows, *balls[i])
             self._require_neighbors(i, rows, labels)

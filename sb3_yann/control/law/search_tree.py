@@ -116,7 +116,9 @@ def _grow(regions: _Polytopes, random: np.random.Generator) -> SearchTree:
     children: list[list[int]] = []
     leaves: list[Integers] = []
     # The fullest node first, and of those the oldest: a number, its parent and side.
-    waiting: list[tuple[int, int, Integers, int, int]] = [(-p, 0, np.arange(p), -1, 0)]
+    waiting: list[tuple[int, int, Integers, int, int]] = [
+        (-p, 0, np.arange(p, dtype=np.int64), -1, 0)
+    ]
     order = 0
     while waiting:
         _, _, inside, parent, side = heappop(waiting)
@@ -137,7 +139,7 @@ def _grow(regions: _Polytopes, random: np.random.Generator) -> SearchTree:
         normals=regions.A[rows].reshape(-1, n),
         levels=regions.b[rows],
         children=np.array(children, dtype=np.int64).reshape(-1, 2),
-        leaf_starts=np.cumsum([0, *map(len, leaves)]),
+        leaf_starts=np.cumsum([0, *map(len, leaves)], dtype=np.int64),
         leaf_regions=np.concatenate(leaves),
     )
 
@@ -202,7 +204,7 @@ def _polytopes(A: Array, b: Array, row_starts: Integers) -> _Polytopes:
     A, b = A / length[:, None], b / length
     corners = [vertices(A[i:j], b[i:j]) for i, j in pairwise(row_starts)]
     counts = np.array([len(each) for each in corners])
-    vertex_starts = np.append(0, np.cumsum(counts))
+    vertex_starts = np.append(0, np.cumsum(counts, dtype=np.int64))
     points = np.ascontiguousarray(np.concatenate(corners))
     middles = np.add.reduceat(points, vertex_starts[:-1]) / counts[:, None]
     distance = np.linalg.norm(points - np.repeat(middles, counts, axis=0), axis=1)

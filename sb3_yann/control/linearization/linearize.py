@@ -96,7 +96,7 @@ def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
     if scale is None:
         return size
     k = point.size if np.shape(scale) == point.shape else n
-    size[:k] = as_positive_vector("scale", as_array("scale", scale, (k,)), k)
+    size[:k] = as_positive_vector("scale", scale, k)
     return size
 
 

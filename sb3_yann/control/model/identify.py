@@ -125,8 +125,10 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     >>> found.model.A.round(6).tolist(), found.ten_step_fit.round(3).tolist()
     ([[0.8]], [100.0])
     """
-    point = (x_ss, u_ss, d_ss)
-    found = fit_log(states, actions, dt, disturbances, *point, offset, ridge, held_out, time)
+    found = fit_log(
+        states, actions, dt, disturbances=disturbances, x_ss=x_ss, u_ss=u_ss, d_ss=d_ss,
+        offset=offset, ridge=ridge, held_out=held_out, time=time,
+    )  # fmt: skip
     model, step = LinearModel(**vars(found.system)), found.regression
     n = model.n_states
     A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)

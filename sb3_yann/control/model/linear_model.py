@@ -131,7 +131,7 @@ class LinearModel(LinearSystem):
             The operating point, a steady state of ``f``; d_ss is optional.
         dt : float
             Sampling time.
-        scale : array_like, shape (n,) or (n + m + d,), optional
+        scale : array_like, shape (n,) or (n + m + d,), or float, optional
             Range in which each state, or each state, input and disturbance, moves in use; steps are
             1 % of it. The default is the size of each, at least 1: too much for a trace.
 
@@ -184,7 +184,7 @@ class LinearModel(LinearSystem):
         get_state : callable, optional
             ``get_state(env)`` returns the state, shape (n,). The default is the first that works of
             ``info["state"]``, ``env.unwrapped.state`` and the observation.
-        scale : array_like, shape (n,), optional
+        scale : array_like, shape (n,), or float, optional
             Range in which each state moves in use. Steps are at most 1 % of it, 5 % for float32
             states; a given steady state may be 1 % off. The default is half the width of the
             observation space, or the size of the state, at least 1.

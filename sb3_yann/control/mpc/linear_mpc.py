@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -37,6 +37,7 @@ from sb3_yann.control.mpc.terminal_set import invariant_set
 G = TypeVar("G")
 
 
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class LinearMPC(MPCProblem):
     r"""The linear MPC problem, in deviations from the model's operating point.
 
@@ -200,6 +201,7 @@ class LinearMPC(MPCProblem):
         ValueError
             If the law is unstable under this discount, or does not rest at the origin.
         """
+        gamma = check.as_discount(gamma)  # before the law, which may take long
         return quadratic_value.value_matrix(self, self.explicit(), gamma)
 
     def state_action_matrix(self, gamma: float) -> Array:
@@ -207,6 +209,7 @@ class LinearMPC(MPCProblem):
 
         The law follows. It holds where :meth:`value_matrix` does, and raises its errors.
         """
+        gamma = check.as_discount(gamma)
         return quadratic_value.state_action_matrix(self, self.explicit(), gamma)
 
     def explicit(
@@ -256,17 +259,13 @@ class LinearMPC(MPCProblem):
 
     def report(self, samples: int = 500, seed: int = 0) -> str:
         """Return :func:`~sb3_yann.control.mpc.report.report` of the problem and its law."""
+        check.as_whole("samples", samples)
         return report(self, self.explicit(), samples, seed)
 
 
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:
     """Return a group of arguments; None is one that says nothing."""
-    if isinstance(value, Mapping):
-        value = kind(**value)
-    if value is not None and not isinstance(value, kind):
-        wanted = f"of the class {kind.__name__}: {name}={kind.__name__}(...)"
-        raise TypeError(f"{name} = {value!r} must be {wanted}.")
-    return kind() if value is None else value
+    return check.as_options(name, kind() if value is None else value, kind)
 
 
 def _completed(problem: MPCProblem) -> Terminal:
@@ -276,7 +275,8 @@ def _completed(problem: MPCProblem) -> Terminal:
     half_spaces: Any = problem.terminal.set
     if cost is None:
         cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
-    cost = as_symmetric("Terminal.cost", cost, len(errors.Q))
+    elif len(cost) != len(errors.Q):
+        as_array("Terminal.cost", cost, errors.Q.shape)  # which names the size that is wanted
     if isinstance(half_spaces, str):
         half_spaces = invariant_set(problem, cost)
     n, size = problem.model.n_states, problem.n_theta

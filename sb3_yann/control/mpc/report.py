@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from sb3_yann._validation import Array, as_whole
+from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.mpc.condensing import condense
@@ -31,7 +31,6 @@ def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: 
     seed : int, default 0
         Of the draws.
     """
-    as_whole("samples", samples)
     rng = np.random.default_rng(seed)
     points = rng.uniform(problem.theta_min, problem.theta_max, (samples, problem.n_theta))
     feasible = points[law.in_domain(points)]

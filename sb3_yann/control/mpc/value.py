@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_yann._validation import Array, as_discount
+from sb3_yann._validation import Array
 from sb3_yann.control import lqr
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.mpc.problem import MPCProblem
@@ -12,8 +12,7 @@ from sb3_yann.control.mpc.problem import MPCProblem
 
 def value_matrix(problem: MPCProblem, law: PiecewiseAffine, gamma: float) -> Array:
     """Return P (n_theta, n_theta) of :meth:`LinearMPC.value_matrix`, solved for in z."""
-    gamma, errors = as_discount(gamma), problem.error_system
-    K = gain_at_rest(problem, law)
+    errors, K = problem.error_system, gain_at_rest(problem, law)
     P = lqr.policy_value(errors.model, errors.Q, errors.R, K, gamma, errors.cross)
     return np.asarray(errors.to_error.T @ P @ errors.to_error)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sb3_yann import Identified, LinearModel, LinearMPC, Tracking, identify
+from sb3_yann.control.identification.fit import fit_log
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0], [1.0]])
@@ -351,3 +353,8 @@ def test_bad_data_are_named(changes: dict[str, Any], error: type[Exception], mes
 def test_bad_interval_is_named(name: str, level: float) -> None:
     with pytest.raises(ValueError, match=r"must be one of \('A', 'B', 'E'\)|must lie in \(0, 1\)"):
         identify(X, U, dt=1).interval(name, level)
+
+
+def test_identify_and_from_data_take_the_same_options_with_the_same_defaults() -> None:
+    ours, theirs = (inspect.signature(each).parameters.values() for each in (identify, fit_log))
+    assert [(p.name, p.default) for p in ours] == [(p.name, p.default) for p in theirs]

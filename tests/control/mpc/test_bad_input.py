@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -238,5 +239,16 @@ def test_an_unbounded_box_is_a_value_error(changes: dict[str, Any]) -> None:
 def test_bad_discount_of_the_critic_is_named(
     gamma: Any, error: type[Exception], message: str
 ) -> None:
-    with pytest.raises(error, match=message):
-        small_mpc().state_action_matrix(gamma)
+    mpc = small_mpc()
+    for matrix in (mpc.value_matrix, mpc.state_action_matrix):
+        with pytest.raises(error, match=message):
+            matrix(gamma)
+    with pytest.raises(ValueError, match="samples = 0 must be a whole number"):
+        mpc.report(samples=0)
+    assert mpc._laws == {}  # nothing was solved for it
+
+
+@pytest.mark.parametrize("name", ["Q", "layout", "outside"])
+def test_nothing_of_a_problem_can_be_set(name: str) -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(small_mpc(), name, 0)
