@@ -26,12 +26,14 @@ __version__ = "0.1.0"
 _NAMES = {
     "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning",
     "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
+    "sb3_yann.commissioning": "Improvement improve",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
     "ExplicitSolutionError Identified LinearMPC LinearModel OutputBounds PiecewiseAffine "
     "RateLimits SoftBounds Terminal Tracking identify",
     "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "
     "YannPolicy register_problem",
+    "sb3_yann.twin": "PlantTwin UntrustedTwinError",
     "sb3_yann_envs": "ActionRepeat",
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -4,6 +4,8 @@ from sb3_yann.audit import CostMismatchError as CostMismatchError
 from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
+from sb3_yann.commissioning import Improvement as Improvement
+from sb3_yann.commissioning import improve as improve
 from sb3_yann.control import DisturbanceBounds as DisturbanceBounds
 from sb3_yann.control import DisturbanceObserver as DisturbanceObserver
 from sb3_yann.control import ExplicitLimitError as ExplicitLimitError
@@ -30,6 +32,8 @@ from sb3_yann.policy import YannActor as YannActor
 from sb3_yann.policy import YannCritic as YannCritic
 from sb3_yann.policy import YannPolicy as YannPolicy
 from sb3_yann.policy import register_problem as register_problem
+from sb3_yann.twin import PlantTwin as PlantTwin
+from sb3_yann.twin import UntrustedTwinError as UntrustedTwinError
 from sb3_yann_envs import ActionRepeat as ActionRepeat
 
 __version__: str

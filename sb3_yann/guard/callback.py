@@ -26,6 +26,7 @@ from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, write_csv
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.twin.plant_twin import PlantTwin
 
 
 class ImprovementGuard(BaseCallback):
@@ -43,9 +44,10 @@ class ImprovementGuard(BaseCallback):
 
     Parameters
     ----------
-    env : str, gymnasium.Env, callable or None
+    env : str, gymnasium.Env, callable, PlantTwin or None
         The simulator: an id, a function that makes an env, or an env other than the training env.
-        The first two play all starts side by side. None is for a plant alone.
+        The first two play all starts side by side. Of a twin all members are played, start by
+        start. None is for a plant alone.
     n_starts : int, default 100
         Number of seeded starts.
     n_new_starts : int, default 50
@@ -93,7 +95,7 @@ class ImprovementGuard(BaseCallback):
 
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
         self,
-        env: Source | None,
+        env: Source | PlantTwin | None,
         *,
         n_starts: int = 100,
         n_new_starts: int = 50,
@@ -108,10 +110,13 @@ class ImprovementGuard(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
+        if isinstance(env, PlantTwin):
+            env.require_trust()
+            env = env.env  # each episode's seed names a member: all of them are played
         if not (env is None or isinstance(env, str | gym.Env) or callable(env)):
             raise TypeError(
                 f"env = {env!r} must be the id of an environment, a gymnasium.Env, a function that "
-                "makes one, or None to decide from the training episodes."
+                "makes one, a PlantTwin, or None to decide from the training episodes."
             )
         if log_path is not None and Path(log_path).is_dir():
             raise ValueError(f"log_path = {log_path!r} is a folder; name a file in it.")

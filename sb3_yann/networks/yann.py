@@ -121,7 +121,7 @@ class YannLayer(nn.Module):
         output = self._law(theta, region, inside) + correction
         # As compiled: where theta is not finite nothing is passed off as an input.
         output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
-        bounds = self._within_reach(theta) if self.rated else (-1.0, 1.0)
+        bounds = self.reachable(theta) if self.rated else (-1.0, 1.0)
         return clamp_with_inward_gradient(output, *bounds)
 
     def _compiled(self, theta: th.Tensor) -> th.Tensor:
@@ -160,10 +160,10 @@ class YannLayer(nn.Module):
         if self.infeasible == "zero_input":
             u = th.where(inside[:, None], u, self.resting)
         u = u.clamp(-1, 1).to(self.theta_half)
-        return u.clamp(*self._within_reach(theta)) if self.rated else u
+        return u.clamp(*self.reachable(theta)) if self.rated else u
 
     @th.no_grad()
-    def _within_reach(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def reachable(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return the bounds (batch, m) that the rate leaves of [-1, 1]."""
         previous = (theta[:, -len(self.middle) :] - self.middle) / self.half_range
         low, high = (previous + self.change[:, None]).clamp(-1, 1).to(self.theta_half)

@@ -170,7 +170,10 @@ class YannCritic(SeesTheta, ContinuousCritic):
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """Return Q of each critic, all (batch, 1), in units of the env's reward."""
         theta = self.extract_features(obs, self.features_extractor)  # never trained
-        points = th.cat([theta, actions], dim=1)
+        return self.values(th.cat([theta, actions], dim=1))
+
+    def values(self, points: th.Tensor) -> tuple[th.Tensor, ...]:
+        """Return Q of each critic, all (batch, 1), at points ``[theta, action]``."""
         return tuple(self._in_rewards(q_network(points)) for q_network in self.q_networks)
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -56,3 +57,20 @@ PROGRAMS = [path for path in sorted(EXAMPLES.glob("*.py")) if "def main" in path
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.name)
 def test_an_example_fits_a_page(path) -> None:
     assert len(path.read_text(encoding="utf-8").splitlines()) < 80
+
+
+@pytest.mark.slow
+def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "from_a_log.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "100"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Verdict: trusted." in (tmp_path / "out" / "twin.txt").read_text(encoding="utf-8")
+    costs = re.findall(r"mean cost +(.*) \(MPC\) -> (.*)", done.stdout)[0]
+    before, after = map(float, costs)
+    assert after < 0.99 * before and "violations: 0" in done.stdout
+    assert (tmp_path / "out" / "from_a_log.zip").exists()

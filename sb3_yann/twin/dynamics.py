@@ -1,0 +1,190 @@
+"""The linear model plus a residual, bounded outside the data: what a twin steps with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC
+from sb3_yann.twin.log import Episode
+from sb3_yann.twin.residuals import Polynomial, Residual
+
+MARGIN = 0.25
+"""How far the residual reaches beyond the data, in widths of the data."""
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Where the data are: what residuals are fed is scaled by it, and never lies far outside.
+
+    Attributes
+    ----------
+    low, high : ndarray, shape (k,)
+        The box of the logged ``[x, d, u]``, a quarter of its width beyond the data.
+    scale : ndarray, shape (k,)
+        The largest magnitudes.
+    units : ndarray, shape (n,)
+        How far the states move in the log: standard deviations.
+    """
+
+    low: Array
+    high: Array
+    scale: Array
+    units: Array
+
+    @classmethod
+    def of(cls, problem: LinearMPC, episodes: Sequence[Episode]) -> Coordinates:
+        """Return those of a log."""
+        seen = np.concatenate([features(problem, e.thetas[:-1], e.actions) for e in episodes])
+        half = features(problem, problem.theta_half, problem.u_half)
+        low, high = seen.min(0), seen.max(0)
+        width = np.maximum(high - low, 1e-6 * half)
+        scale = np.maximum(np.abs(seen).max(0), 1e-3 * half)
+        units = np.maximum(np.std(seen, axis=0), 1e-6 * half)[: problem.model.n_states]
+        return cls(low - MARGIN * width, high + MARGIN * width, scale, units)
+
+    def scaled(self, features: Array) -> Array:
+        """Return what residuals are fed, inside the box."""
+        return np.asarray(np.clip(features, self.low, self.high) / self.scale)
+
+
+def features(problem: LinearMPC, theta: Array, u: Array) -> Array:
+    """Return ``[x, d, u]`` (..., k): what the next state depends on."""
+    parts = problem.layout
+    return np.concatenate([theta[..., parts.state], theta[..., parts.disturbance], u], axis=-1)
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """``theta+ = A_bar theta + B_bar u + residual``, with one residual for each member.
+
+    Attributes
+    ----------
+    problem : LinearMPC
+    coordinates : Coordinates
+    members : tuple of Residual
+        One for each member, all of the same kind.
+    """
+
+    problem: LinearMPC
+    coordinates: Coordinates
+    members: tuple[Residual, ...]
+
+    @cached_property
+    def _stack(self) -> Polynomial | None:
+        """All members as one polynomial with weights (members, 1, size, n), where they are such."""
+        first = self.members[0]
+        if not isinstance(first, Polynomial):
+            return None
+        stack = Polynomial(first.degree, first.shrinkage, first.offset, first.inputs)
+        stack.monomials = first.monomials
+        stack.weights = np.array([each.weights for each in self.members])  # type: ignore[attr-defined]
+        return stack
+
+    def residual(self, theta: Array, u: Array) -> Array:
+        """Return the residuals (members, batch, n) at theta (members, batch, n_theta)."""
+        z = self.coordinates.scaled(features(self.problem, theta, u))
+        if self._stack is not None:
+            return self._stack.predict(z)
+        pairs = zip(self.members, z, strict=True)
+        return np.array([member.predict(each) for member, each in pairs])
+
+    def step(self, theta: Array, u: Array) -> Array:
+        """Return the next theta (members, batch, n_theta); r and d stay as they are."""
+        A, B = self.problem.prediction
+        after = theta @ A.T + u @ B.T
+        after[..., self.problem.layout.state] += self.residual(theta, u)
+        return np.asarray(after)
+
+    def jacobians(self, theta: Array, u: Array) -> tuple[Array, Array]:
+        """Return the derivatives of the step by theta and by u, for each member and row."""
+        problem, at = self.problem, features(self.problem, theta, u)
+        z, parts, m = self.coordinates.scaled(at), problem.layout, problem.model.n_inputs
+        if self._stack is not None:
+            weights = self._stack.weights[:, :-1] if self._stack.offset else self._stack.weights
+            slopes = self._stack.monomials.slopes(z, weights[:, None])
+            J = np.swapaxes(slopes, -1, -2)
+        else:
+            pairs = zip(self.members, z, strict=True)
+            J = np.array([member.jacobian(each) for member, each in pairs])
+        inside = (at > self.coordinates.low) & (at < self.coordinates.high)
+        J = J * (inside / self.coordinates.scale)[..., None, :]
+        n, d = problem.model.n_states, parts.disturbance.stop - parts.disturbance.start
+        A, B = (np.broadcast_to(M, (*at.shape[:-1], *M.shape)).copy() for M in problem.prediction)
+        A[..., :n, parts.state] += J[..., :n]
+        A[..., :n, parts.disturbance] += J[..., n : n + d]
+        B[..., :n, :] += J[..., n + d : n + d + m]
+        return A, B
+
+    def replay(self, episode: Episode, starts: Array, steps: int) -> Array:
+        """Return states (members, starts, steps + 1, n) from logged ones, under the logged inputs.
+
+        References and disturbances are those of the log at each step.
+        """
+        parts, n = self.problem.layout, self.problem.model.n_states
+        theta = np.broadcast_to(
+            episode.thetas[starts], (len(self.members), len(starts), parts.size)
+        )
+        theta, found = theta.copy(), np.empty((len(self.members), len(starts), steps + 1, n))
+        for k in range(steps + 1):
+            found[:, :, k] = theta[..., parts.state]
+            if k == steps:
+                break
+            theta[..., parts.constant] = episode.thetas[starts + k][:, parts.constant]
+            u = np.broadcast_to(
+                episode.actions[starts + k], (*theta.shape[:2], len(self.problem.R))
+            )
+            theta = self.step(theta, u)
+        return found
+
+    def roll_out(
+        self, act: Callable[[Array], Array], starts: Array, steps: int
+    ) -> tuple[Array, Array]:
+        """Return thetas (steps + 1, members, batch, n_theta) and inputs (steps, ...) of a policy.
+
+        Parameters
+        ----------
+        act : callable
+            From theta (rows, n_theta) to inputs (rows, m).
+        starts : ndarray, shape (members, batch, n_theta)
+            Where the runs begin.
+        steps : int
+            How long they are.
+        """
+        k, batch, size = starts.shape
+        thetas, inputs = np.empty((steps + 1, *starts.shape)), np.empty((steps, k, batch, self.m))
+        thetas[0] = starts
+        for t in range(steps):
+            u = np.asarray(act(thetas[t].reshape(-1, size)), np.float64).reshape(k, batch, self.m)
+            inputs[t] = u
+            thetas[t + 1] = self.step(thetas[t], u)
+        return thetas, inputs
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.problem.model.n_inputs
+
+    def replay_in_closed_loop(self, episode: Episode) -> tuple[Array, Array]:
+        """Return predicted costs (members,) of a whole episode, and the states' errors over it.
+
+        The inputs are the logged ones, corrected by what the law makes of the deviation of the
+        state: where the law made the log, it acts on its own predictions.
+        """
+        parts, law, steps = self.problem.layout, self.problem.explicit(), len(episode)
+        u_min, u_max = self.problem.u_min, self.problem.u_max
+        logged = np.atleast_2d(law(episode.thetas[:-1]))
+        theta = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
+        costs, errors = np.zeros(len(self.members)), np.zeros((len(self.members), parts.n_states))
+        for k in range(steps):
+            theta[..., parts.constant] = episode.thetas[k, parts.constant]
+            correction = np.atleast_2d(law(theta[:, 0])) - logged[k]
+            u = np.clip(episode.actions[k] + correction, u_min, u_max)[:, None]
+            costs += self.problem.stage_cost(theta, u)[:, 0]
+            theta = self.step(theta, u)
+            errors += (theta[:, 0, parts.state] - episode.thetas[k + 1, parts.state]) ** 2
+        return costs, np.sqrt(errors / steps)

@@ -1,0 +1,97 @@
+"""A twin as a Gymnasium env, with the plant's spaces."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array, as_whole
+from sb3_yann.twin.dynamics import Dynamics
+from sb3_yann_envs.spaces import ProblemBox
+
+if TYPE_CHECKING:
+    from sb3_yann.twin.plant_twin import PlantTwin
+
+Single = NDArray[np.float32]
+
+
+class TwinEnv(gym.Env[Single, Single]):
+    """Episodes of a member of a twin: theta is observed, the reward is minus the stage cost.
+
+    An episode begins in the box of the log's first states, takes the references and disturbances of
+    one of its episodes, and lasts as long. ``info["violation"]`` reports a state beyond the
+    problem's bounds, or outside what the log shows: there the twin knows nothing.
+
+    Parameters
+    ----------
+    twin : PlantTwin
+        It must be trusted.
+    member : int, optional
+        The member that acts; by default the seed of an episode decides: seed modulo members.
+
+    Raises
+    ------
+    UntrustedTwinError
+        If the twin is not to be trusted.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}
+    observation_space: ProblemBox
+
+    def __init__(self, twin: PlantTwin, member: int | None = None) -> None:
+        twin.require_trust()
+        members = len(twin.dynamics.members)
+        if member is not None and as_whole("member", member, 0) >= members:
+            raise ValueError(f"member = {member} must be below {members}, how many there are.")
+        self.twin, self.member, self.render_mode = twin, member, None
+        problem = twin.problem
+        low, high = (each.astype(np.float32) for each in (problem.theta_min, problem.theta_max))
+        self.observation_space = ProblemBox(low, high, problem=problem)
+        u_min, u_max = (each.astype(np.float32) for each in (problem.u_min, problem.u_max))
+        self.action_space = gym.spaces.Box(u_min, u_max)
+        self._theta: Array | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Single, dict[str, Any]]:
+        """Start an episode, from a random theta or ``options["state"]``, (n,) or (n_theta,)."""
+        super().reset(seed=seed)
+        twin, parts = self.twin, self.twin.problem.layout
+        members = twin.dynamics.members
+        acting = int(self.np_random.integers(len(members)))
+        if self.member is not None:
+            acting = self.member
+        elif seed is not None:
+            acting = seed % len(members)
+        self._dynamics = Dynamics(twin.problem, twin.dynamics.coordinates, (members[acting],))
+        self._episode = twin.episodes[int(self.np_random.integers(len(twin.episodes)))]
+        theta = self._episode.thetas[0].copy()
+        theta[parts.state] = twin.starts.draw(1, self.np_random)[0, parts.state]
+        if options:
+            given = np.asarray(options["state"], np.float64)
+            theta[: len(given)] = given
+        self._theta, self._steps = theta, 0
+        return theta.astype(np.float32), {"state": theta.copy(), "member": acting}
+
+    def step(self, action: Single) -> tuple[Single, float, bool, bool, dict[str, Any]]:
+        """Hold an input, clipped to its bounds, for one sample."""
+        if self._theta is None:
+            raise gym.error.ResetNeeded("Call env.reset() before env.step().")
+        problem, parts = self.twin.problem, self.twin.problem.layout
+        u = np.asarray(action, np.float64)
+        if u.shape != problem.u_min.shape or not np.all(np.isfinite(u)):
+            raise ValueError(f"action = {action!r} must be {problem.u_min.shape} finite numbers.")
+        u = np.clip(u, problem.u_min, problem.u_max)
+        cost = float(problem.stage_cost(self._theta, u))
+        theta = self._dynamics.step(self._theta[None, None], u[None, None])[0, 0]
+        self._steps += 1
+        if self._steps < len(self._episode.thetas):
+            theta[parts.constant] = self._episode.thetas[self._steps, parts.constant]
+        self._theta = theta
+        violation = bool(self.twin.limits.violated(theta))
+        over = self._steps >= len(self._episode)
+        info = {"cost": cost, "violation": violation, "state": theta.copy()}
+        return theta.astype(np.float32), -cost, False, over, info

@@ -1,0 +1,171 @@
+"""The gradient of a policy's cost in a twin, by the actor's parameters.
+
+Backpropagation through time with the costate: the actions are computed forward without torch's
+graph, the costate runs backward through the twin's and the actor's Jacobians, and one backward pass
+of the actor over all steps at once takes what the costate makes of each action.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch as th
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC
+from sb3_yann.networks import YannLayer
+from sb3_yann.twin.dynamics import Dynamics
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """A batch of closed-loop runs in a twin.
+
+    Attributes
+    ----------
+    thetas, inputs : ndarray, shapes (T + 1, members, batch, n_theta) and (T, members, batch, m)
+    costs : ndarray, shape (members, batch)
+        Summed stage costs, and the value function at the end.
+    """
+
+    thetas: Array
+    inputs: Array
+    costs: Array
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What is minimized: stage costs, the value at the end, and a penalty beyond limits.
+
+    Attributes
+    ----------
+    problem : LinearMPC
+    value : ndarray, shape (n_theta, n_theta)
+        ``theta' value theta`` is the cost of what comes after the last step.
+    low, high : ndarray, shape (n,)
+        Limits of the states, infinite where there are none.
+    penalty : float
+        Cost of a step one half-width beyond.
+    """
+
+    problem: LinearMPC
+    value: Array
+    low: Array
+    high: Array
+    penalty: float
+
+    def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
+        """Return the derivatives of the cost of each step by theta and by the input."""
+        W, size = self.problem.stage_matrix, self.problem.n_theta
+        both = 2 * np.concatenate([thetas, inputs], axis=-1) @ W
+        by_theta, by_u = both[..., :size].copy(), both[..., size:]
+        state = self.problem.layout.state
+        by_theta[..., state] += 2 * self.penalty * self._beyond(thetas[..., state])
+        return by_theta, by_u
+
+    def _beyond(self, x: Array) -> Array:
+        half = self.problem.theta_half[self.problem.layout.state]
+        over = np.maximum(x - self.high, 0.0) - np.maximum(self.low - x, 0.0)
+        return np.asarray(over / half**2)
+
+    def costs(self, thetas: Array, inputs: Array) -> Array:
+        """Return the costs of runs, without the penalty."""
+        end = thetas[-1]
+        stage = self.problem.stage_cost(thetas[:-1], inputs).sum(axis=0)
+        return np.asarray(stage + np.sum((end @ self.value) * end, axis=-1))
+
+
+def actor_inputs(layer: YannLayer, problem: LinearMPC, theta: Array) -> Array:
+    """Return the inputs (rows, m) of an actor at theta (rows, n_theta)."""
+    with th.no_grad():
+        actions = layer(th.as_tensor(theta)).double().numpy()
+    middle, half = (problem.u_max + problem.u_min) / 2, (problem.u_max - problem.u_min) / 2
+    return np.asarray(middle + half * actions)
+
+
+def accumulate_gradient(
+    layer: YannLayer,
+    dynamics: Dynamics,
+    objective: Objective,
+    starts: Array,
+    steps: int,
+    reference: tuple[Array, Array, Array] | None = None,
+) -> Unrolled:
+    """Add to the parameters' ``grad`` the gradient of the mean cost of runs from some starts.
+
+    Parameters
+    ----------
+    layer : YannLayer
+        On the CPU.
+    dynamics : Dynamics
+        The twin's.
+    objective : Objective
+        What is minimized.
+    starts : ndarray, shape (members, batch, n_theta)
+        Where the runs begin.
+    steps : int
+        Length T of the runs.
+    reference : three of ndarray, shape (members, batch), optional
+        Costs that no run should exceed; how much each counts below them, and above.
+    """
+    problem = objective.problem
+    half = (problem.u_max - problem.u_min) / 2
+    thetas, inputs = dynamics.roll_out(
+        lambda rows: actor_inputs(layer, problem, rows), starts, steps
+    )
+    flat = thetas[:-1].reshape(-1, problem.n_theta)
+    A, B = dynamics.jacobians(*_by_member(thetas[:-1], inputs))
+    shape = (steps, *starts.shape[:2])
+    A, B = (
+        np.moveaxis(each.reshape(len(each), steps, -1, *each.shape[2:]), 0, 1) for each in (A, B)
+    )
+    K = half[:, None] * _slopes_of_actor(layer, flat).reshape(*shape, len(half), -1)
+    by_theta, by_u = objective.slopes(thetas[:-1], inputs)
+    costs = objective.costs(thetas, inputs)
+    weights = np.ones_like(costs)
+    if reference is not None:
+        weights = np.where(costs > reference[0], reference[2], reference[1])
+    costate = 2 * thetas[-1] @ objective.value
+    by_action = np.empty_like(inputs)
+    for t in reversed(range(steps)):
+        row = costate[..., None, :]
+        by_action[t] = by_u[t] + (row @ B[t])[..., 0, :]
+        costate = by_theta[t] + (row @ A[t] + by_action[t][..., None, :] @ K[t])[..., 0, :]
+    actions = layer(th.as_tensor(flat))
+    upstream = by_action * weights[..., None] * half / weights.size
+    upstream = upstream.reshape(len(flat), -1)
+    actions.backward(th.as_tensor(upstream).to(actions))
+    return Unrolled(thetas, inputs, costs)
+
+
+def _by_member(thetas: Array, inputs: Array) -> tuple[Array, Array]:
+    """Return (T, members, batch, ...) as (members, T batch, ...)."""
+    first, second = (np.moveaxis(each, 1, 0) for each in (thetas, inputs))
+    return (
+        first.reshape(len(first), -1, thetas.shape[-1]),
+        second.reshape(len(second), -1, inputs.shape[-1]),
+    )
+
+
+def _slopes_of_actor(layer: YannLayer, theta: Array) -> Array:
+    """Return the derivatives (rows, m, n_theta) of the actions in [-1, 1] by theta.
+
+    Zero where an action lies on its bound; on a bound of the rate it moves with the previous input.
+    """
+    at = th.as_tensor(theta).requires_grad_()
+    actions = layer(at)
+    m, size = actions.shape[1], theta.shape[1]
+    rows = [
+        th.autograd.grad(actions[:, k].sum(), at, retain_graph=k + 1 < m)[0].numpy()
+        for k in range(m)
+    ]
+    slopes, found = np.stack(rows, axis=1), actions.detach().numpy()
+    slopes[np.abs(found) >= 1] = 0.0
+    if layer.rated:
+        low, high = (each.numpy() for each in layer.reachable(at.detach()))
+        at_rate = ((found <= low) | (found >= high)) & (np.abs(found) < 1)
+        slopes[at_rate] = 0.0
+        row, k = np.nonzero(at_rate)
+        slopes[row, k, size - m + k] = 1 / layer.half_range.numpy()[k]
+    return np.asarray(slopes, np.float64)

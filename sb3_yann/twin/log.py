@@ -1,0 +1,172 @@
+"""A plant's own episodes, checked, in the parts of theta."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import Array, to_float
+from sb3_yann.control import LinearMPC
+
+SHORTEST = 5
+"""Steps that an episode has at least."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode without gaps.
+
+    Attributes
+    ----------
+    thetas : ndarray, shape (T + 1, n_theta)
+        ``[x, r, d, u_prev]`` at each sample, as the law sees it.
+    actions : ndarray, shape (T, m)
+        The inputs, in the units of the problem.
+    """
+
+    thetas: Array
+    actions: Array
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.actions)
+
+
+def as_episodes(
+    problem: LinearMPC,
+    episodes: Iterable[tuple[ArrayLike, ArrayLike]],
+    references: Sequence[ArrayLike] | None = None,
+    disturbances: Sequence[ArrayLike] | None = None,
+    previous: Sequence[ArrayLike] | None = None,
+) -> tuple[Episode, ...]:
+    """Return episodes as the problem sees them.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Of the plant.
+    episodes : sequence of pairs
+        States (T + 1, n), or all of theta (T + 1, n_theta), and actions (T, m).
+    references, disturbances : sequence of array_like, shapes (T + 1, p) and (T + 1, d)
+        What theta holds besides, one for each episode, or one row for all of it.
+    previous : sequence of array_like, shape (m,), optional
+        The input before each episode; zero by default.
+
+    Raises
+    ------
+    ValueError
+        For no episodes, wrong shapes, entries that are not finite, inputs beyond their bounds.
+    """
+    layout, pairs = problem.layout, _pairs(episodes)
+    given = {"references": references, "disturbances": disturbances, "previous": previous}
+    for name, values in given.items():
+        if values is not None and len(values) != len(pairs):
+            raise ValueError(f"{name} has {len(values)} entries for {len(pairs)} episodes.")
+    found = []
+    for i, (states, actions) in enumerate(pairs):
+        u = _actions(problem, i, actions)
+        x = _finite(f"episode {i}: states", states)
+        if x.ndim == 1:
+            x = x[:, None]
+        own = {name: None if each is None else each[i] for name, each in given.items()}
+        if x.ndim != 2 or x.shape[1] not in (layout.n_states, layout.size):
+            wanted = f"(T + 1, {layout.n_states})"
+            if layout.size > layout.n_states:
+                wanted += f", or all of theta, (T + 1, {layout.size})"
+            raise ValueError(f"episode {i}: states have shape {x.shape}, expected {wanted}.")
+        if len(x) != len(u) + 1:
+            raise ValueError(
+                f"episode {i}: {len(x)} states and {len(u)} actions; there is one state more than "
+                "actions, the one after the last."
+            )
+        if len(u) < SHORTEST:
+            raise ValueError(f"episode {i} has {len(u)} steps; {SHORTEST} are the least.")
+        whole = x.shape[1] == layout.size and layout.size > layout.n_states
+        found.append(Episode(x if whole else _theta(problem, i, x, u, own), u))
+    return tuple(found)
+
+
+def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
+    """Return at least so many pieces of two episodes or more: whole ones where there are enough.
+
+    Each piece of an episode begins where the one before it ends.
+    """
+    if len(episodes) < 2 or len(episodes) >= least:
+        return episodes
+    found = []
+    for episode in episodes:
+        count = min(-(-least // len(episodes)), max(1, len(episode) // (4 * SHORTEST)))
+        edges = np.linspace(0, len(episode), count + 1).astype(int)
+        for first, last in pairwise(edges):
+            rows = episode.thetas[first : last + 1], episode.actions[first:last]
+            found.append(Episode(*rows))
+    return tuple(found)
+
+
+def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
+    pairs = [*episodes]
+    if not pairs:
+        raise ValueError("episodes is empty: pass a list of (states, actions), one per episode.")
+    for i, pair in enumerate(pairs):
+        if not (isinstance(pair, tuple | list) and len(pair) == 2):
+            raise TypeError(f"episode {i} must be a pair (states, actions), got {type(pair)}.")
+    return [(states, actions) for states, actions in pairs]
+
+
+def _finite(name: str, values: ArrayLike) -> Array:
+    array = to_float(name, values)
+    if not np.all(np.isfinite(array)):
+        row = int(np.argwhere(~np.isfinite(array))[0][0])
+        raise ValueError(
+            f"{name} are not finite in row {row}: {array[row].tolist()}. Cut the episode there, "
+            "into two of their own."
+        )
+    return array
+
+
+def _actions(problem: LinearMPC, i: int, actions: ArrayLike) -> Array:
+    u = _finite(f"episode {i}: actions", actions)
+    u = u[:, None] if u.ndim == 1 else u
+    m = problem.model.n_inputs
+    if u.ndim != 2 or u.shape[1] != m:
+        raise ValueError(f"episode {i}: actions have shape {u.shape}, expected (T, {m}).")
+    room = 1e-3 * problem.u_half
+    beyond = (u < problem.u_min - room) | (u > problem.u_max + room)
+    if beyond.any():
+        row, k = np.argwhere(beyond)[0]
+        raise ValueError(
+            f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds "
+            f"{problem.u_min[k]:g} and {problem.u_max[k]:g} of the problem. Are these deviations "
+            "from the operating point, in the problem's units?"
+        )
+    return np.clip(u, problem.u_min, problem.u_max)
+
+
+def _theta(problem: LinearMPC, i: int, x: Array, u: Array, given: dict[str, Any]) -> Array:
+    layout = problem.layout
+    theta = np.zeros((len(x), layout.size))
+    theta[:, layout.state] = x
+    for name, part in (("references", layout.reference), ("disturbances", layout.disturbance)):
+        size = part.stop - part.start
+        if given[name] is None:
+            if size:
+                raise ValueError(
+                    f"The problem's theta holds {size} {name}: pass {name}=, shape (T + 1, "
+                    f"{size}) for each episode, or states of all of theta."
+                )
+            continue
+        values = np.atleast_2d(_finite(f"episode {i}: {name}", given[name]))
+        if values.shape not in ((1, size), (len(x), size)):
+            raise ValueError(
+                f"episode {i}: {name} have shape {values.shape}, expected ({len(x)}, {size})."
+            )
+        theta[:, part] = values
+    if layout.n_previous:
+        first = np.zeros(len(u[0])) if given["previous"] is None else given["previous"]
+        theta[:, layout.previous] = np.vstack([np.reshape(first, (1, -1)), u])
+    return theta

@@ -1,0 +1,259 @@
+"""A plant's twin: its linear model, and what its own episodes teach beyond it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import as_whole
+from sb3_yann.control import LinearMPC
+from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.limits import Limits
+from sb3_yann.twin.log import Episode, as_episodes, pieces
+from sb3_yann.twin.replay_buffer import episodes_of
+from sb3_yann.twin.report import report
+from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.selection import FOLDS, Candidate, FreeRuns, candidates, fitted, held_out
+from sb3_yann.twin.starts import Starts
+from sb3_yann.twin.trust import (
+    Trust,
+    UntrustedTwinError,
+    beyond_the_box,
+    excitation,
+    held_out_costs,
+    judge,
+    standing_still,
+)
+
+if TYPE_CHECKING:
+    from sb3_yann.twin.env import TwinEnv
+
+BLOCKS = 40
+"""Pieces of a log of few episodes that its members are fitted to some of."""
+KINDS = ("none", "linear", "quadratic", "cubic")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlantTwin:
+    """A simulator learnt from a plant's own episodes, which says what it is worth.
+
+    ``x+ = A x + B u + E d + residual(x, d, u)``. Which residual, and how strongly it is shrunk
+    towards the given model, is chosen by free runs over episodes that its fit has not seen.
+    Several members, fitted to episodes drawn with replacement, tell how much is not known. Two to
+    four episodes are cut into pieces for both. Outside the data the residual stays what it is at
+    their edge.
+
+    Make one with :meth:`fit` or :meth:`from_buffer`.
+
+    Attributes
+    ----------
+    problem : LinearMPC
+    episodes : tuple of Episode
+        The log.
+    kind : str
+        The residual that was chosen.
+    dynamics : Dynamics
+        The members; the first one is fitted to all episodes.
+    trust : Trust
+        The evidence.
+
+    Examples
+    --------
+    >>> import gymnasium
+    >>> from sb3_yann.evaluation import evaluate
+    >>> problem = gymnasium.make("CSTR-v0").observation_space.problem
+    >>> log = evaluate(problem.explicit(), "CSTR-v0", seeds=range(3))
+    >>> twin = PlantTwin.fit(problem, [*zip(log.observations, log.actions)])
+    >>> twin.trusted
+    True
+    """
+
+    problem: LinearMPC
+    episodes: tuple[Episode, ...]
+    kind: str
+    dynamics: Dynamics
+    trust: Trust
+
+    def __repr__(self) -> str:
+        """Name the sizes, and whether to trust it."""
+        verdict = "trusted" if self.trusted else "not trusted"
+        members = len(self.dynamics.members)
+        return (
+            f"PlantTwin({self.kind}, {len(self.episodes)} episodes, {members} members, {verdict})"
+        )
+
+    @classmethod
+    def fit(
+        cls,
+        problem: LinearMPC,
+        episodes: Iterable[tuple[ArrayLike, ArrayLike]],
+        *,
+        references: Sequence[ArrayLike] | None = None,
+        disturbances: Sequence[ArrayLike] | None = None,
+        previous: Sequence[ArrayLike] | None = None,
+        residuals: Sequence[str | Callable[[], Any]] = KINDS,
+        n_members: int = 5,
+        seed: int = 0,
+    ) -> PlantTwin:
+        """Return the twin of a plant that was logged.
+
+        Parameters
+        ----------
+        problem : LinearMPC
+            The MPC of the plant: its model is where the twin starts from.
+        episodes : sequence of pairs
+            States (T + 1, n), or all of theta (T + 1, n_theta), and actions (T, m), in the units
+            of the problem.
+        references, disturbances : sequence of array_like, optional
+            What theta holds besides the state, shapes (T + 1, p) and (T + 1, d) for each episode.
+        previous : sequence of array_like, shape (m,), optional
+            The input before each episode.
+        residuals : sequence, default ("none", "linear", "quadratic", "cubic")
+            What there is to choose from. A function makes a regressor with ``fit(z, y)`` and
+            ``predict(z)``, as scikit-learn has it.
+        n_members : int, default 5
+            The first is fitted to all episodes, the others to as many drawn from them.
+        seed : int, default 0
+            Of the draws of episodes.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For a log that cannot be read; one that says little makes a twin that is not trusted.
+        """
+        if not isinstance(problem, LinearMPC):
+            raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
+        as_whole("n_members", n_members)
+        log = as_episodes(problem, episodes, references, disturbances, previous)
+        coordinates, choices = Coordinates.of(problem, log), candidates(problem, residuals)
+        parts = pieces(log, FOLDS)
+        runs, chosen = _choose(problem, coordinates, parts, choices)
+        choice = choices[chosen]
+        drawn = log if len(log) >= FOLDS else pieces(log, BLOCKS)
+        members = _members(problem, coordinates, drawn, choice, n_members, seed)
+        dynamics = Dynamics(problem, coordinates, members)
+        trust = _trust(problem, coordinates, parts, (choices, chosen, runs), dynamics)
+        return cls(problem, log, choice.name, dynamics, trust)
+
+    @classmethod
+    def from_buffer(cls, model: Any, **options: Any) -> PlantTwin:
+        """Return the twin of the plant whose transitions a model's replay buffer holds.
+
+        Parameters
+        ----------
+        model : DDPG or TD3
+            With a :class:`YannPolicy`.
+        **options
+            As in :meth:`fit`.
+
+        Raises
+        ------
+        ValueError
+            If the buffer holds no episode of some steps.
+        """
+        return cls.fit(model.policy.problem, episodes_of(model), **options)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against the twin; :meth:`report` says why or why not."""
+        return self.trust.trusted
+
+    def require_trust(self) -> None:
+        """Raise UntrustedTwinError, with its reasons, unless the twin is trusted."""
+        if not self.trusted:
+            said = " ".join([*self.trust.problems, *self.trust.advice])
+            raise UntrustedTwinError(f"The twin is not to be trusted: {said}")
+
+    def report(self) -> str:
+        """Return what the twin explains, what it does not know, and whether to trust it."""
+        return report(self.problem, self.episodes, self.kind, self.trust)
+
+    @cached_property
+    def starts(self) -> Starts:
+        """Where episodes begin."""
+        return Starts.of(self.problem, self.episodes)
+
+    @cached_property
+    def limits(self) -> Limits:
+        """Where the twin holds, and the problem's own bounds of the states."""
+        return Limits.of(self.problem, self.dynamics.coordinates, self.starts)
+
+    def env(self, member: int | None = None) -> TwinEnv:
+        """Return a Gymnasium env with the twin's dynamics and the plant's spaces.
+
+        Parameters
+        ----------
+        member : int, optional
+            The member that acts; by default the seed of an episode decides: seed modulo members.
+
+        Raises
+        ------
+        UntrustedTwinError
+            If the twin is not to be trusted.
+        """
+        from sb3_yann.twin.env import TwinEnv  # which needs this class
+
+        return TwinEnv(self, member)
+
+
+def _choose(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    log: tuple[Episode, ...],
+    choices: list[Candidate],
+) -> tuple[FreeRuns, int]:
+    """Return the candidates' free runs, and which is best: the first without a second episode."""
+    if len(log) < 2:
+        errors = np.full((len(choices), 1, 1), np.inf)
+        return FreeRuns(np.array([1]), errors, tuple(each.name for each in choices)), 0
+    runs = held_out(problem, coordinates, log, choices)
+    return runs, runs.choose(np.array([each.freedom for each in choices]))
+
+
+def _members(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    log: tuple[Episode, ...],
+    choice: Candidate,
+    n_members: int,
+    seed: int,
+) -> tuple[Residual, ...]:
+    """Return one residual fitted to all episodes, and others to episodes drawn from them."""
+    rng = np.random.default_rng(seed)
+    members = fitted(problem, coordinates, log, [choice.make()])
+    for _ in range(n_members - 1):
+        drawn = rng.integers(len(log), size=len(log))
+        members += fitted(problem, coordinates, [log[i] for i in drawn], [choice.make()])
+    return tuple(members)
+
+
+def _trust(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    log: tuple[Episode, ...],
+    found: tuple[list[Candidate], int, FreeRuns],
+    dynamics: Dynamics,
+) -> Trust:
+    choices, chosen, runs = found
+    linear = next((i for i, each in enumerate(choices) if each.name == "none"), chosen)
+    standing = standing_still(problem, coordinates, log, runs.horizons)
+    costs = held_out_costs(problem, coordinates, log, choices[chosen])
+    inputs = excitation(problem, log)
+    problems, advice = judge(
+        runs, linear, standing, costs, inputs, len(log), beyond_the_box(problem, log)
+    )
+    n, first = problem.model.n_states, Dynamics(problem, coordinates, dynamics.members[:1])
+    left = np.concatenate(
+        [e.thetas[1:, :n] - first.step(e.thetas[None, :-1], e.actions[None])[0][:, :n] for e in log]
+    )
+    # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
+    gain = np.sqrt(1 + np.sum(problem.model.A**2, axis=1))
+    noise = np.std(left, axis=0) / gain
+    return Trust(
+        runs, chosen, linear, standing, *costs, *inputs, noise, tuple(problems), tuple(advice)
+    )

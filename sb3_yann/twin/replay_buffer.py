@@ -1,0 +1,53 @@
+"""Episodes out of a replay buffer of Stable-Baselines3."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.twin.log import SHORTEST
+
+
+def episodes_of(model: Any) -> list[tuple[Array, Array]]:
+    """Return the episodes (thetas, actions) that a model's replay buffer holds, whole or in part.
+
+    Raises
+    ------
+    ValueError
+        If it holds none of five steps.
+    """
+    buffer, policy, problem = model.replay_buffer, model.policy, model.policy.problem
+    order = np.arange(buffer.size())
+    if buffer.full:  # the oldest row is the one that comes next
+        order = np.roll(order, -buffer.pos)
+    normalize = model.get_vec_normalize_env()
+
+    def theta(observations: Any) -> Array:
+        seen = observations if normalize is None else normalize.normalize_obs(observations)
+        return np.asarray(policy.theta(seen).double().cpu().numpy())
+
+    found = []
+    for env in range(buffer.n_envs):
+        now, after = buffer.observations[order, env], buffer.next_observations[order, env]
+        if buffer.optimize_memory_usage:
+            after = buffer.observations[(order + 1) % buffer.buffer_size, env]
+        scaled = buffer.actions[order, env].astype(np.float64)
+        u = problem.u_min + (scaled + 1) / 2 * (problem.u_max - problem.u_min)
+        ends = buffer.dones[order, env].astype(bool)
+        same = np.all(now[1:] == after[:-1], axis=tuple(range(1, now.ndim)))
+        ends[:-1] |= ~same
+        begin = 0
+        for end in [*np.flatnonzero(ends), len(order) - 1]:
+            rows = slice(begin, end + 1)
+            if end + 1 - begin >= SHORTEST:
+                thetas = np.concatenate([theta(now[rows]), theta(after[end : end + 1])])
+                found.append((thetas, u[rows]))
+            begin = end + 1
+    if not found:
+        raise ValueError(
+            f"The replay buffer holds {buffer.size()} rows and no episode of {SHORTEST} steps. "
+            "Let the model run on the plant first: model.learn(steps, callback=NoActionNoise())."
+        )
+    return found

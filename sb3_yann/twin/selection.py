@@ -1,0 +1,193 @@
+"""Which residual, and how strongly shrunk: by free runs over episodes that the fit has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, features
+from sb3_yann.twin.log import Episode
+from sb3_yann.twin.residuals import Nothing, Polynomial, Regressor, Residual
+
+SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
+INPUT_FACTORS = (1.0, 30.0)
+LONGEST = 100
+"""Steps of a free run, at most."""
+RUNS = 20
+"""Free runs in an episode."""
+FOLDS = 5
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A kind of residual with its settings.
+
+    Attributes
+    ----------
+    name : str
+    make : callable
+        Returns a residual that is not fitted.
+    freedom : float
+        How far it may leave the given model: of what predicts as well, the least free is taken.
+    """
+
+    name: str
+    make: Callable[[], Any]
+    freedom: float
+
+
+def candidates(problem: LinearMPC, kinds: Sequence[Any]) -> list[Candidate]:
+    """Return what there is to choose from; a kind is a name, or makes something with fit."""
+    offset, found = problem.layout.has_constants, []
+    for kind in kinds:
+        if kind == "none":
+            found.append(Candidate("none", partial(Nothing, problem.model.n_states), -np.inf))
+        elif isinstance(kind, str) and kind in DEGREES:
+            for shrinkage in SHRINKAGES:
+                for factor in INPUT_FACTORS:
+                    name = f"{kind}, shrinkage {shrinkage:g} ({shrinkage * factor:g} of inputs)"
+                    inputs = problem.model.n_inputs, factor
+                    options = DEGREES[kind], shrinkage, offset, inputs
+                    freedom = DEGREES[kind] - 2 * np.log10(shrinkage) - np.log10(factor)
+                    found.append(Candidate(name, partial(Polynomial, *options), freedom))
+        elif callable(kind):
+            name = getattr(kind, "__name__", type(kind).__name__)
+            found.append(Candidate(name, partial(Regressor, kind), np.inf))
+        else:
+            raise ValueError(
+                f"residuals holds {kind!r}; expected some of {('none', *DEGREES)}"
+                ", or a function that makes a regressor with fit and predict."
+            )
+    return found
+
+
+def fitted(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    episodes: Sequence[Episode],
+    made: Sequence[Any],
+) -> list[Residual]:
+    """Return residuals fitted to what the linear model leaves of each step."""
+    z, y = zip(*(regression(problem, coordinates, each) for each in episodes), strict=True)
+    z_all, y_all = np.concatenate(z), np.concatenate(y)
+    moments: dict[tuple[int, bool], Any] = {}
+    for residual in made:
+        if isinstance(residual, Polynomial):
+            key = residual.degree, residual.offset
+            if key not in moments:
+                moments[key] = residual.moments(z_all, y_all)
+            residual.moments(z_all[:1], y_all[:1])  # which makes its monomials
+            residual.solve(*moments[key])
+        elif not isinstance(residual, Nothing):
+            residual.fit(z_all, y_all)
+    return list(made)
+
+
+def regression(
+    problem: LinearMPC, coordinates: Coordinates, episode: Episode
+) -> tuple[Array, Array]:
+    """Return z (T, k), and what the linear model leaves of the next states (T, n)."""
+    A, B = problem.prediction
+    theta, u, n = episode.thetas, episode.actions, problem.model.n_states
+    left = theta[1:, :n] - (theta[:-1] @ A.T + u @ B.T)[:, :n]
+    return coordinates.scaled(features(problem, theta[:-1], u)), left
+
+
+@dataclass(frozen=True)
+class FreeRuns:
+    """Errors of free runs over episodes that were held out.
+
+    Attributes
+    ----------
+    horizons : ndarray of int, shape (h,)
+    by_episode : ndarray, shape (candidates, episodes, h)
+        Root mean squares over states, in units of how far each moves in the log.
+    names : tuple of str
+    """
+
+    horizons: Any
+    by_episode: Array
+    names: tuple[str, ...]
+
+    @property
+    def errors(self) -> Array:
+        """Root mean squares over all episodes, (candidates, h)."""
+        return np.asarray(np.sqrt(np.mean(self.by_episode**2, axis=1)))
+
+    @property
+    def scores(self) -> Array:
+        """The mean logarithm over horizons, (candidates, episodes): less is better."""
+        return np.asarray(np.log(self.by_episode + 1e-12).mean(axis=2))
+
+    def choose(self, freedom: Array) -> int:
+        """Return the least free candidate that is within one standard error of the best.
+
+        The error is that of the difference of the two, over episodes (the one-standard-error rule
+        of Hastie, Tibshirani and Friedman, section 7.10).
+        """
+        best = int(np.argmin(self.scores.mean(axis=1)))
+        behind = self.scores - self.scores[best]
+        error = behind.std(axis=1, ddof=1) / np.sqrt(behind.shape[1])
+        near = behind.mean(axis=1) <= error
+        near[best] = True
+        return int(np.flatnonzero(near)[np.argmin(freedom[near])])
+
+
+def held_out(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    episodes: Sequence[Episode],
+    choices: Sequence[Candidate],
+) -> FreeRuns:
+    """Return the free-run errors of candidates, over folds of whole episodes."""
+    longest = min(LONGEST, min(map(len, episodes)))
+    horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
+    folds = [range(k, len(episodes), min(FOLDS, len(episodes))) for k in range(FOLDS)]
+    errors = np.zeros((len(choices), len(episodes), len(horizons)))
+    for fold in filter(len, folds):
+        kept = [each for i, each in enumerate(episodes) if i not in fold]
+        if not kept:
+            continue
+        made = fitted(problem, coordinates, kept, [each.make() for each in choices])
+        for i in fold:
+            errors[:, i] = _errors(problem, coordinates, episodes[i], made, horizons)
+    names = tuple(each.name for each in choices)
+    return FreeRuns(horizons, np.sqrt(errors), names)
+
+
+def _errors(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    episode: Episode,
+    made: Sequence[Residual],
+    horizons: Any,
+) -> Array:
+    """Return mean squares (candidates, h) of one episode's free runs."""
+    steps, n = int(horizons[-1]), problem.model.n_states
+    starts = np.unique(np.linspace(0, len(episode) - steps, RUNS).astype(int))
+    actual = episode.thetas[starts[:, None] + horizons, :n]
+    found = np.empty((len(made), len(horizons)))
+    for same in _alike(made):
+        dynamics = Dynamics(problem, coordinates, tuple(made[i] for i in same))
+        with np.errstate(all="ignore"):
+            free = dynamics.replay(episode, starts, steps)[:, :, horizons]
+            error = (free - actual) / coordinates.units
+            mean = np.mean(error**2, axis=(1, 3))
+        found[same] = np.where(np.isfinite(mean), np.minimum(mean, 1e12), 1e12)
+    return found
+
+
+def _alike(made: Sequence[Residual]) -> list[list[int]]:
+    """Return which residuals can be stepped as one: polynomials of one degree."""
+    groups: dict[Any, list[int]] = {}
+    for i, each in enumerate(made):
+        key = each.degree if isinstance(each, Polynomial) else f"own {i}"
+        groups.setdefault(key, []).append(i)
+    return list(groups.values())

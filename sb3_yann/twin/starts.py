@@ -1,0 +1,77 @@
+"""Where episodes of a twin begin, and what they are given: as in the log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC
+from sb3_yann.twin.log import Episode
+
+AROUND, WIDEST = 3.0, 2.0
+
+
+@dataclass(frozen=True)
+class Starts:
+    """The box of first states, and the logged rows.
+
+    The box is that of a uniform distribution, estimated without bias from the first states of the
+    log: with k of them it is (k + 1) / (k - 1) times as wide as they are, twice at most.
+
+    Attributes
+    ----------
+    problem : LinearMPC
+    low, high : ndarray, shape (n,)
+    first, rows : ndarray, shapes (episodes, n_theta) and (rows, n_theta)
+        The first theta of each episode, and all of them.
+    """
+
+    problem: LinearMPC
+    low: Array
+    high: Array
+    first: Array
+    rows: Array
+
+    @classmethod
+    def of(cls, problem: LinearMPC, episodes: tuple[Episode, ...]) -> Starts:
+        """Return those of a log."""
+        first = np.array([each.thetas[0] for each in episodes])
+        rows = np.concatenate([each.thetas[:-1] for each in episodes])
+        n = problem.model.n_states
+        x, k = first[:, :n], max(len(first), 2)
+        middle, half = (x.max(0) + x.min(0)) / 2, (x.max(0) - x.min(0)) / 2
+        half = half * min(WIDEST, (k + 1) / (k - 1))
+        low = np.maximum(middle - half, problem.theta_min[:n])
+        high = np.minimum(middle + half, problem.theta_max[:n])
+        return cls(problem, low, high, first, rows)
+
+    def draw(self, count: int, rng: np.random.Generator) -> Array:
+        """Return thetas (count, n_theta) where episodes begin: in the box, the rest as logged."""
+        drawn = self.first[rng.integers(len(self.first), size=count)].copy()
+        drawn[:, : len(self.low)] = rng.uniform(self.low, self.high, (count, len(self.low)))
+        return drawn
+
+    def draw_logged(self, count: int, rng: np.random.Generator) -> Array:
+        """Return thetas (count, n_theta) from amid the log."""
+        return self.rows[rng.integers(len(self.rows), size=count)]
+
+    def draw_around(self, count: int, rng: np.random.Generator) -> Array:
+        """Return thetas (count, n_theta) from a box three times as wide, of which nothing is known.
+
+        Those that the law has no solution for are replaced by logged ones.
+        """
+        drawn, n = self.draw(count, rng), len(self.low)
+        middle, reach = (self.high + self.low) / 2, AROUND * (self.high - self.low) / 2
+        drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
+        drawn = np.clip(drawn, self.problem.theta_min, self.problem.theta_max)
+        outside = ~self.problem.explicit().in_domain(drawn)
+        drawn[outside] = self.draw_logged(int(outside.sum()), rng)
+        return drawn
+
+    def draw_anywhere(self, count: int, rng: np.random.Generator) -> Array:
+        """Return thetas (count, n_theta), a third each of beginnings, of logged and of around."""
+        third = count // 3
+        parts = self.draw_logged(third, rng), self.draw_around(third, rng)
+        return np.concatenate([self.draw(count - 2 * third, rng), *parts])

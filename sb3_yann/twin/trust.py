@@ -1,0 +1,180 @@
+"""What a twin is worth: how well it predicts what it has not seen, and what would help."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC
+from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.log import Episode
+from sb3_yann.twin.selection import Candidate, FreeRuns, fitted
+
+COST_ERROR = 0.25
+"""The largest error of a predicted episode cost, relative to the mean cost, that is trusted."""
+STILL = 1e-4
+"""An input that moves by less, in half-widths, does not move."""
+FOREIGN = 10.0
+"""A model that errs by so many times what moves describes another plant."""
+OUTSIDE = 0.05
+"""Share of logged rows beyond the box of theta from which on units are doubted."""
+ALONE = 0.02
+"""An input's gain is known from the data where at least this share of its variance is its own."""
+
+
+class UntrustedTwinError(ValueError):
+    """The twin cannot be trusted; the message says why, and what would help."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """The evidence for a twin.
+
+    Attributes
+    ----------
+    runs : FreeRuns
+        Held-out free-run errors of all candidates, of the model as it is, and of standing still.
+    chosen, linear : int
+        Which candidate was taken, and which one is the linear model as it is.
+    standing : ndarray, shape (h,)
+        Errors of the prediction that nothing moves.
+    predicted, actual : ndarray, shape (episodes,)
+        Costs of whole held-out episodes, in closed loop.
+    excitation : ndarray, shape (m,)
+        Share of each input's variance that states and disturbances do not explain.
+    moves : ndarray, shape (m,)
+        Standard deviations of the inputs, in half-widths.
+    noise : ndarray, shape (n,)
+        Standard deviation of the measurement that the one-step errors amount to, at most.
+    problems, advice : tuple of str
+        Why it is not to be trusted, and what would help; empty where there is nothing to say.
+    """
+
+    runs: FreeRuns
+    chosen: int
+    linear: int
+    standing: Array
+    predicted: Array
+    actual: Array
+    excitation: Array
+    moves: Array
+    noise: Array
+    problems: tuple[str, ...]
+    advice: tuple[str, ...]
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against it."""
+        return not self.problems
+
+    @property
+    def cost_error(self) -> float:
+        """Root mean square error of the predicted costs, relative to the mean cost."""
+        if not len(self.actual):
+            return float("inf")
+        scale = max(float(np.abs(self.actual).mean()), 1e-300)
+        return float(np.sqrt(np.mean((self.predicted - self.actual) ** 2)) / scale)
+
+
+def costs_of(problem: LinearMPC, episode: Episode) -> float:
+    """Return the stage cost of a logged episode."""
+    return float(np.sum(problem.stage_cost(episode.thetas[:-1], episode.actions)))
+
+
+def held_out_costs(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    episodes: tuple[Episode, ...],
+    choice: Candidate,
+) -> tuple[Array, Array]:
+    """Return predicted and actual costs of episodes, each left out of the fit."""
+    if len(episodes) < 2:
+        return np.empty(0), np.empty(0)
+    predicted = []
+    for i, episode in enumerate(episodes):
+        others = episodes[:i] + episodes[i + 1 :]
+        (residual,) = fitted(problem, coordinates, others, [choice.make()])
+        with np.errstate(all="ignore"):
+            cost, _ = Dynamics(problem, coordinates, (residual,)).replay_in_closed_loop(episode)
+        predicted.append(float(np.nan_to_num(cost[0], nan=1e300, posinf=1e300)))
+    return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
+
+
+def standing_still(
+    problem: LinearMPC, coordinates: Coordinates, episodes: tuple[Episode, ...], horizons: Any
+) -> Array:
+    """Return the error (h,) of the prediction that the state stays where it is."""
+    n, found = problem.model.n_states, []
+    for h in horizons:
+        moves = [(e.thetas[h:, :n] - e.thetas[:-h, :n]) / coordinates.units for e in episodes]
+        found.append(np.sqrt(np.mean(np.concatenate(moves) ** 2)))
+    return np.array(found)
+
+
+def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array, Array]:
+    """Return how much of each input is its own (m,), and how much it moves (m,)."""
+    theta = np.concatenate([each.thetas[:-1] for each in episodes])
+    u = np.concatenate([each.actions for each in episodes])
+    columns = np.column_stack([np.ones(len(theta)), theta])
+    left = u - columns @ np.linalg.lstsq(columns, u, rcond=None)[0]
+    variance = np.var(u, axis=0)
+    share = np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)
+    return share, np.sqrt(variance) / problem.u_half
+
+
+def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> float:
+    """Return the share of logged rows whose state lies beyond the box of theta."""
+    x = np.concatenate([each.thetas[:, problem.layout.state] for each in episodes])
+    low, high = (each[problem.layout.state] for each in (problem.theta_min, problem.theta_max))
+    return float(np.mean(np.any((x < low) | (x > high), axis=1)))
+
+
+def judge(
+    runs: FreeRuns,
+    linear: int,
+    standing: Array,
+    costs: tuple[Array, Array],
+    inputs: tuple[Array, Array],
+    n_episodes: int,
+    beyond: float,
+) -> tuple[list[str], list[str]]:
+    """Return what speaks against a twin, and what would help."""
+    problems, advice = [], []
+    share, moves = inputs
+    if n_episodes < 2:
+        problems.append("There is one episode: nothing is left to test the twin on.")
+        advice.append("Log at least one episode more; five are a good number.")
+    still: NDArray[np.bool_] = moves < STILL
+    for k in np.flatnonzero(still):
+        problems.append(f"Input {k} never moves: what it does is not in the log.")
+        advice.append(f"Make a small step test on input {k}, or log another set-point.")
+    for k in np.flatnonzero(~still & (share < ALONE)):
+        advice.append(
+            f"Input {k} follows the state ({100 * share[k]:.2g} % of its variance is its own), so "
+            "its gain rests on the given B. A small step test on it would tell."
+        )
+    if n_episodes > 1 and runs.errors[linear][0] > FOREIGN * standing[0]:
+        problems.append(
+            f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing moves' "
+            f"({runs.errors[linear][0]:.3g} against {standing[0]:.3g} standard deviations)."
+        )
+        advice.append("Compare units, operating point and sampling time of the log and the model.")
+    if beyond > OUTSIDE:
+        problems.append(
+            f"{100 * beyond:.3g} % of the logged states lie beyond the problem's box of theta."
+        )
+        advice.append("Compare units and operating point of the log and the model.")
+    if len(costs[0]):
+        scale = max(float(np.abs(costs[1]).mean()), 1e-300)
+        error = float(np.sqrt(np.mean((costs[0] - costs[1]) ** 2))) / scale
+        if not error <= COST_ERROR:
+            problems.append(
+                f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
+                f"mean; {100 * COST_ERROR:.0f} % are the most."
+            )
+            advice.append(f"Log {max(3, n_episodes)} episodes more, or lessen the sensors' noise.")
+    return problems, advice

@@ -1,0 +1,119 @@
+"""A policy that is improved in a twin is better on the plant, or stays what it was."""
+
+from __future__ import annotations
+
+import copy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG, TD3
+
+from sb3_yann import NoActionNoise, PlantTwin, UntrustedTwinError, YannPolicy, improve
+from sb3_yann.evaluation import evaluate
+from twin_samples import Cart, log, problem, twin
+from weights import is_mpc
+
+
+def reactor(seeds: range) -> PlantTwin:
+    """Return the reactor's twin from episodes of its MPC."""
+    model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    mpc = model.policy.problem
+    played = evaluate(mpc.explicit(), "CSTR-v0", seeds)
+    return PlantTwin.fit(mpc, [*zip(played.observations, played.actions, strict=True)])
+
+
+@pytest.mark.slow
+def test_on_the_reactor_five_episodes_are_enough_and_the_model_goes_on(tmp_path) -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", device="cpu", seed=0, learning_starts=0)
+    found = improve(model, reactor(range(5)), iterations=60)
+    assert found.accepted and found.change < -0.01
+    seeds = range(500, 530)
+    ours, mpc = (evaluate(each, "CSTR-v0", seeds) for each in (model, problem_law("CSTR-v0")))
+    assert np.mean(ours.costs) < 0.99 * np.mean(mpc.costs)
+    assert ours.violations.sum() == 0
+    assert np.max(ours.costs - mpc.costs) < 0.005 * np.mean(mpc.costs)
+    target, actor = model.actor_target.state_dict(), model.actor.state_dict()
+    assert all(th.equal(target[name], value) for name, value in actor.items())
+    model.save(tmp_path / "model")
+    again = DDPG.load(tmp_path / "model", env=gym.make("CSTR-v0"))
+    theta = np.float32([0.01, 0.1, -0.1, 1.0])
+    np.testing.assert_array_equal(again.predict(theta)[0], model.predict(theta)[0])
+    again.learn(20, callback=NoActionNoise())
+
+
+def problem_law(env_id: str):
+    return DDPG("YannPolicy", env_id, device="cpu").policy.problem.explicit()
+
+
+def policy_bits(model) -> dict[str, bytes]:
+    return {name: each.numpy().tobytes() for name, each in model.policy.state_dict().items()}
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_where_nothing_passes_the_model_is_as_it_was(algorithm, monkeypatch) -> None:
+    from sb3_yann.commissioning import search
+
+    monkeypatch.setattr(search, "MARGIN", -1.0)  # no start can pass
+    model = algorithm(YannPolicy, Cart(), seed=0, device="cpu")
+    before = policy_bits(model)
+    found = improve(model, twin(), iterations=3, check_every=1, n_starts=3)
+    assert not found.accepted and found.change == 0 and is_mpc(model)
+    assert policy_bits(model) == before
+    assert {each.iteration for each in found.checks} == {1, 2, 3}
+
+
+def test_no_random_state_is_moved_and_a_seed_repeats_it() -> None:
+    states, numbers = [], []
+    for _ in range(2):
+        model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
+        th.manual_seed(3)
+        np.random.seed(3)  # noqa: NPY002 (the global state is what is looked at)
+        improve(model, twin(), iterations=2, check_every=1, n_starts=3)
+        numbers.append((float(th.rand(1)), float(np.random.rand())))  # noqa: NPY002
+        states.append(policy_bits(model))
+    th.manual_seed(3)
+    np.random.seed(3)  # noqa: NPY002
+    assert numbers == [(float(th.rand(1)), float(np.random.rand()))] * 2  # noqa: NPY002
+    assert states[0] == states[1]
+
+
+def test_what_cannot_be_improved_is_refused_and_left() -> None:
+    model = DDPG(YannPolicy, Cart(), device="cpu")
+    before = copy.deepcopy(model.policy.state_dict())
+    with pytest.raises(UntrustedTwinError, match="There is one episode"):
+        improve(model, PlantTwin.fit(problem(), log(1)))
+    with pytest.raises(ValueError, match=r"Fit the twin with model\.policy\.problem"):
+        improve(DDPG("YannPolicy", "CSTR-v0", device="cpu"), twin())
+    with pytest.raises(TypeError, match="twin = 'CSTR-v0' must be a PlantTwin"):
+        improve(model, "CSTR-v0")
+    with pytest.raises(TypeError, match="improve needs a YannPolicy"):
+        improve(DDPG("MlpPolicy", Cart(), device="cpu"), twin())
+    for wrong in ({"iterations": 0}, {"batch": 0}, {"learning_rate": 0}, {"patience": 0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            improve(model, twin(), **wrong)
+    after = model.policy.state_dict()
+    assert all(th.equal(value, after[name]) for name, value in before.items())
+
+
+def test_the_critic_is_refitted_to_the_returns_of_the_twin() -> None:
+    from sb3_yann.commissioning.critic import _costs, refit_critic
+
+    model, found = DDPG(YannPolicy, Cart(), seed=0, device="cpu"), twin()
+    rng = np.random.default_rng(5)
+    at = found.starts.draw_logged(500, rng)
+    u = problem().explicit()(at) + 0.1 * rng.standard_normal((500, 1))
+    u = np.clip(u, -1, 1)
+    returns = -_costs(model.policy, found, model.actor.mu, at, u)
+    known = np.isfinite(returns)
+
+    def error() -> float:
+        with th.no_grad():
+            points = th.as_tensor(np.hstack([at, u]))
+            off = model.critic.values(points)[0].numpy()[:, 0] - returns
+            return float(np.abs(off[known]).mean())
+
+    before = error()
+    refit_critic(model.policy, found, seed=0)
+    assert error() < 0.5 * before

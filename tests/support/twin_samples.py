@@ -1,0 +1,82 @@
+"""A small plant that its linear model does not describe, its MPC, and logs of it."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_yann import LinearModel, LinearMPC, PlantTwin
+from sb3_yann_envs import ProblemBox
+
+DT = 0.1
+
+
+@cache
+def problem() -> LinearMPC:
+    """A cart with a force; the model knows nothing of the slope that it stands on."""
+    model = LinearModel([[1.0, DT], [0.0, 0.95]], [[0.0], [DT]], DT)
+    return LinearMPC(
+        model, Q=np.diag([1.0, 0.1]), R=[[0.5]], horizon=3,
+        u_min=-1, u_max=1, theta_min=[-3, -3], theta_max=[3, 3],
+    )  # fmt: skip
+
+
+class Cart(gym.Env[Any, Any]):
+    """The plant: theta is observed, the reward is minus the stage cost."""
+
+    def __init__(self, steps: int = 60) -> None:
+        mpc = problem()
+        low, high = np.float32(mpc.theta_min), np.float32(mpc.theta_max)
+        self.observation_space = ProblemBox(low, high, problem=mpc)
+        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+        self.length = steps
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.t = self.np_random.uniform([-1.5, -0.5], [1.5, 0.5]), 0
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        u = np.clip(np.asarray(action, float), -1, 1)
+        cost = float(problem().stage_cost(self.x, u))
+        place, speed = self.x
+        pull = 0.3 * place**2 - 0.8 * place
+        self.x = np.array([place + DT * speed, 0.9 * speed + DT * (2.0 * u[0] - pull)])
+        self.t += 1
+        return self.x.astype(np.float32), -cost, False, self.t >= self.length, {}
+
+
+def log(episodes: int, noise: float = 0.0, first: int = 0, act: Any = None) -> list[Any]:
+    """Return episodes of the MPC, or of another function, with sensor noise."""
+    rng, env, found = np.random.default_rng(first), Cart(), []
+    act = problem().explicit() if act is None else act
+    for seed in range(first, first + episodes):
+        x, over = env.reset(seed=seed)[0], False
+        states, actions = [x + noise * rng.standard_normal(2)], []
+        while not over:
+            actions.append(np.atleast_1d(act(states[-1])))
+            x, _, _, over, _ = env.step(actions[-1])
+            states.append(x + noise * rng.standard_normal(2))
+        found.append((np.array(states, float), np.array(actions, float)))
+    return found
+
+
+@cache
+def twin(episodes: int = 5) -> PlantTwin:
+    """Return the cart's twin."""
+    return PlantTwin.fit(problem(), log(episodes))
+
+
+def mean_cost(act: Any, seeds: range = range(900, 940)) -> np.ndarray:
+    """Return the costs of a policy on the plant."""
+    env, costs = Cart(), []
+    for seed in seeds:
+        x, over, cost = env.reset(seed=seed)[0], False, 0.0
+        while not over:
+            x, reward, _, over, _ = env.step(act(x))
+            cost -= reward
+        costs.append(cost)
+    return np.array(costs)

@@ -1,0 +1,74 @@
+"""The gradient through twin and actor is that of the cost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_yann import LinearMPC, PlantTwin, RateLimits
+from sb3_yann.networks import YannLayer
+from sb3_yann.twin.gradient import Objective, accumulate_gradient, actor_inputs
+from twin_samples import log, problem, twin
+
+
+def rated() -> PlantTwin:
+    """The cart's twin with bounds on the rate of its input."""
+    plain = problem()
+    mpc = LinearMPC(
+        plain.model, Q=plain.Q, R=plain.R, horizon=3, u_min=-1, u_max=1, theta_min=[-3, -3],
+        theta_max=[3, 3], rate=RateLimits(-0.3, 0.3),
+    )  # fmt: skip
+    return PlantTwin.fit(mpc, log(4))
+
+
+@pytest.mark.parametrize("make", [twin, rated])
+def test_it_is_the_directional_derivative_of_the_mean_cost(make) -> None:
+    found = make()
+    mpc, law = found.problem, found.problem.explicit()
+    rate = (mpc.rate.du_min, mpc.rate.du_max) if mpc.has_rate_bounds else None
+    layer = YannLayer(law, rate=rate).double()
+    generator = th.Generator().manual_seed(0)
+    weights = list(layer.network.weights())
+    with th.no_grad():
+        for each in weights:
+            each.add_(0.02 * th.randn(each.shape, generator=generator))
+    # Away from bounds: the actor's own gradient leads inside from there, the true one is zero.
+    starts = 0.1 * found.starts.draw(15, np.random.default_rng(1)).reshape(5, 3, -1)
+    nowhere = np.full(mpc.model.n_states, np.inf)
+    objective = Objective(mpc, np.eye(mpc.n_theta), -nowhere, nowhere, 0.0)
+    runs = accumulate_gradient(layer, found.dynamics, objective, starts, 12)
+    assert np.abs(runs.inputs).max() < 1
+    direction = [th.randn(each.shape, generator=generator, dtype=th.float64) for each in weights]
+    slope = sum(float((g.grad * d).sum()) for g, d in zip(weights, direction, strict=True))
+
+    def cost(step: float) -> float:
+        with th.no_grad():
+            for each, d in zip(weights, direction, strict=True):
+                each.add_(step * d)
+        rolled = found.dynamics.roll_out(lambda rows: actor_inputs(layer, mpc, rows), starts, 12)
+        with th.no_grad():
+            for each, d in zip(weights, direction, strict=True):
+                each.sub_(step * d)
+        return float(objective.costs(*rolled).mean())
+
+    difference = (cost(1e-5) - cost(-1e-5)) / 2e-5
+    assert slope == pytest.approx(difference, rel=1e-3)
+
+
+def test_a_limit_pushes_back_and_runs_above_a_reference_count_more() -> None:
+    found = twin()
+    mpc, layer = found.problem, YannLayer(found.problem.explicit())
+    starts = found.starts.draw(10, np.random.default_rng(1)).reshape(5, 2, -1)
+
+    def gradient(low, reference=None) -> np.ndarray:
+        layer.zero_grad()
+        objective = Objective(mpc, np.eye(2), np.full(2, low), np.full(2, np.inf), 100.0)
+        accumulate_gradient(layer, found.dynamics, objective, starts, 20, reference)
+        return np.concatenate([each.grad.numpy().ravel() for each in layer.network.weights()])
+
+    assert not np.allclose(gradient(-np.inf), gradient(0.5))
+    ones = np.ones((5, 2))
+    np.testing.assert_allclose(
+        gradient(-np.inf, (0 * ones, ones, 3 * ones)), 3 * gradient(-np.inf), rtol=1e-4, atol=1e-6
+    )

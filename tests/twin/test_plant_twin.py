@@ -1,0 +1,109 @@
+"""A twin predicts what it has not seen, and says what it is worth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG
+
+from sb3_yann import ImprovementGuard, NoActionNoise, PlantTwin, UntrustedTwinError, YannPolicy
+from twin_samples import Cart, log, problem, twin
+
+
+def test_it_predicts_episodes_that_it_has_not_seen() -> None:
+    found = twin()
+    assert found.trusted and found.kind.startswith("quadratic")
+    for states, actions in log(3, first=50):
+        thetas, _ = found.dynamics.roll_out(
+            lambda rows: np.zeros((len(rows), 1)), np.repeat(states[None, :1], 5, axis=0), 1
+        )
+        assert thetas.shape == (2, 5, 1, 2)
+        after = found.dynamics.step(states[None, :-1].repeat(5, 0), actions[None].repeat(5, 0))
+        np.testing.assert_allclose(after, states[None, 1:].repeat(5, 0), atol=5e-3)
+
+
+def test_the_jacobians_are_those_of_differences_inside_the_data_and_outside() -> None:
+    dynamics, rng = twin().dynamics, np.random.default_rng(0)
+    theta, u = rng.uniform(-4, 4, (5, 20, 2)), rng.uniform(-1, 1, (5, 20, 1))
+    A, B = dynamics.jacobians(theta, u)
+    for j in range(2):
+        e = 1e-6 * np.eye(2)[j]
+        slope = (dynamics.step(theta + e, u) - dynamics.step(theta - e, u)) / 2e-6
+        np.testing.assert_allclose(A[..., j], slope, atol=1e-6)
+    slope = (dynamics.step(theta, u + 1e-6) - dynamics.step(theta, u - 1e-6)) / 2e-6
+    np.testing.assert_allclose(B[..., 0], slope, atol=1e-6)
+
+
+def test_far_outside_the_data_the_residual_stays_what_it_is_at_their_edge() -> None:
+    dynamics = twin().dynamics
+    u = np.zeros((5, 1, 1))
+    far, further = (dynamics.residual(np.full((5, 1, 2), each), u) for each in (1e3, 1e6))
+    np.testing.assert_array_equal(far, further)
+
+
+def test_the_same_log_gives_the_same_twin() -> None:
+    again = PlantTwin.fit(problem(), log(5))
+    for one, other in zip(twin().dynamics.members, again.dynamics.members, strict=True):
+        np.testing.assert_array_equal(one.weights, other.weights)
+
+
+def test_sensor_noise_is_measured_and_shrinks_the_residual() -> None:
+    noisy = PlantTwin.fit(problem(), log(5, noise=0.01))
+    np.testing.assert_allclose(noisy.trust.noise, 0.01, rtol=0.3)
+    assert noisy.kind != twin().kind
+
+
+@pytest.mark.parametrize(
+    ("episodes", "message"),
+    [
+        (lambda: log(1), "There is one episode"),
+        (lambda: log(3, act=lambda x: [0.5]), "Input 0 never moves"),
+        (lambda: [(100 * x, u) for x, u in log(3)], "beyond the problem's box of theta"),
+        (lambda: log(5, noise=0.3), "Predicted costs of held-out episodes err by"),
+    ],
+)
+def test_what_cannot_be_trusted_says_why_and_is_refused(episodes, message) -> None:
+    found = PlantTwin.fit(problem(), episodes())
+    assert not found.trusted and "not trusted" in repr(found)
+    assert message in found.report() and "Verdict: NOT trusted; the MPC stays." in found.report()
+    for refused in (found.env, lambda: ImprovementGuard(found)):
+        with pytest.raises(UntrustedTwinError, match=message):
+            refused()
+
+
+def test_the_report_shows_errors_costs_inputs_and_noise() -> None:
+    text = twin().report()
+    for part in ("5 episodes, 300 steps", "nothing moves", "u[0]:", "Sensor noise", "trusted."):
+        assert part in text
+
+
+def test_residuals_are_chosen_from_what_is_asked_for() -> None:
+    found = PlantTwin.fit(problem(), log(3), residuals=["none"])
+    assert found.kind == "none"
+    assert np.all(found.dynamics.residual(np.ones((5, 1, 2)), np.ones((5, 1, 1))) == 0)
+    with pytest.raises(ValueError, match="residuals holds 'quartic'; expected some of"):
+        PlantTwin.fit(problem(), log(3), residuals=["quartic"])
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_replay_buffer_gives_the_episodes_that_were_played(n_envs) -> None:
+    model = DDPG(
+        YannPolicy, Cart(), seed=0, gradient_steps=0, learning_starts=0, buffer_size=1000 * n_envs
+    )
+    if n_envs == 2:
+        from stable_baselines3.common.vec_env import DummyVecEnv
+
+        model = DDPG(YannPolicy, DummyVecEnv([Cart] * 2), seed=0, gradient_steps=0, train_freq=1)
+    model.learn(150 * n_envs, callback=NoActionNoise())
+    found = PlantTwin.from_buffer(model)
+    assert [len(each) for each in found.episodes] == [60, 60, 30] * n_envs
+    law = problem().explicit()
+    for episode in found.episodes:
+        np.testing.assert_allclose(episode.actions, law(episode.thetas[:-1]), atol=1e-5)
+    assert found.kind.startswith(("quadratic", "cubic"))
+
+
+def test_an_empty_buffer_is_refused() -> None:
+    model = DDPG(YannPolicy, Cart(), buffer_size=10)
+    with pytest.raises(ValueError, match="no episode of 5 steps"):
+        PlantTwin.from_buffer(model)

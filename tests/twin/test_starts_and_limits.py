@@ -1,0 +1,37 @@
+"""Where a twin's episodes begin, and where it holds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_yann import PlantTwin
+from twin_samples import log, problem, twin
+
+
+def test_the_box_of_starts_is_on_average_that_of_the_plant() -> None:
+    widths = []
+    for k in range(40):
+        starts = PlantTwin.fit(problem(), log(5, first=10 * k), residuals=["none"]).starts
+        widths.append(starts.high - starts.low)
+    np.testing.assert_allclose(np.mean(widths, axis=0), [3.0, 1.0], rtol=0.1)
+
+
+def test_draws_lie_where_they_should_and_have_the_log_s_rest() -> None:
+    starts, rng = twin().starts, np.random.default_rng(0)
+    drawn = starts.draw(200, rng)
+    assert np.all((drawn >= starts.low) & (drawn <= starts.high))
+    around = starts.draw_around(2000, rng)
+    assert np.ptp(around[:, 0]) > 1.5 * (starts.high - starts.low)[0]
+    assert np.all((around >= problem().theta_min) & (around <= problem().theta_max))
+    logged = {row.tobytes() for each in twin().episodes for row in each.thetas}
+    assert all(row.tobytes() in logged for row in starts.draw_logged(50, rng))
+    assert starts.draw_anywhere(50, rng).shape == (50, 2)
+
+
+def test_the_log_and_the_starts_lie_within_the_limits_and_nan_does_not() -> None:
+    found = twin()
+    for episode in found.episodes:
+        assert not found.limits.violated(episode.thetas).any()
+    rng = np.random.default_rng(0)
+    assert not found.limits.violated(found.starts.draw(500, rng)).any()
+    assert found.limits.violated(np.array([[np.nan, 0.0], [100.0, 0.0]])).all()
