@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, as_whole
 from sb3_yann.twin.dynamics import Dynamics
+from sb3_yann.twin.limits import Limits
+from sb3_yann.twin.log import Episode
+from sb3_yann.twin.starts import Starts
 from sb3_yann_envs.spaces import ProblemBox
-
-if TYPE_CHECKING:
-    from sb3_yann.twin.plant_twin import PlantTwin
 
 Single = NDArray[np.float32]
 
@@ -25,29 +25,38 @@ class TwinEnv(gym.Env[Single, Single]):
     one of its episodes, and lasts as long. ``info["violation"]`` reports a state beyond the
     problem's bounds, or outside what the log shows: there the twin knows nothing.
 
+    :meth:`PlantTwin.env` makes one.
+
     Parameters
     ----------
-    twin : PlantTwin
-        It must be trusted.
+    dynamics : Dynamics
+        The members.
+    episodes : tuple of Episode
+        The log.
+    starts : Starts
+        Where episodes begin.
+    limits : Limits
+        Beyond which there is a violation.
     member : int, optional
         The member that acts; by default the seed of an episode decides: seed modulo members.
-
-    Raises
-    ------
-    UntrustedTwinError
-        If the twin is not to be trusted.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}
     observation_space: ProblemBox
 
-    def __init__(self, twin: PlantTwin, member: int | None = None) -> None:
-        twin.require_trust()
-        members = len(twin.dynamics.members)
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        episodes: tuple[Episode, ...],
+        starts: Starts,
+        limits: Limits,
+        member: int | None = None,
+    ) -> None:
+        members = len(dynamics.members)
         if member is not None and as_whole("member", member, 0) >= members:
             raise ValueError(f"member = {member} must be below {members}, how many there are.")
-        self.twin, self.member, self.render_mode = twin, member, None
-        problem = twin.problem
+        self.dynamics, self.episodes, self.starts, self.limits = dynamics, episodes, starts, limits
+        self.member, self.render_mode, problem = member, None, dynamics.problem
         low, high = (each.astype(np.float32) for each in (problem.theta_min, problem.theta_max))
         self.observation_space = ProblemBox(low, high, problem=problem)
         u_min, u_max = (each.astype(np.float32) for each in (problem.u_min, problem.u_max))
@@ -59,17 +68,17 @@ class TwinEnv(gym.Env[Single, Single]):
     ) -> tuple[Single, dict[str, Any]]:
         """Start an episode, from a random theta or ``options["state"]``, (n,) or (n_theta,)."""
         super().reset(seed=seed)
-        twin, parts = self.twin, self.twin.problem.layout
-        members = twin.dynamics.members
+        problem, members = self.dynamics.problem, self.dynamics.members
         acting = int(self.np_random.integers(len(members)))
         if self.member is not None:
             acting = self.member
         elif seed is not None:
             acting = seed % len(members)
-        self._dynamics = Dynamics(twin.problem, twin.dynamics.coordinates, (members[acting],))
-        self._episode = twin.episodes[int(self.np_random.integers(len(twin.episodes)))]
+        self._acting = Dynamics(problem, self.dynamics.coordinates, (members[acting],))
+        self._episode = self.episodes[int(self.np_random.integers(len(self.episodes)))]
         theta = self._episode.thetas[0].copy()
-        theta[parts.state] = twin.starts.draw(1, self.np_random)[0, parts.state]
+        state = problem.layout.state
+        theta[state] = self.starts.draw(1, self.np_random)[0, state]
         if options:
             given = np.asarray(options["state"], np.float64)
             theta[: len(given)] = given
@@ -80,18 +89,18 @@ class TwinEnv(gym.Env[Single, Single]):
         """Hold an input, clipped to its bounds, for one sample."""
         if self._theta is None:
             raise gym.error.ResetNeeded("Call env.reset() before env.step().")
-        problem, parts = self.twin.problem, self.twin.problem.layout
+        problem, parts = self.dynamics.problem, self.dynamics.problem.layout
         u = np.asarray(action, np.float64)
         if u.shape != problem.u_min.shape or not np.all(np.isfinite(u)):
             raise ValueError(f"action = {action!r} must be {problem.u_min.shape} finite numbers.")
         u = np.clip(u, problem.u_min, problem.u_max)
         cost = float(problem.stage_cost(self._theta, u))
-        theta = self._dynamics.step(self._theta[None, None], u[None, None])[0, 0]
+        theta = self._acting.step(self._theta[None, None], u[None, None])[0, 0]
         self._steps += 1
         if self._steps < len(self._episode.thetas):
             theta[parts.constant] = self._episode.thetas[self._steps, parts.constant]
         self._theta = theta
-        violation = bool(self.twin.limits.violated(theta))
+        violation = bool(self.limits.violated(theta))
         over = self._steps >= len(self._episode)
         info = {"cost": cost, "violation": violation, "state": theta.copy()}
         return theta.astype(np.float32), -cost, False, over, info

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import as_whole
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.env import TwinEnv
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode, as_episodes, pieces
 from sb3_yann.twin.replay_buffer import episodes_of
@@ -29,9 +30,6 @@ from sb3_yann.twin.trust import (
     judge,
     standing_still,
 )
-
-if TYPE_CHECKING:
-    from sb3_yann.twin.env import TwinEnv
 
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
@@ -67,7 +65,7 @@ class PlantTwin:
     >>> import gymnasium
     >>> from sb3_yann.evaluation import evaluate
     >>> problem = gymnasium.make("CSTR-v0").observation_space.problem
-    >>> log = evaluate(problem.explicit(), "CSTR-v0", seeds=range(3))
+    >>> log = evaluate(problem.explicit(), "CSTR-v0", seeds=range(5))
     >>> twin = PlantTwin.fit(problem, [*zip(log.observations, log.actions)])
     >>> twin.trusted
     True
@@ -196,9 +194,8 @@ class PlantTwin:
         UntrustedTwinError
             If the twin is not to be trusted.
         """
-        from sb3_yann.twin.env import TwinEnv  # which needs this class
-
-        return TwinEnv(self, member)
+        self.require_trust()
+        return TwinEnv(self.dynamics, self.episodes, self.starts, self.limits, member)
 
 
 def _choose(

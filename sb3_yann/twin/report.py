@@ -12,7 +12,19 @@ from sb3_yann.twin.trust import ALONE, Trust
 
 
 def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: Trust) -> str:
-    """Return what a twin explains, what it does not know, and whether to trust it, as text."""
+    """Return what a twin explains, what it does not know, and whether to trust it, as text.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Of the plant.
+    episodes : tuple of Episode
+        The log.
+    kind : str
+        The residual that was chosen.
+    trust : Trust
+        The evidence.
+    """
     parts = _data(episodes), _errors(kind, trust), _costs(trust), _inputs(problem, trust)
     lines = [line for part in (*parts, _noise(problem, trust), _verdict(trust)) for line in part]
     return "\n".join(lines)

@@ -74,7 +74,19 @@ def fitted(
     episodes: Sequence[Episode],
     made: Sequence[Any],
 ) -> list[Residual]:
-    """Return residuals fitted to what the linear model leaves of each step."""
+    """Return residuals fitted to what the linear model leaves of each step.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Of the plant.
+    coordinates : Coordinates
+        What residuals are scaled by.
+    episodes : sequence of Episode
+        What they are fitted to.
+    made : sequence
+        Residuals that are not fitted yet.
+    """
     z, y = zip(*(regression(problem, coordinates, each) for each in episodes), strict=True)
     z_all, y_all = np.concatenate(z), np.concatenate(y)
     moments: dict[tuple[int, bool], Any] = {}
@@ -146,7 +158,19 @@ def held_out(
     episodes: Sequence[Episode],
     choices: Sequence[Candidate],
 ) -> FreeRuns:
-    """Return the free-run errors of candidates, over folds of whole episodes."""
+    """Return the free-run errors of candidates, over folds of whole episodes.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Of the plant.
+    coordinates : Coordinates
+        What residuals are scaled by.
+    episodes : sequence of Episode
+        Each is left out once.
+    choices : sequence of Candidate
+        What is compared.
+    """
     longest = min(LONGEST, min(map(len, episodes)))
     horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
     folds = [range(k, len(episodes), min(FOLDS, len(episodes))) for k in range(FOLDS)]

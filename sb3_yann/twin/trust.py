@@ -91,7 +91,19 @@ def held_out_costs(
     episodes: tuple[Episode, ...],
     choice: Candidate,
 ) -> tuple[Array, Array]:
-    """Return predicted and actual costs of episodes, each left out of the fit."""
+    """Return predicted and actual costs of episodes, each left out of the fit.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Of the plant.
+    coordinates : Coordinates
+        What residuals are scaled by.
+    episodes : sequence of Episode
+        Each is left out once.
+    choice : Candidate
+        What is fitted to the others.
+    """
     if len(episodes) < 2:
         return np.empty(0), np.empty(0)
     predicted = []
@@ -107,7 +119,19 @@ def held_out_costs(
 def standing_still(
     problem: LinearMPC, coordinates: Coordinates, episodes: tuple[Episode, ...], horizons: Any
 ) -> Array:
-    """Return the error (h,) of the prediction that the state stays where it is."""
+    """Return the error (h,) of the prediction that the state stays where it is.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Of the plant.
+    coordinates : Coordinates
+        What residuals are scaled by.
+    episodes : sequence of Episode
+        The log.
+    horizons : ndarray of int, shape (h,)
+        Steps ahead.
+    """
     n, found = problem.model.n_states, []
     for h in horizons:
         moves = [(e.thetas[h:, :n] - e.thetas[:-h, :n]) / coordinates.units for e in episodes]
@@ -142,7 +166,25 @@ def judge(
     n_episodes: int,
     beyond: float,
 ) -> tuple[list[str], list[str]]:
-    """Return what speaks against a twin, and what would help."""
+    """Return what speaks against a twin, and what would help.
+
+    Parameters
+    ----------
+    runs : FreeRuns
+        Errors of all candidates.
+    linear : int
+        Which of them is the linear model as it is.
+    standing : ndarray, shape (h,)
+        Errors of standing still.
+    costs : pair of ndarray, shape (episodes,)
+        Predicted and actual.
+    inputs : pair of ndarray, shape (m,)
+        How much of each input is its own, and how much it moves.
+    n_episodes : int
+        In the log.
+    beyond : float
+        Share of logged rows beyond the box of theta.
+    """
     problems, advice = [], []
     share, moves = inputs
     if n_episodes < 2:
