@@ -61,8 +61,9 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     twin and actor, with the linear-quadratic value at the end. Every so many steps the policy is
     checked against the MPC, from seeded starts on every member of the twin. It is accepted if no
     start costs more than with the MPC by 0.3 % of the mean, none violates more, and the mean is
-    not above that of the accepted policy. The model ends with the policy accepted last and a critic
-    that is refitted to it, else as it was. It saves and goes on learning as any other.
+    not above that of the accepted policy; a start around the log may cost 1 % of its own more.
+    The model ends with the policy accepted last and a critic that is refitted to it, else as it
+    was. It saves and goes on learning as any other.
 
     Parameters
     ----------
@@ -128,5 +129,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
         return Improvement(tuple(checks), 0.0)
     policy.actor.mu.load_state_dict(search.accepted)
     policy.actor_target.load_state_dict(policy.actor.state_dict())
+    for network in (policy.actor, policy.critic):
+        network.optimizer.state.clear()  # what other weights were moved by
     refit_critic(policy, twin, seed)
     return Improvement(tuple(checks), accepted[-1])

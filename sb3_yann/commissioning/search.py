@@ -103,18 +103,20 @@ class Trial:
         with np.errstate(all="ignore"):
             thetas, inputs = twin.dynamics.roll_out(act, self.starts, self.steps)
             costs = twin.problem.stage_cost(thetas[:-1], inputs).sum(axis=0).ravel()
-        violations = twin.limits.violated(thetas[1:]).sum(axis=0).ravel() * self.known
-        unsafe = np.column_stack([violations, 0 * violations, ~np.isfinite(costs)])
+        left = twin.limits.violated(thetas[1:]).sum(axis=0).ravel() * self.known
+        broken = twin.limits.broken(thetas[1:]).sum(axis=0).ravel()
+        unsafe = np.column_stack([left + broken, 0 * left, ~np.isfinite(costs)])
         return costs, unsafe.astype(np.int64)
 
     def check(self, iteration: int) -> Check:
         """Compare the present actor with the accepted policy and the MPC."""
         costs, unsafe = self.play(self.act)
         known, mean, mpc = self.known, self.mean, self.mpc[0]
-        accepted = self.accepted[0][known], self.accepted[1][known]
-        reason = PairedEpisodes(mpc[known], *accepted, MARGIN * mean).objection(
-            costs[known], unsafe[known]
-        )
+        safe = np.minimum(self.accepted[1], self.mpc[1])  # neither is exceeded
+        paired = PairedEpisodes(mpc[known], self.accepted[0][known], safe[known], MARGIN * mean)
+        reason = paired.objection(costs[known], unsafe[known])
+        if not reason and np.any(unsafe > safe):
+            reason = "a start outside the log breaks a bound of the problem"
         excess = costs - mpc
         around = (excess - MARGIN * mean - AROUND * np.abs(mpc))[~known]
         if not reason and not np.all(around <= 0):
@@ -233,8 +235,15 @@ class Search:
 
 def law_of(problem: LinearMPC) -> Inputs:
     """Return the explicit law as a function of rows."""
-    law = problem.explicit()
-    return lambda rows: np.atleast_2d(law(rows))
+    law, m = problem.explicit(), problem.model.n_inputs
+
+    def act(rows: Array) -> Array:
+        finite = np.isfinite(rows).all(axis=1)
+        u = np.full((len(rows), m), np.nan)
+        u[finite] = law(rows[finite])
+        return u
+
+    return act
 
 
 def settling_steps(problem: LinearMPC) -> int:

@@ -25,7 +25,7 @@ from sb3_yann.guard.session import GuardSession, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, write_csv
 from sb3_yann.policy._finite import watch_buffer
-from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.policy.policies import require_twin_of, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
 
@@ -90,6 +90,7 @@ class ImprovementGuard(BaseCallback):
     """
 
     model: OffPolicyAlgorithm
+    twin: PlantTwin | None = None
     _handler: Handler | None = None
     _has_begun = False
 
@@ -112,7 +113,10 @@ class ImprovementGuard(BaseCallback):
         super().__init__(verbose)
         if isinstance(env, PlantTwin):
             env.require_trust()
-            env = env.env  # each episode's seed names a member: all of them are played
+            self.twin, env = (
+                env,
+                env.env,
+            )  # each episode's seed names a member: all of them are played
         if not (env is None or isinstance(env, str | gym.Env) or callable(env)):
             raise TypeError(
                 f"env = {env!r} must be the id of an environment, a gymnasium.Env, a function that "
@@ -155,6 +159,8 @@ class ImprovementGuard(BaseCallback):
     def _init_callback(self) -> None:
         check_not_nested(self)
         policy = require_yann_policy(self.model.policy, "ImprovementGuard")
+        if self.twin is not None:
+            require_twin_of(policy, self.twin.problem)
         watch_buffer(self.model)
         self.session = GuardSession(
             self.model, policy, self.env, self.step_size, self.log_path, self.verbose

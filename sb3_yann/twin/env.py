@@ -80,7 +80,10 @@ class TwinEnv(gym.Env[Single, Single]):
         state = problem.layout.state
         theta[state] = self.starts.draw(1, self.np_random)[0, state]
         if options:
-            given = np.asarray(options["state"], np.float64)
+            given = np.asarray(options.get("state"), np.float64)
+            if given.shape not in ((problem.model.n_states,), (problem.n_theta,)):
+                sizes = f"({problem.model.n_states},) or ({problem.n_theta},)"
+                raise ValueError(f"options['state'] has shape {given.shape}, expected {sizes}.")
             theta[: len(given)] = given
         self._theta, self._steps = theta, 0
         return theta.astype(np.float32), {"state": theta.copy(), "member": acting}

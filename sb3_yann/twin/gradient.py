@@ -8,6 +8,7 @@ of the actor over all steps at once takes what the costate makes of each action.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -151,21 +152,58 @@ def _by_member(thetas: Array, inputs: Array) -> tuple[Array, Array]:
 def _slopes_of_actor(layer: YannLayer, theta: Array) -> Array:
     """Return the derivatives (rows, m, n_theta) of the actions in [-1, 1] by theta.
 
-    Zero where an action lies on its bound; on a bound of the rate it moves with the previous input.
+    Those of the law and of the network, each zero where it lies on its bound. On a bound of the
+    rate an action moves with the previous input. (The layer's own gradient leads inside from its
+    bounds, which is for training and not for this.)
     """
-    at = th.as_tensor(theta).requires_grad_()
-    actions = layer(at)
-    m, size = actions.shape[1], theta.shape[1]
+    at, law = th.as_tensor(theta), layer.piecewise_affine
+    region = layer.regions(at)
+    of_law = layer.gains[region].numpy().copy()
+    raw = (of_law @ theta[..., None])[..., 0] + layer.offsets[region].numpy()
+    of_law[np.abs(raw) >= 1] = 0.0
+    if layer.infeasible == "zero_input":
+        of_law[~law.in_domain(theta)] = 0.0
+    of_network = _slopes_of_network(layer, at, region)
+    with th.no_grad():
+        by_law, actions = layer.law(at).double().numpy(), layer(at).double().numpy()
+        bounds = [each.double().numpy() for each in layer.reachable(at)] if layer.rated else []
+    low, high = bounds or (np.full_like(actions, -1.0), np.full_like(actions, 1.0))
+    of_law = _moved_by_bounds(layer, of_law, by_law, low, high)
+    return _moved_by_bounds(layer, of_law + of_network, actions, low, high)
+
+
+def _slopes_of_network(layer: YannLayer, at: th.Tensor, region: Any) -> Array:
+    z = (at / layer.theta_half).to(layer.theta_half).requires_grad_()
+    correction = layer.network(z, th.as_tensor(region))
+    m = correction.shape[1]
     rows = [
-        th.autograd.grad(actions[:, k].sum(), at, retain_graph=k + 1 < m)[0].numpy()
+        th.autograd.grad(correction[:, k].sum(), z, retain_graph=k + 1 < m)[0] / layer.theta_half
         for k in range(m)
     ]
-    slopes, found = np.stack(rows, axis=1), actions.detach().numpy()
-    slopes[np.abs(found) >= 1] = 0.0
+    slopes = th.stack(rows, dim=1).double().numpy()
+    if layer.reach is not None:
+        slopes[np.abs(correction.detach().numpy()) >= layer.reach] = 0.0
+    return np.asarray(slopes)
+
+
+def _moved_by_bounds(
+    layer: YannLayer, slopes: Array, values: Array, low: Array, high: Array
+) -> Array:
+    """Return the slopes of what lies on a bound: zero, or those of the bound of the rate.
+
+    Parameters
+    ----------
+    layer : YannLayer
+        Which knows whether there are bounds of the rate.
+    slopes : ndarray, shape (rows, m, n_theta)
+        Of the values.
+    values, low, high : ndarray, shape (rows, m)
+        In [-1, 1].
+    """
+    slopes, held = slopes.copy(), (values <= low) | (values >= high)
+    slopes[held] = 0.0
     if layer.rated:
-        low, high = (each.numpy() for each in layer.reachable(at.detach()))
-        at_rate = ((found <= low) | (found >= high)) & (np.abs(found) < 1)
-        slopes[at_rate] = 0.0
-        row, k = np.nonzero(at_rate)
+        row, k = np.nonzero(held & (np.abs(values) < 1))
+        m, size = values.shape[1], slopes.shape[2]
         slopes[row, k, size - m + k] = 1 / layer.half_range.numpy()[k]
-    return np.asarray(slopes, np.float64)
+    return slopes

@@ -41,6 +41,13 @@ class Limits:
         limited = np.minimum(high, np.where(soft, np.inf, problem.x_max))
         return cls(problem, bounded - room, limited + room)
 
+    def broken(self, thetas: Array) -> NDArray[np.bool_]:
+        """Return whether states break a hard bound of the problem itself."""
+        x, problem = thetas[..., self.problem.layout.state], self.problem
+        room, hard = ROUNDING * problem.theta_half[problem.layout.state], problem.soft.x <= 0
+        beyond = (x < problem.x_min - room) | (x > problem.x_max + room)
+        return np.asarray((beyond & hard).any(axis=-1))
+
     def violated(self, thetas: Array) -> NDArray[np.bool_]:
         """Return whether states lie beyond, for thetas (..., n_theta); NaN does."""
         x = thetas[..., self.problem.layout.state]

@@ -87,6 +87,9 @@ def as_episodes(
         if len(u) < SHORTEST:
             raise ValueError(f"episode {i} has {len(u)} steps; {SHORTEST} are the least.")
         whole = x.shape[1] == layout.size and layout.size > layout.n_states
+        beside = [name for name, each in given.items() if each is not None]
+        if whole and beside:
+            raise ValueError(f"{beside} is given, but states are all of theta: leave it out.")
         found.append(Episode(x if whole else _theta(problem, i, x, u, own), u))
     return tuple(found)
 
@@ -160,13 +163,22 @@ def _theta(problem: LinearMPC, i: int, x: Array, u: Array, given: dict[str, Any]
                     f"{size}) for each episode, or states of all of theta."
                 )
             continue
-        values = np.atleast_2d(_finite(f"episode {i}: {name}", given[name]))
+        values = _finite(f"episode {i}: {name}", given[name])
+        if values.ndim == 1 and size == 1 and len(values) == len(x):
+            values = values[:, None]
+        values = np.atleast_2d(values)
         if values.shape not in ((1, size), (len(x), size)):
             raise ValueError(
                 f"episode {i}: {name} have shape {values.shape}, expected ({len(x)}, {size})."
             )
         theta[:, part] = values
     if layout.n_previous:
-        first = np.zeros(len(u[0])) if given["previous"] is None else given["previous"]
-        theta[:, layout.previous] = np.vstack([np.reshape(first, (1, -1)), u])
+        first = np.zeros(u.shape[1])
+        if given["previous"] is not None:
+            first = np.atleast_1d(_finite(f"episode {i}: previous", [given["previous"]])[0])
+        if first.shape != (u.shape[1],):
+            raise ValueError(
+                f"episode {i}: previous has shape {first.shape}, expected ({u.shape[1]},)."
+            )
+        theta[:, layout.previous] = np.vstack([first, u])
     return theta

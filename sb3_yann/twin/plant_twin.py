@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import nnls
 
 from sb3_yann._validation import as_whole
 from sb3_yann.control import LinearMPC
@@ -128,7 +129,9 @@ class PlantTwin:
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
         as_whole("n_members", n_members)
         log = as_episodes(problem, episodes, references, disturbances, previous)
-        coordinates, choices = Coordinates.of(problem, log), candidates(problem, residuals)
+        coordinates, asked = Coordinates.of(problem, log), candidates(problem, residuals)
+        # The model as it is comes first, to compare with, whether it may be chosen or not.
+        choices = [candidates(problem, ["none"])[0], *asked]
         parts = pieces(log, FOLDS)
         runs, chosen = _choose(problem, coordinates, parts, choices)
         choice = choices[chosen]
@@ -207,9 +210,10 @@ def _choose(
     """Return the candidates' free runs, and which is best: the first without a second episode."""
     if len(log) < 2:
         errors = np.full((len(choices), 1, 1), np.inf)
-        return FreeRuns(np.array([1]), errors, tuple(each.name for each in choices)), 0
+        return FreeRuns(np.array([1]), errors, tuple(each.name for each in choices)), 1
     runs = held_out(problem, coordinates, log, choices)
-    return runs, runs.choose(np.array([each.freedom for each in choices]))
+    asked = FreeRuns(runs.horizons, runs.by_episode[1:], runs.names[1:])
+    return runs, 1 + asked.choose(np.array([each.freedom for each in choices[1:]]))
 
 
 def _members(
@@ -237,7 +241,7 @@ def _trust(
     dynamics: Dynamics,
 ) -> Trust:
     choices, chosen, runs = found
-    linear = next((i for i, each in enumerate(choices) if each.name == "none"), chosen)
+    linear = 0
     standing = standing_still(problem, coordinates, log, runs.horizons)
     costs = held_out_costs(problem, coordinates, log, choices[chosen])
     inputs = excitation(problem, log)
@@ -249,8 +253,8 @@ def _trust(
         [e.thetas[1:, :n] - first.step(e.thetas[None, :-1], e.actions[None])[0][:, :n] for e in log]
     )
     # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
-    gain = np.sqrt(1 + np.sum(problem.model.A**2, axis=1))
-    noise = np.std(left, axis=0) / gain
+    mixing = np.eye(n) + problem.model.A**2
+    noise = np.sqrt(nnls(mixing, np.var(left, axis=0))[0])
     return Trust(
         runs, chosen, linear, standing, *costs, *inputs, noise, tuple(problems), tuple(advice)
     )

@@ -15,10 +15,18 @@ def episodes_of(model: Any) -> list[tuple[Array, Array]]:
 
     Raises
     ------
-    ValueError
-        If it holds none of five steps.
+    TypeError, ValueError
+        If the model has no YannPolicy, or its buffer holds no episode of five steps.
     """
-    buffer, policy, problem = model.replay_buffer, model.policy, model.policy.problem
+    buffer, policy = model.replay_buffer, model.policy
+    problem = getattr(policy, "problem", None)
+    if problem is None:
+        raise TypeError(f"model must have a YannPolicy, its policy is {type(policy).__name__}.")
+    if buffer.optimize_memory_usage:
+        raise ValueError(
+            "optimize_memory_usage=True keeps no last states of episodes. Build the model without "
+            "it, or pass the episodes to PlantTwin.fit."
+        )
     order = np.arange(buffer.size())
     if buffer.full:  # the oldest row is the one that comes next
         order = np.roll(order, -buffer.pos)
@@ -31,8 +39,6 @@ def episodes_of(model: Any) -> list[tuple[Array, Array]]:
     found = []
     for env in range(buffer.n_envs):
         now, after = buffer.observations[order, env], buffer.next_observations[order, env]
-        if buffer.optimize_memory_usage:
-            after = buffer.observations[(order + 1) % buffer.buffer_size, env]
         scaled = buffer.actions[order, env].astype(np.float64)
         u = problem.u_min + (scaled + 1) / 2 * (problem.u_max - problem.u_min)
         ends = buffer.dones[order, env].astype(bool)

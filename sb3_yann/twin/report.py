@@ -53,7 +53,7 @@ def _errors(kind: str, trust: Trust) -> Iterator[str]:
 def _costs(trust: Trust) -> Iterator[str]:
     if len(trust.actual) == 0:
         return
-    yield "Cost of held-out episodes, predicted and actual:"
+    yield "Cost of held-out episodes (or pieces of them), predicted and actual:"
     for predicted, actual in zip(trust.predicted[:10], trust.actual[:10], strict=True):
         yield f"  {predicted:>10.4g} {actual:>10.4g}"
     if (more := len(trust.actual) - 10) > 0:

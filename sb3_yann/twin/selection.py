@@ -46,6 +46,8 @@ class Candidate:
 def candidates(problem: LinearMPC, kinds: Sequence[Any]) -> list[Candidate]:
     """Return what there is to choose from; a kind is a name, or makes something with fit."""
     offset, found = problem.layout.has_constants, []
+    if isinstance(kinds, str) or not kinds:
+        raise ValueError(f"residuals = {kinds!r} must be a list with at least one kind.")
     for kind in kinds:
         if kind == "none":
             found.append(Candidate("none", partial(Nothing, problem.model.n_states), -np.inf))
@@ -131,12 +133,12 @@ class FreeRuns:
     @property
     def errors(self) -> Array:
         """Root mean squares over all episodes, (candidates, h)."""
-        return np.asarray(np.sqrt(np.mean(self.by_episode**2, axis=1)))
+        return np.asarray(np.sqrt(np.nanmean(self.by_episode**2, axis=1)))
 
     @property
     def scores(self) -> Array:
         """The mean logarithm over horizons, (candidates, episodes): less is better."""
-        return np.asarray(np.log(self.by_episode + 1e-12).mean(axis=2))
+        return np.asarray(np.nanmean(np.log(self.by_episode + 1e-12), axis=2))
 
     def choose(self, freedom: Array) -> int:
         """Return the least free candidate that is within one standard error of the best.
@@ -144,8 +146,9 @@ class FreeRuns:
         The error is that of the difference of the two, over episodes (the one-standard-error rule
         of Hastie, Tibshirani and Friedman, section 7.10).
         """
-        best = int(np.argmin(self.scores.mean(axis=1)))
-        behind = self.scores - self.scores[best]
+        scores = self.scores[:, ~np.isnan(self.scores).any(axis=0)]
+        best = int(np.argmin(scores.mean(axis=1)))
+        behind = scores - scores[best]
         error = behind.std(axis=1, ddof=1) / np.sqrt(behind.shape[1])
         near = behind.mean(axis=1) <= error
         near[best] = True
@@ -171,7 +174,7 @@ def held_out(
     choices : sequence of Candidate
         What is compared.
     """
-    longest = min(LONGEST, min(map(len, episodes)))
+    longest = min(LONGEST, int(np.median([*map(len, episodes)])))
     horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
     folds = [range(k, len(episodes), min(FOLDS, len(episodes))) for k in range(FOLDS)]
     errors = np.zeros((len(choices), len(episodes), len(horizons)))
@@ -194,17 +197,20 @@ def _errors(
     horizons: Any,
 ) -> Array:
     """Return mean squares (candidates, h) of one episode's free runs."""
-    steps, n = int(horizons[-1]), problem.model.n_states
+    n, found = problem.model.n_states, np.full((len(made), len(horizons)), np.nan)
+    horizons = horizons[horizons <= len(episode)]  # a short piece says nothing of more
+    if not len(horizons):
+        return found
+    steps = int(horizons[-1])
     starts = np.unique(np.linspace(0, len(episode) - steps, RUNS).astype(int))
     actual = episode.thetas[starts[:, None] + horizons, :n]
-    found = np.empty((len(made), len(horizons)))
     for same in _alike(made):
         dynamics = Dynamics(problem, coordinates, tuple(made[i] for i in same))
         with np.errstate(all="ignore"):
             free = dynamics.replay(episode, starts, steps)[:, :, horizons]
             error = (free - actual) / coordinates.units
             mean = np.mean(error**2, axis=(1, 3))
-        found[same] = np.where(np.isfinite(mean), np.minimum(mean, 1e12), 1e12)
+        found[same, : len(horizons)] = np.where(np.isfinite(mean), np.minimum(mean, 1e12), 1e12)
     return found
 
 

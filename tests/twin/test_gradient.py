@@ -8,7 +8,12 @@ import torch as th
 
 from sb3_yann import LinearMPC, PlantTwin, RateLimits
 from sb3_yann.networks import YannLayer
-from sb3_yann.twin.gradient import Objective, accumulate_gradient, actor_inputs
+from sb3_yann.twin.gradient import (
+    Objective,
+    _slopes_of_actor,
+    accumulate_gradient,
+    actor_inputs,
+)
 from twin_samples import log, problem, twin
 
 
@@ -72,3 +77,30 @@ def test_a_limit_pushes_back_and_runs_above_a_reference_count_more() -> None:
     np.testing.assert_allclose(
         gradient(-np.inf, (0 * ones, ones, 3 * ones)), 3 * gradient(-np.inf), rtol=1e-4, atol=1e-6
     )
+
+
+@pytest.mark.parametrize("options", [{}, {"max_correction": 0.02}])
+@pytest.mark.parametrize("make", [twin, rated])
+def test_the_actor_s_slopes_are_those_of_differences_on_bounds_as_well(make, options) -> None:
+    problem_ = make().problem
+    rate = None
+    if problem_.has_rate_bounds:
+        rate = problem_.rate.du_min, problem_.rate.du_max
+    layer = YannLayer(problem_.explicit(), rate=rate, **options).double()
+    generator = th.Generator().manual_seed(0)
+    with th.no_grad():
+        for each in layer.network.weights():
+            each.add_(0.3 * th.randn(each.shape, generator=generator))
+    low, high = problem_.theta_min, problem_.theta_max
+    theta = 0.5 * np.random.default_rng(0).uniform(low, high, (400, problem_.n_theta))
+    found, step = _slopes_of_actor(layer, theta), 1e-6
+
+    def actions(at: np.ndarray) -> np.ndarray:
+        with th.no_grad():
+            return layer(th.as_tensor(at).requires_grad_()).numpy()  # in float64
+
+    for j in range(problem_.n_theta):
+        e = step * np.eye(problem_.n_theta)[j]
+        slope = (actions(theta + e) - actions(theta - e)) / (2 * step)
+        wrong = np.abs(slope - found[..., j]) > 1e-4 * (1 + np.abs(slope))
+        assert np.mean(wrong) < 0.01  # of 400 points a few lie on a facet

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_yann import ImprovementGuard, NoActionNoise, PlantTwin, UntrustedTwinError, YannPolicy
+from sb3_yann import (
+    AffineObservation,
+    ImprovementGuard,
+    NoActionNoise,
+    PlantTwin,
+    UntrustedTwinError,
+    YannPolicy,
+)
 from twin_samples import Cart, log, problem, twin
 
 
@@ -107,3 +114,36 @@ def test_an_empty_buffer_is_refused() -> None:
     model = DDPG(YannPolicy, Cart(), buffer_size=10)
     with pytest.raises(ValueError, match="no episode of 5 steps"):
         PlantTwin.from_buffer(model)
+
+
+def test_a_guard_refuses_a_twin_of_another_problem_or_of_other_observations() -> None:
+    other = DDPG("YannPolicy", "CSTR-v0", device="cpu", learning_starts=0)
+    with pytest.raises(ValueError, match=r"Fit the twin with model\.policy\.problem"):
+        other.learn(5, callback=[NoActionNoise(), ImprovementGuard(twin())])
+    options = {"observation": AffineObservation.identity(2), "problem": problem()}
+    model = DDPG(YannPolicy, Cart(), policy_kwargs=options, learning_starts=0)
+    with pytest.raises(ValueError, match="The twin shows theta"):
+        model.learn(5, callback=[NoActionNoise(), ImprovementGuard(twin())])
+
+
+def test_a_short_piece_of_a_log_changes_nothing_that_matters() -> None:
+    states, actions = log(1, first=70)[0]
+    found = PlantTwin.fit(problem(), [*log(5), (states[:8], actions[:7])])
+    assert found.trusted and found.trust.runs.horizons[-1] == 60
+
+
+def test_the_model_as_it_is_is_looked_at_even_where_it_may_not_be_chosen() -> None:
+    found = PlantTwin.fit(problem(), log(3), residuals=["quadratic"])
+    assert found.kind.startswith("quadratic") and found.trust.runs.names[0] == "none"
+    assert found.trust.runs.errors[0][0] > found.trust.runs.errors[found.trust.chosen][0]
+    with pytest.raises(ValueError, match="at least one kind"):
+        PlantTwin.fit(problem(), log(3), residuals=[])
+
+
+def test_a_buffer_that_keeps_no_last_states_is_refused() -> None:
+    options = {"replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    model = DDPG(YannPolicy, Cart(), optimize_memory_usage=True, **options)
+    with pytest.raises(ValueError, match="optimize_memory_usage=True keeps no last states"):
+        PlantTwin.from_buffer(model)
+    with pytest.raises(TypeError, match="must have a YannPolicy"):
+        PlantTwin.from_buffer(DDPG("MlpPolicy", Cart()))
