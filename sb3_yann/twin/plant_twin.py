@@ -157,7 +157,8 @@ class PlantTwin:
         ValueError
             If the buffer holds no episode of some steps.
         """
-        return cls.fit(model.policy.problem, episodes_of(model), **options)
+        episodes = episodes_of(model)
+        return cls.fit(model.policy.problem, episodes, **options)
 
     @property
     def trusted(self) -> bool:
