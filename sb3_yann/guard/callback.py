@@ -113,10 +113,8 @@ class ImprovementGuard(BaseCallback):
         super().__init__(verbose)
         if isinstance(env, PlantTwin):
             env.require_trust()
-            self.twin, env = (
-                env,
-                env.env,
-            )  # each episode's seed names a member: all of them are played
+            # The seed of an episode names a member: all of them are played.
+            self.twin, env = env, env.env
         if not (env is None or isinstance(env, str | gym.Env) or callable(env)):
             raise TypeError(
                 f"env = {env!r} must be the id of an environment, a gymnasium.Env, a function that "
