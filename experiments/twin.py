@@ -1,6 +1,6 @@
 """The reactor improved from a log alone: `python -m experiments.twin`, ten minutes on two cores.
 
-Ten logs of the MPC for each case, none of which was looked at before; 100 starts of the plant that
+Ten logs of the MPC for each case, on none of which anything was tuned; 100 starts of the plant that
 are in no log. Prints the table of docs/twin.md.
 """
 
