@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.critic import refit_critic
 from sb3_yann.commissioning.search import Check, Search
-from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
 
@@ -109,11 +109,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     policy = require_yann_policy(model.policy, "improve")
     if not isinstance(twin, PlantTwin):
         raise TypeError(f"twin = {twin!r} must be a PlantTwin.")
-    if policy.problem != twin.problem:
-        raise ValueError(
-            f"The twin is one of {twin.problem!r}, the model's problem is {policy.problem!r}. Fit "
-            "the twin with model.policy.problem."
-        )
+    require_problem_of_twin(policy, twin.problem)
     counts = {"iterations": iterations, "batch": batch, "n_starts": n_starts}
     for name, value in (counts | {"check_every": check_every, "patience": patience}).items():
         as_whole(name, value)

@@ -15,6 +15,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, lqr
 from sb3_yann.guard.statistics import PairedEpisodes
 from sb3_yann.networks import RowAdam, YannLayer
+from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import Objective, accumulate_gradient, actor_inputs
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -148,14 +149,14 @@ class Search:
         self.layer, self.twin, problem = layer, twin, twin.problem
         members, checked = len(twin.dynamics.members), np.random.default_rng([seed, 1])
         self.shape, self.rng = (members, max(1, batch // members)), np.random.default_rng(seed)
-        lengths = [*map(len, twin.episodes)]
-        self.steps = min(LONGEST, min(lengths), settling_steps(problem))
+        longest = max(map(len, twin.episodes))
+        self.steps = min(LONGEST, longest, settling_steps(problem))
         drawn = twin.starts.draw(n_starts, checked), twin.starts.draw_around(n_starts, checked)
         starts = np.repeat(np.concatenate(drawn)[None], members, axis=0)
-        self.trial = Trial(self._inputs, twin, starts, n_starts, max(lengths))
+        self.trial = Trial(self._inputs, twin, starts, n_starts, longest)
         penalty, value = PENALTY * self.trial.mean, _value(problem)
         self.objective = Objective(problem, value, twin.limits.low, twin.limits.high, penalty)
-        self.accepted = copy.deepcopy(layer.state_dict())
+        self.accepted, self.law = copy.deepcopy(layer.state_dict()), law_of(problem)
 
     def run(
         self, iterations: Any, count: int, learning_rate: float, every: int, patience: int
@@ -220,7 +221,7 @@ class Search:
         starts = self.rng.permutation(drawn).reshape(members, batch, -1)
         dynamics = self.twin.dynamics
         with np.errstate(all="ignore"):
-            runs = dynamics.roll_out(law_of(self.twin.problem), starts, self.steps)
+            runs = dynamics.roll_out(self.law, starts, self.steps)
             mpc = self.objective.costs(*runs)
             # Starts around the log may be many times as dear: none counts for more than one of it.
             weights = np.minimum(1.0, self.trial.mean / np.maximum(np.abs(mpc), 1e-300))
@@ -231,19 +232,6 @@ class Search:
 
     def _inputs(self, theta: Array) -> Array:
         return actor_inputs(self.layer, self.twin.problem, theta)
-
-
-def law_of(problem: LinearMPC) -> Inputs:
-    """Return the explicit law as a function of rows."""
-    law, m = problem.explicit(), problem.model.n_inputs
-
-    def act(rows: Array) -> Array:
-        finite = np.isfinite(rows).all(axis=1)
-        u = np.full((len(rows), m), np.nan)
-        u[finite] = law(rows[finite])
-        return u
-
-    return act
 
 
 def settling_steps(problem: LinearMPC) -> int:

@@ -20,12 +20,12 @@ from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.options import AcceptanceRule, StepSize
 from sb3_yann.guard.plant_acceptance import PlantAcceptance
-from sb3_yann.guard.preconditions import check_not_nested
+from sb3_yann.guard.preconditions import check_not_nested, check_twin
 from sb3_yann.guard.session import GuardSession, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, write_csv
 from sb3_yann.policy._finite import watch_buffer
-from sb3_yann.policy.policies import require_twin_of, require_yann_policy
+from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
 
@@ -158,7 +158,7 @@ class ImprovementGuard(BaseCallback):
         check_not_nested(self)
         policy = require_yann_policy(self.model.policy, "ImprovementGuard")
         if self.twin is not None:
-            require_twin_of(policy, self.twin.problem)
+            check_twin(policy, self.twin.problem)
         watch_buffer(self.model)
         self.session = GuardSession(
             self.model, policy, self.env, self.step_size, self.log_path, self.verbose

@@ -9,10 +9,12 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann.control import LinearMPC
 from sb3_yann.evaluation.episodes import Episodes, one_env
 from sb3_yann.guard.episodes import Outcome, outcome_of, play_episodes
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
+from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin
 
 
 def check_simulator(session: GuardSession, name: str) -> None:
@@ -108,3 +110,13 @@ def _all_alike(episodes: Episodes) -> bool:
     first = episodes.observations[0][0]
     starts = all(np.array_equal(each[0], first) for each in episodes.observations)
     return starts and bool(np.allclose(episodes.costs, episodes.costs[0], rtol=1e-6, atol=0))
+
+
+def check_twin(policy: YannPolicy, problem: LinearMPC) -> None:
+    """Raise ValueError unless a twin shows what the policy observes, theta of the same problem."""
+    require_problem_of_twin(policy, problem)
+    if policy.observation is not None:
+        raise ValueError(
+            "The twin shows theta, but the model's policy makes theta of its observations. Guard "
+            "it in a simulator that shows those, or improve it with improve(model, twin)."
+        )

@@ -254,17 +254,12 @@ def require_yann_policy(policy: BasePolicy, who: str) -> YannPolicy:
     return policy
 
 
-def require_twin_of(policy: YannPolicy, problem: LinearMPC) -> None:
-    """Raise ValueError unless a twin's problem is the policy's, and the policy observes theta."""
+def require_problem_of_twin(policy: YannPolicy, problem: LinearMPC) -> None:
+    """Raise ValueError unless a twin's problem is the policy's."""
     if policy.problem != problem:
         raise ValueError(
             f"The twin is one of {problem!r}, the model's problem is {policy.problem!r}. Fit "
             "the twin with model.policy.problem."
-        )
-    if policy.observation is not None:
-        raise ValueError(
-            "The twin shows theta, but the model's policy makes theta of its observations. Guard "
-            "it in a simulator that shows those, or improve it with improve(model, twin)."
         )
 
 

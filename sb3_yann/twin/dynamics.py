@@ -52,6 +52,19 @@ class Coordinates:
         return np.asarray(np.clip(features, self.low, self.high) / self.scale)
 
 
+def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
+    """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
+    law, m = problem.explicit(), problem.model.n_inputs
+
+    def act(rows: Array) -> Array:
+        finite = np.isfinite(rows).all(axis=1)
+        u = np.full((len(rows), m), np.nan)
+        u[finite] = law(rows[finite])
+        return u
+
+    return act
+
+
 def features(problem: LinearMPC, theta: Array, u: Array) -> Array:
     """Return ``[x, d, u]`` (..., k): what the next state depends on."""
     parts = problem.layout
@@ -76,7 +89,7 @@ class Dynamics:
 
     @cached_property
     def _stack(self) -> Polynomial | None:
-        """All members as one polynomial with weights (members, 1, size, n), where they are such."""
+        """All members as one polynomial with weights (members, size, n), where they are such."""
         first = self.members[0]
         if not isinstance(first, Polynomial):
             return None
@@ -169,22 +182,21 @@ class Dynamics:
         """Number of inputs."""
         return self.problem.model.n_inputs
 
-    def replay_in_closed_loop(self, episode: Episode) -> tuple[Array, Array]:
-        """Return predicted costs (members,) of a whole episode, and the states' errors over it.
+    def replay_in_closed_loop(self, episode: Episode) -> Array:
+        """Return the predicted costs (members,) of a whole episode.
 
         The inputs are the logged ones, corrected by what the law makes of the deviation of the
         state: where the law made the log, it acts on its own predictions.
         """
-        parts, law, steps = self.problem.layout, self.problem.explicit(), len(episode)
+        parts, law = self.problem.layout, law_of(self.problem)
         u_min, u_max = self.problem.u_min, self.problem.u_max
-        logged = np.atleast_2d(law(episode.thetas[:-1]))
+        logged = law(episode.thetas[:-1])
         theta = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
-        costs, errors = np.zeros(len(self.members)), np.zeros((len(self.members), parts.n_states))
-        for k in range(steps):
+        costs = np.zeros(len(self.members))
+        for k in range(len(episode)):
             theta[..., parts.constant] = episode.thetas[k, parts.constant]
-            correction = np.atleast_2d(law(theta[:, 0])) - logged[k]
+            correction = law(theta[:, 0]) - logged[k]
             u = np.clip(episode.actions[k] + correction, u_min, u_max)[:, None]
             costs += self.problem.stage_cost(theta, u)[:, 0]
             theta = self.step(theta, u)
-            errors += (theta[:, 0, parts.state] - episode.thetas[k + 1, parts.state]) ** 2
-        return costs, np.sqrt(errors / steps)
+        return costs

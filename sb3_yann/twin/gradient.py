@@ -20,22 +20,6 @@ from sb3_yann.twin.dynamics import Dynamics
 
 
 @dataclass(frozen=True)
-class Unrolled:
-    """A batch of closed-loop runs in a twin.
-
-    Attributes
-    ----------
-    thetas, inputs : ndarray, shapes (T + 1, members, batch, n_theta) and (T, members, batch, m)
-    costs : ndarray, shape (members, batch)
-        Summed stage costs, and the value function at the end.
-    """
-
-    thetas: Array
-    inputs: Array
-    costs: Array
-
-
-@dataclass(frozen=True)
 class Objective:
     """What is minimized: stage costs, the value at the end, and a penalty beyond limits.
 
@@ -92,7 +76,7 @@ def accumulate_gradient(
     starts: Array,
     steps: int,
     reference: tuple[Array, Array, Array] | None = None,
-) -> Unrolled:
+) -> None:
     """Add to the parameters' ``grad`` the gradient of the mean cost of runs from some starts.
 
     Parameters
@@ -137,7 +121,6 @@ def accumulate_gradient(
     upstream = by_action * weights[..., None] * half / weights.size
     upstream = upstream.reshape(len(flat), -1)
     actions.backward(th.as_tensor(upstream).to(actions))
-    return Unrolled(thetas, inputs, costs)
 
 
 def _by_member(thetas: Array, inputs: Array) -> tuple[Array, Array]:

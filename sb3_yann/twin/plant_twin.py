@@ -242,13 +242,11 @@ def _trust(
     dynamics: Dynamics,
 ) -> Trust:
     choices, chosen, runs = found
-    linear = 0
     standing = standing_still(problem, coordinates, log, runs.horizons)
     costs = held_out_costs(problem, coordinates, log, choices[chosen])
     inputs = excitation(problem, log)
-    problems, advice = judge(
-        runs, linear, standing, costs, inputs, len(log), beyond_the_box(problem, log)
-    )
+    beyond = beyond_the_box(problem, log)
+    problems, advice = judge(runs, standing, costs, inputs, len(log), beyond)
     n, first = problem.model.n_states, Dynamics(problem, coordinates, dynamics.members[:1])
     left = np.concatenate(
         [e.thetas[1:, :n] - first.step(e.thetas[None, :-1], e.actions[None])[0][:, :n] for e in log]
@@ -256,6 +254,4 @@ def _trust(
     # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
     mixing = np.eye(n) + problem.model.A**2
     noise = np.sqrt(nnls(mixing, np.var(left, axis=0))[0])
-    return Trust(
-        runs, chosen, linear, standing, *costs, *inputs, noise, tuple(problems), tuple(advice)
-    )
+    return Trust(runs, chosen, standing, *costs, *inputs, noise, tuple(problems), tuple(advice))

@@ -43,7 +43,7 @@ def _errors(kind: str, trust: Trust) -> Iterator[str]:
     yield "  steps ahead      " + "".join(f"{h:>9d}" for h in trust.runs.horizons)
     rows = (
         ("twin", trust.runs.errors[trust.chosen]),
-        ("linear model", trust.runs.errors[trust.linear]),
+        ("linear model", trust.runs.errors[0]),
         ("nothing moves", trust.standing),
     )
     for name, errors in rows:

@@ -142,18 +142,24 @@ class Polynomial:
 
     def fit(self, z: Array, y: Array) -> Polynomial:
         """Fit to residuals y (N, n) at z (N, k)."""
-        self.monomials = Monomials(z.shape[1], self.degree)
         self.solve(*self.moments(z, y))
         return self
 
-    def moments(self, z: Array, y: Array) -> tuple[Array, Array, int]:
-        """Return the sums of squares and products, which sums of episodes add up to."""
+    def moments(self, z: Array, y: Array) -> tuple[Monomials, Array, Array, int]:
+        """Return the monomials, and the sums of their products with each other and with y."""
         self.monomials = Monomials(z.shape[1], self.degree)
         F = self._features(z)
-        return F.T @ F, F.T @ y, len(z)
+        return self.monomials, F.T @ F, F.T @ y, len(z)
 
-    def solve(self, gram: Array, cross: Array, count: int) -> None:
-        """Fit to the moments of some data."""
+    def solve(self, monomials: Monomials, gram: Array, cross: Array, count: int) -> None:
+        """Fit to the moments of some data, which polynomials of other shrinkages may share.
+
+        Parameters
+        ----------
+        monomials, gram, cross, count : Monomials, ndarray, ndarray and int
+            As :meth:`moments` returns them.
+        """
+        self.monomials = monomials
         number, factor = self.inputs
         own = self.monomials.holding(self.monomials.k - number)
         ridge = self.shrinkage * count * np.where(own, factor, 1.0)

@@ -91,13 +91,12 @@ def fitted(
     """
     z, y = zip(*(regression(problem, coordinates, each) for each in episodes), strict=True)
     z_all, y_all = np.concatenate(z), np.concatenate(y)
-    moments: dict[tuple[int, bool], Any] = {}
+    moments: dict[tuple[int, bool], Any] = {}  # which do not depend on the shrinkage
     for residual in made:
         if isinstance(residual, Polynomial):
             key = residual.degree, residual.offset
             if key not in moments:
                 moments[key] = residual.moments(z_all, y_all)
-            residual.moments(z_all[:1], y_all[:1])  # which makes its monomials
             residual.solve(*moments[key])
         elif not isinstance(residual, Nothing):
             residual.fit(z_all, y_all)
@@ -180,8 +179,6 @@ def held_out(
     errors = np.zeros((len(choices), len(episodes), len(horizons)))
     for fold in filter(len, folds):
         kept = [each for i, each in enumerate(episodes) if i not in fold]
-        if not kept:
-            continue
         made = fitted(problem, coordinates, kept, [each.make() for each in choices])
         for i in fold:
             errors[:, i] = _errors(problem, coordinates, episodes[i], made, horizons)

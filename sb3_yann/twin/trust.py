@@ -38,12 +38,12 @@ class Trust:
     ----------
     runs : FreeRuns
         Held-out free-run errors of all candidates, of the model as it is, and of standing still.
-    chosen, linear : int
-        Which candidate was taken, and which one is the linear model as it is.
+    chosen : int
+        Which candidate was taken; the first is the linear model as it is.
     standing : ndarray, shape (h,)
         Errors of the prediction that nothing moves.
     predicted, actual : ndarray, shape (episodes,)
-        Costs of whole held-out episodes, in closed loop.
+        Costs of held-out episodes, of two to four their pieces, in closed loop.
     excitation : ndarray, shape (m,)
         Share of each input's variance that states and disturbances do not explain.
     moves : ndarray, shape (m,)
@@ -56,7 +56,6 @@ class Trust:
 
     runs: FreeRuns
     chosen: int
-    linear: int
     standing: Array
     predicted: Array
     actual: Array
@@ -74,10 +73,15 @@ class Trust:
     @property
     def cost_error(self) -> float:
         """Root mean square error of the predicted costs, relative to the mean cost."""
-        if not len(self.actual):
-            return float("inf")
-        scale = max(float(np.abs(self.actual).mean()), 1e-300)
-        return float(np.sqrt(np.mean((self.predicted - self.actual) ** 2)) / scale)
+        return relative_error(self.predicted, self.actual)
+
+
+def relative_error(predicted: Array, actual: Array) -> float:
+    """Return the root mean square error relative to the mean; inf where there is nothing."""
+    if not len(actual):
+        return float("inf")
+    scale = max(float(np.abs(actual).mean()), 1e-300)
+    return float(np.sqrt(np.mean((predicted - actual) ** 2)) / scale)
 
 
 def costs_of(problem: LinearMPC, episode: Episode) -> float:
@@ -111,7 +115,7 @@ def held_out_costs(
         others = episodes[:i] + episodes[i + 1 :]
         (residual,) = fitted(problem, coordinates, others, [choice.make()])
         with np.errstate(all="ignore"):
-            cost, _ = Dynamics(problem, coordinates, (residual,)).replay_in_closed_loop(episode)
+            cost = Dynamics(problem, coordinates, (residual,)).replay_in_closed_loop(episode)
         predicted.append(float(np.nan_to_num(cost[0], nan=1e300, posinf=1e300)))
     return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
 
@@ -159,7 +163,6 @@ def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> float:
 
 def judge(
     runs: FreeRuns,
-    linear: int,
     standing: Array,
     costs: tuple[Array, Array],
     inputs: tuple[Array, Array],
@@ -171,9 +174,7 @@ def judge(
     Parameters
     ----------
     runs : FreeRuns
-        Errors of all candidates.
-    linear : int
-        Which of them is the linear model as it is.
+        Errors of all candidates, of which the first is the linear model as it is.
     standing : ndarray, shape (h,)
         Errors of standing still.
     costs : pair of ndarray, shape (episodes,)
@@ -199,10 +200,10 @@ def judge(
             f"Input {k} follows the state ({100 * share[k]:.2g} % of its variance is its own), so "
             "its gain rests on the given B. A small step test on it would tell."
         )
-    if n_episodes > 1 and runs.errors[linear][0] > FOREIGN * standing[0]:
+    if n_episodes > 1 and runs.errors[0][0] > FOREIGN * standing[0]:
         problems.append(
             f"The problem's model predicts {runs.horizons[0]} steps far worse than 'nothing moves' "
-            f"({runs.errors[linear][0]:.3g} against {standing[0]:.3g} standard deviations)."
+            f"({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
         )
         advice.append("Compare units, operating point and sampling time of the log and the model.")
     if beyond > OUTSIDE:
@@ -210,13 +211,11 @@ def judge(
             f"{100 * beyond:.3g} % of the logged states lie beyond the problem's box of theta."
         )
         advice.append("Compare units and operating point of the log and the model.")
-    if len(costs[0]):
-        scale = max(float(np.abs(costs[1]).mean()), 1e-300)
-        error = float(np.sqrt(np.mean((costs[0] - costs[1]) ** 2))) / scale
-        if not error <= COST_ERROR:
-            problems.append(
-                f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
-                f"mean; {100 * COST_ERROR:.0f} % are the most."
-            )
-            advice.append(f"Log {max(3, n_episodes)} episodes more, or lessen the sensors' noise.")
+    error = relative_error(*costs)
+    if n_episodes > 1 and not error <= COST_ERROR:
+        problems.append(
+            f"Predicted costs of held-out episodes err by {100 * min(error, 1e6):.3g} % of the "
+            f"mean; {100 * COST_ERROR:.0f} % are the most."
+        )
+        advice.append(f"Log {max(3, n_episodes)} episodes more, or lessen the sensors' noise.")
     return problems, advice

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+
 import numpy as np
 import pytest
 from stable_baselines3 import DDPG
@@ -9,11 +12,14 @@ from stable_baselines3 import DDPG
 from sb3_yann import (
     AffineObservation,
     ImprovementGuard,
+    LinearModel,
     NoActionNoise,
     PlantTwin,
     UntrustedTwinError,
     YannPolicy,
 )
+from sb3_yann.commissioning.search import Search
+from sb3_yann.networks import YannLayer
 from twin_samples import Cart, log, problem, twin
 
 
@@ -130,6 +136,17 @@ def test_a_short_piece_of_a_log_changes_nothing_that_matters() -> None:
     states, actions = log(1, first=70)[0]
     found = PlantTwin.fit(problem(), [*log(5), (states[:8], actions[:7])])
     assert found.trusted and found.trust.runs.horizons[-1] == 60
+    layer = YannLayer(problem().explicit())
+    whole, cut = (Search(copy.deepcopy(layer), each, 5, 2, 0).steps for each in (twin(), found))
+    assert whole == cut > 7
+
+
+def test_a_model_that_is_far_worse_than_none_is_that_of_another_plant() -> None:
+    plain = problem()
+    model = LinearModel(plain.model.A, 200 * plain.model.B, plain.model.dt)
+    foreign = dataclasses.replace(plain, model=model, terminal=None)
+    found = PlantTwin.fit(foreign, log(3), residuals=["cubic"])
+    assert not found.trusted and "far worse than 'nothing moves'" in found.report()
 
 
 def test_the_model_as_it_is_is_looked_at_even_where_it_may_not_be_chosen() -> None:
