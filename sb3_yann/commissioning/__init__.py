@@ -1,6 +1,6 @@
 """From a plant's log to a better controller on the plant."""
 
 from sb3_yann.commissioning.improve import Improvement, improve
-from sb3_yann.commissioning.search import Check
+from sb3_yann.commissioning.trial import Check
 
 __all__ = ["Check", "Improvement", "improve"]

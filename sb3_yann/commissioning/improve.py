@@ -11,7 +11,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.critic import refit_critic
-from sb3_yann.commissioning.search import Check, Search
+from sb3_yann.commissioning.search import Search
+from sb3_yann.commissioning.trial import Check
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -39,7 +40,7 @@ class Improvement:
     @property
     def accepted(self) -> bool:
         """Whether any policy passed; if none did, the model is as it was."""
-        return any(each.accepted for each in self.checks)
+        return any(each.accepted for each in self.checks if each.iteration > 0)
 
 
 def improve(  # noqa: PLR0913 (settings of a user, each by its name)
@@ -60,8 +61,11 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     The actor's parameters follow the gradient of the summed stage cost through unrolled runs of
     twin and actor, with the linear-quadratic value at the end. Every so many steps the policy is
     checked against the MPC, from seeded starts on every member of the twin. It is accepted if no
-    start costs more than with the MPC by 0.3 % of the mean, none violates more, and the mean is
+    start costs more than with the MPC by 0.05 % of the mean, none violates more, and the mean is
     not above that of the accepted policy; a start around the log may cost 1 % of its own more.
+    What passes is confirmed on new starts. Starts that it loses, or nearly, are played in the
+    gradients to come. What the model has learnt before is checked first.
+
     The model ends with the policy accepted last and a critic that is refitted to it, else as it
     was. It saves and goes on learning as any other.
 
@@ -119,13 +123,14 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     twin.require_trust()
     search = Search(copy.deepcopy(policy.actor.mu).cpu(), twin, batch, n_starts, seed)
     steps = track(range(iterations), "improving", disable=not progress_bar)
-    checks = search.run(steps, iterations, learning_rate, check_every, patience)
-    accepted = [each.change for each in checks if each.accepted]
-    if not accepted:
-        return Improvement(tuple(checks), 0.0)
+    search.run(steps, iterations, learning_rate, check_every, patience)
+    accepted = [each.change for each in search.checks if each.accepted]
+    found = Improvement(tuple(search.checks), accepted[-1] if accepted else 0.0)
+    if not found.accepted or search.accepted is None:
+        return found
     policy.actor.mu.load_state_dict(search.accepted)
     policy.actor_target.load_state_dict(policy.actor.state_dict())
     for network in (policy.actor, policy.critic):
         network.optimizer.state.clear()  # what other weights were moved by
     refit_critic(policy, twin, seed)
-    return Improvement(tuple(checks), accepted[-1])
+    return found

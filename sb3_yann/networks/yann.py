@@ -78,8 +78,6 @@ class YannLayer(nn.Module):
                 "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
             )
         self.infeasible, self.piecewise_affine, self.row_gradients = law.infeasible, law, False
-        # The input range is 2 here. A little is left for the float32 rounding of what follows.
-        self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
         self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
         middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
@@ -103,9 +101,15 @@ class YannLayer(nn.Module):
         self.network = ZeroOutputNetwork(*sizes, hidden, activation=activation, pinned=stay)
         scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
         change = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
-        # For compiled code.
-        self.constants = (scaling, change, np.inf if self.reach is None else self.reach)
+        self.constants = (scaling, change, np.inf)  # for compiled code
+        self.limit(max_correction)
         self.has_its_law = True
+
+    def limit(self, max_correction: float | None) -> None:
+        """Bound the network's output to a fraction of the input range, or not at all."""
+        # The input range is 2 here. A little is left for the float32 rounding of what follows.
+        self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
+        self.constants = (*self.constants[:2], np.inf if self.reach is None else self.reach)
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""

@@ -137,10 +137,7 @@ class YannPolicy(TD3Policy):
         }
         self.critic_options = as_critic_options(critic)
         self.critic_warmup = as_whole("critic_warmup", critic_warmup, 0, "It counts updates.")
-        if max_correction is not None:
-            hint = "It is a fraction of the input range, or None."
-            max_correction = as_between("max_correction", max_correction, 0, 1, hint=hint)
-        self.max_correction = max_correction
+        self.max_correction = _as_correction(max_correction)
         if pin_equilibrium is None:
             pin_equilibrium = not self.problem.layout.has_constants
         self.pin_equilibrium = as_flag("pin_equilibrium", pin_equilibrium)
@@ -228,6 +225,13 @@ class YannPolicy(TD3Policy):
         options, pinned = self.critic_options, self.pin_equilibrium
         return YannCritic(self.problem, self.gamma, options, pinned, **kwargs).to(self.device)
 
+    def limit_correction(self, max_correction: float | None) -> None:
+        """Bound what the actor's networks may add to the law, as a fraction of the input range."""
+        self.max_correction = _as_correction(max_correction)
+        for actor in (self.actor, self.actor_target):
+            actor.options["max_correction"] = self.max_correction
+            actor.mu.limit(self.max_correction)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),
@@ -241,6 +245,13 @@ class YannPolicy(TD3Policy):
             "pin_equilibrium": self.pin_equilibrium,
             "observation": self.observation,
         }
+
+
+def _as_correction(value: float | None) -> float | None:
+    if value is None:
+        return None
+    hint = "It is a fraction of the input range, or None."
+    return as_between("max_correction", value, 0, 1, hint=hint)
 
 
 def require_yann_policy(policy: BasePolicy, who: str) -> YannPolicy:

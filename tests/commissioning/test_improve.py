@@ -53,9 +53,9 @@ def policy_bits(model) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_where_nothing_passes_the_model_is_as_it_was(algorithm, monkeypatch) -> None:
-    from sb3_yann.commissioning import search
+    from sb3_yann.commissioning import trial
 
-    monkeypatch.setattr(search, "MARGIN", -1.0)  # no start can pass
+    monkeypatch.setattr(trial, "MARGIN", -1.0)  # no start can pass
     model = algorithm(YannPolicy, Cart(), seed=0, device="cpu")
     before = policy_bits(model)
     found = improve(model, twin(), iterations=3, check_every=1, n_starts=3)

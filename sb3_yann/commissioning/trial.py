@@ -1,0 +1,134 @@
+"""What comes of a policy from many starts on every member of a twin, against the MPC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.guard.statistics import PairedEpisodes
+from sb3_yann.twin.dynamics import law_of
+from sb3_yann.twin.plant_twin import PlantTwin
+
+MARGIN = 5e-4
+"""What one start may cost more than with the MPC on one member, in mean costs of the MPC."""
+AROUND = 0.01
+"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it."""
+FURTHER = 0.01
+"""How much farther than the MPC a run may leave what the log shows, in its widths."""
+NEARLY = 0.5
+"""A start that loses so much of what it may lose is a hard one."""
+
+Inputs = Callable[[Array], Array]
+Outcome = tuple[Array, NDArray[np.int64]]
+"""Costs, and what is unsafe, of all starts."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One comparison with the MPC in the twin.
+
+    Attributes
+    ----------
+    iteration : int
+    accepted : bool
+    reason : str
+        Why not; empty where it was.
+    change : float
+        Mean cost against the MPC's, over all starts and members: -0.02 is 2 % less.
+    worst : float
+        The largest increase of one start on one member, in mean costs of the MPC.
+    """
+
+    iteration: int
+    accepted: bool
+    reason: str
+    change: float
+    worst: float
+
+
+@dataclass
+class Trial:
+    """Starts on every member, and what came of the MPC and of the accepted policy there.
+
+    Attributes
+    ----------
+    act : callable
+        The actor, from theta (rows, n_theta) to inputs (rows, m).
+    twin : PlantTwin
+    starts : ndarray, shape (members, starts, n_theta)
+        The first ``n_known`` of each member begin as the log does, the others around it.
+    n_known, steps : int
+    """
+
+    twin: PlantTwin
+    starts: Array
+    n_known: int
+    steps: int
+    far: Any = np.inf
+    mpc: Outcome = field(init=False)
+
+    def __post_init__(self) -> None:
+        thetas, _ = self._run(law_of(self.twin.problem))
+        self.far = np.nan_to_num(self._beyond(thetas), nan=np.inf)
+        self.mpc = self.play(law_of(self.twin.problem))
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which of all starts, member by member, begin as the log does."""
+        return np.tile(np.arange(self.starts.shape[1]) < self.n_known, len(self.starts))
+
+    @property
+    def mean(self) -> float:
+        """The MPC's mean cost from them."""
+        return float(np.abs(self.mpc[0][self.known]).mean())
+
+    def play(self, act: Inputs) -> Outcome:
+        """Return what comes of a policy."""
+        twin = self.twin
+        thetas, inputs = self._run(act)
+        with np.errstate(all="ignore"):
+            costs = twin.problem.stage_cost(thetas[:-1], inputs).sum(axis=0).ravel()
+        left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
+        broken = twin.limits.broken(thetas[1:]).sum(axis=0).ravel()
+        unsafe = np.column_stack([left + broken, 0 * broken, ~np.isfinite(costs)])
+        return costs, unsafe.astype(np.int64)
+
+    def _run(self, act: Inputs) -> tuple[Array, Array]:
+        with np.errstate(all="ignore"):
+            return self.twin.dynamics.roll_out(act, self.starts, self.steps)
+
+    def _beyond(self, thetas: Array) -> Array:
+        """Return how far each run gets beyond what the log shows, in its widths; 0 inside."""
+        limits, x = self.twin.limits, thetas[1:][..., self.twin.problem.layout.state]
+        over = np.maximum(x - limits.high, limits.low - x) / (limits.high - limits.low)
+        return np.asarray(np.maximum(over, 0.0).max(axis=(0, -1)).ravel())
+
+    def check(self, iteration: int, played: Outcome, accepted: Outcome) -> Check:
+        """Compare a policy with the accepted one and the MPC, by what came of them."""
+        costs, unsafe = played
+        known, mean, excess = self.known, self.mean, costs - self.mpc[0]
+        safe = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
+        paired = PairedEpisodes(self.mpc[0][known], accepted[0][known], safe[known], MARGIN * mean)
+        reason = paired.objection(costs[known], unsafe[known])
+        if not reason and np.any(unsafe > safe):
+            reason = "a start outside the log breaks a bound of the problem"
+        beyond = (excess - self.room())[~known]
+        if not reason and not np.all(beyond <= 0):
+            reason = f"a start outside the log costs {excess[~known][np.argmax(beyond)]:.4g} more"
+        change, worst = float(excess[known].mean()), float(excess[known].max())
+        return Check(iteration, not reason, reason, change / mean, worst / mean)
+
+    def room(self) -> Array:
+        """Return what each start may cost more than with the MPC."""
+        return MARGIN * self.mean + AROUND * np.abs(self.mpc[0]) * ~self.known
+
+    def hard(self, played: Outcome) -> NDArray[np.bool_]:
+        """Return which starts (members, starts) a policy loses, or nearly."""
+        loses = ~(played[0] - self.mpc[0] <= NEARLY * self.room())
+        unsafe = np.any(played[1] > self.mpc[1], axis=1)
+        return np.asarray((loses | unsafe).reshape(self.starts.shape[:2]))
