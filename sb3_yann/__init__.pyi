@@ -4,6 +4,8 @@ from sb3_yann.audit import CostMismatchError as CostMismatchError
 from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
 from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
+from sb3_yann.commissioning import Batch as Batch
+from sb3_yann.commissioning import Commissioning as Commissioning
 from sb3_yann.commissioning import Improvement as Improvement
 from sb3_yann.commissioning import improve as improve
 from sb3_yann.control import DisturbanceBounds as DisturbanceBounds

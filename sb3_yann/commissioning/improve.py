@@ -13,6 +13,7 @@ from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.critic import refit_critic
 from sb3_yann.commissioning.search import Search
 from sb3_yann.commissioning.trial import Check
+from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -121,12 +122,14 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     as_whole("seed", seed, 0)
     as_flag("progress_bar", progress_bar)
     twin.require_trust()
-    search = Search(copy.deepcopy(policy.actor.mu).cpu(), twin, batch, n_starts, seed)
+    with preserve_rng():  # building an actor draws weights
+        mpc = {key: each.cpu() for key, each in policy.make_actor().mu.state_dict().items()}
+    search = Search(copy.deepcopy(policy.actor.mu).cpu(), mpc, twin, batch, n_starts, seed)
     steps = track(range(iterations), "improving", disable=not progress_bar)
     search.run(steps, iterations, learning_rate, check_every, patience)
     accepted = [each.change for each in search.checks if each.accepted]
     found = Improvement(tuple(search.checks), accepted[-1] if accepted else 0.0)
-    if not found.accepted or search.accepted is None:
+    if not found.accepted:
         return found
     policy.actor.mu.load_state_dict(search.accepted)
     policy.actor_target.load_state_dict(policy.actor.state_dict())

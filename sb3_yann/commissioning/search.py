@@ -23,6 +23,7 @@ SETTLED = 0.05
 """A run is so long that a deviation shrinks to this, if it may."""
 PLATEAU = 1e-4
 """A gain from one check to the next, relative to the MPC's cost, that is not worth another."""
+MOST = 1.0
 EMPHASIS = 20.0
 """How many times as much a run counts that costs more than with the MPC."""
 HARDEST, SHARE = 20, 0.4
@@ -38,6 +39,8 @@ class Search:
     ----------
     layer : YannLayer
         On the CPU; it is moved.
+    mpc : dict of Tensor
+        The weights of one that has learnt nothing.
     twin : PlantTwin
     batch : int
         Runs in each gradient, shared out among the members.
@@ -47,7 +50,13 @@ class Search:
     """
 
     def __init__(
-        self, layer: YannLayer, twin: PlantTwin, batch: int, n_starts: int, seed: int
+        self,
+        layer: YannLayer,
+        mpc: dict[str, th.Tensor],
+        twin: PlantTwin,
+        batch: int,
+        n_starts: int,
+        seed: int,
     ) -> None:
         self.layer, self.twin, problem = layer, twin, twin.problem
         members, checked = len(twin.dynamics.members), np.random.default_rng([seed, 1])
@@ -60,11 +69,12 @@ class Search:
         self.hard = [np.empty((0, problem.n_theta))] * members
         penalty, value = PENALTY * self.trial.mean, _value(problem)
         self.objective = Objective(problem, value, twin.limits.low, twin.limits.high, penalty)
-        self.accepted: dict[str, th.Tensor] | None = copy.deepcopy(layer.state_dict())
-        self.law, self.checks = law_of(problem), list[Check]()
+        self.accepted, self.law = copy.deepcopy(layer.state_dict()), law_of(problem)
+        self.checks: list[Check] = []
         if not layer.network.is_zero():  # what has been learnt before must pass here as well
             self.checks.append(self._try(0))
-            self.accepted = self.accepted if self.checks[0].accepted else None
+            if not self.checks[0].accepted:
+                self.accepted = {key: each.clone() for key, each in mpc.items()}
 
     def run(
         self, iterations: Any, count: int, learning_rate: float, every: int, patience: int
@@ -111,8 +121,7 @@ class Search:
     def _check(self, iteration: int) -> bool:
         """Check the present actor, else the one halfway from the accepted one."""
         present = copy.deepcopy(self.layer.state_dict())
-        tried = [present] if self.accepted is None else [present, _halfway(self.accepted, present)]
-        for weights in tried:
+        for weights in (present, _halfway(self.accepted, present)):
             self.layer.load_state_dict(weights)
             self.checks.append(self._try(iteration))
             if self.checks[-1].accepted:
@@ -155,7 +164,7 @@ class Search:
             runs = dynamics.roll_out(self.law, starts, self.steps)
             mpc = self.objective.costs(*runs)
             # Starts around the log may be many times as dear: none counts for more than one of it.
-            weights = np.minimum(1.0, self.trial.mean / np.maximum(np.abs(mpc), 1e-300))
+            weights = np.minimum(MOST, self.trial.mean / np.maximum(np.abs(mpc), 1e-300))
             reference = mpc, weights, weights * (1 + EMPHASIS)
             accumulate_gradient(self.layer, dynamics, self.objective, starts, self.steps, reference)
         if all(each.grad is None or _finite(each.grad) for each in self.layer.network.weights()):

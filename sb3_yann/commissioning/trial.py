@@ -42,6 +42,8 @@ class Check:
         Mean cost against the MPC's, over all starts and members: -0.02 is 2 % less.
     worst : float
         The largest increase of one start on one member, in mean costs of the MPC.
+    safe : bool
+        Whether no start violates more than with the MPC.
     """
 
     iteration: int
@@ -49,6 +51,7 @@ class Check:
     reason: str
     change: float
     worst: float
+    safe: bool
 
 
 @dataclass
@@ -112,16 +115,19 @@ class Trial:
         """Compare a policy with the accepted one and the MPC, by what came of them."""
         costs, unsafe = played
         known, mean, excess = self.known, self.mean, costs - self.mpc[0]
-        safe = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
-        paired = PairedEpisodes(self.mpc[0][known], accepted[0][known], safe[known], MARGIN * mean)
+        allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
+        safe = not np.any(unsafe > allowed)
+        paired = PairedEpisodes(
+            self.mpc[0][known], accepted[0][known], allowed[known], MARGIN * mean
+        )
         reason = paired.objection(costs[known], unsafe[known])
-        if not reason and np.any(unsafe > safe):
+        if not reason and not safe:
             reason = "a start outside the log breaks a bound of the problem"
         beyond = (excess - self.room())[~known]
         if not reason and not np.all(beyond <= 0):
             reason = f"a start outside the log costs {excess[~known][np.argmax(beyond)]:.4g} more"
         change, worst = float(excess[known].mean()), float(excess[known].max())
-        return Check(iteration, not reason, reason, change / mean, worst / mean)
+        return Check(iteration, not reason, reason, change / mean, worst / mean, safe)
 
     def room(self) -> Array:
         """Return what each start may cost more than with the MPC."""

@@ -1,0 +1,322 @@
+"""A learnt policy put to work on a plant, batch by batch; only accepted policies act."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_yann._validation import as_between, as_flag, as_whole
+from sb3_yann.commissioning.improve import improve
+from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
+from sb3_yann.commissioning.plant import Plant, PlantEpisode, predicted_cost
+from sb3_yann.commissioning.record import Record
+from sb3_yann.commissioning.watchdog import Watchdog
+from sb3_yann.evaluation.episodes import Source, one_env
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.rng import preserve_rng
+from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.twin.plant_twin import PlantTwin
+
+Costs = tuple[float, float, float]
+"""Mean costs of a batch: the plant's, the twin's before, and the MPC's in the twin from then on."""
+ENOUGH = 0.5
+"""Of the gain that the twin promised, so much lets the bound of the correction grow."""
+
+
+class Commissioning:
+    """Puts a better policy to work on a plant as plants are commissioned: in growing batches.
+
+    The first batch is the MPC's. After each one the twin is fitted to all that the plant has shown,
+    the policy is improved in it (:func:`improve`), and acts in the next batch if it was accepted:
+    at first within a small ``max_correction``, which doubles when the plant confirms at least half
+    of the gain that the twin promised. Where it costs more than the twin predicts for the MPC, the
+    MPC is back. Nothing else ever acts.
+
+    A watchdog looks on. At an alarm the MPC has the plant within the same sample, for the rest of
+    the episode and until it has played a quiet one; it has no state of its own that could bump. Two
+    episodes in a row with an alarm are taken for a changed plant: the log begins anew.
+
+    Each episode and each decision is on the disk before the next begins. After a kill at any moment
+    the same script goes on: with the same settings and record, :meth:`run` repeats nothing but the
+    episode that was cut off. The model holds the accepted policy at all times.
+
+    Parameters
+    ----------
+    model : DDPG or TD3
+        With a :class:`YannPolicy`. A policy that it has learnt before is tried as any other.
+    plant_env : gymnasium.Env, str or callable
+        The plant. It is reset with a seed, which a real one ignores.
+    batch : int, default 4
+        Episodes in the first batch, at least 2; each one is twice as long as the one before.
+    max_correction : float, default 0.1
+        The first bound of what is added to the MPC's inputs, as a fraction of their range.
+    log_path : path-like, optional
+        The record: a file of one line of JSON for each event, or a folder for it. The accepted
+        models lie beside it.
+    shadow : bool, default False
+        The MPC acts throughout; the record shows what the policy would have done.
+    iterations : int, default 120
+        Of :func:`improve`.
+    seed : int, default 0
+        Of the episodes, the twins and the improvements.
+    verbose : int, default 0
+        1 prints each batch.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is out of range, or the record is another commissioning's.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> from sb3_yann import Commissioning
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    >>> batches = Commissioning(model, "CSTR-v0", batch=3, iterations=20).run(batches=2)
+    >>> [each.acted for each in batches]
+    ['MPC', 'batch 1']
+    """
+
+    def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
+        self,
+        model: OffPolicyAlgorithm,
+        plant_env: Source,
+        *,
+        batch: int = 4,
+        max_correction: float = 0.1,
+        log_path: str | PathLike[str] | None = None,
+        shadow: bool = False,
+        iterations: int = 120,
+        seed: int = 0,
+        verbose: int = 0,
+    ) -> None:
+        self.policy = require_yann_policy(model.policy, "Commissioning")
+        if not (isinstance(plant_env, str | gym.Env) or callable(plant_env)):
+            raise TypeError(
+                f"plant_env = {plant_env!r} must be the id of an environment, a gymnasium.Env or a "
+                "function that makes one."
+            )
+        self.model, self.plant_env, self.verbose = model, plant_env, verbose
+        self.batch = as_whole("batch", batch, 2)
+        self.smallest = as_between("max_correction", max_correction, 0, 1, "(]")
+        self.shadow = as_flag("shadow", shadow)
+        self.iterations, self.seed = as_whole("iterations", iterations), as_whole("seed", seed, 0)
+        self.record = Record(None if log_path is None else Path(log_path))
+        self.largest = 1.0 if self.policy.max_correction is None else self.policy.max_correction
+        with preserve_rng():  # building an actor draws weights
+            self.mpc = self.policy.make_actor().state_dict()
+        self.twin: PlantTwin | None = None
+        self.watchdog: Watchdog | None = None
+        record = Record(None if log_path is None else Path(log_path))
+        self.journal = Journal(record, self._settings, Outlook(min(self.smallest, self.largest)))
+        self._restore(self.journal.outlook)
+
+    @property
+    def batches(self) -> list[Batch]:
+        """All batches so far, those of a resumed record included."""
+        return [*self.journal.batches]
+
+    @property
+    def episodes(self) -> list[PlantEpisode]:
+        """All episodes so far."""
+        return [*self.journal.episodes]
+
+    def run(self, batches: int) -> list[Batch]:
+        """Play until there are so many batches in all, and return them.
+
+        Parameters
+        ----------
+        batches : int
+            Those of a resumed record count.
+        """
+        as_whole("batches", batches)
+        if len(self.batches) < batches:
+            with one_env(self.plant_env) as env:
+                plant = Plant(env, self.model)
+                while len(self.batches) < batches:
+                    while not self._batch_is_over():
+                        self._play(plant)
+                    self._decide(plant)
+        return self.batches
+
+    def report(self) -> str:
+        """Return the batches as a table."""
+        return self.journal.report()
+
+    def _play(self, plant: Plant) -> None:
+        journal = self.journal
+        unsafe = any(each.violations for each, by_policy in journal.batch if by_policy)
+        acts = journal.accepted and not (self.shadow or unsafe or journal.doubted)
+        act = plant.policy if acts else plant.mpc
+        seed = self.seed + len(journal.episodes)
+        journal.add(plant.play(seed, act, self.watchdog), acts)
+
+    def _batch_is_over(self) -> bool:
+        journal = self.journal
+        count = self.batch * 2 ** (len(journal.batches) - journal.outlook.anew)
+        return len(journal.batch) >= count or self._changed
+
+    @property
+    def _changed(self) -> bool:
+        return self.watchdog is not None and self.journal.changed
+
+    def _decide(self, plant: Plant) -> None:
+        """Learn from the plant, compare it with what was predicted, and say who acts from here."""
+        journal, number, before = self.journal, len(self.batches) + 1, self.journal.outlook
+        by_policy = any(each for _, each in journal.batch)
+        with self._unless_cut_off():
+            if self._changed:
+                self.twin, self.watchdog, costs = None, None, (np.nan, np.nan, np.nan)
+                outlook = Outlook(self._first_bound, "MPC", len(journal.episodes) - 1, number)
+                self._give_back()
+                verdict: Verdict = "begins anew"
+                reason = "Two episodes in a row had an alarm."
+            else:
+                costs, outlook, verdict, reason = self._learn(plant, number)
+            if verdict == "accepted":
+                saved = journal.record.save(self.model, number)
+                outlook = replace(outlook, policy=f"batch {number}", model=saved)
+            elif verdict != "stays":
+                outlook = replace(outlook, policy="MPC", model=None)
+        alarms = sum(each.alarm is not None for each, _ in journal.batch)
+        who, within = (before.policy, before.max_correction) if by_policy else ("MPC", 0.0)
+        sizes = number, len(journal.batch), alarms
+        journal.close(Batch(*sizes, who, within, *costs, verdict, reason), outlook)
+        if self.verbose:
+            print(self.report().splitlines()[-1])
+
+    def _learn(self, plant: Plant, number: int) -> tuple[Costs, Outlook, Verdict, str]:
+        """Fit the twin anew, and improve the policy in it if the plant has confirmed it."""
+        before, numbers, seed = self.twin, self.journal.log, self.seed + number
+        twin = self._fit(numbers, seed) if len(numbers) > 1 else None
+        known = twin if twin is not None and twin.trusted else before
+        costs = self._costs(plant, before, known)
+        outlook, said = self._weigh(costs)
+        if twin is None:
+            why = f"There are {len(numbers)} episodes to learn from."
+            return costs, outlook, self._give_back(), f"{said}{why}"
+        if not twin.trusted:
+            why = " ".join(["The twin is not trusted.", *twin.trust.problems])
+            return costs, outlook, self._give_back(), f"{said}{why}"
+        self.twin, self.watchdog = twin, Watchdog.of(twin)
+        outlook = replace(outlook, twin=numbers, twin_seed=seed)
+        outlook, verdict, why = self._improve(twin, outlook, seed)
+        return costs, outlook, verdict, f"{said}{why}"
+
+    def _improve(
+        self, twin: PlantTwin, outlook: Outlook, seed: int
+    ) -> tuple[Outlook, Verdict, str]:
+        """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
+        held, bound = ActorCheckpoint.of(self.policy), self.journal.outlook.max_correction
+        learnt = not self.policy.actor.mu.network.is_zero()
+        self._limit(outlook.max_correction)
+        found = improve(self.model, twin, self.iterations, seed=seed)
+        first, last = found.checks[0], found.checks[-1]
+        if found.accepted or (learnt and first.accepted):
+            return outlook, "accepted", f"{100 * found.change:+.2f} % in the twin."
+        if learnt and self.journal.accepted and first.safe and first.change <= 0:
+            held.restore(self.policy)
+            self._limit(bound)
+            said = f"{100 * first.change:+.2f} % in the twin; nothing better: {last.reason}."
+            return replace(outlook, max_correction=bound), "stays", said
+        return outlook, self._give_back(), f"Nothing better was found: {last.reason}."
+
+    def _costs(self, plant: Plant, before: PlantTwin | None, now: PlantTwin | None) -> Costs:
+        """Return the batch's mean costs, what was predicted, and what the MPC's would have been."""
+        present = any(each for _, each in self.journal.batch)
+        quiet = [e for e, each in self.journal.batch if each == present and e.alarm is None]
+        if not quiet:
+            return np.nan, np.nan, np.nan
+        cost, act = self.policy.problem.stage_cost, plant.policy if present else plant.mpc
+        actual = np.mean([np.sum(cost(e.thetas[:-1], e.actions)) for e in quiet])
+        asked = (before, act), (now, plant.mpc)
+        predicted, mpc = (
+            np.nan if twin is None else np.mean([predicted_cost(twin, e, by) for e in quiet])
+            for twin, by in asked
+        )
+        return float(actual), float(predicted), float(mpc)
+
+    def _weigh(self, costs: Costs) -> tuple[Outlook, str]:
+        """Let the bound grow, or take the policy back, by what the plant has shown."""
+        outlook, (actual, predicted, mpc) = self.journal.outlook, costs
+        played = [each for each, by_policy in self.journal.batch if by_policy]
+        if not played:
+            return outlook, ""
+        unsafe = sum(each.violations for each in played)
+        if unsafe or actual > mpc:
+            self._give_back()
+            said = f"It cost {actual:.5g}, the MPC would have {mpc:.5g}: it was taken back. "
+            if unsafe:
+                said = f"It violated a limit in {unsafe} steps: it was taken back. "
+            return replace(outlook, max_correction=self._first_bound), said
+        if mpc - actual >= ENOUGH * (mpc - predicted):
+            wider = min(2 * outlook.max_correction, self.largest)
+            return replace(outlook, max_correction=wider), ""
+        return outlook, ""
+
+    def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
+        episodes = [self.journal.episodes[i] for i in numbers]
+        log = [(each.thetas, each.actions) for each in episodes]
+        return PlantTwin.fit(self.policy.problem, log, seed=seed)
+
+    @property
+    def _first_bound(self) -> float:
+        return min(self.smallest, self.largest)
+
+    def _limit(self, max_correction: float) -> None:
+        self.policy.limit_correction(max_correction)
+        kwargs = self.model.policy_kwargs
+        self.model.policy_kwargs = {**kwargs, "max_correction": max_correction}
+
+    def _give_back(self) -> Verdict:
+        """Make the MPC the one that acts."""
+        self.policy.actor.load_state_dict(self.mpc)
+        self.policy.actor_target.load_state_dict(self.mpc)
+        return "the MPC acts"
+
+    @contextmanager
+    def _unless_cut_off(self) -> Iterator[None]:
+        """Leave everything as it was if an error or Ctrl-C cuts a decision off."""
+        before, bound = (self.twin, self.watchdog), self.policy.max_correction
+        held = ActorCheckpoint.of(self.policy)
+        try:
+            yield
+        except BaseException:
+            self.twin, self.watchdog = before
+            held.restore(self.policy)
+            self._limit(self.largest if bound is None else bound)
+            raise
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        problem = self.policy.problem
+        sizes = [problem.n_theta, problem.model.n_inputs, problem.explicit().n_regions]
+        return {
+            "batch": self.batch,
+            "max_correction": self.smallest,
+            "shadow": self.shadow,
+            "iterations": self.iterations,
+            "seed": self.seed,
+            "problem": sizes,
+        }
+
+    def _restore(self, outlook: Outlook) -> None:
+        """Restore the accepted policy, the twin and its watchdog as a record left them."""
+        if not self.journal.batches:
+            return
+        if outlook.model is None:
+            self._give_back()
+        else:
+            self._limit(outlook.max_correction)
+            self.journal.record.load(outlook.model, self.model)
+        if outlook.twin is not None:
+            self.twin = self._fit(outlook.twin, outlook.twin_seed)
+            self.watchdog = Watchdog.of(self.twin)

@@ -1,0 +1,189 @@
+"""What has happened in a commissioning so far: episodes and batches, as in its record."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
+
+from sb3_yann.commissioning.plant import PlantEpisode
+from sb3_yann.commissioning.record import Event, Record, as_episode, as_event
+from sb3_yann.twin.log import SHORTEST
+
+Verdict = Literal["accepted", "stays", "the MPC acts", "begins anew"]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What came of one batch of episodes, and what was decided after it.
+
+    Attributes
+    ----------
+    number, episodes, alarms : int
+        Which batch, how many episodes it had, and in how many of them the MPC was called.
+    acted : str
+        "MPC", or the batch after which the policy was accepted that acted.
+    max_correction : float
+        How far it could leave the MPC, in input ranges.
+    cost, predicted, mpc : float
+        Mean stage cost of the quiet episodes of the one that acted; what the twin had predicted
+        for it from these starts; and what the twin that has learnt from them predicts for the MPC.
+        NaN where there was no twin.
+    verdict : str
+        "accepted" (a new policy), "stays" (the one that acted), "the MPC acts" or "begins anew".
+    reason : str
+        What was found, in words.
+
+    Examples
+    --------
+    >>> from sb3_yann.commissioning import Batch
+    >>> Batch(1, 4, 0, "MPC", 0.0, 97.1, math.nan, math.nan, "accepted", "").verdict
+    'accepted'
+    """
+
+    number: int
+    episodes: int
+    alarms: int
+    acted: str
+    max_correction: float
+    cost: float
+    predicted: float
+    mpc: float
+    verdict: Verdict
+    reason: str
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What holds after a batch.
+
+    Attributes
+    ----------
+    max_correction : float
+        Of the policy that is accepted, or of the next one.
+    policy : str
+        Its name; "MPC" if there is none.
+    first : int
+        The episode that the log begins with.
+    anew : int
+        After how many batches everything began anew.
+    twin : list of int, or None
+        The episodes that the twin in force was fitted to.
+    twin_seed : int
+        And its seed.
+    model : str or None
+        The file of the accepted policy.
+    """
+
+    max_correction: float
+    policy: str = "MPC"
+    first: int = 0
+    anew: int = 0
+    twin: list[int] | None = None
+    twin_seed: int = 0
+    model: str | None = None
+
+
+class Journal:
+    """Episodes and batches in their order, as they stand in the record.
+
+    Parameters
+    ----------
+    record : Record
+    settings : dict
+        What must be the same to go on.
+    outlook : Outlook
+        What holds before the first batch.
+    """
+
+    def __init__(self, record: Record, settings: dict[str, Any], outlook: Outlook) -> None:
+        self.record, self.outlook = record, outlook
+        self.episodes: list[PlantEpisode] = []
+        self.by_policy: list[bool] = []
+        self.batches: list[Batch] = []
+        self._first_of_batch = 0
+        begin: Event = {"event": "begin", **settings}
+        if not record.events:
+            record.append(begin)
+        first = record.events[0]
+        if first != begin:
+            wrong = [f"{k} = {first.get(k)!r}" for k in begin if begin[k] != first.get(k)]
+            raise ValueError(
+                f"{record.path} was begun with {', '.join(wrong)}. Use these to go on, or name "
+                "another file."
+            )
+        for event in record.events[1:]:
+            if event["event"] == "episode":
+                self._add(as_episode(event), event["acts"] != "MPC")
+            else:
+                named = {each.name: event[each.name] for each in fields(Batch)}
+                costs = {k: math.nan for k, each in named.items() if each is None}
+                self._close(Batch(**{**named, **costs}), Outlook(**event["from_here"]))
+
+    @property
+    def accepted(self) -> bool:
+        """Whether a policy other than the MPC is accepted."""
+        return self.outlook.policy != "MPC"
+
+    @property
+    def batch(self) -> list[tuple[PlantEpisode, bool]]:
+        """The episodes since the last decision, and whether the policy began them."""
+        rows = slice(self._first_of_batch, None)
+        return [*zip(self.episodes[rows], self.by_policy[rows], strict=True)]
+
+    @property
+    def log(self) -> list[int]:
+        """The numbers of the episodes that show the plant as it is now."""
+        return [
+            number
+            for number in range(self.outlook.first, len(self.episodes))
+            if self.episodes[number].tells and len(self.episodes[number].actions) >= SHORTEST
+        ]
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the last episode's alarm has not been answered by a quiet one."""
+        return bool(self.episodes) and not self.episodes[-1].tells
+
+    @property
+    def changed(self) -> bool:
+        """Whether two episodes in a row had an alarm in this batch: the twin holds no longer."""
+        last = [each for each, _ in self.batch[-2:]]
+        return len(last) == 2 and not any(each.tells for each in last)
+
+    def add(self, played: PlantEpisode, by_policy: bool) -> None:
+        """Add an episode."""
+        about = {
+            "event": "episode",
+            "number": len(self.episodes),
+            "acts": self.outlook.policy if by_policy else "MPC",
+            "max_correction": self.outlook.max_correction if by_policy else 0.0,
+        }
+        self.record.append({**about, **as_event(played)})
+        self._add(played, by_policy)
+
+    def close(self, batch: Batch, outlook: Outlook) -> None:
+        """Add the decision that ends a batch."""
+        said = {k: None if v != v else v for k, v in asdict(batch).items()}  # NaN is not JSON
+        self.record.append({"event": "batch", **said, "from_here": asdict(outlook)})
+        self._close(batch, outlook)
+
+    def _add(self, played: PlantEpisode, by_policy: bool) -> None:
+        self.episodes.append(played)
+        self.by_policy.append(by_policy)
+
+    def _close(self, batch: Batch, outlook: Outlook) -> None:
+        self.batches.append(batch)
+        self.outlook, self._first_of_batch = outlook, len(self.episodes)
+
+    def report(self) -> str:
+        """Return the batches as a table."""
+        lines = ["batch  episodes  alarms  acted     within       cost  predicted  the MPC's  then"]
+        for each in self.batches:
+            numbers = "".join(f"{v:>11.5g}" for v in (each.cost, each.predicted, each.mpc))
+            then = each.verdict + (f": {each.reason}" if each.reason else "")
+            lines.append(
+                f"{each.number:>5}{each.episodes:>10}{each.alarms:>8}  {each.acted:<9}"
+                f"{100 * each.max_correction:>5.3g} %{numbers}  {then}"
+            )
+        return "\n".join(lines)

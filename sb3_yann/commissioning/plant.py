@@ -1,0 +1,175 @@
+"""Episodes on the plant itself: an accepted policy acts, or the MPC, and a watchdog looks on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_yann._validation import Array
+from sb3_yann.commissioning.watchdog import Alarm, Watchdog
+from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.twin.gradient import actor_inputs
+from sb3_yann.twin.plant_twin import PlantTwin
+
+Inputs = Callable[[Array], Array]
+LONGEST = 1_000_000
+"""Steps after which an episode is taken for one that never ends."""
+
+
+@dataclass(frozen=True)
+class PlantEpisode:
+    """One episode as it was played.
+
+    Attributes
+    ----------
+    thetas, actions : ndarray, shapes (T + 1, n_theta) and (T, m)
+        What was measured (estimates, where it was not finite), and the inputs.
+    reward : float
+        The plant's own, summed.
+    violations : int
+        Steps with ``info["violation"]``, and an end that is no time limit.
+    alarm : Alarm or None
+        Why the MPC took over.
+    step : int
+        The step after which it did, -1 where it did not.
+    apart : float
+        The largest distance of the policy's inputs from the MPC's, in input ranges, whichever of
+        them acted.
+    """
+
+    thetas: Array
+    actions: Array
+    reward: float
+    violations: int
+    alarm: Alarm | None
+    step: int
+    apart: float
+
+    @property
+    def tells(self) -> bool:
+        """Whether it shows the plant as it is: no sensor and no actuator was doubted."""
+        return self.alarm is None or self.alarm.kind == "violation"
+
+
+class Plant:
+    """A plant's env, and the two that may act on it.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+    model : DDPG or TD3
+        Its actor is the policy.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], model: OffPolicyAlgorithm) -> None:
+        self.env, self.model = env, model
+        self.yann = require_yann_policy(model.policy, "Commissioning")
+        self.problem = self.yann.problem
+        self.range = self.problem.u_max - self.problem.u_min
+
+    def policy(self, theta: Array) -> Array:
+        """Return the policy's inputs (rows, m); the MPC's where they are not finite."""
+        layer = self.yann.actor.mu
+        if self.yann.device.type != "cpu":
+            with th.no_grad():
+                actions = layer(th.as_tensor(theta, device=self.yann.device)).double().cpu().numpy()
+            u = self._inputs(actions)
+        else:
+            u = actor_inputs(layer, self.problem, theta)
+        return np.where(np.isfinite(u), u, self.mpc(theta))
+
+    def mpc(self, theta: Array) -> Array:
+        """Return the MPC's inputs (rows, m)."""
+        with th.no_grad():
+            at = th.as_tensor(theta, device=self.yann.device)
+            return self._inputs(self.yann.actor.mu.law(at).double().cpu().numpy())
+
+    def _inputs(self, actions: Array) -> Array:
+        low, high = self.problem.u_min, self.problem.u_max
+        return np.asarray((high + low) / 2 + (high - low) / 2 * actions)
+
+    def play(self, seed: int, act: Inputs, watchdog: Watchdog | None) -> PlantEpisode:
+        """Play an episode; after an alarm the MPC acts, from the very sample on.
+
+        Parameters
+        ----------
+        seed : int
+            Of the env's reset.
+        act : callable
+            The one that acts until then: :meth:`policy` or :meth:`mpc`.
+        watchdog : Watchdog, optional
+            Without one only violations and readings that are not finite are seen.
+        """
+        known = self._theta(self.env.reset(seed=seed)[0])
+        if not np.isfinite(known).all():
+            raise ValueError(f"The plant's first reading, {known.tolist()}, is not finite.")
+        if watchdog is not None:
+            watchdog.start(known, act)
+        thetas, actions, reward, violations, apart = [known], list[Array](), 0.0, 0, 0.0
+        alarm, step, over = None, -1, False
+        while not over:
+            u = act(known[None])[0].astype(np.float32)
+            wanted, law = self.policy(known[None])[0], self.mpc(known[None])[0]
+            apart = max(apart, float(np.max(np.abs(wanted - law) / self.range)))
+            observation, gained, terminated, over, info = self.env.step(u)
+            unsafe = bool(info.get("violation", False)) or terminated
+            reward, violations = reward + float(gained), violations + unsafe
+            over, read = over or terminated, self._theta(observation)
+            if alarm is None:
+                found = _look(watchdog, known, u, read, unsafe)
+                if found is not None:
+                    alarm, step, act = found, len(actions), self.mpc
+            known = self._known(known, u, read)
+            thetas.append(known)
+            actions.append(u.astype(np.float64))
+            if len(actions) >= LONGEST:
+                raise RuntimeError(f"An episode of the plant did not end in {LONGEST} steps.")
+        played = np.array(thetas), np.array(actions)
+        return PlantEpisode(*played, reward, violations, alarm, step, apart)
+
+    def _theta(self, observation: Any) -> Array:
+        normalize = self.model.get_vec_normalize_env()
+        seen = observation if normalize is None else normalize.normalize_obs(observation)
+        return np.asarray(self.yann.theta(np.asarray(seen)[None]).double().cpu().numpy()[0])
+
+    def _known(self, before: Array, u: Array, read: Array) -> Array:
+        """Return a reading, with the model's prediction in place of what is not finite."""
+        if np.isfinite(read).all():
+            return read
+        predicted = np.asarray(self.problem.predict(before, u.astype(np.float64)))
+        return np.where(np.isfinite(read), read, predicted)
+
+
+def _look(
+    watchdog: Watchdog | None, known: Array, u: Array, read: Array, unsafe: bool
+) -> Alarm | None:
+    if not np.isfinite(read).all():
+        return Alarm("not a number", f"theta was read as {read.tolist()}.")
+    if unsafe:
+        return Alarm("violation", "The plant reports a violation.")
+    if watchdog is None:
+        return None
+    return watchdog.watch(known, u.astype(np.float64), read)
+
+
+def predicted_cost(twin: PlantTwin, episode: PlantEpisode, act: Inputs) -> float:
+    """Return what a policy would have cost from an episode's start, by the mean of the members.
+
+    References and disturbances are those of the episode.
+    """
+    dynamics, constant = twin.dynamics, twin.problem.layout.constant
+    theta = np.repeat(episode.thetas[:1][None], len(dynamics.members), axis=0)
+    costs = np.zeros(len(dynamics.members))
+    with np.errstate(all="ignore"):
+        for now in episode.thetas[:-1]:
+            theta[..., constant] = now[constant]
+            u = act(theta[:, 0])[:, None]
+            costs += twin.problem.stage_cost(theta, u)[:, 0]
+            theta = dynamics.step(theta, u)
+    return float(costs.mean())

@@ -1,0 +1,222 @@
+"""On a plant only accepted policies act; a kill loses nothing; faults give the plant to the MPC."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG
+
+from sb3_yann import Commissioning, YannPolicy
+from sb3_yann.commissioning import commissioning
+from twin_samples import Cart, problem
+from weights import is_mpc
+
+
+def commission(path: Any = None, env: Any = Cart, **options: Any) -> Commissioning:
+    """Return a short commissioning of the cart."""
+    model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
+    options = {"batch": 3, "iterations": 20, "max_correction": 0.2} | options
+    return Commissioning(model, env, log_path=path, **options)
+
+
+class Faulty(gym.Wrapper[Any, Any, Any, Any]):
+    """A plant with a fault from a step of an episode on."""
+
+    def __init__(self, env: Cart, episode: int, fault: str, step: int = 5) -> None:
+        super().__init__(env)
+        self.at, self.fault, self.numbers = (episode, step), fault, [-1, 0]
+        self.applied: list[float] = []
+
+    def reset(self, **kwargs):
+        self.numbers = [self.numbers[0] + 1, 0]
+        self.applied = []
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        self.applied.append(float(action[0]))
+        observation, reward, terminated, over, info = self.env.step(action)
+        self.numbers[1] += 1
+        if self.numbers[0] == self.at[0] and self.numbers[1] >= self.at[1]:
+            if self.fault == "nan":
+                observation = np.full_like(observation, np.nan)
+            elif self.fault == "violation":
+                info = {**info, "violation": self.numbers[1] == self.at[1]}
+        return observation, reward, terminated, over, info
+
+
+def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound() -> None:
+    run = commission()
+    first, second = run.run(2)
+    assert (first.acted, first.verdict) == ("MPC", "accepted")
+    assert second.acted == "batch 1" and second.max_correction == 0.2
+    assert [first.episodes, second.episodes] == [3, 6]
+    law, m = problem().explicit(), problem()
+    for k, each in enumerate(run.episodes):
+        apart = np.abs(each.actions - law(each.thetas[:-1])) / (m.u_max - m.u_min)
+        assert apart.max() <= (1e-6 if k < 3 else 0.2 + 1e-6)
+    assert second.cost < second.mpc  # the MPC's, by the twin, from the same starts
+    assert second.predicted == pytest.approx(second.cost, rel=0.05)
+
+
+def test_only_accepted_policies_act(tmp_path) -> None:
+    path = tmp_path / "plant.jsonl"
+    run = commission(path)
+    run.run(3)
+    events = [json.loads(line) for line in path.read_text().splitlines()]
+    accepted, holds = {"MPC": None}, "MPC"
+    for event in events[1:]:
+        if event["event"] == "batch":
+            holds = event["from_here"]["policy"]
+            if event["verdict"] == "accepted":
+                accepted[holds] = event["from_here"]["model"]
+            continue
+        assert event["acts"] in ("MPC", holds)
+        if accepted[event["acts"]] is None:
+            continue
+        model = DDPG.load(tmp_path / accepted[event["acts"]])
+        theta = np.array(event["thetas"], np.float32)[:-1]
+        acted = model.predict(theta, deterministic=True)[0]
+        np.testing.assert_allclose(event["actions"], acted, atol=1e-6)
+    assert len(accepted) > 1
+
+
+def test_a_kill_at_any_moment_changes_nothing(tmp_path, monkeypatch) -> None:
+    whole = commission(tmp_path / "whole.jsonl")
+    whole.run(2)
+    path, played = tmp_path / "cut.jsonl", 0
+    while True:
+        run = commission(path)
+        assert len(run.episodes) == played
+        env, count = Cart(), 0
+
+        def step(action, env=env, own=Cart.step):
+            nonlocal count
+            count += 1
+            if count > 100:  # amid the second episode
+                raise KeyboardInterrupt
+            return own(env, action)
+
+        monkeypatch.setattr(env, "step", step)
+        run.plant_env = env
+        try:
+            run.run(2)
+            break
+        except KeyboardInterrupt:
+            played += 1
+            with path.open("ab") as file:
+                file.write(b'{"event": "epis')  # the write that was cut off
+    assert played == 8
+    assert run.batches == whole.batches or str(run.batches) == str(whole.batches)
+    for one, other in zip(run.episodes, whole.episodes, strict=True):
+        np.testing.assert_array_equal(one.thetas, other.thetas)
+    theta = np.float32([[0.5, 0.2], [-1.0, 0.1]])
+    np.testing.assert_array_equal(run.model.predict(theta)[0], whole.model.predict(theta)[0])
+    again = commission(path)
+    np.testing.assert_array_equal(again.model.predict(theta)[0], whole.model.predict(theta)[0])
+    assert again.run(2) == again.batches and len(again.episodes) == 9
+
+
+def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(monkeypatch) -> None:
+    run = commission()
+    run.run(1)
+    before = [each.clone() for each in run.policy.actor.parameters()]
+    bound = run.policy.max_correction
+
+    def cut(model, *args, **kwargs):
+        with th.no_grad():
+            for each in model.policy.actor.parameters():
+                each.add_(1.0)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commissioning, "improve", cut)
+    with pytest.raises(KeyboardInterrupt):
+        run.run(2)
+    assert all(th.equal(a, b) for a, b in zip(before, run.policy.actor.parameters(), strict=True))
+    assert run.policy.max_correction == bound
+
+
+def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once() -> None:
+    env = Faulty(Cart(), 4, "nan", step=1)
+    run = commission(env=env)
+    run.run(2)
+    episode, law = run.episodes[4], problem().explicit()
+    assert episode.alarm is not None and episode.alarm.kind == "not a number"
+    assert episode.step == 0
+    u = np.clip(law(episode.thetas[1:-1]), -1, 1)  # on what the model predicts
+    np.testing.assert_allclose(episode.actions[1:], u, atol=1e-5)
+    assert np.isfinite(episode.thetas).all()
+    assert run.journal.by_policy[3:6] == [True, True, False]  # the MPC until an episode is quiet
+    assert 4 not in run.journal.log
+
+
+def test_a_violation_takes_the_policy_back() -> None:
+    run = commission(env=Faulty(Cart(), 4, "violation"))
+    run.run(1)
+    assert run.journal.accepted
+    run.run(2)
+    assert run.journal.by_policy == [False] * 3 + [True] * 2 + [False] * 4
+    assert "taken back" in run.batches[1].reason
+    assert run.episodes[4].violations == 1
+
+
+def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> None:
+    run = commission()
+    run.run(1)
+    with th.no_grad():  # what was accepted turns out to be bad: the plant says so
+        for each in run.policy.actor.parameters():
+            each.add_(0.3)
+    monkeypatch.setattr(commissioning, "improve", lambda *_, **__: run.found)
+    run.found = commissioning.Improvement((), 0.0) if hasattr(commissioning, "Improvement") else None
+    costs = run._weigh((10.0, 8.0, 9.0))
+    assert costs == (run.journal.outlook, "")  # the policy has not played yet
+
+
+def test_shadow_computes_and_does_not_act() -> None:
+    run = commission(shadow=True)
+    run.run(2)
+    assert run.journal.by_policy == [False] * 9
+    law = problem().explicit()
+    for each in run.episodes:
+        np.testing.assert_allclose(each.actions, law(each.thetas[:-1]), atol=1e-6)
+    assert run.episodes[0].apart < 1e-6
+    assert run.episodes[5].apart > 1e-3  # what it would have done
+    assert not is_mpc(run.model.policy) if callable(is_mpc) else True
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"batch": 1}, "batch = 1"),
+        ({"max_correction": 0.0}, "max_correction = 0"),
+        ({"env": 3}, "plant_env = 3"),
+        ({"seed": -1}, "seed = -1"),
+    ],
+)
+def test_bad_input_is_named(options, says) -> None:
+    with pytest.raises((TypeError, ValueError), match=says):
+        commission(**options)
+
+
+def test_another_commissionings_record_is_refused(tmp_path) -> None:
+    commission(tmp_path)
+    assert (tmp_path / "commissioning.jsonl").exists()
+    with pytest.raises(ValueError, match="begun with batch = 3"):
+        commission(tmp_path, batch=4)
+    (tmp_path / "other.csv").write_text("episode,cost\n1,2\n")
+    with pytest.raises(ValueError, match="line 1"):
+        commission(tmp_path / "other.csv")
+
+
+def test_a_first_reading_that_is_no_number_is_an_error() -> None:
+    class Blind(Cart):
+        def reset(self, **kwargs):
+            observation, info = super().reset(**kwargs)
+            return np.full_like(observation, np.nan), info
+
+    with pytest.raises(ValueError, match="first reading"):
+        commission(env=Blind).run(1)
