@@ -14,7 +14,7 @@ POINTS = 150
 """Points that carry the fitted function: the time of a prediction grows with their number."""
 ROWS = 200
 """Rows of the log, evenly drawn, that the lengths and noises are fitted to."""
-LENGTHS, NOISES = (0.3, 10.0), (1e-8, 1e3)
+LENGTHS, NOISES = (2.0, 20.0), (1e-8, 1e3)
 """Bounds of the lengths, in scaled coordinates, and of the noise, in variances of the function."""
 SMALLEST = 1e-9
 """A point that leaves less of the variance unexplained adds nothing but rounding."""
@@ -35,12 +35,16 @@ class GaussianProcess:
         How many times the fitted variance of the noise is taken: more leads to the linear model.
     """
 
+    lengths: Array
+    points: Array
+    weights: Array
+
     def __init__(self, offset: bool = False, stiffness: float = 1.0) -> None:
         self.offset, self.stiffness = offset, stiffness
 
     @classmethod
     def stack(cls, members: Sequence[GaussianProcess]) -> GaussianProcess:
-        """Return fitted ones as one, from z (members, batch, k) to residuals (members, batch, n)."""
+        """Return fitted ones as one, from z (members, batch, k) to (members, batch, n)."""
         found = cls(members[0].offset)
         found.lengths = np.array([each.lengths for each in members])[:, None]
         found.points = np.array([each.points for each in members])
@@ -103,7 +107,9 @@ class GaussianProcess:
 
     def _most_likely(self, z: Array, y: Array) -> tuple[Array, Array]:
         """Return the lengths (k,) and noises (n,) that make y (N, n) at z (N, k) most likely."""
-        distinct = np.sort(np.unique(z, axis=0, return_index=True)[1])  # one drawn twice is no proof
+        distinct = np.sort(
+            np.unique(z, axis=0, return_index=True)[1]
+        )  # one drawn twice is no proof
         rows = distinct[np.linspace(0, len(distinct) - 1, min(ROWS, len(distinct))).astype(int)]
         k, n = z.shape[1], y.shape[1]
         bounds = [np.log(LENGTHS)] * k + [np.log(NOISES)] * n

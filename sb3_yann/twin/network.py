@@ -34,7 +34,7 @@ class Network:
 
     @classmethod
     def stack(cls, members: Sequence[Network]) -> Network:
-        """Return fitted ones as one, from z (members, batch, k) to residuals (members, batch, n)."""
+        """Return fitted ones as one, from z (members, batch, k) to (members, batch, n)."""
         found = cls(members[0].rng, members[0].decay, members[0].offset)
         found.first = np.array([each.first for each in members])
         found.shift, found.constant = (
@@ -54,7 +54,7 @@ class Network:
         flat = np.concatenate([start.ravel(), np.zeros(n)])
         scaled = y / np.where(size > 0, size, 1.0)
         found = minimize(
-            self._loss, flat, (z, scaled), "L-BFGS-B", jac=True, options={"maxiter": 300}
+            self._loss, flat, (z, scaled), "L-BFGS-B", jac=True, options={"maxiter": 200}
         ).x
         self.first, self.shift, second, self.constant = self._parts(found, k, n)
         self.second, self.constant = second.T * size, self.constant * size

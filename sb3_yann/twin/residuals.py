@@ -142,7 +142,7 @@ class Polynomial:
 
     @classmethod
     def stack(cls, members: Sequence[Polynomial]) -> Polynomial:
-        """Return fitted ones as one, from z (members, batch, k) to residuals (members, batch, n)."""
+        """Return fitted ones as one, from z (members, batch, k) to (members, batch, n)."""
         first = members[0]
         found = cls(first.degree, first.shrinkage, first.offset, first.inputs)
         found.monomials = first.monomials
