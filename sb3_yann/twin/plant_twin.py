@@ -32,6 +32,7 @@ from sb3_yann.twin.trust import (
     judge,
     standing_still,
 )
+from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
 
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
@@ -214,6 +215,19 @@ class PlantTwin:
         """
         self.require_trust()
         return TwinEnv(self.dynamics, self.episodes, self.starts, self.limits, member)
+
+    def vector_env(self, n_envs: int, member: int | None = None) -> TwinVectorEnv:
+        """Return as many of :meth:`env`, which step as one array, as Gymnasium's vector env."""
+        return TwinVectorEnv(copies(self.env(member), n_envs))
+
+    def vec_env(self, n_envs: int, member: int | None = None) -> TwinVecEnv:
+        """Return as many of :meth:`env`, which step as one array, for Stable-Baselines3.
+
+        Examples
+        --------
+        ``DDPG("YannPolicy", twin.vec_env(16), policy_kwargs={"problem": twin.problem})``
+        """
+        return TwinVecEnv(copies(self.env(member), n_envs))
 
 
 def _choose(
