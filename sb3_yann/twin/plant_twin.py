@@ -74,6 +74,9 @@ class PlantTwin:
     >>> twin = PlantTwin.fit(problem, [*zip(log.observations, log.actions)])
     >>> twin.trusted
     True
+    >>> observations, _ = twin.vector_env(8).reset(seed=0)
+    >>> observations.shape
+    (8, 4)
     """
 
     problem: LinearMPC
@@ -221,12 +224,7 @@ class PlantTwin:
         return TwinVectorEnv(copies(self.env(member), n_envs))
 
     def vec_env(self, n_envs: int, member: int | None = None) -> TwinVecEnv:
-        """Return as many of :meth:`env`, which step as one array, for Stable-Baselines3.
-
-        Examples
-        --------
-        ``DDPG("YannPolicy", twin.vec_env(16), policy_kwargs={"problem": twin.problem})``
-        """
+        """Return as many of :meth:`env`, which step as one array, for Stable-Baselines3."""
         return TwinVecEnv(copies(self.env(member), n_envs))
 
 
