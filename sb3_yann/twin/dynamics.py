@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Polynomial, Residual
+from sb3_yann.twin.residuals import Residual
 
 MARGIN = 0.25
 """How far the residual reaches beyond the data, in widths of the data."""
@@ -88,23 +89,21 @@ class Dynamics:
     members: tuple[Residual, ...]
 
     @cached_property
-    def _stack(self) -> Polynomial | None:
-        """All members as one polynomial with weights (members, size, n), where they are such."""
-        first = self.members[0]
-        if not isinstance(first, Polynomial):
-            return None
-        stack = Polynomial(first.degree, first.shrinkage, first.offset, first.inputs)
-        stack.monomials = first.monomials
-        stack.weights = np.array([each.weights for each in self.members])  # type: ignore[attr-defined]
-        return stack
+    def _stack(self) -> Any:
+        """All members as one that maps (members, batch, k), of a kind that can."""
+        stack = getattr(type(self.members[0]), "stack", None)
+        return stack and stack(self.members)
 
     def residual(self, theta: Array, u: Array) -> Array:
         """Return the residuals (members, batch, n) at theta (members, batch, n_theta)."""
-        z = self.coordinates.scaled(features(self.problem, theta, u))
+        return self._each("predict", self.coordinates.scaled(features(self.problem, theta, u)))
+
+    def _each(self, method: str, z: Array) -> Array:
+        """Return what the members say of z (members, batch, k)."""
         if self._stack is not None:
-            return self._stack.predict(z)
+            return np.asarray(getattr(self._stack, method)(z))
         pairs = zip(self.members, z, strict=True)
-        return np.array([member.predict(each) for member, each in pairs])
+        return np.array([getattr(member, method)(rows) for member, rows in pairs])
 
     def step(self, theta: Array, u: Array) -> Array:
         """Return the next theta (members, batch, n_theta); r and d stay as they are."""
@@ -117,13 +116,7 @@ class Dynamics:
         """Return the derivatives of the step by theta and by u, for each member and row."""
         problem, at = self.problem, features(self.problem, theta, u)
         z, parts, m = self.coordinates.scaled(at), problem.layout, problem.model.n_inputs
-        if self._stack is not None:
-            weights = self._stack.weights[:, :-1] if self._stack.offset else self._stack.weights
-            slopes = self._stack.monomials.slopes(z, weights[:, None])
-            J = np.swapaxes(slopes, -1, -2)
-        else:
-            pairs = zip(self.members, z, strict=True)
-            J = np.array([member.jacobian(each) for member, each in pairs])
+        J = self._each("jacobian", z)
         inside = (at > self.coordinates.low) & (at < self.coordinates.high)
         J = J * (inside / self.coordinates.scale)[..., None, :]
         n, d = problem.model.n_states, parts.disturbance.stop - parts.disturbance.start

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -92,18 +93,39 @@ class TwinEnv(gym.Env[Single, Single]):
         """Hold an input, clipped to its bounds, for one sample."""
         if self._theta is None:
             raise gym.error.ResetNeeded("Call env.reset() before env.step().")
-        problem, parts = self.dynamics.problem, self.dynamics.problem.layout
         u = np.asarray(action, np.float64)
-        if u.shape != problem.u_min.shape or not np.all(np.isfinite(u)):
-            raise ValueError(f"action = {action!r} must be {problem.u_min.shape} finite numbers.")
-        u = np.clip(u, problem.u_min, problem.u_max)
-        cost = float(problem.stage_cost(self._theta, u))
-        theta = self._acting.step(self._theta[None, None], u[None, None])[0, 0]
-        self._steps += 1
-        if self._steps < len(self._episode.thetas):
-            theta[parts.constant] = self._episode.thetas[self._steps, parts.constant]
-        self._theta = theta
-        violation = bool(self.limits.violated(theta))
-        over = self._steps >= len(self._episode)
-        info = {"cost": cost, "violation": violation, "state": theta.copy()}
-        return theta.astype(np.float32), -cost, False, over, info
+        if u.shape != self.action_space.shape or not np.all(np.isfinite(u)):
+            wanted = f"{self.action_space.shape} finite numbers"
+            raise ValueError(f"action = {action!r} must be {wanted}.")
+        thetas, costs, violated, over = step_all([self], self._acting, u[None])
+        cost, violation = float(costs[0]), bool(violated[0])
+        info = {"cost": cost, "violation": violation, "state": thetas[0]}
+        return thetas[0].astype(np.float32), -cost, False, bool(over[0]), info
+
+
+def step_all(
+    envs: Sequence[TwinEnv], dynamics: Dynamics, actions: Array
+) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Step envs of one twin as one array; return thetas, costs, violations, and who is over.
+
+    Parameters
+    ----------
+    envs : sequence of TwinEnv
+        Amid their episodes.
+    dynamics : Dynamics
+        One member for each env: the one that acts.
+    actions : ndarray, shape (envs, m)
+        Clipped to their bounds.
+    """
+    problem, constant = dynamics.problem, dynamics.problem.layout.constant
+    u = np.clip(actions, problem.u_min, problem.u_max)
+    before = np.array([each._theta for each in envs])
+    costs = np.asarray(problem.stage_cost(before, u))
+    after = dynamics.step(before[:, None], u[:, None])[:, 0]
+    for each, theta in zip(envs, after, strict=True):
+        each._steps += 1
+        if each._steps < len(each._episode.thetas):
+            theta[constant] = each._episode.thetas[each._steps, constant]
+        each._theta = theta.copy()
+    over = np.array([each._steps >= len(each._episode) for each in envs])
+    return after, costs, envs[0].limits.violated(after), over

@@ -20,6 +20,7 @@ from sb3_yann.twin.log import Episode, as_episodes, pieces
 from sb3_yann.twin.replay_buffer import episodes_of
 from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.sampling import cut_at_gaps
 from sb3_yann.twin.selection import FOLDS, Candidate, FreeRuns, candidates, fitted, held_out
 from sb3_yann.twin.starts import Starts
 from sb3_yann.twin.trust import (
@@ -31,6 +32,7 @@ from sb3_yann.twin.trust import (
     judge,
     standing_still,
 )
+from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
 
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
@@ -60,6 +62,8 @@ class PlantTwin:
         The members; the first one is fitted to all episodes.
     trust : Trust
         The evidence.
+    notes : tuple of str
+        What of the log was left out.
 
     Examples
     --------
@@ -70,6 +74,9 @@ class PlantTwin:
     >>> twin = PlantTwin.fit(problem, [*zip(log.observations, log.actions)])
     >>> twin.trusted
     True
+    >>> observations, _ = twin.vector_env(8).reset(seed=0)
+    >>> observations.shape
+    (8, 4)
     """
 
     problem: LinearMPC
@@ -77,6 +84,7 @@ class PlantTwin:
     kind: str
     dynamics: Dynamics
     trust: Trust
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Name the sizes, and whether to trust it."""
@@ -87,7 +95,7 @@ class PlantTwin:
         )
 
     @classmethod
-    def fit(
+    def fit(  # noqa: PLR0913 (what a log consists of, by name)
         cls,
         problem: LinearMPC,
         episodes: Iterable[tuple[ArrayLike, ArrayLike]],
@@ -95,6 +103,7 @@ class PlantTwin:
         references: Sequence[ArrayLike] | None = None,
         disturbances: Sequence[ArrayLike] | None = None,
         previous: Sequence[ArrayLike] | None = None,
+        time: Sequence[ArrayLike] | None = None,
         residuals: Sequence[str | Callable[[], Any]] = KINDS,
         n_members: int = 5,
         seed: int = 0,
@@ -112,13 +121,16 @@ class PlantTwin:
             What theta holds besides the state, shapes (T + 1, p) and (T + 1, d) for each episode.
         previous : sequence of array_like, shape (m,), optional
             The input before each episode.
+        time : sequence of array_like, shape (T + 1,), optional
+            When each row of an episode's states was measured, in the unit of ``model.dt``. An
+            episode is cut at steps that take less than half or more than one and a half of dt.
         residuals : sequence, default ("none", "linear", "quadratic", "cubic")
-            What there is to choose from. A function makes a regressor with ``fit(z, y)`` and
-            ``predict(z)``, as scikit-learn has it.
+            What there is to choose from; "gaussian process" and "network" take longer. A function
+            makes a regressor with ``fit(z, y)`` and ``predict(z)``, as scikit-learn has it.
         n_members : int, default 5
             The first is fitted to all episodes, the others to as many drawn from them.
         seed : int, default 0
-            Of the draws of episodes.
+            Of the draws of episodes, and of the weights that networks start from.
 
         Raises
         ------
@@ -129,17 +141,22 @@ class PlantTwin:
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
         as_whole("n_members", n_members)
         log = as_episodes(problem, episodes, references, disturbances, previous)
-        coordinates, asked = Coordinates.of(problem, log), candidates(problem, residuals)
+        notes: tuple[str, ...] = ()
+        if time is not None:
+            log, notes = cut_at_gaps(log, time, problem.model.dt)
+        coordinates, rng = Coordinates.of(problem, log), np.random.default_rng(seed)
+        asked = candidates(problem, residuals, rng)
         # The model as it is comes first, to compare with, whether it may be chosen or not.
-        choices = [candidates(problem, ["none"])[0], *asked]
-        parts = pieces(log, FOLDS)
-        runs, chosen = _choose(problem, coordinates, parts, choices)
+        others = [each for each in asked if each.name != "none"]
+        choices = [*candidates(problem, ["none"], rng), *others]
+        parts, first = pieces(log, FOLDS), int(len(others) == len(asked))
+        runs, chosen = _choose(problem, coordinates, parts, choices, first)
         choice = choices[chosen]
         drawn = log if len(log) >= FOLDS else pieces(log, BLOCKS)
         members = _members(problem, coordinates, drawn, choice, n_members, seed)
         dynamics = Dynamics(problem, coordinates, members)
         trust = _trust(problem, coordinates, parts, (choices, chosen, runs), dynamics)
-        return cls(problem, log, choice.name, dynamics, trust)
+        return cls(problem, log, choice.name, dynamics, trust, notes)
 
     @classmethod
     def from_buffer(cls, model: Any, **options: Any) -> PlantTwin:
@@ -173,7 +190,8 @@ class PlantTwin:
 
     def report(self) -> str:
         """Return what the twin explains, what it does not know, and whether to trust it."""
-        return report(self.problem, self.episodes, self.kind, self.trust)
+        text = report(self.problem, self.episodes, self.kind, self.trust)
+        return "\n".join([*self.notes, text])
 
     @cached_property
     def starts(self) -> Starts:
@@ -201,20 +219,32 @@ class PlantTwin:
         self.require_trust()
         return TwinEnv(self.dynamics, self.episodes, self.starts, self.limits, member)
 
+    def vector_env(self, n_envs: int, member: int | None = None) -> TwinVectorEnv:
+        """Return as many of :meth:`env`, which step as one array, as Gymnasium's vector env."""
+        return TwinVectorEnv(copies(self.env(member), n_envs))
+
+    def vec_env(self, n_envs: int, member: int | None = None) -> TwinVecEnv:
+        """Return as many of :meth:`env`, which step as one array, for Stable-Baselines3."""
+        return TwinVecEnv(copies(self.env(member), n_envs))
+
 
 def _choose(
     problem: LinearMPC,
     coordinates: Coordinates,
     log: tuple[Episode, ...],
     choices: list[Candidate],
+    first: int,
 ) -> tuple[FreeRuns, int]:
-    """Return the candidates' free runs, and which is best: the first without a second episode."""
+    """Return the candidates' free runs, and which is best, from number ``first`` on.
+
+    Without a second episode it is the first.
+    """
     if len(log) < 2:
         errors = np.full((len(choices), 1, 1), np.inf)
-        return FreeRuns(np.array([1]), errors, tuple(each.name for each in choices)), 1
+        return FreeRuns(np.array([1]), errors, tuple(each.name for each in choices)), first
     runs = held_out(problem, coordinates, log, choices)
-    asked = FreeRuns(runs.horizons, runs.by_episode[1:], runs.names[1:])
-    return runs, 1 + asked.choose(np.array([each.freedom for each in choices[1:]]))
+    asked = FreeRuns(runs.horizons, runs.by_episode[first:], runs.names[first:])
+    return runs, first + asked.choose(np.array([each.freedom for each in choices[first:]]))
 
 
 def _members(

@@ -6,7 +6,7 @@ the linear model leaves unexplained.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
 from typing import Any, Protocol
@@ -140,6 +140,15 @@ class Polynomial:
         self.degree, self.shrinkage = as_whole("degree", degree), shrinkage
         self.offset, self.inputs = offset, inputs
 
+    @classmethod
+    def stack(cls, members: Sequence[Polynomial]) -> Polynomial:
+        """Return fitted ones as one, from z (members, batch, k) to (members, batch, n)."""
+        first = members[0]
+        found = cls(first.degree, first.shrinkage, first.offset, first.inputs)
+        found.monomials = first.monomials
+        found.weights = np.array([each.weights for each in members])
+        return found
+
     def fit(self, z: Array, y: Array) -> Polynomial:
         """Fit to residuals y (N, n) at z (N, k)."""
         self.solve(*self.moments(z, y))
@@ -178,8 +187,10 @@ class Polynomial:
 
     def jacobian(self, z: Array) -> Array:
         """Return its derivatives (batch, n, k)."""
-        weights = self.weights[:-1] if self.offset else self.weights
-        return np.swapaxes(self.monomials.slopes(z, weights), -1, -2)
+        weights = self.weights[..., :-1, :] if self.offset else self.weights
+        # Between the members of a stack and their monomials is the batch.
+        slopes = self.monomials.slopes(z, np.expand_dims(weights, -3))
+        return np.asarray(np.swapaxes(slopes, -1, -2))
 
 
 class Regressor:

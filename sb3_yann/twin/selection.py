@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,19 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, features
+from sb3_yann.twin.gaussian_process import GaussianProcess
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.network import Network
 from sb3_yann.twin.residuals import Nothing, Polynomial, Regressor, Residual
 
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
 INPUT_FACTORS = (1.0, 30.0)
+STIFFNESSES = (1.0, 10.0, 100.0)
+DECAYS = (1e-4, 1e-3, 1e-2)
+MORE_THAN_A_POLYNOMIAL = 20.0
+"""Freedom of a Gaussian process, and half that of a network: they are taken where they win."""
+NAMES = ("none", *DEGREES, "gaussian process", "network")
 LONGEST = 100
 """Steps of a free run, at most."""
 RUNS = 20
@@ -43,31 +51,43 @@ class Candidate:
     freedom: float
 
 
-def candidates(problem: LinearMPC, kinds: Sequence[Any]) -> list[Candidate]:
+def candidates(
+    problem: LinearMPC, kinds: Sequence[Any], rng: np.random.Generator
+) -> list[Candidate]:
     """Return what there is to choose from; a kind is a name, or makes something with fit."""
-    offset, found = problem.layout.has_constants, []
     if isinstance(kinds, str) or not kinds:
         raise ValueError(f"residuals = {kinds!r} must be a list with at least one kind.")
-    for kind in kinds:
-        if kind == "none":
-            found.append(Candidate("none", partial(Nothing, problem.model.n_states), -np.inf))
-        elif isinstance(kind, str) and kind in DEGREES:
-            for shrinkage in SHRINKAGES:
-                for factor in INPUT_FACTORS:
-                    name = f"{kind}, shrinkage {shrinkage:g} ({shrinkage * factor:g} of inputs)"
-                    inputs = problem.model.n_inputs, factor
-                    options = DEGREES[kind], shrinkage, offset, inputs
-                    freedom = DEGREES[kind] - 2 * np.log10(shrinkage) - np.log10(factor)
-                    found.append(Candidate(name, partial(Polynomial, *options), freedom))
-        elif callable(kind):
-            name = getattr(kind, "__name__", type(kind).__name__)
-            found.append(Candidate(name, partial(Regressor, kind), np.inf))
-        else:
-            raise ValueError(
-                f"residuals holds {kind!r}; expected some of {('none', *DEGREES)}"
-                ", or a function that makes a regressor with fit and predict."
-            )
-    return found
+    return [each for kind in kinds for each in _of_a_kind(problem, kind, rng)]
+
+
+def _of_a_kind(problem: LinearMPC, kind: Any, rng: np.random.Generator) -> Iterator[Candidate]:
+    offset = problem.layout.has_constants
+    if kind == "none":
+        yield Candidate("none", partial(Nothing, problem.model.n_states), -np.inf)
+    elif isinstance(kind, str) and kind in DEGREES:
+        for shrinkage, factor in product(SHRINKAGES, INPUT_FACTORS):
+            name = f"{kind}, shrinkage {shrinkage:g} ({shrinkage * factor:g} of inputs)"
+            options = DEGREES[kind], shrinkage, offset, (problem.model.n_inputs, factor)
+            freedom = DEGREES[kind] - 2 * np.log10(shrinkage) - np.log10(factor)
+            yield Candidate(name, partial(Polynomial, *options), freedom)
+    elif kind == "gaussian process":
+        for stiffness in STIFFNESSES:
+            process = partial(GaussianProcess, offset, stiffness)
+            freedom = MORE_THAN_A_POLYNOMIAL - np.log10(stiffness)
+            yield Candidate(f"{kind}, stiffness {stiffness:g}", process, freedom)
+    elif kind == "network":
+        for decay in DECAYS:
+            network = partial(Network, rng, decay, offset)
+            freedom = 2 * MORE_THAN_A_POLYNOMIAL - np.log10(decay)
+            yield Candidate(f"{kind}, decay {decay:g}", network, freedom)
+    elif callable(kind):
+        name = getattr(kind, "__name__", type(kind).__name__)
+        yield Candidate(name, partial(Regressor, kind), np.inf)
+    else:
+        raise ValueError(
+            f"residuals holds {kind!r}; expected some of {NAMES}"
+            ", or a function that makes a regressor with fit and predict."
+        )
 
 
 def fitted(
@@ -212,9 +232,10 @@ def _errors(
 
 
 def _alike(made: Sequence[Residual]) -> list[list[int]]:
-    """Return which residuals can be stepped as one: polynomials of one degree."""
+    """Return which residuals can be stepped as one: those of a kind, polynomials of one degree."""
     groups: dict[Any, list[int]] = {}
     for i, each in enumerate(made):
-        key = each.degree if isinstance(each, Polynomial) else f"own {i}"
+        stacks = hasattr(each, "stack")
+        key = (type(each), getattr(each, "degree", 0)) if stacks else i
         groups.setdefault(key, []).append(i)
     return list(groups.values())

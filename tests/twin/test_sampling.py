@@ -1,0 +1,124 @@
+"""When a log was sampled, and in which units: cut, refused by name, or not trusted."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from sb3_yann import PlantTwin
+from sb3_yann.evaluation import evaluate
+from sb3_yann_envs import cstr, problems
+from twin_samples import DT, log, problem
+
+
+def clock(episodes, first: float = 0.0):
+    return [first + DT * np.arange(len(states)) for states, _ in episodes]
+
+
+def test_a_log_without_gaps_is_that_of_one_without_times() -> None:
+    found = PlantTwin.fit(problem(), log(3), time=clock(log(3), first=1e5), residuals=["none"])
+    assert [len(each) for each in found.episodes] == [60, 60, 60] and found.notes == ()
+
+
+def test_an_episode_is_cut_at_gaps_and_what_is_too_short_is_left_out_and_said() -> None:
+    times = clock(log(3))
+    times[1][21:] += 0.6 * DT
+    times[1][24:] += 100.0
+    times[2] = times[2] + 0.04 * DT * (-1.0) ** np.arange(61)  # no clock is exact
+    found = PlantTwin.fit(problem(), log(3), time=times, residuals=["none"])
+    assert [len(each) for each in found.episodes] == [60, 20, 36, 60]
+    states, actions = log(3)[1]
+    np.testing.assert_array_equal(found.episodes[1].thetas, states[:21])
+    np.testing.assert_array_equal(found.episodes[2].thetas, states[24:])
+    np.testing.assert_allclose(found.episodes[2].actions, actions[24:])
+    assert "Cut at 2 gaps; 1 pieces of less than 5 steps left out, 4 of 180" in found.report()
+
+
+def broken(change):
+    def times():
+        found = clock(log(2))
+        change(found)
+        return found
+
+    return times
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (broken(lambda t: t.pop()), "time has 1 entries for 2 episodes"),
+        (broken(lambda t: t.append(t[0])), "time has 3 entries for 2 episodes"),
+        (broken(lambda t: t.__setitem__(1, t[1][1:])), r"episode 1: time has shape \(60,\)"),
+        (broken(lambda t: t[1].__setitem__(7, np.nan)), "episode 1: time is nan in row 7"),
+        (broken(lambda t: t[1].__setitem__(8, t[1][7])), "does not increase after row 7: 0.7, 0.7"),
+        (
+            broken(lambda t: t[1].__imul__(1.06)),
+            r"episode 1: a step takes 0.106 \(the median\), .* dt = 0.1\. .* resample the log",
+        ),
+        (broken(lambda t: t[0].__imul__(1000)), "episode 0: a step takes 100 .* the unit of dt"),
+    ],
+)
+def test_times_that_are_none_are_refused_by_name(times, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        PlantTwin.fit(problem(), log(2), time=times())
+
+
+def test_a_log_of_gaps_alone_is_refused() -> None:
+    times = [t + 10.0 * (np.arange(len(t)) // 4) for t in clock(log(2))]
+    with pytest.raises(ValueError, match="at 30 gaps into pieces of less than 5 steps"):
+        PlantTwin.fit(problem(), log(2), time=times)
+
+
+@cache
+def reactor():
+    played = evaluate(problems.cstr().explicit(), "CSTR-v0", seeds=range(3))
+    return [*zip(played.observations, played.actions, strict=True)]
+
+
+KELVIN = np.array([0.0, 0.0, *cstr.X_SS[2:]])
+PER_CENT = np.array([100.0, 100.0, 1.0, 1.0])
+
+
+def refuse_or_doubt(mpc, episodes) -> None:
+    try:
+        found = PlantTwin.fit(mpc, episodes)
+    except ValueError as refused:
+        assert "in the problem's units?" in str(refused)
+    else:
+        assert not found.trusted and "Compare units" in " ".join(found.trust.advice)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x, u: (x + cstr.X_SS, u),
+        lambda x, u: (x + KELVIN, u),
+        lambda x, u: (PER_CENT * x, u),
+        lambda x, u: (x, u + cstr.U_SS),
+    ],
+    ids=["absolute", "kelvin", "per cent", "absolute input"],
+)
+def test_a_reactor_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
+    refuse_or_doubt(problems.cstr(), [change(x, u) for x, u in reactor()])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x, u: (x + np.array([20.0, 0.0]), u),
+        lambda x, u: (100 * x, u),
+        lambda x, u: (x, 100 * u),
+    ],
+    ids=["absolute place", "per cent", "input in per cent"],
+)
+def test_the_cart_s_log_in_other_units_is_refused_or_not_trusted(change) -> None:
+    refuse_or_doubt(problem(), [change(x, u) for x, u in log(3)])
+
+
+def test_what_is_missing_in_a_poor_log_is_advised() -> None:
+    one, still = reactor()[:1], [(x, 0 * u + 0.1) for x, u in reactor()]
+    for episodes, advice in ((one, "Log at least one episode more"), (still, "step test on input")):
+        found = PlantTwin.fit(problems.cstr(), episodes, residuals=["none", "linear"])
+        assert not found.trusted and advice in found.report()
