@@ -63,19 +63,82 @@ class PairedEpisodes:
         return ""
 
 
+Logged = tuple[Array, Array]
+"""The thetas (T + 1, n_theta) and the inputs (T, m) of an episode."""
+
+
 @dataclass(frozen=True)
 class PlantEpisodes:
-    """Training episodes of one policy; ``predicted`` is what the MPC costs on its own model."""
+    """Training episodes of one policy.
+
+    Attributes
+    ----------
+    costs, predicted : ndarray, shape (episodes,)
+        What each cost, and what it should cost from its start, whoever plays: the covariate.
+    log : tuple of pairs of ndarray, shapes (T + 1, n_theta) and (T, m)
+        Thetas and inputs of each; empty where they are not known.
+    """
 
     costs: Array
     predicted: Array
+    log: tuple[Logged, ...] = ()
+
+    def __add__(self, other: PlantEpisodes) -> PlantEpisodes:
+        """Return the episodes of both, which one policy has played."""
+        return PlantEpisodes(
+            np.concatenate([self.costs, other.costs]),
+            np.concatenate([self.predicted, other.predicted]),
+            self.log + other.log,
+        )
 
 
-def excess_of_an_outlier(candidate: PlantEpisodes, accepted: PlantEpisodes) -> float:
+@dataclass(frozen=True)
+class ErrorBudget:
+    """How much of the probability of an error each test of a run may use.
+
+    The tests of a run share ``significance``: number i has ``1 / (i (i + 1))`` of it, which adds up
+    to 1, and a test that passes hands its size on to the next one. So a run passes a policy that is
+    no better with probability ``significance`` at most, however many tests it makes, whenever it
+    stops, and however the tests depend on each other (online fallback: Tian and Ramdas, *Online
+    control of the familywise error rate*, Statistical Methods in Medical Research, 2021).
+
+    Attributes
+    ----------
+    tests : int, so many have been made
+    handed_on : float, the size of the last one if it passed, else 0
+
+    Examples
+    --------
+    >>> budget = ErrorBudget()
+    >>> [round(budget.size(0.05), 4), round(budget.after(0.025, passed=False).size(0.05), 4)]
+    [0.025, 0.0083]
+    """
+
+    tests: int = 0
+    handed_on: float = 0.0
+
+    def size(self, significance: float) -> float:
+        """Return the size of the next test."""
+        return significance / ((self.tests + 1) * (self.tests + 2)) + self.handed_on
+
+    def after(self, size: float, passed: bool) -> ErrorBudget:
+        """Return what is left after a test of that size."""
+        return ErrorBudget(self.tests + 1, size if passed else 0.0)
+
+
+def is_promising(candidate: PlantEpisodes, accepted: PlantEpisodes, size: float) -> bool:
+    """Return whether a test of that size would pass if both played all their episodes once more."""
+    return analyze_covariance(candidate + candidate, accepted + accepted)[1] < size
+
+
+def excess_of_an_outlier(
+    candidate: PlantEpisodes, accepted: PlantEpisodes, margin: float = 0.0
+) -> float:
     """Return by how much one of the candidate's episodes costs more than the accepted policy's.
 
     0 where none is beyond the upper prediction limit, of size ``OUTLIER`` for all of them, of the
-    least-squares line of the accepted costs on the predicted ones (e.g. Montgomery, chapter 10).
+    least-squares line of the accepted costs on the predicted ones (e.g. Montgomery, chapter 10), by
+    more than a margin: the line may leave next to no scatter.
     """
     covariate = _varies(accepted.predicted) and bool(np.all(np.isfinite(candidate.predicted)))
     X, new = (
@@ -88,7 +151,7 @@ def excess_of_an_outlier(candidate: PlantEpisodes, accepted: PlantEpisodes) -> f
     leverage = np.einsum("ij,jk,ik->i", new, np.linalg.pinv(X.T @ X), new)
     excess = candidate.costs - new @ coefficients
     limit = stats.t.isf(OUTLIER / len(new), freedom) * scatter * np.sqrt(1 + leverage)
-    beyond = excess > limit + 1e-9 * np.abs(accepted.costs).max()
+    beyond = excess > limit + margin + 1e-9 * np.abs(accepted.costs).max()
     return float(np.max(excess, where=beyond, initial=0.0))
 
 
@@ -100,10 +163,10 @@ def _varies(predicted: Array) -> bool:
 def analyze_covariance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, float]:
     """Return how much more the candidate costs from the same starts, and the one-sided p-value.
 
-    Ordinary least squares of the cost on the cost that the linear model predicts and on which
-    policy played; Student's t test of the policy's coefficient. It assumes independent episodes
-    with normal residuals of one variance, and one slope for both policies (e.g. Montgomery, *Design
-    and Analysis of Experiments*, chapter 15). Where nothing can be told: nan and p = 1.
+    Ordinary least squares of the cost on the cost that was predicted and on which policy played;
+    Student's t test of the policy's coefficient. It assumes independent episodes with normal
+    residuals of one variance, and one slope for both policies (e.g. Montgomery, *Design and
+    Analysis of Experiments*, chapter 15). Where nothing can be told: nan and p = 1.
     """
     costs = np.concatenate([candidate.costs, accepted.costs])
     if not np.all(np.isfinite(costs)):
