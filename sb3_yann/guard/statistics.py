@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special, stats
 
 from sb3_yann._validation import Array
 
@@ -169,25 +169,34 @@ def analyze_covariance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tup
     Analysis of Experiments*, chapter 15). Where nothing can be told: nan and p = 1.
     """
     costs = np.concatenate([candidate.costs, accepted.costs])
+    predicted = np.concatenate([candidate.predicted, accepted.predicted])
     if not np.all(np.isfinite(costs)):
         return np.nan, 1.0
-    is_candidate = np.arange(len(costs)) < len(candidate.costs)
-    predicted = np.concatenate([candidate.predicted, accepted.predicted])
-    columns = [np.ones(len(costs)), is_candidate.astype(float)]
-    if _varies(predicted):
-        columns.append((predicted - predicted.mean()) / predicted.std())
-    X = np.column_stack(columns)
-    freedom = len(costs) - X.shape[1]
-    if freedom < 1:
+    covariate, count = _varies(predicted), len(candidate.costs)
+    if (freedom := len(costs) - 2 - covariate) < 1:
         raise ValueError(f"{len(costs)} episodes are too few to compare two policies.")
-    if np.linalg.matrix_rank(X) < X.shape[1]:
-        return np.nan, 1.0  # the starts alone tell the two policies' episodes apart
-    coefficients, *_ = np.linalg.lstsq(X, costs, rcond=None)
-    difference = coefficients[1]
+    # Deviations from each policy's own means tell the slope; the means tell the difference.
+    y, difference = _within(costs, count)
+    variance = 1 / count + 1 / len(accepted.costs)
+    if covariate:
+        x, apart = _within(predicted, count)
+        spread = float(x @ x)
+        if spread <= 1e-12 * np.sum((predicted - predicted.mean()) ** 2):
+            return np.nan, 1.0  # the starts alone tell the two policies' episodes apart
+        slope = float(x @ y) / spread
+        difference -= slope * apart
+        variance += apart**2 / spread
+        y = y - slope * x
     if abs(difference) <= 1e-12 * np.abs(costs).max():
         return 0.0, 1.0  # rounding: "no difference" is no improvement
-    variance = np.sum((costs - X @ coefficients) ** 2) / freedom
-    error = np.sqrt(variance * np.linalg.pinv(X.T @ X)[1, 1])
+    error = np.sqrt(y @ y / freedom * variance)
     # Without any scatter the sign alone decides.
     t = difference / error if error > 0 else np.sign(difference) * np.inf
-    return float(difference), float(stats.t.cdf(t, freedom))
+    return difference, float(special.stdtr(freedom, t))
+
+
+def _within(values: Array, count: int) -> tuple[Array, float]:
+    """Return the deviations from each policy's mean, and how far apart the two means are."""
+    new, old = values[:count], values[count:]
+    parts = new - new.mean(), old - old.mean()
+    return np.concatenate(parts), float(new.mean() - old.mean())

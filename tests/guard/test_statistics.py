@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from sb3_yann.guard.statistics import (
     OUTLIER,
+    ErrorBudget,
     PairedEpisodes,
     PlantEpisodes,
     analyze_covariance,
     excess_of_an_outlier,
+    is_promising,
 )
 
 
@@ -219,3 +223,91 @@ def test_without_scatter_equal_or_lower_costs_are_no_outlier_and_higher_ones_are
     old = episodes([4.25] * 3, predicted)
     assert excess_of_an_outlier(episodes([4.25, 4.0, 4.25], predicted), old) == 0
     assert excess_of_an_outlier(episodes([4.25, 4.0, 5.25], predicted), old) == pytest.approx(1)
+
+
+def test_a_margin_lets_an_episode_cost_so_much_more_than_its_prediction_limit() -> None:
+    old, new = episodes([4.25] * 3), episodes([4.25, 4.0, 4.3])
+    assert excess_of_an_outlier(new, old) == pytest.approx(0.05)
+    assert excess_of_an_outlier(new, old, margin=0.06) == 0
+
+
+def test_the_tests_of_a_run_share_its_significance_whatever_passes() -> None:
+    budget, spent = ErrorBudget(), []
+    for _ in range(10_000):
+        spent.append(budget.size(0.05))
+        budget = budget.after(spent[-1], passed=False)
+    assert spent[0] == pytest.approx(0.025)
+    assert all(later < earlier for earlier, later in pairwise(spent))
+    assert 0.0499 < sum(spent) < 0.05
+
+
+def test_a_test_that_passes_hands_its_size_on_once() -> None:
+    refused = ErrorBudget().after(0.025, passed=False)
+    passed = ErrorBudget().after(0.025, passed=True)
+    assert passed.size(0.05) == pytest.approx(refused.size(0.05) + 0.025)
+    later = [each.after(0.01, passed=False) for each in (passed, refused)]
+    assert later[0] == later[1]
+
+
+def test_promising_is_what_would_pass_if_it_went_on_like_that() -> None:
+    rng = np.random.default_rng(8)
+    noise = rng.normal(size=20)
+    old = episodes(noise[:10])
+    for gain in np.linspace(-1, 3, 9):
+        new = episodes(noise[10:] - gain)
+        twice = probability_of_chance(
+            episodes(np.tile(new.costs, 2)), episodes(np.tile(old.costs, 2))
+        )
+        assert is_promising(new, old, 0.01) == (twice < 0.01)
+    assert not is_promising(episodes(noise[10:] + 5), old, 0.01)
+    assert is_promising(episodes(noise[10:] - 5), old, 0.01)
+
+
+def a_run_errs(
+    draw, rng, candidates: int = 30, significance: float = 0.05, block: int = 10
+) -> bool:
+    """Return whether one of a run's candidates is accepted, none of which is better."""
+    accepted, budget = draw(rng, block), ErrorBudget()
+    for _ in range(candidates):
+        candidate = draw(rng, block)
+        while True:
+            size = budget.size(significance)
+            if probability_of_chance(candidate, accepted) < size:
+                return True
+            budget = budget.after(size, passed=False)
+            if not is_promising(candidate, accepted, budget.size(significance)):
+                break
+            if len(accepted.costs) <= len(candidate.costs):
+                accepted += draw(rng, block)
+            else:
+                candidate += draw(rng, block)
+    return False
+
+
+def skewed_costs(correlation: float, noise: float = 0.0):
+    """Return a function that draws episodes whose costs and residuals are skewed as a plant's."""
+
+    def draw(rng, count: int) -> PlantEpisodes:
+        predicted, rest = rng.exponential(82, size=(2, count))
+        costs = correlation * predicted + np.sqrt(1 - correlation**2) * rest
+        return PlantEpisodes(costs + noise * rng.normal(size=count), predicted)
+
+    return draw
+
+
+@pytest.mark.parametrize(
+    ("correlation", "noise", "runs"),
+    [
+        (0.3, 0.0, 100),
+        (0.99, 0.0, 100),
+        pytest.param(0.3, 0.0, 1000, marks=pytest.mark.slow),
+        pytest.param(0.99, 0.0, 1000, marks=pytest.mark.slow),
+        pytest.param(0.99, 80.0, 1000, marks=pytest.mark.slow),
+    ],
+)
+def test_of_runs_with_thirty_candidates_that_are_no_better_few_accept_any(
+    correlation, noise, runs
+) -> None:
+    rng, draw = np.random.default_rng(9), skewed_costs(correlation, noise)
+    wrong = sum(a_run_errs(draw, rng) for _ in range(runs))
+    assert wrong <= stats.binom.ppf(0.999, runs, 0.05)  # with tests of 5 % each it is two in five
