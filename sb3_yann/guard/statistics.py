@@ -164,20 +164,22 @@ def analyze_covariance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tup
     """Return how much more the candidate costs from the same starts, and the one-sided p-value.
 
     Ordinary least squares of the cost on the cost that was predicted and on which policy played;
-    Student's t test of the policy's coefficient. It assumes independent episodes with normal
-    residuals of one variance, and one slope for both policies (e.g. Montgomery, *Design and
-    Analysis of Experiments*, chapter 15). Where nothing can be told: nan and p = 1.
+    Welch's t test of the policy's coefficient (Welch, *Biometrika* 34, 1947, with Satterthwaite's
+    degrees of freedom). A prediction for the accepted policy fits the candidate less well, so each
+    policy has a variance of its own. The test assumes independent episodes and residuals that are
+    nearly normal. Where nothing can be told: nan and p = 1.
     """
     costs = np.concatenate([candidate.costs, accepted.costs])
     predicted = np.concatenate([candidate.predicted, accepted.predicted])
     if not np.all(np.isfinite(costs)):
         return np.nan, 1.0
     covariate, count = _varies(predicted), len(candidate.costs)
-    if (freedom := len(costs) - 2 - covariate) < 1:
+    if min(count, len(accepted.costs)) < 2:
         raise ValueError(f"{len(costs)} episodes are too few to compare two policies.")
     # Deviations from each policy's own means tell the slope; the means tell the difference.
     y, difference = _within(costs, count)
-    variance = 1 / count + 1 / len(accepted.costs)
+    is_candidate = np.arange(len(costs)) < count
+    weights = np.where(is_candidate, 1 / count, -1 / len(accepted.costs))
     if covariate:
         x, apart = _within(predicted, count)
         spread = float(x @ x)
@@ -185,14 +187,18 @@ def analyze_covariance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tup
             return np.nan, 1.0  # the starts alone tell the two policies' episodes apart
         slope = float(x @ y) / spread
         difference -= slope * apart
-        variance += apart**2 / spread
+        weights = weights - apart * x / spread
         y = y - slope * x
     if abs(difference) <= 1e-12 * np.abs(costs).max():
         return 0.0, 1.0  # rounding: "no difference" is no improvement
-    error = np.sqrt(y @ y / freedom * variance)
-    # Without any scatter the sign alone decides.
-    t = difference / error if error > 0 else np.sign(difference) * np.inf
-    return difference, float(special.stdtr(freedom, t))
+    each = np.array([is_candidate, ~is_candidate])
+    freedom = each.sum(1) - 1 - covariate / 2  # the slope takes half a degree of each
+    variances = (each @ weights**2) * (each @ y**2) / freedom
+    variance = variances.sum()
+    if not variance > 0:  # without any scatter the sign alone decides
+        return difference, float(difference > 0)
+    joint = variance**2 / np.sum(variances**2 / freedom)
+    return difference, float(special.stdtr(joint, difference / np.sqrt(variance)))
 
 
 def _within(values: Array, count: int) -> tuple[Array, float]:

@@ -6,14 +6,12 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from general_problems import servo
 from guard_samples import (
     MPC,
-    REGION,
     RIGHT,
     At,
     Slide,
@@ -23,7 +21,6 @@ from guard_samples import (
     guard_alone,
     random_states,
     train,
-    verdicts,
 )
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.covariate import Recorder, costs_in_twin, predict_by_twin
@@ -143,8 +140,7 @@ def a_log(problem, moves: float, count: int = 5) -> tuple[Any, ...]:
 
 
 def servo_session(problem) -> Any:
-    """Return as much of a session as the twin needs: the accepted policy is the MPC."""
-    gym.spaces.Box(-5, 5, (3,))
+    """Return as much of a session as is asked for until a twin is trusted."""
     return SimpleNamespace(policy=SimpleNamespace(problem=problem))
 
 
@@ -166,15 +162,3 @@ def test_where_no_twin_can_be_trusted_the_linear_model_predicts(change, why) -> 
     broken = PlantEpisodes(np.ones(5), predicted, change(known.log))
     found = predict_by_twin(servo_session(problem), new, broken)
     assert found == (new, broken, "the linear model"), why
-
-
-def test_a_twin_finds_a_gain_of_two_percent_that_the_linear_model_hides() -> None:
-    """Costs of 10 to 60, and 2 % less for a candidate, in blocks of ten."""
-
-    class Cheaper(Curved):
-        def step(self, action):
-            observation, reward, *rest = super().step(action)
-            cheaper = float(np.asarray(action)[0]) > -0.9 and self.t == 1
-            return observation, reward, *rest
-
-    assert verdicts  # placeholder
