@@ -37,10 +37,11 @@ class ImprovementGuard(BaseCallback):
     :func:`restore_accepted` gives it the accepted policy.
 
     With a simulator, candidates, accepted policy and MPC play the same seeded starts. On a plant
-    alone (``env=None``) the training episodes decide, by a one-sided test. `docs/guard.md` says
-    when a candidate is refused. A refusal restores actor, target actor and the actor's optimizer
-    bit for bit, at once or when ``patience`` is over. No random numbers are drawn. The state
-    travels with the model, as ``model.guard_state``: a guard with the same settings goes on there.
+    alone (``env=None``) the training episodes decide, by tests that share one error probability.
+    `docs/guard.md` says when a candidate is refused. A refusal restores actor, target actor and the
+    actor's optimizer bit for bit, at once or when ``patience`` is over. No random numbers are
+    drawn. The state travels with the model, as ``model.guard_state``: a guard with the same
+    settings goes on there.
 
     Parameters
     ----------
