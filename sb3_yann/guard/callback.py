@@ -37,10 +37,11 @@ class ImprovementGuard(BaseCallback):
     :func:`restore_accepted` gives it the accepted policy.
 
     With a simulator, candidates, accepted policy and MPC play the same seeded starts. On a plant
-    alone (``env=None``) the training episodes decide, by a one-sided test. `docs/guard.md` says
-    when a candidate is refused. A refusal restores actor, target actor and the actor's optimizer
-    bit for bit, at once or when ``patience`` is over. No random numbers are drawn. The state
-    travels with the model, as ``model.guard_state``: a guard with the same settings goes on there.
+    alone (``env=None``) the training episodes decide, by tests that share one error probability.
+    `docs/guard.md` says when a candidate is refused. A refusal restores actor, target actor and the
+    actor's optimizer bit for bit, at once or when ``patience`` is over. No random numbers are
+    drawn. The state travels with the model, as ``model.guard_state``: a guard with the same
+    settings goes on there.
 
     Parameters
     ----------
@@ -189,6 +190,7 @@ class ImprovementGuard(BaseCallback):
         state = GuardState(self.acceptance.settings, present, evidence=None)
         if known is not None:  # other starts or another plant: the policies are tried anew
             state.decisions, state.episodes = [*known.decisions], known.episodes
+            state.budget = known.budget
         self.model.guard_state = state  # type: ignore[attr-defined]
         try:
             self.acceptance.first_evidence(self.session, known)
@@ -201,9 +203,11 @@ class ImprovementGuard(BaseCallback):
         self.acceptance.before_steps(self.session)
 
     def _on_step(self) -> bool:
-        dones = self.locals["dones"]
+        dones, rewards, infos = (self.locals[each] for each in ("dones", "rewards", "infos"))
         self.state.episodes += int(np.sum(dones))
-        self.acceptance.step(self.session, dones, self.locals["rewards"], self.locals["infos"])
+        if isinstance(self.acceptance, PlantAcceptance):
+            self.acceptance.record(self.session, self.locals["buffer_actions"])
+        self.acceptance.step(self.session, dones, rewards, infos)
         return True
 
     def _on_training_end(self) -> None:

@@ -17,12 +17,13 @@ class AcceptanceRule:
     ----------
     margin : float, default 0.01
         What one start may cost more than with the MPC, as a fraction of the MPC's median cost.
+        Plant alone: what it may cost beyond its prediction limit, of the accepted median.
     by_region : bool, default True
         Whether single regions are tried where the whole candidate is refused.
     trial_episodes : int, default 10
         Plant alone: training episodes of a block, at least 3.
     significance : float, default 0.05
-        Plant alone: size of the one-sided test.
+        Plant alone: probability that a run accepts a policy that is no better, at most.
 
     Examples
     --------

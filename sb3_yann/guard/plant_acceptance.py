@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC
 from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint, diverged
+from sb3_yann.guard.covariate import Recorder, predict_by_twin, predicted_cost
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.preconditions import check_acts_alone
 from sb3_yann.guard.session import GuardSession
 from sb3_yann.guard.state import GuardState, Verdict
-from sb3_yann.guard.statistics import PlantEpisodes, analyze_covariance, excess_of_an_outlier
+from sb3_yann.guard.statistics import (
+    Logged,
+    PlantEpisodes,
+    analyze_covariance,
+    excess_of_an_outlier,
+    is_promising,
+)
 
-Phase = Literal["first", "learning", "trial"]
+Phase = Literal["first", "learning", "trial", "again"]
 
 
 @dataclass
@@ -25,12 +30,16 @@ class BlockEvidence:
 
     Attributes
     ----------
-    phase : str, "first", "learning" or "trial"; the actor learns in the second only
+    phase : str, "first", "learning", "trial" or "again"; the actor learns in the second only
+        The accepted policy plays "again" while it is not clear yet what a candidate is worth.
     mpc, accepted : PlantEpisodes or None, those of the MPC and of the accepted policy, if known
     costs : list of float, those of the block's episodes so far
     predicted : list of float, what the MPC costs on its own model; empty while the actor learns
     resting : ActorCheckpoint or None, what the actor stays in this block, None while it learns
     terminates : bool, whether the env itself has ended an episode of an accepted policy
+    log : tuple of pairs of ndarray, thetas and inputs of the block's episodes, as ``predicted``
+    candidate : ActorCheckpoint or None, the policy on trial after its first block
+    on_trial : PlantEpisodes or None, its episodes
     """
 
     phase: Phase = "first"
@@ -40,6 +49,14 @@ class BlockEvidence:
     predicted: list[float] = field(default_factory=list)
     resting: ActorCheckpoint | None = None
     terminates: bool = False
+    log: tuple[Logged, ...] = ()
+    candidate: ActorCheckpoint | None = None
+    on_trial: PlantEpisodes | None = None
+
+    @property
+    def played(self) -> PlantEpisodes:
+        """The block's episodes."""
+        return PlantEpisodes(np.array(self.costs), np.array(self.predicted), self.log)
 
 
 class PlantAcceptance:
@@ -58,7 +75,7 @@ class PlantAcceptance:
         self.costs, self.lengths = np.zeros(n_envs), np.full(n_envs, going_on)
         self.violated = np.zeros(n_envs, dtype=bool)
         self.accepted_led = np.zeros(n_envs, dtype=bool)  # whether for all of the episode so far
-        self.starts: list[Array] = [np.empty(0)] * n_envs
+        self.recorders = [Recorder() for _ in range(n_envs)]
         self.blocks, self.block = np.full(n_envs, -1), 0
         self.last_restore = "", -1  # why, and after how many episodes
         self.left_out = 0  # episodes of the first block whose cost is not known
@@ -91,6 +108,18 @@ class PlantAcceptance:
         if diverged(session.policy.actor.parameters()):
             self._restore(session, DIVERGED)
 
+    def record(self, session: GuardSession, actions: Any) -> None:
+        """Note the thetas of the present step, and the actions (n_envs, m) in [-1, 1]."""
+        starting = self.lengths == 0
+        if _evidence(session).phase == "learning" and not starting.any():
+            return  # no twin is fitted to episodes in which the actor learns
+        observations = session.model._last_obs  # s_t, before the step
+        theta = session.policy.theta(observations).double().cpu().numpy()  # type: ignore[arg-type]
+        for i in range(len(theta)):
+            if starting[i]:
+                self.recorders[i] = Recorder()
+            self.recorders[i].add(theta[i], actions[i])
+
     def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
         """Count the step; decide where a block is over.
 
@@ -114,7 +143,7 @@ class PlantAcceptance:
             self.lengths[i] += 1
             self._watch_limits(session, i, bool(done), infos[i])
             if done:
-                self._end_episode(session, i)
+                self._end_episode(session, i, infos[i])
         if len(evidence.costs) >= self.rule.trial_episodes:
             self._end_block(session)
         # After a violation the actor rests while the accepted policy leads the plant back.
@@ -135,13 +164,11 @@ class PlantAcceptance:
         if len(starting) == 0:
             return
         self.accepted_led[starting] = True
-        observations = session.model._last_obs
-        theta = session.policy.theta(observations).double().cpu().numpy()  # type: ignore[arg-type]
-        for i in starting:  # s_t, before the step
-            self.starts[i] = theta[i]
+        for i in starting:
             counted = len(_evidence(session).costs) + np.count_nonzero(self.blocks == self.block)
             # Where theta is not finite, nobody knows what it should cost from there.
-            if np.all(np.isfinite(theta[i])) and counted < self.rule.trial_episodes:
+            known = np.all(np.isfinite(self.recorders[i].thetas[0]))
+            if known and counted < self.rule.trial_episodes:
                 self.blocks[i] = self.block
 
     def _watch_limits(self, session: GuardSession, i: int, done: bool, info: Any) -> None:
@@ -156,7 +183,7 @@ class PlantAcceptance:
         elif terminated and self.accepted_led[i]:
             evidence.terminates = True
 
-    def _end_episode(self, session: GuardSession, i: int) -> None:
+    def _end_episode(self, session: GuardSession, i: int, info: Any) -> None:
         """Add an episode to the block, if it is one of the block's."""
         evidence = _evidence(session)
         if self.blocks[i] == self.block:
@@ -165,7 +192,10 @@ class PlantAcceptance:
             else:
                 evidence.costs.append(float(self.costs[i]))
                 if evidence.phase != "learning":
-                    problem, start = session.policy.problem, self.starts[i]
+                    problem, recorder = session.policy.problem, self.recorders[i]
+                    last = session.policy.theta(info["terminal_observation"][None]).cpu().numpy()
+                    evidence.log += (recorder.episode(problem, last[0]),)
+                    start = recorder.thetas[0].astype(np.float64)
                     evidence.predicted.append(predicted_cost(problem, start, self.lengths[i]))
         self.costs[i], self.lengths[i], self.violated[i] = 0.0, 0, False
         self.blocks[i] = -1
@@ -182,8 +212,10 @@ class PlantAcceptance:
     def _begin(self, session: GuardSession, phase: Phase) -> None:
         evidence = _evidence(session)
         evidence.phase = phase
-        evidence.costs, evidence.predicted = [], []
+        evidence.costs, evidence.predicted, evidence.log = [], [], ()
         evidence.resting = None if phase == "learning" else ActorCheckpoint.of(session.policy)
+        if phase in ("first", "learning"):
+            evidence.candidate = evidence.on_trial = None
         self.block += 1
 
     def _restore(self, session: GuardSession, reason: str) -> None:
@@ -197,35 +229,60 @@ class PlantAcceptance:
 
     def _end_block(self, session: GuardSession) -> None:
         evidence = _evidence(session)
-        if evidence.phase == "learning":
+        played, phase = evidence.played, evidence.phase
+        if phase == "learning":
             self._begin(session, "trial")
-            return
-        played = PlantEpisodes(np.array(evidence.costs), np.array(evidence.predicted))
-        if evidence.accepted is None:
+        elif evidence.accepted is None:
             evidence.accepted = played
             if session.policy.actor.mu.network.is_zero():
-                evidence.mpc = played
-        elif not session.state.accepted.is_actor_of(session.policy):
-            self._judge(session, played, evidence.accepted)
+                evidence.mpc = replace(played, log=())
+            self._begin(session, "learning")
+        elif phase == "again":
+            evidence.accepted += played
+            self._judge(session)
+        elif session.state.accepted.is_actor_of(session.policy):  # nothing to be tried
+            self._begin(session, "learning")
+        else:
+            evidence.candidate = ActorCheckpoint.of(session.policy)
+            evidence.on_trial = played if evidence.on_trial is None else evidence.on_trial + played
+            self._judge(session)
+
+    def _judge(self, session: GuardSession) -> None:
+        """Accept the policy on trial, refuse it, or play a block more where it is promising."""
+        state, evidence = session.state, _evidence(session)
+        candidate, on_trial, known = evidence.candidate, evidence.on_trial, evidence.accepted
+        assert candidate is not None and on_trial is not None and known is not None
+        new, old, who = predict_by_twin(session, on_trial, known)
+        size = state.budget.size(self.rule.significance)
+        passed, outlier, reason = self._compare(new, old, size)
+        state.budget = state.budget.after(size, passed)
+        next_size = state.budget.size(self.rule.significance)
+        if not (passed or outlier) and is_promising(new, old, next_size):
+            again = len(old.costs) <= len(new.costs)
+            (state.accepted if again else candidate).restore(session.policy)
+            self._begin(session, "again" if again else "trial")
+            return
+        if passed:
+            evidence.accepted = on_trial
+            state.accept(candidate, evidence)
+        state.accepted.restore(session.policy)
+        verdict: Verdict = "accepted" if passed else "rejected"
+        self._report(session, verdict, reason.format(who), float(on_trial.costs.mean()))
         self._begin(session, "learning")
 
-    def _judge(self, session: GuardSession, played: PlantEpisodes, accepted: PlantEpisodes) -> None:
-        """Accept the policy that rested in this block, or restore the accepted one."""
-        difference, chance = analyze_covariance(played, accepted)
-        reason = f"{difference:+.4g} from the same starts by the linear model, p = {chance:.3g}"
-        if lost := np.count_nonzero(~np.isfinite(played.costs)):
-            reason = f"{lost} of {len(played.costs)} episodes cost no finite number"
-        beyond = excess_of_an_outlier(played, accepted)
+    def _compare(
+        self, new: PlantEpisodes, old: PlantEpisodes, size: float
+    ) -> tuple[bool, bool, str]:
+        """Return whether a test of that size passes, whether an episode is an outlier, and why."""
+        difference, chance = analyze_covariance(new, old)
+        beyond = excess_of_an_outlier(new, old, self.rule.margin * float(np.median(old.costs)))
+        if lost := np.count_nonzero(~np.isfinite(new.costs)):
+            return False, True, f"{lost} of {len(new.costs)} episodes cost no finite number"
+        reason = f"{difference:+.4g} from the same starts by {{}}, p = {chance:.3g}"
         if beyond > 0:
-            reason += f", but one start costs {beyond:.4g} more than it should"
-        verdict: Verdict = "rejected"
-        if chance < self.rule.significance and not beyond > 0:
-            verdict, evidence = "accepted", _evidence(session)
-            evidence.accepted = played
-            session.state.accept(ActorCheckpoint.of(session.policy), evidence)
-        else:
-            session.state.accepted.restore(session.policy)
-        self._report(session, verdict, reason, float(played.costs.mean()))
+            return False, True, f"{reason}, but one start costs {beyond:.4g} more than it should"
+        passed = chance < size
+        return passed, False, reason if passed else f"{reason}, not below {size:.2g}"
 
     def _report(self, session: GuardSession, verdict: Verdict, reason: str, cost: float) -> None:
         evidence = _evidence(session)
@@ -237,13 +294,3 @@ class PlantAcceptance:
 def _evidence(session: GuardSession) -> BlockEvidence:
     evidence: BlockEvidence = session.state.evidence
     return evidence
-
-
-def predicted_cost(problem: LinearMPC, start: Array, steps: int) -> float:
-    """Return what the MPC costs on its own linear model, from a start, over a number of steps."""
-    law, theta, cost = problem.explicit(), start, 0.0
-    for _ in range(steps):
-        u = law(theta)
-        cost += float(problem.stage_cost(theta, u))
-        theta = problem.predict(theta, u)
-    return cost

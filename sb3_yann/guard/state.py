@@ -11,6 +11,7 @@ from typing import Any, Literal
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.statistics import ErrorBudget
 
 Verdict = Literal["accepted", "accepted in part", "rejected"]
 
@@ -73,6 +74,7 @@ class GuardState:
     passed : list of (ActorCheckpoint, Outcome or None), the latest last
         Earlier accepted checkpoints, with their outcomes on the first of the known starts.
     decisions : list of Decision, all so far
+    budget : ErrorBudget, what is left to the tests on a plant alone
     """
 
     settings: dict[str, Any]
@@ -85,6 +87,7 @@ class GuardState:
     next_start: int = 0
     passed: list[tuple[ActorCheckpoint, Any]] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
+    budget: ErrorBudget = ErrorBudget()  # noqa: RUF009 (frozen)
 
     def accept(self, checkpoint: ActorCheckpoint, evidence: Any) -> None:
         """Make a checkpoint the accepted one."""

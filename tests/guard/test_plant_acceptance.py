@@ -38,7 +38,7 @@ from guard_samples import (
     train,
     verdicts,
 )
-from sb3_yann.guard.plant_acceptance import predicted_cost
+from sb3_yann.guard.covariate import predicted_cost
 from weights import last_layer
 
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from sb3_yann.guard.statistics import (
     OUTLIER,
+    ErrorBudget,
     PairedEpisodes,
     PlantEpisodes,
     analyze_covariance,
     excess_of_an_outlier,
+    is_promising,
 )
 
 
@@ -86,34 +90,36 @@ def episodes(costs, predicted=None) -> PlantEpisodes:
 
 @pytest.mark.parametrize("sizes", [(10, 10), (4, 9), (3, 3)])
 @pytest.mark.parametrize("predicted", ["equal", "missing"])
-def test_without_a_covariate_it_is_student_s_test(sizes, predicted) -> None:
+def test_without_a_covariate_it_is_welch_s_test(sizes, predicted) -> None:
     rng = np.random.default_rng(0)
     new, old = (rng.normal(size=size) for size in sizes)
     covariates = [np.full(size, 7.0 if predicted == "equal" else NAN) for size in sizes]
     chance = probability_of_chance(episodes(new, covariates[0]), episodes(old, covariates[1]))
-    expected = stats.ttest_ind(new, old, alternative="less").pvalue
+    expected = stats.ttest_ind(new, old, equal_var=False, alternative="less").pvalue
     assert chance == pytest.approx(expected, rel=1e-9)
 
 
-def test_with_a_covariate_it_is_the_test_of_the_partial_correlation() -> None:
+def test_with_a_covariate_it_is_least_squares_with_a_variance_for_each_policy() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         sizes = rng.integers(3, 12, 2)
         predicted = rng.exponential(size=sizes.sum()) * 1e3
-        costs = 2 * predicted + rng.normal(size=sizes.sum()) * 300
         policy = np.arange(sizes.sum()) < sizes[0]
-
-        def residual(y, x=predicted):
-            slope = np.cov(x, y)[0, 1] / np.var(x, ddof=1)
-            return y - y.mean() - slope * (x - x.mean())
-
-        r = np.corrcoef(residual(costs), residual(policy.astype(float)))[0, 1]
-        freedom = len(costs) - 3
-        expected = stats.t.cdf(r * np.sqrt(freedom / (1 - r**2)), freedom)
-        chance = probability_of_chance(
+        costs = 2 * predicted + rng.normal(size=sizes.sum()) * np.where(policy, 300, 50)
+        X = np.column_stack([policy, ~policy, (predicted - 1e3) / 1e3]).astype(float)
+        solver = np.linalg.pinv(X)
+        coefficients, row = solver @ costs, solver[0] - solver[1]
+        rest = costs - X @ coefficients
+        parts = np.array([np.sum(row[k] ** 2) * np.sum(rest[k] ** 2) for k in (policy, ~policy)])
+        parts /= sizes - 1.5
+        freedom = parts.sum() ** 2 / np.sum(parts**2 / (sizes - 1.5))
+        expected = coefficients[0] - coefficients[1]
+        difference, chance = analyze_covariance(
             episodes(costs[policy], predicted[policy]), episodes(costs[~policy], predicted[~policy])
         )
-        assert chance == pytest.approx(expected, rel=1e-7)
+        assert difference == pytest.approx(expected, rel=1e-7)
+        t = expected / np.sqrt(parts.sum())
+        assert chance == pytest.approx(stats.t.cdf(t, freedom), rel=1e-6)
 
 
 @pytest.mark.slow
@@ -219,3 +225,95 @@ def test_without_scatter_equal_or_lower_costs_are_no_outlier_and_higher_ones_are
     old = episodes([4.25] * 3, predicted)
     assert excess_of_an_outlier(episodes([4.25, 4.0, 4.25], predicted), old) == 0
     assert excess_of_an_outlier(episodes([4.25, 4.0, 5.25], predicted), old) == pytest.approx(1)
+
+
+def test_a_margin_lets_an_episode_cost_so_much_more_than_its_prediction_limit() -> None:
+    old, new = episodes([4.25] * 3), episodes([4.25, 4.0, 4.3])
+    assert excess_of_an_outlier(new, old) == pytest.approx(0.05)
+    assert excess_of_an_outlier(new, old, margin=0.06) == 0
+
+
+def test_the_tests_of_a_run_share_its_significance_whatever_passes() -> None:
+    budget, spent = ErrorBudget(), []
+    for _ in range(10_000):
+        spent.append(budget.size(0.05))
+        budget = budget.after(spent[-1], passed=False)
+    assert spent[0] == pytest.approx(0.025)
+    assert all(later < earlier for earlier, later in pairwise(spent))
+    assert 0.0499 < sum(spent) < 0.05
+
+
+def test_a_test_that_passes_hands_its_size_on_once() -> None:
+    refused = ErrorBudget().after(0.025, passed=False)
+    passed = ErrorBudget().after(0.025, passed=True)
+    assert passed.size(0.05) == pytest.approx(refused.size(0.05) + 0.025)
+    later = [each.after(0.01, passed=False) for each in (passed, refused)]
+    assert later[0] == later[1]
+
+
+def test_promising_is_what_would_pass_if_it_went_on_like_that() -> None:
+    rng = np.random.default_rng(8)
+    noise = rng.normal(size=20)
+    old = episodes(noise[:10])
+    for gain in np.linspace(-1, 3, 9):
+        new = episodes(noise[10:] - gain)
+        twice = probability_of_chance(
+            episodes(np.tile(new.costs, 2)), episodes(np.tile(old.costs, 2))
+        )
+        assert is_promising(new, old, 0.01) == (twice < 0.01)
+    assert not is_promising(episodes(noise[10:] + 5), old, 0.01)
+    assert is_promising(episodes(noise[10:] - 5), old, 0.01)
+
+
+def a_run_errs(draw, trial, rng, candidates: int = 30) -> bool:
+    """Return whether one of a run's candidates is accepted, none of which is better."""
+    accepted, budget = draw(rng, 10), ErrorBudget()
+    for _ in range(candidates):
+        candidate = trial(rng, 10)
+        while True:
+            size = budget.size(0.05)
+            budget = budget.after(size, passed=False)
+            passes = probability_of_chance(candidate, accepted) < size
+            if not (passes or is_promising(candidate, accepted, budget.size(0.05))):
+                break
+            if excess_of_an_outlier(candidate, accepted, 0.01 * np.median(accepted.costs)) > 0:
+                break
+            if passes:
+                return True
+            if len(accepted.costs) <= len(candidate.costs):
+                accepted += draw(rng, 10)
+            else:
+                candidate += trial(rng, 10)
+    return False
+
+
+def skewed_costs(correlation: float, residual, noise: float = 0.0):
+    """Return a function that draws episodes whose costs and residuals are skewed as a plant's."""
+
+    def draw(rng, count: int) -> PlantEpisodes:
+        predicted, rest = rng.exponential(size=count), residual.rvs(count, random_state=rng)
+        costs = 1 + correlation * predicted + np.sqrt(1 - correlation**2) * rest
+        return PlantEpisodes(costs + noise * rng.normal(size=count), predicted)
+
+    return draw
+
+
+SAME = skewed_costs(0.3, stats.expon())
+NEARLY_EXACT = skewed_costs(0.99, stats.lognorm(1))
+NOISY = skewed_costs(0.99, stats.expon(), 0.05)
+NOISIER = skewed_costs(0.99, stats.expon(), 0.5)
+PAIRS = {
+    "correlation .3": (SAME, SAME),
+    "correlation .99": (NEARLY_EXACT, NEARLY_EXACT),
+    "noisy plant": (NOISIER, NOISIER),
+    "candidates that scatter more": (NOISY, NOISIER),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("runs", [40, pytest.param(1000, marks=pytest.mark.slow)])
+def test_of_runs_with_thirty_candidates_that_are_no_better_few_accept_any(name, runs) -> None:
+    """Tests of 5 % each, as on a single candidate, would err in two runs of five."""
+    rng, pair = np.random.default_rng(77), PAIRS[name]
+    wrong = sum(a_run_errs(*pair, rng) for _ in range(runs))
+    assert wrong <= (0.05 * runs if runs == 1000 else stats.binom.ppf(0.999, runs, 0.05))

@@ -14,7 +14,7 @@ from general_problems import LOADED, servo, solved
 from sample_plants import LinearPlant, feasible_states
 from sb3_yann import NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceObserver, LinearMPC
-from sb3_yann.guard.plant_acceptance import predicted_cost
+from sb3_yann.guard.covariate import predicted_cost
 from sb3_yann.wrappers import ObserveDisturbance, PreviousInput, SetPoint, StageCost
 
 NAMES = [
