@@ -15,14 +15,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.improve import improve
+from sb3_yann.commissioning.incumbent import Incumbent
 from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
-from sb3_yann.commissioning.plant import Plant, PlantEpisode, predicted_cost
+from sb3_yann.commissioning.plant import Plant, PlantEpisode, predicted_costs
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.evaluation.episodes import Source, one_env
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
-from sb3_yann.guard.rng import preserve_rng
-from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
 Costs = tuple[float, float, float]
@@ -98,7 +97,8 @@ class Commissioning:
         seed: int = 0,
         verbose: int = 0,
     ) -> None:
-        self.policy = require_yann_policy(model.policy, "Commissioning")
+        self.incumbent = Incumbent(model)
+        self.policy = self.incumbent.policy
         if not (isinstance(plant_env, str | gym.Env) or callable(plant_env)):
             raise TypeError(
                 f"plant_env = {plant_env!r} must be the id of an environment, a gymnasium.Env or a "
@@ -111,8 +111,6 @@ class Commissioning:
         self.iterations, self.seed = as_whole("iterations", iterations), as_whole("seed", seed, 0)
         self.record = Record(None if log_path is None else Path(log_path))
         self.largest = 1.0 if self.policy.max_correction is None else self.policy.max_correction
-        with preserve_rng():  # building an actor draws weights
-            self.mpc = self.policy.make_actor().state_dict()
         self.twin: PlantTwin | None = None
         self.watchdog: Watchdog | None = None
         record = Record(None if log_path is None else Path(log_path))
@@ -176,7 +174,7 @@ class Commissioning:
             if self._changed:
                 self.twin, self.watchdog, costs = None, None, (np.nan, np.nan, np.nan)
                 outlook = Outlook(self._first_bound, "MPC", len(journal.episodes) - 1, number)
-                self._give_back()
+                self.incumbent.give_back()
                 verdict: Verdict = "begins anew"
                 reason = "Two episodes in a row had an alarm."
             else:
@@ -202,10 +200,11 @@ class Commissioning:
         outlook, said = self._weigh(costs)
         if twin is None:
             why = f"There are {len(numbers)} episodes to learn from."
-            return costs, outlook, self._give_back(), f"{said}{why}"
-        if not twin.trusted:
+        elif not twin.trusted:
             why = " ".join(["The twin is not trusted.", *twin.trust.problems])
-            return costs, outlook, self._give_back(), f"{said}{why}"
+        if twin is None or not twin.trusted:
+            self.incumbent.give_back()
+            return costs, outlook, "the MPC acts", f"{said}{why}"
         self.twin, self.watchdog = twin, Watchdog.of(twin)
         outlook = replace(outlook, twin=numbers, twin_seed=seed)
         outlook, verdict, why = self._improve(twin, outlook, seed)
@@ -216,18 +215,19 @@ class Commissioning:
     ) -> tuple[Outlook, Verdict, str]:
         """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
         held, bound = ActorCheckpoint.of(self.policy), self.journal.outlook.max_correction
-        learnt = not self.policy.actor.mu.network.is_zero()
-        self._limit(outlook.max_correction)
+        learnt = self.incumbent.has_learnt
+        self.incumbent.limit(outlook.max_correction)
         found = improve(self.model, twin, self.iterations, seed=seed)
         first, last = found.checks[0], found.checks[-1]
         if found.accepted or (learnt and first.accepted):
             return outlook, "accepted", f"{100 * found.change:+.2f} % in the twin."
         if learnt and self.journal.accepted and first.safe and first.change <= 0:
             held.restore(self.policy)
-            self._limit(bound)
+            self.incumbent.limit(bound)
             said = f"{100 * first.change:+.2f} % in the twin; nothing better: {last.reason}."
             return replace(outlook, max_correction=bound), "stays", said
-        return outlook, self._give_back(), f"Nothing better was found: {last.reason}."
+        self.incumbent.give_back()
+        return outlook, "the MPC acts", f"Nothing better was found: {last.reason}."
 
     def _costs(self, plant: Plant, before: PlantTwin | None, now: PlantTwin | None) -> Costs:
         """Return the batch's mean costs, what was predicted, and what the MPC's would have been."""
@@ -237,10 +237,9 @@ class Commissioning:
             return np.nan, np.nan, np.nan
         cost, act = self.policy.problem.stage_cost, plant.policy if present else plant.mpc
         actual = np.mean([np.sum(cost(e.thetas[:-1], e.actions)) for e in quiet])
-        asked = (before, act), (now, plant.mpc)
         predicted, mpc = (
-            np.nan if twin is None else np.mean([predicted_cost(twin, e, by) for e in quiet])
-            for twin, by in asked
+            np.nan if twin is None else np.mean(predicted_costs(twin, quiet, by))
+            for twin, by in ((before, act), (now, plant.mpc))
         )
         return float(actual), float(predicted), float(mpc)
 
@@ -252,7 +251,7 @@ class Commissioning:
             return outlook, ""
         unsafe = sum(each.violations for each in played)
         if unsafe or actual > mpc:
-            self._give_back()
+            self.incumbent.give_back()
             said = f"It cost {actual:.5g}, the MPC would have {mpc:.5g}: it was taken back. "
             if unsafe:
                 said = f"It violated a limit in {unsafe} steps: it was taken back. "
@@ -271,28 +270,14 @@ class Commissioning:
     def _first_bound(self) -> float:
         return min(self.smallest, self.largest)
 
-    def _limit(self, max_correction: float) -> None:
-        self.policy.limit_correction(max_correction)
-        kwargs = self.model.policy_kwargs
-        self.model.policy_kwargs = {**kwargs, "max_correction": max_correction}
-
-    def _give_back(self) -> Verdict:
-        """Make the MPC the one that acts."""
-        self.policy.actor.load_state_dict(self.mpc)
-        self.policy.actor_target.load_state_dict(self.mpc)
-        return "the MPC acts"
-
     @contextmanager
     def _unless_cut_off(self) -> Iterator[None]:
-        """Leave everything as it was if an error or Ctrl-C cuts a decision off."""
-        before, bound = (self.twin, self.watchdog), self.policy.max_correction
-        held = ActorCheckpoint.of(self.policy)
+        before = self.twin, self.watchdog
         try:
-            yield
+            with self.incumbent.unless_cut_off():
+                yield
         except BaseException:
             self.twin, self.watchdog = before
-            held.restore(self.policy)
-            self._limit(self.largest if bound is None else bound)
             raise
 
     @property
@@ -313,9 +298,9 @@ class Commissioning:
         if not self.journal.batches:
             return
         if outlook.model is None:
-            self._give_back()
+            self.incumbent.give_back()
         else:
-            self._limit(outlook.max_correction)
+            self.incumbent.limit(outlook.max_correction)
             self.journal.record.load(outlook.model, self.model)
         if outlook.twin is not None:
             self.twin = self._fit(outlook.twin, outlook.twin_seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import actor_inputs
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -71,28 +72,29 @@ class Plant:
         self.env, self.model = env, model
         self.yann = require_yann_policy(model.policy, "Commissioning")
         self.problem = self.yann.problem
+        self.law, self.device = law_of(self.problem), self.yann.device
         self.range = self.problem.u_max - self.problem.u_min
 
     def policy(self, theta: Array) -> Array:
         """Return the policy's inputs (rows, m); the MPC's where they are not finite."""
         layer = self.yann.actor.mu
-        if self.yann.device.type != "cpu":
-            with th.no_grad():
-                actions = layer(th.as_tensor(theta, device=self.yann.device)).double().cpu().numpy()
-            u = self._inputs(actions)
-        else:
+        if self.device.type == "cpu":
             u = actor_inputs(layer, self.problem, theta)
-        return np.where(np.isfinite(u), u, self.mpc(theta))
+        else:
+            with th.no_grad():
+                actions = layer(th.as_tensor(theta, device=self.device)).double().cpu().numpy()
+            u = (self.problem.u_max + self.problem.u_min) / 2 + self.range / 2 * actions
+        finite = np.isfinite(u)
+        return u if finite.all() else np.where(finite, u, self.mpc(theta))
 
     def mpc(self, theta: Array) -> Array:
-        """Return the MPC's inputs (rows, m)."""
-        with th.no_grad():
-            at = th.as_tensor(theta, device=self.yann.device)
-            return self._inputs(self.yann.actor.mu.law(at).double().cpu().numpy())
-
-    def _inputs(self, actions: Array) -> Array:
-        low, high = self.problem.u_min, self.problem.u_max
-        return np.asarray((high + low) / 2 + (high - low) / 2 * actions)
+        """Return the MPC's inputs (rows, m), within the bounds of their rate if there are some."""
+        u, problem = self.law(theta), self.problem
+        if not problem.has_rate_bounds:
+            return u
+        previous = theta[:, problem.layout.previous]
+        low, high = previous + problem.rate.du_min, previous + problem.rate.du_max
+        return np.clip(np.clip(u, low, high), problem.u_min, problem.u_max)
 
     def play(self, seed: int, act: Inputs, watchdog: Watchdog | None) -> PlantEpisode:
         """Play an episode; after an alarm the MPC acts, from the very sample on.
@@ -158,18 +160,20 @@ def _look(
     return watchdog.watch(known, u.astype(np.float64), read)
 
 
-def predicted_cost(twin: PlantTwin, episode: PlantEpisode, act: Inputs) -> float:
-    """Return what a policy would have cost from an episode's start, by the mean of the members.
+def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inputs) -> Array:
+    """Return what a policy would have cost from each episode's start, by the members' mean.
 
-    References and disturbances are those of the episode.
+    References and disturbances are those of the episodes.
     """
     dynamics, constant = twin.dynamics, twin.problem.layout.constant
-    theta = np.repeat(episode.thetas[:1][None], len(dynamics.members), axis=0)
-    costs = np.zeros(len(dynamics.members))
+    lengths, members = np.array([len(each.actions) for each in episodes]), len(dynamics.members)
+    theta = np.repeat(np.array([[each.thetas[0] for each in episodes]]), members, axis=0)
+    shape, costs = theta.shape, np.zeros(theta.shape[:2])
     with np.errstate(all="ignore"):
-        for now in episode.thetas[:-1]:
-            theta[..., constant] = now[constant]
-            u = act(theta[:, 0])[:, None]
-            costs += twin.problem.stage_cost(theta, u)[:, 0]
+        for k in range(lengths.max()):
+            now = [each.thetas[min(k, last)] for each, last in zip(episodes, lengths, strict=True)]
+            theta[..., constant] = np.array(now)[:, constant]
+            u = act(theta.reshape(-1, shape[-1])).reshape(*shape[:2], -1)
+            costs += np.where(k < lengths, twin.problem.stage_cost(theta, u), 0.0)
             theta = dynamics.step(theta, u)
-    return float(costs.mean())
+    return np.asarray(costs.mean(axis=0))

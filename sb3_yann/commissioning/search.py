@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.commissioning.trial import Check, Outcome, Trial
+from sb3_yann.commissioning.trial import Check, Trial
 from sb3_yann.control import LinearMPC, lqr
 from sb3_yann.networks import RowAdam, YannLayer
 from sb3_yann.twin.dynamics import law_of
@@ -23,11 +23,12 @@ SETTLED = 0.05
 """A run is so long that a deviation shrinks to this, if it may."""
 PLATEAU = 1e-4
 """A gain from one check to the next, relative to the MPC's cost, that is not worth another."""
-MOST = 1.0
-EMPHASIS = 20.0
+MOST = 3.0
+"""How many times as much a run may count at most that costs less than the mean one."""
+EMPHASIS = 100.0
 """How many times as much a run counts that costs more than with the MPC."""
-HARDEST, SHARE = 20, 0.4
-"""How many hard starts are kept for each member, and which share of a gradient's runs they are."""
+HARDEST, SHARE = 50, 0.6
+"""How many new hard starts are kept for each member; the share of hard ones in a gradient's runs."""
 PENALTY = 10.0
 """Of a step one half-width beyond a limit, in mean costs of a run."""
 
@@ -66,7 +67,8 @@ class Search:
         self.n_starts, self.checked, self.longest = n_starts, checked, longest
         self.trial = self._draw()
         self.outcome = self.trial.mpc
-        self.hard = [np.empty((0, problem.n_theta))] * members
+        nothing: list[Array] = [np.empty((0, problem.n_theta))] * members
+        self.known_hard = self.new_hard = nothing
         penalty, value = PENALTY * self.trial.mean, _value(problem)
         self.objective = Objective(problem, value, twin.limits.low, twin.limits.high, penalty)
         self.accepted, self.law = copy.deepcopy(layer.state_dict()), law_of(problem)
@@ -134,36 +136,32 @@ class Search:
         """Check the layer on the known starts, then on new ones; learn from what it loses."""
         played = self.trial.play(self._inputs)
         found = self.trial.check(iteration, played, self.outcome)
-        self._remember(self.trial, played)
+        self.known_hard = self.trial.hard(played)
         if not found.accepted:
             return found
         new = self._draw()
         there = new.play(self._inputs)
-        self._remember(new, there)
+        pairs = zip(new.hard(there), self.new_hard, strict=True)
+        self.new_hard = [np.concatenate(each)[:HARDEST] for each in pairs]
         confirmed = new.check(iteration, there, new.mpc)
         if not confirmed.accepted:
             return replace(found, accepted=False, reason=f"on new starts, {confirmed.reason}")
         self.outcome = played
         return found
 
-    def _remember(self, trial: Trial, played: Outcome) -> None:
-        """Keep the hardest starts of each member for the gradients to come."""
-        for i, hard in enumerate(trial.hard(played)):
-            self.hard[i] = np.concatenate([trial.starts[i, hard], self.hard[i]])[:HARDEST]
-
     def _step(self, optimizer: Any) -> None:
         optimizer.zero_grad()
         members, batch = self.shape
         drawn = self.twin.starts.draw_anywhere(members * batch, self.rng)
         starts = self.rng.permutation(drawn).reshape(members, batch, -1)
-        for i, hard in enumerate(self.hard):
-            count = min(len(hard), int(SHARE * batch))
-            starts[i, :count] = self.rng.permutation(hard)[:count]
+        for i, hard in enumerate(zip(self.known_hard, self.new_hard, strict=True)):
+            chosen = self.rng.permutation(np.concatenate(hard))[: int(SHARE * batch)]
+            starts[i, : len(chosen)] = chosen
         dynamics = self.twin.dynamics
         with np.errstate(all="ignore"):
             runs = dynamics.roll_out(self.law, starts, self.steps)
             mpc = self.objective.costs(*runs)
-            # Starts around the log may be many times as dear: none counts for more than one of it.
+            # Relative costs count: starts around the log may be many times as dear as those in it.
             weights = np.minimum(MOST, self.trial.mean / np.maximum(np.abs(mpc), 1e-300))
             reference = mpc, weights, weights * (1 + EMPHASIS)
             accumulate_gradient(self.layer, dynamics, self.objective, starts, self.steps, reference)

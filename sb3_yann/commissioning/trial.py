@@ -14,9 +14,9 @@ from sb3_yann.guard.statistics import PairedEpisodes
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
-MARGIN = 5e-4
+MARGIN = 7e-4
 """What one start may cost more than with the MPC on one member, in mean costs of the MPC."""
-AROUND = 0.01
+AROUND = 0.02
 """What a start outside the log may cost more besides, as a fraction of the MPC's cost of it."""
 FURTHER = 0.01
 """How much farther than the MPC a run may leave what the log shows, in its widths."""
@@ -133,8 +133,9 @@ class Trial:
         """Return what each start may cost more than with the MPC."""
         return MARGIN * self.mean + AROUND * np.abs(self.mpc[0]) * ~self.known
 
-    def hard(self, played: Outcome) -> NDArray[np.bool_]:
-        """Return which starts (members, starts) a policy loses, or nearly."""
+    def hard(self, played: Outcome) -> list[Array]:
+        """Return the starts of each member that a policy loses, or nearly."""
         loses = ~(played[0] - self.mpc[0] <= NEARLY * self.room())
         unsafe = np.any(played[1] > self.mpc[1], axis=1)
-        return np.asarray((loses | unsafe).reshape(self.starts.shape[:2]))
+        chosen = (loses | unsafe).reshape(self.starts.shape[:2])
+        return [starts[which] for starts, which in zip(self.starts, chosen, strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -11,8 +12,8 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG
 
-from sb3_yann import Commissioning, YannPolicy
-from sb3_yann.commissioning import commissioning
+from sb3_yann import Commissioning, Improvement, YannPolicy
+from sb3_yann.commissioning import Check, commissioning
 from twin_samples import Cart, problem
 from weights import is_mpc
 
@@ -50,17 +51,17 @@ class Faulty(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound() -> None:
-    run = commission()
+    run = commission(batch=5)
     first, second = run.run(2)
     assert (first.acted, first.verdict) == ("MPC", "accepted")
     assert second.acted == "batch 1" and second.max_correction == 0.2
-    assert [first.episodes, second.episodes] == [3, 6]
+    assert [first.episodes, second.episodes] == [5, 10]
     law, m = problem().explicit(), problem()
     for k, each in enumerate(run.episodes):
         apart = np.abs(each.actions - law(each.thetas[:-1])) / (m.u_max - m.u_min)
-        assert apart.max() <= (1e-6 if k < 3 else 0.2 + 1e-6)
+        assert apart.max() <= (1e-6 if k < 5 else 0.2 + 1e-6)
     assert second.cost < second.mpc  # the MPC's, by the twin, from the same starts
-    assert second.predicted == pytest.approx(second.cost, rel=0.05)
+    assert second.predicted == pytest.approx(second.cost, rel=0.1)
 
 
 def test_only_accepted_policies_act(tmp_path) -> None:
@@ -165,15 +166,32 @@ def test_a_violation_takes_the_policy_back() -> None:
 
 
 def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> None:
-    run = commission()
+    run = commission(max_correction=1.0)
     run.run(1)
     with th.no_grad():  # what was accepted turns out to be bad: the plant says so
         for each in run.policy.actor.parameters():
-            each.add_(0.3)
-    monkeypatch.setattr(commissioning, "improve", lambda *_, **__: run.found)
-    run.found = commissioning.Improvement((), 0.0) if hasattr(commissioning, "Improvement") else None
-    costs = run._weigh((10.0, 8.0, 9.0))
-    assert costs == (run.journal.outlook, "")  # the policy has not played yet
+            each.add_(0.2 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
+    monkeypatch.setattr(commissioning, "improve", lambda *_, **__: found)
+    found = Improvement((Check(1, False, "nothing", 0.0, 0.0, True),), 0.0)
+    last = run.run(2)[-1]
+    assert last.cost > last.mpc and "taken back" in last.reason
+    assert last.verdict == "the MPC acts" and is_mpc(run.model)
+
+
+def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatch) -> None:
+    run = commission(batch=5)
+    run.run(1)
+    bound = run.policy.max_correction
+    before = [each.clone() for each in run.policy.actor.parameters()]
+    refused = Check(0, False, "start 3 costs a little more", -0.01, 0.001, True)
+    monkeypatch.setattr(commissioning, "improve", lambda *_, **__: Improvement((refused,), 0.0))
+    assert run.run(2)[-1].verdict == "stays"
+    assert all(th.equal(a, b) for a, b in zip(before, run.policy.actor.parameters(), strict=True))
+    assert run.policy.max_correction == bound
+    unsafe = replace(refused, safe=False)
+    monkeypatch.setattr(commissioning, "improve", lambda *_, **__: Improvement((unsafe,), 0.0))
+    run.batch = 1  # short
+    assert run.run(3)[-1].verdict == "the MPC acts" and is_mpc(run.model)
 
 
 def test_shadow_computes_and_does_not_act() -> None:
@@ -185,7 +203,7 @@ def test_shadow_computes_and_does_not_act() -> None:
         np.testing.assert_allclose(each.actions, law(each.thetas[:-1]), atol=1e-6)
     assert run.episodes[0].apart < 1e-6
     assert run.episodes[5].apart > 1e-3  # what it would have done
-    assert not is_mpc(run.model.policy) if callable(is_mpc) else True
+    assert not is_mpc(run.model)
 
 
 @pytest.mark.parametrize(
