@@ -1,13 +1,19 @@
-"""What the watchdog finds on the reactor, and when: `python -m experiments.watchdog`."""
+"""What the watchdog finds on the reactor, and when: `python -m experiments.watchdog`, ten minutes.
+
+Prints the table of docs/commissioning.md. Its factors were set on other logs and other starts.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from stable_baselines3 import DDPG
 
-from sb3_yann_envs import cstr
+from sb3_yann import PlantTwin, improve
+from sb3_yann.commissioning.watchdog import Alarm, Watchdog
+from sb3_yann_envs import cstr, problems
 
 Act = Callable[[np.ndarray], np.ndarray]
 NOISE = np.array([0.001, 0.001, 0.001, 0.03])  # mol/L and K
@@ -18,12 +24,29 @@ class Fault(NamedTuple):
     """What goes wrong from a step on: parameters times a factor, a sensor or the actuator."""
 
     name: str
-    factors: dict[str, float] = {}  # noqa: RUF012 (is only read)
+    factors: dict[str, float] = {}
     sensor: int | None = None
     actuator: bool = False
 
 
 QUIET = Fault("quiet")
+FAULTS = (
+    Fault("wanted reaction 10 % faster", {"k1": 1.1}),
+    Fault("wanted reaction 10 % slower", {"k1": 0.9}),
+    Fault("feed of B 10 % lower", {"feed B": 0.9}),
+    Fault("heat transfer 10 % better", {"transfer": 1.1}),
+    Fault("heat transfer 10 % worse", {"transfer": 0.9}),
+    Fault("C_A sensor frozen", sensor=0),
+    Fault("C_B sensor frozen", sensor=1),
+    Fault("C_S sensor frozen", sensor=2),
+    Fault("T sensor frozen", sensor=3),
+    Fault("actuator stuck", actuator=True),
+)
+LOGS = {4: (300, 301), 10: (310, 311), 20: (320, 321)}
+"""Seeds of logs of so many episodes."""
+QUIET_EPISODES, FAULTY_EPISODES, RUNS = 17, 3, 200
+BATCHES = {4: 6, 10: 10, 20: 14}
+"""A run: how many episodes follow which log before the watchdog is calibrated anew."""
 PLANT = {"k1": 1.0, "k2": 1.0, "feed A": 4.3, "feed B": 5.1, "feed S": 3.0,
          "feed T": cstr.FEED_TEMPERATURE, "transfer": 1.0, "coolant T": 373.0}  # fmt: skip
 
@@ -59,8 +82,17 @@ def step(x: np.ndarray, u: np.ndarray, factors: dict[str, np.ndarray]) -> np.nda
     return np.asarray(x - cstr.X_SS)
 
 
-def play(act: Act, runs: int, seed: int, fault: Fault = QUIET, noise: float = 0.0):
-    """Return readings (runs, T + 1, 4), inputs (runs, T, 1), hot (runs, T), onsets (runs,)."""
+class Played(NamedTuple):
+    """Episodes side by side."""
+
+    readings: np.ndarray  # (runs, T + 1, 4)
+    inputs: np.ndarray  # (runs, T, 1)
+    hot: np.ndarray  # (runs, T), beyond the limit
+    onsets: np.ndarray  # (runs,), of the fault
+
+
+def play(act: Act, runs: int, seed: int, fault: Fault = QUIET, noise: float = 0.0) -> Played:
+    """Return episodes of a policy on the plant, with a fault from some step on."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(cstr.START_LOW, cstr.START_HIGH, (runs, 4))
     onset = rng.integers(5, STEPS // 2, runs)
@@ -84,4 +116,78 @@ def play(act: Act, runs: int, seed: int, fault: Fault = QUIET, noise: float = 0.
             x = step(x, u, {n: np.where(on, f, 1.0) for n, f in fault.factors.items()})
             x = np.clip(np.nan_to_num(x, nan=1e3), [-3, -3, -3, -70], [3, 3, 3, 25])
         hot[:, k] = x[:, 3] > cstr.TEMPERATURE_LIMIT - cstr.X_SS[3]
-    return readings, inputs, hot, onset
+    return Played(readings, inputs, hot, onset)
+
+
+def watch(dog: Watchdog, act: Act, played: Played) -> list[tuple[int, Alarm] | None]:
+    """Return the first alarm of each episode, with its step."""
+    found: list[tuple[int, Alarm] | None] = []
+    for x, u, hot in zip(played.readings, played.inputs, played.hot, strict=True):
+        dog.start(x[0], act)
+        rows = enumerate(zip(x, u, x[1:], hot, strict=False))
+        alarms = ((k, dog.watch(*row)) for k, row in rows)
+        found.append(next(((k, alarm) for k, alarm in alarms if alarm is not None), None))
+    return found
+
+
+def delays(found: list[tuple[int, Alarm] | None], onsets: np.ndarray) -> list[float]:
+    """Return steps from the onset to the alarm: infinite without one, NaN for one before it."""
+    late = [
+        np.inf if each is None else each[0] - at for each, at in zip(found, onsets, strict=True)
+    ]
+    return [np.nan if each < 0 else float(each) for each in late]
+
+
+def improved(problem: Any, twin: PlantTwin) -> Act:
+    """Return a policy that is better than the MPC in a twin."""
+    options = {"policy_kwargs": {"problem": problem}, "device": "cpu"}
+    model = DDPG("YannPolicy", "CSTR-v0", **options)
+    improve(model, twin)
+    return lambda rows: np.asarray(model.predict(np.float32(rows), deterministic=True)[0])
+
+
+def main() -> None:
+    """Print the tables."""
+    problem = problems.cstr()
+    law = problem.explicit()
+    log = play(law, 10, seed=299)
+    better = improved(
+        problem, PlantTwin.fit(problem, [*zip(log.readings, log.inputs, strict=True)])
+    )
+    quiet: dict[tuple[float, int], list[bool]] = {}
+    print("| noise | log | policy | fault | found | median delay |")
+    print("| --- | ---: | --- | --- | ---: | ---: |")
+    for noise, (n, seeds) in ((noise, each) for noise in (0.0, 1.0) for each in LOGS.items()):
+        alarms: list[bool] = []
+        late: dict[tuple[str, str], list[float]] = {}
+        for seed in seeds:
+            log = play(law, n, seed, noise=noise)
+            dog = Watchdog.of(PlantTwin.fit(problem, [*zip(log.readings, log.inputs, strict=True)]))
+            for name, act in (("MPC", law), ("improved", better)):
+                calm = play(act, QUIET_EPISODES, seed + 1000, noise=noise)
+                found = watch(dog, act, calm)
+                alarms += [each is not None for each in found]
+                for i, fault in enumerate(FAULTS):
+                    hurt = play(act, FAULTY_EPISODES, seed + 2000 + 10 * i, fault, noise)
+                    found = watch(dog, act, hurt)
+                    late.setdefault((name, fault.name), []).extend(delays(found, hurt.onsets))
+        quiet[noise, n] = alarms
+        for (name, fault_name), each in late.items():
+            share, middle = np.isfinite(each).mean(), np.nanmedian(each)
+            print(
+                f"| {noise:g} | {n} | {name} | {fault_name} | {100 * share:.0f} % | {middle:.0f} |"
+            )
+        print(f"| {noise:g} | {n} | both | quiet: {sum(alarms)} alarms in {len(alarms)} episodes |"
+              " | |", flush=True)  # fmt: skip
+    rng = np.random.default_rng(0)
+    for noise in (0.0, 1.0):
+        loud = sum(
+            any(rng.choice(quiet[noise, n], size).any() for n, size in BATCHES.items())
+            for _ in range(RUNS)
+        )
+        print(f"noise {noise:g}: {loud} of {RUNS} runs of {sum(BATCHES.values())} quiet episodes "
+              "have an alarm")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""How familiar a point is to a plant's log: what a residual may be there, and is not known to be."""
+"""How familiar a point is to a plant's log: how far the twin's residual may be wrong there."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class Familiarity:
     Attributes
     ----------
     problem : LinearMPC
-    scale, low, high, prior : ndarray, shape (k,)
-        Of the features ``[x, d, u]``: magnitudes, the log's box, shares of the prior.
+    scale, low, high : ndarray, shape (k,)
+        Of the features ``[x, d, u]``: magnitudes, and the log's box.
     monomials : Monomials
     axes : ndarray, shape (size, size)
-        Eigenvectors of the features' Gram matrix, of its shares of the prior.
+        Eigenvectors of the Gram matrix of the monomials, each times its share of the prior.
     variances : ndarray, shape (size, n)
         Posterior variances along them.
     size : ndarray, shape (n,)
@@ -84,8 +84,8 @@ class Familiarity:
         size = np.sqrt(np.mean(np.concatenate(explained) ** 2, axis=0) + (LEAST * error) ** 2)
         known = np.maximum(values, 0.0)[:, None] * white / error**2
         low, high = seen.min(axis=0), seen.max(axis=0)
-        return cls(problem, scale, low, high, monomials, share[:, None] * axes,
-                   1.0 / (known + 1.0 / size**2), size)  # fmt: skip
+        variances = 1.0 / (known + 1.0 / size**2)
+        return cls(problem, scale, low, high, monomials, share[:, None] * axes, variances, size)
 
     @cached_property
     def _width(self) -> Array:

@@ -158,9 +158,9 @@ class Watchdog:
         if self._episode is None:
             raise RuntimeError("No episode has begun: call start(theta, act) first.")
         if self.alarm is None:
-            rows = (np.array(each, np.float64) for each in (theta, u, after))
+            theta, u, after = (np.array(each, np.float64) for each in (theta, u, after))
             with np.errstate(all="ignore"):
-                self.alarm = self._seen(self._episode, *rows, violation)
+                self.alarm = self._seen(self._episode, theta, u, after, violation)
         return self.alarm
 
     def _seen(
