@@ -58,8 +58,8 @@ class Tracks:
     familiarity: Familiarity
     theta: Array
     act: Act
-    steps: int = 0
-    cost: float = 0.0
+    steps: int = field(default=0, init=False)
+    cost: float = field(default=0.0, init=False)
     costs: Array = field(init=False)
     charts: Array = field(init=False)
     doubts: Array = field(init=False)
@@ -169,9 +169,12 @@ class Bands:
         )
 
     def ratios(self, tracks: Tracks) -> Array:
-        """Return charts (gains, n) in units of their bands: beyond 1 something is wrong."""
+        """Return charts (gains, n) in units of their bands: beyond 1 something is wrong.
+
+        A slow observer of an unstable plant may run away; its charts are left out.
+        """
         band = self.factor * self.most * np.hypot(self.spread, tracks.doubts)
-        return np.asarray(tracks.charts / band)
+        return np.nan_to_num(tracks.charts / band, nan=0.0, posinf=np.inf, neginf=-np.inf)
 
     def cost_ratio(self, tracks: Tracks) -> float:
         """Return by how much the plant has cost more than the twin, in units of the band."""

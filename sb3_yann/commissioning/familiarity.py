@@ -96,5 +96,6 @@ class Familiarity:
         z = features(self.problem, theta, u)
         beyond = np.maximum(np.maximum(z - self.high, self.low - z), 0.0)
         far = (beyond / self._width).sum()
+        far += far**2  # a twin of a narrow log underrates what is far away
         along = self.monomials.values(z / self.scale) @ self.axes
         return np.asarray(np.sqrt(along**2 @ self.variances + (far * self.size) ** 2))
