@@ -155,7 +155,7 @@ class Bands:
             found += [_played(model, known, each, offset) for each in out]
         charts, doubts, ratios = (np.concatenate(each) for each in zip(*found, strict=True))
         spread = np.sqrt(np.mean(charts**2, axis=0)) + 1e-9 * error
-        most = np.max(np.abs(charts) / np.hypot(spread, doubts), axis=0)
+        most = np.fmax.reduce(np.abs(charts) / np.hypot(spread, doubts), axis=0)
         return cls(
             familiarity=Familiarity.of(twin, log, error, white),
             error=error,
@@ -174,7 +174,8 @@ class Bands:
         A slow observer of an unstable plant may run away; its charts are left out.
         """
         band = self.factor * self.most * np.hypot(self.spread, tracks.doubts)
-        return np.nan_to_num(tracks.charts / band, nan=0.0, posinf=np.inf, neginf=-np.inf)
+        ratios = tracks.charts / band
+        return np.where(np.isnan(ratios), 0.0, ratios)
 
     def cost_ratio(self, tracks: Tracks) -> float:
         """Return by how much the plant has cost more than the twin, in units of the band."""
