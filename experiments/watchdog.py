@@ -1,4 +1,4 @@
-"""What the watchdog finds on the reactor, and when: `python -m experiments.watchdog`, half an hour.
+"""What the watchdog finds on the reactor, and when: `python -m experiments.watchdog`, ten minutes.
 
 Prints the table of docs/commissioning.md. Its factors were set on other logs and other starts.
 """
@@ -42,7 +42,7 @@ FAULTS = (
     Fault("T sensor frozen", sensor=3),
     Fault("actuator stuck", actuator=True),
 )
-LOGS = {4: (400, 401), 10: (410, 411), 20: (420, 421)}
+LOGS = {4: (500, 501), 10: (510, 511), 20: (520, 521)}
 """Seeds of logs of so many episodes."""
 QUIET_EPISODES, FAULTY_EPISODES, RUNS = 17, 2, 200
 BATCHES = {4: 6, 10: 10, 20: 14}
