@@ -42,7 +42,7 @@ FAULTS = (
     Fault("T sensor frozen", sensor=3),
     Fault("actuator stuck", actuator=True),
 )
-LOGS = {4: (500, 501), 10: (510, 511), 20: (520, 521)}
+LOGS = {4: (600, 601), 10: (610, 611), 20: (620, 621)}
 """Seeds of logs of so many episodes."""
 QUIET_EPISODES, FAULTY_EPISODES, RUNS = 17, 2, 200
 BATCHES = {4: 6, 10: 10, 20: 14}
@@ -130,12 +130,21 @@ def watch(dog: Watchdog, act: Act, played: Played) -> list[tuple[int, Alarm] | N
     return found
 
 
-def delays(found: list[tuple[int, Alarm] | None], onsets: np.ndarray) -> list[float]:
-    """Return steps from the onset to the alarm: infinite without one, NaN for one before it."""
-    late = [
-        np.inf if each is None else each[0] - at for each, at in zip(found, onsets, strict=True)
-    ]
-    return [np.nan if each < 0 else float(each) for each in late]
+def summary(delays: list[float]) -> str:
+    """Return how many faults were found, and the median delay of those."""
+    found = [each for each in delays if np.isfinite(each)]
+    middle = f", {np.median(found):.0f}" if found else ""
+    return f"{len(found)} of {len(delays)}{middle}"
+
+
+def late(found: list[tuple[int, Alarm] | None], onsets: np.ndarray) -> list[float]:
+    """Return samples from the onset to the alarm, infinite without one.
+
+    A sample earlier than the onset is a false alarm; such episodes are left out.
+    """
+    pairs = zip(found, onsets, strict=True)
+    steps = [np.inf if each is None else each[0] + 1.0 - at for each, at in pairs]
+    return [each for each in steps if each >= 0]
 
 
 def improved(problem: Any, twin: PlantTwin) -> Act:
@@ -154,32 +163,31 @@ def main() -> None:
     better = improved(
         problem, PlantTwin.fit(problem, [*zip(log.readings, log.inputs, strict=True)])
     )
+    cases = [(noise, n) for noise in (0.0, 1.0) for n in LOGS]
     quiet: dict[tuple[float, int], list[bool]] = {}
-    print("| noise | log | policy | fault | found | median delay |")
-    print("| --- | ---: | --- | --- | ---: | ---: |")
-    for noise, (n, seeds) in ((noise, each) for each in LOGS.items() for noise in (0.0, 1.0)):
+    table: dict[tuple[str, str], list[str]] = {}
+    for noise, n in cases:
         alarms: list[bool] = []
-        late: dict[tuple[str, str], list[float]] = {}
-        for seed in seeds:
+        found: dict[tuple[str, str], list[float]] = {}
+        for seed in LOGS[n]:
             log = play(law, n, seed, noise=noise)
             dog = Watchdog.of(PlantTwin.fit(problem, [*zip(log.readings, log.inputs, strict=True)]))
-            for name, act in (("MPC", law), ("improved", better)):
-                calm = play(act, QUIET_EPISODES, seed + 1000, noise=noise)
-                found = watch(dog, act, calm)
-                alarms += [each is not None for each in found]
+            for k, (name, act) in enumerate((("MPC", law), ("improved", better))):
+                calm = play(act, QUIET_EPISODES, seed + 1000 + 500 * k, noise=noise)
+                alarms += [each is not None for each in watch(dog, act, calm)]
                 for i, fault in enumerate(FAULTS):
                     hurt = play(act, FAULTY_EPISODES, seed + 2000 + 10 * i, fault, noise)
-                    found = watch(dog, act, hurt)
-                    late.setdefault((name, fault.name), []).extend(delays(found, hurt.onsets))
+                    delays = late(watch(dog, act, hurt), hurt.onsets)
+                    found.setdefault((fault.name, name), []).extend(delays)
         quiet[noise, n] = alarms
-        for (name, fault_name), each in late.items():
-            before = np.isnan(each)
-            share, middle = np.isfinite(each).sum(), np.median(np.array(each)[~before])
-            total = len(each) - before.sum()
-            row = f"{noise:g} | {n} | {name} | {fault_name} | {share} of {total} | {middle:.0f}"
-            print(f"| {row} |")
-        print(f"| {noise:g} | {n} | both | quiet: {sum(alarms)} alarms in {len(alarms)} episodes |"
-              " | |", flush=True)  # fmt: skip
+        for row, delays in found.items():
+            table.setdefault(row, []).append(summary(delays))
+        table.setdefault(("false alarms", "both"), []).append(f"{sum(alarms)} of {len(alarms)}")
+    heads = [f"{'noise' if noise else 'no noise'}, {n} episodes" for noise, n in cases]
+    print("| fault | policy |", " | ".join(heads), "|")
+    print("| --- | --- |", " | ".join("---:" for _ in heads), "|")
+    for (fault_name, name), cells in table.items():
+        print(f"| {fault_name} | {name} |", " | ".join(cells), "|")
     rng = np.random.default_rng(0)
     for noise in (0.0, 1.0):
         loud = sum(

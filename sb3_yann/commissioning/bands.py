@@ -23,10 +23,10 @@ GAINS = np.array([1.0, 0.2, 0.05, 0.02])
 FOLDS = 10
 FEWEST = 4
 """Whole episodes to leave out one by one; of fewer, pieces are left out."""
-COST_FLOOR, COST_ERROR = 0.5, 0.03
+COST_FLOOR, COST_ERROR = 1.0, 0.03
 """Of the mean cost of an episode, and of what is predicted: what no cost band is narrower than."""
-FACTOR, FACTOR_OF_FEW = 1.6, 7.5
-"""A band is so many times the largest held-out ratio: 1.6 + 7.5 / episodes."""
+FACTOR, FACTOR_OF_FEW = 2.0, 7.5
+"""A band is so many times the largest held-out ratio: 2 + 7.5 / episodes."""
 LEAST_RATIO = 0.5
 """The largest ratio is taken to be at least this, however well the log is predicted."""
 NOISY = 0.3
