@@ -62,7 +62,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     The actor's parameters follow the gradient of the summed stage cost through unrolled runs of
     twin and actor, with the linear-quadratic value at the end. Every so many steps the policy is
     checked against the MPC, from seeded starts on every member of the twin. It is accepted if no
-    start costs more than with the MPC by 0.07 % of the mean, none violates more, and the mean is
+    start costs more than with the MPC by 0.05 % of the mean, none violates more, and the mean is
     not above that of the accepted policy; a start around the log may cost 2 % of its own more.
     What passes is confirmed on new starts. Starts that it loses, or nearly, are played in the
     gradients to come. What the model has learnt before is checked first.

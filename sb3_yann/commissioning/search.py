@@ -28,7 +28,7 @@ MOST = 3.0
 EMPHASIS = 100.0
 """How many times as much a run counts that costs more than with the MPC."""
 HARDEST, SHARE = 50, 0.6
-"""How many new hard starts are kept for each member; the share of hard ones in a gradient's runs."""
+"""How many new hard starts each member keeps; the share of hard ones in a gradient's runs."""
 PENALTY = 10.0
 """Of a step one half-width beyond a limit, in mean costs of a run."""
 

@@ -14,7 +14,7 @@ from sb3_yann.guard.statistics import PairedEpisodes
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
-MARGIN = 7e-4
+MARGIN = 5e-4
 """What one start may cost more than with the MPC on one member, in mean costs of the MPC."""
 AROUND = 0.02
 """What a start outside the log may cost more besides, as a fraction of the MPC's cost of it."""

@@ -21,7 +21,7 @@ from weights import is_mpc
 def commission(path: Any = None, env: Any = Cart, **options: Any) -> Commissioning:
     """Return a short commissioning of the cart."""
     model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
-    options = {"batch": 3, "iterations": 20, "max_correction": 0.2} | options
+    options = {"batch": 5, "iterations": 40, "max_correction": 0.2} | options
     return Commissioning(model, env, log_path=path, **options)
 
 
@@ -51,7 +51,7 @@ class Faulty(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound() -> None:
-    run = commission(batch=5)
+    run = commission()
     first, second = run.run(2)
     assert (first.acted, first.verdict) == ("MPC", "accepted")
     assert second.acted == "batch 1" and second.max_correction == 0.2
@@ -67,7 +67,7 @@ def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound
 def test_only_accepted_policies_act(tmp_path) -> None:
     path = tmp_path / "plant.jsonl"
     run = commission(path)
-    run.run(3)
+    run.run(2)
     events = [json.loads(line) for line in path.read_text().splitlines()]
     accepted, holds = {"MPC": None}, "MPC"
     for event in events[1:]:
@@ -111,7 +111,7 @@ def test_a_kill_at_any_moment_changes_nothing(tmp_path, monkeypatch) -> None:
             played += 1
             with path.open("ab") as file:
                 file.write(b'{"event": "epis')  # the write that was cut off
-    assert played == 8
+    assert played == 14
     assert run.batches == whole.batches or str(run.batches) == str(whole.batches)
     for one, other in zip(run.episodes, whole.episodes, strict=True):
         np.testing.assert_array_equal(one.thetas, other.thetas)
@@ -119,7 +119,7 @@ def test_a_kill_at_any_moment_changes_nothing(tmp_path, monkeypatch) -> None:
     np.testing.assert_array_equal(run.model.predict(theta)[0], whole.model.predict(theta)[0])
     again = commission(path)
     np.testing.assert_array_equal(again.model.predict(theta)[0], whole.model.predict(theta)[0])
-    assert again.run(2) == again.batches and len(again.episodes) == 9
+    assert again.run(2) == again.batches and len(again.episodes) == 15
 
 
 def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(monkeypatch) -> None:
@@ -142,27 +142,27 @@ def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(monkeypatch) -> N
 
 
 def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once() -> None:
-    env = Faulty(Cart(), 4, "nan", step=1)
+    env = Faulty(Cart(), 6, "nan", step=1)
     run = commission(env=env)
     run.run(2)
-    episode, law = run.episodes[4], problem().explicit()
+    episode, law = run.episodes[6], problem().explicit()
     assert episode.alarm is not None and episode.alarm.kind == "not a number"
     assert episode.step == 0
     u = np.clip(law(episode.thetas[1:-1]), -1, 1)  # on what the model predicts
     np.testing.assert_allclose(episode.actions[1:], u, atol=1e-5)
     assert np.isfinite(episode.thetas).all()
-    assert run.journal.by_policy[3:6] == [True, True, False]  # the MPC until an episode is quiet
-    assert 4 not in run.journal.log
+    assert run.journal.by_policy[5:8] == [True, True, False]  # the MPC until an episode is quiet
+    assert 6 not in run.journal.log
 
 
 def test_a_violation_takes_the_policy_back() -> None:
-    run = commission(env=Faulty(Cart(), 4, "violation"))
+    run = commission(env=Faulty(Cart(), 6, "violation"))
     run.run(1)
     assert run.journal.accepted
     run.run(2)
-    assert run.journal.by_policy == [False] * 3 + [True] * 2 + [False] * 4
+    assert run.journal.by_policy == [False] * 5 + [True] * 2 + [False] * 8
     assert "taken back" in run.batches[1].reason
-    assert run.episodes[4].violations == 1
+    assert run.episodes[6].violations == 1
 
 
 def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> None:
@@ -179,7 +179,7 @@ def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> Non
 
 
 def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatch) -> None:
-    run = commission(batch=5)
+    run = commission()
     run.run(1)
     bound = run.policy.max_correction
     before = [each.clone() for each in run.policy.actor.parameters()]
@@ -197,12 +197,12 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
 def test_shadow_computes_and_does_not_act() -> None:
     run = commission(shadow=True)
     run.run(2)
-    assert run.journal.by_policy == [False] * 9
+    assert run.journal.by_policy == [False] * 15
     law = problem().explicit()
     for each in run.episodes:
         np.testing.assert_allclose(each.actions, law(each.thetas[:-1]), atol=1e-6)
     assert run.episodes[0].apart < 1e-6
-    assert run.episodes[5].apart > 1e-3  # what it would have done
+    assert run.episodes[7].apart > 1e-3  # what it would have done
     assert not is_mpc(run.model)
 
 
@@ -223,7 +223,7 @@ def test_bad_input_is_named(options, says) -> None:
 def test_another_commissionings_record_is_refused(tmp_path) -> None:
     commission(tmp_path)
     assert (tmp_path / "commissioning.jsonl").exists()
-    with pytest.raises(ValueError, match="begun with batch = 3"):
+    with pytest.raises(ValueError, match="begun with batch = 5"):
         commission(tmp_path, batch=4)
     (tmp_path / "other.csv").write_text("episode,cost\n1,2\n")
     with pytest.raises(ValueError, match="line 1"):
