@@ -56,7 +56,7 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["guard", "policy", "twin"])
+@pytest.mark.parametrize("name", ["commissioning", "guard", "policy", "twin"])
 def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     run(f"docs/{name}.md")
@@ -68,7 +68,7 @@ def test_the_code_in_the_page_of_the_environments_runs() -> None:
 
 def test_every_page_with_code_is_run_by_a_test() -> None:
     found = {path.stem for path in PAGES if blocks(path.read_text(encoding="utf-8"))}
-    assert found == {"README", "environments", "guard", "mpc", "policy", "twin"}
+    assert found == {*("README", "commissioning", "environments", "guard", "mpc", "policy", "twin")}
 
 
 def test_the_tracking_problem_of_the_page_ends_at_its_reference(tmp_path, monkeypatch) -> None:

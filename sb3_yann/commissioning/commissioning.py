@@ -79,9 +79,9 @@ class Commissioning:
     >>> from stable_baselines3 import DDPG
     >>> from sb3_yann import Commissioning
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> batches = Commissioning(model, "CSTR-v0", batch=3, iterations=20).run(batches=2)
-    >>> [each.acted for each in batches]
-    ['MPC', 'batch 1']
+    >>> first = Commissioning(model, "CSTR-v0", batch=2, iterations=20).run(batches=1)[0]
+    >>> first.acted, first.episodes
+    ('MPC', 2)
     """
 
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +71,7 @@ class Trial:
     starts: Array
     n_known: int
     steps: int
-    far: Any = np.inf
+    far: Array = field(init=False)
     mpc: Outcome = field(init=False)
 
     def __post_init__(self) -> None:
