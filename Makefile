@@ -18,8 +18,9 @@ CODE := sb3_yann envs benchmarks experiments examples tests
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-demo: $(STAMP)  ## run the example, examples/cstr.py
+demo: $(STAMP)  ## run two examples, examples/cstr.py and examples/from_a_log.py
 	@$(PY) examples/cstr.py
+	@$(PY) examples/from_a_log.py
 
 paper: $(STAMP)  ## run the paper's experiments, hours (make paper ARGS="--quick" for minutes)
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m experiments $(ARGS)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from experiments import twin
 from experiments.results import in_short, write_report
 from experiments.runner import Outcome, Run, RunsFailed, load_all, run_all
 from experiments.summary import quote
@@ -39,17 +40,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             console.print(f"Interrupted. What is finished lies in {folder} and is not run again.")
             return 130
-    outcomes = load_all(runs, folder, catalog.FINGERPRINT)
+    everything = load_all(runs, folder, catalog.FINGERPRINT)
+    from_logs = {run: each for run, each in everything.items() if run.plant == twin.PLANT}
+    outcomes = {run: each for run, each in everything.items() if run not in from_logs}
     if outcomes:
         command = f'make paper ARGS="{shlex.join(given)}"' if given else "make paper"
         for path in write_report(outcomes, report_folder, command=command):
             console.print(f"Written: {path}")
         if not options.quick and quote(in_short(outcomes), Path("README.md")):
             console.print("Written: the results in README.md")
-    console.print(f"{len(outcomes)} of {len(runs)} runs are in {folder}.")
+    for path in twin.write_report(from_logs, report_folder):
+        console.print(f"Written: {path}")
+    console.print(f"{len(everything)} of {len(runs)} runs are in {folder}.")
     if failed:
         console.print(str(failed), style="red", markup=False)
-    return 1 if failed or not outcomes else 0
+    return 1 if failed or not everything else 0
 
 
 def _run(

@@ -20,8 +20,8 @@ from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 
-import sb3_yann
-from experiments import optimum, yardsticks
+from experiments import FINGERPRINT as FINGERPRINT
+from experiments import optimum, twin, yardsticks
 from experiments.measures import OURS
 from experiments.runner import Outcome, Run
 from experiments.yardsticks import Learner
@@ -35,8 +35,6 @@ GUARD_SEEDS = range(1_000_000, 1_000_200)
 """Starts on which a rival may choose its best policy: as many as the guard's, and new ones."""
 CHECKPOINTS = (0, 10, 20, 30, 40, 50, 75, 100, 150, 200)
 """Training episodes after which the policy is tested."""
-FINGERPRINT = f"{sb3_yann.__version__}-3"
-"""Results of another version are not taken for those of this one."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +217,7 @@ def _runs() -> list[Run]:
     return runs
 
 
-RUNS = _runs()
+RUNS = [*_runs(), *twin.runs()]
 QUICK = [
     *(Run(plant, name, 0, 0) for plant in ("CSTR", "pendulum, Q = I") for name in FIXED),
     Run("CSTR", OURS, 20, 8),
@@ -278,6 +276,8 @@ def execute(run: Run) -> Outcome:
     """Return the outcome of a run."""
     began = time.perf_counter()
     torch.set_num_threads(1)
+    if run.plant == twin.PLANT:
+        return twin.execute(run)
     plant = PLANTS[run.plant]
     test = partial(evaluate, env=plant.env_id, seeds=TEST_SEEDS)
     if run.learner in FIXED:

@@ -1,21 +1,28 @@
 """The reactor improved from a log alone: `python -m experiments.twin`, ten minutes on two cores.
 
 Ten logs of the MPC for each case, on none of which anything was tuned; 100 starts of the plant that
-are in no log. Prints the table of docs/twin.md.
+are in no log. Writes the table into docs/twin.md, and the picture beside it; `make paper` does so
+too. What is done lies in out/paper; to do it again, delete its files cstr-from-a-log-* there.
 """
 
 from __future__ import annotations
 
-import os
+import argparse
 import time
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3 import DDPG
 
+from experiments import FINGERPRINT
+from experiments.markdown import table
+from experiments.measures import MPC, OPTIMUM
+from experiments.optimum import cstr_optimum
+from experiments.pictures import save_from_a_log
+from experiments.runner import Outcome, Run, run_all
+from experiments.summary import quote
 from sb3_yann import PlantTwin, improve
 from sb3_yann.evaluation import evaluate
 from sb3_yann_envs import problems
@@ -27,18 +34,18 @@ CASES = {
     "five episodes, sensor noise of .001 mol/L and .03 K": (5, 1.0),
     "the same with ten times the noise": (5, 10.0),
 }
+PLANT = "CSTR, from a log"
 SEEDS = range(20, 30)
 STARTS = range(30_000, 30_100)
+HEADER = ("log", "trusted", "change of the mean cost, %", "gap closed, %", "seeds below -1.9 %",
+          "worst start, %", "violations", "improve, s")  # fmt: skip
+BEGIN, END = "<!-- from a log: begin -->\n", "<!-- from a log: end -->"
 
 
-class Outcome(NamedTuple):
-    """What came of one log; changes are in percent of the MPC's mean cost on the plant."""
-
-    trusted: bool
-    change: float
-    worst: float
-    violations: int
-    seconds: float
+def runs(seeds: Sequence[int] = SEEDS) -> list[Run]:
+    """Return the MPC, the optimum, and each case with each seed."""
+    fixed = [Run(PLANT, name, 0, 0) for name in (MPC, OPTIMUM)]
+    return [*fixed, *(Run(PLANT, case, seed, 0) for case in CASES for seed in seeds)]
 
 
 def log(episodes: int, noise: float, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -60,43 +67,94 @@ def log(episodes: int, noise: float, seed: int) -> list[tuple[np.ndarray, np.nda
     return found
 
 
-def run(case: str, seed: int) -> Outcome:
-    """Fit a twin to a log, improve the policy in it, and play it on the plant."""
-    th.set_num_threads(1)
-    problem = problems.cstr()
-    twin = PlantTwin.fit(problem, log(*CASES[case], seed), seed=seed)
-    if not twin.trusted:
-        return Outcome(False, 0.0, 0.0, 0, 0.0)
-    model = DDPG("YannPolicy", "CSTR-v0", policy_kwargs={"problem": problem}, device="cpu")
-    began = time.perf_counter()
-    improve(model, twin, seed=seed)
-    seconds = time.perf_counter() - began
-    ours = evaluate(model, "CSTR-v0", STARTS)
-    mpc = evaluate(problem.explicit(), "CSTR-v0", STARTS)
-    excess = 100 * (ours.costs - mpc.costs) / mpc.costs.mean()
-    return Outcome(True, excess.mean(), excess.max(), int(ours.violations.sum()), seconds)
+def execute(run: Run) -> Outcome:
+    """Fit a twin to a log, improve the policy in it, and play it on the plant.
+
+    Where the twin is not trusted the MPC is played.
+    """
+    mpc, seconds, trusted = problems.cstr(), 0.0, True
+    policy: Any = mpc.explicit()
+    if run.learner in CASES:
+        twin = PlantTwin.fit(mpc, log(*CASES[run.learner], run.seed), seed=run.seed)
+        trusted = twin.trusted
+    if run.learner in CASES and trusted:
+        policy = DDPG("YannPolicy", "CSTR-v0", policy_kwargs={"problem": mpc}, device="cpu")
+        began = time.perf_counter()
+        improve(policy, twin, seed=run.seed)
+        seconds = time.perf_counter() - began
+    played = evaluate(policy, "CSTR-v0", STARTS)
+    costs, violations = played.costs, played.violations
+    if run.learner == OPTIMUM:
+        costs, violations = cstr_optimum([each[0] for each in played.observations]), 0 * violations
+    none = np.zeros(0)
+    extra = {"trusted": np.array(trusted)}
+    return Outcome(np.zeros(1), costs[None], violations[None], none, none, none, extra, seconds)
 
 
-def row(case: str, outcomes: list[Outcome]) -> str:
-    """Return a case's row of the table."""
-    trusted = [each for each in outcomes if each.trusted]
-    change = np.array([each.change for each in outcomes])
-    worst = max(each.worst for each in outcomes)
-    violations = sum(each.violations for each in outcomes)
-    seconds = f"{np.median([each.seconds for each in trusted]):.0f}" if trusted else ""
-    spread = f"{np.median(change):+.2f} ({change.min():+.2f} to {change.max():+.2f})"
-    parts = (case, f"{len(trusted)} of {len(outcomes)}", spread, f"{np.sum(change < -1.9)}")
-    return " | ".join(("", *parts, f"{worst:+.2f}", f"{violations}", seconds, "")).strip()
+def excess(outcomes: Mapping[Run, Outcome]) -> dict[str, np.ndarray]:
+    """Return what each start costs above the MPC (seeds, starts), in % of the MPC's mean."""
+    mpc = outcomes[Run(PLANT, MPC, 0, 0)].test_costs[0]
+    found: dict[str, list[np.ndarray]] = {}
+    for run, outcome in outcomes.items():
+        more = 100 * (outcome.test_costs[0] - mpc) / mpc.mean()
+        found.setdefault(run.learner, []).append(more)
+    return {name: np.array(each) for name, each in found.items()}
 
 
-def main() -> None:
-    """Print the table."""
-    print("| log | trusted | change of the mean cost, % | seeds below -1.9 % | worst start, % "
-          "| violations | improve, s |")  # fmt: skip
-    print("| --- | --- | --- | ---: | ---: | ---: | ---: |")
-    with ProcessPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for case in CASES:
-            print(row(case, [*pool.map(partial(run, case), SEEDS)]), flush=True)
+def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
+    """Return the rows of the table; the optimum is the last."""
+    more, found = excess(outcomes), []
+    best = more[OPTIMUM].mean()
+    for case in CASES:
+        of = [outcome for run, outcome in outcomes.items() if run.learner == case]
+        if not of:
+            continue
+        change = more[case].mean(axis=1)
+        spread = f"{np.median(change):+.2f} ({change.min():+.2f} to {change.max():+.2f})"
+        seconds = [each.seconds for each in of if each.extra["trusted"]]
+        found.append((
+            case,
+            f"{len(seconds)} of {len(of)}",
+            spread,
+            f"{100 * np.median(change) / best + 0.0:.0f}",
+            f"{np.sum(change < -1.9)}",
+            f"{more[case].max():+.2f}",
+            f"{sum(int(each.test_violations.sum()) for each in of)}",
+            f"{np.median(seconds):.0f}" if seconds else "",
+        ))  # fmt: skip
+    worst = f"{more[OPTIMUM].max():+.2f}"
+    return [*found, ("the optimum", "", f"{best:+.2f}", "100", "", worst, "0", "")]
+
+
+def write_report(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
+    """Save ``from-a-log.png``, quote the table in ``twin.md`` if it is there, return the paths.
+
+    Nothing is written without the MPC, the optimum and a case.
+    """
+    more = excess(outcomes) if Run(PLANT, MPC, 0, 0) in outcomes else {}
+    changes = {case: more[case].mean(axis=1) for case in CASES if case in more}
+    if OPTIMUM not in more or not changes:
+        return []
+    written = [save_from_a_log(changes, float(more[OPTIMUM].mean()), folder)]
+    page = folder / "twin.md"
+    if quote(table(HEADER, rows(outcomes), texts=3), page, BEGIN, END):
+        written.append(page)
+    return written
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Do the runs that are missing, print the table and save the picture."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.twin", description=__doc__)
+    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="of each case")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes (all cores)")
+    parser.add_argument("--results", type=Path, default=Path("out/paper"), help="of the runs")
+    parser.add_argument("--report", type=Path, default=Path("docs"), help="folder of the report")
+    options = parser.parse_args(arguments)
+    wanted, folder = runs(SEEDS[: options.seeds]), options.results
+    found = run_all(wanted, execute, folder, fingerprint=FINGERPRINT, jobs=options.jobs)
+    print(table(HEADER, rows(found), texts=3))
+    for path in write_report(found, options.report):
+        print(f"Written: {path}")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,17 @@
 """From a plant's log to a better controller on the plant."""
 
+from sb3_yann.commissioning.callback import Attempt, ImproveInTwin
 from sb3_yann.commissioning.commissioning import Commissioning
 from sb3_yann.commissioning.improve import Improvement, improve
 from sb3_yann.commissioning.journal import Batch
 from sb3_yann.commissioning.trial import Check
 
-__all__ = ["Batch", "Check", "Commissioning", "Improvement", "improve"]
+__all__ = [
+    "Attempt",
+    "Batch",
+    "Check",
+    "Commissioning",
+    "ImproveInTwin",
+    "Improvement",
+    "improve",
+]

@@ -180,7 +180,8 @@ class ImprovementGuard(BaseCallback):
             )
             self._start_afresh(known)
         self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
-        self.session.policy.actor_step, self._has_begun = self.state.step, True
+        self.session.policy.actor_step = self.acceptance.actor_step(self.session)
+        self._has_begun = True
         if self.log_path is not None:
             write_csv(self.log_path, self.decisions)
 

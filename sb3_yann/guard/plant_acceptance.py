@@ -146,9 +146,12 @@ class PlantAcceptance:
                 self._end_episode(session, i, infos[i])
         if len(evidence.costs) >= self.rule.trial_episodes:
             self._end_block(session)
-        # After a violation the actor rests while the accepted policy leads the plant back.
-        rests = evidence.phase != "learning" or self.violated.any()
-        session.policy.actor_step = 0.0 if rests else state.step
+        session.policy.actor_step = self.actor_step(session)
+
+    def actor_step(self, session: GuardSession) -> float:
+        """Return the factor of the learning rate: 0 while the actor rests."""
+        rests = _evidence(session).phase != "learning" or self.violated.any()
+        return 0.0 if rests else session.state.step
 
     def end(self, session: GuardSession) -> None:
         """Leave an unfinished block undecided: the accepted policy stays, and learns again."""

@@ -118,6 +118,10 @@ class SimulatorAcceptance:
     def before_steps(self, session: GuardSession) -> None:
         """Do nothing: the training env may meet any candidate."""
 
+    def actor_step(self, session: GuardSession) -> float:
+        """Return the factor of the actor's learning rate."""
+        return session.state.step
+
     def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
         """Try the policy where an episode has ended and it is time.
 

@@ -74,3 +74,4 @@ def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
     before, after = map(float, costs)
     assert after < 0.99 * before and "violations: 0" in done.stdout
     assert (tmp_path / "out" / "from_a_log.zip").exists()
+    assert (tmp_path / "out" / "from_a_log.png").stat().st_size > 10_000

@@ -11,6 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import experiments
+from experiments import twin
 from experiments.__main__ import main
 from experiments.criteria import criteria
 from experiments.markdown import number, table
@@ -313,3 +314,39 @@ def test_the_readme_gets_the_short_table_between_its_marks(tmp_path) -> None:
     assert not quote("| new |", readme)
     assert readme.read_text(encoding="utf-8") == "nothing to replace"
     assert not quote("| new |", tmp_path / "missing.md")
+
+
+def from_a_log() -> dict[Run, Outcome]:
+    """Return an improvement of 4 and 2 %, and an untrusted twin, where the optimum is at -5 %."""
+    found = {
+        Run(twin.PLANT, "MPC", 0, 0): fixed(MPC_COSTS),
+        Run(twin.PLANT, "optimum", 0, 0): fixed(OPTIMUM),
+    }
+    for seed, less in enumerate((8.0, 4.0)):
+        better = fixed(MPC_COSTS - [3 * less, -less])
+        found[Run(twin.PLANT, "five episodes", seed, 0)] = dataclasses.replace(
+            better, extra={"trusted": np.array(True)}, seconds=7.0 + seed
+        )
+        found[Run(twin.PLANT, "two episodes", seed, 0)] = dataclasses.replace(
+            fixed(MPC_COSTS), extra={"trusted": np.array(False)}
+        )
+    return found
+
+
+def test_the_table_from_a_log_says_what_was_gained_of_what_was_possible() -> None:
+    five, two, optimum = twin.rows(from_a_log())
+    assert five[1:] == ("2 of 2", "-3.00 (-4.00 to -2.00)", "60", "2", "+4.00", "0", "8")
+    assert two[1:] == ("0 of 2", "+0.00 (+0.00 to +0.00)", "0", "0", "+0.00", "0", "")
+    assert optimum[2:4] == ("-5.00", "100")
+
+
+def test_the_table_from_a_log_is_quoted_beside_its_picture(tmp_path) -> None:
+    page = tmp_path / "twin.md"
+    page.write_text(f"before\n{twin.BEGIN}old\n{twin.END}after\n", encoding="utf-8")
+    picture, written = twin.write_report(from_a_log(), tmp_path)
+    assert picture.stat().st_size > 10_000 and written == page
+    text = page.read_text(encoding="utf-8")
+    assert "| five episodes | 2 of 2 |" in text and "old" not in text
+    assert text.startswith("before") and text.endswith("after\n")
+    some = {run: each for run, each in from_a_log().items() if run.learner != "optimum"}
+    assert twin.write_report(some, tmp_path) == twin.write_report({}, tmp_path) == []
