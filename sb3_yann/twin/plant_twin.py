@@ -16,7 +16,7 @@ from sb3_yann.control import LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.env import TwinEnv
 from sb3_yann.twin.limits import Limits
-from sb3_yann.twin.log import Episode, as_episodes, pieces
+from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from sb3_yann.twin.replay_buffer import episodes_of
 from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import Residual
@@ -140,10 +140,13 @@ class PlantTwin:
         if not isinstance(problem, LinearMPC):
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
         as_whole("n_members", n_members)
+        as_whole("seed", seed, 0)
         log = as_episodes(problem, episodes, references, disturbances, previous)
         notes: tuple[str, ...] = ()
         if time is not None:
             log, notes = cut_at_gaps(log, time, problem.model.dt)
+        log, copied = without_copies(log)
+        notes += copied
         coordinates, rng = Coordinates.of(problem, log), np.random.default_rng(seed)
         asked = candidates(problem, residuals, rng)
         # The model as it is comes first, to compare with, whether it may be chosen or not.
@@ -283,5 +286,5 @@ def _trust(
     )
     # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
     mixing = np.eye(n) + problem.model.A**2
-    noise = np.sqrt(nnls(mixing, np.var(left, axis=0))[0])
+    noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(left, axis=0)))[0])
     return Trust(runs, chosen, standing, *costs, *inputs, noise, tuple(problems), tuple(advice))

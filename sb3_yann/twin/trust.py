@@ -116,7 +116,7 @@ def held_out_costs(
         (residual,) = fitted(problem, coordinates, others, [choice.make()])
         with np.errstate(all="ignore"):
             cost = Dynamics(problem, coordinates, (residual,)).replay_in_closed_loop(episode)
-        predicted.append(float(np.nan_to_num(cost[0], nan=1e300, posinf=1e300)))
+        predicted.append(float(np.nan_to_num(cost[0], nan=1e150, posinf=1e150)))
     return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
 
 
