@@ -28,6 +28,7 @@ from sb3_yann.twin.trust import (
     UntrustedTwinError,
     beyond_the_box,
     excitation,
+    foreign_previous,
     held_out_costs,
     judge,
     standing_still,
@@ -280,6 +281,7 @@ def _trust(
     inputs = excitation(problem, log)
     beyond = beyond_the_box(problem, log)
     problems, advice = judge(runs, standing, costs, inputs, len(log), beyond)
+    problems += foreign_previous(problem, log)
     n, first = problem.model.n_states, Dynamics(problem, coordinates, dynamics.members[:1])
     left = np.concatenate(
         [e.thetas[1:, :n] - first.step(e.thetas[None, :-1], e.actions[None])[0][:, :n] for e in log]

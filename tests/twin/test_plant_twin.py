@@ -15,6 +15,7 @@ from sb3_yann import (
     LinearModel,
     NoActionNoise,
     PlantTwin,
+    RateLimits,
     UntrustedTwinError,
     YannPolicy,
 )
@@ -171,6 +172,16 @@ def test_a_copy_of_an_episode_is_no_second_one() -> None:
     found = PlantTwin.fit(problem(), [episode] * 5)
     assert not found.trusted and found.trust.problems[0].startswith("There is one episode")
     assert "Left out 4 copies of other episodes." in found.report()
+
+
+def test_a_theta_that_forgets_the_input_before_it_is_not_trusted() -> None:
+    limited = dataclasses.replace(problem(), rate=RateLimits(-2, 2), terminal=None)
+    whole = [(np.hstack([x, np.vstack([[0.0], u])]), u) for x, u in log(4)]
+    forgetful = [(np.hstack([x, np.zeros((len(x), 1))]), u) for x, u in log(4)]
+    wrong = "theta does not hold the input before it"
+    assert wrong not in PlantTwin.fit(limited, whole).report()
+    found = PlantTwin.fit(limited, forgetful)
+    assert not found.trusted and wrong in found.report()
 
 
 def test_what_is_no_list_of_a_log_is_named() -> None:
