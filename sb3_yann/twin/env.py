@@ -85,6 +85,8 @@ class TwinEnv(gym.Env[Single, Single]):
             if given.shape not in ((problem.model.n_states,), (problem.n_theta,)):
                 sizes = f"({problem.model.n_states},) or ({problem.n_theta},)"
                 raise ValueError(f"options['state'] has shape {given.shape}, expected {sizes}.")
+            if not np.all(np.isfinite(given)):
+                raise ValueError(f"options['state'] = {given.tolist()} must be finite numbers.")
             theta[: len(given)] = given
         self._theta, self._steps = theta, 0
         return theta.astype(np.float32), {"state": theta.copy(), "member": acting}

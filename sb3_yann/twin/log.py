@@ -15,6 +15,8 @@ from sb3_yann.control import LinearMPC
 
 SHORTEST = 5
 """Steps that an episode has at least."""
+LARGE = 1e100
+"""Beyond this, squares and their sums overflow."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +67,7 @@ def as_episodes(
     layout, pairs = problem.layout, _pairs(episodes)
     given = {"references": references, "disturbances": disturbances, "previous": previous}
     for name, values in given.items():
-        if values is not None and len(values) != len(pairs):
-            raise ValueError(f"{name} has {len(values)} entries for {len(pairs)} episodes.")
+        _one_for_each(name, values, len(pairs))
     found = []
     for i, (states, actions) in enumerate(pairs):
         u = _actions(problem, i, actions)
@@ -94,6 +95,14 @@ def as_episodes(
     return tuple(found)
 
 
+def without_copies(episodes: tuple[Episode, ...]) -> tuple[tuple[Episode, ...], tuple[str, ...]]:
+    """Return each episode once, and a note: a copy would test the twin on what it has seen."""
+    kept = {(each.thetas.tobytes(), each.actions.tobytes()): each for each in episodes}
+    if len(kept) == len(episodes):
+        return episodes, ()
+    return (*kept.values(),), (f"Left out {len(episodes) - len(kept)} copies of other episodes.",)
+
+
 def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
     """Return at least so many pieces of two episodes or more: whole ones where there are enough.
 
@@ -112,6 +121,11 @@ def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
 
 
 def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
+    if not isinstance(episodes, Iterable):
+        raise TypeError(
+            f"episodes must be a list of pairs (states, actions), got {type(episodes).__name__}. "
+            "Of what evaluate returns: zip(log.observations, log.actions)."
+        )
     pairs = [*episodes]
     if not pairs:
         raise ValueError("episodes is empty: pass a list of (states, actions), one per episode.")
@@ -121,13 +135,21 @@ def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:
     return [(states, actions) for states, actions in pairs]
 
 
+def _one_for_each(name: str, values: Any, count: int) -> None:
+    if values is not None and not hasattr(values, "__len__"):
+        raise TypeError(f"{name} must be a list with an entry for each episode.")
+    if values is not None and len(values) != count:
+        raise ValueError(f"{name} has {len(values)} entries for {count} episodes.")
+
+
 def _finite(name: str, values: ArrayLike) -> Array:
     array = to_float(name, values)
-    if not np.all(np.isfinite(array)):
-        row = int(np.argwhere(~np.isfinite(array))[0][0])
+    finite = np.abs(array) < LARGE  # nor is NaN
+    if not np.all(finite):
+        row = int(np.argwhere(~finite)[0][0])
         raise ValueError(
-            f"{name} are not finite in row {row}: {array[row].tolist()}. Cut the episode there, "
-            "into two of their own."
+            f"{name} are not finite, or too large, in row {row}: {array[row].tolist()}. Cut the "
+            "episode there, into two of their own."
         )
     return array
 

@@ -16,7 +16,7 @@ from sb3_yann.control import LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.env import TwinEnv
 from sb3_yann.twin.limits import Limits
-from sb3_yann.twin.log import Episode, as_episodes, pieces
+from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from sb3_yann.twin.replay_buffer import episodes_of
 from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import Residual
@@ -28,6 +28,7 @@ from sb3_yann.twin.trust import (
     UntrustedTwinError,
     beyond_the_box,
     excitation,
+    foreign_previous,
     held_out_costs,
     judge,
     standing_still,
@@ -140,10 +141,13 @@ class PlantTwin:
         if not isinstance(problem, LinearMPC):
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
         as_whole("n_members", n_members)
+        as_whole("seed", seed, 0)
         log = as_episodes(problem, episodes, references, disturbances, previous)
         notes: tuple[str, ...] = ()
         if time is not None:
             log, notes = cut_at_gaps(log, time, problem.model.dt)
+        log, copied = without_copies(log)
+        notes += copied
         coordinates, rng = Coordinates.of(problem, log), np.random.default_rng(seed)
         asked = candidates(problem, residuals, rng)
         # The model as it is comes first, to compare with, whether it may be chosen or not.
@@ -277,11 +281,12 @@ def _trust(
     inputs = excitation(problem, log)
     beyond = beyond_the_box(problem, log)
     problems, advice = judge(runs, standing, costs, inputs, len(log), beyond)
+    problems += foreign_previous(problem, log)
     n, first = problem.model.n_states, Dynamics(problem, coordinates, dynamics.members[:1])
     left = np.concatenate(
         [e.thetas[1:, :n] - first.step(e.thetas[None, :-1], e.actions[None])[0][:, :n] for e in log]
     )
     # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
     mixing = np.eye(n) + problem.model.A**2
-    noise = np.sqrt(nnls(mixing, np.var(left, axis=0))[0])
+    noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(left, axis=0)))[0])
     return Trust(runs, chosen, standing, *costs, *inputs, noise, tuple(problems), tuple(advice))

@@ -18,10 +18,11 @@ def episodes_of(model: Any) -> list[tuple[Array, Array]]:
     TypeError, ValueError
         If the model has no YannPolicy, or its buffer holds no episode of five steps.
     """
-    buffer, policy = model.replay_buffer, model.policy
+    policy: Any = getattr(model, "policy", None)
     problem = getattr(policy, "problem", None)
     if problem is None:
         raise TypeError(f"model must have a YannPolicy, its policy is {type(policy).__name__}.")
+    buffer = model.replay_buffer
     if buffer.optimize_memory_usage:
         raise ValueError(
             "optimize_memory_usage=True keeps no last states of episodes. Build the model without "

@@ -208,12 +208,23 @@ class Regressor:
     def fit(self, z: Array, y: Array) -> Regressor:
         """Fit to residuals y (N, n) at z (N, k)."""
         self.estimator, self.n = self.make(), y.shape[1]
+        if not all(callable(getattr(self.estimator, name, None)) for name in ("fit", "predict")):
+            raise TypeError(
+                f"residuals holds a function that made {self.estimator!r}; it must make a "
+                "regressor with fit(z, y) and predict(z), as scikit-learn has it."
+            )
         self.estimator.fit(z, y)
         return self
 
     def predict(self, z: Array) -> Array:
         """Return the residual (batch, n)."""
-        return np.asarray(self.estimator.predict(z), np.float64).reshape(len(z), self.n)
+        found = np.asarray(self.estimator.predict(z), np.float64)
+        if found.size != len(z) * self.n:
+            raise ValueError(
+                f"A residual of residuals= predicts shape {found.shape} for {len(z)} rows, "
+                f"expected ({len(z)}, {self.n})."
+            )
+        return found.reshape(len(z), self.n)
 
     def jacobian(self, z: Array) -> Array:
         """Return its derivatives (batch, n, k), by central differences."""

@@ -22,6 +22,8 @@ FOREIGN = 10.0
 """A model that errs by so many times what moves describes another plant."""
 OUTSIDE = 0.05
 """Share of logged rows beyond the box of theta from which on units are doubted."""
+PREVIOUS = 0.01
+"""How far theta's previous input may be from the one before it, in half-widths."""
 ALONE = 0.02
 """An input's gain is known from the data where at least this share of its variance is its own."""
 
@@ -116,7 +118,7 @@ def held_out_costs(
         (residual,) = fitted(problem, coordinates, others, [choice.make()])
         with np.errstate(all="ignore"):
             cost = Dynamics(problem, coordinates, (residual,)).replay_in_closed_loop(episode)
-        predicted.append(float(np.nan_to_num(cost[0], nan=1e300, posinf=1e300)))
+        predicted.append(float(np.nan_to_num(cost[0], nan=1e150, posinf=1e150)))
     return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
 
 
@@ -159,6 +161,18 @@ def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> float:
     x = np.concatenate([each.thetas[:, problem.layout.state] for each in episodes])
     low, high = (each[problem.layout.state] for each in (problem.theta_min, problem.theta_max))
     return float(np.mean(np.any((x < low) | (x > high), axis=1)))
+
+
+def foreign_previous(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[str]:
+    """Return what speaks against a log whose theta does not hold the input before it."""
+    if not problem.layout.n_previous:
+        return []
+    held = np.concatenate([each.thetas[1:, problem.layout.previous] for each in episodes])
+    apart = np.abs(held - np.concatenate([each.actions for each in episodes])) / problem.u_half
+    share = float(np.mean(np.any(apart > PREVIOUS, axis=1)))
+    if share <= OUTSIDE:
+        return []
+    return [f"In {100 * share:.3g} % of the rows theta does not hold the input before it."]
 
 
 def judge(

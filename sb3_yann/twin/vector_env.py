@@ -89,6 +89,8 @@ class TwinVectorEnv(VectorEnv[Single, Single, NDArray[Any]]):
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         else:
             seeds = [*seed]
+        if options and "state" not in options:
+            raise ValueError(f"options = {options!r} must be {{'state': starts}}.")
         starts = [{"state": each} for each in options["state"]] if options else [None] * len(seeds)
         for name, given in (("seed", seeds), ("options['state']", starts)):
             if len(given) != self.num_envs:

@@ -21,7 +21,7 @@ HOLED = np.where(np.arange(11)[:, None] == 4, np.nan, X)
         ([(X, U), (X, U[1:])], ValueError, "episode 1: 11 states and 9 actions"),
         ([(X[:, :1], U)], ValueError, r"episode 0: states have shape \(11, 1\), expected \(T \+ 1"),
         ([(X, np.hstack([U, U]))], ValueError, r"actions have shape \(10, 2\), expected \(T, 1\)"),
-        ([(HOLED, U)], ValueError, "not finite in row 4.* Cut the episode there"),
+        ([(HOLED, U)], ValueError, "not finite, or too large, in row 4.* Cut the episode there"),
         ([(X, 30 * U)], ValueError, "action 0 is 3 in row 0, beyond the bounds -1 and 1"),
         ([(X[:4], U[:3])], ValueError, "episode 0 has 3 steps; 5 are the least"),
     ],

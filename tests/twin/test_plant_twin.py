@@ -15,6 +15,7 @@ from sb3_yann import (
     LinearModel,
     NoActionNoise,
     PlantTwin,
+    RateLimits,
     UntrustedTwinError,
     YannPolicy,
 )
@@ -164,3 +165,56 @@ def test_a_buffer_that_keeps_no_last_states_is_refused() -> None:
         PlantTwin.from_buffer(model)
     with pytest.raises(TypeError, match="must have a YannPolicy"):
         PlantTwin.from_buffer(DDPG("MlpPolicy", Cart()))
+
+
+def test_a_copy_of_an_episode_is_no_second_one() -> None:
+    (episode,) = log(1)
+    found = PlantTwin.fit(problem(), [episode] * 5)
+    assert not found.trusted and found.trust.problems[0].startswith("There is one episode")
+    assert "Left out 4 copies of other episodes." in found.report()
+
+
+def test_a_theta_that_forgets_the_input_before_it_is_not_trusted() -> None:
+    limited = dataclasses.replace(problem(), rate=RateLimits(-2, 2), terminal=None)
+    whole = [(np.hstack([x, np.vstack([[0.0], u])]), u) for x, u in log(4)]
+    forgetful = [(np.hstack([x, np.zeros((len(x), 1))]), u) for x, u in log(4)]
+    wrong = "theta does not hold the input before it"
+    assert wrong not in PlantTwin.fit(limited, whole).report()
+    found = PlantTwin.fit(limited, forgetful)
+    assert not found.trusted and wrong in found.report()
+
+
+def test_what_is_no_list_of_a_log_is_named() -> None:
+    for wrong in (None, 5.0):
+        with pytest.raises(TypeError, match="episodes must be a list of pairs"):
+            PlantTwin.fit(problem(), wrong)
+    with pytest.raises(TypeError, match="previous must be a list with an entry for each"):
+        PlantTwin.fit(problem(), log(2), previous=iter([[0.0], [0.0]]))
+    huge = [(1e200 * x, u) for x, u in log(2)]
+    with pytest.raises(ValueError, match="not finite, or too large, in row 0"):
+        PlantTwin.fit(problem(), huge)
+    with pytest.raises(ValueError, match="seed = -1"):
+        PlantTwin.fit(problem(), log(2), seed=-1)
+    with pytest.raises(TypeError, match="must have a YannPolicy, its policy is NoneType"):
+        PlantTwin.from_buffer(None)
+
+
+class Nowhere:
+    """A regressor that says nothing, or too much."""
+
+    def __init__(self, width) -> None:
+        self.width = width
+
+    def fit(self, z, y) -> None:
+        """Learn nothing."""
+
+    def predict(self, z):
+        return np.full((len(z), self.width), np.nan)
+
+
+def test_a_residual_that_is_none_is_named_or_not_trusted() -> None:
+    with pytest.raises(TypeError, match="residuals holds a function that made 3; it must make"):
+        PlantTwin.fit(problem(), log(2), residuals=[lambda: 3])
+    with pytest.raises(ValueError, match=r"predicts shape \(\d+, 7\) for \d+ rows, expected"):
+        PlantTwin.fit(problem(), log(2), residuals=[lambda: Nowhere(7)])
+    assert not PlantTwin.fit(problem(), log(2), residuals=[lambda: Nowhere(2)]).trusted
