@@ -14,18 +14,17 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_between, as_flag, as_whole
+from sb3_yann.commissioning.comparison import Costs, compare
 from sb3_yann.commissioning.improve import improve
 from sb3_yann.commissioning.incumbent import Incumbent
 from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
-from sb3_yann.commissioning.plant import Plant, PlantEpisode, predicted_costs
+from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.evaluation.episodes import Source, one_env
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.twin.plant_twin import PlantTwin
 
-Costs = tuple[float, float, float]
-"""Mean costs of a batch: the plant's, the twin's before, and the MPC's in the twin from then on."""
 ENOUGH = 0.5
 """Of the gain that the twin promised, so much lets the bound of the correction grow."""
 
@@ -196,7 +195,7 @@ class Commissioning:
         before, numbers, seed = self.twin, self.journal.log, self.seed + number
         twin = self._fit(numbers, seed) if len(numbers) > 1 else None
         known = twin if twin is not None and twin.trusted else before
-        costs = self._costs(plant, before, known)
+        costs = compare(self.journal, plant, before, known)
         outlook, said = self._weigh(costs)
         if twin is None:
             why = f"There are {len(numbers)} episodes to learn from."
@@ -229,20 +228,6 @@ class Commissioning:
         self.incumbent.give_back()
         return outlook, "the MPC acts", f"Nothing better was found: {last.reason}."
 
-    def _costs(self, plant: Plant, before: PlantTwin | None, now: PlantTwin | None) -> Costs:
-        """Return the batch's mean costs, what was predicted, and what the MPC's would have been."""
-        present = any(each for _, each in self.journal.batch)
-        quiet = [e for e, each in self.journal.batch if each == present and e.alarm is None]
-        if not quiet:
-            return np.nan, np.nan, np.nan
-        cost, act = self.policy.problem.stage_cost, plant.policy if present else plant.mpc
-        actual = np.mean([np.sum(cost(e.thetas[:-1], e.actions)) for e in quiet])
-        predicted, mpc = (
-            np.nan if twin is None else np.mean(predicted_costs(twin, quiet, by))
-            for twin, by in ((before, act), (now, plant.mpc))
-        )
-        return float(actual), float(predicted), float(mpc)
-
     def _weigh(self, costs: Costs) -> tuple[Outlook, str]:
         """Let the bound grow, or take the policy back, by what the plant has shown."""
         outlook, (actual, predicted, mpc) = self.journal.outlook, costs
@@ -252,9 +237,9 @@ class Commissioning:
         unsafe = sum(each.violations for each in played)
         if unsafe or actual > mpc:
             self.incumbent.give_back()
-            said = f"It cost {actual:.5g}, the MPC would have {mpc:.5g}: it was taken back. "
+            said = f"It cost {actual:.5g}, the MPC would have {mpc:.5g}: it was taken back. New: "
             if unsafe:
-                said = f"It violated a limit in {unsafe} steps: it was taken back. "
+                said = f"It violated a limit in {unsafe} steps: it was taken back. New: "
             return replace(outlook, max_correction=self._first_bound), said
         if mpc - actual >= ENOUGH * (mpc - predicted):
             wider = min(2 * outlook.max_correction, self.largest)

@@ -111,6 +111,8 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     >>> improve(model, twin, iterations=40).change < -0.005
     True
     """
+    if not isinstance(model, OffPolicyAlgorithm):
+        raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
     policy = require_yann_policy(model.policy, "improve")
     if not isinstance(twin, PlantTwin):
         raise TypeError(f"twin = {twin!r} must be a PlantTwin.")

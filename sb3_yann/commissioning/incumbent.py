@@ -22,6 +22,8 @@ class Incumbent:
     """
 
     def __init__(self, model: OffPolicyAlgorithm) -> None:
+        if not isinstance(model, OffPolicyAlgorithm):
+            raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
         self.model, self.policy = model, require_yann_policy(model.policy, "Commissioning")
         with preserve_rng():  # building an actor draws weights
             self._mpc = self.policy.make_actor().state_dict()

@@ -27,8 +27,9 @@ class Batch:
         How far it could leave the MPC, in input ranges.
     cost, predicted, mpc : float
         Mean stage cost of the quiet episodes of the one that acted; what the twin had predicted
-        for it from these starts; and what the twin that has learnt from them predicts for the MPC.
-        NaN where there was no twin.
+        for it from these starts; and what the MPC would have cost, by the twin that has learnt
+        from them and by what the MPC's own episodes cost beyond that twin, with sensor noise for
+        one. NaN where there was no twin.
     verdict : str
         "accepted" (a new policy), "stays" (the one that acted), "the MPC acts" or "begins anew".
     reason : str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,6 @@ from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import actor_inputs
-from sb3_yann.twin.plant_twin import PlantTwin
 
 Inputs = Callable[[Array], Array]
 LONGEST = 1_000_000
@@ -72,6 +71,12 @@ class Plant:
         self.env, self.model = env, model
         self.yann = require_yann_policy(model.policy, "Commissioning")
         self.problem = self.yann.problem
+        for name in ("observation_space", "action_space"):
+            own, its = getattr(model, name), getattr(env, name)
+            if own.shape != its.shape:
+                raise ValueError(
+                    f"plant_env has {name} = {its}, the model {own}: it is another plant."
+                )
         self.law, self.device = law_of(self.problem), self.yann.device
         self.range = self.problem.u_max - self.problem.u_min
 
@@ -158,22 +163,3 @@ def _look(
     if watchdog is None:
         return None
     return watchdog.watch(known, u.astype(np.float64), read)
-
-
-def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inputs) -> Array:
-    """Return what a policy would have cost from each episode's start, by the members' mean.
-
-    References and disturbances are those of the episodes.
-    """
-    dynamics, constant = twin.dynamics, twin.problem.layout.constant
-    lengths, members = np.array([len(each.actions) for each in episodes]), len(dynamics.members)
-    theta = np.repeat(np.array([[each.thetas[0] for each in episodes]]), members, axis=0)
-    shape, costs = theta.shape, np.zeros(theta.shape[:2])
-    with np.errstate(all="ignore"):
-        for k in range(lengths.max()):
-            now = [each.thetas[min(k, last)] for each, last in zip(episodes, lengths, strict=True)]
-            theta[..., constant] = np.array(now)[:, constant]
-            u = act(theta.reshape(-1, shape[-1])).reshape(*shape[:2], -1)
-            costs += np.where(k < lengths, twin.problem.stage_cost(theta, u), 0.0)
-            theta = dynamics.step(theta, u)
-    return np.asarray(costs.mean(axis=0))

@@ -25,11 +25,12 @@ class Record:
     Parameters
     ----------
     path : Path, optional
-        A file, or a folder, in which it is ``commissioning.jsonl``.
+        A file, or a folder (without a suffix), in which it is ``commissioning.jsonl``.
     """
 
     def __init__(self, path: Path | None) -> None:
-        self.path = path / NAME if path is not None and path.is_dir() else path
+        is_folder = path is not None and (path.is_dir() or not path.suffix)
+        self.path = path / NAME if path is not None and is_folder else path
         self.events: list[Event] = []
         if self.path is None:
             return

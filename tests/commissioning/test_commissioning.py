@@ -14,6 +14,9 @@ from stable_baselines3 import DDPG
 
 from sb3_yann import Commissioning, Improvement, YannPolicy
 from sb3_yann.commissioning import Check, commissioning
+from sb3_yann.commissioning.comparison import predicted_costs
+from sb3_yann.commissioning.plant import Plant
+from sb3_yann.evaluation.episodes import one_env
 from twin_samples import Cart, problem
 from weights import is_mpc
 
@@ -62,6 +65,23 @@ def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound
         assert apart.max() <= (1e-6 if k < 5 else 0.2 + 1e-6)
     assert second.cost < second.mpc  # the MPC's, by the twin, from the same starts
     assert second.predicted == pytest.approx(second.cost, rel=0.1)
+
+
+def test_what_noise_costs_is_not_held_against_the_policy() -> None:
+    rng = np.random.default_rng(0)
+
+    class Noisy(Cart):
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return (observation + 0.001 * rng.standard_normal(2).astype(np.float32), *rest)
+
+    run = commission(env=Noisy, iterations=1)
+    first = run.run(1)[0]
+    twin = run._fit(run.journal.log, 1)
+    with one_env(Noisy) as env:
+        predicted = predicted_costs(twin, run.episodes, Plant(env, run.model).mpc).mean()
+    assert predicted != pytest.approx(first.cost, rel=1e-6)
+    assert first.mpc == pytest.approx(first.cost, rel=1e-9)  # its own batch has no excess
 
 
 def test_only_accepted_policies_act(tmp_path) -> None:
@@ -212,6 +232,7 @@ def test_shadow_computes_and_does_not_act() -> None:
         ({"batch": 1}, "batch = 1"),
         ({"max_correction": 0.0}, "max_correction = 0"),
         ({"env": 3}, "plant_env = 3"),
+        ({"iterations": 0}, "iterations = 0"),
         ({"seed": -1}, "seed = -1"),
     ],
 )
@@ -228,6 +249,18 @@ def test_another_commissionings_record_is_refused(tmp_path) -> None:
     (tmp_path / "other.csv").write_text("episode,cost\n1,2\n")
     with pytest.raises(ValueError, match="line 1"):
         commission(tmp_path / "other.csv")
+
+
+def test_another_plant_and_what_is_no_model_are_refused() -> None:
+    with pytest.raises(ValueError, match="another plant"):
+        commission(env="CSTR-v0").run(1)
+    with pytest.raises(TypeError, match="must be a DDPG or TD3 model"):
+        Commissioning(None, Cart)
+
+
+def test_a_path_without_a_suffix_is_a_folder(tmp_path) -> None:
+    commission(tmp_path / "plant")
+    assert (tmp_path / "plant" / "commissioning.jsonl").exists()
 
 
 def test_a_first_reading_that_is_no_number_is_an_error() -> None:
