@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.twin.dynamics import MARGIN, Coordinates
+from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, law_of
+from sb3_yann.twin.residuals import Nothing
 from sb3_yann.twin.starts import Starts
 
 ROUNDING = 1e-9
+PLANNED = 200
+"""Runs of the MPC on its own model that tell where it means to go."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +34,17 @@ class Limits:
 
     @classmethod
     def of(cls, problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> Limits:
-        """Return the data's neighborhood, with the starts, as far as hard bounds let it."""
+        """Return the data's neighborhood, with the starts, as far as hard bounds let it.
+
+        With set-points or disturbances also that of where the MPC would take its own model: the log
+        of a worn plant, which rests beside its set-points, does not show that.
+        """
         n, soft = problem.model.n_states, problem.soft.x > 0
-        width = MARGIN * (starts.high - starts.low)
-        low = np.minimum(coordinates.low[:n], starts.low - width)
-        high = np.maximum(coordinates.high[:n], starts.high + width)
+        low, high = coordinates.low[:n], coordinates.high[:n]
+        planned = [_planned(problem, coordinates, starts)] if problem.layout.has_constants else []
+        for least, most in [(starts.low, starts.high), *planned]:
+            width = MARGIN * (most - least)
+            low, high = np.minimum(low, least - width), np.maximum(high, most + width)
         room = ROUNDING * problem.theta_half[:n]
         bounded = np.maximum(low, np.where(soft, -np.inf, problem.x_min))
         limited = np.minimum(high, np.where(soft, np.inf, problem.x_max))
@@ -53,3 +62,13 @@ class Limits:
         x = thetas[..., self.problem.layout.state]
         inside = (x >= self.low) & (x <= self.high)
         return np.asarray(~inside.all(axis=-1))
+
+
+def _planned(problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> tuple[Array, Array]:
+    """Return the box of the MPC's runs on its own model: as long as the log's, from its starts."""
+    n, steps = problem.model.n_states, len(starts.rows) // len(starts.first)
+    model = Dynamics(problem, coordinates, (Nothing(n),))
+    first = starts.draw(PLANNED, np.random.default_rng(0))
+    x = model.roll_out(law_of(problem), first[None], steps)[0][..., :n].reshape(-1, n)
+    least, most = problem.theta_min[:n], problem.theta_max[:n]
+    return np.clip(x.min(axis=0), least, most), np.clip(x.max(axis=0), least, most)

@@ -17,11 +17,12 @@ from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.env import TwinEnv
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
+from sb3_yann.twin.reidentification import reidentified
 from sb3_yann.twin.replay_buffer import episodes_of
 from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.sampling import cut_at_gaps
-from sb3_yann.twin.selection import FOLDS, Candidate, FreeRuns, candidates, fitted, held_out
+from sb3_yann.twin.selection import FOLDS, Candidate, FreeRuns, candidates, choose, fitted
 from sb3_yann.twin.starts import Starts
 from sb3_yann.twin.trust import (
     Trust,
@@ -154,7 +155,7 @@ class PlantTwin:
         others = [each for each in asked if each.name != "none"]
         choices = [*candidates(problem, ["none"], rng), *others]
         parts, first = pieces(log, FOLDS), int(len(others) == len(asked))
-        runs, chosen = _choose(problem, coordinates, parts, choices, first)
+        runs, chosen = choose(problem, coordinates, parts, choices, first)
         choice = choices[chosen]
         drawn = log if len(log) >= FOLDS else pieces(log, BLOCKS)
         members = _members(problem, coordinates, drawn, choice, n_members, seed)
@@ -197,6 +198,36 @@ class PlantTwin:
         text = report(self.problem, self.episodes, self.kind, self.trust)
         return "\n".join([*self.notes, text])
 
+    def reidentified(self) -> LinearMPC:
+        """Return the MPC of the same costs, bounds and horizon with a model of the log.
+
+        Its A, B and E are fitted to the log, and shrunk towards the given ones as far as held-out
+        free runs ask for it. It is :attr:`problem` itself where no linear model predicts better.
+
+        With references or disturbances its operating point is where the plant rests today: its
+        ``theta`` is in deviations from the new ``model.x_ss`` and ``model.u_ss``. The terminal cost
+        is solved anew, and a terminal set is the new model's invariant one.
+
+        Raises
+        ------
+        UntrustedTwinError
+            If the twin is not to be trusted.
+        ValueError
+            Where the new model has no steady state or no Riccati solution.
+
+        Examples
+        --------
+        >>> from sb3_yann.evaluation import evaluate
+        >>> from sb3_yann_envs import problems
+        >>> log = evaluate(problems.cstr().explicit(), "CSTR-v0", seeds=range(5))
+        >>> twin = PlantTwin.fit(problems.cstr(), [*zip(log.observations, log.actions)])
+        >>> today = evaluate(twin.reidentified().explicit(), "CSTR-v0", seeds=range(5))
+        >>> bool(today.costs.mean() < log.costs.mean())
+        True
+        """
+        self.require_trust()
+        return reidentified(self.problem, self.dynamics.coordinates, self.episodes)
+
     @cached_property
     def starts(self) -> Starts:
         """Where episodes begin."""
@@ -230,25 +261,6 @@ class PlantTwin:
     def vec_env(self, n_envs: int, member: int | None = None) -> TwinVecEnv:
         """Return as many of :meth:`env`, which step as one array, for Stable-Baselines3."""
         return TwinVecEnv(copies(self.env(member), n_envs))
-
-
-def _choose(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    log: tuple[Episode, ...],
-    choices: list[Candidate],
-    first: int,
-) -> tuple[FreeRuns, int]:
-    """Return the candidates' free runs, and which is best, from number ``first`` on.
-
-    Without a second episode it is the first.
-    """
-    if len(log) < 2:
-        errors = np.full((len(choices), 1, 1), np.inf)
-        return FreeRuns(np.array([1]), errors, tuple(each.name for each in choices)), first
-    runs = held_out(problem, coordinates, log, choices)
-    asked = FreeRuns(runs.horizons, runs.by_episode[first:], runs.names[first:])
-    return runs, first + asked.choose(np.array([each.freedom for each in choices[first:]]))
 
 
 def _members(

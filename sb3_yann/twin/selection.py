@@ -206,6 +206,38 @@ def held_out(
     return FreeRuns(horizons, np.sqrt(errors), names)
 
 
+def choose(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    log: Sequence[Episode],
+    choices: Sequence[Candidate],
+    first: int,
+) -> tuple[FreeRuns, int]:
+    """Return the candidates' free runs, and which is best, from number ``first`` on.
+
+    Without a second episode it is the first.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Of the plant.
+    coordinates : Coordinates
+        What residuals are scaled by.
+    log : sequence of Episode
+        Each is left out once.
+    choices : sequence of Candidate
+        What is compared.
+    first : int
+        Those before it are compared, and not chosen.
+    """
+    if len(log) < 2:
+        errors = np.full((len(choices), 1, 1), np.inf)
+        return FreeRuns(np.array([1]), errors, tuple(each.name for each in choices)), first
+    runs = held_out(problem, coordinates, log, choices)
+    asked = FreeRuns(runs.horizons, runs.by_episode[first:], runs.names[first:])
+    return runs, first + asked.choose(np.array([each.freedom for each in choices[first:]]))
+
+
 def _errors(
     problem: LinearMPC,
     coordinates: Coordinates,

@@ -1,0 +1,73 @@
+"""The same MPC with a model of what the plant is today."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearModel, LinearMPC, OutputBounds, Terminal
+from sb3_yann.control.mpc.steady_state import steady_states
+from sb3_yann.twin.dynamics import Coordinates
+from sb3_yann.twin.log import Episode, pieces
+from sb3_yann.twin.selection import FOLDS, candidates, choose, fitted
+
+
+def reidentified(
+    problem: LinearMPC, coordinates: Coordinates, log: tuple[Episode, ...]
+) -> LinearMPC:
+    """Return the MPC of a model that is shrunk towards the given one; see `PlantTwin.reidentified`.
+
+    Parameters
+    ----------
+    problem, coordinates, log : LinearMPC, Coordinates and tuple of Episode
+        Of a twin; two episodes at least.
+    """
+    choices = candidates(problem, ["none", "linear"], np.random.default_rng(0))
+    _, chosen = choose(problem, coordinates, pieces(log, FOLDS), choices, 0)
+    if chosen == 0:
+        return problem
+    (residual,) = fitted(problem, coordinates, log, [choices[chosen].make()])
+    middle, model = np.zeros((1, len(coordinates.scale))), problem.model
+    n, m, d = model.n_states, model.n_inputs, model.n_disturbances
+    slopes = residual.jacobian(middle)[0] / coordinates.scale
+    A, E, B = np.split(slopes, [n, n + d], axis=1)
+    A, B, E = model.A + A, model.B + B, model.E + E
+    x: Array = np.zeros(n)
+    u: Array = np.zeros(m)
+    if problem.layout.has_constants:  # else the residual has no constant term
+        x, u = _rest(problem, A, B, residual.predict(middle)[0])
+    note = f"Re-identified from {len(log)} episodes: {choices[chosen].name}."
+    point = model.x_ss + x, model.u_ss + u, E, model.d_ss
+    return _with(problem, LinearModel(A, B, model.dt, *point, notes=[note]), x, u)
+
+
+def _rest(problem: LinearMPC, A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
+    """Return the state (n,) and the input (m,) that rest despite the drift (n,), with ``C x = 0``.
+
+    The drift acts as a constant disturbance does.
+    """
+    drifting = LinearModel(A, B, problem.model.dt, E=drift[:, None])
+    x_unit = problem.theta_half[problem.layout.state]
+    weights = problem.Q, problem.R, x_unit, problem.u_half
+    found = steady_states(drifting, problem.tracking.C, *weights)
+    return found.x[:, -1], found.u[:, -1]
+
+
+def _with(problem: LinearMPC, model: LinearModel, x: Array, u: Array) -> LinearMPC:
+    """Return the problem with another model, whose operating point lies x and u from its own."""
+    outputs, states = problem.outputs, problem.layout.state
+    y = outputs.C @ x
+    return dataclasses.replace(
+        problem,
+        model=model,
+        x_min=problem.x_min - x,
+        x_max=problem.x_max - x,
+        u_min=problem.u_min - u,
+        u_max=problem.u_max - u,
+        theta_min=problem.theta_min[states] - x,
+        theta_max=problem.theta_max[states] - x,
+        outputs=OutputBounds(outputs.C, outputs.y_min - y, outputs.y_max - y),
+        terminal=Terminal(set="invariant" if len(problem.terminal.set[1]) else None),
+    )
