@@ -37,8 +37,8 @@ CASES = {
 PLANT = "CSTR, from a log"
 SEEDS = range(20, 30)
 STARTS = range(30_000, 30_100)
-HEADER = ("log", "trusted", "change of the mean cost, %", "gap closed, %", "seeds below -1.9 %",
-          "worst start, %", "violations", "improve, s")  # fmt: skip
+HEADER = ("log", "trusted", "change of the mean cost, %", "re-identified MPC, %", "gap closed, %",
+          "seeds below -1.9 %", "worst start, %", "violations", "improve, s")  # fmt: skip
 BEGIN, END = "<!-- from a log: begin -->\n", "<!-- from a log: end -->"
 
 
@@ -87,7 +87,11 @@ def execute(run: Run) -> Outcome:
     if run.learner == OPTIMUM:
         costs, violations = cstr_optimum([each[0] for each in played.observations]), 0 * violations
     none = np.zeros(0)
-    extra = {"trusted": np.array(trusted)}
+    linear = costs
+    if run.learner in CASES:
+        again = twin.reidentified() if trusted else mpc
+        linear = evaluate(again.explicit(), "CSTR-v0", STARTS).costs
+    extra = {"trusted": np.array(trusted), "reidentified": linear}
     return Outcome(np.zeros(1), costs[None], violations[None], none, none, none, extra, seconds)
 
 
@@ -109,13 +113,17 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
         of = [outcome for run, outcome in outcomes.items() if run.learner == case]
         if not of:
             continue
-        change = more[case].mean(axis=1)
-        spread = f"{np.median(change):+.2f} ({change.min():+.2f} to {change.max():+.2f})"
+        change, mpc = more[case].mean(axis=1), outcomes[Run(PLANT, MPC, 0, 0)].test_costs[0].mean()
+        linear = np.array([100 * (each.extra["reidentified"].mean() / mpc - 1) for each in of])
+        spreads = [
+            f"{np.median(each):+.2f} ({each.min():+.2f} to {each.max():+.2f})"
+            for each in (change, linear)
+        ]
         seconds = [each.seconds for each in of if each.extra["trusted"]]
         found.append((
             case,
             f"{len(seconds)} of {len(of)}",
-            spread,
+            *spreads,
             f"{100 * np.median(change) / best + 0.0:.0f}",
             f"{np.sum(change < -1.9)}",
             f"{more[case].max():+.2f}",
@@ -123,7 +131,7 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
             f"{np.median(seconds):.0f}" if seconds else "",
         ))  # fmt: skip
     worst = f"{more[OPTIMUM].max():+.2f}"
-    return [*found, ("the optimum", "", f"{best:+.2f}", "100", "", worst, "0", "")]
+    return [*found, ("the optimum", "", f"{best:+.2f}", "", "100", "", worst, "0", "")]
 
 
 def write_report(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
@@ -137,7 +145,7 @@ def write_report(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
         return []
     written = [save_from_a_log(changes, float(more[OPTIMUM].mean()), folder)]
     page = folder / "twin.md"
-    if quote(table(HEADER, rows(outcomes), texts=3), page, BEGIN, END):
+    if quote(table(HEADER, rows(outcomes), texts=4), page, BEGIN, END):
         written.append(page)
     return written
 
@@ -152,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     wanted, folder = runs(SEEDS[: options.seeds]), options.results
     found = run_all(wanted, execute, folder, fingerprint=FINGERPRINT, jobs=options.jobs)
-    print(table(HEADER, rows(found), texts=3))
+    print(table(HEADER, rows(found), texts=4))
     for path in write_report(found, options.report):
         print(f"Written: {path}")
 

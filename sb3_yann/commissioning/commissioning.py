@@ -61,6 +61,8 @@ class Commissioning:
         models lie beside it.
     shadow : bool, default False
         The MPC acts throughout; the record shows what the policy would have done.
+    reidentify : bool, default False
+        As in :func:`improve`: the re-identified MPC is the first candidate.
     iterations : int, default 120
         Of :func:`improve`.
     seed : int, default 0
@@ -92,6 +94,7 @@ class Commissioning:
         max_correction: float = 0.1,
         log_path: str | PathLike[str] | None = None,
         shadow: bool = False,
+        reidentify: bool = False,
         iterations: int = 120,
         seed: int = 0,
         verbose: int = 0,
@@ -107,6 +110,7 @@ class Commissioning:
         self.batch = as_whole("batch", batch, 2)
         self.smallest = as_between("max_correction", max_correction, 0, 1, "(]")
         self.shadow = as_flag("shadow", shadow)
+        self.reidentify = as_flag("reidentify", reidentify)
         self.iterations, self.seed = as_whole("iterations", iterations), as_whole("seed", seed, 0)
         self.record = Record(None if log_path is None else Path(log_path))
         self.largest = 1.0 if self.policy.max_correction is None else self.policy.max_correction
@@ -216,7 +220,8 @@ class Commissioning:
         held, bound = ActorCheckpoint.of(self.policy), self.journal.outlook.max_correction
         learnt = self.incumbent.has_learnt
         self.incumbent.limit(outlook.max_correction)
-        found = improve(self.model, twin, self.iterations, seed=seed)
+        reidentify, count = self.reidentify, self.iterations
+        found = improve(self.model, twin, count, reidentify=reidentify, seed=seed)
         first, last = found.checks[0], found.checks[-1]
         if found.accepted or (learnt and first.accepted):
             return outlook, "accepted", f"{100 * found.change:+.2f} % in the twin."
@@ -273,6 +278,7 @@ class Commissioning:
             "batch": self.batch,
             "max_correction": self.smallest,
             "shadow": self.shadow,
+            "reidentify": self.reidentify,
             "iterations": self.iterations,
             "seed": self.seed,
             "problem": sizes,

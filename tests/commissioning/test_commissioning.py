@@ -192,7 +192,7 @@ def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> Non
         for each in run.policy.actor.parameters():
             each.add_(0.2 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
     monkeypatch.setattr(commissioning, "improve", lambda *_, **__: found)
-    found = Improvement((Check(1, False, "nothing", 0.0, 0.0, True),), 0.0)
+    found = Improvement((Check(1, False, "nothing", 0.0, 0.0, True),), 0.0, False)
     last = run.run(2)[-1]
     assert last.cost > last.mpc and "taken back" in last.reason
     assert last.verdict == "the MPC acts" and is_mpc(run.model)
@@ -204,12 +204,16 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
     bound = run.policy.max_correction
     before = [each.clone() for each in run.policy.actor.parameters()]
     refused = Check(0, False, "start 3 costs a little more", -0.01, 0.001, True)
-    monkeypatch.setattr(commissioning, "improve", lambda *_, **__: Improvement((refused,), 0.0))
+    monkeypatch.setattr(
+        commissioning, "improve", lambda *_, **__: Improvement((refused,), -0.01, False)
+    )
     assert run.run(2)[-1].verdict == "stays"
     assert all(th.equal(a, b) for a, b in zip(before, run.policy.actor.parameters(), strict=True))
     assert run.policy.max_correction == bound
     unsafe = replace(refused, safe=False)
-    monkeypatch.setattr(commissioning, "improve", lambda *_, **__: Improvement((unsafe,), 0.0))
+    monkeypatch.setattr(
+        commissioning, "improve", lambda *_, **__: Improvement((unsafe,), 0.0, False)
+    )
     run.batch = 1  # short
     assert run.run(3)[-1].verdict == "the MPC acts" and is_mpc(run.model)
 

@@ -138,10 +138,7 @@ def test_a_short_piece_of_a_log_changes_nothing_that_matters() -> None:
     found = PlantTwin.fit(problem(), [*log(5), (states[:8], actions[:7])])
     assert found.trusted and found.trust.runs.horizons[-1] == 60
     layer = YannLayer(problem().explicit())
-    mpc = layer.state_dict()
-    whole, cut = (
-        Search(copy.deepcopy(layer), mpc, each, 5, 2, 0).steps for each in (twin(), found)
-    )
+    whole, cut = (Search(copy.deepcopy(layer), each, 5, 2, 0).steps for each in (twin(), found))
     assert whole == cut > 7
 
 

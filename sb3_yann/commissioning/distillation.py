@@ -1,0 +1,64 @@
+"""The re-identified MPC as the weights of an actor: what the law of today adds to the given one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch as th
+
+from sb3_yann._validation import Array
+from sb3_yann.networks import YannLayer
+from sb3_yann.twin.dynamics import law_of
+from sb3_yann.twin.plant_twin import PlantTwin
+
+STARTS, STEPS, BATCH, UPDATES, RATE = 60, 100, 512, 600, 1e-2
+
+
+def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
+    """Return the law of the re-identified MPC, of theta and for inputs of the given problem.
+
+    None where no linear model predicts better than the given one, or the new one has no MPC.
+    """
+    try:
+        today = twin.reidentified()
+    except ValueError:  # no steady state, or no solution of the Riccati equation
+        return None
+    if today is twin.problem:
+        return None
+    layout, before, law = today.layout, twin.problem.model, law_of(today)
+    x, u = today.model.x_ss - before.x_ss, today.model.u_ss - before.u_ss
+    shift = np.zeros(layout.size)
+    shift[layout.state] = x
+    if layout.n_previous:
+        shift[layout.previous] = u
+    return lambda rows: law(rows - shift) + u
+
+
+def distill(layer: YannLayer, twin: PlantTwin, seed: int) -> bool:
+    """Fit a layer to the re-identified MPC where that comes in the twin, if there is one.
+
+    Return whether there is. Least squares on the inputs along its own runs, with Adam.
+    """
+    law = law_today(twin)
+    if law is None:
+        return False
+    problem, rng = twin.problem, np.random.default_rng([seed, 3])
+    members = len(twin.dynamics.members)
+    starts = twin.starts.draw_anywhere(STARTS, rng)[None].repeat(members, axis=0)
+    with np.errstate(all="ignore"):
+        thetas, inputs = twin.dynamics.roll_out(law, starts, STEPS)
+    rows = thetas[:-1].reshape(-1, problem.n_theta)
+    wanted = (inputs.reshape(len(rows), -1) - problem.u_min) / (problem.u_max - problem.u_min)
+    wanted = np.clip(2 * wanted - 1, -1, 1)
+    finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
+    at, to = th.as_tensor(rows[finite]), th.as_tensor(wanted[finite], dtype=th.float32)
+    optimizer = th.optim.Adam(layer.network.weights(), lr=RATE)
+    for k in range(UPDATES):
+        optimizer.param_groups[0]["lr"] = RATE * (1 - k / UPDATES)
+        chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
+        optimizer.zero_grad()
+        th.nn.functional.mse_loss(layer(at[chosen]), to[chosen]).backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    optimizer.zero_grad()
+    return True
