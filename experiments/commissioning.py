@@ -91,6 +91,7 @@ def strange_inputs(folder: Path) -> int:
             if event["verdict"] == "accepted":
                 here = event["from_here"]
                 models[here["policy"]] = DDPG.load(folder / here["model"], device="cpu")
+        if event["event"] != "episode":
             continue
         theta, u = np.array(event["thetas"])[:-1], np.array(event["actions"])
         allowed = law(theta)

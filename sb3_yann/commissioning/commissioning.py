@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,7 +15,7 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_between, as_flag, as_whole
-from sb3_yann.commissioning.comparison import Costs, compare
+from sb3_yann.commissioning.comparison import Costs, compare, is_confirmed, why_taken_back
 from sb3_yann.commissioning.improve import improve
 from sb3_yann.commissioning.incumbent import Incumbent
 from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
@@ -24,9 +25,6 @@ from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.evaluation.episodes import Source, one_env
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.twin.plant_twin import PlantTwin
-
-ENOUGH = 0.5
-"""Of the gain that the twin promised, so much lets the bound of the correction grow."""
 
 
 class Commissioning:
@@ -112,12 +110,14 @@ class Commissioning:
         self.shadow = as_flag("shadow", shadow)
         self.reidentify = as_flag("reidentify", reidentify)
         self.iterations, self.seed = as_whole("iterations", iterations), as_whole("seed", seed, 0)
-        self.record = Record(None if log_path is None else Path(log_path))
-        self.largest = 1.0 if self.policy.max_correction is None else self.policy.max_correction
         self.twin: PlantTwin | None = None
         self.watchdog: Watchdog | None = None
         record = Record(None if log_path is None else Path(log_path))
-        self.journal = Journal(record, self._settings, Outlook(min(self.smallest, self.largest)))
+        bound = 1.0 if self.policy.max_correction is None else self.policy.max_correction
+        # A model that was saved meanwhile has the bound of then.
+        self.largest: float = record.events[0].get("largest", bound) if record.events else bound
+        begin = {**self._settings, "largest": self.largest}
+        self.journal = Journal(record, begin, Outlook(self._first_bound))
         self._restore(self.journal.outlook)
 
     @property
@@ -155,10 +155,17 @@ class Commissioning:
     def _play(self, plant: Plant) -> None:
         journal = self.journal
         unsafe = any(each.violations for each, by_policy in journal.batch if by_policy)
-        acts = journal.accepted and not (self.shadow or unsafe or journal.doubted)
-        act = plant.policy if acts else plant.mpc
-        seed = self.seed + len(journal.episodes)
-        journal.add(plant.play(seed, act, self.watchdog), acts)
+        doubted = unsafe or journal.doubted or journal.cut_off >= 2
+        acts = journal.accepted and not (self.shadow or doubted)
+        self.incumbent.restore()
+        journal.begin(acts)
+        try:
+            act, seed = plant.policy if acts else plant.mpc, self.seed + len(journal.episodes)
+            played = plant.play(seed, act, self.watchdog)
+        except KeyboardInterrupt:
+            journal.interrupt()
+            raise
+        journal.add(played, acts)
 
     def _batch_is_over(self) -> bool:
         journal = self.journal
@@ -173,10 +180,14 @@ class Commissioning:
         """Learn from the plant, compare it with what was predicted, and say who acts from here."""
         journal, number, before = self.journal, len(self.batches) + 1, self.journal.outlook
         by_policy = any(each for _, each in journal.batch)
+        who, within = (before.policy, before.max_correction) if by_policy else ("MPC", 0.0)
+        alarms = sum(each.alarm is not None for each, _ in journal.batch)
+        self.incumbent.restore()
         with self._unless_cut_off():
             if self._changed:
-                self.twin, self.watchdog, costs = None, None, (np.nan, np.nan, np.nan)
-                outlook = Outlook(self._first_bound, "MPC", len(journal.episodes) - 1, number)
+                costs = compare(journal, plant, self.twin, None)
+                self.twin = self.watchdog = None
+                outlook = Outlook(self._first_bound, "MPC", len(journal.episodes), number)
                 self.incumbent.give_back()
                 verdict: Verdict = "begins anew"
                 reason = "Two episodes in a row had an alarm."
@@ -187,10 +198,9 @@ class Commissioning:
                 outlook = replace(outlook, policy=f"batch {number}", model=saved)
             elif verdict != "stays":
                 outlook = replace(outlook, policy="MPC", model=None)
-        alarms = sum(each.alarm is not None for each, _ in journal.batch)
-        who, within = (before.policy, before.max_correction) if by_policy else ("MPC", 0.0)
-        sizes = number, len(journal.batch), alarms
-        journal.close(Batch(*sizes, who, within, *costs, verdict, reason), outlook)
+            shown = costs.actual, costs.predicted, costs.mpc
+            sizes = number, len(journal.batch), alarms
+            journal.close(Batch(*sizes, who, within, *shown, verdict, reason), outlook)
         if self.verbose:
             print(self.report().splitlines()[-1])
 
@@ -199,8 +209,14 @@ class Commissioning:
         before, numbers, seed = self.twin, self.journal.log, self.seed + number
         twin = self._fit(numbers, seed) if len(numbers) > 1 else None
         known = twin if twin is not None and twin.trusted else before
-        costs = compare(self.journal, plant, before, known)
-        outlook, said = self._weigh(costs)
+        costs, outlook, said = compare(self.journal, plant, before, known), self.journal.outlook, ""
+        if why := why_taken_back(self.journal, costs):
+            self.incumbent.give_back()
+            outlook = replace(outlook, max_correction=self._first_bound, policy="MPC")
+            said = f"The policy was taken back: {why}. "
+        elif is_confirmed(self.journal, costs):
+            wider = min(2 * outlook.max_correction, self.largest)
+            outlook = replace(outlook, max_correction=wider)
         if twin is None:
             why = f"There are {len(numbers)} episodes to learn from."
         elif not twin.trusted:
@@ -210,15 +226,18 @@ class Commissioning:
             return costs, outlook, "the MPC acts", f"{said}{why}"
         self.twin, self.watchdog = twin, Watchdog.of(twin)
         outlook = replace(outlook, twin=numbers, twin_seed=seed)
-        outlook, verdict, why = self._improve(twin, outlook, seed)
-        return costs, outlook, verdict, f"{said}{why}"
+        if why:  # what learns from that acts after a batch of the MPC
+            return costs, outlook, "the MPC acts", said.strip()
+        outlook, verdict, found = self._improve(twin, outlook, seed)
+        return costs, outlook, verdict, f"{said}{found}"
 
     def _improve(
         self, twin: PlantTwin, outlook: Outlook, seed: int
     ) -> tuple[Outlook, Verdict, str]:
         """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
-        held, bound = ActorCheckpoint.of(self.policy), self.journal.outlook.max_correction
-        learnt = self.incumbent.has_learnt
+        bound = self.journal.outlook.max_correction
+        self.incumbent.take_candidate()
+        held, learnt = ActorCheckpoint.of(self.policy), self.incumbent.has_learnt
         self.incumbent.limit(outlook.max_correction)
         reidentify, count = self.reidentify, self.iterations
         found = improve(self.model, twin, count, reidentify=reidentify, seed=seed)
@@ -231,25 +250,8 @@ class Commissioning:
             said = f"{100 * first.change:+.2f} % in the twin; nothing better: {last.reason}."
             return replace(outlook, max_correction=bound), "stays", said
         self.incumbent.give_back()
-        return outlook, "the MPC acts", f"Nothing better was found: {last.reason}."
-
-    def _weigh(self, costs: Costs) -> tuple[Outlook, str]:
-        """Let the bound grow, or take the policy back, by what the plant has shown."""
-        outlook, (actual, predicted, mpc) = self.journal.outlook, costs
-        played = [each for each, by_policy in self.journal.batch if by_policy]
-        if not played:
-            return outlook, ""
-        unsafe = sum(each.violations for each in played)
-        if unsafe or actual > mpc:
-            self.incumbent.give_back()
-            said = f"It cost {actual:.5g}, the MPC would have {mpc:.5g}: it was taken back. New: "
-            if unsafe:
-                said = f"It violated a limit in {unsafe} steps: it was taken back. New: "
-            return replace(outlook, max_correction=self._first_bound), said
-        if mpc - actual >= ENOUGH * (mpc - predicted):
-            wider = min(2 * outlook.max_correction, self.largest)
-            return replace(outlook, max_correction=wider), ""
-        return outlook, ""
+        reason = last.reason or "it gains less than 0.2 %"
+        return outlook, "the MPC acts", f"Nothing better was found: {reason}."
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]
@@ -273,7 +275,9 @@ class Commissioning:
     @property
     def _settings(self) -> dict[str, Any]:
         problem = self.policy.problem
-        sizes = [problem.n_theta, problem.model.n_inputs, problem.explicit().n_regions]
+        parts = (*problem.prediction, problem.stage_matrix, problem.u_min, problem.u_max)
+        numbers = b"".join(np.asarray(each, np.float64).tobytes() for each in parts)
+        learner = f"{type(self.model).__name__} {self.policy.actor.net_arch}"
         return {
             "batch": self.batch,
             "max_correction": self.smallest,
@@ -281,7 +285,8 @@ class Commissioning:
             "reidentify": self.reidentify,
             "iterations": self.iterations,
             "seed": self.seed,
-            "problem": sizes,
+            "learner": learner,
+            "problem": hashlib.sha256(numbers).hexdigest()[:16],
         }
 
     def _restore(self, outlook: Outlook) -> None:
@@ -293,6 +298,8 @@ class Commissioning:
         else:
             self.incumbent.limit(outlook.max_correction)
             self.journal.record.load(outlook.model, self.model)
+        self.incumbent.candidate = None
+        self.incumbent.hold()
         if outlook.twin is not None:
             self.twin = self._fit(outlook.twin, outlook.twin_seed)
             self.watchdog = Watchdog.of(self.twin)

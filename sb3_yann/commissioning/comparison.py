@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,17 +13,36 @@ from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.plant_twin import PlantTwin
 
-Costs = tuple[float, float, float]
-"""Mean costs of a batch: the plant's, as the twin had predicted, and what the MPC's would be."""
+ENOUGH = 0.5
+"""Of the gain that the twin promised, so much lets the bound of the correction grow."""
+ALARMS = 0.25
+"""Share of a policy's episodes with an alarm from which on it is taken back, two at least."""
+
+
+class Costs(NamedTuple):
+    """Mean costs of the episodes of the one that acted in a batch; NaN where nothing is known.
+
+    Attributes
+    ----------
+    actual : float
+        The plant's, episodes with an alarm included.
+    predicted, promised : float
+        What the twin had predicted, and how much less than for the MPC.
+    mpc : float
+        The MPC's from the same starts: what the twin that has learnt from them predicts, and what
+        the MPC's own episodes cost beyond that. With sensor noise a plant costs more than any twin.
+    """
+
+    actual: float
+    predicted: float
+    promised: float
+    mpc: float
 
 
 def compare(
     journal: Journal, plant: Plant, before: PlantTwin | None, now: PlantTwin | None
 ) -> Costs:
-    """Return the mean costs of the present batch; NaN where there is no twin, or nothing quiet.
-
-    The MPC's are those that the present twin predicts, and what its own episodes cost beyond that:
-    with sensor noise a plant costs more than any twin without.
+    """Return the costs of the present batch.
 
     Parameters
     ----------
@@ -34,17 +54,43 @@ def compare(
         The twin that was in force, and the one that has learnt from the batch.
     """
     by_policy = any(each for _, each in journal.batch)
-    quiet = [e for e, each in journal.batch if each == by_policy and e.alarm is None]
-    if not quiet:
-        return np.nan, np.nan, np.nan
+    own = [e for e, each in journal.batch if each == by_policy and (by_policy or not e.alarm)]
+    if not own:
+        return Costs(np.nan, np.nan, np.nan, np.nan)
     problem, act = plant.problem, plant.policy if by_policy else plant.mpc
-    actual, predicted, mpc = float(_costs(problem, quiet).mean()), np.nan, np.nan
+    predicted = promised = mpc = np.nan
     if before is not None:
-        predicted = float(predicted_costs(before, quiet, act).mean())
+        predicted = predicted_costs(before, own, act).mean()
+        promised = predicted_costs(before, own, plant.mpc).mean() - predicted
     if now is not None:
-        length = np.mean([len(each.actions) for each in quiet])
-        mpc = predicted_costs(now, quiet, plant.mpc).mean() + length * _beyond(journal, plant, now)
-    return actual, predicted, float(mpc)
+        length = np.mean([len(each.actions) for each in own])
+        mpc = predicted_costs(now, own, plant.mpc).mean() + length * _beyond(journal, plant, now)
+    actual = _costs(problem, own).mean()
+    return Costs(*map(float, (actual, predicted, promised, mpc)))
+
+
+def why_taken_back(journal: Journal, costs: Costs) -> str:
+    """Return what the plant says against the policy of the present batch; empty if nothing."""
+    played = [each for each, by_policy in journal.batch if by_policy]
+    if journal.cut_off >= 2:
+        return f"{journal.cut_off} episodes that it began never ended"
+    if not played:
+        return ""
+    if unsafe := sum(each.violations for each in played):
+        return f"it violated a limit in {unsafe} steps"
+    alarms = sum(each.alarm is not None for each in played)
+    if alarms >= max(2.0, ALARMS * len(played)):
+        return f"{alarms} of its {len(played)} episodes had an alarm"
+    if not costs.actual <= costs.mpc < np.inf:  # nor does NaN pass
+        return f"it cost {costs.actual:.5g}, the MPC would have {costs.mpc:.5g}"
+    return ""
+
+
+def is_confirmed(journal: Journal, costs: Costs) -> bool:
+    """Return whether the plant gave at least half of what the twin had promised, without alarm."""
+    quiet = not any(each.alarm for each, by_policy in journal.batch if by_policy)
+    gained = costs.mpc - costs.actual
+    return quiet and 0 < ENOUGH * costs.promised <= gained < np.inf
 
 
 def _beyond(journal: Journal, plant: Plant, twin: PlantTwin) -> float:

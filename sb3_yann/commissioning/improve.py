@@ -13,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.critic import refit_critic
 from sb3_yann.commissioning.distillation import distill
+from sb3_yann.commissioning.incumbent import all_or_nothing
 from sb3_yann.commissioning.search import Search
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
@@ -149,9 +150,10 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     moved = any(not th.equal(own[key].cpu(), each) for key, each in search.accepted.items())
     if not moved or change > -LEAST:
         return Improvement(tuple(search.checks), 0.0 if moved else change, False)
-    policy.actor.mu.load_state_dict(search.accepted)
-    policy.actor_target.load_state_dict(policy.actor.state_dict())
-    for network in (policy.actor, policy.critic):
-        network.optimizer.state.clear()  # what other weights were moved by
-    refit_critic(policy, twin, seed)
+    with all_or_nothing(policy):
+        policy.actor.mu.load_state_dict(search.accepted)
+        policy.actor_target.load_state_dict(policy.actor.state_dict())
+        for network in (policy.actor, policy.critic):
+            network.optimizer.state.clear()  # what other weights were moved by
+        refit_critic(policy, twin, seed)
     return Improvement(tuple(search.checks), change, True)

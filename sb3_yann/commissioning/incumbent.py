@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -9,11 +11,14 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.rng import preserve_rng
-from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.policy.policies import YannPolicy, require_yann_policy
 
 
 class Incumbent:
     """A model's policy, its bound, and the MPC that it can always return to.
+
+    A policy that the model has learnt before is nobody's yet: it waits as ``candidate``, and the
+    model is the MPC.
 
     Parameters
     ----------
@@ -27,6 +32,11 @@ class Incumbent:
         self.model, self.policy = model, require_yann_policy(model.policy, "Commissioning")
         with preserve_rng():  # building an actor draws weights
             self._mpc = self.policy.make_actor().state_dict()
+        self.candidate: ActorCheckpoint | None = None
+        if self.has_learnt:
+            self.candidate = ActorCheckpoint.of(self.policy)
+            self.give_back()
+        self.hold()
 
     @property
     def has_learnt(self) -> bool:
@@ -43,13 +53,53 @@ class Incumbent:
         self.policy.actor.load_state_dict(self._mpc)
         self.policy.actor_target.load_state_dict(self._mpc)
 
+    def take_candidate(self) -> None:
+        """Make it what the model had learnt before, if that still waits, to be tried."""
+        if self.candidate is not None:
+            self.candidate.restore(self.policy)
+            self.candidate = None
+
+    def hold(self) -> None:
+        """Take it for the accepted one from here on."""
+        self._held = ActorCheckpoint.of(self.policy), self.policy.max_correction
+
+    def restore(self) -> None:
+        """Make it the accepted one again, with a warning where something has changed it."""
+        held, bound = self._held
+        if held.is_actor_of(self.policy) and bound == self.policy.max_correction:
+            return
+        held.restore(self.policy)
+        self.limit(bound)
+        warnings.warn(
+            "The model's actor is not the one that was accepted: that one is restored. Train "
+            "another copy of the model, not the one that is being commissioned.",
+            stacklevel=2,
+        )
+
     @contextmanager
     def unless_cut_off(self) -> Iterator[None]:
         """Leave it as it was if an error or Ctrl-C cuts a decision off."""
-        held, bound = ActorCheckpoint.of(self.policy), self.policy.max_correction
+        bound, candidate = self.policy.max_correction, self.candidate
         try:
-            yield
+            with all_or_nothing(self.policy):
+                yield
         except BaseException:
-            held.restore(self.policy)
             self.limit(bound)
+            self.candidate = candidate
             raise
+        self.hold()
+
+
+@contextmanager
+def all_or_nothing(policy: YannPolicy) -> Iterator[None]:
+    """Undo what happens to a policy's weights and optimizers, if an error or Ctrl-C cuts it off."""
+    weights = {name: each.clone() for name, each in policy.state_dict().items()}
+    optimizers = policy.actor.optimizer, policy.critic.optimizer
+    states = [copy.deepcopy(each.state_dict()) for each in optimizers]
+    try:
+        yield
+    except BaseException:
+        policy.load_state_dict(weights)
+        for optimizer, state in zip(optimizers, states, strict=True):
+            optimizer.load_state_dict(state)
+        raise

@@ -12,6 +12,9 @@ from sb3_yann.twin.log import SHORTEST
 
 Verdict = Literal["accepted", "stays", "the MPC acts", "begins anew"]
 
+NOT_DYNAMICS = ("not a number", "violation")
+"""Alarms that say nothing of how the plant moves."""
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -103,6 +106,7 @@ class Journal:
         self.by_policy: list[bool] = []
         self.batches: list[Batch] = []
         self._first_of_batch = 0
+        self._cut_off, self._open = 0, ""
         begin: Event = {"event": "begin", **settings}
         if not record.events:
             record.append(begin)
@@ -114,7 +118,11 @@ class Journal:
                 "another file."
             )
         for event in record.events[1:]:
-            if event["event"] == "episode":
+            if event["event"] == "start":
+                self._begin(event["acts"])
+            elif event["event"] == "interrupted":
+                self._open = ""
+            elif event["event"] == "episode":
                 self._add(as_episode(event), event["acts"] != "MPC")
             else:
                 named = {each.name: event[each.name] for each in fields(Batch)}
@@ -143,14 +151,33 @@ class Journal:
 
     @property
     def doubted(self) -> bool:
-        """Whether the last episode's alarm has not been answered by a quiet one."""
-        return bool(self.episodes) and not self.episodes[-1].tells
+        """Whether the last episode's alarm has not been answered by a quiet one.
+
+        An episode that began and never ended counts as one.
+        """
+        return bool(self._open) or (bool(self.episodes) and not self.episodes[-1].tells)
+
+    @property
+    def cut_off(self) -> int:
+        """How many episodes of this batch the policy began that never ended, but by Ctrl-C."""
+        return self._cut_off + (self._open not in ("", "MPC"))
 
     @property
     def changed(self) -> bool:
         """Whether two episodes in a row had an alarm in this batch: the twin holds no longer."""
-        last = [each for each, _ in self.batch[-2:]]
-        return len(last) == 2 and not any(each.tells for each in last)
+        last = [each.alarm for each, _ in self.batch[-2:]]
+        return len(last) == 2 and all(alarm and alarm.kind not in NOT_DYNAMICS for alarm in last)
+
+    def begin(self, by_policy: bool) -> None:
+        """Note that an episode begins: if it never ends, that is evidence too."""
+        acts = self.outlook.policy if by_policy else "MPC"
+        self.record.append({"event": "start", "number": len(self.episodes), "acts": acts})
+        self._begin(acts)
+
+    def interrupt(self) -> None:
+        """Note that Ctrl-C has ended the episode: that says nothing of the policy."""
+        self.record.append({"event": "interrupted", "number": len(self.episodes)})
+        self._open = ""
 
     def add(self, played: PlantEpisode, by_policy: bool) -> None:
         """Add an episode."""
@@ -165,17 +192,24 @@ class Journal:
 
     def close(self, batch: Batch, outlook: Outlook) -> None:
         """Add the decision that ends a batch."""
-        said = {k: None if v != v else v for k, v in asdict(batch).items()}  # NaN is not JSON
+        said = {  # NaN is not JSON
+            k: None if isinstance(v, float) and not math.isfinite(v) else v
+            for k, v in asdict(batch).items()
+        }
         self.record.append({"event": "batch", **said, "from_here": asdict(outlook)})
         self._close(batch, outlook)
 
+    def _begin(self, acts: str) -> None:
+        self._cut_off, self._open = self.cut_off, acts
+
     def _add(self, played: PlantEpisode, by_policy: bool) -> None:
+        self._open = ""
         self.episodes.append(played)
         self.by_policy.append(by_policy)
 
     def _close(self, batch: Batch, outlook: Outlook) -> None:
         self.batches.append(batch)
-        self.outlook, self._first_of_batch = outlook, len(self.episodes)
+        self.outlook, self._first_of_batch, self._cut_off = outlook, len(self.episodes), 0
 
     def report(self) -> str:
         """Return the batches as a table."""

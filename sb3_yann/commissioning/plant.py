@@ -73,7 +73,10 @@ class Plant:
         self.problem = self.yann.problem
         for name in ("observation_space", "action_space"):
             own, its = getattr(model, name), getattr(env, name)
-            if own.shape != its.shape:
+            if own.shape != its.shape or (
+                name == "action_space"
+                and not np.allclose([own.low, own.high], [its.low, its.high], rtol=1e-4)
+            ):
                 raise ValueError(
                     f"plant_env has {name} = {its}, the model {own}: it is another plant."
                 )
@@ -122,7 +125,8 @@ class Plant:
         alarm, step, over = None, -1, False
         while not over:
             u = act(known[None])[0].astype(np.float32)
-            wanted, law = self.policy(known[None])[0], self.mpc(known[None])[0]
+            wanted = u if act == self.policy else self.policy(known[None])[0]
+            law = self.mpc(known[None])[0]
             apart = max(apart, float(np.max(np.abs(wanted - law) / self.range)))
             observation, gained, terminated, over, info = self.env.step(u)
             unsafe = bool(info.get("violation", False)) or terminated

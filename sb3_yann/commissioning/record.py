@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from sb3_yann.commissioning.watchdog import Alarm
 
 Event = dict[str, Any]
 NAME = "commissioning.jsonl"
+BEGIN = b'{"event": "begin"'
 
 
 class Record:
@@ -36,33 +38,41 @@ class Record:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
-            whole, _, _ = self.path.read_bytes().rpartition(b"\n")
+            read = self.path.read_bytes()
+            whole, _, rest = read.rpartition(b"\n")
+            if rest and not whole and not rest.startswith(BEGIN[: len(rest)]):
+                raise ValueError(f"{self.path} is no record of a commissioning. Name another file.")
             lines = whole.decode("utf-8").splitlines()
             for number, line in enumerate(lines, start=1):
                 try:
-                    self.events.append(json.loads(line))
-                except json.JSONDecodeError as error:
+                    self.events.append(_event(line))
+                except ValueError as error:
                     raise ValueError(
                         f"{self.path}, line {number}: no event of a commissioning ({error}). Name "
                         "another file, or the one that was begun."
                     ) from error
-            self._size = len(whole) + (len(whole) > 0)
+            self._size, self._seen = len(whole) + (len(whole) > 0), len(read)
         else:
-            self._size = 0
+            self._size = self._seen = 0
 
     def append(self, event: Event) -> None:
         """Add an event; when this returns it is on the disk."""
-        self.events.append(event)
         if self.path is None:
+            self.events.append(event)
             return
-        line = (json.dumps(event) + "\n").encode("utf-8")
+        line = (json.dumps(event, allow_nan=False) + "\n").encode("utf-8")
+        if (self.path.stat().st_size if self.path.exists() else 0) != self._seen:
+            raise RuntimeError(
+                f"{self.path} was changed by somebody else. One record belongs to one run."
+            )
         with self.path.open("r+b" if self.path.exists() else "w+b") as file:
             file.truncate(self._size)
             file.seek(self._size)
             file.write(line)
             file.flush()
             os.fsync(file.fileno())
-        self._size += len(line)
+        self._size = self._seen = self._size + len(line)
+        self.events.append(event)
 
     def save(self, model: OffPolicyAlgorithm, batch: int) -> str | None:
         """Save a model beside the record, all of it or nothing; return its name."""
@@ -80,11 +90,18 @@ class Record:
         model.set_parameters(str(self.path.with_name(name)), device=model.device)
 
 
+def _event(line: str) -> Event:
+    event = json.loads(line)
+    if not isinstance(event, dict) or "event" not in event:
+        raise ValueError("it has no key 'event'")
+    return event
+
+
 def as_event(episode: PlantEpisode) -> Event:
     """Return an episode as numbers and text."""
     alarm = episode.alarm
     return {
-        "reward": episode.reward,
+        "reward": episode.reward if math.isfinite(episode.reward) else None,
         "violations": episode.violations,
         "alarm": None if alarm is None else [alarm.kind, alarm.message],
         "step": episode.step,
@@ -97,6 +114,7 @@ def as_event(episode: PlantEpisode) -> Event:
 def as_episode(event: Event) -> PlantEpisode:
     """Return the episode of an event."""
     alarm = None if event["alarm"] is None else Alarm(*event["alarm"])
-    numbers = event["reward"], event["violations"]
+    reward = math.nan if event["reward"] is None else event["reward"]
+    numbers = reward, event["violations"]
     played = np.array(event["thetas"], float), np.array(event["actions"], float)
     return PlantEpisode(*played, *numbers, alarm, event["step"], event["apart"])

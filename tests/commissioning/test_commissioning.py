@@ -14,8 +14,9 @@ from stable_baselines3 import DDPG
 
 from sb3_yann import Commissioning, Improvement, YannPolicy
 from sb3_yann.commissioning import Check, commissioning
-from sb3_yann.commissioning.comparison import predicted_costs
+from sb3_yann.commissioning.comparison import Costs, is_confirmed, predicted_costs
 from sb3_yann.commissioning.plant import Plant
+from sb3_yann.commissioning.watchdog import Alarm
 from sb3_yann.evaluation.episodes import one_env
 from twin_samples import Cart, problem
 from weights import is_mpc
@@ -95,6 +96,7 @@ def test_only_accepted_policies_act(tmp_path) -> None:
             holds = event["from_here"]["policy"]
             if event["verdict"] == "accepted":
                 accepted[holds] = event["from_here"]["model"]
+        if event["event"] != "episode":
             continue
         assert event["acts"] in ("MPC", holds)
         if accepted[event["acts"]] is None:
@@ -191,6 +193,7 @@ def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> Non
     with th.no_grad():  # what was accepted turns out to be bad: the plant says so
         for each in run.policy.actor.parameters():
             each.add_(0.2 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
+    run.incumbent.hold()
     monkeypatch.setattr(commissioning, "improve", lambda *_, **__: found)
     found = Improvement((Check(1, False, "nothing", 0.0, 0.0, True),), 0.0, False)
     last = run.run(2)[-1]
@@ -216,6 +219,91 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
     )
     run.batch = 1  # short
     assert run.run(3)[-1].verdict == "the MPC acts" and is_mpc(run.model)
+
+
+def test_weights_that_nobody_accepted_never_act() -> None:
+    run = commission()
+    run.run(1)
+    accepted = [each.clone() for each in run.policy.actor.parameters()]
+    with th.no_grad():
+        for each in run.policy.actor.parameters():
+            each.add_(1.0)
+    run.policy.limit_correction(None)
+    with pytest.warns(UserWarning, match="that one is restored"), one_env(Cart) as env:
+        run._play(Plant(env, run.model))
+    assert all(th.equal(a, b) for a, b in zip(accepted, run.policy.actor.parameters(), strict=True))
+    assert run.policy.max_correction == 0.2 and run.episodes[-1].apart <= 0.2 + 1e-6
+
+
+def test_what_the_model_had_learnt_before_waits_for_its_test() -> None:
+    model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
+    with th.no_grad():
+        for each in model.policy.actor.parameters():
+            each.add_(0.01)
+    run = Commissioning(model, Cart, batch=3, iterations=1)
+    assert is_mpc(model) and run.incumbent.candidate is not None
+
+
+def test_a_plant_that_trips_under_the_policy_gets_the_mpc(tmp_path) -> None:
+    class Trips(Cart):
+        def step(self, action):
+            if abs(action[0] - problem().explicit()(self.x)[0]) > 1e-4:
+                raise RuntimeError("emergency stop")
+            return super().step(action)
+
+    commission(tmp_path).run(1)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="emergency stop"):
+            commission(tmp_path, env=Trips).run(2)
+    last = commission(tmp_path, env=Trips).run(2)[-1]
+    assert "never ended" in last.reason and last.verdict == "the MPC acts"
+
+
+def test_a_policy_with_alarms_is_taken_back(monkeypatch) -> None:
+    run = commission()
+    run.run(1)
+    alarm = Alarm("drift", "as a test has it")
+    monkeypatch.setattr(run.watchdog, "watch", lambda *_, **__: alarm if run_is_policys() else None)
+
+    def run_is_policys() -> bool:
+        return run.journal._open != "MPC"
+
+    last = run.run(2)[-1]
+    assert last.alarms >= 2 and "had an alarm" in last.reason and is_mpc(run.model)
+
+
+def test_a_strangers_file_is_left_alone(tmp_path) -> None:
+    path = tmp_path / "settings.json"
+    path.write_text('{"my": "settings"}')
+    with pytest.raises(ValueError, match="no record"):
+        commission(path)
+    assert path.read_text() == '{"my": "settings"}'
+
+
+def test_two_runs_on_one_record_are_noticed(tmp_path) -> None:
+    one, other = commission(tmp_path), commission(tmp_path)
+    one.run(1)
+    with pytest.raises(RuntimeError, match="somebody else"):
+        other.run(1)
+
+
+def test_another_cost_is_another_commissioning(tmp_path) -> None:
+    commission(tmp_path)
+    model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
+    other = replace(problem(), Q=np.diag([1.5, 0.1]))
+    model = DDPG(YannPolicy, Cart(), policy_kwargs={"problem": other}, device="cpu")
+    options = {"batch": 5, "iterations": 40, "max_correction": 0.2}
+    with pytest.raises(ValueError, match="begun with problem"):
+        Commissioning(model, Cart, log_path=tmp_path, **options)
+
+
+def test_the_bound_grows_only_with_what_was_promised() -> None:
+    journal = commission().journal
+    assert is_confirmed(journal, Costs(9.0, 8.9, 1.0, 9.6))
+    assert not is_confirmed(journal, Costs(9.0, 8.9, 1.0, 9.4))
+    assert not is_confirmed(journal, Costs(100.0, 101.0, -1.0, 100.0))
+    for unknown in (Costs(*4 * (np.nan,)), Costs(100.0, 90.0, np.inf, np.inf)):
+        assert not is_confirmed(journal, unknown)
 
 
 def test_shadow_computes_and_does_not_act() -> None:
