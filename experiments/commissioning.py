@@ -25,7 +25,11 @@ from sb3_yann import Commissioning
 from sb3_yann.evaluation import evaluate
 from sb3_yann_envs import problems
 
-CASES = {"no noise": 0.0, "sensor noise of .001 mol/L and .03 K": 1.0}
+CASES = {
+    "no noise": (0.0, False),
+    "no noise, reidentify=True": (0.0, True),
+    "sensor noise of .001 mol/L and .03 K": (1.0, False),
+}
 SEEDS = range(40, 50)
 BATCHES, FIRST = 4, 4  # 4 + 8 + 16 + 32 episodes
 
@@ -67,9 +71,11 @@ def run(case: str, seed: int) -> Outcome:
     th.set_num_threads(1)
     problem, first = problems.cstr(), 200_000 + 1000 * seed
     model = DDPG("YannPolicy", "CSTR-v0", policy_kwargs={"problem": problem}, device="cpu")
-    plant = Noisy(gym.make("CSTR-v0"), CASES[case], seed)
+    noise, reidentify = CASES[case]
+    plant = Noisy(gym.make("CSTR-v0"), noise, seed)
     with tempfile.TemporaryDirectory() as folder:
-        work = Commissioning(model, plant, batch=FIRST, seed=first, log_path=folder)
+        options = {"batch": FIRST, "seed": first, "reidentify": reidentify}
+        work = Commissioning(model, plant, log_path=folder, **options)
         work.run(BATCHES)
         strange = strange_inputs(Path(folder))
     ours, mpc = (evaluate(each, "CSTR-v0", STARTS) for each in (model, problem.explicit()))
