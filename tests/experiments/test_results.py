@@ -325,19 +325,22 @@ def from_a_log() -> dict[Run, Outcome]:
     for seed, less in enumerate((8.0, 4.0)):
         better = fixed(MPC_COSTS - [3 * less, -less])
         found[Run(twin.PLANT, "five episodes", seed, 0)] = dataclasses.replace(
-            better, extra={"trusted": np.array(True)}, seconds=7.0 + seed
+            better,
+            extra={"trusted": np.array(True), "reidentified": 0.97 * MPC_COSTS},
+            seconds=7.0 + seed,
         )
         found[Run(twin.PLANT, "two episodes", seed, 0)] = dataclasses.replace(
-            fixed(MPC_COSTS), extra={"trusted": np.array(False)}
+            fixed(MPC_COSTS), extra={"trusted": np.array(False), "reidentified": MPC_COSTS}
         )
     return found
 
 
 def test_the_table_from_a_log_says_what_was_gained_of_what_was_possible() -> None:
     five, two, optimum = twin.rows(from_a_log())
-    assert five[1:] == ("2 of 2", "-3.00 (-4.00 to -2.00)", "60", "2", "+4.00", "0", "8")
-    assert two[1:] == ("0 of 2", "+0.00 (+0.00 to +0.00)", "0", "0", "+0.00", "0", "")
-    assert optimum[2:4] == ("-5.00", "100")
+    linear, none = "-3.00 (-3.00 to -3.00)", "+0.00 (+0.00 to +0.00)"
+    assert five[1:] == ("2 of 2", "-3.00 (-4.00 to -2.00)", linear, "60", "2", "+4.00", "0", "8")
+    assert two[1:] == ("0 of 2", none, none, "0", "0", "+0.00", "0", "")
+    assert optimum[2:5] == ("-5.00", "", "100")
 
 
 def test_the_table_from_a_log_is_quoted_beside_its_picture(tmp_path) -> None:
