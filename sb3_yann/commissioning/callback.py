@@ -161,5 +161,4 @@ class ImproveInTwin(BaseCallback):
         if not self.twin.trusted:
             return Attempt(*now, False, False, error, np.nan, problems)
         found = improve(self.model, self.twin, self.iterations, seed=seed)
-        reason = "" if found.accepted else f"Nothing better was found: {found.checks[-1].reason}."
-        return Attempt(*now, True, found.accepted, error, found.change, reason)
+        return Attempt(*now, True, found.accepted, error, found.change, found.reason)

@@ -60,7 +60,7 @@ class Commissioning:
     shadow : bool, default False
         The MPC acts throughout; the record shows what the policy would have done.
     reidentify : bool, default False
-        As in :func:`improve`: the re-identified MPC is the first candidate.
+        As in :func:`improve`: a second search begins at the re-identified MPC.
     iterations : int, default 120
         Of :func:`improve`.
     seed : int, default 0
@@ -241,17 +241,16 @@ class Commissioning:
         self.incumbent.limit(outlook.max_correction)
         reidentify, count = self.reidentify, self.iterations
         found = improve(self.model, twin, count, reidentify=reidentify, seed=seed)
-        first, last = found.checks[0], found.checks[-1]
+        first = found.checks[0]
         if found.accepted or (learnt and first.accepted):
             return outlook, "accepted", f"{100 * found.change:+.2f} % in the twin."
         if learnt and self.journal.accepted and first.safe and first.change <= 0:
             held.restore(self.policy)
             self.incumbent.limit(bound)
-            said = f"{100 * first.change:+.2f} % in the twin; nothing better: {last.reason}."
+            said = f"{100 * first.change:+.2f} % in the twin. {found.reason}"
             return replace(outlook, max_correction=bound), "stays", said
         self.incumbent.give_back()
-        reason = last.reason or "it gains less than 0.2 %"
-        return outlook, "the MPC acts", f"Nothing better was found: {reason}."
+        return outlook, "the MPC acts", found.reason
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]

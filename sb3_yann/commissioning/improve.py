@@ -41,13 +41,21 @@ class Improvement:
 
     Examples
     --------
-    >>> Improvement(checks=(), change=-0.02, accepted=True).change
-    -0.02
+    >>> Improvement(checks=(), change=-0.02, accepted=True).reason
+    ''
     """
 
     checks: tuple[Check, ...]
     change: float
     accepted: bool
+
+    @property
+    def reason(self) -> str:
+        """Why nothing was accepted; empty where something was."""
+        if self.accepted:
+            return ""
+        last = self.checks[-1].reason or f"it gains less than {100 * LEAST:g} %"
+        return f"Nothing better was found: {last}."
 
 
 def improve(  # noqa: PLR0913 (settings of a user, each by its name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 
 import gymnasium as gym
 import numpy as np
@@ -117,3 +118,17 @@ def test_the_critic_is_refitted_to_the_returns_of_the_twin() -> None:
     before = error()
     refit_critic(model.policy, found, seed=0)
     assert error() < 0.5 * before
+
+
+def test_what_gains_next_to_nothing_changes_nothing(monkeypatch) -> None:
+    module = importlib.import_module("sb3_yann.commissioning.improve")
+    model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
+    before = policy_bits(model)
+    monkeypatch.setattr(module, "LEAST", 1.0)  # nobody saves all of the cost
+    found = improve(model, twin(), iterations=40)
+    assert any(each.accepted for each in found.checks) and not found.accepted
+    assert found.change == 0.0 and "Nothing better was found" in found.reason
+    assert policy_bits(model) == before
+    monkeypatch.undo()
+    assert improve(model, twin(), iterations=40).accepted
+    assert policy_bits(model) != before
