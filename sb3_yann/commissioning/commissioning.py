@@ -212,7 +212,7 @@ class Commissioning:
         costs, outlook, said = compare(self.journal, plant, before, known), self.journal.outlook, ""
         if why := why_taken_back(self.journal, costs):
             self.incumbent.give_back()
-            outlook = replace(outlook, max_correction=self._first_bound, policy="MPC")
+            outlook = replace(outlook, max_correction=self._first_bound)
             said = f"The policy was taken back: {why}. "
         elif is_confirmed(self.journal, costs):
             wider = min(2 * outlook.max_correction, self.largest)
