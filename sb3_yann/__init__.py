@@ -28,8 +28,8 @@ _NAMES = {
     "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
     "sb3_yann.commissioning": "Batch Commissioning ImproveInTwin Improvement improve",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
-    "ExplicitSolutionError Identified LinearMPC LinearModel OutputBounds PiecewiseAffine "
-    "RateLimits SoftBounds Terminal Tracking identify",
+    "ExplicitSolutionError Identified LinearMPC LinearModel OnlineLaw OnlineLawWarning "
+    "OutputBounds PiecewiseAffine RateLimits SoftBounds Terminal Tracking identify",
     "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "
     "YannPolicy register_problem",

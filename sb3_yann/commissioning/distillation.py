@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.networks import YannLayer
+from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -35,7 +35,7 @@ def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
     return lambda rows: law(rows - shift) + u
 
 
-def distill(layer: YannLayer, twin: PlantTwin, seed: int) -> bool:
+def distill(layer: LawLayer, twin: PlantTwin, seed: int) -> bool:
     """Fit a layer to the re-identified MPC where that comes in the twin, if there is one.
 
     Return whether there is. Least squares on the inputs along its own runs, with Adam.

@@ -12,7 +12,8 @@ import torch as th
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.trial import Check, Trial
 from sb3_yann.control import LinearMPC, lqr
-from sb3_yann.networks import RowAdam, YannLayer
+from sb3_yann.networks import RowAdam
+from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import Objective, accumulate_gradient, actor_inputs
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -38,7 +39,7 @@ class Search:
 
     Parameters
     ----------
-    layer : YannLayer
+    layer : LawLayer
         On the CPU; it is moved.
     twin : PlantTwin
     batch : int
@@ -49,7 +50,7 @@ class Search:
     """
 
     def __init__(
-        self, layer: YannLayer, twin: PlantTwin, batch: int, n_starts: int, seed: int
+        self, layer: LawLayer, twin: PlantTwin, batch: int, n_starts: int, seed: int
     ) -> None:
         self.layer, self.twin, problem = layer, twin, twin.problem
         members, checked = len(twin.dynamics.members), np.random.default_rng([seed, 1])
@@ -171,10 +172,10 @@ class Search:
 
 def settling_steps(problem: LinearMPC) -> int:
     """Return after how many steps of the linear closed loop little is left of a deviation."""
-    law, layout, numbers = problem.explicit(), problem.layout, np.arange(problem.n_theta)
+    law, layout, numbers = problem.law(), problem.layout, np.arange(problem.n_theta)
     A, B = problem.prediction
     moving = np.concatenate([numbers[layout.state], numbers[layout.previous]])
-    gain = law.gains[law.locate(np.zeros(problem.n_theta))]
+    gain = law.gain(np.zeros(problem.n_theta))
     radius = lqr.spectral_radius((A + B @ gain)[np.ix_(moving, moving)])
     return int(np.ceil(np.log(SETTLED) / np.log(radius))) if 0 < radius < 1 else LONGEST
 

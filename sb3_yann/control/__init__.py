@@ -6,6 +6,7 @@ from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.model.identify import Identified, identify
 from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.mpc.choice import OnlineLawWarning
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
     OutputBounds,
@@ -17,6 +18,7 @@ from sb3_yann.control.mpc.groups import (
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
 from sb3_yann.control.observer import DisturbanceObserver
+from sb3_yann.control.online.online_law import OnlineLaw
 
 __all__ = [
     "DisturbanceBounds",
@@ -26,6 +28,8 @@ __all__ = [
     "Identified",
     "LinearMPC",
     "LinearModel",
+    "OnlineLaw",
+    "OnlineLawWarning",
     "OutputBounds",
     "ParametricQP",
     "PiecewiseAffine",

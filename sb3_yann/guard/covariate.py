@@ -44,7 +44,7 @@ class Recorder:
 
 def predicted_cost(problem: LinearMPC, start: Array, steps: int) -> float:
     """Return what the MPC costs on its own linear model, from a start, over a number of steps."""
-    law, theta, cost = problem.explicit(), start, 0.0
+    law, theta, cost = problem.law(), start, 0.0
     for _ in range(steps):
         u = law(theta)
         cost += float(problem.stage_cost(theta, u))

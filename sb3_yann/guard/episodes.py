@@ -183,7 +183,7 @@ def outcome_of(session: GuardSession, episodes: Episodes) -> Outcome:
     lost = ~(np.isfinite(episodes.costs) & finite)
     unsafe = np.column_stack([episodes.violations, episodes.terminated, lost]).astype(np.int64)
     layer = session.policy.actor.mu
-    visits = np.zeros((len(episodes.costs), len(layer.gains)), dtype=bool)
+    visits = np.zeros((len(episodes.costs), layer.n_networks), dtype=bool)
     for visited, states in zip(visits, episodes.observations, strict=True):
         visited[layer.regions(session.policy.theta(session.seen(states[:-1])))] = True
     return Outcome(episodes.costs, unsafe, visits)

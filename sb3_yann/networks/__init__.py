@@ -2,6 +2,7 @@
 
 from sb3_yann.networks.paper_yann import PaperYann
 from sb3_yann.networks.row_adam import RowAdam
+from sb3_yann.networks.shared_yann import SharedYannLayer
 from sb3_yann.networks.value import (
     AfterstateValue,
     LinearPrediction,
@@ -18,6 +19,7 @@ __all__ = [
     "QuadraticStateActionValue",
     "Ranges",
     "RowAdam",
+    "SharedYannLayer",
     "YannLayer",
     "ZeroOutputNetwork",
 ]

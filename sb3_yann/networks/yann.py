@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from torch import nn
 
 from sb3_yann._validation import Array
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
 
 
-class YannLayer(nn.Module):
+class YannLayer(LawLayer):
     """theta -> input in [-1, 1]: a piecewise affine law, exactly, plus a network per region.
 
     At first the networks are exactly zero and the layer is the law, to float32 rounding. Once
@@ -54,11 +54,7 @@ class YannLayer(nn.Module):
     offsets: th.Tensor
     half_space_A: th.Tensor
     half_space_b: th.Tensor
-    theta_half: th.Tensor
     resting: th.Tensor
-    middle: th.Tensor
-    half_range: th.Tensor
-    change: th.Tensor
 
     def __init__(
         self,
@@ -67,49 +63,23 @@ class YannLayer(nn.Module):
         activation: Activation = th.tanh,
         max_correction: float | None = None,
         pinned: bool = True,
-        rate: tuple[Array, Array] | None = None,
+        rate: Rate | None = None,
     ) -> None:
         super().__init__()
         # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
         import_module("sb3_yann.networks._kernels.yann_layer")
-        if not np.all(np.isfinite([law.u_min, law.u_max])):
-            raise ValueError(
-                f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
-                "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
-            )
-        self.infeasible, self.piecewise_affine, self.row_gradients = law.infeasible, law, False
+        require_finite_inputs(law)
+        self.infeasible, self.piecewise_affine = law.infeasible, law
         self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
-        middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
         # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
         register_constants(self, **_constants(law))
-        half = (law.theta_max - law.theta_min) / 2
-        self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
-        self.rated = rate is not None
-        if rate is not None:
-            if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
-                raise ValueError(
-                    f"rate has shape {np.shape(rate)}, expected (2, {law.n_inputs}) and a theta "
-                    f"that ends with the {law.n_inputs} previous inputs; it has {law.n_theta}."
-                )
-            # In both directions a little is left for the rounding of actions and observations.
-            room = np.maximum(np.stack([-rate[0], rate[1]]) / reach - 1e-6, 0.0)
-            change = room * [[-1.0], [1.0]]
-            register_constants(self, middle=middle, half_range=reach, change=change)
+        self._set_ranges(law, rate)
         at_origin = np.minimum.reduceat(law.b, law.starts) >= -law.tolerance
         stay, sizes = th.as_tensor(at_origin & pinned), (law.n_theta, law.n_inputs)
         self.network = ZeroOutputNetwork(*sizes, hidden, activation=activation, pinned=stay)
-        scaling = np.concatenate([2 / (law.theta_max - law.theta_min), middle, 1 / reach])
-        change = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
-        self.constants = (scaling, change, np.inf)  # for compiled code
         self.limit(max_correction)
         self.has_its_law = True
-
-    def limit(self, max_correction: float | None) -> None:
-        """Bound the network's output to a fraction of the input range, or not at all."""
-        # The input range is 2 here. A little is left for the float32 rounding of what follows.
-        self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
-        self.constants = (*self.constants[:2], np.inf if self.reach is None else self.reach)
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
@@ -118,15 +88,7 @@ class YannLayer(nn.Module):
             return self._compiled(theta)
         region, inside = self.locate(theta)
         correction = self.network((theta / self.theta_half).to(self.theta_half), region)
-        if self.reach is not None:
-            # The bound holds for weights that overflow, or are no numbers, as well.
-            correction = correction.nan_to_num(0.0, self.reach, -self.reach)
-            correction = clamp_with_inward_gradient(correction, -self.reach, self.reach)
-        output = self._law(theta, region, inside) + correction
-        # As compiled: where theta is not finite nothing is passed off as an input.
-        output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
-        bounds = self.reachable(theta) if self.rated else (-1.0, 1.0)
-        return clamp_with_inward_gradient(output, *bounds)
+        return self._with_correction(theta, self._law(theta, region, inside), correction)
 
     def _compiled(self, theta: th.Tensor) -> th.Tensor:
         from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
@@ -166,12 +128,15 @@ class YannLayer(nn.Module):
         u = u.clamp(-1, 1).to(self.theta_half)
         return u.clamp(*self.reachable(theta)) if self.rated else u
 
-    @th.no_grad()
-    def reachable(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return the bounds (batch, m) that the rate leaves of [-1, 1]."""
-        previous = (theta[:, -len(self.middle) :] - self.middle) / self.half_range
-        low, high = (previous + self.change[:, None]).clamp(-1, 1).to(self.theta_half)
-        return low, high
+    def slopes_of_law(self, theta: Array) -> Array:
+        """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""
+        region = self.regions(th.as_tensor(theta))
+        slopes: Array = self.gains[region].numpy().copy()
+        raw = (slopes @ theta[..., None])[..., 0] + self.offsets[region].numpy()
+        slopes[np.abs(raw) >= 1] = 0.0
+        if self.infeasible == "zero_input":
+            slopes[~self.piecewise_affine.in_domain(theta)] = 0.0
+        return slopes
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         super()._load_from_state_dict(state_dict, prefix, *args)
@@ -205,26 +170,3 @@ def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
         A[:, :count, i] = law.A[start : start + count].T
         b[:count, i] = law.b[start : start + count]
     return A.reshape(law.n_theta, -1), b.ravel()
-
-
-class _InwardGradientClamp(th.autograd.Function):
-    """Clamp to [low, high]; backward, stop only what would push further out."""
-
-    @staticmethod
-    def forward(ctx: Any, x: th.Tensor, low: Any, high: Any) -> th.Tensor:
-        ctx.save_for_backward(x)
-        ctx.low, ctx.high = low, high
-        return x.clamp(low, high)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, None, None]:
-        (x,), (grad,) = ctx.saved_tensors, grad_outputs
-        # Descent moves x against its gradient.
-        outward = ((x >= ctx.high) & (grad < 0)) | ((x <= ctx.low) & (grad > 0))
-        return grad.masked_fill(outward, 0.0), None, None
-
-
-def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:
-    """Return x clamped to numbers or tensors, with a gradient that can still lead inside."""
-    clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
-    return clamped

@@ -203,9 +203,11 @@ def _require_theta(
         raise ValueError(f"{given} law of the problem {takes}: give it {problem.n_theta} rows.")
 
 
-def as_net_arch(value: dict[str, list[int]] | list[int] | None) -> dict[str, list[int]]:
+def as_net_arch(
+    value: dict[str, list[int]] | list[int] | None, shared: bool = False
+) -> dict[str, list[int]]:
     """Return the hidden widths of actor (pi) and critic (qf), with defaults for what is missing."""
-    known = {"pi": [16, 16], "qf": [64, 64]}
+    known = {"pi": [64, 64] if shared else [16, 16], "qf": [64, 64]}
     if value is None:
         return known
     if isinstance(value, list):  # SB3's short form

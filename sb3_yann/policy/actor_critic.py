@@ -16,25 +16,29 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from sb3_yann import networks
-from sb3_yann._validation import NonFiniteWarning
-from sb3_yann.control import LinearMPC
-from sb3_yann.networks import AfterstateValue, YannLayer
+from sb3_yann._validation import NonFiniteWarning, as_choice
+from sb3_yann.control import LinearMPC, PiecewiseAffine
+from sb3_yann.control.mpc.choice import Law
+from sb3_yann.networks import AfterstateValue, SharedYannLayer, YannLayer
+from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.policy._features import SeesTheta, without_entries
 from sb3_yann.policy._finite import what_is_not_finite
 from sb3_yann.policy.critic_options import CriticOptions
 
+NETWORKS = ("per_region", "shared")
+
 
 class YannActor(SeesTheta, Actor):
-    """SB3's actor with a :class:`YannLayer` in place of the multi-layer perceptron.
+    """SB3's actor with a law and its networks in place of the multi-layer perceptron.
 
     Parameters
     ----------
     problem : LinearMPC
-        The MPC whose explicit law the actor starts from.
+        The MPC whose law the actor starts from.
     net_arch : list of int
-        Widths of each region's network.
+        Widths of each network.
     activation_fn : type, default torch.nn.Tanh
-    max_correction, pin_equilibrium
+    max_correction, pin_equilibrium, law, networks
         As in :class:`YannPolicy`.
     **sb3_kwargs
         Other arguments of SB3's `Actor`: spaces and features extractor.
@@ -47,7 +51,7 @@ class YannActor(SeesTheta, Actor):
     torch.Size([1, 1])
     """
 
-    mu: YannLayer  # type: ignore[assignment]
+    mu: LawLayer  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -57,6 +61,8 @@ class YannActor(SeesTheta, Actor):
         activation_fn: type[nn.Module] = nn.Tanh,
         max_correction: float | None = None,
         pin_equilibrium: bool = True,
+        law: str = "auto",
+        networks: str | None = None,
         **sb3_kwargs: Any,
     ) -> None:
         # No perceptron is built that would be thrown away.
@@ -67,14 +73,14 @@ class YannActor(SeesTheta, Actor):
             "problem": problem,
             "max_correction": max_correction,
             "pin_equilibrium": pin_equilibrium,
+            "law": law,
+            "networks": networks,
         }
         rate = (problem.rate.du_min, problem.rate.du_max) if problem.has_rate_bounds else None
-        law, widths, options = (
-            problem.explicit(),
-            tuple(net_arch),
-            (max_correction, pin_equilibrium),
-        )
-        self.mu = YannLayer(law, widths, activation_fn(), *options, rate)
+        given = problem.law(law)
+        kind = layer_for(given, networks)
+        own = tuple(net_arch), activation_fn(), max_correction, pin_equilibrium
+        self.mu = kind(given, *own, rate)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """Return the actions in [-1, 1], (batch, m), finite whatever is observed and learnt."""
@@ -202,6 +208,23 @@ class YannCritic(SeesTheta, ContinuousCritic):
         finally:
             for parameter in trained:
                 parameter.requires_grad_(True)
+
+
+def layer_for(law: Law, networks: str | None) -> Any:
+    """Return the class of layers around a law; by default per region where there are regions.
+
+    ValueError where a network for each region is asked of a law that has none.
+    """
+    if networks is not None:
+        as_choice("networks", networks, NETWORKS)
+    if isinstance(law, PiecewiseAffine):
+        return SharedYannLayer if networks == "shared" else YannLayer
+    if networks == "per_region":
+        raise ValueError(
+            "networks = 'per_region' needs the regions of an explicit law, and this law is solved "
+            "online. Take networks='shared', or solve problem.explicit() before, without a limit."
+        )
+    return SharedYannLayer
 
 
 def _initial_value(

@@ -17,14 +17,15 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_yann._validation import as_between, as_discount, as_flag, as_whole
+from sb3_yann._validation import as_between, as_choice, as_discount, as_flag, as_whole
 from sb3_yann.control import LinearMPC
-from sb3_yann.networks import RowAdam
+from sb3_yann.control.mpc.choice import LAWS
+from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
 from sb3_yann.policy import _checks, _sb3_hooks
 from sb3_yann.policy._features import AffineFeatures
 from sb3_yann.policy._finite import finite_gradient, warn_of_refused_step, watch_buffer
-from sb3_yann.policy.actor_critic import YannActor, YannCritic
+from sb3_yann.policy.actor_critic import YannActor, YannCritic, layer_for
 from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
 from sb3_yann.policy.observations import AffineObservation
 from sb3_yann.policy.problem_registry import resolve_problem
@@ -33,7 +34,7 @@ from sb3_yann.policy.problem_registry import resolve_problem
 class YannPolicy(TD3Policy):
     """A TD3 or DDPG policy that starts as a linear MPC, exactly, with the critic that goes with it.
 
-    The actor is the explicit law of the MPC plus networks that are zero at first. The critic is
+    The actor is the law of the MPC plus networks that are zero at first. The critic is
     the state-action value of the law on the linear model, plus such a network. Transitions and
     gradients that are not finite are left out, with a :class:`NonFiniteWarning`; where an
     observation or the actor's networks are not finite, the law acts.
@@ -54,8 +55,8 @@ class YannPolicy(TD3Policy):
     gamma : float, optional
         Discount of the critic. The default is the algorithm's, 0.99 without an algorithm.
     net_arch : dict or list, optional
-        Widths of one or two hidden layers, for each region of the actor and for each critic:
-        ``{"pi": [16, 16], "qf": [64, 64]}`` by default.
+        Widths of one or two hidden layers, for each network of the actor and for each critic:
+        ``{"pi": [16, 16], "qf": [64, 64]}`` by default, with [64, 64] for a shared network.
     activation_fn : type, default torch.nn.Tanh
         An activation that is 0 at 0.
     actor_lr_mult, critic_lr_mult : float, default 0.1 and 1
@@ -72,6 +73,12 @@ class YannPolicy(TD3Policy):
         steady-state input is wrong. False for problems with references or disturbances, else True.
     observation : AffineObservation, optional
         The map from an observation to theta. The default is the identity.
+    law : {"auto", "explicit", "online"}, default "auto"
+        The explicit law, or the one whose program is solved at each point: see
+        :meth:`LinearMPC.law`.
+    networks : {"per_region", "shared"}, optional
+        A network for each region of an explicit law, as in the paper, or one for all theta, which
+        keeps the policy as continuous as the law. The default is the first where there are regions.
     **sb3_kwargs
         ``n_critics``, ``optimizer_class`` and ``optimizer_kwargs``, as in SB3's `TD3Policy`. For
         Adam, the actor of more than 32 regions has :class:`RowAdam`. Arguments for features must
@@ -113,6 +120,8 @@ class YannPolicy(TD3Policy):
         max_correction: float | None = None,
         pin_equilibrium: bool | None = None,
         observation: AffineObservation | None = None,
+        law: str = "auto",
+        networks: str | None = None,
         **sb3_kwargs: Any,
     ) -> None:
         algorithm = _sb3_hooks.algorithm_under_construction()
@@ -141,6 +150,8 @@ class YannPolicy(TD3Policy):
         if pin_equilibrium is None:
             pin_equilibrium = not self.problem.layout.has_constants
         self.pin_equilibrium = as_flag("pin_equilibrium", pin_equilibrium)
+        self.law, self.networks = as_choice("law", law, LAWS), networks
+        shared = layer_for(self.problem.law(law), networks) is SharedYannLayer
         self.actor_step = 1.0  # another factor of the learning rate, which an ImprovementGuard sets
         self.refused = {"actor": 0, "critic": 0}  # steps whose gradient was not finite
         self.batch_is_finite = True
@@ -148,7 +159,7 @@ class YannPolicy(TD3Policy):
             observation_space,
             action_space,
             lr_schedule,
-            net_arch=_checks.as_net_arch(net_arch),
+            net_arch=_checks.as_net_arch(net_arch, shared),
             activation_fn=_checks.as_activation(activation_fn),
             **_checks.with_fused_adam(sb3_kwargs),
         )
@@ -159,10 +170,10 @@ class YannPolicy(TD3Policy):
         super()._build(lr_schedule)
         chosen = {name: each for name, each in self.optimizer_kwargs.items() if name != "fused"}
         adam = self.optimizer_class is th.optim.Adam and chosen.keys() <= {"betas", "eps"}
-        if adam and self.problem.explicit().n_regions > FEW:
+        if adam and (mu := self.actor.mu).n_networks > FEW:
             # A step, and its gradients, of the regions in use alone.
             self.actor.optimizer = RowAdam(self.actor.parameters(), lr=lr_schedule(1), **chosen)
-            self.actor.mu.row_gradients = True
+            mu.row_gradients = True
         # A buffer travels with the parameters: a model that is loaded goes on where it was.
         self.register_buffer("critic_updates", th.zeros((), dtype=th.int64))
         self._attach_hooks()
@@ -214,9 +225,10 @@ class YannPolicy(TD3Policy):
         return AffineFeatures(self.observation_space, self.observation)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
-        """Return an actor that equals the explicit law, with networks that are zero."""
+        """Return an actor that equals the law, with networks that are zero."""
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         kwargs |= {"max_correction": self.max_correction, "pin_equilibrium": self.pin_equilibrium}
+        kwargs |= {"law": self.law, "networks": self.networks}
         return YannActor(self.problem, **kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannCritic:
@@ -244,6 +256,8 @@ class YannPolicy(TD3Policy):
             "max_correction": self.max_correction,
             "pin_equilibrium": self.pin_equilibrium,
             "observation": self.observation,
+            "law": self.law,
+            "networks": self.networks,
         }
 
 

@@ -55,7 +55,7 @@ class Coordinates:
 
 def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
     """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
-    law, m = problem.explicit(), problem.model.n_inputs
+    law, m = problem.law(), problem.model.n_inputs
 
     def act(rows: Array) -> Array:
         finite = np.isfinite(rows).all(axis=1)

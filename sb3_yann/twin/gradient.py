@@ -15,7 +15,7 @@ import torch as th
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.networks import YannLayer
+from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import Dynamics
 
 
@@ -61,7 +61,7 @@ class Objective:
         return np.asarray(stage + np.sum((end @ self.value) * end, axis=-1))
 
 
-def actor_inputs(layer: YannLayer, problem: LinearMPC, theta: Array) -> Array:
+def actor_inputs(layer: LawLayer, problem: LinearMPC, theta: Array) -> Array:
     """Return the inputs (rows, m) of an actor at theta (rows, n_theta)."""
     with th.no_grad():
         actions = layer(th.as_tensor(theta)).double().numpy()
@@ -70,7 +70,7 @@ def actor_inputs(layer: YannLayer, problem: LinearMPC, theta: Array) -> Array:
 
 
 def accumulate_gradient(
-    layer: YannLayer,
+    layer: LawLayer,
     dynamics: Dynamics,
     objective: Objective,
     starts: Array,
@@ -81,7 +81,7 @@ def accumulate_gradient(
 
     Parameters
     ----------
-    layer : YannLayer
+    layer : LawLayer
         On the CPU.
     dynamics : Dynamics
         The twin's.
@@ -132,21 +132,15 @@ def _by_member(thetas: Array, inputs: Array) -> tuple[Array, Array]:
     )
 
 
-def _slopes_of_actor(layer: YannLayer, theta: Array) -> Array:
+def _slopes_of_actor(layer: LawLayer, theta: Array) -> Array:
     """Return the derivatives (rows, m, n_theta) of the actions in [-1, 1] by theta.
 
     Those of the law and of the network, each zero where it lies on its bound. On a bound of the
     rate an action moves with the previous input. (The layer's own gradient leads inside from its
     bounds, which is for training and not for this.)
     """
-    at, law = th.as_tensor(theta), layer.piecewise_affine
-    region = layer.regions(at)
-    of_law = layer.gains[region].numpy().copy()
-    raw = (of_law @ theta[..., None])[..., 0] + layer.offsets[region].numpy()
-    of_law[np.abs(raw) >= 1] = 0.0
-    if layer.infeasible == "zero_input":
-        of_law[~law.in_domain(theta)] = 0.0
-    of_network = _slopes_of_network(layer, at, region)
+    at, of_law = th.as_tensor(theta), layer.slopes_of_law(theta)
+    of_network = _slopes_of_network(layer, at, layer.regions(at))
     with th.no_grad():
         by_law, actions = layer.law(at).double().numpy(), layer(at).double().numpy()
         bounds = [each.double().numpy() for each in layer.reachable(at)] if layer.rated else []
@@ -155,7 +149,7 @@ def _slopes_of_actor(layer: YannLayer, theta: Array) -> Array:
     return _moved_by_bounds(layer, of_law + of_network, actions, low, high)
 
 
-def _slopes_of_network(layer: YannLayer, at: th.Tensor, region: Any) -> Array:
+def _slopes_of_network(layer: LawLayer, at: th.Tensor, region: Any) -> Array:
     z = (at / layer.theta_half).to(layer.theta_half).requires_grad_()
     correction = layer.network(z, th.as_tensor(region))
     m = correction.shape[1]
@@ -170,13 +164,13 @@ def _slopes_of_network(layer: YannLayer, at: th.Tensor, region: Any) -> Array:
 
 
 def _moved_by_bounds(
-    layer: YannLayer, slopes: Array, values: Array, low: Array, high: Array
+    layer: LawLayer, slopes: Array, values: Array, low: Array, high: Array
 ) -> Array:
     """Return the slopes of what lies on a bound: zero, or those of the bound of the rate.
 
     Parameters
     ----------
-    layer : YannLayer
+    layer : LawLayer
         Which knows whether there are bounds of the rate.
     slopes : ndarray, shape (rows, m, n_theta)
         Of the values.

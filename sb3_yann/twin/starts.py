@@ -66,7 +66,7 @@ class Starts:
         middle, reach = (self.high + self.low) / 2, AROUND * (self.high - self.low) / 2
         drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
         drawn = np.clip(drawn, self.problem.theta_min, self.problem.theta_max)
-        outside = ~self.problem.explicit().in_domain(drawn)
+        outside = ~self.problem.law().in_domain(drawn)
         drawn[outside] = self.draw_logged(int(outside.sum()), rng)
         return drawn
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from os import PathLike, fspath
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
@@ -16,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
 from sb3_yann._validation import Array, ReadOnlyArrays, as_array
+from sb3_yann.control.law._files import read_arrays, write_arrays
 
 if TYPE_CHECKING:
     from sb3_yann.control.law.search_tree import SearchTree
@@ -147,6 +146,10 @@ class PiecewiseAffine(ReadOnlyArrays):
         """Return the index of the region in use at theta, one for each row of a batch."""
         return self._choose(theta)[0]
 
+    def gain(self, theta: ArrayLike) -> Array:
+        """Return the gain in use, (m, n) at theta (n,) or (batch, m, n), before bounds clip it."""
+        return np.asarray(self.gains[self.locate(theta)])
+
     def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
         """Tell whether the MPC has a solution at theta, for each row of a batch."""
         return np.asarray(self._choose(theta)[1] >= -self.tolerance)
@@ -156,26 +159,17 @@ class PiecewiseAffine(ReadOnlyArrays):
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.tree is not None:
             arrays.update({f"tree_{name}": each for name, each in vars(self.tree).items()})
-        part = f"{fspath(path)}.{os.getpid()}.part"  # another process may be writing the same
-        try:
-            with open(part, "wb") as file:
-                np.savez(file, **arrays)
-            os.replace(part, path)  # a reader never sees half a file
-        finally:
-            Path(part).unlink(missing_ok=True)
+        write_arrays(path, arrays)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> PiecewiseAffine:
         """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
         try:
-            data = np.load(path, allow_pickle=False)
-            if isinstance(data, np.ndarray):
-                raise ValueError("it is a single array")
-            with data:
-                values = {field.name: data[field.name] for field in fields(cls)}
-                for name, kind in (("infeasible", str), ("disjoint", bool)):
-                    values[name] = kind(values[name])
-                tree = {name[5:]: data[name] for name in data.files if name.startswith("tree_")}
+            data = read_arrays(path)
+            values = {field.name: data[field.name] for field in fields(cls)}
+            for name, kind in (("infeasible", str), ("disjoint", bool)):
+                values[name] = kind(values[name])
+            tree = {name[5:]: each for name, each in data.items() if name.startswith("tree_")}
             law = cls(**values)
             if tree:
                 from sb3_yann.control.law.search_tree import SearchTree
@@ -244,11 +238,15 @@ class PiecewiseAffine(ReadOnlyArrays):
         return {name: each for name, each in vars(self).items() if name not in ("packed", "_at")}
 
     def _as_theta(self, theta: ArrayLike) -> tuple[Array, Array]:
-        """Return theta as checked numbers, and as contiguous rows of a batch."""
-        points = check.to_float("theta", theta)
-        if points.ndim not in (1, 2) or points.shape[-1] != self.n_theta:
-            wanted = f"({self.n_theta},) or (batch, {self.n_theta})"
-            raise ValueError(f"theta has shape {points.shape}, expected {wanted}.")
-        if not np.all(np.isfinite(points)):
-            raise ValueError("theta holds NaN or infinite entries; the law is defined for numbers.")
-        return points, np.ascontiguousarray(np.atleast_2d(points))
+        return as_points(theta, self.n_theta)
+
+
+def as_points(theta: ArrayLike, n: int) -> tuple[Array, Array]:
+    """Return theta as checked numbers (n,) or (batch, n), and as contiguous rows of a batch."""
+    points = check.to_float("theta", theta)
+    if points.ndim not in (1, 2) or points.shape[-1] != n:
+        wanted = f"({n},) or (batch, {n})"
+        raise ValueError(f"theta has shape {points.shape}, expected {wanted}.")
+    if not np.all(np.isfinite(points)):
+        raise ValueError("theta holds NaN or infinite entries; the law is defined for numbers.")
+    return points, np.ascontiguousarray(np.atleast_2d(points))

@@ -21,6 +21,7 @@ from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability
 from sb3_yann.control.mpc import value as quadratic_value
 from sb3_yann.control.mpc._arguments import Given
+from sb3_yann.control.mpc.choice import LAWS, Law, choose
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
@@ -33,6 +34,7 @@ from sb3_yann.control.mpc.groups import (
 from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.terminal_set import invariant_set
+from sb3_yann.control.online.online_law import OnlineLaw
 
 G = TypeVar("G")
 
@@ -202,7 +204,7 @@ class LinearMPC(MPCProblem):
             If the law is unstable under this discount, or does not rest at the origin.
         """
         gamma = check.as_discount(gamma)  # before the law, which may take long
-        return quadratic_value.value_matrix(self, self.explicit(), gamma)
+        return quadratic_value.value_matrix(self, self.law(), gamma)
 
     def state_action_matrix(self, gamma: float) -> Array:
         """Return M (n_theta + m, n_theta + m): ``[theta; u]' M [theta; u]`` is the cost of u now.
@@ -210,7 +212,7 @@ class LinearMPC(MPCProblem):
         The law follows. It holds where :meth:`value_matrix` does, and raises its errors.
         """
         gamma = check.as_discount(gamma)
-        return quadratic_value.state_action_matrix(self, self.explicit(), gamma)
+        return quadratic_value.state_action_matrix(self, self.law(), gamma)
 
     def explicit(
         self,
@@ -249,6 +251,22 @@ class LinearMPC(MPCProblem):
         budget.require(self._laws[solver].n_regions)
         return self._laws[solver]
 
+    def online(self) -> OnlineLaw:
+        """Return the law theta -> u_0 that solves the program at each point: there at once."""
+        return self._online
+
+    def law(self, kind: str = "auto") -> Law:
+        """Return :meth:`explicit` or :meth:`online`, the same function where it is feasible.
+
+        "auto" is what was solved or chosen before; else the explicit law if 10 s find it, of at
+        most 5,000 regions; else the online law, with an :class:`OnlineLawWarning`.
+        """
+        return choose(self, self._laws, check.as_choice("kind", kind, LAWS))
+
+    @cached_property
+    def _online(self) -> OnlineLaw:
+        return OnlineLaw.of(self.condensed(), self.u_min, self.u_max, self.infeasible)
+
     @cached_property
     def _laws(self) -> dict[str, PiecewiseAffine]:
         return {}
@@ -260,7 +278,7 @@ class LinearMPC(MPCProblem):
     def report(self, samples: int = 500, seed: int = 0) -> str:
         """Return :func:`~sb3_yann.control.mpc.report.report` of the problem and its law."""
         check.as_whole("samples", samples)
-        return report(self, self.explicit(), samples, seed)
+        return report(self, self.law(), samples, seed)
 
 
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:

@@ -9,22 +9,23 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
-from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.mpc.choice import Law
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.problem import MPCProblem
 from sb3_yann.control.mpc.reachability import is_reachable
+from sb3_yann.control.online.online_law import OnlineLaw
 
 LOOP_STEPS = 50  # of a closed loop on the model
 
 
-def report(problem: MPCProblem, law: PiecewiseAffine, samples: int = 500, seed: int = 0) -> str:
+def report(problem: MPCProblem, law: Law, samples: int = 500, seed: int = 0) -> str:
     """Return the parameters, the size of the law, and sampled shares of the box, as text.
 
     Parameters
     ----------
     problem : MPCProblem
         With a bounded box of parameters.
-    law : PiecewiseAffine
+    law : PiecewiseAffine or OnlineLaw
         The problem's.
     samples : int, default 500
         Points drawn uniformly from the box of parameters: shares are good to 1 / sqrt(samples).
@@ -51,9 +52,12 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
         yield f"  {name:<10} {low:>10.4g} to {high:<10.4g} {meanings[kind]} {index}"
 
 
-def _size(problem: MPCProblem, law: PiecewiseAffine) -> Iterator[str]:
+def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
     yield f"Horizon: {problem.horizon} steps of {problem.model.dt:g}."
-    yield f"The law has {law.n_regions} regions and {law.n_halfspaces} half-spaces."
+    if isinstance(law, OnlineLaw):
+        yield f"The law is solved online, with {law.n_constraints} constraints."
+    else:
+        yield f"The law has {law.n_regions} regions and {law.n_halfspaces} half-spaces."
     rows = len(problem.terminal.set[1])
     yield f"The terminal set has {rows} half-spaces." if rows else "There is no terminal set."
     if problem.soft.penalty:
@@ -62,9 +66,7 @@ def _size(problem: MPCProblem, law: PiecewiseAffine) -> Iterator[str]:
         yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
 
 
-def _shares(
-    problem: MPCProblem, law: PiecewiseAffine, points: Array, feasible: Array
-) -> Iterator[str]:
+def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> Iterator[str]:
     yield f"Of {len(points)} random parameters of the box"
     yield f"  {_percent(len(feasible), len(points))} are feasible;"
     if len(problem.tracking.C):
@@ -76,7 +78,7 @@ def _shares(
     yield f"{kept_share} for {LOOP_STEPS} steps in closed loop on the model."
 
 
-def _stay_feasible(problem: MPCProblem, law: PiecewiseAffine, theta: Array) -> Array:
+def _stay_feasible(problem: MPCProblem, law: Law, theta: Array) -> Array:
     """Tell which rows of theta (batch, n_theta) the closed loop keeps in the domain."""
     (A, B), kept = problem.prediction, np.ones(len(theta), dtype=bool)
     for _ in range(LOOP_STEPS):
@@ -108,7 +110,7 @@ def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
         yield f"  never: {', '.join(idle)}"
 
 
-def _values(problem: MPCProblem, law: PiecewiseAffine, feasible: Array) -> Iterator[str]:
+def _values(problem: MPCProblem, law: Law, feasible: Array) -> Iterator[str]:
     yield f"The law at a few parameters [{', '.join(problem.layout.names)}]:"
     for theta in np.vstack([np.zeros((1, problem.n_theta)), feasible[:3]]):
         where = "" if law.in_domain(theta) else " (not feasible)"

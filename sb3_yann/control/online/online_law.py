@@ -1,0 +1,227 @@
+"""The law of a linear MPC whose program is solved at each point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+from os import PathLike, fspath
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann import _validation as check
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array
+from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.law._files import read_arrays, write_arrays
+from sb3_yann.control.law.piecewise_affine import INFEASIBLE, as_points
+from sb3_yann.control.online.dual_program import Answers, DualProgram, scaled_program
+from sb3_yann.control.online.known_points import KnownPoints
+
+_KEPT = ("dual", "known", "program")
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineLaw(ReadOnlyArrays):
+    """The first input of a condensed program, which is solved at each theta; total and bounded.
+
+    A compiled dual active-set method solves it, and an answer counts where all optimality
+    conditions hold. Else DAQP is asked. The answer depends on theta alone, not on what was asked
+    before. Answers are kept: the same theta is not solved again.
+
+    Where the program has no solution, ``infeasible`` decides:
+
+    - ``"nearest_region"``: all constraints but those of single inputs give way as little as
+      possible, at a large cost of the squares of their violations.
+    - ``"zero_input"``: no deviation of the input, clipped to the bounds.
+
+    Other than :class:`PiecewiseAffine`, it does not end at the box of theta.
+
+    Attributes
+    ----------
+    H, F, c, G, w, S : ndarray
+        As in :class:`ParametricQP`.
+    u_min, u_max : ndarray, shape (m,)
+        Bounds of the input, infinite where there is none.
+    theta_min, theta_max : ndarray, shape (n,)
+        The box of theta; a network scales its inputs by it.
+    n_slacks : int, default 0
+    infeasible : {"nearest_region", "zero_input"}
+
+    Examples
+    --------
+    >>> one = np.ones((1, 1))
+    >>> law = OnlineLaw(
+    ...     H=one, F=2 * one, c=[0.0], G=[[1.0], [-1.0]], w=[1.0, 1.0], S=[[0.0], [0.0]],
+    ...     u_min=[-1.0], u_max=[1.0], theta_min=[-1.0], theta_max=[1.0],
+    ... )
+    >>> law([0.25]), law([[3.0], [0.0]]).tolist()
+    (array([-0.5]), [[-1.0], [0.0]])
+    """
+
+    H: Array
+    F: Array
+    c: Array
+    G: Array
+    w: Array
+    S: Array
+    u_min: Array
+    u_max: Array
+    theta_min: Array
+    theta_max: Array
+    n_slacks: int = 0
+    infeasible: str = "nearest_region"
+
+    def __post_init__(self) -> None:
+        """Check the arrays against each other and store them as read-only float64."""
+        F, G = as_array("F", self.F, ("v", "n")), as_array("G", self.G, ("rows", len(self.F)))
+        (v, n), rows = F.shape, len(G)
+        shapes: dict[str, tuple[int, ...]] = {"H": (v, v), "c": (v,), "w": (rows,), "S": (rows, n)}
+        values = {name: as_array(name, getattr(self, name), size) for name, size in shapes.items()}
+        m = np.size(self.u_min)
+        for name, size in (("u", m), ("theta", n)):
+            low, high = f"{name}_min", f"{name}_max"
+            bounds = check.as_bounds(name, getattr(self, low), getattr(self, high), size)
+            values[low], values[high] = bounds
+        check.as_choice("infeasible", self.infeasible, INFEASIBLE)
+        slacks = check.as_whole("n_slacks", self.n_slacks, 0)
+        if m == 0 or (v - slacks) % m or v == slacks:
+            raise ValueError(
+                f"The program has {v} variables, {slacks} of them slacks: the others must be the "
+                f"{m} inputs of each step."
+            )
+        self._store(F=F, G=G, **values)
+
+    @classmethod
+    def of(cls, program: ParametricQP, u_min: Array, u_max: Array, infeasible: str) -> OnlineLaw:
+        """Return the law of a program whose first variables are the inputs."""
+        parts = {field.name: getattr(program, field.name) for field in fields(program)}
+        return cls(**parts, u_min=u_min, u_max=u_max, infeasible=infeasible)
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters n."""
+        return int(self.F.shape[1])
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs m."""
+        return len(self.u_min)
+
+    @property
+    def n_constraints(self) -> int:
+        """Number of constraints of the program; it has no regions that could be counted."""
+        return len(self.w)
+
+    def __call__(self, theta: ArrayLike) -> Array:
+        """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
+        points, rows = as_points(theta, self.n_theta)
+        inputs = self.known(rows)
+        return inputs if points.ndim == 2 else inputs[0]
+
+    def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
+        """Tell whether the MPC has a solution at theta, for each row of a batch."""
+        points, rows = as_points(theta, self.n_theta)
+        return self._answers(rows)[1].reshape(points.shape[:-1])
+
+    def gain(self, theta: ArrayLike) -> Array:
+        """Return the derivative of the input by theta, (m, n) at (n,) or (batch, m, n).
+
+        It is that of the constraints which are active at theta, before bounds clip the input.
+        """
+        points, rows = as_points(theta, self.n_theta)
+        _, feasible, found, softened = self._answers(rows)
+        gains = np.empty((len(rows), self.n_inputs, self.n_theta))
+        place = np.cumsum(~feasible) - 1
+        for i, solved in enumerate(feasible):
+            if not solved and softened is None:
+                gains[i] = 0.0
+                continue
+            own, at = (found, i) if solved or softened is None else (softened, place[i])
+            gains[i] = self.dual.gain(own.active[at, : own.sizes[at]], soft=not solved)
+        return gains if points.ndim == 2 else gains[0]
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the program to ``path`` as an ``.npz`` file of plain arrays."""
+        write_arrays(path, {field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> OnlineLaw:
+        """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
+        try:
+            data = read_arrays(path)
+            values = {field.name: data[field.name] for field in fields(cls)}
+            for name, kind in (("infeasible", str), ("n_slacks", int)):
+                values[name] = kind(values[name])
+            return cls(**values)
+        except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
+            what = f"{fspath(path)} does not hold an OnlineLaw ({error})"
+            raise ValueError(f"{what}. Write it with law.save(path).") from None
+
+    @cached_property
+    def program(self) -> ParametricQP:
+        """The condensed program, in the units of the plant."""
+        return ParametricQP(
+            **{each.name: getattr(self, each.name) for each in fields(ParametricQP)}
+        )
+
+    @cached_property
+    def dual(self) -> DualProgram:
+        """The program as it is solved."""
+        return DualProgram.of(self.program, self.u_min, self.u_max)
+
+    @cached_property
+    def known(self) -> KnownPoints:
+        """The law as a function of contiguous rows (batch, n), with what it remembers."""
+        return KnownPoints(lambda rows: self._answers(rows)[0], self.n_inputs)
+
+    def _answers(self, rows: Array) -> tuple[Array, NDArray[np.bool_], Answers, Answers | None]:
+        """Return inputs, what is feasible, the answers, and those of infeasible rows softened."""
+        from sb3_yann.control.online._kernels import INFEASIBLE as NONE
+        from sb3_yann.control.online._kernels import UNKNOWN
+
+        found = self.dual.solve(rows)
+        u, feasible = self.dual.inputs(rows, found), found.status != NONE
+        for i in np.flatnonzero(found.status == UNKNOWN):
+            feasible[i] = self._ask_daqp(rows[i], u[i], found, i)
+        feasible &= self.dual.meets_fixed(rows)
+        softened, lost = None, np.flatnonzero(~feasible)
+        if len(lost) and self.infeasible == "zero_input":
+            u[lost] = 0.0
+        elif len(lost):
+            again = np.ascontiguousarray(rows[lost])
+            softened = self.dual.solve(again, soft=True)
+            u[lost] = self.dual.inputs(again, softened)
+        u = np.where(np.isfinite(u), u, 0.0)  # far from everything
+        return np.clip(u, self.u_min, self.u_max), feasible, found, softened
+
+    def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:
+        """Write DAQP's input and active set where the compiled method has no certificate."""
+        scaled, reach = scaled_program(self.program, self.u_min, self.u_max)
+        U, multipliers = scaled.solve_with_multipliers(theta)
+        if U is None:
+            return False
+        active = np.flatnonzero(multipliers[self.dual.rows] > 0)[: found.active.shape[1]]
+        found.sizes[at], found.active[at, : len(active)] = len(active), active
+        u[:] = (reach * U)[: len(u)]
+        return True
+
+    def __hash__(self) -> int:
+        """Return a hash that equal laws share."""
+        return hash((self.H.tobytes(), self.F.tobytes(), self.infeasible))
+
+    def __repr__(self) -> str:
+        """Name the sizes."""
+        sizes = f"constraints={self.n_constraints}, variables={len(self.c)}, theta={self.n_theta}"
+        return f"OnlineLaw({sizes}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
+
+    def __deepcopy__(self, memo: object = None) -> OnlineLaw:
+        """Return the law itself: nothing of it can change."""
+        return self
+
+    __copy__ = __deepcopy__
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what follows from the rest, and what is remembered."""
+        return {name: each for name, each in vars(self).items() if name not in _KEPT}

@@ -1,0 +1,130 @@
+"""What the layers around a law share: ranges, the bound of a correction, and that of the rate."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from torch import nn
+
+from sb3_yann._validation import Array, half_widths
+from sb3_yann.control.mpc.choice import Law
+from sb3_yann.networks.zero_output import ZeroOutputNetwork, register_constants
+
+Rate = tuple[Array, Array]
+
+
+class LawLayer(nn.Module):
+    """theta -> input in [-1, 1]: a law, and what networks add to it within bounds."""
+
+    theta_half: th.Tensor
+    middle: th.Tensor
+    half_range: th.Tensor
+    change: th.Tensor
+    network: ZeroOutputNetwork
+    reach: float | None
+    constants: tuple[Array, Array, float]
+    row_gradients: bool
+
+    @property
+    def n_networks(self) -> int:
+        """How many networks there are: one for each region, or one."""
+        return len(self.network.pinned)
+
+    def law(self, theta: th.Tensor) -> th.Tensor:
+        """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
+        raise NotImplementedError
+
+    def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
+        """Return which network each row of theta (batch, n) goes through."""
+        raise NotImplementedError
+
+    def slopes_of_law(self, theta: Array) -> Array:
+        """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""
+        raise NotImplementedError
+
+    def limit(self, max_correction: float | None) -> None:
+        """Bound the network's output to a fraction of the input range, or not at all."""
+        # The input range is 2 here. A little is left for the float32 rounding of what follows.
+        self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
+        self.constants = (*self.constants[:2], np.inf if self.reach is None else self.reach)
+
+    def _set_ranges(self, law: Law, rate: Rate | None, always: bool = False) -> None:
+        """Keep the ranges of a law and, with a rate, by how much an input may change.
+
+        ``always`` keeps the ranges of the inputs without a rate too.
+        """
+        middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
+        half = half_widths(law.theta_min, law.theta_max)
+        self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
+        self.rated, self.row_gradients = rate is not None, False
+        if rate is None and always:
+            register_constants(self, middle=middle, half_range=reach)
+        if rate is not None:
+            if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
+                raise ValueError(
+                    f"rate has shape {np.shape(rate)}, expected (2, {law.n_inputs}) and a theta "
+                    f"that ends with the {law.n_inputs} previous inputs; it has {law.n_theta}."
+                )
+            # In both directions a little is left for the rounding of actions and observations.
+            room = np.maximum(np.stack([-rate[0], rate[1]]) / reach - 1e-6, 0.0)
+            change = room * [[-1.0], [1.0]]
+            register_constants(self, middle=middle, half_range=reach, change=change)
+        scaling = np.concatenate([1 / half, middle, 1 / reach])
+        change = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
+        self.constants = (scaling, change, np.inf)  # for compiled code
+
+    def _with_correction(
+        self, theta: th.Tensor, law: th.Tensor, correction: th.Tensor
+    ) -> th.Tensor:
+        """Return the action (batch, m): law and correction, each within its bounds."""
+        if self.reach is not None:
+            # The bound holds for weights that overflow, or are no numbers, as well.
+            correction = correction.nan_to_num(0.0, self.reach, -self.reach)
+            correction = clamp_with_inward_gradient(correction, -self.reach, self.reach)
+        output = law + correction
+        # As compiled: where theta is not finite nothing is passed off as an input.
+        output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
+        bounds = self.reachable(theta) if self.rated else (-1.0, 1.0)
+        return clamp_with_inward_gradient(output, *bounds)
+
+    @th.no_grad()
+    def reachable(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the bounds (batch, m) that the rate leaves of [-1, 1]."""
+        previous = (theta[:, -len(self.middle) :] - self.middle) / self.half_range
+        low, high = (previous + self.change[:, None]).clamp(-1, 1).to(self.theta_half)
+        return low, high
+
+
+def require_finite_inputs(law: Law) -> None:
+    """Raise unless the inputs of a law have bounds, which -1 and 1 stand for."""
+    if not np.all(np.isfinite([law.u_min, law.u_max])):
+        raise ValueError(
+            f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
+            "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
+        )
+
+
+class _InwardGradientClamp(th.autograd.Function):
+    """Clamp to [low, high]; backward, stop only what would push further out."""
+
+    @staticmethod
+    def forward(ctx: Any, x: th.Tensor, low: Any, high: Any) -> th.Tensor:
+        ctx.save_for_backward(x)
+        ctx.low, ctx.high = low, high
+        return x.clamp(low, high)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, None, None]:
+        (x,), (grad,) = ctx.saved_tensors, grad_outputs
+        # Descent moves x against its gradient.
+        outward = ((x >= ctx.high) & (grad < 0)) | ((x <= ctx.low) & (grad > 0))
+        return grad.masked_fill(outward, 0.0), None, None
+
+
+def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:
+    """Return x clamped to numbers or tensors, with a gradient that can still lead inside."""
+    clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
+    return clamped

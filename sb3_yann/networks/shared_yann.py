@@ -1,0 +1,116 @@
+"""One network beside a law: continuous as the law is, and for any law that can be evaluated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.control.mpc.choice import Law
+from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
+from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
+
+
+class SharedYannLayer(LawLayer):
+    """theta -> input in [-1, 1]: a law, exactly, plus one network for all of it.
+
+    At first the network is exactly zero and the layer is the law, to float32 rounding. The network
+    does not grow with the law, and leaves it as continuous as it is.
+
+    The law is evaluated by numpy, on the processor. It is not part of the state_dict.
+
+    Parameters
+    ----------
+    law : PiecewiseAffine or OnlineLaw
+        With finite input bounds, which map to -1 and 1.
+    hidden : tuple of int, default (64, 64)
+        Widths of the network.
+    activation, max_correction, pinned, rate
+        As in :class:`YannLayer`.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> law = problems.cstr().online()
+    >>> layer, theta = SharedYannLayer(law), np.full(4, 0.1)
+    >>> u = layer(th.as_tensor(theta)[None]).detach().numpy()[0] * law.u_max  # from [-1, 1]
+    >>> bool(np.allclose(u, law(theta), atol=1e-5))
+    True
+    """
+
+    def __init__(
+        self,
+        law: Law,
+        hidden: tuple[int, ...] = (64, 64),
+        activation: Activation = th.tanh,
+        max_correction: float | None = None,
+        pinned: bool = True,
+        rate: Rate | None = None,
+    ) -> None:
+        super().__init__()
+        require_finite_inputs(law)
+        self.given = law
+        law(np.zeros(law.n_theta))  # compiled now, not in the midst of learn: see YannLayer
+        self._set_ranges(law, rate, always=True)
+        stay, sizes = th.tensor([pinned]), (law.n_theta, law.n_inputs)
+        self.network = ZeroOutputNetwork(*sizes, hidden, activation=activation, pinned=stay)
+        self.limit(max_correction)
+
+    def forward(self, theta: th.Tensor) -> th.Tensor:
+        """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
+        correction = self.network((theta / self.theta_half).to(self.theta_half))
+        return self._with_correction(theta, self.law(theta), correction)
+
+    def law(self, theta: th.Tensor) -> th.Tensor:
+        """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
+        tracing = th.jit.is_tracing() or th.compiler.is_compiling()  # type: ignore[attr-defined, no-untyped-call]
+        if tracing:
+            raise RuntimeError(
+                "A law beside a shared network is evaluated outside of torch: it cannot be traced "
+                "or compiled by it. Trace a policy with networks='per_region'."
+            )
+        u: th.Tensor = _Law.apply(theta, self)  # type: ignore[no-untyped-call]
+        return u.clamp(*self.reachable(theta)) if self.rated else u
+
+    def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
+        """Return zeros: all rows of theta (batch, n) go through the one network."""
+        return np.zeros(len(theta), np.int64)
+
+    def inputs(self, theta: th.Tensor) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the law's inputs (batch, m), zeros where theta is not finite, and where it is."""
+        points = theta.detach().double().cpu().numpy()
+        finite = np.isfinite(points).all(axis=1)
+        if finite.all():
+            return self.given(points), finite
+        u = np.zeros((len(points), self.given.n_inputs))
+        u[finite] = self.given(points[finite])
+        return u, finite
+
+    def slopes_of_law(self, theta: Array) -> Array:
+        """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""
+        middle, half = self.middle.cpu().numpy(), self.half_range.cpu().numpy()
+        slopes: Array = self.given.gain(theta) / half[:, None]
+        slopes[np.abs((self.given(theta) - middle) / half) >= 1] = 0.0
+        return slopes
+
+
+class _Law(th.autograd.Function):
+    """A law in [-1, 1], with its gain for a gradient where theta has one."""
+
+    @staticmethod
+    def forward(ctx: Any, theta: th.Tensor, layer: SharedYannLayer) -> th.Tensor:
+        ctx.layer = layer
+        ctx.save_for_backward(theta)
+        u = th.as_tensor(layer.inputs(theta)[0], device=theta.device)
+        return ((u - layer.middle) / layer.half_range).to(layer.theta_half)
+
+    @staticmethod
+    @th.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor, None]:
+        (theta,), (by_u,) = ctx.saved_tensors, gradients
+        points = theta.detach().double().cpu().nan_to_num(0.0, 0.0, 0.0).numpy()
+        slopes = th.as_tensor(ctx.layer.slopes_of_law(points), device=theta.device)
+        return (by_u.double()[:, None] @ slopes)[:, 0].to(theta), None
