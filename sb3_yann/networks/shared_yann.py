@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control.mpc.choice import Law
+from sb3_yann.networks._kernels.mlp import as_array
 from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
@@ -53,6 +55,7 @@ class SharedYannLayer(LawLayer):
         super().__init__()
         require_finite_inputs(law)
         self.given = law
+        import_module("sb3_yann.networks._kernels.yann_layer")
         law(np.zeros(law.n_theta))  # compiled now, not in the midst of learn: see YannLayer
         self._set_ranges(law, rate, always=True)
         stay, sizes = th.tensor([pinned]), (law.n_theta, law.n_inputs)
@@ -61,8 +64,21 @@ class SharedYannLayer(LawLayer):
 
     def forward(self, theta: th.Tensor) -> th.Tensor:
         """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
+        fixed = theta.device.type == "cpu" and not theta.requires_grad
+        if fixed and self.network.compiles:
+            return self._compiled(theta)
         correction = self.network((theta / self.theta_half).to(self.theta_half))
         return self._with_correction(theta, self.law(theta), correction)
+
+    def _compiled(self, theta: th.Tensor) -> th.Tensor:
+        from sb3_yann.networks._kernels.yann_layer import shared_layer_on_cpu  # compiled once
+
+        network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
+        u, finite = self.inputs(theta)
+        if not finite.all():
+            u[~finite] = np.nan
+        own = network.weights(), network.pinned_array
+        return shared_layer_on_cpu(theta, u, self.constants, *own)
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
@@ -81,7 +97,7 @@ class SharedYannLayer(LawLayer):
 
     def inputs(self, theta: th.Tensor) -> tuple[Array, NDArray[np.bool_]]:
         """Return the law's inputs (batch, m), zeros where theta is not finite, and where it is."""
-        points = theta.detach().double().cpu().numpy()
+        points = as_array(theta, np.float64)
         finite = np.isfinite(points).all(axis=1)
         if finite.all():
             return self.given(points), finite

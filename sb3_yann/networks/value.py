@@ -20,6 +20,10 @@ PredictionModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
 """``(theta, u) -> next theta``: (batch, n), (batch, m) to (batch, n), float64, physical units."""
 
 
+LOOPS = 48
+"""Parameters and inputs up to which loops over a quadratic form are faster than BLAS."""
+
+
 @dataclass(frozen=True)
 class Ranges:
     """What a value is scaled by: the box of theta and the range of the inputs.
@@ -210,7 +214,8 @@ class AfterstateValue(nn.Module):
         """Whether there is compiled code for such a value where it is now."""
         modules: Any = self._modules
         linear = isinstance(modules.get("model"), LinearPrediction)
-        if not linear or self._buffers["W"].dtype != th.float64:  # type: ignore[union-attr]
+        weight: Any = self._buffers["W"]
+        if not linear or weight.dtype != th.float64 or len(weight) > LOOPS:
             return False
         double: bool = modules["quadratic"].entries.dtype == th.float64
         return double and modules["network"].compiles

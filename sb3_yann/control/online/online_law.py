@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, fields
 from functools import cached_property
 from os import PathLike, fspath
@@ -162,9 +163,9 @@ class OnlineLaw(ReadOnlyArrays):
     @cached_property
     def program(self) -> ParametricQP:
         """The condensed program, in the units of the plant."""
-        return ParametricQP(
-            **{each.name: getattr(self, each.name) for each in fields(ParametricQP)}
-        )
+        values = {each.name: getattr(self, each.name) for each in fields(ParametricQP)}
+        # copies: DAQP takes no arrays that are read-only
+        return ParametricQP(**{name: copy.copy(value) for name, value in values.items()})
 
     @cached_property
     def dual(self) -> DualProgram:
