@@ -16,6 +16,8 @@ from sb3_yann.control import ExplicitSolutionError as ExplicitSolutionError
 from sb3_yann.control import Identified as Identified
 from sb3_yann.control import LinearModel as LinearModel
 from sb3_yann.control import LinearMPC as LinearMPC
+from sb3_yann.control import OnlineLaw as OnlineLaw
+from sb3_yann.control import OnlineLawWarning as OnlineLawWarning
 from sb3_yann.control import OutputBounds as OutputBounds
 from sb3_yann.control import PiecewiseAffine as PiecewiseAffine
 from sb3_yann.control import RateLimits as RateLimits

@@ -1,0 +1,65 @@
+"""Points that are known are not computed again, and come back as they were."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from general_problems import solved
+from sb3_yann.control.online.known_points import FIRST, KnownPoints
+
+
+class Counted:
+    """Returns two sums of each row, and counts the rows it was asked for."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        self.rows += len(rows)
+        return np.column_stack([rows.sum(1), rows[:, 0]])
+
+
+def test_a_row_is_computed_once() -> None:
+    counted, rows = Counted(), np.random.default_rng(0).normal(size=(500, 3))
+    known = KnownPoints(counted, 2)
+    first = known(rows)
+    assert counted.rows == 500
+    assert np.array_equal(known(rows[::-1].copy()), first[::-1])
+    assert counted.rows == 500
+    assert np.array_equal(first, Counted()(rows))
+
+
+def test_the_table_grows() -> None:
+    counted, rows = Counted(), np.random.default_rng(0).normal(size=(4 * FIRST, 2))
+    known = KnownPoints(counted, 2)
+    for part in np.split(rows, 64):
+        known(part)
+    before = counted.rows
+    assert np.array_equal(known(rows), Counted()(rows))
+    assert counted.rows - before < 0.01 * len(rows)
+    assert known.count <= len(rows)
+
+
+def test_a_full_table_forgets_and_stays_right() -> None:
+    counted, rows = Counted(), np.random.default_rng(0).normal(size=(1000, 2))
+    known = KnownPoints(counted, 2, most=64)
+    for _ in range(3):
+        assert np.array_equal(known(rows), Counted()(rows))
+    assert known.count <= 64
+
+
+@pytest.mark.parametrize("size", [0, 1])
+def test_no_rows_and_zeros_are_rows_too(size) -> None:
+    known = KnownPoints(Counted(), 2)
+    for _ in range(2):
+        assert np.array_equal(known(np.zeros((size, 3))), np.zeros((size, 2)))
+
+
+def test_what_a_law_remembers_does_not_travel() -> None:
+    law = solved("servo").online()
+    law([[0.1, 0.2, 0.3]])
+    assert law.known.count
+    assert not pickle.loads(pickle.dumps(law)).known.count

@@ -1,0 +1,209 @@
+"""The law that is solved at each point: right, total, the same whatever was asked before."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.online_problems import points, six_masses, three_masses, wide_plant
+from general_problems import PROBLEMS, solved
+from reference_answers import online_answers, relative_error
+from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, ParametricQP, SoftBounds
+from sb3_yann.control.online import _kernels
+from sb3_yann.control.online.dual_program import DualProgram
+
+
+def drawn(mpc: LinearMPC, count: int, stretch: float = 1.0) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return stretch * rng.uniform(mpc.theta_min, mpc.theta_max, (count, mpc.n_theta))
+
+
+def regulator(**changes) -> LinearMPC:
+    """A double integrator with hard bounds of its states: part of its box has no solution."""
+    model = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
+    design = {"Q": np.eye(2), "R": [[0.03]], "horizon": 6}
+    bounds = {"x_min": [-5, -2], "x_max": [5, 2], "u_min": -1, "u_max": 1}
+    return LinearMPC(model, **{**design, **bounds, **changes})
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_it_is_the_explicit_law_where_there_is_a_solution(name) -> None:
+    mpc = solved(name)
+    explicit, online, theta = mpc.explicit(), mpc.online(), drawn(mpc, 1000)
+    feasible = explicit.in_domain(theta)
+    assert np.array_equal(online.in_domain(theta), feasible)
+    assert relative_error(mpc, online(theta)[feasible], explicit(theta)[feasible]) < 1e-9
+    ours, theirs = online.gain(theta)[feasible], explicit.gain(theta)[feasible]
+    assert np.abs(ours - theirs).max() <= 1e-9 * max(1.0, np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("name", ["servo with all of it", "soft states", "two tanks, all parts"])
+def test_it_is_the_program_written_a_second_time(name) -> None:
+    mpc, theta = solved(name), drawn(solved(name), 100)
+    expected, feasible = online_answers(mpc, theta)
+    assert relative_error(mpc, mpc.online()(theta[feasible]), expected) < 1e-6
+
+
+def worst_condition(law: OnlineLaw, theta: np.ndarray) -> float:
+    """Return by how much the optimality conditions fail, for plans made from the active sets."""
+    units = np.tile((law.u_max - law.u_min) / 2, (len(law.c) - law.n_slacks) // law.n_inputs)
+    units, worst = np.concatenate([units, np.ones(law.n_slacks)]), 0.0
+    H, G = law.H * np.outer(units, units), law.G * units
+    found, inputs = law.dual.solve(theta), law(theta)
+    for k, at in enumerate(theta):
+        active = law.dual.rows[found.active[k, : found.sizes[k]]]
+        zero = np.zeros((len(active), len(active)))
+        left = np.block([[H, G[active].T], [G[active], zero]])
+        right = [-(law.F @ at + law.c) * units, law.w[active] + law.S[active] @ at]
+        solution = np.linalg.solve(left, np.concatenate(right))
+        plan, multipliers = solution[: len(H)], solution[len(H) :]
+        slack = law.w + law.S @ at - G @ plan
+        size = max(1.0, np.abs(multipliers).max(initial=0.0))
+        wrong = np.abs((units * plan)[: law.n_inputs] - inputs[k]).max()
+        worst = max(worst, -slack.min(), -multipliers.min(initial=0.0) / size, wrong)
+    return worst
+
+
+@pytest.mark.parametrize("make", [three_masses, six_masses, wide_plant])
+def test_all_optimality_conditions_hold_where_no_regions_can_be_counted(make) -> None:
+    mpc = make()
+    assert worst_condition(mpc.online(), points(mpc, 40)) < 1e-8
+
+
+def test_inputs_do_not_depend_on_what_was_asked_before() -> None:
+    mpc = three_masses()
+    theta, fresh = points(mpc, 300), three_masses().online()
+    together = mpc.online()(theta)
+    assert np.array_equal(together, mpc.online()(theta))  # now they are known
+    assert np.array_equal(together, [fresh(each) for each in theta[::-1]][::-1])
+
+
+@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
+@pytest.mark.parametrize("stretch", [1.0, 10.0, 1e6])
+def test_every_theta_has_an_input_within_its_bounds(infeasible, stretch) -> None:
+    for mpc in (regulator(infeasible=infeasible), three_masses()):
+        u = mpc.online()(drawn(mpc, 100, stretch))
+        assert np.all((mpc.u_min <= u) & (u <= mpc.u_max))
+
+
+def test_infeasible_constraints_give_way_and_the_input_does_not_jump_at_the_border() -> None:
+    law = regulator().online()
+    inside, outside = np.array([4.9, 0.0]), np.array([4.9, 2.0])
+    assert law.in_domain(inside)
+    assert not law.in_domain(outside)
+    for _ in range(50):
+        middle = (inside + outside) / 2
+        inside, outside = (middle, outside) if law.in_domain(middle) else (inside, middle)
+    assert abs(law(inside) - law(outside)) < 1e-4
+    assert law([4.9, 2.0]) == pytest.approx(-1)  # it brakes
+
+
+def test_zero_input_is_none_where_there_is_no_solution() -> None:
+    mpc = regulator(infeasible="zero_input")
+    assert mpc.online()([4.9, 2.0]) == 0
+    assert np.all(mpc.online().gain([4.9, 2.0]) == 0)
+    assert mpc.online()([4.9, 0.0]) == pytest.approx(mpc.explicit()([4.9, 0.0]))
+
+
+def test_its_gain_is_its_slope_softened_or_not() -> None:
+    law = regulator().online()
+    for theta in ([0.1, 0.1], [4.9, 0.2], [4.9, 0.8], [0.5, 1.95], [-5.1, 0.3]):
+        step, slopes = 1e-6 * np.eye(2), []
+        for each in step:
+            slopes.append((law(theta + each) - law(theta - each)) / 2e-6)
+        assert law.gain(theta) == pytest.approx(np.transpose(slopes), abs=1e-4)
+
+
+def test_constraints_that_depend_on_each_other_are_no_obstacle() -> None:
+    law = regulator().online()
+    double = replace(
+        law,
+        G=np.vstack([law.G] * 2 + [law.G[:1]]),
+        w=np.concatenate([law.w, law.w, law.w[:1]]),
+        S=np.vstack([law.S] * 2 + [law.S[:1]]),
+    )
+    theta = drawn(regulator(), 500)
+    assert np.array_equal(law.in_domain(theta), double.in_domain(theta))
+    feasible = law.in_domain(theta)
+    assert np.abs(law(theta) - double(theta))[feasible].max() < 1e-9
+
+
+def test_daqp_is_asked_where_there_is_no_certificate(monkeypatch) -> None:
+    mpc = regulator()
+    theta, solve = drawn(mpc, 60), DualProgram.solve
+    expected, feasible = mpc.online()(theta), mpc.online().in_domain(theta)
+    gains = mpc.online().gain(theta)
+
+    def unsure(self: DualProgram, rows: np.ndarray, soft: bool = False) -> object:
+        found = solve(self, rows, soft)
+        if not soft:
+            found.status[:], found.sizes[:] = _kernels.UNKNOWN, 0
+        return found
+
+    monkeypatch.setattr(DualProgram, "solve", unsure)
+    fresh = regulator().online()
+    assert np.array_equal(fresh.in_domain(theta), feasible)
+    assert np.abs(fresh(theta) - expected).max() < 1e-8
+    assert np.abs(fresh.gain(theta) - gains)[feasible].max() < 1e-6
+
+
+def test_it_is_saved_pickled_and_copied(tmp_path) -> None:
+    mpc = solved("one of two states soft, soft outputs")
+    law, theta = mpc.online(), drawn(mpc, 50)
+    law.save(tmp_path / "law.npz")
+    for other in (OnlineLaw.load(tmp_path / "law.npz"), pickle.loads(pickle.dumps(law))):
+        assert other == law
+        assert hash(other) == hash(law)
+        assert np.array_equal(other(theta), law(theta))
+    assert copy.deepcopy(law) is law
+    assert replace(law, infeasible="zero_input") != law
+    assert "theta=3, inputs=1" in repr(law)
+    assert law.n_constraints == len(mpc.condensed().w)
+
+
+def test_a_file_without_a_law_is_named(tmp_path) -> None:
+    solved("servo").explicit().save(tmp_path / "other.npz")
+    with pytest.raises(ValueError, match="does not hold an OnlineLaw"):
+        OnlineLaw.load(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    ("theta", "message"),
+    [([0.0], r"shape \(1,\)"), ([[0.0, np.nan]], "NaN"), (np.zeros((2, 2, 2)), "shape")],
+)
+def test_a_theta_that_is_none_is_refused(theta, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        regulator().online()(theta)
+
+
+def test_a_program_that_does_not_fit_its_inputs_is_refused() -> None:
+    law = regulator().online()
+    with pytest.raises(ValueError, match="inputs of each step"):
+        replace(law, u_min=-np.ones(4), u_max=np.ones(4))
+
+
+def test_a_box_without_ends_is_no_obstacle() -> None:
+    mpc = regulator(x_min=None, x_max=None)
+    law = mpc.online()
+    assert np.all(np.isinf(law.theta_max))
+    assert law([100.0, 0.0]) == pytest.approx(-1)
+    assert law([0.0, 0.0]) == 0
+
+
+def test_a_steep_soft_bound_is_kept_exactly_where_it_can_be() -> None:
+    hard = regulator()
+    soft = regulator(soft=SoftBounds(x=1.0, penalty=1e5), theta_min=-8, theta_max=8)
+    theta = drawn(hard, 300)
+    theta = theta[hard.online().in_domain(theta)]
+    assert np.abs(soft.online()(theta) - hard.online()(theta)).max() < 1e-6
+
+
+def test_the_program_of_the_law_is_that_of_the_problem() -> None:
+    mpc = regulator()
+    assert isinstance(mpc.online().program, ParametricQP)
+    assert np.array_equal(mpc.online().program.G, mpc.condensed().G)
+    assert mpc.online() is mpc.online()

@@ -1,0 +1,158 @@
+"""One network beside a law: the law at first, bounded, pinned, continuous, and it trains."""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+
+import numpy as np
+import pytest
+import torch as th
+
+from general_problems import servo, solved
+from sample_layers import scrambled, train
+from sb3_yann.control import LinearModel, LinearMPC
+from sb3_yann.networks import SharedYannLayer, YannLayer
+from sb3_yann_envs import problems
+
+LAWS = pytest.mark.parametrize("kind", ["explicit", "online"])
+
+
+@cache
+def reactor() -> LinearMPC:
+    return problems.cstr()
+
+
+def layer_of(mpc: LinearMPC, kind: str, **options) -> SharedYannLayer:
+    rate = (mpc.rate.du_min, mpc.rate.du_max) if mpc.has_rate_bounds else None
+    return SharedYannLayer(mpc.law(kind), (8, 8), rate=rate, **options)
+
+
+def drawn(mpc: LinearMPC, count: int = 64) -> th.Tensor:
+    theta = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (count, mpc.n_theta))
+    return th.as_tensor(theta)
+
+
+def as_inputs(mpc: LinearMPC, actions: th.Tensor) -> np.ndarray:
+    low, high = mpc.u_min, mpc.u_max
+    return low + (actions.detach().double().numpy() + 1) / 2 * (high - low)
+
+
+@LAWS
+@pytest.mark.parametrize("name", ["servo", "servo with all of it", "two tanks, all parts"])
+def test_it_starts_as_the_law(kind, name) -> None:
+    mpc = solved(name)
+    layer, theta = layer_of(mpc, kind), drawn(mpc)
+    actions = layer(theta)
+    feasible = mpc.explicit().in_domain(theta.numpy())
+    error = np.abs(as_inputs(mpc, actions) - mpc.explicit()(theta.numpy()))[feasible]
+    # An explicit law keeps the rate to rounding; the layer keeps a millionth more.
+    assert np.max(error / (mpc.u_max - mpc.u_min)) < 2e-6
+    assert th.equal(actions, layer.law(theta))
+
+
+@LAWS
+def test_loops_and_operations_of_torch_agree(kind) -> None:
+    mpc = solved("servo with rates")
+    theta = drawn(mpc)
+    for limit in (None, 0.1):
+        layer = scrambled(layer_of(mpc, kind, max_correction=limit))
+        target, found = th.linspace(-1, 1, len(theta))[:, None], []
+        for compiles in (True, False):
+            layer.network.has_loops = compiles
+            layer.zero_grad()
+            actions = layer(theta)
+            (actions - target).square().sum().backward()
+            found.append([actions, *[each.grad.clone() for each in layer.network.weights()]])
+        for ours, theirs in zip(*found, strict=True):
+            assert th.allclose(ours, theirs, atol=1e-4, rtol=1e-4)
+
+
+@LAWS
+def test_bounds_hold_whatever_is_learnt(kind) -> None:
+    mpc = solved("servo with rates")
+    theta = drawn(mpc, 200)
+    layer = scrambled(layer_of(mpc, kind, max_correction=0.05), 10.0)
+    actions, law = layer(theta), layer.law(theta)
+    assert (actions - law).abs().max() <= 0.1
+    low, high = layer.reachable(theta)
+    assert bool(((low <= actions) & (actions <= high)).all())
+    layer.limit(0.0)
+    assert th.equal(layer(theta), law)
+
+
+def test_the_equilibrium_stays_where_it_is_unless_it_is_not_pinned() -> None:
+    origin = th.zeros(1, 4)
+    rest = layer_of(reactor(), "online")(origin)
+    assert th.equal(scrambled(layer_of(reactor(), "online"))(origin), rest)
+    assert not th.equal(scrambled(layer_of(reactor(), "online", pinned=False))(origin), rest)
+
+
+def test_it_is_continuous_where_networks_per_region_jump() -> None:
+    mpc = servo()
+    law, line = mpc.explicit(), np.linspace(mpc.theta_min, mpc.theta_max, 100_001)
+    theta = th.as_tensor(line)
+    own, shared = scrambled(YannLayer(law)), scrambled(SharedYannLayer(mpc.law("online")))
+    steps = [layer(theta).detach().diff(dim=0).abs().max().item() for layer in (own, shared)]
+    assert len(np.unique(law.locate(theta.numpy()))) > 1
+    assert steps[1] < 1e-2 < steps[0]
+
+
+@LAWS
+def test_what_is_not_finite_is_not_passed_off_as_an_input(kind) -> None:
+    layer, theta = layer_of(reactor(), kind), drawn(reactor(), 3)
+    theta[1, 2] = th.nan
+    for compiles in (True, False):
+        layer.network.has_loops = compiles
+        actions = layer(theta)
+        assert actions[1].isnan().all()
+        assert actions[[0, 2]].isfinite().all()
+
+
+@LAWS
+def test_its_gradient_by_theta_is_its_slope(kind) -> None:
+    mpc = servo()
+    layer = scrambled(layer_of(mpc, kind), 0.3).double()
+    layer.theta_half = layer.theta_half.double()
+    theta = drawn(mpc, 40).requires_grad_()
+    layer(theta).sum().backward()
+    step, slopes = 1e-6, []
+    for j in range(mpc.n_theta):
+        shift = th.zeros(mpc.n_theta).double()
+        shift[j] = step
+        slopes.append((layer(theta + shift) - layer(theta - shift)).detach()[:, 0] / (2 * step))
+    inside = layer(theta).detach().abs()[:, 0] < 0.999
+    assert inside.sum() > 10
+    assert th.allclose(theta.grad[inside], th.stack(slopes, 1)[inside], atol=1e-4)
+
+
+def test_it_learns_and_copies() -> None:
+    layer, theta = layer_of(reactor(), "online"), drawn(reactor())
+    other = copy.deepcopy(layer)
+    train(layer, theta, 0.5, steps=30)
+    assert other.given is layer.given
+    assert not layer.network.is_zero()
+    assert other.network.is_zero()
+    other.load_state_dict(layer.state_dict())
+    assert th.equal(other(theta), layer(theta))
+    assert layer.n_networks == 1
+    assert layer.regions(theta).tolist() == [0] * len(theta)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace` is deprecated")
+def test_it_says_that_it_cannot_be_traced() -> None:
+    with pytest.raises(RuntimeError, match="cannot be traced"):
+        th.jit.trace(layer_of(reactor(), "online"), drawn(reactor()).float())
+
+
+def test_inputs_without_bounds_are_refused() -> None:
+    mpc = LinearMPC(
+        LinearModel([[0.5]], [[1.0]], 1), Q=[[1]], R=[[1]], horizon=2, x_min=-1, x_max=1
+    )
+    with pytest.raises(ValueError, match="finite bounds on every input"):
+        SharedYannLayer(mpc.online())
+
+
+def test_a_theta_of_another_size_is_named() -> None:
+    with pytest.raises(ValueError, match="theta has shape"):
+        layer_of(reactor(), "online")(th.zeros(2, 3))
