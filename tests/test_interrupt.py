@@ -8,10 +8,12 @@ from numba.core.dispatcher import Dispatcher
 
 from fresh_process import run_python
 from sb3_yann.control.law import _kernels, search_tree
+from sb3_yann.control.online import _kernels as online
+from sb3_yann.control.online import _table_kernels as table
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
 from sb3_yann_envs import cstr
 
-MODULES = (_kernels, search_tree, yann_layer, afterstate_value, cstr)
+MODULES = (_kernels, search_tree, online, table, yann_layer, afterstate_value, cstr)
 CALLED = {
     f"{module.__name__}.{name}": function
     for module in MODULES

@@ -139,7 +139,7 @@ def test_it_learns_and_copies() -> None:
     assert layer.regions(theta).tolist() == [0] * len(theta)
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.trace` is deprecated")
+@pytest.mark.filterwarnings("ignore")
 def test_it_says_that_it_cannot_be_traced() -> None:
     with pytest.raises(RuntimeError, match="cannot be traced"):
         th.jit.trace(layer_of(reactor(), "online"), drawn(reactor()).float())
