@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks import evaluation, exactness, networks, offline, peers, simulators
+from benchmarks import evaluation, exactness, networks, offline, online, peers, simulators
 from benchmarks.records import Figures, seconds, times
 from benchmarks.timing import ratios
 
@@ -36,7 +36,7 @@ class Criterion:
 
 def criteria(figures: Figures) -> list[Criterion]:
     """Return every requirement whose figures are there."""
-    parts = (_law, _batch, _actor, _training, _exact, _solve, _steps)
+    parts = (_law, _batch, _actor, _training, _exact, _solve, _online, _steps)
     return [line for part in parts for line in part(figures)]
 
 
@@ -147,6 +147,35 @@ def _solve(figures: Figures) -> Iterator[Criterion]:
         if size > offline.SMALL:
             each = ours.middle / size
             yield Criterion(what, "at most 0.5 ms a region", seconds(each), each <= 5e-4)
+
+
+def _online(figures: Figures) -> Iterator[Criterion]:
+    for column in figures.columns(online.PREDICT):
+        predict, built = (
+            figures.get(section, networks.OURS, column)
+            for section in (online.PREDICT, online.BUILT)
+        )
+        ours, theirs = (
+            figures.get(online.TRAIN, each, column) for each in (networks.OURS, peers.MLP)
+        )
+        error = figures.get(online.EXACT, online.ERROR, column)
+        if not (predict and built and ours and theirs and error):
+            continue
+        wide = column.startswith("165")
+        most = 15e-3 if wide else 1e-3
+        yield Criterion(
+            f"{online.PREDICT}, {column}", f"at most {seconds(most)}", seconds(predict.middle),
+            predict.middle <= most,
+        )  # fmt: skip
+        ratio = float(np.median(ratios(ours.samples, theirs.samples)))
+        shown = f"{seconds(ours.middle)}: {times(ratio)} {peers.MLP}"
+        required = "at least 50 a second" if wide else f"at most {times(1.5)} {peers.MLP}"
+        holds = ours.middle <= 0.02 if wide else ratio <= 1.5
+        yield Criterion(f"{online.TRAIN}, {column}", required, shown, holds)
+        shown = seconds(built.middle)
+        yield Criterion(f"{online.BUILT}, {column}", "in 2 s", shown, built.middle <= 2)
+        shown = f"{error.middle:.1e}"
+        yield Criterion(f"{online.EXACT}, {column}", "at most 1e-6", shown, error.middle <= 1e-6)
 
 
 def _steps(figures: Figures) -> Iterator[Criterion]:

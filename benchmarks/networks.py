@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from benchmarks import peers
+from benchmarks.online_problems import OnlineProblem
 from benchmarks.problems import Array, Problem
 from benchmarks.records import Bench, timed
 from benchmarks.timing import Task
@@ -48,7 +49,7 @@ def actor(bench: Bench, problem: Problem) -> None:
         tasks = {name: Task(model.actor, inputs) for name, model in models.items()}
         with th.no_grad():
             bench.figures.add(timed(section, problem.regions, bench.watch.compare(tasks)))
-    tasks = {name: Task(_predict(model), [*points]) for name, model in models.items()}
+    tasks = {name: Task(predictor(model), [*points]) for name, model in models.items()}
     bench.figures.add(timed(PREDICT, problem.regions, bench.watch.compare(tasks)))
 
 
@@ -62,7 +63,7 @@ def training(bench: Bench, problem: Problem) -> None:
     bench.figures.add(timed(TRAIN, problem.regions, bench.watch.compare(tasks)))
 
 
-def learner(problem: Problem, policy: Any) -> DDPG:
+def learner(problem: Problem | OnlineProblem, policy: Any) -> DDPG:
     """Return DDPG with one of the policies, as after some training: no network is zero."""
     ours = policy is YannPolicy
     options = {"problem": problem.mpc, "critic_warmup": 0} if ours else {"net_arch": [256, 256]}
@@ -86,7 +87,7 @@ def disturb(module: nn.Module) -> None:
         parameter.add_(0.01 * th.randn(parameter.shape, generator=generator))
 
 
-def fill(model: DDPG, problem: Problem) -> None:
+def fill(model: DDPG, problem: Problem | OnlineProblem) -> None:
     """Fill the replay buffer with transitions of the linear model from anywhere in the domain."""
     mpc, rng = problem.mpc, np.random.default_rng(1)
     theta = problem.points(STORED, seed=1)
@@ -100,5 +101,6 @@ def fill(model: DDPG, problem: Problem) -> None:
         buffer.add(theta[k], following[k], actions[k], rewards[k], np.zeros(1), [{}])
 
 
-def _predict(model: DDPG) -> Any:
+def predictor(model: DDPG) -> Any:
+    """Return a function of one observation."""
     return lambda observation: model.predict(observation, deterministic=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -12,6 +14,7 @@ from sb3_yann.control import (
     DisturbanceBounds,
     LinearModel,
     LinearMPC,
+    OnlineLaw,
     OutputBounds,
     RateLimits,
     SoftBounds,
@@ -28,9 +31,11 @@ def chain(masses: int, pushed: Sequence[int], horizon: int) -> LinearMPC:
     nothing, eye = np.zeros((masses, masses)), np.eye(masses)
     A = np.block([[nothing, eye], [springs, nothing]])
     B = np.vstack([np.zeros((masses, len(pushed))), eye[:, list(pushed)]])
-    size = {"Q": np.eye(2 * masses), "R": 0.1 * np.eye(len(pushed)), "horizon": horizon}
-    bounds = {"x_min": -4, "x_max": 4, "u_min": -1, "u_max": 1}
-    return LinearMPC(LinearModel.from_continuous(A, B, 0.5), **size, **bounds)
+    return LinearMPC(
+        LinearModel.from_continuous(A, B, 0.5),
+        Q=np.eye(2 * masses), R=0.1 * np.eye(len(pushed)), horizon=horizon,
+        x_min=-4, x_max=4, u_min=-1, u_max=1,
+    )  # fmt: skip
 
 
 def three_masses() -> LinearMPC:
@@ -67,17 +72,73 @@ def wide_plant() -> LinearMPC:
     )  # fmt: skip
 
 
-PROBLEMS = {
-    "three masses, N = 10 (6 states, 2 inputs)": three_masses,
-    "six masses, N = 20 (12 states, 3 inputs)": six_masses,
-    "wide plant, N = 10 (165 parameters, 10 inputs)": wide_plant,
-}
+@dataclass(eq=False)
+class OnlineProblem:
+    """A problem with its online law; what is measured of it is named by its size.
+
+    Attributes
+    ----------
+    name : str
+    make : callable
+    """
+
+    name: str
+    make: Callable[[], LinearMPC]
+
+    @cached_property
+    def mpc(self) -> LinearMPC:
+        """The problem, which keeps to its online law."""
+        mpc = self.make()
+        mpc.law("online")
+        return mpc
+
+    @property
+    def law(self) -> OnlineLaw:
+        """Its law."""
+        return self.mpc.online()
+
+    def points(self, count: int, seed: int = 0) -> Array:
+        """Return feasible points drawn uniformly from the middle of the box, half as wide."""
+        return points(self.mpc, count, seed)
 
 
 def points(mpc: LinearMPC, count: int, seed: int = 0) -> Array:
-    """Return feasible points drawn uniformly from the middle half of the box."""
-    rng, law, found = np.random.default_rng(seed), mpc.online(), np.empty((0, mpc.n_theta))
+    """Return feasible points drawn uniformly from the middle of the box, half as wide."""
+    rng, law = np.random.default_rng(seed), mpc.online()
+    found: Array = np.empty((0, mpc.n_theta))
     while len(found) < count:
         drawn = rng.uniform(mpc.theta_min, mpc.theta_max, (256, mpc.n_theta)) / 2
         found = np.concatenate([found, drawn[law.in_domain(drawn)]])
     return found[:count]
+
+
+def worst_condition(law: OnlineLaw, theta: Array) -> tuple[float, float]:
+    """Return by how much optimality fails, and the largest error of an input, of its range.
+
+    The plan for the constraints that the law holds to be active is solved for in the units of the
+    input range, without any of the law's own matrices. It is the optimum where slacks and
+    multipliers are positive; negative ones count by their size.
+    """
+    units = np.tile((law.u_max - law.u_min) / 2, (len(law.c) - law.n_slacks) // law.n_inputs)
+    units, worst, error = np.concatenate([units, np.ones(law.n_slacks)]), 0.0, 0.0
+    H, G = law.H * np.outer(units, units), law.G * units
+    found, inputs = law.dual.solve(theta), law(theta)
+    for k, at in enumerate(theta):
+        active = law.dual.rows[found.active[k, : found.sizes[k]]]
+        left = np.block([[H, G[active].T], [G[active], np.zeros((len(active), len(active)))]])
+        right = [-(law.F @ at + law.c) * units, law.w[active] + law.S[active] @ at]
+        solution = np.linalg.solve(left, np.concatenate(right))
+        plan, multipliers = solution[: len(H)], solution[len(H) :]
+        slack = law.w + law.S @ at - G @ plan
+        size = max(1.0, float(np.abs(multipliers).max(initial=0.0)))
+        worst = max(worst, -slack.min(), -multipliers.min(initial=0.0) / size)
+        apart = (units * plan)[: law.n_inputs] - inputs[k]
+        error = max(error, float(np.max(np.abs(apart) / (law.u_max - law.u_min))))
+    return float(worst), error
+
+
+PROBLEMS = (
+    OnlineProblem("6 states, N = 10", three_masses),
+    OnlineProblem("12 states, N = 20", six_masses),
+    OnlineProblem("165 parameters, N = 10", wide_plant),
+)

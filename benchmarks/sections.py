@@ -8,7 +8,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch as th
 
-from benchmarks import evaluation, exactness, gpu, memory, networks, offline, simulators
+from benchmarks import (
+    evaluation,
+    exactness,
+    gpu,
+    memory,
+    networks,
+    offline,
+    online,
+    simulators,
+)
 from benchmarks.problems import PROBLEMS, SMALLEST, Problem
 from benchmarks.records import Bench, Figure, show, timed
 from benchmarks.timing import Array
@@ -22,6 +31,11 @@ TITLES = {
     networks.TRAIN: "One training step of DDPG, batch of 256",
     offline.SECTION: "Offline solution",
     exactness.SECTION: "Exactness",
+    online.LAW: "The online law in numpy, one point",
+    online.PREDICT: "The online law: model.predict of one observation",
+    online.TRAIN: "The online law: one training step of DDPG, batch of 256",
+    online.BUILT: "The online law: DDPG is built",
+    online.EXACT: "The online law: exactness",
     simulators.SECTION: "Environments",
     memory.SECTION: "Memory",
     gpu.SECTION: "Processor and CUDA device",
@@ -35,8 +49,8 @@ EACH: dict[str, PerProblem] = {
     "exact": exactness.exactness,
     "memory": memory.memory,
 }
-ENVS, GPU = "env", "gpu"
-NAMES = (*EACH, ENVS, GPU)
+ENVS, GPU, ONLINE = "env", "gpu", "online"
+NAMES = (*EACH, ONLINE, ENVS, GPU)
 
 
 def run(bench: Bench, names: Sequence[str]) -> None:
@@ -46,6 +60,8 @@ def run(bench: Bench, names: Sequence[str]) -> None:
         before, began = set(bench.figures.sections()), time.perf_counter()
         if name == ENVS:
             simulators.simulators(bench)
+        elif name == ONLINE:
+            online.online(bench)
         elif name == GPU:
             _devices(bench, problems)
         else:

@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
+from sb3_yann.control import OnlineLaw
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -26,6 +27,8 @@ def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
         return None
     if today is twin.problem:
         return None
+    if isinstance(twin.problem.law(), OnlineLaw):
+        today.law("online")  # nor is its explicit law looked for
     layout, before, law = today.layout, twin.problem.model, law_of(today)
     x, u = today.model.x_ss - before.x_ss, today.model.u_ss - before.u_ss
     shift = np.zeros(layout.size)

@@ -224,7 +224,7 @@ def solve_batch(
 
 @compiled(
     "void(float64[:, ::1], float64[:, ::1], float64[::1], float64[:, ::1], float64[:, ::1], "
-    "int64[:, ::1], int64[::1], float64[:, ::1])"
+    "int64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1])"
 )
 def inputs_of_batch(
     theta: Array,
@@ -234,9 +234,13 @@ def inputs_of_batch(
     multipliers: Array,
     active: Integers,
     sizes: Integers,
+    bounds: Array,
     u: Array,
 ) -> None:
-    """Write ``u = k0 + K theta - E lam`` (batch, m) for K (m, n) and E (rows, m)."""
+    """Write ``u = k0 + K theta - E lam`` (batch, m), clipped to bounds (2, m).
+
+    K is (m, n), E (rows, m). Sums that overflow, far from everything, are 0 before.
+    """
     for at in range(len(theta)):
         for k in range(len(k0)):
             total = k0[k]
@@ -244,4 +248,5 @@ def inputs_of_batch(
                 total += K[k, i] * theta[at, i]
             for i in range(sizes[at]):
                 total -= E[active[at, i], k] * multipliers[at, i]
-            u[at, k] = total
+            total = total if np.isfinite(total) else 0.0
+            u[at, k] = min(max(total, bounds[0, k]), bounds[1, k])

@@ -49,6 +49,8 @@ class DualProgram:
         What is added to the diagonal of ``gram`` where a constraint is to give way.
     fixed : pair of ndarray, shapes (k, n) and (k,)
         ``S theta + w >= 0``: what no input can change.
+    bounds : ndarray, shape (2, m)
+        Of the inputs.
     rows : ndarray of int
         Where these constraints lie in the program.
     n_variables : int
@@ -62,6 +64,7 @@ class DualProgram:
     k0: Array
     softness: Array
     fixed: tuple[Array, Array]
+    bounds: Array
     rows: Integers
     n_variables: int
 
@@ -85,8 +88,10 @@ class DualProgram:
         E, K = (unit * by_row[:m, moved] / own[:, 0]).T, -unit * by_theta[:m]
         D, gram, E, K = map(np.ascontiguousarray, (D.T, gram, E, K))
         fixed = scaled.S[~moved], scaled.w[~moved]
-        k0 = -reach[:m] * by_one[:m, 0]
-        return cls(D, d0, gram, E, K, k0, softness, fixed, np.flatnonzero(moved), len(reach))
+        k0, bounds = -reach[:m] * by_one[:m, 0], np.stack([u_min, u_max])
+        return cls(
+            D, d0, gram, E, K, k0, softness, fixed, bounds, np.flatnonzero(moved), len(reach)
+        )
 
     def solve(self, theta: Array, soft: bool = False) -> Answers:
         """Return what comes of rows (batch, n); where ``soft``, constraints give way."""
@@ -105,12 +110,12 @@ class DualProgram:
         return found
 
     def inputs(self, theta: Array, found: Answers) -> Array:
-        """Return the inputs (batch, m)."""
+        """Return the inputs (batch, m), between their bounds."""
         from sb3_yann.control.online._kernels import inputs_of_batch
 
         u = np.empty((len(theta), len(self.k0)))
         lam = found.multipliers, found.active, found.sizes
-        inputs_of_batch(theta, self.K, self.k0, self.E, *lam, u)
+        inputs_of_batch(theta, self.K, self.k0, self.E, *lam, self.bounds, u)
         return u
 
     def meets_fixed(self, theta: Array) -> NDArray[np.bool_]:

@@ -179,12 +179,13 @@ class OnlineLaw(ReadOnlyArrays):
 
     def _answers(self, rows: Array) -> tuple[Array, NDArray[np.bool_], Answers, Answers | None]:
         """Return inputs, what is feasible, the answers, and those of infeasible rows softened."""
-        from sb3_yann.control.online._kernels import INFEASIBLE as NONE
-        from sb3_yann.control.online._kernels import UNKNOWN
+        from sb3_yann.control.online import _kernels
 
         found = self.dual.solve(rows)
-        u, feasible = self.dual.inputs(rows, found), found.status != NONE
-        for i in np.flatnonzero(found.status == UNKNOWN):
+        u, feasible = self.dual.inputs(rows, found), found.status == _kernels.SOLVED
+        if not len(self.dual.fixed[1]) and feasible.all():  # mostly: the rest takes microseconds
+            return u, feasible, found, None
+        for i in np.flatnonzero(found.status == _kernels.UNKNOWN):
             feasible[i] = self._ask_daqp(rows[i], u[i], found, i)
         feasible &= self.dual.meets_fixed(rows)
         softened, lost = None, np.flatnonzero(~feasible)
@@ -194,7 +195,6 @@ class OnlineLaw(ReadOnlyArrays):
             again = np.ascontiguousarray(rows[lost])
             softened = self.dual.solve(again, soft=True)
             u[lost] = self.dual.inputs(again, softened)
-        u = np.where(np.isfinite(u), u, 0.0)  # far from everything
         return np.clip(u, self.u_min, self.u_max), feasible, found, softened
 
     def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:
