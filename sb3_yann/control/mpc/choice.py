@@ -8,6 +8,7 @@ from typing import Protocol
 
 from sb3_yann.control.explicit.budget import ExplicitLimitError
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
+from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.online.online_law import OnlineLaw
 
@@ -15,6 +16,8 @@ Law = PiecewiseAffine | OnlineLaw
 LAWS = ("auto", "explicit", "online")
 SECONDS, REGIONS = 10.0, 5000
 """What "auto" spends on the search for an explicit law."""
+LARGE = 50_000
+"""Constraints times parameters beyond which a single region takes long, and none is looked for."""
 CHOSEN = "_online_chosen"
 
 
@@ -36,6 +39,9 @@ class Solvable(Protocol):
     ) -> PiecewiseAffine:
         """Return the explicit law."""
 
+    def condensed(self) -> ParametricQP:
+        """Return the program in U."""
+
     def online(self) -> OnlineLaw:
         """Return the online law."""
 
@@ -50,19 +56,26 @@ def choose(problem: Solvable, solved: Mapping[str, PiecewiseAffine], kind: str) 
     if kind == "explicit":
         return problem.explicit()
     if kind == "auto" and CHOSEN not in vars(problem):
-        try:
-            return problem.explicit(time_limit=SECONDS, region_limit=REGIONS)
-        except (ExplicitLimitError, ExplicitSolutionError) as error:
-            _warn(error)
+        found = _searched(problem)
+        if isinstance(found, PiecewiseAffine):
+            return found
+        warnings.warn(
+            f"The program will be solved online, at each point: {found}. For the explicit law call "
+            "problem.explicit() before, which has no limit by default; to skip the search, and "
+            "this warning, choose law='online'.",
+            OnlineLawWarning,
+            stacklevel=3,
+        )
     vars(problem)[CHOSEN] = True
     return problem.online()
 
 
-def _warn(error: RuntimeError) -> None:
-    warnings.warn(
-        f"The program will be solved online, at each point: {str(error).partition(': ')[0]}. For "
-        "the explicit law call problem.explicit() before, which has no limit by default; to skip "
-        "the search, and this warning, choose law='online'.",
-        OnlineLawWarning,
-        stacklevel=4,
-    )
+def _searched(problem: Solvable) -> PiecewiseAffine | str:
+    """Return the explicit law if it is found within the budget, else why it is not."""
+    rows, n = problem.condensed().S.shape
+    if rows * n > LARGE:
+        return f"it has {rows} constraints on {n} parameters, too many to look for regions"
+    try:
+        return problem.explicit(time_limit=SECONDS, region_limit=REGIONS)
+    except (ExplicitLimitError, ExplicitSolutionError) as error:
+        return str(error).partition(": ")[0]

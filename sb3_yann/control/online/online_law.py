@@ -48,7 +48,8 @@ class OnlineLaw(ReadOnlyArrays):
     theta_min, theta_max : ndarray, shape (n,)
         The box of theta; a network scales its inputs by it.
     n_slacks : int, default 0
-    infeasible : {"nearest_region", "zero_input"}
+        How many of the last variables are slacks.
+    infeasible : {"nearest_region", "zero_input"}, default "nearest_region"
 
     Examples
     --------
@@ -57,8 +58,8 @@ class OnlineLaw(ReadOnlyArrays):
     ...     H=one, F=2 * one, c=[0.0], G=[[1.0], [-1.0]], w=[1.0, 1.0], S=[[0.0], [0.0]],
     ...     u_min=[-1.0], u_max=[1.0], theta_min=[-1.0], theta_max=[1.0],
     ... )
-    >>> law([0.25]), law([[3.0], [0.0]]).tolist()
-    (array([-0.5]), [[-1.0], [0.0]])
+    >>> law([0.25]), law([[3.0], [-0.25]]).tolist()
+    (array([-0.5]), [[-1.0], [0.5]])
     """
 
     H: Array
@@ -96,7 +97,15 @@ class OnlineLaw(ReadOnlyArrays):
 
     @classmethod
     def of(cls, program: ParametricQP, u_min: Array, u_max: Array, infeasible: str) -> OnlineLaw:
-        """Return the law of a program whose first variables are the inputs."""
+        """Return the law of a program.
+
+        Parameters
+        ----------
+        program : ParametricQP
+            Whose first variables are the inputs.
+        u_min, u_max, infeasible
+            As in :class:`OnlineLaw`.
+        """
         parts = {field.name: getattr(program, field.name) for field in fields(program)}
         return cls(**parts, u_min=u_min, u_max=u_max, infeasible=infeasible)
 

@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 
+from benchmarks.online_problems import wide_plant
 from general_problems import PROBLEMS, servo, solved
 from sb3_yann.control import LinearMPC, OnlineLaw, OnlineLawWarning, PiecewiseAffine
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
@@ -29,6 +30,12 @@ def test_auto_is_the_online_law_beyond_the_budget_and_says_so_once(monkeypatch) 
         warnings.simplefilter("error")
         assert mpc.law() is law
         assert isinstance(pickle.loads(pickle.dumps(mpc)).law(), OnlineLaw)
+
+
+def test_regions_of_a_very_large_program_are_not_looked_for(monkeypatch) -> None:
+    monkeypatch.setattr(LinearMPC, "explicit", None)
+    with pytest.warns(OnlineLawWarning, match="801 constraints on 165 parameters, too many"):
+        assert isinstance(wide_plant().law(), OnlineLaw)
 
 
 def test_a_law_that_fails_its_check_is_not_taken(monkeypatch) -> None:
