@@ -8,10 +8,13 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
+from sb3_yann.control import ExplicitLimitError
 from sb3_yann.networks import YannLayer
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
+LARGER = 10
+"""How many times as many regions the law of today may have."""
 STARTS, STEPS, BATCH, UPDATES, RATE = 60, 100, 512, 600, 1e-2
 
 
@@ -22,9 +25,10 @@ def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
     """
     try:
         today = twin.reidentified()
-    except ValueError:  # no steady state, or no solution of the Riccati equation
-        return None
-    if today is twin.problem:
+        if today is twin.problem:
+            return None
+        today.explicit(region_limit=LARGER * twin.problem.explicit().n_regions)
+    except (ValueError, ExplicitLimitError):  # no steady state, no Riccati solution, or too large
         return None
     layout, before, law = today.layout, twin.problem.model, law_of(today)
     x, u = today.model.x_ss - before.x_ss, today.model.u_ss - before.u_ss
