@@ -27,7 +27,7 @@ def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
         today = twin.reidentified()
         if today is twin.problem:
             return None
-        today.explicit(region_limit=LARGER * twin.problem.explicit().n_regions)
+        today.explicit(region_limit=int(LARGER * twin.problem.explicit().n_regions))
     except (ValueError, ExplicitLimitError):  # no steady state, no Riccati solution, or too large
         return None
     layout, before, law = today.layout, twin.problem.model, law_of(today)
