@@ -26,9 +26,9 @@ from sb3_yann.evaluation import evaluate
 from sb3_yann_envs import problems
 
 CASES = {
-    "no noise": (0.0, False),
-    "no noise, reidentify=True": (0.0, True),
-    "sensor noise of .001 mol/L and .03 K": (1.0, False),
+    "no noise": (0.0, True),
+    "sensor noise of .001 mol/L and .03 K": (1.0, True),
+    "no noise, reidentify=False": (0.0, False),
 }
 SEEDS = range(40, 50)
 BATCHES, FIRST = 4, 4  # 4 + 8 + 16 + 32 episodes

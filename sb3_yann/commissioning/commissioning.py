@@ -59,7 +59,7 @@ class Commissioning:
         models lie beside it.
     shadow : bool, default False
         The MPC acts throughout; the record shows what the policy would have done.
-    reidentify : bool, default False
+    reidentify : bool, default True
         As in :func:`improve`: a second search begins at the re-identified MPC.
     iterations : int, default 120
         Of :func:`improve`.
@@ -92,7 +92,7 @@ class Commissioning:
         max_correction: float = 0.1,
         log_path: str | PathLike[str] | None = None,
         shadow: bool = False,
-        reidentify: bool = False,
+        reidentify: bool = True,
         iterations: int = 120,
         seed: int = 0,
         verbose: int = 0,
@@ -237,17 +237,17 @@ class Commissioning:
         """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
         bound = self.journal.outlook.max_correction
         self.incumbent.take_candidate()
-        held, learnt = ActorCheckpoint.of(self.policy), self.incumbent.has_learnt
+        held = ActorCheckpoint.of(self.policy)
         self.incumbent.limit(outlook.max_correction)
         reidentify, count = self.reidentify, self.iterations
         found = improve(self.model, twin, count, reidentify=reidentify, seed=seed)
-        first = found.checks[0]
-        if found.accepted or (learnt and first.accepted):
+        before = found.before
+        if found.accepted or (before is not None and before.accepted):
             return outlook, "accepted", f"{100 * found.change:+.2f} % in the twin."
-        if learnt and self.journal.accepted and first.safe and first.change <= 0:
+        if before is not None and self.journal.accepted and before.safe and before.change <= 0:
             held.restore(self.policy)
             self.incumbent.limit(bound)
-            said = f"{100 * first.change:+.2f} % in the twin. {found.reason}"
+            said = f"{100 * before.change:+.2f} % in the twin. {found.reason}"
             return replace(outlook, max_correction=bound), "stays", said
         self.incumbent.give_back()
         return outlook, "the MPC acts", found.reason

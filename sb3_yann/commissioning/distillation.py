@@ -8,11 +8,13 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.control import OnlineLaw
+from sb3_yann.control import ExplicitLimitError, LinearMPC, OnlineLaw
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
+LARGER = 10
+"""How many times as many regions the law of today may have."""
 STARTS, STEPS, BATCH, UPDATES, RATE = 60, 100, 512, 600, 1e-2
 
 
@@ -23,12 +25,11 @@ def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
     """
     try:
         today = twin.reidentified()
-    except ValueError:  # no steady state, or no solution of the Riccati equation
+        if today is twin.problem:
+            return None
+        _choose_law(today, twin.problem)
+    except (ValueError, ExplicitLimitError):  # no steady state, no Riccati solution, or too large
         return None
-    if today is twin.problem:
-        return None
-    if isinstance(twin.problem.law(), OnlineLaw):
-        today.law("online")  # nor is its explicit law looked for
     layout, before, law = today.layout, twin.problem.model, law_of(today)
     x, u = today.model.x_ss - before.x_ss, today.model.u_ss - before.u_ss
     shift = np.zeros(layout.size)
@@ -36,6 +37,15 @@ def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
     if layout.n_previous:
         shift[layout.previous] = u
     return lambda rows: law(rows - shift) + u
+
+
+def _choose_law(today: LinearMPC, before: LinearMPC) -> None:
+    """Solve the law of today as that of before was; ExplicitLimitError if it is far larger."""
+    law = before.law()
+    if isinstance(law, OnlineLaw):
+        today.law("online")
+    else:
+        today.explicit(region_limit=int(LARGER * law.n_regions))
 
 
 def distill(layer: LawLayer, twin: PlantTwin, seed: int) -> bool:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch as th
@@ -14,13 +15,16 @@ from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.critic import refit_critic
 from sb3_yann.commissioning.distillation import distill
 from sb3_yann.commissioning.incumbent import all_or_nothing
-from sb3_yann.commissioning.search import Search
+from sb3_yann.commissioning.search import Pace, Search
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
 LEAST = 2e-3
 """A policy that gains less in the twin, relative to the MPC's mean cost, is not worth a change."""
+
+RACE = 3
+"""Of two searches the better one goes on after such a part of the iterations."""
 
 REFINED = 0.2
 """Factor of the learning rate where the re-identified MPC is refined."""
@@ -33,11 +37,13 @@ class Improvement:
     Attributes
     ----------
     checks : tuple of Check
-        All comparisons with the MPC in the twin.
+        The comparisons with the MPC in the twin, of the better search.
     change : float
         The accepted policy's mean cost in the twin against the MPC's: -0.02 is 2 % less.
     accepted : bool
         Whether a policy passed that gains at least 0.2 %; if none did, the model is as it was.
+    before : Check, optional
+        Of what the model had learnt before, if it had.
 
     Examples
     --------
@@ -48,6 +54,7 @@ class Improvement:
     checks: tuple[Check, ...]
     change: float
     accepted: bool
+    before: Check | None = None
 
     @property
     def reason(self) -> str:
@@ -65,7 +72,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     *,
     batch: int = 50,
     learning_rate: float = 5e-3,
-    reidentify: bool = False,
+    reidentify: bool = True,
     n_starts: int = 40,
     check_every: int = 20,
     patience: int = 5,
@@ -78,10 +85,14 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     twin and actor, with the linear-quadratic value at the end. Every so many steps the policy is
     checked against the MPC, from seeded starts on every member of the twin. It is accepted if no
     start costs more than with the MPC by 0.05 % of the mean, none violates more, and the mean is
-    not above that of the accepted policy; a start around the log may cost 2 % of its own more.
-    What passes is confirmed on new starts, and must gain 0.2 % in the end. Starts that it loses,
-    or nearly, are played in the gradients to come. What the model has learnt before is checked
-    first.
+    not above that of the accepted policy. A start outside the log may cost 2 % of its own more,
+    and up to ten times as much the rarer it is. Of what is refused, a half and a quarter are
+    tried. What passes is confirmed on new starts, and must gain 0.2 % in the end. Starts that it
+    loses, or nearly, are played in the gradients to come. What the model has learnt before is
+    checked first.
+
+    Two searches run, one from the present policy and one from the re-identified MPC. After a third
+    of the iterations the better one goes on.
 
     The model ends with the policy accepted last and a critic that is refitted to it, else as it
     was. It saves and goes on learning as any other.
@@ -98,9 +109,9 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
         Runs in each.
     learning_rate : float, default 5e-3
         Of Adam at first; it falls to zero.
-    reidentify : bool, default False
-        Whether a second search begins at the re-identified MPC (:meth:`PlantTwin.reidentified`)
-        where the policy has learnt nothing yet. The better of both is taken.
+    reidentify : bool, default True
+        Whether a search begins at the re-identified MPC (:meth:`PlantTwin.reidentified`), if its
+        law has at most ten times as many regions.
     n_starts : int, default 40
         Starts of a check, for each member: so many as the log begins, and as many around.
     check_every : int, default 20
@@ -144,24 +155,39 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     as_flag("progress_bar", progress_bar)
     as_flag("reidentify", reidentify)
     twin.require_trust()
-    layer, rates = copy.deepcopy(policy.actor.mu).cpu(), [learning_rate]
-    layers, today = [layer], copy.deepcopy(layer)
-    if reidentify and layer.network.is_zero() and distill(today, twin, seed):
-        layers.append(today)
-        rates.append(REFINED * learning_rate)
-    searches = [Search(each, twin, batch, n_starts, seed) for each in layers]
-    for search, rate in zip(searches, rates, strict=True):
-        steps = track(range(iterations), "improving", disable=not progress_bar)
-        search.run(steps, iterations, rate, check_every, patience)
-    search = min(searches, key=lambda each: each.change)
+    layer, size = copy.deepcopy(policy.actor.mu).cpu(), (batch, n_starts, seed)
+    searches = [Search(layer, twin, Pace(iterations, learning_rate, check_every, patience), *size)]
+    today = copy.deepcopy(layer)
+    if reidentify and distill(today, twin, seed):
+        slower = replace(searches[0].pace, learning_rate=REFINED * learning_rate)
+        searches.append(Search(today, twin, slower, *size))
+    before = None if layer.network.is_zero() else searches[0].checks[0]
+    leg = min(iterations, max(check_every, -(-iterations // RACE)))
+    total = iterations + (len(searches) - 1) * leg
+    for _ in track(_race(searches, leg), "improving", total, disable=not progress_bar):
+        pass
+    search = _best(searches)
     change, own = search.change, policy.actor.mu.state_dict()
     moved = any(not th.equal(own[key].cpu(), each) for key, each in search.accepted.items())
     if not moved or change > -LEAST:
-        return Improvement(tuple(search.checks), 0.0 if moved else change, False)
+        return Improvement(tuple(search.checks), 0.0 if moved else change, False, before)
     with all_or_nothing(policy):
         policy.actor.mu.load_state_dict(search.accepted)
         policy.actor_target.load_state_dict(policy.actor.state_dict())
         for network in (policy.actor, policy.critic):
             network.optimizer.state.clear()  # what other weights were moved by
         refit_critic(policy, twin, seed)
-    return Improvement(tuple(search.checks), change, True)
+    return Improvement(tuple(search.checks), change, True, before)
+
+
+def _race(searches: list[Search], leg: int) -> Iterator[int]:
+    """Yield after each gradient step: of all searches in the first leg, then of the best one."""
+    if len(searches) > 1:
+        for each in searches:
+            yield from each.steps(leg)
+    best = _best(searches)
+    yield from best.steps(best.pace.iterations)
+
+
+def _best(searches: list[Search]) -> Search:
+    return min(searches, key=lambda each: each.change)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,37 @@ EMPHASIS = 100.0
 """How many times as much a run counts that costs more than with the MPC."""
 HARDEST, SHARE = 50, 0.6
 """How many new hard starts each member keeps; the share of hard ones in a gradient's runs."""
+RETREATS = 1.0, 0.5, 0.25
+"""Of the way from the accepted policy to the present one: what is checked until one passes."""
+POOL = 400
+"""Starts of each member that gradients draw from; what they cost with the MPC is known."""
 PENALTY = 10.0
 """Of a step one half-width beyond a limit, in mean costs of a run."""
+
+Valued = tuple[Array, Array]
+"""Starts (rows, n_theta), and costs (rows,)."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How a search proceeds.
+
+    Attributes
+    ----------
+    iterations : int
+        Gradient steps, at most.
+    learning_rate : float
+        Of Adam at first; it falls to zero.
+    check_every : int
+        Steps from one check to the next.
+    patience : int
+        Checks without an acceptance after which to stop.
+    """
+
+    iterations: int
+    learning_rate: float
+    check_every: int
+    patience: int
 
 
 class Search:
@@ -42,6 +72,7 @@ class Search:
     layer : LawLayer
         On the CPU; it is moved.
     twin : PlantTwin
+    pace : Pace
     batch : int
         Runs in each gradient, shared out among the members.
     n_starts : int
@@ -50,13 +81,19 @@ class Search:
     """
 
     def __init__(
-        self, layer: LawLayer, twin: PlantTwin, batch: int, n_starts: int, seed: int
+        self,
+        layer: LawLayer,
+        twin: PlantTwin,
+        pace: Pace,
+        batch: int,
+        n_starts: int,
+        seed: int,
     ) -> None:
-        self.layer, self.twin, problem = layer, twin, twin.problem
+        self.layer, self.twin, self.pace, problem = layer, twin, pace, twin.problem
         members, checked = len(twin.dynamics.members), np.random.default_rng([seed, 1])
         self.shape, self.rng = (members, max(1, batch // members)), np.random.default_rng(seed)
         longest = max(map(len, twin.episodes))
-        self.steps = min(LONGEST, longest, settling_steps(problem))
+        self.length = min(LONGEST, longest, settling_steps(problem))
         self.n_starts, self.checked, self.longest = n_starts, checked, longest
         self.trial = self._draw()
         self.outcome = self.trial.mpc
@@ -64,47 +101,37 @@ class Search:
         self.known_hard = self.new_hard = nothing
         penalty, value = PENALTY * self.trial.mean, _value(problem)
         self.objective = Objective(problem, value, twin.limits.low, twin.limits.high, penalty)
-        self.accepted, self.law = copy.deepcopy(layer.state_dict()), law_of(problem)
+        drawn = self.rng.permutation(twin.starts.draw_anywhere(members * POOL, self.rng))
+        starts = drawn.reshape(members, POOL, -1)
+        self.pool = [*zip(starts, self._costs_of_mpc(starts), strict=True)]
+        self.hard = [(each[:0], costs[:0]) for each, costs in self.pool]
+        self.accepted = copy.deepcopy(layer.state_dict())
+        kind = RowAdam if layer.row_gradients else th.optim.Adam
+        self.optimizer: Any = kind(layer.network.weights())
+        self.iteration = self.refused = 0
         self.checks: list[Check] = []
         if not layer.network.is_zero():  # what has been learnt before must pass here as well
             last = [key for key in self.accepted if key.startswith("network.rest.")][-1]
             self.accepted[last].zero_()  # the MPC
-            self._check(0)
+            self._check()
 
-    def run(
-        self, iterations: Any, count: int, learning_rate: float, every: int, patience: int
-    ) -> None:
-        """Take gradient steps; leave all checks in ``checks``, and the weights in ``accepted``.
+    def steps(self, until: int) -> Iterator[int]:
+        """Yield after each gradient step up to iteration ``until``, or until it stalls.
 
-        Parameters
-        ----------
-        iterations : iterable of int
-            From 0 on.
-        count : int
-            How many.
-        learning_rate : float
-            Of Adam at first.
-        every : int
-            Steps from one check to the next.
-        patience : int
-            Checks without an acceptance after which to stop.
+        All checks are in ``checks`` then, and the weights in ``accepted``.
         """
-        kind = RowAdam if self.layer.row_gradients else th.optim.Adam
-        optimizer: Any = kind(self.layer.network.weights(), lr=learning_rate)
-        checks = self.checks
-        refused, last = 0, 0.0
-        for k in iterations:
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate * (1 - k / count)
-            self._step(optimizer)
-            if (k + 1) % every and k + 1 < count:
-                continue
-            passed = self._check(k + 1)
-            refused = 0 if passed else refused + 1
-            stalls = passed and k + 1 > every and last - checks[-1].change < PLATEAU
-            last = checks[-1].change if passed else last
-            if stalls or refused >= patience:
-                break
+        pace = self.pace
+        while self.iteration < until and self.refused < pace.patience:
+            for group in self.optimizer.param_groups:
+                group["lr"] = pace.learning_rate * (1 - self.iteration / pace.iterations)
+            self._step()
+            self.iteration += 1
+            if self.iteration % pace.check_every == 0 or self.iteration == pace.iterations:
+                before, passed = self.change, self._check()
+                self.refused = 0 if passed else self.refused + 1
+                if passed and self.iteration > pace.check_every and before - self.change < PLATEAU:
+                    self.refused = pace.patience  # it stalls
+            yield self.iteration
 
     @property
     def change(self) -> float:
@@ -118,22 +145,24 @@ class Search:
         rows = np.repeat(np.concatenate(drawn)[None], len(self.twin.dynamics.members), axis=0)
         return Trial(self.twin, rows, count, self.longest)
 
-    def _check(self, iteration: int) -> bool:
-        """Check the present actor, else the one halfway from the accepted one."""
+    def _check(self) -> bool:
+        """Check the present actor, else what lies between it and the accepted one."""
         present = copy.deepcopy(self.layer.state_dict())
-        for weights in (present, _halfway(self.accepted, present)):
+        for share in RETREATS:
+            weights = _between(self.accepted, present, share)
             self.layer.load_state_dict(weights)
-            self.checks.append(self._try(iteration))
+            self.checks.append(self._try())
             if self.checks[-1].accepted:
                 self.accepted = weights
                 break
         self.layer.load_state_dict(present)
+        self._value_hard_starts()
         return self.checks[-1].accepted
 
-    def _try(self, iteration: int) -> Check:
+    def _try(self) -> Check:
         """Check the layer on the known starts, then on new ones; learn from what it loses."""
         played = self.trial.play(self._inputs)
-        found = self.trial.check(iteration, played, self.outcome)
+        found = self.trial.check(self.iteration, played, self.outcome)
         self.known_hard = self.trial.hard(played)
         if not found.accepted:
             return found
@@ -141,30 +170,45 @@ class Search:
         there = new.play(self._inputs)
         pairs = zip(new.hard(there), self.new_hard, strict=True)
         self.new_hard = [np.concatenate(each)[:HARDEST] for each in pairs]
-        confirmed = new.check(iteration, there, new.mpc)
+        confirmed = new.check(self.iteration, there, new.mpc)
         if not confirmed.accepted:
             return replace(found, accepted=False, reason=f"on new starts, {confirmed.reason}")
         self.outcome = played
         return found
 
-    def _step(self, optimizer: Any) -> None:
-        optimizer.zero_grad()
-        members, batch = self.shape
-        drawn = self.twin.starts.draw_anywhere(members * batch, self.rng)
-        starts = self.rng.permutation(drawn).reshape(members, batch, -1)
-        for i, hard in enumerate(zip(self.known_hard, self.new_hard, strict=True)):
-            chosen = self.rng.permutation(np.concatenate(hard))[: int(SHARE * batch)]
-            starts[i, : len(chosen)] = chosen
-        dynamics = self.twin.dynamics
+    def _step(self) -> None:
+        self.optimizer.zero_grad()
+        chosen = [self._chosen(*each) for each in zip(self.pool, self.hard, strict=True)]
+        starts, mpc = (np.array(each) for each in zip(*chosen, strict=True))
+        # Relative costs count: starts around the log may be many times as dear as those in it.
+        weights = np.minimum(MOST, self.trial.mean / np.maximum(np.abs(mpc), 1e-300))
+        reference = mpc, weights, weights * (1 + EMPHASIS)
+        dynamics, length = self.twin.dynamics, self.length
         with np.errstate(all="ignore"):
-            runs = dynamics.roll_out(self.law, starts, self.steps)
-            mpc = self.objective.costs(*runs)
-            # Relative costs count: starts around the log may be many times as dear as those in it.
-            weights = np.minimum(MOST, self.trial.mean / np.maximum(np.abs(mpc), 1e-300))
-            reference = mpc, weights, weights * (1 + EMPHASIS)
-            accumulate_gradient(self.layer, dynamics, self.objective, starts, self.steps, reference)
+            accumulate_gradient(self.layer, dynamics, self.objective, starts, length, reference)
         if all(each.grad is None or _finite(each.grad) for each in self.layer.network.weights()):
-            optimizer.step()
+            self.optimizer.step()
+
+    def _chosen(self, pool: Valued, hard: Valued) -> Valued:
+        """Return the starts of one member's runs, and what they cost with the MPC."""
+        batch = self.shape[1]
+        first = self.rng.permutation(len(hard[0]))[: int(SHARE * batch)]
+        rest = self.rng.permutation(len(pool[0]))[: batch - len(first)]
+        starts, costs = ((a[first], b[rest]) for a, b in zip(hard, pool, strict=True))
+        return np.concatenate(starts), np.concatenate(costs)
+
+    def _costs_of_mpc(self, starts: Array) -> Array:
+        with np.errstate(all="ignore"):
+            runs = self.twin.dynamics.roll_out(law_of(self.twin.problem), starts, self.length)
+            return self.objective.costs(*runs)
+
+    def _value_hard_starts(self) -> None:
+        hard = [np.concatenate(each) for each in zip(self.known_hard, self.new_hard, strict=True)]
+        most = max(map(len, hard))
+        filled = zip(hard, self.pool, strict=True)  # every member runs as many
+        starts = np.array([[*rows, *pool[0][: most - len(rows)]] for rows, pool in filled])
+        costs = self._costs_of_mpc(starts) if most else np.empty((len(hard), 0))
+        self.hard = [(rows, known[: len(rows)]) for rows, known in zip(hard, costs, strict=True)]
 
     def _inputs(self, theta: Array) -> Array:
         return actor_inputs(self.layer, self.twin.problem, theta)
@@ -193,8 +237,10 @@ def _finite(gradient: th.Tensor) -> bool:
     return bool(values.isfinite().all())
 
 
-def _halfway(first: dict[str, th.Tensor], second: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
+def _between(
+    first: dict[str, th.Tensor], second: dict[str, th.Tensor], share: float
+) -> dict[str, th.Tensor]:
     return {
-        key: th.lerp(value, second[key], 0.5) if key.startswith("network.") else value
-        for key, value in first.items()
+        key: th.lerp(first[key], value, share) if key.startswith("network.") else value
+        for key, value in second.items()
     }

@@ -15,8 +15,9 @@ from sb3_yann.twin.plant_twin import PlantTwin
 
 MARGIN = 5e-4
 """What one start may cost more than with the MPC on one member, in mean costs of the MPC."""
-AROUND = 0.02
-"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it."""
+AROUND, RAREST = 0.02, 10.0
+"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; this
+many times as much at most where it is rare."""
 FURTHER = 0.01
 """How much farther than the MPC a run may leave what the log shows, in its widths."""
 NEARLY = 0.5
@@ -130,7 +131,9 @@ class Trial:
 
     def room(self) -> Array:
         """Return what each start may cost more than with the MPC."""
-        return MARGIN * self.mean + AROUND * np.abs(self.mpc[0]) * ~self.known
+        rare = np.minimum(self.twin.starts.rareness(self.starts), RAREST).ravel()
+        more = AROUND * rare * np.abs(self.mpc[0]) * ~self.known
+        return np.asarray(MARGIN * self.mean + more)
 
     def hard(self, played: Outcome) -> list[Array]:
         """Return the starts of each member that a policy loses, or nearly."""

@@ -58,17 +58,29 @@ class Starts:
         return self.rows[rng.integers(len(self.rows), size=count)]
 
     def draw_around(self, count: int, rng: np.random.Generator) -> Array:
-        """Return thetas (count, n_theta) from a box three times as wide, of which nothing is known.
+        """Return thetas (count, n_theta) from boxes up to three times as wide: nothing is known.
 
         Those that the law has no solution for are replaced by logged ones.
         """
         drawn, n = self.draw(count, rng), len(self.low)
-        middle, reach = (self.high + self.low) / 2, AROUND * (self.high - self.low) / 2
+        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        reach = rng.uniform(1, AROUND, (count, 1)) * half
         drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
         drawn = np.clip(drawn, self.problem.theta_min, self.problem.theta_max)
         outside = ~self.problem.law().in_domain(drawn)
         drawn[outside] = self.draw_logged(int(outside.sum()), rng)
         return drawn
+
+    def rareness(self, thetas: Array) -> Array:
+        """Return by how much rarer than in the box such starts are, for thetas (..., n_theta).
+
+        Of k draws from a uniform distribution another one lies beyond ``rho`` times their box
+        with a probability that falls as ``rho ** (1 - k)``.
+        """
+        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        x = thetas[..., : len(half)]
+        rho = (np.abs(x - middle) / np.maximum(half, 1e-300)).max(axis=-1)
+        return np.asarray(np.maximum(rho, 1.0) ** (len(self.first) - 1))
 
     def draw_anywhere(self, count: int, rng: np.random.Generator) -> Array:
         """Return thetas (count, n_theta), a third each of beginnings, of logged and of around."""

@@ -208,7 +208,9 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
     before = [each.clone() for each in run.policy.actor.parameters()]
     refused = Check(0, False, "start 3 costs a little more", -0.01, 0.001, True)
     monkeypatch.setattr(
-        commissioning, "improve", lambda *_, **__: Improvement((refused,), -0.01, False)
+        commissioning,
+        "improve",
+        lambda *_, **__: Improvement((refused,), -0.01, False, refused),
     )
     assert run.run(2)[-1].verdict == "stays"
     assert all(th.equal(a, b) for a, b in zip(before, run.policy.actor.parameters(), strict=True))

@@ -9,6 +9,7 @@ import pytest
 from stable_baselines3 import DDPG
 
 from sb3_yann import YannPolicy, improve
+from sb3_yann.commissioning import distillation
 from sb3_yann.commissioning.distillation import distill, law_today
 from sb3_yann.twin.gradient import actor_inputs
 from twin_samples import Cart, problem, twin
@@ -43,10 +44,17 @@ def test_without_a_better_model_there_is_no_law_of_today(monkeypatch) -> None:
     assert not distill(layer, twin(), seed=0) and is_mpc(layer)
 
 
+def test_a_law_of_today_that_would_be_much_larger_is_left_out(monkeypatch) -> None:
+    today = twin().reidentified()  # with more regions than the one that it may have here
+    monkeypatch.setattr(type(twin()), "reidentified", lambda self: today)
+    monkeypatch.setattr(distillation, "LARGER", 1 / problem().explicit().n_regions)
+    assert law_today(twin()) is None
+
+
 def test_the_better_of_two_searches_is_taken() -> None:
     plain, today = model(), model()
-    one = improve(plain, twin(), iterations=20)
-    both = improve(today, twin(), iterations=20, reidentify=True)
+    one = improve(plain, twin(), iterations=20, reidentify=False)
+    both = improve(today, twin(), iterations=60)  # the first leg of both is 20
     assert both.change <= one.change
     assert both.accepted == (not is_mpc(today))
 

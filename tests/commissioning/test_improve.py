@@ -12,6 +12,8 @@ import torch as th
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import NoActionNoise, PlantTwin, UntrustedTwinError, YannPolicy, improve
+from sb3_yann.commissioning.search import Pace, Search
+from sb3_yann.commissioning.trial import Check
 from sb3_yann.evaluation import evaluate
 from twin_samples import Cart, log, problem, twin
 from weights import is_mpc
@@ -132,3 +134,18 @@ def test_what_gains_next_to_nothing_changes_nothing(monkeypatch) -> None:
     monkeypatch.undo()
     assert improve(model, twin(), iterations=40).accepted
     assert policy_bits(model) != before
+
+
+def test_of_what_is_refused_a_half_and_a_quarter_are_tried(monkeypatch) -> None:
+    layer = copy.deepcopy(DDPG(YannPolicy, Cart(), seed=0, device="cpu").policy.actor.mu)
+    search = Search(layer, twin(), Pace(1, 1e-3, 1, 1), batch=5, n_starts=2, seed=0)
+    mpc = copy.deepcopy(search.accepted)
+    for each in layer.network.parameters():
+        th.nn.init.normal_(each, std=0.3)
+    present, verdicts = copy.deepcopy(layer.state_dict()), iter([False, False, True])
+    monkeypatch.setattr(search, "_try", lambda: Check(1, next(verdicts), "", -0.01, 0.0, True))
+    assert search._check()
+    for name, value in search.accepted.items():
+        if name.startswith("network."):
+            th.testing.assert_close(value, mpc[name] + (present[name] - mpc[name]) / 4)
+    assert all(th.equal(value, present[name]) for name, value in layer.state_dict().items())

@@ -35,3 +35,10 @@ def test_the_log_and_the_starts_lie_within_the_limits_and_nan_does_not() -> None
     rng = np.random.default_rng(0)
     assert not found.limits.violated(found.starts.draw(500, rng)).any()
     assert found.limits.violated(np.array([[np.nan, 0.0], [100.0, 0.0]])).all()
+
+
+def test_a_start_is_the_rarer_the_farther_it_lies_beyond_the_box() -> None:
+    starts, k = twin().starts, len(twin().episodes)
+    middle, half = (starts.high + starts.low) / 2, (starts.high - starts.low) / 2
+    at = middle + half * np.array([[0.0, 0.0], [0.9, -1.0], [0.0, 2.0], [-3.0, 0.5]])
+    np.testing.assert_allclose(starts.rareness(at), [1, 1, 2.0 ** (k - 1), 3.0 ** (k - 1)])
