@@ -55,10 +55,19 @@ def _policy(bench: Bench, problem: OnlineProblem) -> None:
     tasks = {}
     for name, model in models.items():
         networks.fill(model, problem)
+        _ask_what_is_stored(model, problem)
         tasks[name] = Task(partial(_train, model), [1])
     bench.figures.add(timed(TRAIN, problem.name, bench.watch.compare(tasks)))
     found: Array = bench.watch.once(lambda: networks.learner(_anew(problem), YannPolicy))
     bench.figures.add(timed(BUILT, problem.name, {networks.OURS: found}))
+
+
+def _ask_what_is_stored(model: DDPG, problem: OnlineProblem) -> None:
+    """Evaluate the law at all observations of the buffer, as a policy has that acted there."""
+    buffer = model.replay_buffer
+    assert buffer is not None
+    for seen in (buffer.observations, buffer.next_observations):
+        problem.law(seen[: buffer.pos, 0])
 
 
 def _train(model: DDPG, steps: int) -> None:

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 import sb3_yann
-from benchmarks import evaluation, exactness, networks, offline, peers, simulators
+from benchmarks import evaluation, exactness, networks, offline, online, peers, simulators
 from benchmarks.criteria import Criterion, criteria
 from benchmarks.picture import save_picture
 from benchmarks.problems import PROBLEMS, SMALLEST
@@ -31,6 +31,10 @@ NOTES = {
     "are looked for by a plain scan.",
     networks.TRAIN: "`model.train(1)` with a full replay buffer: critic, actor and both targets; "
     "every network has moved away from zero.",
+    online.TRAIN: "As above, with a shared network. The law has been evaluated at all observations "
+    "of the buffer before, as a policy does that has acted there.",
+    online.EXACT: "Points are random, in the middle of the box, half as wide. The plan is solved "
+    "for again, with the constraints that the law holds to be active, and its optimality is checked.",
     evaluation.ONE: "All functions run on the same points, in the feasible part of the box; each "
     "one's answer was compared with ours before. daqp and osqp are set up once. The literal "
     f"network has {evaluation.LITERAL_WIDTH} nodes a region, ours 16 and 16 in training.",

@@ -16,6 +16,7 @@ INFEASIBLE, SOLVED, UNKNOWN = 0, 1, 2
 """What comes of a point. What is UNKNOWN has no certificate, and another solver is asked."""
 
 PRIMAL = 1e-10  # relative to 1 + |d|: so far beyond a constraint is on it
+CERTAIN = 1e-9  # the same, for what counts as an answer
 DUAL = 1e-9  # relative to 1 + the largest multiplier
 DEPENDENT = 1e-11  # a constraint whose part beyond the span of others is shorter depends on them
 
@@ -161,9 +162,16 @@ def _certified(
         if not lam[i] >= -DUAL * (1 + largest):
             return False
         lam[i] = max(lam[i], 0.0)
+    for i in range(size):  # near the border of the domain a factor may be all rounding
+        row = active[i]
+        rest = d[row] + extra[row] * lam[i]
+        for k in range(size):
+            rest += gram[row, active[k]] * lam[k]
+        if not abs(rest) <= CERTAIN * (1 + abs(d[row])):
+            return False
     _slacks(d, gram, active, lam, size, slack)
     for j in range(len(d)):
-        if not slack[j] >= -10 * PRIMAL * (1 + abs(d[j]) + largest):
+        if not slack[j] >= -CERTAIN * (1 + abs(d[j])):
             return False
     return True
 

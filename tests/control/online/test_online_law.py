@@ -54,6 +54,20 @@ def test_all_optimality_conditions_hold_where_no_regions_can_be_counted(make) ->
     assert max(worst_condition(mpc.online(), points(mpc, 40))) < 1e-8
 
 
+def test_what_is_feasible_by_a_hair_is_solved_too() -> None:
+    mpc = three_masses()
+    law, inside = mpc.online(), np.zeros((60, mpc.n_theta))
+    outside = drawn(mpc, 60, 3.0)
+    assert not law.in_domain(outside).any()
+    for _ in range(60):
+        middle = (inside + outside) / 2
+        feasible = law.in_domain(middle)[:, None]
+        inside, outside = np.where(feasible, middle, inside), np.where(feasible, outside, middle)
+    assert max(worst_condition(law, (1 - 1e-7) * inside)) < 1e-6
+    apart = np.abs(law(inside) - law((1 - 1e-7) * inside))
+    assert np.max(apart) < 1e-2  # it is steep there
+
+
 def test_inputs_do_not_depend_on_what_was_asked_before() -> None:
     mpc = three_masses()
     theta, fresh = points(mpc, 300), three_masses().online()
