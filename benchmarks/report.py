@@ -34,7 +34,7 @@ NOTES = {
     online.TRAIN: "As above, with a shared network. The law has been evaluated at all observations "
     "of the buffer before, as a policy does that has acted there.",
     online.EXACT: "Points are random, in the middle of the box, half as wide. The plan is solved "
-    "for again, with the constraints that the law holds to be active, and its optimality is checked.",
+    "for again, with the constraints that the law holds to be active, and its optimality checked.",
     evaluation.ONE: "All functions run on the same points, in the feasible part of the box; each "
     "one's answer was compared with ours before. daqp and osqp are set up once. The literal "
     f"network has {evaluation.LITERAL_WIDTH} nodes a region, ours 16 and 16 in training.",
