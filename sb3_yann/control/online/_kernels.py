@@ -63,7 +63,8 @@ def _forward(factor: Array, size: int, solution: Array) -> None:
 @compiled()
 def _slacks(d: Array, gram: Array, active: Integers, lam: Array, size: int, slack: Array) -> None:
     """Write the slacks; those of the active set are 0."""
-    slack[:] = d
+    for j in range(len(d)):
+        slack[j] = d[j]
     for i in range(size):
         row, own = active[i], lam[i]
         for j in range(len(d)):
@@ -93,6 +94,7 @@ def _add(
     size: int,
     factor: Array,
     step: Array,
+    column: Array,
 ) -> int:
     """Take a constraint into the active set, others out; return its size, -1 if infeasible.
 
@@ -106,7 +108,8 @@ def _add(
         rest = 1.0 + extra[entering]
         for i in range(size):
             rest -= step[i] * step[i]
-        column = step[:size].copy()
+        for i in range(size):
+            column[i] = step[i]
         _backward(factor, size, step)
         most, leaving = np.inf, -1
         for i in range(size):
@@ -120,7 +123,8 @@ def _add(
             lam[i] = max(lam[i] - length * step[i], 0.0)
         own += length
         if full <= most:
-            factor[size, :size] = column
+            for i in range(size):
+                factor[size, i] = column[i]
             factor[size, size] = np.sqrt(rest)
             active[size], lam[size] = entering, own
             return size + 1
@@ -148,7 +152,12 @@ def _certified(
 
     What is written then depends on the set alone, not on the way there.
     """
-    active[:size].sort()
+    for i in range(1, size):
+        own, k = active[i], i
+        while k > 0 and active[k - 1] > own:
+            active[k] = active[k - 1]
+            k -= 1
+        active[k] = own
     if not _factorize(gram, extra, active, 0, size, factor):
         return False
     for i in range(size):
@@ -205,15 +214,17 @@ def solve_batch(
         What is written: (batch, most), (batch, most), (batch,), (batch,).
     """
     rows = len(d0)
-    factor, step = np.empty((most, most)), np.empty(most)
+    factor, step, column = np.empty((most, most)), np.empty(most), np.empty(most)
     d, slack = np.empty(rows), np.empty(rows)
     for at in range(len(theta)):
-        d[:] = d0
+        for j in range(rows):
+            d[j] = d0[j]
         for i in range(theta.shape[1]):
             own = theta[at, i]
             for j in range(rows):
                 d[j] += own * D[i, j]
-        slack[:] = d
+        for j in range(rows):
+            slack[j] = d[j]
         size, status[at], own_set, lam = 0, UNKNOWN, active[at], multipliers[at]
         for _ in range(10 * (rows + 10)):
             entering = _most_violated(d, slack)
@@ -221,7 +232,9 @@ def solve_batch(
                 if _certified(d, gram, extra, own_set, lam, size, factor, slack):
                     status[at] = SOLVED
                 break
-            found = _add(gram, extra, entering, -slack[entering], own_set, lam, size, factor, step)
+            found = _add(
+                gram, extra, entering, -slack[entering], own_set, lam, size, factor, step, column
+            )
             if found < 0:
                 status[at] = INFEASIBLE if found == -1 else UNKNOWN
                 break
