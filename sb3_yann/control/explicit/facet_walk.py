@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.budget import BudgetTimer
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
-from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
+from sb3_yann.control.polyhedra import Region, farthest_point, largest_ball, region
 
 Indices = NDArray[np.intp]
 
@@ -226,10 +226,9 @@ class Conditions:
 
     def _region(self, active: int, law: Array, A: Array, b: Array, label: Indices) -> _Found | None:
         A, b = np.concatenate([A, self.outer_A]), np.concatenate([b, self.outer_b])
-        inside, radius = largest_ball(A, b)
+        inside, radius, rows = region(A, b, THINNEST)
         if radius <= THINNEST:
             return None
-        rows = facets(A, b, inside, radius)
         A, b = A[rows], b[rows]
         labels = [int(label[k]) if k < len(label) else OUTER for k in rows]
         scaled = np.column_stack([A, (b - A @ inside) / radius])
@@ -253,10 +252,11 @@ def _irredundant(program: ParametricQP, rows: Indices, outer_A: Array, outer_b: 
         np.hstack([np.zeros((len(outer_b), v)), outer_A]),
     ])  # fmt: skip
     b = np.concatenate([program.w[rows], outer_b])
+    inside, _ = largest_ball(A, b)
     alive = np.ones(len(b), dtype=bool)
     for k in reversed(range(len(rows))):
         relaxed = b.copy()
         relaxed[k] += 1.0
-        farthest = farthest_point(A[alive], relaxed[alive], A[k])
+        farthest = farthest_point(A[alive], relaxed[alive], A[k], inside)
         alive[k] = A[k] @ farthest > b[k] + 1e-10
     return [int(k) for k in np.flatnonzero(alive[: len(rows)])]
