@@ -6,13 +6,18 @@ from collections.abc import Iterator
 from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.explicit.kkt import Optimality, optimality
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
-from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
+from sb3_yann.control.polyhedra import Region, farthest_points, largest_ball
 
 # How far a law may be off, and a point from a region that holds it, in half-widths of the ranges.
 LAW, INSIDE = 1e-6, 1e-8
+# Half-spaces that differ by less are equal; how far a region may reach beyond another's conditions.
+EQUAL, IMPLIED = 1e-9, 1e-8
+Ball = tuple[Array, float]
 
 
 class ExplicitSolutionError(RuntimeError):
@@ -37,10 +42,11 @@ class Certificate:
     - An independent QP is solved at the innermost point of every region.
     - The law of every region solves the Karush-Kuhn-Tucker (KKT) equations of its active set, and
       its half-spaces imply their inequalities: then it is optimal in all of the region.
-    - Across each facet where constraint k becomes active, or inactive, lies the region of the
-      active set with k added, or removed: their KKT conditions agree on the facet, so it covers
-      all of its other side. Where there is no such region, a QP just across the middle of the facet
-      must be infeasible, or another region there.
+    - Across each facet where constraint k becomes active, or inactive, lie the regions of the
+      active sets with k added, or removed, or in the place of another: their KKT conditions agree
+      on the facet, so they cover all of its other side. Or k contradicts the active constraints
+      there. Where a region is missing, a QP just across the middle of the facet must be infeasible,
+      or another region there.
     - QPs at random points of the box agree with the region there, or are infeasible.
     - No region lies in another one.
 
@@ -70,51 +76,28 @@ class Certificate:
         balls = [region.ball() for region in self.regions]
         for i, (region, (inside, _)) in enumerate(zip(self.regions, balls, strict=True)):
             U = self.program.solve(inside)
-            if U is None or np.max(np.abs(U - region.gain @ inside - region.offset)) > LAW:
+            if U is None or self._off(i, inside[None], U[None])[0] > LAW:
                 self._fail(f"the law of region {i} is not optimal inside it", inside)
-        for i, law, rows, labels in self._conditions():
-            self._require_law(i, law, balls[i][0])
-            self._require_implied(i, rows, *balls[i])
-            self._require_neighbors(i, rows, labels)
+        for i, each in self._conditions():
+            region = self.regions[i]
+            own = np.column_stack([region.A, region.b])
+            known = np.concatenate([self.outer, each.rows])
+            same = np.abs(own[:, None] - known[None]).max(axis=2) < EQUAL
+            self._require_law(i, each.law, balls[i][0])
+            self._require_implied(i, each.rows, np.any(same, axis=0)[len(self.outer) :], balls[i])
+            self._require_neighbors(i, same, each)
         self._require_agreement()
         self._require_no_doubles(balls)
 
-    def _conditions(self) -> Iterator[tuple[int, Array, Array, list[int]]]:
-        """Yield the KKT conditions of each region: its law, and rows [A b] with labels."""
-        for size, members in batches(len(region.active_set) for region in self.regions):
-            yield from self._conditions_of(members, size)
-
-    def _conditions_of(
-        self, members: list[int], size: int
-    ) -> Iterator[tuple[int, Array, Array, list[int]]]:
-        program, (v, n) = self.program, self.program.F.shape
-        active = np.array([self.regions[i].active_set for i in members], dtype=int)
-        active, limit = active.reshape(len(members), size), np.column_stack([program.S, program.w])
-        K = np.zeros((len(members), v + size, v + size))
-        K[:, :v, :v] = program.H
-        K[:, v:, :v] = program.G[active]
-        K[:, :v, v:] = np.swapaxes(program.G[active], 1, 2)
-        right = np.empty((len(members), v + size, n + 1))
-        right[:, :v] = -np.column_stack([program.F, program.c])
-        right[:, v:] = limit[active]
-        try:
-            both = np.linalg.solve(K, right)
-        except np.linalg.LinAlgError:
-            self._fail("the active constraints of a region depend on each other", self.center * 0)
-        laws, multipliers = both[:, :v], both[:, v:]
-        rows = limit - program.G @ laws
-        noise = 1 + np.linalg.norm(laws, axis=(1, 2))[:, None] * np.ones(len(program.w))
-        each = np.arange(len(members))[:, None]
-        rows[each, active] = multipliers
-        noise[each, active] = np.abs(multipliers).max(axis=(1, 2), initial=0.0)[:, None]
-        length = np.linalg.norm(rows[:, :, :n], axis=2)
-        fixed = length <= 1e-11 * noise
-        length[fixed] = np.maximum(noise[fixed], 1e-300)
-        rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
-        rows[fixed, :n] = 0.0
-        binding = rows[:, :, n] < np.abs(rows[:, :, :n]).sum(axis=2)
-        for k, i in enumerate(members):
-            yield i, laws[k], rows[k, binding[k]], np.flatnonzero(binding[k]).tolist()
+    def _conditions(self) -> Iterator[tuple[int, Optimality]]:
+        """Yield the KKT conditions of each region."""
+        sets = [region.active_set for region in self.regions]
+        for _, members in batches(map(len, sets)):
+            try:
+                found = optimality(self.program, [sets[i] for i in members])
+            except np.linalg.LinAlgError:
+                self._fail("the active constraints of a region depend on each other", self.center * 0)
+            yield from zip(members, found, strict=True)
 
     def _require_law(self, i: int, law: Array, inside: Array) -> None:
         region = self.regions[i]
@@ -122,34 +105,26 @@ class Certificate:
         if off > LAW * (1 + np.abs(law).max()):
             self._fail(f"the law of region {i} is not optimal inside it", inside)
 
-    def _require_implied(self, i: int, rows: Array, inside: Array, radius: float) -> None:
-        """Raise unless the half-spaces of region i imply all rows."""
-        region, n = self.regions[i], len(inside)
-        A, b = np.concatenate([rows[:, :n], region.A]), np.concatenate([rows[:, n], region.b])
-        b[: len(rows)] += 1e-4 * radius
-        if radius <= 0 or np.any(rows[:, n] < rows[:, :n] @ inside - LAW):
+    def _require_implied(self, i: int, rows: Array, known: NDArray[np.bool_], ball: Ball) -> None:
+        """Raise unless the half-spaces of region i imply all rows; those known are among them."""
+        region, n, (inside, radius) = self.regions[i], len(ball[0]), ball
+        if radius <= 0 or np.any(rows[:, n] < rows[:, :n] @ inside - IMPLIED):
             self._fail(f"the law of region {i} violates the KKT conditions", inside)
-        for k in facets(A, b, inside, radius):
-            if k >= len(rows):
-                break
-            # Within DAQP's tolerance it may count: the farthest point decides.
-            point = farthest_point(region.A, region.b, rows[k, :n])
-            if rows[k, :n] @ point > rows[k, n] + LAW:
-                self._fail(f"the law of region {i} violates the KKT conditions", point)
+        rows = rows[~known]
+        points = farthest_points(region.A, region.b, inside, rows[:, :n])
+        beyond = np.sum(rows[:, :n] * points, axis=1) - rows[:, n]
+        if np.any(beyond > IMPLIED):
+            point = points[np.argmax(beyond)]
+            self._fail(f"the law of region {i} violates the KKT conditions", point)
 
-    def _require_neighbors(self, i: int, rows: Array, labels: list[int]) -> None:
+    def _require_neighbors(self, i: int, same: NDArray[np.bool_], conditions: Optimality) -> None:
         region = self.regions[i]
-        known = np.concatenate([self.outer, rows])
-        own = np.column_stack([region.A, region.b])
-        same = np.abs(own[:, None] - known[None]).max(axis=2) < 1e-9
-        first = len(self.outer)
-        meant: list[list[int]] = [[] for _ in own]
-        for row, which in zip(*(index.tolist() for index in np.nonzero(same)), strict=True):
-            meant[row].append(which - first)
-        active = as_bits(region.active_set)
-        for row, which in enumerate(meant):
-            outer = bool(which) and which[0] < 0  # a bound of theta
-            if not outer and not any(active ^ (1 << labels[k]) in self.by_set for k in which):
+        outer = len(self.outer)  # bounds of theta
+        for row, each in enumerate(same):
+            if np.any(each[:outer]):
+                continue
+            across = [conditions.across(k) for k in np.flatnonzero(each[outer:])]
+            if not any(self.by_set.keys() >= set(sets) for sets in across):
                 self._look_across(region, row)
 
     def _look_across(self, region: Region, row: int) -> None:
@@ -174,13 +149,22 @@ class Certificate:
             if np.any(self._slacks(middle)[holders] >= -INSIDE):
                 return
 
+    def _off(self, i: int, points: Array, inputs: Array) -> Array:
+        """Return how far the law of a region is from the answers of a QP, beyond what the QP is.
+
+        Constraints that hold to 1e-11 move its answer by so much times the slope of the law.
+        """
+        region = self.regions[i]
+        off = np.abs(points @ region.gain.T + region.offset - inputs).max(axis=1)
+        return np.asarray(off - 1e-10 * np.abs(region.gain).sum(axis=1).max())
+
     def _slacks(self, point: Array) -> Array:
         return np.asarray(np.minimum.reduceat(self.b - self.A @ point, self.starts))
 
     def _require_agreement(self) -> None:
         """Raise unless QPs at random points of the box agree with the regions."""
-        n = self.program.F.shape[1]
-        drawn = np.random.default_rng(1).uniform(-1, 1, (50 * n, n))
+        n, random = self.program.F.shape[1], np.random.default_rng(1)
+        drawn = random.uniform(-1, 1, (50 * n, n))
         solved = [(point, *self.program.solve_with_multipliers(point)) for point in drawn]
         feasible = [each for each in solved if each[1] is not None]
         if not feasible:
@@ -191,8 +175,7 @@ class Certificate:
         for i in np.unique(meant[held]):
             region, at = self.regions[i], np.flatnonzero(meant == i)
             held[at] = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE
-            off = np.abs(points[at] @ region.gain.T + region.offset - inputs[at]).max(axis=1)
-            wrong = at[held[at] & (off > LAW)]
+            wrong = at[held[at] & (self._off(i, points[at], inputs[at]) > LAW)]
             if len(wrong):
                 self._fail(f"the law of region {i} violates the KKT conditions", points[wrong[0]])
         for k in np.flatnonzero(~held):
@@ -205,7 +188,7 @@ class Certificate:
         region = self.regions[nearest]
         if slacks[nearest] < -INSIDE:
             self._fail("no region covers a feasible parameter", point)
-        if np.max(np.abs(U - region.gain @ point - region.offset)) > LAW:
+        if self._off(nearest, point[None], U[None])[0] > LAW:
             self._fail(f"the law of region {nearest} violates the KKT conditions", point)
 
     def _require_no_doubles(self, balls: list[tuple[Array, float]]) -> None:

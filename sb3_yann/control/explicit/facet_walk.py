@@ -11,19 +11,32 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.budget import BudgetTimer
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
-from sb3_yann.control.polyhedra import Region, farthest_point, largest_ball, region
+from sb3_yann.control.polyhedra import (
+    Region,
+    farthest_point,
+    farthest_points,
+    largest_ball,
+    region,
+)
 
 Indices = NDArray[np.intp]
+Rows = tuple[Array, Array]  # half-spaces A x <= b
 
 # Regions that hold no ball of this radius, in half-widths of the box, are left out.
 THINNEST = 1e-9
-# Facets of theta alone; and facets that several constraints share.
+# Facets with nothing feasible beyond; and facets that several constraints share.
 OUTER, SHARED = -1, -2
+# Constraints whose part across those of an active set is smaller, relative to all, depend on them.
+DEPENDENT = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A critical region, its law ``U = law [theta; 1]`` and the constraint of each row."""
+    """A critical region, its law ``U = law [theta; 1]`` and the constraint of each row.
+
+    ``beyond`` has the active sets that lie across the rows of constraints that depend on the active
+    ones.
+    """
 
     active: int
     law: Array
@@ -31,15 +44,23 @@ class _Found:
     b: Array
     labels: list[int]
     inside: Array
+    beyond: dict[int, tuple[int, ...]]
+
+    def across(self, row: int) -> tuple[int, ...]:
+        """Return the active sets that share a facet if nothing degenerates."""
+        label = self.labels[row]
+        return self.beyond.get(label, (self.active ^ (1 << label),)) if label >= 0 else ()
 
 
 def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program with unit rows whose box is the unit box.
 
     Across a facet where constraint k becomes active, or inactive, lies the region of the active
-    set with k added, or removed. Where that set has no region, a QP just across the middle of the
-    facet tells what lies there. Last, QPs at random points of the box look for what the walk has
-    not seen. Sets of constraints are whole numbers, with bit k for k.
+    set with k added, or removed. If k depends on the active constraints, it takes the place of one
+    of those that it contains with a positive factor; if there is none, nothing feasible lies there
+    (Farkas' lemma). Where these sets have no region, a QP just across the middle of the facet tells
+    what lies there. Last, QPs at random points look for what the walk has not seen. Sets of
+    constraints are whole numbers, with bit k for k.
     """
     found = _Walk(program, timer)
     found.explore(found.seeds(20))
@@ -57,6 +78,7 @@ class _Walk:
         self.conditions = Conditions(program)
         self.found: dict[int, _Found] = {}
         self.seen: set[int] = set()
+        self.random = np.random.default_rng(0)
 
     def regions(self) -> list[Region]:
         kept = self.conditions.kept
@@ -67,9 +89,10 @@ class _Walk:
         ]
 
     def seeds(self, count: int) -> Iterator[int]:
-        """Yield the active sets where no region is known: at the center and at random points."""
-        n = self.program.F.shape[1]
-        points = np.vstack([np.zeros(n), np.random.default_rng(0).uniform(-1, 1, (count, n))])
+        """Yield the active sets where no region is known, at random points of the feasible set."""
+        corners, middle = self.conditions.corners, self.conditions.middle
+        weights = self.random.dirichlet(np.ones(len(corners)), count)
+        points = np.vstack([0 * middle, middle, 0.9 * weights @ corners + 0.1 * middle])
         for point in points[~self._known(points)]:
             active = self._active_at(point)
             if active is not None:
@@ -100,7 +123,7 @@ class _Walk:
                 self.timer.count()
                 self.found[one.active] = one
                 facets += [(one, row) for row in range(len(one.labels))]
-                following |= {one.active ^ (1 << label) for label in one.labels if label >= 0}
+                following.update(*map(one.across, range(len(one.labels))))
             ahead = sorted(following - self.seen)
             if not ahead:  # what the flips have left open
                 left = [(pair, self._across(*pair)) for pair in facets if self._open(*pair)]
@@ -109,8 +132,9 @@ class _Walk:
 
     def _open(self, one: _Found, row: int) -> bool:
         """Tell whether it is not known what lies across a facet."""
-        label = one.labels[row]
-        return label == SHARED or (label >= 0 and one.active ^ (1 << label) not in self.found)
+        label, across = one.labels[row], one.across(row)
+        known = any(active in self.found for active in across)
+        return label != OUTER and (not known or not self.conditions.degenerate.isdisjoint(across))
 
     def _across(self, one: _Found, row: int) -> int | None:
         """Return the active set across a facet, None if none is new or feasible there."""
@@ -145,19 +169,26 @@ class Conditions:
     """
 
     def __init__(self, program: ParametricQP) -> None:
-        moving = np.flatnonzero(np.any(program.G, axis=1))
+        moving, n = np.flatnonzero(np.any(program.G, axis=1)), program.F.shape[1]
         self.outer_A, self.outer_b = program.theta_rows()
-        self.kept = moving[_irredundant(program, moving, self.outer_A, self.outer_b)]
+        joint = _joint(program, moving, self.outer_A, self.outer_b)
+        inside, _ = largest_ball(*joint)
+        # Points of the feasible set that span it.
+        self.corners, self.middle = _corners(*joint, inside, n), inside[-n:]
+        self.kept = moving[_irredundant(*joint, inside, len(moving))]
         L = np.linalg.cholesky(program.H)
         self.back = np.linalg.inv(L).T
         self.Y = np.linalg.solve(L, np.column_stack([program.F, program.c]))
         self.N = program.G[self.kept] @ self.back
+        self.length = np.linalg.norm(self.N, axis=1)
         # The slack that each constraint has where none is active.
         self.D = np.column_stack([program.S, program.w])[self.kept] + self.N @ self.Y
         v, rows = len(self.back), len(self.kept)
         # Where constraints that depend on each other are all tight over a region, several active
         # sets have its law. Those count that are right with each constraint moved out a little.
         self.apart = np.random.default_rng(0).uniform(0.5, 1.5, rows)
+        # Active sets that depend on each other, or share their law with another one.
+        self.degenerate: set[int] = set()
         self._shortest = (np.eye(v), np.zeros(v), self.N)
         self._options = (np.full(rows, -1e30), np.zeros(rows, dtype=np.intc))
 
@@ -188,12 +219,15 @@ class Conditions:
         index = np.array([_members(active) for active in members], dtype=int)
         index = index.reshape(len(members), size)
         Q, R = np.linalg.qr(np.swapaxes(self.N[index], 1, 2))
-        lengths = np.linalg.norm(self.N, axis=1)[index]
-        full = np.all(np.abs(np.diagonal(R, axis1=1, axis2=2)) > 1e-9 * lengths, axis=1)
+        steep = np.abs(np.diagonal(R, axis1=1, axis2=2))
+        full = np.all(steep > DEPENDENT * self.length[index], axis=1)
         Q, R, index = Q[full], R[full], index[full]
         inverse = np.linalg.inv(R)
         right = np.swapaxes(inverse, 1, 2)
         W, NQ = right @ self.D[index], self.N @ Q
+        left = np.linalg.norm(self.N - NQ @ np.swapaxes(Q, 1, 2), axis=2)
+        depends = left <= DEPENDENT * self.length
+        depends[np.arange(len(index))[:, None], index] = False
         rows = self.D - NQ @ W
         width = np.linalg.norm(W, axis=(1, 2))[:, None]
         noise = np.linalg.norm(self.D, axis=1) + np.linalg.norm(NQ, axis=2) * width
@@ -206,25 +240,52 @@ class Conditions:
         ok = ~np.any(constant & (rows[:, :, -1] < -1e-10 * noise), axis=1)
         weak = constant[each, index] & (rows[each, index, -1] <= 1e-10 * noise[each, index])
         ok &= ~np.any(weak, axis=1)
+        regular = ok.copy()
         tight = constant & (np.abs(rows[:, :, -1]) <= 1e-10 * noise)
         tight[each, index] = False
         if np.any(tight):
             moved = self.apart - np.squeeze(NQ @ (right @ self.apart[index][:, :, None]), axis=2)
             ok &= ~np.any(tight & (moved < 0), axis=1)
+        actives = [active for active, good in zip(members, full, strict=True) if good]
+        self.degenerate.update(active for active, good in zip(members, full) if not good)
+        self.degenerate.update(actives[i] for i in np.flatnonzero(regular & ~ok))
         scale = np.linalg.norm(rows[:, :, :-1], axis=2)
         scale[constant] = 1.0
         A, b = -rows[:, :, :-1] / scale[:, :, None], rows[:, :, -1] / scale
         reach = np.sum(np.abs(A), axis=2)
         ok &= ~np.any((b < THINNEST - reach) & ~constant, axis=1)
         needed = (b < reach - 1e-12) & ~constant
-        actives = [active for active, good in zip(members, full, strict=True) if good]
         for i in np.flatnonzero(ok):
             label = np.flatnonzero(needed[i])
             one = self._region(actives[i], laws[i], A[i, label], b[i, label], label)
             if one is not None:
+                swapped = [k for k in one.labels if k >= 0 and depends[i, k]]
+                factors = NQ[i, swapped] @ right[i]
+                one.beyond.update(self._exchanges(actives[i], index[i], swapped, factors))
+                one.labels[:] = [OUTER if one.beyond.get(k) == () else k for k in one.labels]
                 yield one
 
-    def _region(self, active: int, law: Array, A: Array, b: Array, label: Indices) -> _Found | None:
+    def _exchanges(
+        self, active: int, index: Indices, added: list[int], factors: Array
+    ) -> dict[int, tuple[int, ...]]:
+        """Return the active sets across constraints that the active ones make with these factors.
+
+        One of those with a positive factor leaves.
+        """
+        leaves = factors * self.length[index] > DEPENDENT * self.length[added, None]
+        return {
+            k: tuple(active ^ (1 << k) ^ (1 << int(j)) for j in index[leave])
+            for k, leave in zip(added, leaves, strict=True)
+        }
+
+    def _region(
+        self,
+        active: int,
+        law: Array,
+        A: Array,
+        b: Array,
+        label: Indices,
+    ) -> _Found | None:
         A, b = np.concatenate([A, self.outer_A]), np.concatenate([b, self.outer_b])
         inside, radius, rows = region(A, b, THINNEST)
         if radius <= THINNEST:
@@ -241,22 +302,32 @@ class Conditions:
                 if len(twins) > 1:
                     labels[k] = OUTER if OUTER in twins else SHARED
             A, b, labels = A[keep], b[keep], [labels[k] for k in keep]
-        return _Found(active, law, A, b, labels, inside)
+        return _Found(active, law, A, b, labels, inside, {})
 
 
-def _irredundant(program: ParametricQP, rows: Indices, outer_A: Array, outer_b: Array) -> list[int]:
-    """Return which rows bound the pairs (U, theta); of those that say the same, the first."""
+def _joint(program: ParametricQP, rows: Indices, outer_A: Array, outer_b: Array) -> Rows:
+    """Return the half-spaces of the feasible pairs (U, theta), those of theta alone last."""
     v = program.G.shape[1]
     A = np.vstack([
         np.hstack([program.G[rows], -program.S[rows]]),
         np.hstack([np.zeros((len(outer_b), v)), outer_A]),
     ])  # fmt: skip
-    b = np.concatenate([program.w[rows], outer_b])
-    inside, _ = largest_ball(A, b)
+    return A, np.concatenate([program.w[rows], outer_b])
+
+
+def _corners(A: Array, b: Array, inside: Array, n: int) -> Array:
+    """Return the theta of feasible pairs that are farthest along every axis (2 n, n)."""
+    axes = np.zeros((2 * n, len(inside)))
+    axes[:n, -n:], axes[n:, -n:] = np.eye(n), -np.eye(n)
+    return farthest_points(A, b, inside, axes)[:, -n:]
+
+
+def _irredundant(A: Array, b: Array, inside: Array, count: int) -> list[int]:
+    """Return which of the first rows bound a polyhedron; of those that say the same, the first."""
     alive = np.ones(len(b), dtype=bool)
-    for k in reversed(range(len(rows))):
+    for k in reversed(range(count)):
         relaxed = b.copy()
         relaxed[k] += 1.0
         farthest = farthest_point(A[alive], relaxed[alive], A[k], inside)
         alive[k] = A[k] @ farthest > b[k] + 1e-10
-    return [int(k) for k in np.flatnonzero(alive[: len(rows)])]
+    return [int(k) for k in np.flatnonzero(alive[:count])]
