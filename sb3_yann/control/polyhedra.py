@@ -10,6 +10,7 @@ from scipy import optimize
 
 from sb3_yann._validation import Array
 
+
 @dataclass(frozen=True, eq=False)
 class Region:
     """Where ``A theta <= b``, rows of unit length, ``U = gain theta + offset`` is optimal.

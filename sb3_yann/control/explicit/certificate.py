@@ -96,7 +96,9 @@ class Certificate:
             try:
                 found = optimality(self.program, [sets[i] for i in members])
             except np.linalg.LinAlgError:
-                self._fail("the active constraints of a region depend on each other", self.center * 0)
+                self._fail(
+                    "the active constraints of a region depend on each other", self.center * 0
+                )
             yield from zip(members, found, strict=True)
 
     def _require_law(self, i: int, law: Array, inside: Array) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.budget import BudgetTimer
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches, row_units
 from sb3_yann.control.polyhedra import (
     Region,
     farthest_point,
@@ -189,7 +189,8 @@ class Conditions:
         self.apart = np.random.default_rng(0).uniform(0.5, 1.5, rows)
         # Active sets that depend on each other, or share their law with another one.
         self.degenerate: set[int] = set()
-        self._shortest = (np.eye(v), np.zeros(v), self.N)
+        self.units = row_units(self.N)
+        self._shortest = (np.eye(v), np.zeros(v), self.N * self.units[:, None])
         self._options = (np.full(rows, -1e30), np.zeros(rows, dtype=np.intc))
 
     def active_at(self, theta: Array, apart: float = 0.0) -> int | None:
@@ -202,7 +203,9 @@ class Conditions:
 
         n = len(theta)
         upper = self.D[:, :n] @ theta + self.D[:, n] + apart * self.apart
-        _, _, status, info = daqp.solve(*self._shortest, upper, *self._options, primal_tol=1e-11)
+        _, _, status, info = daqp.solve(
+            *self._shortest, upper * self.units, *self._options, primal_tol=1e-11
+        )
         if status != 1:
             return None
         multipliers = np.asarray(info["lam"])

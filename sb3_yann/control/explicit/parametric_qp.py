@@ -27,6 +27,16 @@ def batches(sizes: Iterable[int]) -> Iterator[tuple[int, list[int]]]:
             yield size, members[start : start + 256]
 
 
+def row_units(G: Array) -> Array:
+    """Return factors (rows,) that give rows a length of about 1, without rounding.
+
+    DAQP takes a row that is shorter than about 1e-6 for one that does not bind.
+    """
+    length = np.linalg.norm(G, axis=1)
+    length[length == 0] = 1.0
+    return np.asarray(2.0 ** -np.round(np.log2(length)))
+
+
 @dataclass(frozen=True, eq=False)
 class ParametricQP:
     """``min_U 1/2 U'HU + (F theta + c)'U`` with ``G U <= w + S theta``, for theta in a box.
@@ -70,8 +80,8 @@ class ParametricQP:
         """Return the optimal U (v,), or None, and the multipliers of all rows (rows,)."""
         import daqp
 
-        H, G, fixed, lower, sense = self._arrays
-        upper = self.w + self.S @ theta
+        H, G, fixed, lower, sense, units = self._arrays
+        upper = (self.w + self.S @ theta) * units
         if fixed.size:  # bounds of theta alone
             if upper[fixed].min() < -1e-11:
                 return None, np.zeros(upper.size)
@@ -79,14 +89,18 @@ class ParametricQP:
         U, _, status, info = daqp.solve(
             H, self.F @ theta + self.c, G, upper, lower, sense, primal_tol=1e-11
         )
-        return (np.asarray(U) if status == 1 else None), np.asarray(info["lam"])
+        return (np.asarray(U) if status == 1 else None), np.asarray(info["lam"]) * units
 
     @cached_property
-    def _arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc]]:
-        """What DAQP asks for at every theta: H, G, the rows without U, no bounds, no options."""
-        H, G, rows = np.ascontiguousarray(self.H), np.ascontiguousarray(self.G), len(self.w)
+    def _arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc], Array]:
+        """What DAQP asks for at every theta: H, G, the rows without U, no bounds, no options.
+
+        Last come the units in which it gets the rows.
+        """
+        units, rows = row_units(self.G), len(self.w)
+        H, G = np.ascontiguousarray(self.H), np.ascontiguousarray(self.G * units[:, None])
         fixed = np.flatnonzero(~np.any(G, axis=1))
-        return H, G, fixed, np.full(rows, -1e30), np.zeros(rows, dtype=np.intc)
+        return H, G, fixed, np.full(rows, -1e30), np.zeros(rows, dtype=np.intc), units
 
     def theta_rows(self) -> tuple[Array, Array]:
         """Return A and b of the bounds of theta alone, for a program whose box is the unit box."""
