@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
@@ -16,7 +17,9 @@ from sb3_yann.control.polyhedra import Region, farthest_points, largest_ball
 # How far a law may be off, and a point from a region that holds it, in half-widths of the ranges.
 LAW, INSIDE = 1e-6, 1e-8
 # Half-spaces that differ by less are equal; how far a region may reach beyond another's conditions.
-EQUAL, IMPLIED = 1e-9, 1e-8
+EQUAL, IMPLIED = 1e-9, 1e-9
+# With a larger gain the law is that of the check: the QR factors of the walk leave it off by 1e-13.
+STEEP = 1e3
 Ball = tuple[Array, float]
 
 
@@ -65,8 +68,12 @@ class Certificate:
         self.by_set = {as_bits(region.active_set): i for i, region in enumerate(regions)}
         self.outer = np.column_stack(program.theta_rows())
 
-    def check(self) -> None:
-        """Raise ExplicitSolutionError, with a theta that shows what is wrong, unless all pass."""
+    def check(self) -> list[Region]:
+        """Return the regions, with the laws of steep ones more exact.
+
+        Raise ExplicitSolutionError, with a theta that shows what is wrong, unless all pass.
+        """
+        refined = list(self.regions)
         if not self.regions:
             self._fail("no region was found", self.center * 0)
         self.A, self.b = (
@@ -84,10 +91,13 @@ class Certificate:
             known = np.concatenate([self.outer, each.rows])
             same = np.abs(own[:, None] - known[None]).max(axis=2) < EQUAL
             self._require_law(i, each.law, balls[i][0])
-            self._require_implied(i, each.rows, np.any(same, axis=0)[len(self.outer) :], balls[i])
+            self._require_implied(i, np.any(same[:, len(self.outer) :], axis=0), balls[i], each)
             self._require_neighbors(i, same, each)
+            if np.abs(each.law[:, :-1]).max() > STEEP:
+                refined[i] = replace(region, gain=each.law[:, :-1], offset=each.law[:, -1])
         self._require_agreement()
         self._require_no_doubles(balls)
+        return refined
 
     def _conditions(self) -> Iterator[tuple[int, Optimality]]:
         """Yield the KKT conditions of each region."""
@@ -107,27 +117,28 @@ class Certificate:
         if off > LAW * (1 + np.abs(law).max()):
             self._fail(f"the law of region {i} is not optimal inside it", inside)
 
-    def _require_implied(self, i: int, rows: Array, known: NDArray[np.bool_], ball: Ball) -> None:
-        """Raise unless the half-spaces of region i imply all rows; those known are among them."""
+    def _require_implied(self, i: int, known: NDArray[np.bool_], ball: Ball, kkt: Optimality) -> None:
+        """Raise unless the half-spaces of region i imply its conditions; they are those known."""
         region, n, (inside, radius) = self.regions[i], len(ball[0]), ball
-        if radius <= 0 or np.any(rows[:, n] < rows[:, :n] @ inside - IMPLIED):
+        limit = kkt.rows[:, n] + IMPLIED
+        if radius <= 0 or np.any(limit < kkt.rows[:, :n] @ inside):
             self._fail(f"the law of region {i} violates the KKT conditions", inside)
-        rows = rows[~known]
+        rows, limit = kkt.rows[~known], limit[~known]
         points = farthest_points(region.A, region.b, inside, rows[:, :n])
-        beyond = np.sum(rows[:, :n] * points, axis=1) - rows[:, n]
-        if np.any(beyond > IMPLIED):
+        beyond = np.sum(rows[:, :n] * points, axis=1) - limit
+        if np.any(beyond > 0):
             point = points[np.argmax(beyond)]
             self._fail(f"the law of region {i} violates the KKT conditions", point)
 
     def _require_neighbors(self, i: int, same: NDArray[np.bool_], conditions: Optimality) -> None:
-        region = self.regions[i]
-        outer = len(self.outer)  # bounds of theta
-        for row, each in enumerate(same):
-            if np.any(each[:outer]):
-                continue
-            across = [conditions.across(k) for k in np.flatnonzero(each[outer:])]
-            if not any(self.by_set.keys() >= set(sets) for sets in across):
-                self._look_across(region, row)
+        """Raise if a facet of region i has no neighbor; ``same`` tells which conditions are it."""
+        outer, open_rows = len(self.outer), set(range(len(same)))
+        for row, each in zip(*(index.tolist() for index in np.nonzero(same)), strict=True):
+            # A bound of theta, or a constraint.
+            if each < outer or all(a in self.by_set for a in conditions.across(each - outer)):
+                open_rows.discard(row)
+        for row in sorted(open_rows):
+            self._look_across(self.regions[i], row)
 
     def _look_across(self, region: Region, row: int) -> None:
         """Raise if no region touches a facet from the other side where that is feasible."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ class Optimality:
     factors : ndarray, shape (rows, active)
         Each constraint's part along the active ones, all of unit length in U.
     depends : ndarray of bool, shape (rows,)
-        Whether there is no other part.
+        Whether a constraint that is not active has no other part.
     """
 
     active: tuple[int, ...]
@@ -44,17 +45,29 @@ class Optimality:
     factors: Array
     depends: NDArray[np.bool_]
 
-    def across(self, row: int) -> tuple[int, ...] | None:
+    def across(self, row: int) -> tuple[int, ...]:
         """Return the active sets beyond a row, as whole numbers: an empty tuple is a proof of none.
 
         A constraint that becomes active and depends on the others takes the place of one that it
         contains with a positive factor. If there is no such one, it contradicts them (Farkas).
         """
-        active, label = as_bits(self.active), int(self.labels[row])
-        if label in self.active or not self.depends[row]:
-            return (active ^ (1 << label),)
-        leave = np.flatnonzero(self.factors[row] > DEPENDENT)
-        return tuple(active ^ (1 << label) ^ (1 << self.active[j]) for j in leave)
+        flipped = self._bits ^ (1 << self._labels[row])
+        if not self._depends[row]:
+            return (flipped,)
+        leave = (self.factors[row] > DEPENDENT).tolist()
+        return tuple(flipped ^ (1 << k) for k, each in zip(self.active, leave, strict=True) if each)
+
+    @cached_property
+    def _bits(self) -> int:
+        return as_bits(self.active)
+
+    @cached_property
+    def _labels(self) -> list[int]:
+        return self.labels.tolist()
+
+    @cached_property
+    def _depends(self) -> list[bool]:
+        return self.depends.tolist()
 
 
 def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> list[Optimality]:
@@ -81,12 +94,15 @@ def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> lis
     right[:, v:, : n + 1] = limit[active]
     right[:, :v, n + 1 :] = G.T
     both = np.linalg.solve(K, right)
+    # One more step: rows that hold little U have multipliers of many magnitudes.
+    both += np.linalg.solve(K, right - K @ both)
     laws, multipliers = both[:, :v, : n + 1], both[:, v:, : n + 1]
     factors = np.swapaxes(both[:, v:, n + 1 :], 1, 2)
     depends = np.linalg.norm(G - factors @ G[active], axis=2) <= DEPENDENT
     rows = limit - G @ laws
     noise = np.linalg.norm(limit, axis=1) + np.linalg.norm(laws, axis=(1, 2))[:, None]
     each = np.arange(count)[:, None]
+    depends[each, active] = False
     rows[each, active] = multipliers
     noise[each, active] = np.abs(multipliers).max(axis=(1, 2), initial=0.0)[:, None]
     rows = _of_unit_length(rows, noise)
@@ -101,7 +117,10 @@ def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> lis
 
 
 def _of_unit_length(rows: Array, noise: Array) -> Array:
-    """Return ``[S w]`` of ``0 <= S theta + w`` as ``[A b]`` of ``A theta <= b``."""
+    """Return ``[S w]`` of ``0 <= S theta + w`` as ``[A b]`` of ``A theta <= b``.
+
+    ``noise`` is the size of the terms of each row.
+    """
     length = np.linalg.norm(rows[:, :, :-1], axis=2)
     constant = length <= CONSTANT * noise
     length[constant] = np.maximum(noise[constant], 1e-300)

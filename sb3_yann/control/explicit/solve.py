@@ -51,7 +51,7 @@ def solve_explicit(
     with BudgetTimer(budget) as timer:
         regions = _critical_regions(units.scaled, solver, timer)
         try:
-            Certificate(units.scaled, regions, units.center, units.half).check()
+            regions = Certificate(units.scaled, regions, units.center, units.half).check()
         except ExplicitSolutionError as error:
             if solver == "walk":
                 raise
