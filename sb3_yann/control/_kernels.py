@@ -12,6 +12,8 @@ from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
 
 OPTIMAL, PASSED, UNBOUNDED, STUCK = 0, 1, 2, 3
+SAME, NOISE = 1e-9, 1e-14
+"""Rows that differ by less, relative to the radius of the polyhedron and at all, are one."""
 FLAT = 1e-11  # a direction with a smaller part, relative to its length, runs along a row
 
 
@@ -193,12 +195,12 @@ def _facets(A: Array, b: Array, inside: Array, radius: float, kept: Integers, me
     """Tell which rows bound a polyhedron, of equal ones all; write the mean of points on these."""
     m, n = A.shape
     slack, x, mean[:], count = b - np.dot(A, inside), np.empty(n), 0.0, 0
-    room, free = max(1e-6 * radius, 1e-13), np.empty(m, np.int64)
+    room, free = SAME * radius + 10 * NOISE, np.empty(m, np.int64)
     for k in range(m):
         for i in range(m):
-            same = abs(slack[i] - slack[k]) <= 1e-6 * radius
+            same = abs(slack[i] - slack[k]) <= SAME * radius + NOISE
             for j in range(n):
-                same = same and abs(A[i, j] - A[k, j]) <= 1e-6
+                same = same and abs(A[i, j] - A[k, j]) <= SAME
             free[i] = 0 if same else kept[i]
         x[:] = 0.0
         done = _climb(A[k], A, slack, -1, slack[k] + room, x, free)

@@ -114,6 +114,20 @@ def region(A: Array, b: Array, thinnest: float) -> tuple[Array, float, NDArray[n
     return inside, radius, facets(A, b, inside, radius) if radius > thinnest else np.arange(0)
 
 
+def equal_rows(A: Array, slack: Array, radius: float) -> NDArray[np.bool_]:
+    """Tell which half-spaces of a polyhedron of this radius are equal (q, q).
+
+    ``slack`` (q,) is their distance from a point inside.
+    """
+    from sb3_yann.control._kernels import NOISE, SAME
+
+    near = np.abs(slack[:, None] - slack) <= SAME * radius + NOISE
+    # Seldom any: most pairs are told apart by their distance.
+    first, second = np.nonzero(near)
+    near[first, second] = np.abs(A[first] - A[second]).max(axis=1) <= SAME
+    return np.asarray(near)
+
+
 def _plain(A: Array, b: Array) -> tuple[Array, Array]:
     """Return arrays as the compiled functions take them."""
     return np.ascontiguousarray(A, dtype=float), np.ascontiguousarray(b, dtype=float)

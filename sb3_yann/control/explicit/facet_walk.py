@@ -13,6 +13,7 @@ from sb3_yann.control.explicit.budget import BudgetTimer
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches, row_units
 from sb3_yann.control.polyhedra import (
     Region,
+    equal_rows,
     farthest_point,
     farthest_points,
     largest_ball,
@@ -295,8 +296,7 @@ class Conditions:
             return None
         A, b = A[rows], b[rows]
         labels = [int(label[k]) if k < len(label) else OUTER for k in rows]
-        scaled = np.column_stack([A, (b - A @ inside) / radius])
-        same = np.abs(scaled[:, None] - scaled[None]).max(axis=2) < 1e-6
+        same = equal_rows(A, b - A @ inside, radius)
         if np.count_nonzero(same) > len(rows):
             first = np.argmax(same, axis=1)
             keep = np.flatnonzero(first == np.arange(len(rows)))
