@@ -44,7 +44,7 @@ def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, f
     """Return center and radius (negative: none) of a bounded polyhedron or facet's largest ball."""
     from sb3_yann.control import _kernels
 
-    found = np.empty(A.shape[1] + 1)
+    found: Array = np.empty(A.shape[1] + 1)
     done = _kernels.ball(*_plain(A, b), -1 if facet is None else facet, found)
     if done != _kernels.OPTIMAL:
         rows, cost = np.column_stack([A, np.ones(len(b))]), np.append(np.zeros(A.shape[1]), 1.0)

@@ -81,7 +81,7 @@ class Certificate:
         )
         self.starts = np.cumsum([0, *(len(region.b) for region in self.regions[:-1])])
         balls = [region.ball() for region in self.regions]
-        for i, (region, (inside, _)) in enumerate(zip(self.regions, balls, strict=True)):
+        for i, (inside, _) in enumerate(balls):
             U = self.program.solve(inside)
             if U is None or self._off(i, inside[None], U[None])[0] > LAW:
                 self._fail(f"the law of region {i} is not optimal inside it", inside)
@@ -117,7 +117,9 @@ class Certificate:
         if off > LAW * (1 + np.abs(law).max()):
             self._fail(f"the law of region {i} is not optimal inside it", inside)
 
-    def _require_implied(self, i: int, known: NDArray[np.bool_], ball: Ball, kkt: Optimality) -> None:
+    def _require_implied(
+        self, i: int, known: NDArray[np.bool_], ball: Ball, kkt: Optimality
+    ) -> None:
         """Raise unless the half-spaces of region i imply its conditions; they are those known."""
         region, n, (inside, radius) = self.regions[i], len(ball[0]), ball
         limit = kkt.rows[:, n] + IMPLIED
@@ -198,7 +200,6 @@ class Certificate:
         """Raise unless the region that is nearest to a point holds it, and has the right law."""
         slacks = self._slacks(point)
         nearest = int(np.argmax(slacks))
-        region = self.regions[nearest]
         if slacks[nearest] < -INSIDE:
             self._fail("no region covers a feasible parameter", point)
         if self._off(nearest, point[None], U[None])[0] > LAW:

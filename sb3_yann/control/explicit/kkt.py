@@ -63,11 +63,11 @@ class Optimality:
 
     @cached_property
     def _labels(self) -> list[int]:
-        return self.labels.tolist()
+        return [int(label) for label in self.labels]
 
     @cached_property
     def _depends(self) -> list[bool]:
-        return self.depends.tolist()
+        return [bool(each) for each in self.depends]
 
 
 def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> list[Optimality]:

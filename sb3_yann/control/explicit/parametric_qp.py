@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 
-
 FAINT = 1e-7
 """Bounds that all inputs together move by less, in half-widths of the box of theta, are its own.
 
