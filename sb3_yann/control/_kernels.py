@@ -192,21 +192,23 @@ def ball(A: Array, b: Array, facet: int, out: Array) -> int:
 
 @compiled()
 def _facets(A: Array, b: Array, inside: Array, radius: float, kept: Integers, mean: Array) -> int:
-    """Tell which rows bound a polyhedron, of equal ones all; write the mean of points on these."""
+    """Tell which rows bound a polyhedron, 2 for equal ones; write the mean of points on them."""
     m, n = A.shape
     slack, x, mean[:], count = b - np.dot(A, inside), np.empty(n), 0.0, 0
     room, free = SAME * radius + 10 * NOISE, np.empty(m, np.int64)
     for k in range(m):
+        twins = 1
         for i in range(m):
             same = abs(slack[i] - slack[k]) <= SAME * radius + NOISE
             for j in range(n):
                 same = same and abs(A[i, j] - A[k, j]) <= SAME
+            twins = 2 if same and i != k and kept[i] else twins
             free[i] = 0 if same else kept[i]
         x[:] = 0.0
         done = _climb(A[k], A, slack, -1, slack[k] + room, x, free)
         if done == STUCK:
             return STUCK
-        kept[k] = 0 if done == OPTIMAL else 1
+        kept[k] = 0 if done == OPTIMAL else twins
         if kept[k]:
             mean += x
             count += 1

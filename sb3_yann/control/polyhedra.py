@@ -100,18 +100,19 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
     return _facets_one_by_one(A, b - A @ inside, radius)
 
 
-def region(A: Array, b: Array, thinnest: float) -> tuple[Array, float, NDArray[np.intp]]:
+def region(A: Array, b: Array, thinnest: float) -> tuple[Array, float, NDArray[np.intp], bool]:
     """Return a point inside a bounded polyhedron, its largest ball's radius, and its facets.
 
-    Where the radius is at most ``thinnest`` no facets are looked for.
+    Last comes whether some of these are equal. Where the radius is at most ``thinnest`` no facets
+    are looked for.
     """
     from sb3_yann.control import _kernels
 
     found, kept = np.empty(A.shape[1] + 1), np.ones(len(b), dtype=np.int64)
     if _kernels.region(*_plain(A, b), thinnest, found, kept) == _kernels.OPTIMAL:
-        return found[:-1], float(found[-1]), np.flatnonzero(kept)
+        return found[:-1], float(found[-1]), np.flatnonzero(kept), bool(np.max(kept) > 1)
     inside, radius = largest_ball(A, b)
-    return inside, radius, facets(A, b, inside, radius) if radius > thinnest else np.arange(0)
+    return inside, radius, facets(A, b, inside, radius) if radius > thinnest else np.arange(0), True
 
 
 def equal_rows(A: Array, slack: Array, radius: float) -> NDArray[np.bool_]:

@@ -79,18 +79,24 @@ class Certificate:
         self.A, self.b = (
             np.concatenate([getattr(region, name) for region in self.regions]) for name in "Ab"
         )
+        self.gains = np.array([region.gain for region in self.regions])
+        self.offsets = np.array([region.offset for region in self.regions])
         self.starts = np.cumsum([0, *(len(region.b) for region in self.regions[:-1])])
         balls = [region.ball() for region in self.regions]
-        for i, (inside, _) in enumerate(balls):
-            U = self.program.solve(inside)
-            if U is None or self._off(i, inside[None], U[None])[0] > LAW:
-                self._fail(f"the law of region {i} is not optimal inside it", inside)
+        inside = np.array([middle for middle, _ in balls])
+        answers = [self.program.solve(middle) for middle in inside]
+        for i, U in enumerate(answers):
+            if U is None:
+                self._fail(f"the law of region {i} is not optimal inside it", inside[i])
+        off = self._off(np.arange(len(balls)), inside, np.array(answers))
+        if np.max(off) > LAW:
+            i = int(np.argmax(off > LAW))
+            self._fail(f"the law of region {i} is not optimal inside it", inside[i])
         for i, each in self._conditions():
             region = self.regions[i]
             own = np.column_stack([region.A, region.b])
             known = np.concatenate([self.outer, each.rows])
             same = np.abs(own[:, None] - known[None]).max(axis=2) < EQUAL
-            self._require_law(i, each.law, balls[i][0])
             self._require_implied(i, np.any(same[:, len(self.outer) :], axis=0), balls[i], each)
             self._require_neighbors(i, same, each)
             if np.abs(each.law[:, :-1]).max() > STEEP:
@@ -109,13 +115,17 @@ class Certificate:
                 self._fail(
                     "the active constraints of a region depend on each other", self.center * 0
                 )
+            self._require_laws(np.array(members), np.array([each.law for each in found]))
             yield from zip(members, found, strict=True)
 
-    def _require_law(self, i: int, law: Array, inside: Array) -> None:
-        region = self.regions[i]
-        off = max(np.abs(law[:, :-1] - region.gain).max(), np.abs(law[:, -1] - region.offset).max())
-        if off > LAW * (1 + np.abs(law).max()):
-            self._fail(f"the law of region {i} is not optimal inside it", inside)
+    def _require_laws(self, members: NDArray[np.intp], laws: Array) -> None:
+        """Raise unless some regions have these laws."""
+        off = np.abs(laws[:, :, :-1] - self.gains[members]).max(axis=(1, 2))
+        off = np.maximum(off, np.abs(laws[:, :, -1] - self.offsets[members]).max(axis=1))
+        wrong = members[off > LAW * (1 + np.abs(laws).max(axis=(1, 2)))]
+        if len(wrong):
+            i = int(wrong[0])
+            self._fail(f"the law of region {i} is not optimal inside it", self.regions[i].ball()[0])
 
     def _require_implied(
         self, i: int, known: NDArray[np.bool_], ball: Ball, kkt: Optimality
@@ -125,6 +135,8 @@ class Certificate:
         limit = kkt.rows[:, n] + IMPLIED
         if radius <= 0 or np.any(limit < kkt.rows[:, :n] @ inside):
             self._fail(f"the law of region {i} violates the KKT conditions", inside)
+        if np.all(known):
+            return
         rows, limit = kkt.rows[~known], limit[~known]
         points = farthest_points(region.A, region.b, inside, rows[:, :n])
         beyond = np.sum(rows[:, :n] * points, axis=1) - limit
@@ -164,14 +176,14 @@ class Certificate:
             if np.any(self._slacks(middle)[holders] >= -INSIDE):
                 return
 
-    def _off(self, i: int, points: Array, inputs: Array) -> Array:
-        """Return how far the law of a region is from the answers of a QP, beyond what the QP is.
+    def _off(self, regions: NDArray[np.intp], points: Array, inputs: Array) -> Array:
+        """Return how far laws are from the answers of a QP at points, beyond what the QP is.
 
         Constraints that hold to 1e-11 move its answer by so much times the slope of the law.
         """
-        region = self.regions[i]
-        off = np.abs(points @ region.gain.T + region.offset - inputs).max(axis=1)
-        return np.asarray(off - 1e-10 * np.abs(region.gain).sum(axis=1).max())
+        gains, offsets = self.gains[regions], self.offsets[regions]
+        off = np.abs(np.einsum("kvn,kn->kv", gains, points) + offsets - inputs).max(axis=1)
+        return np.asarray(off - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1))
 
     def _slacks(self, point: Array) -> Array:
         return np.asarray(np.minimum.reduceat(self.b - self.A @ point, self.starts))
@@ -190,7 +202,7 @@ class Certificate:
         for i in np.unique(meant[held]):
             region, at = self.regions[i], np.flatnonzero(meant == i)
             held[at] = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE
-            wrong = at[held[at] & (self._off(i, points[at], inputs[at]) > LAW)]
+            wrong = at[held[at] & (self._off(np.full(len(at), i), points[at], inputs[at]) > LAW)]
             if len(wrong):
                 self._fail(f"the law of region {i} violates the KKT conditions", points[wrong[0]])
         for k in np.flatnonzero(~held):
@@ -202,7 +214,7 @@ class Certificate:
         nearest = int(np.argmax(slacks))
         if slacks[nearest] < -INSIDE:
             self._fail("no region covers a feasible parameter", point)
-        if self._off(nearest, point[None], U[None])[0] > LAW:
+        if self._off(np.array([nearest]), point[None], U[None])[0] > LAW:
             self._fail(f"the law of region {nearest} violates the KKT conditions", point)
 
     def _require_no_doubles(self, balls: list[tuple[Array, float]]) -> None:

@@ -209,6 +209,8 @@ class Conditions:
         """
         index = factors.index[i]
         added = [k for k in one.labels if k >= 0 and factors.depends[i, k]]
+        if not added:
+            return {}
         made_of = factors.NQ[i, added] @ factors.right[i] * self.length[index]
         leaves = made_of > DEPENDENT * self.length[added, None]
         return {
@@ -225,13 +227,13 @@ class Conditions:
         label: Indices,
     ) -> Found | None:
         A, b = np.concatenate([A, self.outer_A]), np.concatenate([b, self.outer_b])
-        inside, radius, rows = region(A, b, THINNEST)
+        inside, radius, rows, equal = region(A, b, THINNEST)
         if radius <= THINNEST:
             return None
         A, b = A[rows], b[rows]
         labels = [int(label[k]) if k < len(label) else OUTER for k in rows]
-        same = equal_rows(A, b - A @ inside, radius)
-        if np.count_nonzero(same) > len(rows):
+        if equal:
+            same = equal_rows(A, b - A @ inside, radius)
             first = np.argmax(same, axis=1)
             keep = np.flatnonzero(first == np.arange(len(rows)))
             for k in keep:

@@ -100,9 +100,11 @@ class _Walk:
 
     def _open(self, one: Found, row: int) -> bool:
         """Tell whether it is not known what lies across a facet."""
-        label, across = one.labels[row], one.across(row)
+        if one.labels[row] == OUTER:
+            return False
+        across = one.across(row)
         known = any(active in self.found for active in across)
-        return label != OUTER and (not known or not self.conditions.degenerate.isdisjoint(across))
+        return not known or not self.conditions.degenerate.isdisjoint(across)
 
     def _across(self, one: Found, row: int) -> int | None:
         """Return the active set across a facet, None if none is new or feasible there."""
