@@ -156,15 +156,6 @@ def _settle(A: Array, b: Array, W: Integers, k: int, Q: Array, R: Array, x: Arra
             x[i] += part[j] * Q[j, i]
 
 
-@compiled("int64(float64[::1], float64[:, ::1], float64[::1], float64[::1])")
-def climb(cost: Array, A: Array, b: Array, x: Array) -> int:
-    """Move x (n,), inside, to the point of ``A x <= b`` with the highest ``cost' x``.
-
-    Returns OPTIMAL, or that it failed.
-    """
-    return _climb(cost, A, b, -1, np.inf, x, np.ones(len(b), np.int64))
-
-
 @compiled()
 def _ball(A: Array, b: Array, facet: int, out: Array) -> int:
     """Write the center of the largest ball, or of that in a facet, and its radius (n + 1,)."""

@@ -59,13 +59,10 @@ def farthest_point(A: Array, b: Array, direction: Array, inside: Array | None = 
 
     With a point inside it is found faster.
     """
-    from sb3_yann.control import _kernels
-
     cost = np.array(direction, dtype=float)
     start = largest_ball(*_unit_rows(A, b))[0] if inside is None else inside
-    point = np.array(start, dtype=float)
-    if np.all(A @ point <= b) and _kernels.climb(cost, *_plain(A, b), point) == _kernels.OPTIMAL:
-        return point
+    if np.all(A @ start <= b):
+        return np.asarray(farthest_points(A, b, start, cost[None])[0])
     return _maximize(cost, A, b, None)
 
 
