@@ -172,15 +172,6 @@ def _ball(A: Array, b: Array, facet: int, out: Array) -> int:
     return _climb(cost, rows, b, facet, np.inf, out, np.ones(m, np.int64))
 
 
-@compiled("int64(float64[:, ::1], float64[::1], int64, float64[::1])")
-def ball(A: Array, b: Array, facet: int, out: Array) -> int:
-    """Write the center of the largest ball and its radius (n + 1,), of a facet unless that is -1.
-
-    Rows are of unit length, and the polyhedron is bounded. Returns OPTIMAL, or that it failed.
-    """
-    return _ball(A, b, facet, out)
-
-
 @compiled()
 def _facets(A: Array, b: Array, inside: Array, radius: float, kept: Integers, mean: Array) -> int:
     """Tell which rows bound a polyhedron, 2 for equal ones; write the mean of points on them."""
@@ -207,20 +198,18 @@ def _facets(A: Array, b: Array, inside: Array, radius: float, kept: Integers, me
     return OPTIMAL
 
 
-@compiled("int64(float64[:, ::1], float64[::1], float64[::1], float64, int64[::1])")
-def facets(A: Array, b: Array, inside: Array, radius: float, kept: Integers) -> int:
-    """Write 0 into ``kept`` (q,), ones before, for rows that bound no facet of a polyhedron."""
-    return _facets(A, b, inside, radius, kept, np.empty(A.shape[1]))
+@compiled("int64(float64[:, ::1], float64[::1], int64, float64, float64[::1], int64[::1])")
+def region(A: Array, b: Array, facet: int, thinnest: float, out: Array, kept: Integers) -> int:
+    """Write the center of the largest ball and its radius (n + 1,), of a facet unless that is -1.
 
-
-@compiled("int64(float64[:, ::1], float64[::1], float64, float64[::1], int64[::1])")
-def region(A: Array, b: Array, thinnest: float, out: Array, kept: Integers) -> int:
-    """Write what `ball` does, and what `facets` does unless the radius is at most ``thinnest``.
-
-    The center is then one away from all facets: the largest ball of a slab may lie at its edge.
+    If the radius is more than ``thinnest``, ``kept`` (q,), ones before, tells which rows bound a
+    facet: 0 for none, 2 where others are equal. The center is then away from all of them: the
+    largest ball of a slab may lie at its edge. Rows are of unit length, and the polyhedron is
+    bounded. Returns OPTIMAL, or that it failed. It is one function, since each takes long to
+    compile.
     """
     n = A.shape[1]
-    done, mean = _ball(A, b, -1, out), np.empty(n)
+    done, mean = _ball(A, b, facet, out), np.empty(n)
     if done != OPTIMAL or out[n] <= thinnest:
         return done
     done = _facets(A, b, out[:n].copy(), out[n], kept, mean)

@@ -45,7 +45,8 @@ def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, f
     from sb3_yann.control import _kernels
 
     found: Array = np.empty(A.shape[1] + 1)
-    done = _kernels.ball(*_plain(A, b), -1 if facet is None else facet, found)
+    which, none = -1 if facet is None else facet, np.empty(0, dtype=np.int64)
+    done = _kernels.region(*_plain(A, b), which, np.inf, found, none)
     if done != _kernels.OPTIMAL:
         rows, cost = np.column_stack([A, np.ones(len(b))]), np.append(np.zeros(A.shape[1]), 1.0)
         if facet is not None:
@@ -91,8 +92,8 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
     """
     from sb3_yann.control import _kernels
 
-    kept = np.ones(len(b), dtype=np.int64)
-    if _kernels.facets(*_plain(A, b), inside, radius, kept) == _kernels.OPTIMAL:
+    found, kept = np.empty(A.shape[1] + 1), np.ones(len(b), dtype=np.int64)
+    if _kernels.region(*_plain(A, b), -1, 0.0, found, kept) == _kernels.OPTIMAL:
         return np.flatnonzero(kept)
     return _facets_one_by_one(A, b - A @ inside, radius)
 
@@ -106,7 +107,7 @@ def region(A: Array, b: Array, thinnest: float) -> tuple[Array, float, NDArray[n
     from sb3_yann.control import _kernels
 
     found, kept = np.empty(A.shape[1] + 1), np.ones(len(b), dtype=np.int64)
-    if _kernels.region(*_plain(A, b), thinnest, found, kept) == _kernels.OPTIMAL:
+    if _kernels.region(*_plain(A, b), -1, thinnest, found, kept) == _kernels.OPTIMAL:
         return found[:-1], float(found[-1]), np.flatnonzero(kept), bool(np.max(kept) > 1)
     inside, radius = largest_ball(A, b)
     return inside, radius, facets(A, b, inside, radius) if radius > thinnest else np.arange(0), True
