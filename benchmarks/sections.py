@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch as th
 
-from benchmarks import evaluation, exactness, gpu, memory, networks, offline, simulators
+from benchmarks import evaluation, exactness, gpu, memory, networks, offline, simulators, suite
 from benchmarks.problems import PROBLEMS, SMALLEST, Problem
 from benchmarks.records import Bench, Figure, show, timed
 from benchmarks.timing import Array
@@ -22,6 +22,7 @@ TITLES = {
     networks.TRAIN: "One training step of DDPG, batch of 256",
     offline.SECTION: "Offline solution",
     exactness.SECTION: "Exactness",
+    suite.SECTION: "Suite of problems",
     simulators.SECTION: "Environments",
     memory.SECTION: "Memory",
     gpu.SECTION: "Processor and CUDA device",
@@ -35,8 +36,8 @@ EACH: dict[str, PerProblem] = {
     "exact": exactness.exactness,
     "memory": memory.memory,
 }
-ENVS, GPU = "env", "gpu"
-NAMES = (*EACH, ENVS, GPU)
+ENVS, GPU, SUITE = "env", "gpu", "suite"
+NAMES = (*EACH, SUITE, ENVS, GPU)
 
 
 def run(bench: Bench, names: Sequence[str]) -> None:
@@ -46,6 +47,8 @@ def run(bench: Bench, names: Sequence[str]) -> None:
         before, began = set(bench.figures.sections()), time.perf_counter()
         if name == ENVS:
             simulators.simulators(bench)
+        elif name == SUITE:
+            suite.suite(bench)
         elif name == GPU:
             _devices(bench, problems)
         else:
