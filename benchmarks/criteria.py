@@ -7,7 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks import evaluation, exactness, networks, offline, online, peers, simulators
+from benchmarks import (
+    evaluation,
+    exactness,
+    networks,
+    offline,
+    online,
+    peers,
+    simulators,
+    suite,
+)
 from benchmarks.records import Figures, seconds, times
 from benchmarks.timing import ratios
 
@@ -36,7 +45,7 @@ class Criterion:
 
 def criteria(figures: Figures) -> list[Criterion]:
     """Return every requirement whose figures are there."""
-    parts = (_law, _batch, _actor, _training, _exact, _solve, _online, _steps)
+    parts = (_law, _batch, _actor, _training, _exact, _suite, _solve, _online, _steps)
     return [line for part in parts for line in part(figures)]
 
 
@@ -128,6 +137,19 @@ def _exact(figures: Figures) -> Iterator[Criterion]:
         yield Criterion(what, "no point uncovered, misplaced or doubled", found, sum(counts) == 0)
         shown = f"{error.middle:.1e}"
         yield Criterion(what, "error against a QP at most 1e-9", shown, error.middle <= 1e-9)
+
+
+def _suite(figures: Figures) -> Iterator[Criterion]:
+    rows = (suite.PROBLEMS, suite.FAILURES, suite.WRONG_LAWS, suite.ERROR)
+    found = [figure.middle for row in rows if (figure := figures.get(suite.SECTION, row, "all"))]
+    if len(found) == len(rows):
+        count, failures, wrong, error = found
+        shown = f"{failures:.0f} failures, {wrong:.0f} wrong laws of {count:.0f}"
+        yield Criterion(
+            suite.SECTION, "every problem solved, and right", shown, failures == wrong == 0
+        )
+        required = "error against a QP at most 1e-9"
+        yield Criterion(suite.SECTION, required, f"{error:.1e}", error <= suite.WRONG)
 
 
 def _solve(figures: Figures) -> Iterator[Criterion]:

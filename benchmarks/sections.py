@@ -17,6 +17,7 @@ from benchmarks import (
     offline,
     online,
     simulators,
+    suite,
 )
 from benchmarks.problems import PROBLEMS, SMALLEST, Problem
 from benchmarks.records import Bench, Figure, show, timed
@@ -31,6 +32,7 @@ TITLES = {
     networks.TRAIN: "One training step of DDPG, batch of 256",
     offline.SECTION: "Offline solution",
     exactness.SECTION: "Exactness",
+    suite.SECTION: "Suite of problems",
     online.LAW: "The online law in numpy, one point",
     online.PREDICT: "The online law: model.predict of one observation",
     online.TRAIN: "The online law: one training step of DDPG, batch of 256",
@@ -49,8 +51,8 @@ EACH: dict[str, PerProblem] = {
     "exact": exactness.exactness,
     "memory": memory.memory,
 }
-ENVS, GPU, ONLINE = "env", "gpu", "online"
-NAMES = (*EACH, ONLINE, ENVS, GPU)
+ENVS, GPU, ONLINE, SUITE = "env", "gpu", "online", "suite"
+NAMES = (*EACH, SUITE, ONLINE, ENVS, GPU)
 
 
 def run(bench: Bench, names: Sequence[str]) -> None:
@@ -60,6 +62,8 @@ def run(bench: Bench, names: Sequence[str]) -> None:
         before, began = set(bench.figures.sections()), time.perf_counter()
         if name == ENVS:
             simulators.simulators(bench)
+        elif name == SUITE:
+            suite.suite(bench)
         elif name == ONLINE:
             online.online(bench)
         elif name == GPU:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
 from sb3_yann.control import ExplicitLimitError, LinearMPC, OnlineLaw
+from sb3_yann.networks import RowAdam
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -66,7 +68,8 @@ def distill(layer: LawLayer, twin: PlantTwin, seed: int) -> bool:
     wanted = np.clip(2 * wanted - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
     at, to = th.as_tensor(rows[finite]), th.as_tensor(wanted[finite], dtype=th.float32)
-    optimizer = th.optim.Adam(layer.network.weights(), lr=RATE)
+    kind = RowAdam if layer.row_gradients else th.optim.Adam
+    optimizer: Any = kind(layer.network.weights(), lr=RATE)
     for k in range(UPDATES):
         optimizer.param_groups[0]["lr"] = RATE * (1 - k / UPDATES)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))

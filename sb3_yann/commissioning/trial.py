@@ -15,9 +15,9 @@ from sb3_yann.twin.plant_twin import PlantTwin
 
 MARGIN = 5e-4
 """What one start may cost more than with the MPC on one member, in mean costs of the MPC."""
-AROUND, RAREST = 0.02, 10.0
-"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; this
-many times as much at most where it is rare."""
+AROUND, RARE, RAREST = 0.02, 0.1, 10.0
+"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; the
+probability below which it may cost more yet, and how many times as much at most."""
 FURTHER = 0.01
 """How much farther than the MPC a run may leave what the log shows, in its widths."""
 NEARLY = 0.5
@@ -131,7 +131,8 @@ class Trial:
 
     def room(self) -> Array:
         """Return what each start may cost more than with the MPC."""
-        rare = np.minimum(self.twin.starts.rareness(self.starts), RAREST).ravel()
+        likely = self.twin.starts.rareness(self.starts).ravel()
+        rare = np.clip(RARE / np.maximum(likely, 1e-300), 1.0, RAREST)
         more = AROUND * rare * np.abs(self.mpc[0]) * ~self.known
         return np.asarray(MARGIN * self.mean + more)
 

@@ -10,11 +10,6 @@ from scipy import optimize
 
 from sb3_yann._validation import Array
 
-# DAQP stops up to 1e-6 from the largest ball: smaller balls need tighter settings.
-THIN = 1e-5
-# In polyhedra with a smaller ball DAQP's own search for redundant rows loses facets.
-SLIM = 1e-4
-
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -47,42 +42,42 @@ class Region:
 
 def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
     """Return center and radius (negative: none) of a bounded polyhedron or facet's largest ball."""
-    rows = np.empty((len(b), A.shape[1] + 1))
-    rows[:, :-1], rows[:, -1] = A, 1.0
-    if facet is not None:
-        rows[facet, -1] = 0.0
-    cost = np.zeros(rows.shape[1])
-    cost[-1] = -1.0
-    point = _minimize(cost, rows, b, facet)
-    if abs(point[-1]) < THIN:
-        point = _minimize(cost, rows, b, facet, eta_prox=1e-14, iter_limit=1000)
-    return point[:-1], float(point[-1])
+    from sb3_yann.control import _kernels
+
+    found: Array = np.empty(A.shape[1] + 1)
+    which, none = -1 if facet is None else facet, np.empty(0, dtype=np.int64)
+    done = _kernels.region(*_plain(A, b), which, np.inf, found, none)
+    if done != _kernels.OPTIMAL:
+        rows, cost = np.column_stack([A, np.ones(len(b))]), np.append(np.zeros(A.shape[1]), 1.0)
+        if facet is not None:
+            rows[facet, -1] = 0.0
+        found = _maximize(cost, rows, b, facet)
+    return found[:-1], float(found[-1])
 
 
-def farthest_point(A: Array, b: Array, direction: Array) -> Array:
-    """Return the point of a bounded polyhedron that is farthest in one direction."""
-    return _minimize(-np.asarray(direction, dtype=float), A, b, None)
+def farthest_point(A: Array, b: Array, direction: Array, inside: Array | None = None) -> Array:
+    """Return the point of a bounded polyhedron that is farthest in one direction.
+
+    With a point inside it is found faster.
+    """
+    cost = np.array(direction, dtype=float)
+    start = largest_ball(*_unit_rows(A, b))[0] if inside is None else inside
+    if np.all(A @ start <= b):
+        return np.asarray(farthest_points(A, b, start, cost[None])[0])
+    return _maximize(cost, A, b, None)
 
 
-def _minimize(cost: Array, A: Array, b: Array, equal: int | None, **settings: float) -> Array:
-    """Return the solution of a small linear program from DAQP, or where that fails from HiGHS."""
-    import daqp
+def farthest_points(A: Array, b: Array, inside: Array, directions: Array) -> Array:
+    """Return the points (k, n) of a bounded polyhedron that are farthest in each direction (k, n).
 
-    sense = np.zeros(len(b), dtype=np.intc)
-    if equal is not None:
-        sense[equal] = 5
-    # Proximal steps make it a linear program; DAQP ends them at the exact vertex.
-    point, _, status, _ = daqp.solve(
-        None, cost, A, b, None, sense, primal_tol=1e-12, eps_prox=1e-2, **settings
-    )
-    if status == 1:
-        return np.asarray(point)
-    tied = np.arange(len(b)) == equal
-    free, equal_rows = (A[~tied], b[~tied]), (A[tied], b[tied])
-    found = optimize.linprog(cost, *free, *equal_rows, bounds=(None, None))
-    if found.x is None:  # an empty facet
-        return np.append(np.zeros(len(cost) - 1), -np.inf)
-    return np.asarray(found.x)
+    ``inside`` (n,) is a point of it.
+    """
+    from sb3_yann.control import _kernels
+
+    found, rows = np.empty_like(directions), _plain(A, b)
+    if _kernels.support(*rows, inside, np.ascontiguousarray(directions), found) != _kernels.OPTIMAL:
+        found = np.array([_maximize(each, A, b, None) for each in directions])
+    return found
 
 
 def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]:
@@ -95,24 +90,62 @@ def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]
     A, b, inside, radius : ndarray, shapes (q, n), (q,) and (n,), and float
         The polyhedron, bounded, and the center and radius of the ball.
     """
-    slack = b - A @ inside
-    if radius < SLIM:
-        if np.min(slack) < 0.5 * radius:
-            return _facets_one_by_one(A, slack, radius)
-        A, slack, radius = _rounded(A, slack)
-    import daqp
+    from sb3_yann.control import _kernels
 
-    # DAQP's tolerance is absolute: in units of the radius it suits small and large polyhedra.
-    return np.flatnonzero(daqp.minrep(np.ascontiguousarray(A), slack / radius) != 1)
+    found, kept = np.empty(A.shape[1] + 1), np.ones(len(b), dtype=np.int64)
+    if _kernels.region(*_plain(A, b), -1, 0.0, found, kept) == _kernels.OPTIMAL:
+        return np.flatnonzero(kept)
+    return _facets_one_by_one(A, b - A @ inside, radius)
 
 
-def _rounded(A: Array, slack: Array) -> tuple[Array, Array, float]:
-    """Return a thin polyhedron ``A z <= slack`` with Dikin's ellipsoid as unit ball, and 1."""
-    scaled = A / slack[:, None]
-    L = np.linalg.cholesky(scaled.T @ scaled)
-    rows = np.linalg.solve(L, A.T).T
-    length = np.linalg.norm(rows, axis=1)
-    return rows / length[:, None], slack / length, 1.0
+def region(A: Array, b: Array, thinnest: float) -> tuple[Array, float, NDArray[np.intp], bool]:
+    """Return a point inside a bounded polyhedron, its largest ball's radius, and its facets.
+
+    Last comes whether some of these are equal. Where the radius is at most ``thinnest`` no facets
+    are looked for.
+    """
+    from sb3_yann.control import _kernels
+
+    found, kept = np.empty(A.shape[1] + 1), np.ones(len(b), dtype=np.int64)
+    if _kernels.region(*_plain(A, b), -1, thinnest, found, kept) == _kernels.OPTIMAL:
+        return found[:-1], float(found[-1]), np.flatnonzero(kept), bool(np.max(kept) > 1)
+    inside, radius = largest_ball(A, b)
+    return inside, radius, facets(A, b, inside, radius) if radius > thinnest else np.arange(0), True
+
+
+def equal_rows(A: Array, slack: Array, radius: float) -> NDArray[np.bool_]:
+    """Tell which half-spaces of a polyhedron of this radius are equal (q, q).
+
+    ``slack`` (q,) is their distance from a point inside.
+    """
+    from sb3_yann.control._kernels import NOISE, SAME
+
+    near = np.abs(slack[:, None] - slack) <= SAME * radius + NOISE
+    # Seldom any: most pairs are told apart by their distance.
+    first, second = np.nonzero(near)
+    near[first, second] = np.abs(A[first] - A[second]).max(axis=1) <= SAME
+    return np.asarray(near)
+
+
+def _plain(A: Array, b: Array) -> tuple[Array, Array]:
+    """Return arrays as the compiled functions take them."""
+    return np.ascontiguousarray(A, dtype=float), np.ascontiguousarray(b, dtype=float)
+
+
+def _unit_rows(A: Array, b: Array) -> tuple[Array, Array]:
+    length = np.linalg.norm(A, axis=1)
+    length[length == 0] = 1.0
+    return A / length[:, None], b / length
+
+
+def _maximize(cost: Array, A: Array, b: Array, equal: int | None) -> Array:
+    """Return the solution of a small linear program from HiGHS, for where our own search fails."""
+    tied = np.arange(len(b)) == equal
+    free, equal_rows = (A[~tied], b[~tied]), (A[tied], b[tied])
+    found = optimize.linprog(-cost, *free, *equal_rows, bounds=(None, None))
+    if found.x is None:  # an empty facet
+        return np.append(np.zeros(len(cost) - 1), -np.inf)
+    return np.asarray(found.x)
 
 
 def _facets_one_by_one(A: Array, b: Array, radius: float) -> NDArray[np.intp]:
@@ -121,7 +154,6 @@ def _facets_one_by_one(A: Array, b: Array, radius: float) -> NDArray[np.intp]:
     for k in range(len(b)):
         relaxed = b.copy()
         relaxed[k] += radius
-        farthest = _minimize(-A[k], A, relaxed, None, eta_prox=1e-14, iter_limit=1000)
-        if A[k] @ farthest > b[k] - max(1e-6 * radius, 1e-13):
+        if A[k] @ _maximize(A[k], A, relaxed, None) > b[k] + max(1e-6 * radius, 1e-13):
             bounding.append(k)
     return np.array(bounding, dtype=np.intp)

@@ -72,15 +72,17 @@ class Starts:
         return drawn
 
     def rareness(self, thetas: Array) -> Array:
-        """Return by how much rarer than in the box such starts are, for thetas (..., n_theta).
+        """Return how likely a start lies so far out or farther, in one coordinate: (...,).
 
-        Of k draws from a uniform distribution another one lies beyond ``rho`` times their box
-        with a probability that falls as ``rho ** (1 - k)``.
+        For thetas (..., n_theta), in the one that lies farthest out. Of k draws from a uniform
+        distribution the next one lies beyond ``rho`` times their range with probability
+        ``2 / (k + 1) ((1 + rho) / 2) ** (1 - k)``: spacings are exchangeable.
         """
-        middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        x = thetas[..., : len(half)]
+        n, k = len(self.low), len(self.first)
+        x, seen = thetas[..., :n], self.first[:, :n]
+        middle, half = (self.high + self.low) / 2, np.ptp(seen, axis=0) / 2
         rho = (np.abs(x - middle) / np.maximum(half, 1e-300)).max(axis=-1)
-        return np.asarray(np.maximum(rho, 1.0) ** (len(self.first) - 1))
+        return np.asarray(2 / (k + 1) * ((1 + np.maximum(rho, 1.0)) / 2) ** (1.0 - k))
 
     def draw_anywhere(self, count: int, rng: np.random.Generator) -> Array:
         """Return thetas (count, n_theta), a third each of beginnings, of logged and of around."""

@@ -77,6 +77,12 @@ class Trust:
         """Root mean square error of the predicted costs, relative to the mean cost."""
         return relative_error(self.predicted, self.actual)
 
+    @property
+    def error_ratio(self) -> float:
+        """Held-out free-run error relative to that of the given model: the geometric mean."""
+        errors = self.runs.errors + 1e-300
+        return float(np.exp(np.nanmean(np.log(errors[self.chosen] / errors[0]))))
+
 
 def relative_error(predicted: Array, actual: Array) -> float:
     """Return the root mean square error relative to the mean; inf where there is nothing."""

@@ -37,8 +37,16 @@ def test_the_log_and_the_starts_lie_within_the_limits_and_nan_does_not() -> None
     assert found.limits.violated(np.array([[np.nan, 0.0], [100.0, 0.0]])).all()
 
 
-def test_a_start_is_the_rarer_the_farther_it_lies_beyond_the_box() -> None:
-    starts, k = twin().starts, len(twin().episodes)
-    middle, half = (starts.high + starts.low) / 2, (starts.high - starts.low) / 2
+def test_a_start_is_the_rarer_the_farther_it_lies_outside_the_range_of_the_log() -> None:
+    starts, rng, k = twin().starts, np.random.default_rng(0), len(twin().episodes)
+    middle, half = (starts.high + starts.low) / 2, np.ptp(starts.first[:, :2], axis=0) / 2
     at = middle + half * np.array([[0.0, 0.0], [0.9, -1.0], [0.0, 2.0], [-3.0, 0.5]])
-    np.testing.assert_allclose(starts.rareness(at), [1, 1, 2.0 ** (k - 1), 3.0 ** (k - 1)])
+    expected = 2 / (k + 1) * np.array([1, 1, 1.5 ** (1 - k), 2.0 ** (1 - k)])
+    np.testing.assert_allclose(starts.rareness(at), expected)
+    # That is how often it happens, in each coordinate alone.
+    drawn = rng.uniform(-1, 1, (20_000, k + 1))
+    seen, new = drawn[:, :k], drawn[:, k]
+    middle, half = (seen.max(1) + seen.min(1)) / 2, np.ptp(seen, axis=1) / 2
+    for rho in (1.0, 1.5, 2.0):
+        often = np.mean(np.abs(new - middle) > rho * half)
+        assert abs(often - 2 / (k + 1) * ((1 + rho) / 2) ** (1.0 - k)) < 0.01

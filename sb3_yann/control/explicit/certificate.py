@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.explicit.kkt import Optimality, optimality
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
-from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
+from sb3_yann.control.polyhedra import Region, farthest_points, largest_ball
 
 # How far a law may be off, and a point from a region that holds it, in half-widths of the ranges.
 LAW, INSIDE = 1e-6, 1e-8
+# Half-spaces that differ by less are equal; how far a region may reach beyond another's conditions.
+EQUAL, IMPLIED = 1e-9, 1e-9
+# With a larger gain the law is that of the check: the QR factors of the walk leave it off by 1e-13.
+STEEP = 1e3
+Ball = tuple[Array, float]
 
 
 class ExplicitSolutionError(RuntimeError):
@@ -37,10 +45,11 @@ class Certificate:
     - An independent QP is solved at the innermost point of every region.
     - The law of every region solves the Karush-Kuhn-Tucker (KKT) equations of its active set, and
       its half-spaces imply their inequalities: then it is optimal in all of the region.
-    - Across each facet where constraint k becomes active, or inactive, lies the region of the
-      active set with k added, or removed: their KKT conditions agree on the facet, so it covers
-      all of its other side. Where there is no such region, a QP just across the middle of the facet
-      must be infeasible, or another region there.
+    - Across each facet where constraint k becomes active, or inactive, lie the regions of the
+      active sets with k added, or removed, or in the place of another: their KKT conditions agree
+      on the facet, so they cover all of its other side. Or k contradicts the active constraints
+      there. Where a region is missing, a QP just across the middle of the facet must be infeasible,
+      or another region there.
     - QPs at random points of the box agree with the region there, or are infeasible.
     - No region lies in another one.
 
@@ -59,98 +68,91 @@ class Certificate:
         self.by_set = {as_bits(region.active_set): i for i, region in enumerate(regions)}
         self.outer = np.column_stack(program.theta_rows())
 
-    def check(self) -> None:
-        """Raise ExplicitSolutionError, with a theta that shows what is wrong, unless all pass."""
+    def check(self) -> list[Region]:
+        """Return the regions, with the laws of steep ones more exact.
+
+        Raise ExplicitSolutionError, with a theta that shows what is wrong, unless all pass.
+        """
+        refined = list(self.regions)
         if not self.regions:
             self._fail("no region was found", self.center * 0)
         self.A, self.b = (
             np.concatenate([getattr(region, name) for region in self.regions]) for name in "Ab"
         )
+        self.gains = np.array([region.gain for region in self.regions])
+        self.offsets = np.array([region.offset for region in self.regions])
         self.starts = np.cumsum([0, *(len(region.b) for region in self.regions[:-1])])
         balls = [region.ball() for region in self.regions]
-        for i, (region, (inside, _)) in enumerate(zip(self.regions, balls, strict=True)):
-            U = self.program.solve(inside)
-            if U is None or np.max(np.abs(U - region.gain @ inside - region.offset)) > LAW:
-                self._fail(f"the law of region {i} is not optimal inside it", inside)
-        for i, law, rows, labels in self._conditions():
-            self._require_law(i, law, balls[i][0])
-            self._require_implied(i, rows, *balls[i])
-            self._require_neighbors(i, rows, labels)
+        inside = np.array([middle for middle, _ in balls])
+        answers = [self.program.solve(middle) for middle in inside]
+        for i, U in enumerate(answers):
+            if U is None:
+                self._fail(f"the law of region {i} is not optimal inside it", inside[i])
+        off = self._off(np.arange(len(balls)), inside, np.array(answers))
+        if np.max(off) > LAW:
+            i = int(np.argmax(off > LAW))
+            self._fail(f"the law of region {i} is not optimal inside it", inside[i])
+        for i, each in self._conditions():
+            region = self.regions[i]
+            own = np.column_stack([region.A, region.b])
+            known = np.concatenate([self.outer, each.rows])
+            same = np.abs(own[:, None] - known[None]).max(axis=2) < EQUAL
+            self._require_implied(i, np.any(same[:, len(self.outer) :], axis=0), balls[i], each)
+            self._require_neighbors(i, same, each)
+            if np.abs(each.law[:, :-1]).max() > STEEP:
+                refined[i] = replace(region, gain=each.law[:, :-1], offset=each.law[:, -1])
         self._require_agreement()
         self._require_no_doubles(balls)
+        return refined
 
-    def _conditions(self) -> Iterator[tuple[int, Array, Array, list[int]]]:
-        """Yield the KKT conditions of each region: its law, and rows [A b] with labels."""
-        for size, members in batches(len(region.active_set) for region in self.regions):
-            yield from self._conditions_of(members, size)
+    def _conditions(self) -> Iterator[tuple[int, Optimality]]:
+        """Yield the KKT conditions of each region."""
+        sets = [region.active_set for region in self.regions]
+        for _, members in batches(map(len, sets)):
+            try:
+                found = optimality(self.program, [sets[i] for i in members])
+            except np.linalg.LinAlgError:
+                self._fail(
+                    "the active constraints of a region depend on each other", self.center * 0
+                )
+            self._require_laws(np.array(members), np.array([each.law for each in found]))
+            yield from zip(members, found, strict=True)
 
-    def _conditions_of(
-        self, members: list[int], size: int
-    ) -> Iterator[tuple[int, Array, Array, list[int]]]:
-        program, (v, n) = self.program, self.program.F.shape
-        active = np.array([self.regions[i].active_set for i in members], dtype=int)
-        active, limit = active.reshape(len(members), size), np.column_stack([program.S, program.w])
-        K = np.zeros((len(members), v + size, v + size))
-        K[:, :v, :v] = program.H
-        K[:, v:, :v] = program.G[active]
-        K[:, :v, v:] = np.swapaxes(program.G[active], 1, 2)
-        right = np.empty((len(members), v + size, n + 1))
-        right[:, :v] = -np.column_stack([program.F, program.c])
-        right[:, v:] = limit[active]
-        try:
-            both = np.linalg.solve(K, right)
-        except np.linalg.LinAlgError:
-            self._fail("the active constraints of a region depend on each other", self.center * 0)
-        laws, multipliers = both[:, :v], both[:, v:]
-        rows = limit - program.G @ laws
-        noise = 1 + np.linalg.norm(laws, axis=(1, 2))[:, None] * np.ones(len(program.w))
-        each = np.arange(len(members))[:, None]
-        rows[each, active] = multipliers
-        noise[each, active] = np.abs(multipliers).max(axis=(1, 2), initial=0.0)[:, None]
-        length = np.linalg.norm(rows[:, :, :n], axis=2)
-        fixed = length <= 1e-11 * noise
-        length[fixed] = np.maximum(noise[fixed], 1e-300)
-        rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
-        rows[fixed, :n] = 0.0
-        binding = rows[:, :, n] < np.abs(rows[:, :, :n]).sum(axis=2)
-        for k, i in enumerate(members):
-            yield i, laws[k], rows[k, binding[k]], np.flatnonzero(binding[k]).tolist()
+    def _require_laws(self, members: NDArray[np.intp], laws: Array) -> None:
+        """Raise unless some regions have these laws."""
+        off = np.abs(laws[:, :, :-1] - self.gains[members]).max(axis=(1, 2))
+        off = np.maximum(off, np.abs(laws[:, :, -1] - self.offsets[members]).max(axis=1))
+        wrong = members[off > LAW * (1 + np.abs(laws).max(axis=(1, 2)))]
+        if len(wrong):
+            i = int(wrong[0])
+            self._fail(f"the law of region {i} is not optimal inside it", self.regions[i].ball()[0])
 
-    def _require_law(self, i: int, law: Array, inside: Array) -> None:
-        region = self.regions[i]
-        off = max(np.abs(law[:, :-1] - region.gain).max(), np.abs(law[:, -1] - region.offset).max())
-        if off > LAW * (1 + np.abs(law).max()):
-            self._fail(f"the law of region {i} is not optimal inside it", inside)
-
-    def _require_implied(self, i: int, rows: Array, inside: Array, radius: float) -> None:
-        """Raise unless the half-spaces of region i imply all rows."""
-        region, n = self.regions[i], len(inside)
-        A, b = np.concatenate([rows[:, :n], region.A]), np.concatenate([rows[:, n], region.b])
-        b[: len(rows)] += 1e-4 * radius
-        if radius <= 0 or np.any(rows[:, n] < rows[:, :n] @ inside - LAW):
+    def _require_implied(
+        self, i: int, known: NDArray[np.bool_], ball: Ball, kkt: Optimality
+    ) -> None:
+        """Raise unless the half-spaces of region i imply its conditions; they are those known."""
+        region, n, (inside, radius) = self.regions[i], len(ball[0]), ball
+        limit = kkt.rows[:, n] + IMPLIED
+        if radius <= 0 or np.any(limit < kkt.rows[:, :n] @ inside):
             self._fail(f"the law of region {i} violates the KKT conditions", inside)
-        for k in facets(A, b, inside, radius):
-            if k >= len(rows):
-                break
-            # Within DAQP's tolerance it may count: the farthest point decides.
-            point = farthest_point(region.A, region.b, rows[k, :n])
-            if rows[k, :n] @ point > rows[k, n] + LAW:
-                self._fail(f"the law of region {i} violates the KKT conditions", point)
+        if np.all(known):
+            return
+        rows, limit = kkt.rows[~known], limit[~known]
+        points = farthest_points(region.A, region.b, inside, rows[:, :n])
+        beyond = np.sum(rows[:, :n] * points, axis=1) - limit
+        if np.any(beyond > 0):
+            point = points[np.argmax(beyond)]
+            self._fail(f"the law of region {i} violates the KKT conditions", point)
 
-    def _require_neighbors(self, i: int, rows: Array, labels: list[int]) -> None:
-        region = self.regions[i]
-        known = np.concatenate([self.outer, rows])
-        own = np.column_stack([region.A, region.b])
-        same = np.abs(own[:, None] - known[None]).max(axis=2) < 1e-9
-        first = len(self.outer)
-        meant: list[list[int]] = [[] for _ in own]
-        for row, which in zip(*(index.tolist() for index in np.nonzero(same)), strict=True):
-            meant[row].append(which - first)
-        active = as_bits(region.active_set)
-        for row, which in enumerate(meant):
-            outer = bool(which) and which[0] < 0  # a bound of theta
-            if not outer and not any(active ^ (1 << labels[k]) in self.by_set for k in which):
-                self._look_across(region, row)
+    def _require_neighbors(self, i: int, same: NDArray[np.bool_], conditions: Optimality) -> None:
+        """Raise if a facet of region i has no neighbor; ``same`` tells which conditions are it."""
+        outer, open_rows = len(self.outer), set(range(len(same)))
+        for row, each in zip(*(index.tolist() for index in np.nonzero(same)), strict=True):
+            # A bound of theta, or a constraint.
+            if each < outer or all(a in self.by_set for a in conditions.across(each - outer)):
+                open_rows.discard(row)
+        for row in sorted(open_rows):
+            self._look_across(self.regions[i], row)
 
     def _look_across(self, region: Region, row: int) -> None:
         """Raise if no region touches a facet from the other side where that is feasible."""
@@ -174,13 +176,22 @@ class Certificate:
             if np.any(self._slacks(middle)[holders] >= -INSIDE):
                 return
 
+    def _off(self, regions: NDArray[np.intp], points: Array, inputs: Array) -> Array:
+        """Return how far laws are from the answers of a QP at points, beyond what the QP is.
+
+        Constraints that hold to 1e-11 move its answer by so much times the slope of the law.
+        """
+        gains, offsets = self.gains[regions], self.offsets[regions]
+        off = np.abs(np.einsum("kvn,kn->kv", gains, points) + offsets - inputs).max(axis=1)
+        return np.asarray(off - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1))
+
     def _slacks(self, point: Array) -> Array:
         return np.asarray(np.minimum.reduceat(self.b - self.A @ point, self.starts))
 
     def _require_agreement(self) -> None:
         """Raise unless QPs at random points of the box agree with the regions."""
-        n = self.program.F.shape[1]
-        drawn = np.random.default_rng(1).uniform(-1, 1, (50 * n, n))
+        n, random = self.program.F.shape[1], np.random.default_rng(1)
+        drawn = random.uniform(-1, 1, (50 * n, n))
         solved = [(point, *self.program.solve_with_multipliers(point)) for point in drawn]
         feasible = [each for each in solved if each[1] is not None]
         if not feasible:
@@ -191,8 +202,7 @@ class Certificate:
         for i in np.unique(meant[held]):
             region, at = self.regions[i], np.flatnonzero(meant == i)
             held[at] = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE
-            off = np.abs(points[at] @ region.gain.T + region.offset - inputs[at]).max(axis=1)
-            wrong = at[held[at] & (off > LAW)]
+            wrong = at[held[at] & (self._off(np.full(len(at), i), points[at], inputs[at]) > LAW)]
             if len(wrong):
                 self._fail(f"the law of region {i} violates the KKT conditions", points[wrong[0]])
         for k in np.flatnonzero(~held):
@@ -202,10 +212,9 @@ class Certificate:
         """Raise unless the region that is nearest to a point holds it, and has the right law."""
         slacks = self._slacks(point)
         nearest = int(np.argmax(slacks))
-        region = self.regions[nearest]
         if slacks[nearest] < -INSIDE:
             self._fail("no region covers a feasible parameter", point)
-        if np.max(np.abs(U - region.gain @ point - region.offset)) > LAW:
+        if self._off(np.array([nearest]), point[None], U[None])[0] > LAW:
             self._fail(f"the law of region {nearest} violates the KKT conditions", point)
 
     def _require_no_doubles(self, balls: list[tuple[Array, float]]) -> None:

@@ -11,6 +11,12 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 
+FAINT = 1e-7
+"""Bounds that all inputs together move by less, in half-widths of the box of theta, are its own.
+
+Where such a bound is active, the law is so steep that its own rounding shows.
+"""
+
 
 def as_bits(active_set: Iterable[int]) -> int:
     """Return a set of constraints as a whole number, with bit k for constraint k."""
@@ -25,6 +31,16 @@ def batches(sizes: Iterable[int]) -> Iterator[tuple[int, list[int]]]:
     for size, members in sorted(indices.items()):
         for start in range(0, len(members), 256):
             yield size, members[start : start + 256]
+
+
+def row_units(G: Array) -> Array:
+    """Return factors (rows,) that give rows a length of about 1, without rounding.
+
+    DAQP takes a row that is shorter than about 1e-6 for one that does not bind.
+    """
+    length = np.linalg.norm(G, axis=1)
+    length[length == 0] = 1.0
+    return np.asarray(2.0 ** -np.round(np.log2(length)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +86,8 @@ class ParametricQP:
         """Return the optimal U (v,), or None, and the multipliers of all rows (rows,)."""
         import daqp
 
-        H, G, fixed, lower, sense = self._arrays
-        upper = self.w + self.S @ theta
+        H, G, fixed, lower, sense, units = self._arrays
+        upper = (self.w + self.S @ theta) * units
         if fixed.size:  # bounds of theta alone
             if upper[fixed].min() < -1e-11:
                 return None, np.zeros(upper.size)
@@ -79,14 +95,18 @@ class ParametricQP:
         U, _, status, info = daqp.solve(
             H, self.F @ theta + self.c, G, upper, lower, sense, primal_tol=1e-11
         )
-        return (np.asarray(U) if status == 1 else None), np.asarray(info["lam"])
+        return (np.asarray(U) if status == 1 else None), np.asarray(info["lam"]) * units
 
     @cached_property
-    def _arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc]]:
-        """What DAQP asks for at every theta: H, G, the rows without U, no bounds, no options."""
-        H, G, rows = np.ascontiguousarray(self.H), np.ascontiguousarray(self.G), len(self.w)
+    def _arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc], Array]:
+        """What DAQP asks for at every theta: H, G, the rows without U, no bounds, no options.
+
+        Last come the units in which it gets the rows.
+        """
+        units, rows = row_units(self.G), len(self.w)
+        H, G = np.ascontiguousarray(self.H), np.ascontiguousarray(self.G * units[:, None])
         fixed = np.flatnonzero(~np.any(G, axis=1))
-        return H, G, fixed, np.full(rows, -1e30), np.zeros(rows, dtype=np.intc)
+        return H, G, fixed, np.full(rows, -1e30), np.zeros(rows, dtype=np.intc), units
 
     def theta_rows(self) -> tuple[Array, Array]:
         """Return A and b of the bounds of theta alone, for a program whose box is the unit box."""
@@ -94,6 +114,21 @@ class ParametricQP:
         bound = ~np.any(self.G, axis=1) & np.any(self.S, axis=1)
         b = np.concatenate([np.ones(2 * len(eye)), self.w[bound]])
         return np.vstack([eye, -eye, -self.S[bound]]), b
+
+    def without_faint_rows(self, most: Array) -> ParametricQP:
+        """Return a program of unit rows where rows that U hardly moves bound theta alone.
+
+        Those are tightened by what U can do to them, less than FAINT: the law stays exact, and the
+        feasible set is so much smaller. ``most`` (v,) is the largest size of each variable,
+        infinite where it has none.
+        """
+        with np.errstate(invalid="ignore"):  # 0 times inf
+            moved = np.nan_to_num(np.abs(self.G) * most, nan=0.0, posinf=np.inf).sum(axis=1)
+        faint = (moved < FAINT) & np.any(self.G, axis=1) & np.any(self.S, axis=1)
+        if not np.any(faint):
+            return self
+        w = self.w - np.where(faint, moved, 0.0)
+        return replace(self, G=np.where(faint[:, None], 0.0, self.G), w=w)
 
     def scaled(self, center: Array, half: Array, reach: Array) -> ParametricQP:
         """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows."""

@@ -51,7 +51,7 @@ def solve_explicit(
     with BudgetTimer(budget) as timer:
         regions = _critical_regions(units.scaled, solver, timer)
         try:
-            Certificate(units.scaled, regions, units.center, units.half).check()
+            regions = Certificate(units.scaled, regions, units.center, units.half).check()
         except ExplicitSolutionError as error:
             if solver == "walk":
                 raise
@@ -75,7 +75,10 @@ class ProgramUnits:
         reach = np.tile(half_widths(u_min, u_max), steps)
         self.reach = np.concatenate([reach, np.ones(program.n_slacks)])
         self.program, self.input_range = program, (u_min, u_max)
-        self.scaled = program.scaled(self.center, self.half, self.reach)
+        most = np.maximum(np.abs(u_min), np.abs(u_max)) / reach[: len(u_min)]
+        most = np.concatenate([np.tile(most, steps), np.full(program.n_slacks, np.inf)])
+        scaled = program.scaled(self.center, self.half, self.reach)
+        self.scaled = scaled.without_faint_rows(most)
 
     def law(self, regions: list[Region], infeasible: str) -> PiecewiseAffine:
         """Return the law of the first inputs in the units of the problem."""

@@ -224,6 +224,10 @@ class LinearMPC(MPCProblem):
     ) -> PiecewiseAffine:
         """Return the explicit law theta -> u_0, solved once, checked, and kept.
 
+        A bound that all inputs together move by less than 1e-7 of the half-widths of the box, such
+        as that of a position one short step ahead, bounds theta alone: the set where the problem
+        has a solution is smaller by so much.
+
         Parameters
         ----------
         solver : {"walk", "ppopt"}, default "walk"

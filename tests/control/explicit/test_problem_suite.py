@@ -1,0 +1,101 @@
+"""Every problem of the suite is solved, and its law is that of a program solved another way."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from benchmarks import suite_problems
+from benchmarks.suite import WRONG, Outcome, compare, examine, names
+from benchmarks.suite_problems import SUITE, chain, off_center, quietly
+from sb3_yann.control.explicit.solve import ProgramUnits
+
+# One of each kind, what once failed first.
+FEW = [
+    *(
+        "chain, dt 0.1, N 3, states within 2",
+        "cart-pole, N 2, states within (0.9, 0.2, 2, 2), u 1.0",
+    ),
+    *("integrator, box (-2, 20), u 0.1, N 1", "integrator, box (-0.3, 100), u 0.02, N 3"),
+    *(f"random, {kind}" for kind in ("states, 3", "invariant, 4", "soft, 1", "parts, 2")),
+    *(
+        "double integrator, invariant set, N 4",
+        "quadruple tank, rates",
+        "aircraft, pitch bounded, N 1",
+    ),
+]
+
+
+def assert_right(outcome: Outcome) -> None:
+    assert outcome.failure == ""
+    assert outcome.holes == 0
+    assert outcome.error <= WRONG
+    assert outcome.points >= 10
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_problems_of_each_kind_are_solved_and_right(name: str) -> None:
+    assert_right(examine(name, 40))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(10))
+def test_the_suite_is_solved_and_right(part: int) -> None:
+    for name in names(large=False)[part::10]:
+        if name not in FEW:
+            assert_right(examine(name, 30))
+
+
+def test_the_suite_holds_300_problems_and_all_of_those_that_once_failed() -> None:
+    assert len(SUITE) >= 300
+    assert sum(name.startswith("chain") for name in SUITE) == 32
+    assert set(names(large=True)) | set(names(large=False)) == set(SUITE)
+
+
+@pytest.mark.parametrize("by", [1e-3, 1e-6])
+def test_a_wrong_law_is_noticed(by: float) -> None:
+    mpc = quietly(SUITE["double integrator, states within 5, N 2"])
+    law = mpc.explicit()
+    wrong = dataclasses.replace(law, gains=law.gains + by)
+    assert compare(mpc, law, 60)[1] <= WRONG
+    assert compare(mpc, wrong, 60)[1] > WRONG
+
+
+def test_a_small_feasible_set_far_from_the_center_of_the_box_is_found() -> None:
+    law = off_center(-2, 20, 0.1, 1).explicit()
+    assert law.n_regions == 3
+    assert law.in_domain([[-0.21], [-0.19], [0.0], [0.19], [0.21]]).tolist() == [0, 1, 1, 1, 0]
+
+
+def test_a_bound_that_the_input_hardly_moves_bounds_theta_alone() -> None:
+    # One step of 0.01 s moves the second mass by 0.01^4 / 24: a law for its bound is not to be had.
+    mpc = chain(0.01, 2, 2.0)
+    plain = mpc.condensed().scaled(np.zeros(4), mpc.theta_max, np.ones(2))
+    units = ProgramUnits(mpc.condensed(), mpc.u_min, mpc.u_max)
+    faint = np.any(plain.G, axis=1) & ~np.any(units.scaled.G, axis=1)
+    assert 0 < np.count_nonzero(faint) < len(faint)
+    moved = np.abs(plain.G).sum(axis=1)
+    assert np.all(moved[faint] < 1e-7)
+    np.testing.assert_allclose(units.scaled.w[faint], (plain.w - moved)[faint], rtol=1e-15)
+    np.testing.assert_array_equal(units.scaled.w[~faint], plain.w[~faint])
+    assert mpc.explicit().n_regions > 9
+
+
+def test_a_bound_that_an_unbounded_input_moves_stays() -> None:
+    mpc = chain(0.01, 2, 2.0)
+    units = ProgramUnits(mpc.condensed(), np.array([-np.inf]), np.array([np.inf]))
+    assert np.all(np.any(units.scaled.G, axis=1))
+
+
+@pytest.mark.parametrize("horizon", [4, 5])
+def test_the_partition_of_a_symmetric_problem_has_its_symmetry(horizon: int) -> None:
+    bounds = {4: (0.5, 0.1, 5, 5), 5: (0.9, 0.2, 10, 10)}[horizon]
+    mpc = suite_problems.cart_pole(horizon - 2, bounds, 3.0)
+    law = mpc.explicit()
+    points = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (500, 4))
+    assert law.n_regions % 2 == 1  # the region of the origin is its own mirror image
+    inside = law.in_domain(points)
+    np.testing.assert_array_equal(law.in_domain(-points), inside)
+    np.testing.assert_allclose(law(-points[inside]), -law(points[inside]), atol=1e-9)
