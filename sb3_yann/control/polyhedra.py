@@ -22,6 +22,8 @@ class Region:
     gain, offset, A, b : ndarray, shapes (v, n), (v,), (q, n) and (q,)
     inside : ndarray, shape (n,), optional
         A point well inside, if known.
+    across : tuple, optional
+        The active set beyond each row, None where there is none, or none is known.
     """
 
     active_set: tuple[int, ...]
@@ -30,6 +32,7 @@ class Region:
     A: Array
     b: Array
     inside: Array | None = None
+    across: tuple[tuple[int, ...] | None, ...] = ()
 
     def ball(self) -> tuple[Array, float]:
         """Return the center of a large ball inside, and its radius, negative if there is none."""

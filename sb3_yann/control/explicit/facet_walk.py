@@ -50,10 +50,17 @@ class _Walk:
 
     def regions(self) -> list[Region]:
         kept = self.conditions.kept
-        rows = [tuple(kept[members_of(active)].tolist()) for active in self.found]
+        rows = {each: tuple(kept[members_of(each)].tolist()) for each in self.found}
+        across = {
+            each: tuple(
+                next((rows[other] for other in one.across(k) if other in rows), None)
+                for k in range(len(one.labels))
+            )
+            for each, one in self.found.items()
+        }
         return [
-            Region(active, one.law[:, :-1], one.law[:, -1], one.A, one.b, one.inside)
-            for active, one in zip(rows, self.found.values(), strict=True)
+            Region(rows[k], one.law[:, :-1], one.law[:, -1], one.A, one.b, one.inside, across[k])
+            for k, one in self.found.items()
         ]
 
     def seeds(self, count: int) -> Iterator[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import optimize
 
 from sb3_yann._validation import Array, as_choice, half_widths
@@ -90,7 +91,20 @@ class ProgramUnits:
         starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
         ranges = *self.input_range, self.program.theta_min, self.program.theta_max
         offsets = offsets - gains @ self.center
-        return PiecewiseAffine(gains, offsets, A, b, starts, *ranges, infeasible, disjoint=True)
+        beyond = _neighbors(regions)
+        return PiecewiseAffine(gains, offsets, A, b, starts, *ranges, infeasible, True, beyond)
+
+
+def _neighbors(regions: list[Region]) -> NDArray[np.int64]:
+    """Return the region beyond each half-space, -1 where none is known; empty for no region."""
+    number = {region.active_set: i for i, region in enumerate(regions)}
+    beyond = [
+        -1 if active is None else number.get(active, -1)
+        for region in regions
+        for active in region.across
+    ]
+    known = len(beyond) == sum(len(region.b) for region in regions)
+    return np.array(beyond if known else [], dtype=np.int64)
 
 
 def _require_box(program: ParametricQP) -> None:

@@ -12,13 +12,16 @@ import numpy as np
 from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
 
-HEADER = 8
-"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero input, disjoint."""
+HEADER = 9
+"""Whole numbers before the packed arrays: n, m, p, q, nodes, leaves, zero input, disjoint, and 1 +
+the region that a walk begins in, 0 where there is none."""
 
 ROWS = 2  # floats before the packed arrays: how far outside counts as inside, which slacks tie
 CLEAR = 1e-6  # so far from all hyperplanes on its way, what holds a point is in the leaf
 SURELY_INSIDE = 1e-9
 """With it, no region that the tree left out, and of disjoint ones no other at all, is as good."""
+STEPS = 10_000  # of a walk at most
+BACK = 1e-9  # a region that a walk enters holds the line from there on, to rounding
 
 
 def pack(
@@ -30,17 +33,23 @@ def pack(
     tolerances: tuple[float, float],
     flags: tuple[bool, bool],
     tree: Sequence[Array | Integers] = (),
+    walk: tuple[Integers, int, Array] | None = None,
 ) -> tuple[Array, Integers]:
     """Return a law as one array of floats and one of whole numbers, for the functions below.
 
     ``rows`` are [A b] (q, n + 1) of all regions, ``bounds`` u_min and u_max (2, m). ``tolerances``
     tell how far outside counts as inside and which slacks tie, ``flags`` whether the input is zero
-    outside and whether no regions overlap. Without a ``tree`` the regions are scanned.
+    outside and whether no regions overlap. Without a ``tree`` the regions are scanned, or a
+    ``walk`` goes from region to region: the one beyond each row, where it begins, and at which
+    point (n,).
     """
     (p, m, n), q = gains.shape, len(rows)
     normals, levels, *numbers = tree or (np.empty(0), np.empty(0))
     leaves = len(numbers[1]) - 1 if numbers else 0
-    header = [n, m, p, q, len(levels), leaves, *flags]
+    header = [n, m, p, q, len(levels), leaves, *flags, 0]
+    if walk is not None:  # in place of a tree: slacks at the start, and neighbors
+        header[-1], normals = 1 + walk[1], rows[:, -1] - rows[:, :-1] @ walk[2]
+        numbers = [walk[0]]
     floats = (np.array(tolerances), rows, gains, offsets, bounds, normals, levels)
     whole = (header, starts, [q], *numbers)
     return np.hstack(list(map(np.ravel, floats))), np.hstack(list(map(np.ravel, whole))).astype(
@@ -158,6 +167,33 @@ def _best_of_leaf(
 
 
 @compiled()
+def _walked(floats: Array, whole: Integers, theta: Array, at: int) -> int:
+    """Return the region where a line from the start of the walk ends, or where it gets lost."""
+    n, m, p, q = whole[0], whole[1], whole[2], whole[3]
+    at_start = ROWS + q * (n + 1) + p * m * n + p * m + 2 * m
+    neighbors = HEADER + p + 1
+    region: int = whole[8] - 1
+    reached = 0.0
+    for _ in range(STEPS):
+        leaves, out = np.inf, -1
+        for k in range(whole[HEADER + region], whole[HEADER + region + 1]):
+            row = ROWS + k * (n + 1)
+            slack = floats[row + n]
+            for j in range(n):
+                slack -= floats[row + j] * theta[at, j]
+            if slack < 0 and slack < floats[at_start + k]:
+                there = floats[at_start + k] / (floats[at_start + k] - slack)
+                if there < leaves:
+                    leaves, out = there, k
+        if out < 0:
+            return region
+        if leaves < reached - BACK or whole[neighbors + out] < 0:
+            return region
+        region, reached = whole[neighbors + out], max(reached, leaves)
+    return region
+
+
+@compiled()
 def _choose(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, float]:
     """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite."""
     n = whole[0]
@@ -165,7 +201,13 @@ def _choose(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int,
         if not np.isfinite(theta[at, j]):
             return -1, np.nan
     known = -np.inf
-    if whole[4] > 0:
+    if whole[8] > 0:
+        region = _walked(floats, whole, theta, at)
+        first, last = whole[HEADER + region], whole[HEADER + region + 1]
+        known = _slack(floats, n, first, last, theta, at, -np.inf)
+        if known >= SURELY_INSIDE:
+            return region, known
+    elif whole[4] > 0:
         first, last, room = _leaf(floats, whole, theta, at)
         best, known = _best_of_leaf(floats, whole, theta, at, first, last)
         if known >= SURELY_INSIDE or (known >= -floats[1] and room > CLEAR):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from os import PathLike, fspath
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann import _validation as check
 from sb3_yann._validation import Array, ReadOnlyArrays, as_array
 from sb3_yann.control.law._files import read_arrays, write_arrays
+from sb3_yann.control.polyhedra import largest_ball
 
 if TYPE_CHECKING:
     from sb3_yann.control.law.search_tree import SearchTree
@@ -23,6 +24,12 @@ if TYPE_CHECKING:
 INFEASIBLE = ("nearest_region", "zero_input")
 SCAN, MOST_PARAMETERS = 4, 10
 """Few regions are asked one by one. With more parameters regions have too many vertices."""
+FLAT = 3
+"""With more parameters a tree takes longer to build than the law to solve; a walk needs none."""
+
+
+def _none() -> NDArray[np.int64]:
+    return np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +61,9 @@ class PiecewiseAffine(ReadOnlyArrays):
     disjoint : bool, default False
         That no two regions share an interior, which is not checked. The search then ends at the
         first region that holds theta.
+    neighbors : ndarray of int, shape (q,), optional
+        The region beyond each half-space, -1 where none is known. Disjoint regions that are many
+        are then found by a walk along a line, without a tree. Empty where there is no region known.
 
     Examples
     --------
@@ -76,6 +86,7 @@ class PiecewiseAffine(ReadOnlyArrays):
     theta_max: Array
     infeasible: str = "nearest_region"
     disjoint: bool = False
+    neighbors: NDArray[np.int64] = field(default_factory=_none, compare=False)
 
     # So far outside a point still counts as inside: facets of neighbors agree to rounding only.
     tolerance = 1e-8
@@ -102,9 +113,18 @@ class PiecewiseAffine(ReadOnlyArrays):
                 f"starts = {rows.tolist()} must be the first row of each region in A, which has "
                 f"{len(A)} rows: whole numbers that increase from 0 on."
             )
-        starts = rows.astype(np.int64)
-        starts.setflags(write=False)
-        self._store(**values, starts=starts)
+        beyond = np.asarray(self.neighbors)
+        if beyond.size and not (
+            beyond.shape == (len(A),)
+            and beyond.dtype.kind == "i"
+            and np.all((beyond >= -1) & (beyond < p))
+        ):
+            raise ValueError(
+                f"neighbors must be {len(A)} whole numbers, one for each row of A, from -1 to "
+                f"{p - 1}, or none at all."
+            )
+        whole = {"starts": rows.astype(np.int64), "neighbors": beyond.astype(np.int64)}
+        self._store(**values, **whole)
 
     @property
     def n_regions(self) -> int:
@@ -166,6 +186,7 @@ class PiecewiseAffine(ReadOnlyArrays):
         """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
         try:
             data = read_arrays(path)
+            data.setdefault("neighbors", _none())  # files of before
             values = {field.name: data[field.name] for field in fields(cls)}
             for name, kind in (("infeasible", str), ("disjoint", bool)):
                 values[name] = kind(values[name])
@@ -200,14 +221,21 @@ class PiecewiseAffine(ReadOnlyArrays):
 
     @cached_property
     def tree(self) -> SearchTree | None:
-        """The tree that finds a region; None for so few regions that a scan is as fast."""
+        """The tree that finds a region; None for so few that a scan is as fast, or for a walk."""
         bounded = np.all(np.isfinite([self.theta_min, self.theta_max]))
-        if self.n_regions <= SCAN or self.n_theta > MOST_PARAMETERS or not bounded:
+        few, wide = self.n_regions <= SCAN, self.n_theta > MOST_PARAMETERS
+        if few or wide or not bounded or self._walks:
             return None
         from sb3_yann.control.law.search_tree import build_tree
 
         tree = build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
         return tree if len(tree.levels) else None  # regions that no hyperplane parts
+
+    @property
+    def _walks(self) -> bool:
+        """Whether a region is found by a walk from region to region."""
+        large = self.n_regions > SCAN and self.n_theta > FLAT
+        return large and self.disjoint and self.neighbors.size > 0
 
     @cached_property
     def packed(self) -> tuple[Array, NDArray[np.int64]]:
@@ -217,8 +245,18 @@ class PiecewiseAffine(ReadOnlyArrays):
         rows, bounds = np.column_stack([self.A, self.b]), np.stack([self.u_min, self.u_max])
         tolerances = self.tolerance, self.tie_tolerance
         flags = self.infeasible == "zero_input", self.disjoint
-        tree = tuple(vars(self.tree).values()) if self.tree else ()
-        return pack(self.gains, self.offsets, rows, self.starts, bounds, tolerances, flags, tree)
+        laws = self.gains, self.offsets, rows, self.starts, bounds, tolerances, flags
+        if self._walks:
+            return pack(*laws, walk=(self.neighbors, *self._start_of_walk()))
+        return pack(*laws, tuple(vars(self.tree).values()) if self.tree else ())
+
+    def _start_of_walk(self) -> tuple[int, Array]:
+        """Return the region at the middle of the box, and a point inside it."""
+        middle, half = (self.theta_max + self.theta_min) / 2, (self.theta_max - self.theta_min) / 2
+        first = int(np.argmax(np.minimum.reduceat(self.b - self.A @ middle, self.starts)))
+        rows = slice(self.starts[first], [*self.starts, len(self.b)][first + 1])
+        inside, _ = largest_ball(self.A[rows] * half, self.b[rows] - self.A[rows] @ middle)
+        return first, middle + half * inside
 
     @cached_property
     def _at(self) -> Callable[[Any, Array], bool]:

@@ -31,14 +31,18 @@ def many_regions(infeasible: str = "nearest_region") -> PiecewiseAffine:
 
 @cache
 def two_masses() -> PiecewiseAffine:
-    """The law of two masses on springs: 4 parameters, 2 inputs, and regions that are long."""
+    """The law of two masses on springs: 4 parameters, 2 inputs, and regions that are long.
+
+    Its neighbors are left out: with them it has no tree.
+    """
     springs = np.array([[-2.0, 1.0], [1.0, -2.0]])
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [springs, -0.1 * np.eye(2)]])
     B = np.vstack([np.zeros((2, 2)), np.eye(2)])
-    return LinearMPC(
+    law = LinearMPC(
         LinearModel.from_continuous(A, B, 0.5), Q=np.eye(4), R=np.eye(2), horizon=2,
         theta_min=[-8] * 4, theta_max=[8] * 4, u_min=[-1, -1], u_max=[1, 1],
     ).explicit()  # fmt: skip
+    return replace(law, neighbors=np.empty(0, np.int64))
 
 
 LAWS = pytest.mark.parametrize("make", [many_regions, two_masses])
@@ -46,7 +50,7 @@ LAWS = pytest.mark.parametrize("make", [many_regions, two_masses])
 
 def scanned(law: PiecewiseAffine, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     region, inside = np.empty(len(points), np.int64), np.empty(len(points))
-    law = replace(law)
+    law = replace(law, neighbors=np.empty(0, np.int64))
     law.__dict__["tree"] = None
     locate_batch(*law.packed, np.ascontiguousarray(points), region, inside)
     return region, inside
