@@ -166,9 +166,11 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     before = None if layer.network.is_zero() else searches[0].checks[0]
     leg = min(iterations, max(check_every, -(-iterations // RACE)))
     total = iterations + (len(searches) - 1) * leg
-    for _ in track(_race(searches, leg), "improving", total, disable=not progress_bar):
+    for _ in track(
+        _race(searches, leg, _least(twin)), "improving", total, disable=not progress_bar
+    ):
         pass
-    search = _best(searches)
+    search = min(searches, key=lambda each: each.change)
     change, own = search.change, policy.actor.mu.state_dict()
     moved = any(not th.equal(own[key].cpu(), each) for key, each in search.accepted.items())
     if not moved or change > -_least(twin):
@@ -182,18 +184,19 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     return Improvement(tuple(search.checks), change, True, before)
 
 
-def _race(searches: list[Search], leg: int) -> Iterator[int]:
-    """Yield after each gradient step: of all searches in the first leg, then of the best one."""
+def _race(searches: list[Search], leg: int, least: float) -> Iterator[int]:
+    """Yield after each gradient step: of all searches in the first leg, then of the best one.
+
+    The others follow where that finds nothing worth a change.
+    """
     if len(searches) > 1:
         for each in searches:
             yield from each.steps(leg)
-    best = _best(searches)
-    yield from best.steps(best.pace.iterations)
+    for each in sorted(searches, key=lambda each: each.change):
+        yield from each.steps(each.pace.iterations)
+        if each.change <= -least:
+            break
 
 
 def _least(twin: PlantTwin) -> float:
     return SURELY if twin.trust.error_ratio < 0.5 else LEAST
-
-
-def _best(searches: list[Search]) -> Search:
-    return min(searches, key=lambda each: each.change)

@@ -40,9 +40,9 @@ class Starts:
         first = np.array([each.thetas[0] for each in episodes])
         rows = np.concatenate([each.thetas[:-1] for each in episodes])
         n = problem.model.n_states
-        x, k = first[:, :n], max(len(first), 2)
+        x, k = first[:, :n], len(first)
         middle, half = (x.max(0) + x.min(0)) / 2, (x.max(0) - x.min(0)) / 2
-        half = half * min(WIDEST, (k + 1) / (k - 1))
+        half = half * _widened(k)
         low = np.maximum(middle - half, problem.theta_min[:n])
         high = np.minimum(middle + half, problem.theta_max[:n])
         return cls(problem, low, high, first, rows)
@@ -60,11 +60,14 @@ class Starts:
     def draw_around(self, count: int, rng: np.random.Generator) -> Array:
         """Return thetas (count, n_theta) from boxes up to three times as wide: nothing is known.
 
-        Those that the law has no solution for are replaced by logged ones.
+        How wide is drawn as :meth:`rareness` has it: the fewer starts there are in the log, the
+        wider. Those that the law has no solution for are replaced by logged ones.
         """
-        drawn, n = self.draw(count, rng), len(self.low)
+        drawn, n, k = self.draw(count, rng), len(self.low), len(self.first)
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
-        reach = rng.uniform(1, AROUND, (count, 1)) * half
+        nearest = (1 + _widened(k)) / 2
+        ranges = 2 * nearest * rng.uniform(size=(count, 1)) ** (-1 / max(k - 1, 1)) - 1
+        reach = np.minimum(ranges / _widened(k), AROUND) * half
         drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
         drawn = np.clip(drawn, self.problem.theta_min, self.problem.theta_max)
         outside = ~self.problem.law().in_domain(drawn)
@@ -89,3 +92,8 @@ class Starts:
         third = count // 3
         parts = self.draw_logged(third, rng), self.draw_around(third, rng)
         return np.concatenate([self.draw(count - 2 * third, rng), *parts])
+
+
+def _widened(k: int) -> float:
+    """Return how many times as wide as the range of k starts their box is."""
+    return min(WIDEST, (k + 1) / max(k - 1, 1))
