@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from tqdm import tqdm  # type: ignore[import-untyped]
 
@@ -70,13 +70,12 @@ class SolveBudget:
 
 
 class BudgetTimer:
-    """Counts the regions and, from now on, the time of one search, and ends it at its limits."""
+    """Counts regions and, from now on, the time of a search and its check; ends them at a limit."""
 
     def __init__(self, budget: SolveBudget) -> None:
         self.budget, self.found, self._start = budget, 0, time.monotonic()
-        self._bar = tqdm(
-            desc="Critical regions", unit=" regions", leave=False, disable=not budget.progress
-        )
+        self._done = ""
+        self._bar = self._new_bar("Critical regions", None)
 
     def __enter__(self) -> BudgetTimer:
         return self
@@ -93,12 +92,26 @@ class BudgetTimer:
             self._stop(f"The law has more than region_limit = {most} regions")
         self.tick()
 
+    def stage(self, name: str, done: str, steps: int) -> None:
+        """Begin to show another stage, of so many steps; ``done`` says what has been before."""
+        self._bar.close()
+        self._done, self._bar = f" {done}", self._new_bar(name, steps)
+
+    def advance(self, more: int = 1) -> None:
+        """Count steps of a stage; raise ExplicitLimitError if the time is over."""
+        self._bar.update(more)
+        self.tick()
+
     def tick(self) -> None:
         """Raise ExplicitLimitError if the time is over."""
         most = self.budget.time_limit
         if most is not None and time.monotonic() - self._start > most:
             self._stop(f"The law was not solved in time_limit = {most:g} s")
 
+    def _new_bar(self, name: str, total: int | None) -> Any:
+        hidden = not self.budget.progress
+        return tqdm(desc=name, total=total, unit=" regions", leave=False, disable=hidden)
+
     def _stop(self, what: str) -> NoReturn:
         found = f"{self.found} regions were found in {time.monotonic() - self._start:.1f} s"
-        raise ExplicitLimitError(f"{what}: {found}. {_ADVICE}", self.found)
+        raise ExplicitLimitError(f"{what}: {found}{self._done}. {_ADVICE}", self.found)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.kkt import Optimality, optimality
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
 from sb3_yann.control.polyhedra import Region, farthest_points, largest_ball
@@ -59,12 +60,20 @@ class Certificate:
         The scaled program, and what was found.
     center, half : ndarray, shape (n,)
         Take theta to the units of the problem.
+    timer : BudgetTimer, optional
+        Shows how far the check is, and ends it.
     """
 
     def __init__(
-        self, program: ParametricQP, regions: list[Region], center: Array, half: Array
+        self,
+        program: ParametricQP,
+        regions: list[Region],
+        center: Array,
+        half: Array,
+        timer: BudgetTimer | None = None,
     ) -> None:
         self.program, self.regions, self.center, self.half = program, regions, center, half
+        self.timer = timer or BudgetTimer(SolveBudget())
         self.by_set = {as_bits(region.active_set): i for i, region in enumerate(regions)}
         self.outer = np.column_stack(program.theta_rows())
 
@@ -84,10 +93,14 @@ class Certificate:
         self.starts = np.cumsum([0, *(len(region.b) for region in self.regions[:-1])])
         balls = [region.ball() for region in self.regions]
         inside = np.array([middle for middle, _ in balls])
-        answers = [self.program.solve(middle) for middle in inside]
-        for i, U in enumerate(answers):
-            if U is None:
-                self._fail(f"the law of region {i} is not optimal inside it", inside[i])
+        # Two looks at each region.
+        self.timer.stage("Checked", "and not all were checked", 2 * len(balls))
+        answers = []
+        for i, middle in enumerate(inside):
+            answers.append(self.program.solve(middle))
+            if answers[-1] is None:
+                self._fail(f"the law of region {i} is not optimal inside it", middle)
+            self.timer.advance()
         off = self._off(np.arange(len(balls)), inside, np.array(answers))
         if np.max(off) > LAW:
             i = int(np.argmax(off > LAW))
@@ -101,6 +114,7 @@ class Certificate:
             self._require_neighbors(i, same, each)
             if np.abs(each.law[:, :-1]).max() > STEEP:
                 refined[i] = replace(region, gain=each.law[:, :-1], offset=each.law[:, -1])
+            self.timer.advance()
         self._require_agreement()
         self._require_no_doubles(balls)
         return refined

@@ -52,12 +52,16 @@ def solve_explicit(
     with BudgetTimer(budget) as timer:
         regions = _critical_regions(units.scaled, solver, timer)
         try:
-            regions = Certificate(units.scaled, regions, units.center, units.half).check()
+            regions = Certificate(units.scaled, regions, units.center, units.half, timer).check()
         except ExplicitSolutionError as error:
             if solver == "walk":
                 raise
             raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
-        return units.law(regions, infeasible)
+        law = units.law(regions, infeasible)
+        if not law.walks:
+            timer.stage("Search tree", "and checked", law.n_regions)
+            law.grow_tree(timer.advance)
+        return law
 
 
 def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> list[Region]:

@@ -28,6 +28,10 @@ FLAT = 3
 """With more parameters a tree takes longer to build than the law to solve; a walk needs none."""
 
 
+def _ignore(count: int) -> None:
+    """Take no notice of progress."""
+
+
 def _none() -> NDArray[np.int64]:
     return np.empty(0, np.int64)
 
@@ -222,17 +226,28 @@ class PiecewiseAffine(ReadOnlyArrays):
     @cached_property
     def tree(self) -> SearchTree | None:
         """The tree that finds a region; None for so few that a scan is as fast, or for a walk."""
+        return self._new_tree(_ignore)
+
+    def grow_tree(self, advance: Callable[[int], None]) -> None:
+        """Build the tree now, so that no call does; ``advance`` counts regions, or 0, now and then.
+
+        What it raises ends the work.
+        """
+        vars(self)["tree"] = self._new_tree(advance)
+
+    def _new_tree(self, advance: Callable[[int], None]) -> SearchTree | None:
         bounded = np.all(np.isfinite([self.theta_min, self.theta_max]))
         few, wide = self.n_regions <= SCAN, self.n_theta > MOST_PARAMETERS
-        if few or wide or not bounded or self._walks:
+        if few or wide or not bounded or self.walks:
             return None
         from sb3_yann.control.law.search_tree import build_tree
 
-        tree = build_tree(self.A, self.b, self.starts, self.theta_min, self.theta_max)
+        box = self.theta_min, self.theta_max
+        tree = build_tree(self.A, self.b, self.starts, *box, advance)
         return tree if len(tree.levels) else None  # regions that no hyperplane parts
 
     @property
-    def _walks(self) -> bool:
+    def walks(self) -> bool:
         """Whether a region is found by a walk from region to region."""
         large = self.n_regions > SCAN and self.n_theta > FLAT
         return large and self.disjoint and self.neighbors.size > 0
@@ -246,7 +261,7 @@ class PiecewiseAffine(ReadOnlyArrays):
         tolerances = self.tolerance, self.tie_tolerance
         flags = self.infeasible == "zero_input", self.disjoint
         laws = self.gains, self.offsets, rows, self.starts, bounds, tolerances, flags
-        if self._walks:
+        if self.walks:
             return pack(*laws, walk=(self.neighbors, *self._start_of_walk()))
         return pack(*laws, tuple(vars(self.tree).values()) if self.tree else ())
 

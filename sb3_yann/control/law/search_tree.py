@@ -6,6 +6,7 @@ tree", with vertices in place of their linear programs, and leaves of a few regi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from itertools import pairwise
@@ -86,7 +87,12 @@ class _Polytopes:
 
 
 def build_tree(
-    A: Array, b: Array, starts: Integers, theta_min: Array, theta_max: Array
+    A: Array,
+    b: Array,
+    starts: Integers,
+    theta_min: Array,
+    theta_max: Array,
+    advance: Callable[[int], None] = lambda count: None,
 ) -> SearchTree:
     """Return a tree for the regions of a :class:`PiecewiseAffine`, the same for the same law.
 
@@ -97,11 +103,13 @@ def build_tree(
     ----------
     A, b, starts, theta_min, theta_max : ndarray, shapes (q, n), (q,), (p,), (n,) and (n,)
         The half-spaces of the law, the first row of each region, and the box, bounded.
+    advance : callable, optional
+        Gets 1 for each region and 0 for each node; what it raises ends the work.
     """
     center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
-    regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)))
+    regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)), advance)
     random = np.random.default_rng(0)
-    tree = _grow(regions, random)
+    tree = _grow(regions, random, advance)
     if not len(tree.levels):  # regions that no hyperplane parts
         return tree
     in_box, leaf_regions = tree.normals / half, _often_first(tree, regions, random)
@@ -109,7 +117,9 @@ def build_tree(
     return replace(tree, normals=in_box, levels=in_all, leaf_regions=leaf_regions)
 
 
-def _grow(regions: _Polytopes, random: np.random.Generator) -> SearchTree:
+def _grow(
+    regions: _Polytopes, random: np.random.Generator, advance: Callable[[int], None]
+) -> SearchTree:
     """Return a tree whose nodes are split until few regions, or too many nodes, are left."""
     p, n = regions.middles.shape
     rows: list[int] = []
@@ -121,6 +131,7 @@ def _grow(regions: _Polytopes, random: np.random.Generator) -> SearchTree:
     ]
     order = 0
     while waiting:
+        advance(0)
         _, _, inside, parent, side = heappop(waiting)
         full = len(rows) >= NODES * p or len(inside) <= LEAF
         split = None if full else _best_split(regions, inside, random)
@@ -198,11 +209,16 @@ def _hits(  # noqa: PLR0913 (compiled: plain arrays)
                 break
 
 
-def _polytopes(A: Array, b: Array, row_starts: Integers) -> _Polytopes:
+def _polytopes(
+    A: Array, b: Array, row_starts: Integers, advance: Callable[[int], None]
+) -> _Polytopes:
     length = np.linalg.norm(A, axis=1)
     length[length == 0] = 1.0
     A, b = A / length[:, None], b / length
-    corners = [vertices(A[i:j], b[i:j]) for i, j in pairwise(row_starts)]
+    corners = []
+    for i, j in pairwise(row_starts):
+        corners.append(vertices(A[i:j], b[i:j]))
+        advance(1)
     counts = np.array([len(each) for each in corners])
     vertex_starts = np.append(0, np.cumsum(counts, dtype=np.int64))
     points = np.ascontiguousarray(np.concatenate(corners))

@@ -9,6 +9,8 @@ import pytest
 
 from sample_problems import PROBLEMS, benchmark, box_points, solved
 from sb3_yann.control import ExplicitLimitError
+from sb3_yann.control.explicit import certificate
+from sb3_yann.control.law import search_tree
 
 
 @pytest.mark.parametrize("name", ["pendulum", "reactor", "benchmark", "one state", "discounted"])
@@ -88,3 +90,41 @@ def test_a_law_that_is_there_keeps_to_the_limit_of_regions() -> None:
     with pytest.raises(ExplicitLimitError, match="9 regions, more than region_limit = 8") as error:
         mpc.explicit(region_limit=8)
     assert error.value.n_regions == 9
+
+
+@pytest.mark.parametrize(
+    ("stage", "message"),
+    [
+        ("Certificate.check", "and not all were checked"),
+        ("build_tree", "and checked"),
+    ],
+)
+def test_the_limit_of_time_holds_for_check_and_tree_too(stage, message, monkeypatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr("sb3_yann.control.explicit.budget.time.monotonic", lambda: clock[0])
+    module = certificate if stage.startswith("Certificate") else search_tree
+    owner, name = (module.Certificate, "check") if module is certificate else (module, stage)
+    original = getattr(owner, name)
+
+    def later(*args: Any, **options: Any) -> Any:
+        clock[0] = 100.0
+        return original(*args, **options)
+
+    monkeypatch.setattr(owner, name, later)
+    with pytest.raises(ExplicitLimitError, match=f"time_limit = 50 s: 9 regions .*{message}"):
+        benchmark().explicit(time_limit=50)
+    monkeypatch.setattr(owner, name, original)
+    assert benchmark().explicit(time_limit=1000).n_regions == 9
+
+
+def test_progress_shows_check_and_tree(capfd: Any) -> None:
+    benchmark().explicit(progress=True)
+    shown = capfd.readouterr().err
+    assert all(stage in shown for stage in ("Critical regions", "Checked", "Search tree"))
+
+
+def test_a_law_that_was_solved_builds_nothing_when_it_is_called(monkeypatch) -> None:
+    law = benchmark().explicit()
+    monkeypatch.setattr(search_tree, "build_tree", None)
+    assert law.tree is not None
+    law(np.zeros(law.n_theta))
