@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks import (
     evaluation,
     exactness,
+    large,
     networks,
     offline,
     online,
@@ -45,7 +46,7 @@ class Criterion:
 
 def criteria(figures: Figures) -> list[Criterion]:
     """Return every requirement whose figures are there."""
-    parts = (_law, _batch, _actor, _training, _exact, _suite, _solve, _online, _steps)
+    parts = (_law, _batch, _actor, _training, _exact, _suite, _solve, _large, _online, _steps)
     return [line for part in parts for line in part(figures)]
 
 
@@ -169,6 +170,18 @@ def _solve(figures: Figures) -> Iterator[Criterion]:
         if size > offline.SMALL:
             each = ours.middle / size
             yield Criterion(what, "at most 0.5 ms a region", seconds(each), each <= 5e-4)
+
+
+def _large(figures: Figures) -> Iterator[Criterion]:
+    for column in figures.columns(large.SECTION):
+        for name, most, required in (
+            (large.SOLVED, 30.0, "in 30 s"),
+            (large.EACH, 5e-6, "at most 5 µs a point"),
+        ):
+            found = figures.get(large.SECTION, name, column)
+            if found is not None:
+                what, shown = f"{large.SECTION}, {column}", seconds(found.middle)
+                yield Criterion(what, required, shown, found.middle <= most)
 
 
 def _online(figures: Figures) -> Iterator[Criterion]:

@@ -22,9 +22,9 @@ SECTION = "memory"
 def memory(bench: Bench, problem: Problem) -> None:
     """Count the bytes of what there is at one problem."""
     law = problem.law
-    law(problem.points(1)[0])  # the search tree is made when it is first needed
+    law(problem.points(1)[0])  # what compiled code takes is made when it is first needed
     found = {"law, regions and gains": sum(arrays(law.__dict__, nested=False))}
-    found["law, with its search tree"] = sum(arrays(law.__dict__))
+    found["law, with what finds its regions"] = sum(arrays(law.__dict__))
     for name, policy in (("ours", YannPolicy), (peers.MLP, "MlpPolicy")):
         model = learner(problem, policy)
         fill(model, problem)

@@ -13,9 +13,8 @@ from benchmarks.timing import Array, Task
 from sb3_yann.control import ParametricQP
 
 SECTION = "offline solution"
-OURS = "ours, with its check"
+OURS = "ours, with its check and search tree"
 EACH = "ours, for each region"
-TREE = "ours, the law's search tree, once"
 SMALL = 300
 """Regions up to which ppopt takes seconds."""
 
@@ -35,7 +34,6 @@ def offline(bench: Bench, problem: Problem) -> None:
         found = bench.watch.compare(tasks)
     bench.figures.add(timed(SECTION, regions, found))
     bench.figures.add([Figure(SECTION, EACH, str(regions), found[OURS] / regions)])
-    bench.figures.add([Figure(SECTION, TREE, str(regions), np.array([problem.tree_seconds]))])
 
 
 def solve(problem: Problem) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -22,13 +21,10 @@ class Problem:
     ----------
     name : str
     make : callable
-    tree_seconds : float
-        What the first location took, once the law was there: it makes the search tree.
     """
 
     name: str
     make: Callable[[], LinearMPC]
-    tree_seconds: float = float("nan")
 
     @cached_property
     def mpc(self) -> LinearMPC:
@@ -37,13 +33,9 @@ class Problem:
 
     @cached_property
     def law(self) -> PiecewiseAffine:
-        """Its explicit law, with its search tree."""
+        """Its explicit law, ready to be asked."""
         _compile()
-        law = self.mpc.explicit()
-        began = time.perf_counter()
-        law.locate((law.theta_min + law.theta_max) / 2)
-        self.tree_seconds = time.perf_counter() - began
-        return law
+        return self.mpc.explicit()
 
     @property
     def regions(self) -> int:

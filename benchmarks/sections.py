@@ -12,6 +12,7 @@ from benchmarks import (
     evaluation,
     exactness,
     gpu,
+    large,
     memory,
     networks,
     offline,
@@ -33,6 +34,7 @@ TITLES = {
     offline.SECTION: "Offline solution",
     exactness.SECTION: "Exactness",
     suite.SECTION: "Suite of problems",
+    large.SECTION: "A large law",
     online.LAW: "The online law in numpy, one point",
     online.PREDICT: "The online law: model.predict of one observation",
     online.TRAIN: "The online law: one training step of DDPG, batch of 256",
@@ -51,8 +53,14 @@ EACH: dict[str, PerProblem] = {
     "exact": exactness.exactness,
     "memory": memory.memory,
 }
-ENVS, GPU, ONLINE, SUITE = "env", "gpu", "online", "suite"
-NAMES = (*EACH, SUITE, ONLINE, ENVS, GPU)
+WHOLE: dict[str, Callable[[Bench], None]] = {
+    "suite": suite.suite,
+    "large": large.large,
+    "online": online.online,
+    "env": simulators.simulators,
+}
+GPU = "gpu"
+NAMES = (*EACH, *WHOLE, GPU)
 
 
 def run(bench: Bench, names: Sequence[str]) -> None:
@@ -60,12 +68,8 @@ def run(bench: Bench, names: Sequence[str]) -> None:
     problems = [SMALLEST] if bench.quick else PROBLEMS
     for name in names:
         before, began = set(bench.figures.sections()), time.perf_counter()
-        if name == ENVS:
-            simulators.simulators(bench)
-        elif name == SUITE:
-            suite.suite(bench)
-        elif name == ONLINE:
-            online.online(bench)
+        if name in WHOLE:
+            WHOLE[name](bench)
         elif name == GPU:
             _devices(bench, problems)
         else:
