@@ -13,7 +13,8 @@ from sb3_yann._validation import Array, as_array, as_positive, as_vector
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.linear_system import LinearSystem, zero_order_hold
-from sb3_yann.control.linearization.linearize import linearize_dynamics, linearize_env
+from sb3_yann.control.linearization.dynamics import linearize_dynamics
+from sb3_yann.control.linearization.linearize import linearize_env
 from sb3_yann.control.model.report import describe
 from sb3_yann.control.model.statespace import from_control
 
@@ -126,9 +127,11 @@ class LinearModel(LinearSystem):
         Parameters
         ----------
         f : callable
-            Takes x (n,) and u (m,), with ``d_ss`` also d (d,); returns dx/dt (n,).
+            Takes x (n,) and u (m,), with ``d_ss`` also d (d,); returns dx/dt (n,). Functions of
+            columns (n, 1) are called with such.
         x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,)
-            The operating point, a steady state of ``f``; d_ss is optional.
+            The operating point, a steady state of ``f``; d_ss is optional. Entries of x_ss and u_ss
+            that are NaN are solved for; the notes name other solutions that were met.
         dt : float
             Sampling time.
         scale : array_like, shape (n,) or (n + m + d,), or float, optional
@@ -139,13 +142,14 @@ class LinearModel(LinearSystem):
         ------
         ValueError
             If ``f`` returns another shape or NaN at the operating point, has a kink or a jump
-            there, or the state moves by more than 0.1 % of ``scale`` within one sample.
+            there, or the state moves by more than 0.1 % of ``scale`` within one sample. Also if no
+            steady state is found.
 
         Examples
         --------
-        >>> tank = LinearModel.from_dynamics(lambda x, u: u - x**0.5, [4], [2], dt=1)
-        >>> tank.A.round(3).tolist(), tank.B.round(3).tolist()  # e^(-1/4) and 4 (1 - e^(-1/4))
-        ([[0.779]], [[0.885]])
+        >>> tank = LinearModel.from_dynamics(lambda x, u: u - x**0.5, [4], [np.nan], dt=1)
+        >>> tank.u_ss.round(6).tolist(), tank.A.round(3).tolist()  # e^(-1/4)
+        ([2.0], [[0.779]])
         """
         return cls(**vars(linearize_dynamics(f, x_ss, u_ss, dt, d_ss, scale)))
 
