@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +15,9 @@ from sb3_yann._validation import Array, to_float
 from sb3_yann.control.linear_system import LinearSystem, names
 from sb3_yann.control.linearization.connect import connect
 from sb3_yann.control.linearization.differences import curvature, differences, idle_inputs
+from sb3_yann.control.linearization.episodes import episode_faults
 from sb3_yann.control.linearization.finite_differences import Jacobian
+from sb3_yann.control.linearization.noise import MOST, noise_of
 from sb3_yann.control.linearization.simulator import Simulator, borrow, sample_time, to_vector
 from sb3_yann.control.linearization.steady_state import require_steady_state, steady_state
 
@@ -22,6 +26,8 @@ if TYPE_CHECKING:
 
 LONGEST = 0.01  # longest step of a difference, relative to the scale of its coordinate
 LONGEST_SINGLE = 0.05  # the same where states are read in float32
+LONGEST_NOISY = 0.2  # the same where an adaptive integrator leaves noise
+NOISY, LEAST = 10.0, 1e-10  # from where on noise counts: beside rounding, and in scales
 
 
 def linearize_env(
@@ -46,7 +52,11 @@ def linearize_env(
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)
         x, u = _partly_known("state", state), _partly_known("action", action)
-        return _linearize(simulator, x, u, step_time, scale)
+        found = _linearize(simulator, x, u, step_time, scale)
+        faults = episode_faults(borrowed.env, found.u_ss) if borrowed.private else []
+        for fault in faults:
+            warnings.warn(fault, stacklevel=3)
+        return replace(found, notes=(*found.notes, *faults))
 
 
 def _linearize(
@@ -65,7 +75,7 @@ def _linearize(
     n = size.size
     free = np.isnan(np.concatenate([np.full(n, np.nan) if x is None else x, u]))
     point = steady_state(simulator, np.concatenate([x_start, u_start]), free, scales)
-    found = _differentiate(simulator, point, scales)
+    found, noise = _differentiate(simulator, point, scales)
     if not np.any(free):
         require_steady_state(simulator, point, found.value, scales)
     A, B = found.value[:, :n], found.value[:, n:]
@@ -75,6 +85,7 @@ def _linearize(
         f"{simulator.setter} and read from {simulator.reader}.",
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
         "for and the others given or taken from the middle of the action space.",
+        *_noise(found, noise),
         *_remarks(simulator, point),
         *curvature(found, names((n, u.size))),
         f"The simulator was {simulator.origin}.",
@@ -100,8 +111,8 @@ def _partly_known(name: str, value: ArrayLike | None) -> Array | None:
     return array
 
 
-def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian:
-    """Return the Jacobian (n, n+m) of the next state with respect to state and action."""
+def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Jacobian, float]:
+    """Return the Jacobian (n, n+m) of the next state, and the simulator's noise in scales."""
     space = simulator.env.action_space
     n = scale.size - space.shape[0]
     room = np.minimum(point[n:] - space.low, space.high - point[n:]).astype(np.float64)
@@ -124,8 +135,29 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian
     longest = (LONGEST_SINGLE if single else LONGEST) * scale
     spacing = np.finfo(np.float32 if single else np.float64).eps
     rounding = spacing * np.maximum(np.abs(readings[0]), longest[:n])
+    noise = noise_of(
+        lambda z: step(actual(z)), point, np.where(np.arange(scale.size) < n, scale, 0.0)
+    )
+    noise = np.where(noise > np.maximum(NOISY * rounding, LEAST * scale[:n]), noise, 0.0)
+    if np.any(noise > MOST * scale[:n]):
+        noise = np.zeros(n)  # no noise that differences could cope with
+    rough = float(np.max(noise / scale[:n]))
+    longest = np.maximum(longest, np.minimum(1e6 * rough, LONGEST_NOISY) * scale)
     longest[n:] = np.minimum(longest[n:], room)
-    return differences(step, point, longest, rounding, names((n, room.size)), actual)
+    labels = names((n, room.size))
+    found = differences(step, point, longest, np.maximum(rounding, noise), labels, actual)
+    return found, rough
+
+
+def _noise(found: Jacobian, noise: float) -> list[str]:
+    """Return a note on a simulator whose own error is noise to differences."""
+    if not noise:
+        return []
+    return [
+        f"The simulator's results carry an error of {noise:.1e} of a state's scale, as adaptive "
+        f"integrators do: steps went up to {np.max(found.steps):.3g}, and the derivatives of two "
+        f"step sizes agree within {found.doubt:.1%}. Tighten its tolerances for better ones."
+    ]
 
 
 def _remarks(simulator: Simulator, point: Array) -> list[str]:

@@ -168,7 +168,8 @@ class LinearModel(LinearSystem):
         """Linearize one step of a simulator and its wrappers by central differences.
 
         An environment is deep-copied. One that cannot be copied is used itself and needs a reset
-        afterwards; the notes then say so.
+        afterwards; the notes then say so. Noise of an adaptive integrator lengthens the steps. An
+        env that ignores seeds, or terminates at a time limit, is warned of.
 
         Parameters
         ----------
@@ -184,10 +185,12 @@ class LinearModel(LinearSystem):
             or ``DT`` of its module. Pass it if a wrapper repeats actions.
         set_state : callable, optional
             ``set_state(env, x)`` puts the environment into the state x. The default is the first of
-            ``env.reset(options={"state": x})`` and ``env.unwrapped.state = x`` that works.
+            ``env.reset(options={"state": x})``, ``env.unwrapped.state = x`` and MuJoCo's
+            ``env.unwrapped.set_state(qpos, qvel)`` that works.
         get_state : callable, optional
             ``get_state(env)`` returns the state, shape (n,). The default is the first that works of
-            ``info["state"]``, ``env.unwrapped.state`` and the observation.
+            ``info["state"]``, ``env.unwrapped.state``, MuJoCo's ``[qpos, qvel]`` and the
+            observation.
         scale : array_like, shape (n,), or float, optional
             Range in which each state moves in use. Steps are at most 1 % of it, 5 % for float32
             states; a given steady state may be 1 % off. The default is half the width of the

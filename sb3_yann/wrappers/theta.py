@@ -12,11 +12,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, NonFiniteWarning, as_number, as_whole
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann._validation import Array, NonFiniteWarning, as_whole
+from sb3_yann.control import DisturbanceObserver
+from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
-Vector = NDArray[np.floating[Any]]
-Env = gym.Env[Vector, Vector]
 Schedule = Callable[[int], ArrayLike]
 """The reference after so many steps of an episode."""
 
@@ -31,8 +30,8 @@ class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
         self, env: Env, low: ArrayLike, high: ArrayLike, n_replaced: int = 0, n_new: int = 0
     ) -> None:
         super().__init__(env)
-        inner = _require_vector(self, "observation_space")
-        self.inputs = _require_vector(self, "action_space")
+        inner = require_vector(self, "observation_space")
+        self.inputs = require_vector(self, "action_space")
         self.low, self.high = (np.atleast_1d(np.array(side, np.float64)) for side in (low, high))
         if self.low.ndim != 1 or self.low.shape != self.high.shape:
             raise ValueError(
@@ -89,7 +88,7 @@ class PreviousInput(_Appending):
     """
 
     def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
-        bounds = _require_vector(env, "action_space")
+        bounds = require_vector(env, "action_space")
         super().__init__(env, bounds.low, bounds.high)
         start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
         if start.shape != bounds.shape:
@@ -266,78 +265,3 @@ class ObserveDisturbance(_Appending):
             measured[failing] = expected[failing]
         x_hat, d_hat = observer.reset(measured) if u is None else observer.update(measured, u)
         return _joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
-
-
-class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
-    """Makes the reward minus the stage cost of the problem, for which the critic is exact.
-
-    The cost is that of the observed theta and of the input played there. A step in which the input
-    moves by more than the problem allows reports ``info["violation"]``.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        Its observation is the theta of the problem.
-    problem : LinearMPC
-    violation_cost : float, default 0
-        Added to the cost of a step that reports ``info["violation"]``.
-
-    Examples
-    --------
-    >>> plant = gym.make("CSTR-v0")
-    >>> env = StageCost(plant, plant.observation_space.problem, violation_cost=10)
-    >>> _ = env.reset(seed=0)
-    >>> env.step(np.zeros(1, np.float32))[1] < 0
-    True
-    """
-
-    def __init__(self, env: Env, problem: LinearMPC, violation_cost: float = 0.0) -> None:
-        super().__init__(env)
-        space = _require_vector(env, "observation_space")
-        self.inputs = _require_vector(env, "action_space")
-        names = problem.layout.names
-        if space.shape != (problem.n_theta,):
-            raise ValueError(
-                f"The observation has shape {space.shape}, but theta = [{', '.join(names)}] has "
-                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order."
-            )
-        self.problem, self.violation_cost = problem, as_number("violation_cost", violation_cost)
-        self.theta: Array = np.zeros(problem.n_theta)
-
-    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
-        """Start an episode."""
-        observation, info = self.env.reset(**kwargs)
-        self.theta = np.asarray(observation, np.float64)
-        return observation, info
-
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Step; the reward is the one of this wrapper."""
-        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
-        cost = float(self.problem.stage_cost(self.theta, u))
-        observation, _, terminated, truncated, info = self.env.step(action)
-        if self._too_fast(u):
-            info = {**info, "violation": True}
-        cost += self.violation_cost if info.get("violation") else 0.0
-        self.theta = np.asarray(observation, np.float64)
-        return observation, -cost, terminated, truncated, info
-
-    def _too_fast(self, u: Array) -> bool:
-        """Tell whether u moves from u_prev by more than its bounds, and rounding, allow."""
-        mpc = self.problem
-        if not mpc.has_rate_bounds:
-            return False
-        moved = u - self.theta[mpc.layout.previous]
-        rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
-        low, high = mpc.rate.du_min - rounding, mpc.rate.du_max + rounding
-        return bool(np.any((moved < low) | (moved > high)))
-
-
-def _require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:
-    """Return a space of the env, a Box with one dimension."""
-    space = getattr(env, name)
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise TypeError(
-            f"{name} is {space}, the wrappers need a Box with one dimension. Wrap the env in "
-            "gymnasium.wrappers.FlattenObservation, or observe the plant's state."
-        )
-    return space

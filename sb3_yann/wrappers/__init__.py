@@ -1,0 +1,20 @@
+"""Wrappers that complete theta, set the reward, shift units, and cure faults of episodes."""
+
+from sb3_yann.wrappers.episodes import SeededGlobals, TimeLimitIsNoTermination
+from sb3_yann.wrappers.stage_cost import StageCost
+from sb3_yann.wrappers.theta import (
+    MeasuredDisturbance,
+    ObserveDisturbance,
+    PreviousInput,
+    SetPoint,
+)
+
+__all__ = [
+    "MeasuredDisturbance",
+    "ObserveDisturbance",
+    "PreviousInput",
+    "SeededGlobals",
+    "SetPoint",
+    "StageCost",
+    "TimeLimitIsNoTermination",
+]
