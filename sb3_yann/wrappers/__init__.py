@@ -5,6 +5,7 @@ from sb3_yann.wrappers.stage_cost import StageCost
 from sb3_yann.wrappers.theta import (
     MeasuredDisturbance,
     ObserveDisturbance,
+    PastInputs,
     PreviousInput,
     SetPoint,
 )
@@ -12,6 +13,7 @@ from sb3_yann.wrappers.theta import (
 __all__ = [
     "MeasuredDisturbance",
     "ObserveDisturbance",
+    "PastInputs",
     "PreviousInput",
     "SeededGlobals",
     "SetPoint",

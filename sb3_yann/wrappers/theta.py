@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -102,6 +102,55 @@ class PreviousInput(_Appending):
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         return _joined(observation, self.initial if u is None else u)
+
+
+class PastInputs(_Appending):
+    """Appends the inputs on their way, which are states of a model with dead time.
+
+    They belong to x: wrap the env in this first. ``LinearModel.from_data(..., delay=)`` makes such
+    a model, and its report names the delays.
+
+    Parameters
+    ----------
+    env : gymnasium.Env, with one-dimensional Box spaces
+    delays : sequence of int, length m
+        For each input, how many of its past values are appended, newest first.
+    initial : array_like, shape (m,), optional
+        What was on its way at the start of an episode: zeros by default, the operating point.
+
+    Examples
+    --------
+    >>> env = PastInputs(gym.make("CSTR-v0"), delays=[2])
+    >>> _ = env.reset(seed=0), env.step(np.float32([1]))
+    >>> env.step(np.float32([-1]))[0][-2:].tolist()
+    [-1.0, 1.0]
+    """
+
+    def __init__(self, env: Env, delays: Sequence[int], initial: ArrayLike | None = None) -> None:
+        bounds = require_vector(env, "action_space")
+        hint = "It counts past values of an input."
+        self.delays = [as_whole("delays", each, 0, hint) for each in delays]
+        if len(self.delays) != bounds.shape[0]:
+            raise ValueError(
+                f"delays = {self.delays} must have one entry for each of the {bounds.shape[0]} "
+                "inputs, 0 for one without dead time."
+            )
+        low, high = np.repeat(bounds.low, self.delays), np.repeat(bounds.high, self.delays)
+        super().__init__(env, low, high)
+        start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
+        if start.shape != bounds.shape:
+            raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
+        self.initial: Array = np.clip(start, bounds.low, bounds.high)
+        self.past: list[Array] = []
+
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+        longest = max(self.delays, default=0)
+        if u is None:
+            self.past = [self.initial] * longest
+        else:
+            self.past = [u, *self.past][:longest]
+        shown = [self.past[k][j] for j, delay in enumerate(self.delays) for k in range(delay)]
+        return _joined(observation, np.array(shown, np.float64))
 
 
 class SetPoint(_Appending):

@@ -21,7 +21,15 @@ def differences(
     labels: list[str],
     actual: Callable[[Array], Array] = lambda z: z,
 ) -> Jacobian:
-    """Return the Jacobian; name the coordinate where there is none."""
+    """Return the Jacobian; name the coordinate where there is none.
+
+    Parameters
+    ----------
+    f, point, steps, rounding, actual : callable, ndarray (c,) twice, ndarray (r,), callable
+        As of `jacobian`, which calls the rounding noise.
+    labels : list of str
+        The names of the coordinates.
+    """
     shortest, steps = steps / SHORTER**2, steps.copy()
     while True:
         try:

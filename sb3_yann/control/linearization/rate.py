@@ -27,7 +27,9 @@ class Rate:
 
     Examples
     --------
-    >>> Rate(lambda x, u: [[x[1, 0]], [u[0, 0]]], (2, 1))(np.array([1.0, 2.0, 3.0]))
+    >>> rate = Rate(lambda x, u: [[x[1, 0]], [u[0, 0]]], (2, 1))
+    >>> rate.choose(np.ones(3))  # it takes columns
+    >>> rate(np.array([1.0, 2.0, 3.0]))
     array([2., 3.])
     """
 
