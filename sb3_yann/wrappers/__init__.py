@@ -9,8 +9,10 @@ from sb3_yann.wrappers.theta import (
     PreviousInput,
     SetPoint,
 )
+from sb3_yann.wrappers.units import Deviations
 
 __all__ = [
+    "Deviations",
     "MeasuredDisturbance",
     "ObserveDisturbance",
     "PastInputs",

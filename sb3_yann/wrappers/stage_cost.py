@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, as_number
 from sb3_yann.control import LinearMPC
@@ -21,10 +23,13 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     Parameters
     ----------
     env : gymnasium.Env
-        Its observation is the theta of the problem.
+        Its observation is the theta of the problem, or what ``observation`` makes theta of.
     problem : LinearMPC
     violation_cost : float, default 0
         Added to the cost of a step that reports ``info["violation"]``.
+    observation : AffineObservation, optional
+        The map from an observation, absolute or normalized, to theta: the one of the policy. The
+        action is in deviations all the same.
 
     Examples
     --------
@@ -35,15 +40,27 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     True
     """
 
-    def __init__(self, env: Env, problem: LinearMPC, violation_cost: float = 0.0) -> None:
+    def __init__(
+        self,
+        env: Env,
+        problem: LinearMPC,
+        violation_cost: float = 0.0,
+        observation: Callable[[ArrayLike], Array] | None = None,
+    ) -> None:
         super().__init__(env)
         space = require_vector(env, "observation_space")
         self.inputs = require_vector(env, "action_space")
         names = problem.layout.names
-        if space.shape != (problem.n_theta,):
+        if observation is not None and not callable(observation):
+            raise TypeError(f"observation = {observation!r} must be an AffineObservation or None.")
+        self.seen: Callable[[ArrayLike], Array] = observation or _as_it_is
+        shape = np.shape(self.seen(np.zeros(space.shape)))
+        if shape != (problem.n_theta,):
+            what = "The observation" if observation is None else "What the map makes of it"
             raise ValueError(
-                f"The observation has shape {space.shape}, but theta = [{', '.join(names)}] has "
-                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order."
+                f"{what} has shape {shape}, but theta = [{', '.join(names)}] has "
+                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order, or "
+                "pass observation=AffineObservation(matrix, offset)."
             )
         self.problem, self.violation_cost = problem, as_number("violation_cost", violation_cost)
         self.theta: Array = np.zeros(problem.n_theta)
@@ -51,7 +68,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(**kwargs)
-        self.theta = np.asarray(observation, np.float64)
+        self.theta = self.seen(observation)
         return observation, info
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
@@ -62,7 +79,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         if self._too_fast(u):
             info = {**info, "violation": True}
         cost += self.violation_cost if info.get("violation") else 0.0
-        self.theta = np.asarray(observation, np.float64)
+        self.theta = self.seen(observation)
         return observation, -cost, terminated, truncated, info
 
     def _too_fast(self, u: Array) -> bool:
@@ -74,3 +91,8 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
         low, high = mpc.rate.du_min - rounding, mpc.rate.du_max + rounding
         return bool(np.any((moved < low) | (moved > high)))
+
+
+def _as_it_is(observation: ArrayLike) -> Array:
+    """Return the observation as theta."""
+    return np.asarray(observation, np.float64)

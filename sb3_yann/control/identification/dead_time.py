@@ -133,7 +133,13 @@ def with_memory_point(
 
 
 def exact_memory(A: Array, B: Array, delays: Sequence[int], n: int) -> tuple[Array, Array]:
-    """Return A and B with the rows of the past inputs, which shift, set to what they are."""
+    """Return A and B with the rows of the past inputs, which shift, set to what they are.
+
+    Parameters
+    ----------
+    A, B, delays, n : ndarray, shapes (n', n') and (n', m), list of int, and int
+        The matrices as they were fitted, the dead times, and the number of states without memory.
+    """
     A, B, row = A.copy(), B.copy(), n
     for j, delay in enumerate(delays):
         A[row : row + delay], B[row : row + delay] = 0.0, 0.0

@@ -158,7 +158,9 @@ def _with_exact_memory(system: LinearSystem, delays: list[int], n: int) -> Linea
     A, B = exact_memory(system.A, system.B, delays, n - sum(delays))
     E = system.E.copy()
     E[n - sum(delays) :] = 0.0
-    return replace(system, A=A, B=B, E=E)
+    memory = memory_labels(delays, names((0, len(delays))))
+    labels = (*names((n - sum(delays),)), *memory)
+    return replace(system, A=A, B=B, E=E, state_names=labels)
 
 
 def _memory_notes(delays: list[int], sizes: tuple[int, int, int]) -> list[str]:

@@ -23,7 +23,15 @@ def quality_notes(
     fits: tuple[Array, Array],
     ridge: float,
 ) -> list[str]:
-    """Return notes on residuals, fit, excitation and bias."""
+    """Return notes on residuals, fit, excitation, bias and poles.
+
+    Parameters
+    ----------
+    found, fitted, tested : Regression and lists of Episode
+        The fit, what it was fitted to, and what was held out.
+    fits, ridge : pair of ndarray (n,), and float
+        The fits one and more steps ahead in percent, and the penalty.
+    """
     notes = [
         f"Fitted to {found.steps} steps; one step differs from the prediction by "
         f"{listed(np.sqrt(np.diag(found.covariance)))} (standard deviation of each state)."

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, to_float
 
 CALLING = (IndexError, TypeError, ValueError)
 """What a function of columns (n, 1) raises where it gets vectors (n,)."""
@@ -68,9 +68,12 @@ class Rate:
 def _vector(value: Any, size: int) -> Array:
     """Return what f returned as a vector (n,)."""
     try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):  # a list of numbers and of arrays with one entry
-        array = np.concatenate([np.ravel(np.asarray(each, np.float64)) for each in value])
+        array = to_float("f(x, u)", value)
+    except TypeError:
+        if not isinstance(value, (list, tuple)):
+            raise
+        # A list of numbers and of arrays with one entry.
+        array = np.concatenate([np.ravel(to_float("f(x, u)", each)) for each in value])
     if array.shape not in ((size,), (size, 1), (1, size)):
         raise ValueError(
             f"f returned the shape {array.shape}, expected ({size},) or ({size}, 1): dx/dt of each "

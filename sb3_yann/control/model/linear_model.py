@@ -12,18 +12,19 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, as_array, as_positive, as_vector
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.logs import Log
-from sb3_yann.control.linear_system import LinearSystem, zero_order_hold
+from sb3_yann.control.linear_system import names, zero_order_hold
 from sb3_yann.control.linearization.dynamics import linearize_dynamics
 from sb3_yann.control.linearization.linearize import linearize_env
-from sb3_yann.control.model.report import describe
+from sb3_yann.control.model.labels import Units, as_names, as_units
+from sb3_yann.control.model.plant import Plant
 from sb3_yann.control.model.statespace import from_control
 
 if TYPE_CHECKING:
     import gymnasium
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class LinearModel(LinearSystem):
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class LinearModel(Plant):
     """The plant near an operating point: ``x[k+1] = A x[k] + B u[k] + E d[k]``, every ``dt``.
 
     ``x``, ``u`` and the measured disturbances ``d`` are deviations from the operating point
@@ -42,6 +43,10 @@ class LinearModel(LinearSystem):
     drift : array_like, shape (n,), optional
         Measured motion in one sample at the operating point, which the model leaves out. Zeros
         where it is within its uncertainty. Ignored and dropped as the notes are.
+    state_names, input_names : sequence of str, optional
+        Names for reports, n and m of them. Equality ignores them.
+    units : mapping from name to str, or sequence of n + m str, optional
+        Units of states and inputs, for reports.
 
     Examples
     --------
@@ -53,6 +58,9 @@ class LinearModel(LinearSystem):
 
     notes: tuple[str, ...] = field(init=False, repr=False, compare=False)
     drift: Array = field(init=False, repr=False, compare=False)
+    state_names: tuple[str, ...] = field(default=(), compare=False)
+    input_names: tuple[str, ...] = field(default=(), compare=False)
+    units: tuple[str, ...] = field(default=(), compare=False)
 
     def __init__(  # noqa: PLR0913 (the matrices of a plant and its operating point)
         self,
@@ -66,6 +74,9 @@ class LinearModel(LinearSystem):
         *,
         notes: Sequence[str] = (),
         drift: ArrayLike | None = None,
+        state_names: Sequence[str] = (),
+        input_names: Sequence[str] = (),
+        units: Units = (),
     ) -> None:
         A = as_array("A", A, ("n", "n"))
         n = A.shape[0]
@@ -79,7 +90,13 @@ class LinearModel(LinearSystem):
             raise ValueError(f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E.")
         x, u = as_vector("x_ss", x_ss, n), as_vector("u_ss", u_ss, B.shape[1])
         d, moved = as_vector("d_ss", d_ss, E.shape[1]), as_vector("drift", drift, n)
-        super().__init__(A, B, as_positive("dt", dt), x, u, E, d, tuple(notes), moved)
+        named = (
+            as_names("state_names", state_names, n),
+            as_names("input_names", input_names, u.size),
+        )
+        labels = [*(named[0] or names((n,))), *(named[1] or names((0, u.size)))]
+        step, kept = as_positive("dt", dt), as_units(units, labels)
+        super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept)
 
     @classmethod
     def from_continuous(
@@ -276,16 +293,3 @@ class LinearModel(LinearSystem):
         """
         A, B, E, step, notes = from_control(system, dt, disturbances)
         return cls(A, B, step, x_ss, u_ss, E, d_ss, notes=notes)
-
-    def step(self, x: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> Array:
-        """Return ``A x + B u + E d``; each is a vector or a batch of them, (batch, size)."""
-        moved = np.asarray(x) @ self.A.T + np.asarray(u) @ self.B.T
-        return moved if d is None else moved + np.asarray(d) @ self.E.T
-
-    def report(self) -> str:
-        """Return an account in words: poles, controllability, scaling, sampling and notes."""
-        return describe(self)
-
-    def __hash__(self) -> int:
-        """Return a hash that equal models share."""
-        return hash((self.A.tobytes(), self.B.tobytes(), self.dt, self.E.tobytes()))
