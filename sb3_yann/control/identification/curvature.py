@@ -10,6 +10,7 @@ from sb3_yann.control.identification.least_squares import Regression
 from sb3_yann.control.identification.logs import Episode
 
 ROWS = 4  # steps for each feature, at least: with fewer the features fit anything
+MOST = 12  # main components, at most: a long log with many states must not take minutes
 SHARE, CHANCE = 0.1, 1e-3
 """Least share of the residuals' variance, and its significance, from which curvature is named."""
 
@@ -23,7 +24,7 @@ def features(regressors: Array) -> Array:
     spread = np.sqrt(np.mean(regressors**2, axis=0))
     z = regressors / np.where(spread > 0, spread, 1.0)
     room, kept = k // ROWS - p - 1, 0
-    while kept < p and (kept + 1) * (kept + 4) / 2 <= room:
+    while kept < min(p, MOST) and (kept + 1) * (kept + 4) / 2 <= room:
         kept += 1
     if not kept:
         return np.zeros((k, 0))

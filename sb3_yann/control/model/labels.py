@@ -64,11 +64,11 @@ def labels_of(model: LinearSystem) -> tuple[list[str], list[str]]:
 
 
 def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
-    """Return the names of states and inputs, each with its unit in brackets where it has one."""
+    """Return the names of states and inputs, each with its unit in parentheses where it has one."""
     states, inputs = labels_of(model)
     units = model.units or ("",) * (len(states) + len(inputs))
     whole = [
-        f"{name} [{unit}]" if unit else name
+        f"{name} ({unit})" if unit else name
         for name, unit in zip([*states, *inputs], units, strict=True)
     ]
     return whole[: len(states)], whole[len(states) :]

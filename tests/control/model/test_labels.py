@@ -23,9 +23,9 @@ A, B = [[0.9, 0.1], [0.0, 0.8]], [[1.0], [0.5]]
 def test_names_and_units_are_shown() -> None:
     model = LinearModel(A, B, dt=1.0, **NAMES)
     report = model.report()
-    assert "States: level [cm], T.top. Inputs: pump [V]." in report
+    assert "States: level (cm), T.top. Inputs: pump (V)." in report
     assert "Held at 1, pump moves the state to" in report
-    assert repr(model).startswith("LinearModel(states=['level [cm]', 'T.top'], inputs=['pump [V]']")
+    assert repr(model).startswith("LinearModel(states=['level (cm)', 'T.top'], inputs=['pump (V)']")
     assert "x_ss=[0.0, 0.0]" in repr(model)
     assert model.units == ("cm", "", "V")
 

@@ -60,6 +60,12 @@ def test_a_box_of_theta_and_what_is_not_given() -> None:
     assert np.all(np.isinf(mpc.x_max))
 
 
+def test_the_report_calls_states_by_their_names() -> None:
+    mpc = dataclasses.replace(deviations(), model=MODEL.named(["T", "c"], units={"T": "K"}))
+    assert ": T (K)\n" in mpc.report(samples=50)
+    assert ": " not in deviations().report(samples=50).splitlines()[1]
+
+
 def test_absolute_is_a_flag() -> None:
     with pytest.raises(TypeError, match="absolute = 1 must be True or False"):
         LinearMPC(MODEL, Q=np.eye(2), R=[[1]], horizon=2, absolute=1)  # type: ignore[arg-type]
