@@ -44,8 +44,8 @@ def bent(found: Regression, episodes: list[Episode]) -> tuple[Array, Array]:
     reached = np.concatenate([episode.states[1:] for episode in episodes])
     residuals = reached - found.predict(now + found.center)
     known, added = np.column_stack([np.ones(len(now)), now]), features(now)
-    before = _without(known, residuals)
-    after = _without(np.column_stack([known, added]), residuals)
+    before = without(known, residuals)
+    after = without(np.column_stack([known, added]), residuals)
     q, free = added.shape[1], len(now) - known.shape[1] - added.shape[1]
     size, rest = np.sum(before**2, axis=0), np.sum(after**2, axis=0)
     real = size > 1e-20 * np.sum(reached**2, axis=0)
@@ -58,7 +58,7 @@ def bent(found: Regression, episodes: list[Episode]) -> tuple[Array, Array]:
     return np.asarray(np.where(sure & (share > SHARE), share, 0.0)), after
 
 
-def _without(basis: Array, values: Array) -> Array:
+def without(basis: Array, values: Array) -> Array:
     """Return what a least-squares fit by the basis leaves of the values."""
     scale = np.linalg.norm(basis, axis=0)
     left, sizes, _ = np.linalg.svd(basis / np.where(scale > 0, scale, 1.0), full_matrices=False)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array
-from sb3_yann.control.identification.curvature import features
+from sb3_yann.control.identification.curvature import features, without
 from sb3_yann.control.identification.logs import Episode
 
 LONGEST = 10  # longest dead time, in samples, that is looked for
@@ -52,24 +52,31 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
     ]
     centered = now - np.mean(now, axis=0)
     basis = np.column_stack([np.ones(steps), centered, features(centered)])
+    whole = without(basis, np.hstack([target, *past]))  # lag after lag, input by input
+    floor = 1e-10 * np.var(target, axis=0) + np.finfo(float).tiny  # below it, all is rounding
+    gram = whole.T @ whole / steps
     for _ in range(2 if n_inputs > 1 else 1):
         for j in range(n_inputs):
             trials = [[*best[:j], lag, *best[j + 1 :]] for lag in range(LONGEST + 1)]
-            left = [_left(basis, past, trial, target) for trial in trials]
-            best = trials[_chosen(np.array(left), steps, n)]
+            left = np.array([_left(gram, trial, n) + floor for trial in trials])
+            best = trials[_chosen(left, steps, n)]
     return best
 
 
-def _left(basis: Array, past: list[Array], delays: list[int], target: Array) -> Array:
-    """Return the mean squared residual (n,) with so many past inputs beside the basis."""
-    taps = [past[lag][:, j] for j, delay in enumerate(delays) for lag in range(delay)]
-    whole = np.column_stack([basis, *taps])
-    scale = np.linalg.norm(whole, axis=0)
-    left, sizes, _ = np.linalg.svd(whole / np.where(scale > 0, scale, 1.0), full_matrices=False)
-    left = left[:, sizes > 1e-9 * sizes[0]]
-    rest = target - left @ (left.T @ target)
-    floor = 1e-10 * np.var(target, axis=0) + np.finfo(float).tiny  # below it, all is rounding
-    return np.asarray(np.mean(rest**2, axis=0) + floor)
+def _left(gram: Array, delays: list[int], n: int) -> Array:
+    """Return the mean squares (n,) of what so many past inputs leave of the targets.
+
+    The Gram matrix is that of the targets, followed by the inputs lag after lag.
+    """
+    m, total = len(delays), np.diag(gram)[:n]
+    taps = [n + lag * m + j for j, delay in enumerate(delays) for lag in range(delay)]
+    if not taps:
+        return np.asarray(total)
+    size = np.sqrt(np.diag(gram)[taps])
+    size = np.where(size > 0, size, 1.0)
+    inner, cross = gram[np.ix_(taps, taps)] / np.outer(size, size), gram[taps, :n] / size[:, None]
+    told = np.sum(cross * (np.linalg.pinv(inner, rcond=1e-9, hermitian=True) @ cross), axis=0)
+    return np.asarray(np.maximum(total - told, 0.0))
 
 
 def _chosen(left: Array, steps: int, n: int) -> int:

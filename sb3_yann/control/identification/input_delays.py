@@ -12,6 +12,7 @@ from sb3_yann.control.identification.logs import Episode
 from sb3_yann.control.linear_system import names
 
 LONGEST = 10  # longest input delay, in samples, that is looked for
+ENOUGH = 5000  # steps in which a delay is looked for
 CHANCE = 0.01  # significance level of an input's effect
 FOLLOWS = 0.25  # least correlation of residuals with an earlier input: sensor noise leaves some
 
@@ -57,6 +58,7 @@ def _delays(
     """Return each input's lag of largest partial correlation with the residuals, 0 for none."""
     best = [(0, 0.0)] * (sizes[1] + sizes[2])
     straight = np.sqrt(1 - bent(found, episodes)[0])  # curvature is no delay
+    episodes = _first(episodes)
     for lag in range(1, LONGEST + 1):
         longer = [episode for episode in episodes if len(episode) > lag]
         steps = sum(len(episode) - lag for episode in longer)
@@ -74,6 +76,16 @@ def _delays(
             if size > max(best[j][1], FOLLOWS, 5 / np.sqrt(steps)):
                 best[j] = (lag, float(size))
     return best
+
+
+def _first(episodes: list[Episode]) -> list[Episode]:
+    """Return the first `ENOUGH` steps: so many tell a delay, and more take long."""
+    kept, room = [], ENOUGH
+    for episode in episodes:
+        if room > 0:
+            kept.append(episode.part(0, min(room, len(episode))))
+            room -= len(episode)
+    return kept
 
 
 def _correlations(known: Array, residuals: Array, past: Array, weights: Array) -> Array:
