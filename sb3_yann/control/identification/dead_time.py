@@ -12,6 +12,7 @@ from sb3_yann.control.identification.curvature import features, without
 from sb3_yann.control.identification.logs import Episode
 
 LONGEST = 10  # longest dead time, in samples, that is looked for
+CURVED = 0.05  # share of the linear fit's residual variance that is left to higher curvature
 GAIN = 0.3  # share of a state's residual variance by which dead time must lower it
 
 
@@ -51,9 +52,12 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
         for lag in range(1, LONGEST + 1)
     ]
     centered = now - np.mean(now, axis=0)
-    basis = np.column_stack([np.ones(steps), centered, features(centered)])
+    plain = np.column_stack([np.ones(steps), centered])
+    basis = np.column_stack([plain, features(centered)])
     whole = without(basis, np.hstack([target, *past]))  # lag after lag, input by input
-    floor = 1e-10 * np.var(target, axis=0) + np.finfo(float).tiny  # below it, all is rounding
+    # Below it, all is rounding, or curvature of higher order.
+    floor = 1e-10 * np.var(target, axis=0) + np.finfo(float).tiny
+    floor += CURVED * np.mean(without(plain, target) ** 2, axis=0)
     gram = whole.T @ whole / steps
     for _ in range(2 if n_inputs > 1 else 1):
         for j in range(n_inputs):
@@ -80,14 +84,11 @@ def _left(gram: Array, delays: list[int], n: int) -> Array:
 
 
 def _chosen(left: Array, steps: int, n: int) -> int:
-    """Return the dead time of least criterion (k, n) that lowers some residual noticeably."""
+    """Return the shortest dead time to which that of least criterion (k, n) adds little."""
     lags = np.arange(len(left))
     criterion = steps * np.sum(np.log(left), axis=1) + np.log(steps) * n * lags
-    best = int(np.argmin(criterion))
-    shorter = left[:best]
-    if best and np.all(left[best] > (1 - GAIN) * np.min(shorter, axis=0)):
-        return 0
-    return best
+    best = left[int(np.argmin(criterion))]
+    return int(np.argmax(np.all(best > (1 - GAIN) * left, axis=1)))
 
 
 def with_memory(episodes: list[Episode], delays: Sequence[int]) -> list[Episode]:

@@ -89,6 +89,19 @@ def test_curvature_is_called_by_its_name() -> None:
     assert identify(x, u, dt=1, delay="auto").model.n_states == 2
 
 
+@pytest.mark.parametrize("delay", [0, 2, 5])
+def test_dead_time_of_a_curved_plant_is_found(delay: int) -> None:
+    rng = np.random.default_rng(delay)
+    u = np.repeat(rng.uniform(-1, 1, (125, 1)), 4, axis=0)
+    x = np.zeros((501, 2))
+    for k in range(500):
+        a, b = x[k]
+        acting = u[k - delay, 0] if k >= delay else 0.0
+        x[k + 1] = a + 0.2 * (b - a**3 - 0.5 * a * b), 0.8 * b + 0.5 * np.exp(acting) - 0.5
+    x = x + 0.005 * rng.normal(size=x.shape)
+    assert identify(x, u, dt=1, delay="auto").model.n_states == 2 + delay
+
+
 @pytest.mark.parametrize("delay", ["soon", -1, [1, 2, 3], 1.5, True])
 def test_a_bad_delay_is_named(delay: Any) -> None:
     with pytest.raises(ValueError, match=r"delay = .* must be"):
