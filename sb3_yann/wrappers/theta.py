@@ -7,70 +7,19 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, NonFiniteWarning, as_whole
 from sb3_yann.control import DisturbanceObserver
+from sb3_yann.wrappers.appending import Appending, joined
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
 Schedule = Callable[[int], ArrayLike]
 """The reference after so many steps of an episode."""
 
 
-class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
-    """Appends a vector between ``low`` and ``high`` to the observation.
-
-    The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
-    """
-
-    def __init__(
-        self, env: Env, low: ArrayLike, high: ArrayLike, n_replaced: int = 0, n_new: int = 0
-    ) -> None:
-        super().__init__(env)
-        inner = require_vector(self, "observation_space")
-        self.inputs = require_vector(self, "action_space")
-        self.low, self.high = (np.atleast_1d(np.array(side, np.float64)) for side in (low, high))
-        if self.low.ndim != 1 or self.low.shape != self.high.shape:
-            raise ValueError(
-                f"low has shape {self.low.shape} and high {self.high.shape}; give the bounds of "
-                "each appended entry as two vectors of the same length."
-            )
-        if not np.all(self.low <= self.high):  # nor is NaN
-            raise ValueError(
-                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, and "
-                "no entry of low may exceed that of high."
-            )
-        free = np.full(n_new, np.inf)
-        self.observation_space = spaces.Box(
-            np.concatenate([-free, inner.low[n_replaced:], self.low]).astype(np.float32),
-            np.concatenate([free, inner.high[n_replaced:], self.high]).astype(np.float32),
-            dtype=np.float32,
-        )
-
-    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
-        """Start an episode."""
-        observation, info = self.env.reset(**kwargs)  # seeds the generator that draws
-        return self._observe(observation, None, info), info
-
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Step; the observation is the completed one."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
-        return self._observe(observation, u, info), float(reward), terminated, truncated, info
-
-    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        """Return what is observed after an input u (m,), None at the start of an episode."""
-        raise NotImplementedError
-
-
-def _joined(*parts: Vector) -> Vector:
-    return np.concatenate(parts).astype(np.float32)
-
-
-class PreviousInput(_Appending):
+class PreviousInput(Appending):
     """Appends the input of the step before, ``u_prev`` (m,), for bounds or weights on its rate.
 
     Parameters
@@ -82,6 +31,7 @@ class PreviousInput(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> env = PreviousInput(gym.make("CSTR-v0"))
     >>> env.reset(seed=0)[0].shape, float(env.step(np.float32([1]))[0][-1])
     ((5,), 1.0)
@@ -101,10 +51,10 @@ class PreviousInput(_Appending):
         self.initial: Array = np.clip(start, bounds.low, bounds.high)
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        return _joined(observation, self.initial if u is None else u)
+        return joined(observation, self.initial if u is None else u)
 
 
-class PastInputs(_Appending):
+class PastInputs(Appending):
     """Appends the inputs on their way, which are states of a model with dead time.
 
     They belong to x: wrap the env in this first. ``LinearModel.from_data(..., delay=)`` makes such
@@ -120,6 +70,7 @@ class PastInputs(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> env = PastInputs(gym.make("CSTR-v0"), delays=[2])
     >>> _ = env.reset(seed=0), env.step(np.float32([1]))
     >>> env.step(np.float32([-1]))[0][-2:].tolist()
@@ -150,10 +101,10 @@ class PastInputs(_Appending):
         else:
             self.past = [u, *self.past][:longest]
         shown = [self.past[k][j] for j, delay in enumerate(self.delays) for k in range(delay)]
-        return _joined(observation, np.array(shown, np.float64))
+        return joined(observation, np.array(shown, np.float64))
 
 
-class SetPoint(_Appending):
+class SetPoint(Appending):
     """Appends the reference r (p,) for the next action: drawn uniformly, or of a schedule.
 
     Parameters
@@ -168,6 +119,7 @@ class SetPoint(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> plant = gym.make("CSTR-v0")
     >>> env = SetPoint(plant, 0, 9, schedule=lambda step: step)
     >>> float(env.reset(seed=0)[0][-1]), float(env.step(np.float32([0]))[0][-1])
@@ -196,7 +148,7 @@ class SetPoint(_Appending):
         scheduled, held = self.schedule is not None, self.hold and self.steps % self.hold == 0
         if u is None or scheduled or held:
             self.reference = self._next()
-        return _joined(observation, self.reference)
+        return joined(observation, self.reference)
 
     def _next(self) -> Array:
         if self.schedule is None:
@@ -210,7 +162,7 @@ class SetPoint(_Appending):
         return r
 
 
-class MeasuredDisturbance(_Appending):
+class MeasuredDisturbance(Appending):
     """Appends a disturbance d (d,) that the env measures and reports in ``info``.
 
     An entry that is no finite number is named, and the last one that was holds: at first 0, the
@@ -226,6 +178,7 @@ class MeasuredDisturbance(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> class Told(gym.Wrapper):
     ...     def reset(self, **kwargs):
     ...         return self.env.reset(**kwargs)[0], {"disturbance": 0.25}
@@ -261,10 +214,10 @@ class MeasuredDisturbance(_Appending):
                 stacklevel=3,
             )
         self.failing = failing
-        return _joined(observation, self.held)
+        return joined(observation, self.held)
 
 
-class ObserveDisturbance(_Appending):
+class ObserveDisturbance(Appending):
     """Puts the estimated state in place of the measurement, and appends the disturbance d (d,).
 
     The first entries of the env's observation are the measured outputs y (q,) of the observer; what
@@ -280,6 +233,7 @@ class ObserveDisturbance(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> from sb3_yann.control import LinearModel
     >>> model = LinearModel(np.eye(4) / 2, np.ones((4, 1)), dt=1, E=np.ones((4, 1)))
     >>> env = ObserveDisturbance(gym.make("CSTR-v0"), DisturbanceObserver(model), -1, 1)
@@ -313,4 +267,4 @@ class ObserveDisturbance(_Appending):
             expected = np.zeros(len(failing)) if u is None else observer.expected(u)
             measured[failing] = expected[failing]
         x_hat, d_hat = observer.reset(measured) if u is None else observer.update(measured, u)
-        return _joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
+        return joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
