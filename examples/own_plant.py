@@ -9,7 +9,7 @@ from functools import partial
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.wrappers import TimeLimit, TransformAction, TransformObservation
+from gymnasium.wrappers import TimeLimit
 from rich.console import Console
 from stable_baselines3 import DDPG
 
@@ -17,7 +17,7 @@ from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
 from sb3_yann import CostAudit, ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
 from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
-from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
+from sb3_yann.wrappers import Deviations, MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
 TEST_SEEDS = range(2000, 2050)  # starts, set-points and disturbances that training never sees
@@ -25,11 +25,7 @@ TEST_SEEDS = range(2000, 2050)  # starts, set-points and disturbances that train
 
 def make_env(mpc: LinearMPC) -> gymnasium.Env:
     """Return the plant of today, in deviations, with all that the MPC's theta holds."""
-    x_ss, u_ss, box = mpc.model.x_ss, mpc.model.u_ss, gymnasium.spaces.Box
-    env = QuadrupleTank(noise=0.03, wear=0.1)
-    levels, pumps = box(0 - x_ss, FULL - x_ss, dtype=float), box(mpc.u_min, mpc.u_max, dtype=float)
-    env = TransformObservation(env, lambda level: level - x_ss, levels)
-    env = TransformAction(env, lambda u: u + u_ss, pumps)
+    env = Deviations(QuadrupleTank(noise=0.03, wear=0.1), mpc.model)
     env = SetPoint(env, mpc.tracking.r_min, mpc.tracking.r_max, hold=HOLD)
     env = MeasuredDisturbance(env, mpc.disturbances.d_min, mpc.disturbances.d_max)
     return TimeLimit(StageCost(env, mpc), STEPS)
@@ -48,12 +44,13 @@ def main() -> None:
     log = np.loadtxt("out/log.csv", delimiter=",", skiprows=1)
     x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
     plant = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=[3, 3], d_ss=[0])
+    plant = plant.named(["h1", "h2", "h3", "h4"], ["v1", "v2"], [*["cm"] * 4, "V", "V"])
     # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
     weights = {"Q": np.diag([1, 1, 0, 0]), "R": 0.5 * np.eye(2), "horizon": 2, "gamma": 0.9}
-    wishes = {"tracking": Tracking([0, 1], -4, 4), "disturbances": DisturbanceBounds(-1, 1)}
-    limits = {"u_min": 0 - plant.u_ss, "u_max": MAX_VOLTAGE - plant.u_ss}
-    limits |= {"theta_min": 0 - plant.x_ss, "theta_max": FULL - plant.x_ss}
-    mpc = LinearMPC(plant, **weights, **wishes, **limits)
+    wanted = Tracking([0, 1], plant.x_ss[:2] - 4, plant.x_ss[:2] + 4)
+    wishes = {"tracking": wanted, "disturbances": DisturbanceBounds(-1, 1)}
+    limits = {"u_min": 0, "u_max": MAX_VOLTAGE, "theta_min": 0, "theta_max": FULL}
+    mpc = LinearMPC(plant, **weights, **wishes, **limits, absolute=True)  # as the plant shows them
     console.print(plant.report(), mpc.report(), sep="\n")
     make = partial(make_env, mpc)
     # Five per cent of the pumps' range is more than the wear takes; V differs by about ten.

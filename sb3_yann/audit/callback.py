@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, as_flag, as_positive, as_whole
+from sb3_yann.audit.absolute import absolute_observation
 from sb3_yann.audit.causes import Cause, likely_cause, not_finite
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning, judged
 from sb3_yann.audit.sample import FEWEST, Sample
@@ -116,6 +117,8 @@ class CostAudit(BaseCallback):
         cause = self._of_the_vec_normalize()
         if cause is None and enough and not sample.is_the_problem_s_cost(self.tolerance):
             cause = likely_cause(sample, self.tolerance)
+        if enough and (cause is None or cause.name == "unknown"):
+            cause = absolute_observation(self.policy.problem, sample.theta) or cause
         if lost.any():
             cause = not_finite(lost, records, cause)
         self.finding = judged(sample, cause, self.training_env)

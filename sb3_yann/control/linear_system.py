@@ -23,6 +23,8 @@ class LinearSystem(ReadOnlyArrays):
     x_ss, u_ss, d_ss : ndarray, shapes (n,), (m,) and (d,)
     notes, drift : tuple of str, and ndarray, shape (n,), optional
         Remarks, and the measured motion in one sample at the operating point.
+    state_names, input_names, units : tuple of str, of n, m and n + m entries
+        Empty where there are none.
     """
 
     A: Array
@@ -34,6 +36,9 @@ class LinearSystem(ReadOnlyArrays):
     d_ss: Array
     notes: tuple[str, ...] = ()
     drift: Array | None = None
+    state_names: tuple[str, ...] = ()
+    input_names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
 
     @property
     def n_states(self) -> int:

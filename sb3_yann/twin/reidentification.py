@@ -40,7 +40,9 @@ def reidentified(
         x, u = _rest(problem, A, B, residual.predict(middle)[0])
     note = f"Re-identified from {len(log)} episodes: {choices[chosen].name}."
     point = model.x_ss + x, model.u_ss + u, E, model.d_ss
-    return _with(problem, LinearModel(A, B, model.dt, *point, notes=[note]), x, u)
+    names = {"state_names": model.state_names, "input_names": model.input_names}
+    found = LinearModel(A, B, model.dt, *point, notes=[note], units=model.units, **names)
+    return _with(problem, found, x, u)
 
 
 def _rest(problem: LinearMPC, A: Array, B: Array, drift: Array) -> tuple[Array, Array]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -56,8 +58,9 @@ def test_a_log_of_the_cart_corrects_its_model_and_keeps_all_else() -> None:
 
 
 def test_with_set_points_the_operating_point_is_where_the_plant_rests_today() -> None:
-    mpc = tank()
+    mpc = dataclasses.replace(tank(), model=tank().model.named(["level"], units={"level": "cm"}))
     found = PlantTwin.fit(mpc, worn_log(mpc)).reidentified()
+    assert (found.model.state_names, found.model.units) == (("level",), ("cm", ""))
     np.testing.assert_allclose(found.model.B, [[PUMP]], rtol=0.05)
     np.testing.assert_allclose(found.model.x_ss, [5.0], atol=1e-9)  # so that r stays what it is
     moved = found.model.u_ss - mpc.model.u_ss

@@ -9,15 +9,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_between, as_positive, as_vector
+from sb3_yann._validation import Array, as_between, as_choice, as_positive, as_vector
+from sb3_yann.control.identification.dead_time import (
+    as_delays,
+    exact_memory,
+    found_delays,
+    memory_labels,
+    with_memory,
+    with_memory_point,
+)
 from sb3_yann.control.identification.input_delays import input_notes
 from sb3_yann.control.identification.least_squares import Regression, regress
 from sb3_yann.control.identification.logs import Episode, Log, as_episodes, split, without_gaps
 from sb3_yann.control.identification.operating_point import FAR, operating_point
-from sb3_yann.control.linear_system import LinearSystem
-
-AHEAD = 10  # steps of the longer prediction whose fit is stated
-POOR = 50.0  # percent of the longer prediction's fit below which a model is called poor
+from sb3_yann.control.identification.quality import AHEAD, listed, quality_notes
+from sb3_yann.control.identification.shrinkage import regularized
+from sb3_yann.control.linear_system import LinearSystem, names
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +45,10 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
     u_ss: ArrayLike | None = None,
     d_ss: ArrayLike | None = None,
     offset: bool = True,
-    ridge: float = 0.0,
+    ridge: float | str = "auto",
     held_out: float = 0.2,
     time: Log | None = None,
+    delay: int | str | Sequence[int] = 0,
 ) -> LogFit:
     """Return the least-squares fit to measured episodes.
 
@@ -48,13 +56,16 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
     ----------
     states, actions, disturbances, time : array_like, or sequence of such
         Episodes, of shapes (T+1, n), (T, m), (T, d) and (T+1,).
-    dt, x_ss, u_ss, d_ss, offset, ridge, held_out : float, array_like, bool
+    dt, x_ss, u_ss, d_ss, offset, ridge, held_out, delay : float, array_like, bool
         As of `identify`: sampling time, operating point (n,), (m,) and (d,), and options.
     """
+    automatic = isinstance(ridge, str) and as_choice("ridge", ridge, ("auto",)) == "auto"
     episodes, sizes = as_episodes(states, actions, disturbances)
     dt, lost = as_positive("dt", dt), 0
     if time is not None:
         episodes, lost = without_gaps(episodes, time, dt)
+    episodes, sizes, delays = _delayed(episodes, sizes, delay)
+    x_ss = with_memory_point(x_ss, u_ss, delays)
     n, m, d = sizes
     if d_ss is not None and disturbances is None:
         raise ValueError("d_ss is given, but there are no disturbances: pass these as well.")
@@ -64,15 +75,19 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
         for name, (value, size) in point.items()
     ]
     fitted, tested = split(episodes, as_between("held_out", held_out, 0, 1, "[)"))
-    weight = as_between("ridge", ridge, 0, np.inf)
+    weight = 0.0 if automatic else as_between("ridge", ridge, 0, np.inf)
     origin = None if offset else np.concatenate([part for part in given if part is not None])
-    found = regress(fitted, sizes, origin, weight)
+    found, shrunk = regress(fitted, sizes, origin, weight), list[str]()
+    if automatic:
+        found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
     system = _system(found, sizes, given, dt)
-    late = input_notes(found, fitted, sizes)
+    system = _with_exact_memory(system, delays, sizes[0])
+    late = [] if any(delays) else input_notes(found, fitted, sizes)
     if late:
         warnings.warn(" ".join(late), stacklevel=3)
-    notes = [*system.notes, *_quality(found, tested, fits, weight), *late]
+    told = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight)
+    notes = [*system.notes, *_memory_notes(delays, sizes), *told, *shrunk, *late]
     if lost:
         notes.append(f"{lost} steps that took another time than dt were left out.")
     return LogFit(replace(system, notes=tuple(notes)), found, fits)
@@ -92,7 +107,7 @@ def _system(
     doubt = np.sqrt(doubt + found.standard_errors**2 @ (point - found.center) ** 2)
     drifts = bool(np.any(np.abs(drift) > 3 * doubt + 1e-9 * (1 + np.abs(x))))
     if drifts:
-        words = f"moves by {_list(drift)} in one step. The model leaves that out."
+        words = f"moves by {listed(drift)} in one step. The model leaves that out."
         notes.append(f"At the operating point the fitted plant {words}")
     away = np.flatnonzero(np.abs(x - found.center[:n]) > FAR * found.spread[:n])
     if away.size:
@@ -118,49 +133,44 @@ def _fit(found: Regression, episodes: list[Episode], steps: int) -> Array:
     return np.asarray(100 * (1 - missed / np.where(moved > 0, moved, np.nan)))
 
 
-def _quality(
-    found: Regression, tested: list[Episode], fits: tuple[Array, Array], ridge: float
-) -> list[str]:
-    """Return notes on residuals, fit, excitation and bias."""
-    notes = [
-        f"Fitted to {found.steps} steps; one step differs from the prediction by "
-        f"{_list(np.sqrt(np.diag(found.covariance)))} (standard deviation of each state)."
-    ]
-    if tested:
-        notes.append(_words_for(fits, sum(map(len, tested))))
-    if found.excitation < 0.01:
-        notes.append(
-            f"Weakly excited: {found.weakest} moved {found.excitation:.1e} times as much as the "
-            "most excited combination. Entries along it are uncertain."
+def _delayed(
+    episodes: list[Episode], sizes: tuple[int, int, int], delay: int | str | Sequence[int]
+) -> tuple[list[Episode], tuple[int, int, int], list[int]]:
+    """Return the episodes with past inputs as states, their sizes, and the dead times."""
+    n, m, d = sizes
+    delays = as_delays(delay, m)
+    if delays is None:
+        delays = found_delays(episodes, m)
+    if not any(delays):
+        return episodes, sizes, delays
+    extended = with_memory(episodes, delays)
+    if not extended:
+        raise ValueError(
+            f"delay = {delay!r}, but no episode has more than {max(delays)} steps: record longer."
         )
-    if ridge > 0:
-        notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
-    colored = np.abs(found.autocorrelation) > 3 / np.sqrt(found.steps)
-    if np.any(colored):
-        notes.append(
-            f"The residuals of neighboring steps are correlated ({_list(found.autocorrelation)}): "
-            "there is sensor noise, which biases A towards zero, or an unmodeled state. The "
-            "standard errors do not tell that."
-        )
-    return notes
+    return extended, (n + sum(delays), m, d), delays
 
 
-def _words_for(fits: tuple[Array, Array], steps: int) -> str:
-    """Return a note on the fits to held-out data."""
-    words = [
-        f"{_list(fit)} % {ahead} ahead"
-        for fit, ahead in zip(fits, ("one step", f"{AHEAD} steps"), strict=True)
-        if not np.all(np.isnan(fit))
+def _with_exact_memory(system: LinearSystem, delays: list[int], n: int) -> LinearSystem:
+    """Return the system with the rows of past inputs as they are, rather than as fitted."""
+    if not any(delays):
+        return system
+    A, B = exact_memory(system.A, system.B, delays, n - sum(delays))
+    E = system.E.copy()
+    E[n - sum(delays) :] = 0.0
+    memory = memory_labels(delays, names((0, len(delays))))
+    labels = (*names((n - sum(delays),)), *memory)
+    return replace(system, A=A, B=B, E=E, state_names=labels)
+
+
+def _memory_notes(delays: list[int], sizes: tuple[int, int, int]) -> list[str]:
+    """Return a note on the dead time that the model holds."""
+    if not any(delays):
+        return []
+    n = sizes[0] - sum(delays)
+    inputs = names((0, sizes[1]))
+    labels = ", ".join(memory_labels(delays, inputs))
+    return [
+        f"Dead time: inputs act for {delays} samples. The states from x[{n}] on are the inputs on "
+        f"their way, {labels}. Show them to a policy: sb3_yann.wrappers.PastInputs(env, {delays})."
     ]
-    if not words:
-        return f"The {steps} steps held out tell no fit: they are too few, or nothing moves."
-    text = f"Fit over {steps} steps held out, 100 % is perfect: {', '.join(words)}."
-    if len(words) < len(fits):
-        text += f" No episode of them is {AHEAD} steps long."
-    if np.any(fits[1] < POOR):
-        text += f" Poor: {AHEAD} steps ahead the model says little of the plant."
-    return text
-
-
-def _list(values: Array) -> str:
-    return ", ".join(f"{value:.3g}" for value in values)

@@ -6,11 +6,13 @@ import numpy as np
 from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
+from sb3_yann.control.identification.curvature import bent, features
 from sb3_yann.control.identification.least_squares import Regression
 from sb3_yann.control.identification.logs import Episode
 from sb3_yann.control.linear_system import names
 
 LONGEST = 10  # longest input delay, in samples, that is looked for
+ENOUGH = 5000  # steps in which a delay is looked for
 CHANCE = 0.01  # significance level of an input's effect
 FOLLOWS = 0.25  # least correlation of residuals with an earlier input: sensor noise leaves some
 
@@ -26,7 +28,7 @@ def input_notes(
         idle = _chance(found, n, column) > CHANCE
         late = (
             f"he residuals follow {name} of {lag} steps before (correlation {correlation:.2f}): "
-            f"it acts {lag} samples late. Append its last {lag} values to the state of each row."
+            f"it acts {lag} samples late. Pass delay={lag}, or delay='auto'."
         )
         if lag:
             start = f"{name} has no effect that can be told from 0, and t" if idle else "T"
@@ -55,6 +57,8 @@ def _delays(
 ) -> list[tuple[int, float]]:
     """Return each input's lag of largest partial correlation with the residuals, 0 for none."""
     best = [(0, 0.0)] * (sizes[1] + sizes[2])
+    straight = np.sqrt(1 - bent(found, episodes)[0])  # curvature is no delay
+    episodes = _first(episodes)
     for lag in range(1, LONGEST + 1):
         longer = [episode for episode in episodes if len(episode) > lag]
         steps = sum(len(episode) - lag for episode in longer)
@@ -66,14 +70,32 @@ def _delays(
         if np.all(np.std(residuals, axis=0) <= 1e-9 * found.spread[: sizes[0]]):
             break  # nothing but rounding
         past = np.concatenate([episode.driven[:-lag] for episode in longer])
-        for j, size in enumerate(_correlations(now - found.center, residuals, past)):
+        centered = now - found.center
+        known = np.column_stack([centered, features(centered)])
+        for j, size in enumerate(_correlations(known, residuals, past, straight)):
             if size > max(best[j][1], FOLLOWS, 5 / np.sqrt(steps)):
                 best[j] = (lag, float(size))
     return best
 
 
-def _correlations(known: Array, residuals: Array, past: Array) -> Array:
-    """Return each past input's largest partial correlation with a residual, given `known`."""
+def _first(episodes: list[Episode]) -> list[Episode]:
+    """Return the first `ENOUGH` steps: so many tell a delay, and more take long."""
+    kept, room = [], ENOUGH
+    for episode in episodes:
+        if room > 0:
+            kept.append(episode.part(0, min(room, len(episode))))
+            room -= len(episode)
+    return kept
+
+
+def _correlations(known: Array, residuals: Array, past: Array, weights: Array) -> Array:
+    """Return each past input's largest weighted partial correlation with a residual.
+
+    Parameters
+    ----------
+    known, residuals, past, weights : ndarray, shapes (k, q), (k, n), (k, m) and (n,)
+        What is taken off first; what is correlated; the weight of each residual.
+    """
     spread = np.std(known, axis=0)
     basis = np.column_stack([np.ones(len(known)), known / np.where(spread > 0, spread, 1.0)])
     orthonormal = np.linalg.qr(basis)[0]
@@ -83,4 +105,4 @@ def _correlations(known: Array, residuals: Array, past: Array) -> Array:
         size, before = np.linalg.norm(left, axis=0), np.linalg.norm(values, axis=0)
         return np.asarray(np.where(size > 1e-6 * before, left / np.where(size > 0, size, 1), 0.0))
 
-    return np.asarray(np.max(np.abs(rest(residuals).T @ rest(past)), axis=0))
+    return np.asarray(np.max(weights[:, None] * np.abs(rest(residuals).T @ rest(past)), axis=0))

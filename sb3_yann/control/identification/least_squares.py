@@ -30,6 +30,8 @@ class Regression:
     center, reached : ndarray, shapes (p,) and (n,)
     spread, factors : ndarray, shape (p,)
         Root mean square about the center; a column's standard errors over the residuals' deviation.
+    correlation : ndarray, shape (p, p)
+        ``outer(covariance, correlation)`` is the coefficients' covariance.
     covariance, autocorrelation : ndarray, shapes (n, n) and (n,)
         Of the residuals; the latter one step apart, zero where they are rounding.
     degrees_of_freedom, steps : int
@@ -43,6 +45,7 @@ class Regression:
     reached: Array
     spread: Array
     factors: Array
+    correlation: Array
     covariance: Array
     autocorrelation: Array
     degrees_of_freedom: int
@@ -102,6 +105,7 @@ def regress(
         reached=reached,
         spread=spread,
         factors=factors,
+        correlation=(inverse / scale[:, None]) @ (inverse / scale[:, None]).T,
         covariance=covariance,
         autocorrelation=_autocorrelation(residuals, episodes, targets),
         degrees_of_freedom=steps - unknowns,
@@ -120,8 +124,13 @@ def _direction(weights: Array, scale: Array, labels: list[str]) -> str:
 
 def _autocorrelation(residuals: Array, episodes: list[Episode], targets: Array) -> Array:
     """Return the correlation of each state's residuals with those one step before."""
+    real = np.sum(residuals**2, axis=0) > 1e-20 * np.sum(targets**2, axis=0)
+    return np.asarray(np.where(real, neighbors(residuals, episodes), 0.0))
+
+
+def neighbors(residuals: Array, episodes: list[Episode]) -> Array:
+    """Return the correlation (n,) of residuals (steps, n) with those one step before."""
     borders = np.cumsum([len(episode) for episode in episodes])[:-1]
     pairs = sum(np.sum(part[1:] * part[:-1], axis=0) for part in np.split(residuals, borders))
     power = np.sum(residuals**2, axis=0)
-    real = power > 1e-20 * np.sum(targets**2, axis=0)
-    return np.asarray(np.where(real, pairs / np.where(real, power, 1.0), 0.0))
+    return np.asarray(pairs / np.where(power > 0, power, 1.0))

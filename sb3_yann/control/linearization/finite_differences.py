@@ -23,12 +23,15 @@ class Jacobian:
         Exactly zero where not above its own error, and the largest derivative set to zero.
     steps, change : ndarray, shape (c,)
         The longest steps, and their errors relative to the column, NaN without a value.
+    doubt : float
+        The largest error left, relative to the column: how far two step sizes agree.
     """
 
     value: Array
     dropped: float
     steps: Array
     change: Array
+    doubt: float
 
 
 class NotSmoothError(ValueError):
@@ -73,7 +76,9 @@ def jacobian(
     value, error, change = (np.array(part) for part in zip(*columns, strict=True))
     lost = np.abs(value) <= error
     dropped = float(np.max(np.abs(value[lost]), initial=0.0))
-    return Jacobian(np.where(lost, 0.0, value).T, dropped, steps, change)
+    largest = np.max(np.abs(value), axis=1)
+    doubt = np.max(np.max(error, axis=1) / np.where(largest > 0, largest, np.inf), initial=0.0)
+    return Jacobian(np.where(lost, 0.0, value).T, dropped, steps, change, float(doubt))
 
 
 def _column(

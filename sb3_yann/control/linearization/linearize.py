@@ -1,19 +1,23 @@
-"""Linear models from equations and from simulators."""
+"""Linear models from simulators, by differences of their own step."""
 
 from __future__ import annotations
 
 import contextlib
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_positive, as_positive_vector, to_float
-from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
+from sb3_yann._validation import Array, to_float
+from sb3_yann.control.linear_system import LinearSystem, names
 from sb3_yann.control.linearization.connect import connect
-from sb3_yann.control.linearization.finite_differences import Jacobian, NotSmoothError, jacobian
+from sb3_yann.control.linearization.differences import curvature, differences, idle_inputs
+from sb3_yann.control.linearization.episodes import episode_faults
+from sb3_yann.control.linearization.finite_differences import Jacobian
+from sb3_yann.control.linearization.noise import MOST, noise_of
 from sb3_yann.control.linearization.simulator import Simulator, borrow, sample_time, to_vector
 from sb3_yann.control.linearization.steady_state import require_steady_state, steady_state
 
@@ -22,82 +26,8 @@ if TYPE_CHECKING:
 
 LONGEST = 0.01  # longest step of a difference, relative to the scale of its coordinate
 LONGEST_SINGLE = 0.05  # the same where states are read in float32
-STEADY = 1e-3  # largest motion of a steady state in one sample, relative to its scale
-MOVES = 0.01  # the same relative to its own size: beyond it, a state smaller than 1 gets a warning
-SHORTER = 64.0  # factor by which steps shrink where a function has no value next to the point
-
-
-def linearize_dynamics(
-    f: Callable[..., ArrayLike],
-    x_ss: ArrayLike,
-    u_ss: ArrayLike,
-    dt: float,
-    d_ss: ArrayLike | None,
-    scale: ArrayLike | None = None,
-) -> LinearSystem:
-    """Return the sampled linearization of `LinearModel.from_dynamics`.
-
-    Parameters
-    ----------
-    f, dt : callable, and float
-        Returns dx/dt (n,) for x and u, with ``d_ss`` also d; the sampling time.
-    x_ss, u_ss, d_ss, scale : array_like, shapes (n,), (m,), (d,), and (n,) or (n + m + d,)
-        A steady state of f, and the range of each entry. d_ss and scale may be None.
-    """
-    x, u = as_array("x_ss", x_ss, ("n",)), as_array("u_ss", u_ss, ("m",))
-    d = as_array("d_ss", [] if d_ss is None else d_ss, ("d",))
-    dt = as_positive("dt", dt)
-    given = {"x": x, "u": u} if d_ss is None else {"x": x, "u": u, "d": d}
-    sizes = (x.size, u.size, d.size)
-    if not callable(f):
-        raise TypeError(f"f = {f!r} must be a function ({', '.join(given)}) -> dx/dt.")
-
-    def rate(point: Array) -> Array:
-        parts = np.split(point, np.cumsum(sizes[:2]))
-        return np.asarray(f(*parts[: len(given)]), dtype=np.float64)
-
-    called = f"f({', '.join(f'{name}_ss' for name in given)})"
-    point = np.concatenate([x, u, d])
-    size = _dynamics_scale(point, x.size, scale)
-    moved = dt * np.abs(as_array(called, f(*given.values()), (x.size,)))
-    _require_steady_dynamics(given, moved, size, dt, scale is not None)
-    rounding = np.finfo(float).eps * np.maximum(np.abs(x), size[: x.size]) / dt
-    labels = names(sizes)
-    found = _differences(rate, point, LONGEST * size, rounding, labels)
-    A, B, E = np.split(found.value, np.cumsum(sizes[:2]), axis=1)
-    A, B, E = zero_order_hold(A, B, E, dt)
-    notes = (*_idle_inputs(B, 4), *_curvature(found, labels))
-    return LinearSystem(A, B, dt, x, u, E, d, notes)
-
-
-def _require_steady_dynamics(
-    given: dict[str, Array], moved: Array, size: Array, dt: float, scaled: bool
-) -> None:
-    """Raise if the operating point moves too far in one sample; warn if that is not certain."""
-    x = given["x"]
-    if np.any(moved > STEADY * size[: x.size]):
-        point = ", ".join(f"{name}_ss = {value.tolist()}" for name, value in given.items())
-        raise ValueError(
-            f"{point} is no steady state: in one sample of {dt:g} the state moves by "
-            f"{moved.tolist()}, with a scale of {size[: x.size].tolist()}. Solve "
-            f"f({', '.join(given)}) = 0 first, e.g. with scipy.optimize.root."
-        )
-    if not scaled and np.any((moved > MOVES * np.abs(x)) & (x != 0) & (moved > 1e-8)):
-        warnings.warn(
-            f"In one sample of {dt:g} the steady state x_ss = {x.tolist()} moves by "
-            f"{moved.tolist()}, much beside itself. Pass scale=..., how far each state moves.",
-            stacklevel=4,
-        )
-
-
-def _dynamics_scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
-    """Return the scale of each state, input and disturbance, completed by their sizes."""
-    size: Array = np.maximum(np.abs(point), 1.0)
-    if scale is None:
-        return size
-    k = point.size if np.shape(scale) == point.shape else n
-    size[:k] = as_positive_vector("scale", scale, k)
-    return size
+LONGEST_NOISY = 0.2  # the same where an adaptive integrator leaves noise
+NOISY, LEAST = 10.0, 1e-10  # from where on noise counts: beside rounding, and in scales
 
 
 def linearize_env(
@@ -122,7 +52,11 @@ def linearize_env(
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)
         x, u = _partly_known("state", state), _partly_known("action", action)
-        return _linearize(simulator, x, u, step_time, scale)
+        found = _linearize(simulator, x, u, step_time, scale)
+        faults = episode_faults(borrowed.env, found.u_ss) if borrowed.private else []
+        for fault in faults:
+            warnings.warn(fault, stacklevel=3)
+        return replace(found, notes=(*found.notes, *faults))
 
 
 def _linearize(
@@ -141,18 +75,19 @@ def _linearize(
     n = size.size
     free = np.isnan(np.concatenate([np.full(n, np.nan) if x is None else x, u]))
     point = steady_state(simulator, np.concatenate([x_start, u_start]), free, scales)
-    found = _differentiate(simulator, point, scales)
+    found, noise = _differentiate(simulator, point, scales)
     if not np.any(free):
         require_steady_state(simulator, point, found.value, scales)
     A, B = found.value[:, :n], found.value[:, n:]
     notes = (
-        *_idle_inputs(B, 5),
+        *idle_inputs(B, 5),
         "Linearized by central differences over one step. The state was set by "
         f"{simulator.setter} and read from {simulator.reader}.",
         f"Of the {free.size} entries of the operating point, {np.count_nonzero(free)} were solved "
         "for and the others given or taken from the middle of the action space.",
+        *_noise(found, noise),
         *_remarks(simulator, point),
-        *_curvature(found, names((n, u.size))),
+        *curvature(found, names((n, u.size))),
         f"The simulator was {simulator.origin}.",
     )
     return LinearSystem(A, B, dt, point[:n], point[n:], np.zeros((n, 0)), np.zeros(0), notes)
@@ -176,8 +111,8 @@ def _partly_known(name: str, value: ArrayLike | None) -> Array | None:
     return array
 
 
-def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian:
-    """Return the Jacobian (n, n+m) of the next state with respect to state and action."""
+def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Jacobian, float]:
+    """Return the Jacobian (n, n+m) of the next state, and the simulator's noise in scales."""
     space = simulator.env.action_space
     n = scale.size - space.shape[0]
     room = np.minimum(point[n:] - space.low, space.high - point[n:]).astype(np.float64)
@@ -200,46 +135,29 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> Jacobian
     longest = (LONGEST_SINGLE if single else LONGEST) * scale
     spacing = np.finfo(np.float32 if single else np.float64).eps
     rounding = spacing * np.maximum(np.abs(readings[0]), longest[:n])
+    noise = noise_of(
+        lambda z: step(actual(z)), point, np.where(np.arange(scale.size) < n, scale, 0.0)
+    )
+    noise = np.where(noise > np.maximum(NOISY * rounding, LEAST * scale[:n]), noise, 0.0)
+    if np.any(noise > MOST * scale[:n]):
+        noise = np.zeros(n)  # no noise that differences could cope with
+    rough = float(np.max(noise / scale[:n]))
+    longest = np.maximum(longest, np.minimum(1e6 * rough, LONGEST_NOISY) * scale)
     longest[n:] = np.minimum(longest[n:], room)
-    return _differences(step, point, longest, rounding, names((n, room.size)), actual)
+    labels = names((n, room.size))
+    found = differences(step, point, longest, np.maximum(rounding, noise), labels, actual)
+    return found, rough
 
 
-def _differences(
-    f: Callable[[Array], Array],
-    point: Array,
-    steps: Array,
-    rounding: Array,
-    labels: list[str],
-    actual: Callable[[Array], Array] = lambda z: z,
-) -> Jacobian:
-    """Return the Jacobian; name the coordinate where there is none."""
-    shortest, steps = steps / SHORTER**2, steps.copy()
-    while True:
-        try:
-            return jacobian(f, point, steps, rounding, actual)
-        except NotSmoothError as error:
-            i, reason = error.column, str(error)
-            if not error.no_value or steps[i] <= shortest[i]:
-                break
-            steps[i] /= SHORTER
-    raise ValueError(
-        f"The plant cannot be linearized at {point.tolist()}: along {labels[i]}, {reason}, with "
-        f"steps up to {steps[i]:.3g}. Clipping, dry friction, angles that wrap and too long steps "
-        "do this: pass scale=..., move the operating point, or use LinearModel.from_data."
-    )
-
-
-def _idle_inputs(B: Array, stacklevel: int) -> list[str]:
-    """Return a note on inputs without effect, and warn of them."""
-    idle = np.flatnonzero(~np.any(B, axis=0))
-    if not idle.size:
+def _noise(found: Jacobian, noise: float) -> list[str]:
+    """Return a note on a simulator whose own error is noise to differences."""
+    if not noise:
         return []
-    note = (
-        f"{', '.join(f'u[{i}]' for i in idle)} has no effect on the next state. With a delay or an "
-        "actuator, make the inputs on their way part of the state; leave out an idle input."
-    )
-    warnings.warn(note, stacklevel=stacklevel)
-    return [note]
+    return [
+        f"The simulator's results carry an error of {noise:.1e} of a state's scale, as adaptive "
+        f"integrators do: steps went up to {np.max(found.steps):.3g}, and the derivatives of two "
+        f"step sizes agree within {found.doubt:.1%}. Tighten its tolerances for better ones."
+    ]
 
 
 def _remarks(simulator: Simulator, point: Array) -> list[str]:
@@ -255,23 +173,3 @@ def _remarks(simulator: Simulator, point: Array) -> list[str]:
         hint = "A policy needs a wrapper that makes it so."
         remarks.append(f"The observation is not this state. {hint}")
     return remarks
-
-
-def _curvature(found: Jacobian, labels: list[str]) -> list[str]:
-    """Return notes on dropped entries, strong nonlinearity, and what has no effect."""
-    notes = []
-    if found.dropped > 0:
-        notes.append(
-            f"Derivatives that are not above their rounding error (at most {found.dropped:.1e}) "
-            "were set to zero."
-        )
-    for i, change in enumerate(found.change):
-        if not change <= 0.1:
-            what = "it has no value there" if np.isnan(change) else f"slopes differ by {change:.0%}"
-            notes.append(
-                f"The plant is not smooth within {found.steps[i]:.3g} of the operating point "
-                f"along {labels[i]}: {what}."
-            )
-        elif not np.any(found.value[:, i]) and not labels[i].startswith("u"):
-            notes.append(f"{labels[i]} has no effect on the next state.")
-    return notes

@@ -22,9 +22,11 @@ Reader = Callable[[Any, Any, dict[str, Any]], Any]  # of an environment, observa
 
 RESET = 'reset(options={"state": x})'
 ATTRIBUTE = "env.unwrapped.state"
+MUJOCO = "env.unwrapped.data.qpos and qvel"
 READERS: dict[str, Reader] = {
     'info["state"]': lambda env, observation, info: info.get("state"),
     ATTRIBUTE: lambda env, observation, info: getattr(env.unwrapped, "state", None),
+    MUJOCO: lambda env, observation, info: _positions_and_velocities(env.unwrapped),
     "the observation": lambda env, observation, info: observation,
 }
 """Where a state may be read, the most precise first: observations are float32."""
@@ -125,6 +127,8 @@ class Simulator:
             self.setters[RESET] = self._reset_to
             if to_vector(getattr(self.env.unwrapped, "state", None)) is not None:
                 self.setters[f"{ATTRIBUTE} = x"] = self._assign
+            if _positions_and_velocities(self.env.unwrapped) is not None:
+                self.setters["env.unwrapped.set_state(qpos, qvel)"] = self._set_mujoco
         self.setter, self.reader = next(iter(self.setters)), next(iter(self.readers))
 
     def read(self, reader: str | None = None) -> Array | None:
@@ -143,7 +147,7 @@ class Simulator:
             self.observation, self.info = self.env.reset()
             self.over = False
         self.setters[self.setter](x)
-        return self.resets or self.reader in ("get_state", ATTRIBUTE)
+        return self.resets or self.reader in ("get_state", ATTRIBUTE, MUJOCO)
 
     def actual(self, u: Array) -> Array:
         """Return the action that the environment gets for u: in the precision of its space."""
@@ -177,6 +181,19 @@ class Simulator:
 
     def _assign(self, x: Array) -> None:
         self.env.unwrapped.state = np.array(x)
+
+    def _set_mujoco(self, x: Array) -> None:
+        plant = self.env.unwrapped
+        split = np.size(plant.data.qpos)
+        plant.set_state(np.array(x[:split]), np.array(x[split:]))
+
+
+def _positions_and_velocities(plant: Any) -> Array | None:
+    """Return [qpos, qvel] of Gymnasium's MuJoCo environments, None where there is no such."""
+    data: Any = getattr(plant, "data", None)
+    if not callable(getattr(plant, "set_state", None)) or not hasattr(data, "qvel"):
+        return None
+    return np.concatenate([np.ravel(data.qpos), np.ravel(data.qvel)]).astype(np.float64)
 
 
 def to_vector(value: Any) -> Array | None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.linearization.noise import MOST, noise_of
 from sb3_yann.control.linearization.simulator import Simulator
 
 MOVED = 1e-3  # largest residual of a given steady state in one step, relative to the scale
@@ -36,7 +37,7 @@ def steady_state(
     point = _solve(simulator, start, free, scale)
     moved = residual(simulator, point, scale)
     n = moved.size
-    if not np.max(np.abs(moved)) <= SOLVED:
+    if not np.max(np.abs(moved)) <= SOLVED and not _is_noise(simulator, point, moved, scale):
         reason = simulator.refusal if np.any(np.isnan(moved)) else f"{(moved * scale[:n]).tolist()}"
         stuck = _at_bounds(simulator, point[n:], scale[n:])
         raise ValueError(
@@ -45,6 +46,17 @@ def steady_state(
             "free (NaN), or start closer to it."
         )
     return point
+
+
+def _is_noise(simulator: Simulator, point: Array, moved: Array, scale: Array) -> bool:
+    """Tell whether what is left of the motion is no more than the simulator's own error."""
+    n = moved.size
+
+    def step(z: Array) -> Array:
+        return simulator.next_state(z[:n], z[n:])
+
+    noise = noise_of(step, point, np.where(np.arange(scale.size) < n, scale, 0.0)) / scale[:n]
+    return bool(np.all(np.abs(moved) <= SOLVED + 5 * noise) and np.all(noise <= MOST))
 
 
 def _at_bounds(simulator: Simulator, u: Array, scale: Array) -> str:

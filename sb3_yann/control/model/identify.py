@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,9 +79,10 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     u_ss: ArrayLike | None = None,
     d_ss: ArrayLike | None = None,
     offset: bool = True,
-    ridge: float = 0.0,
+    ridge: float | str = "auto",
     held_out: float = 0.2,
     time: Log | None = None,
+    delay: int | str | Sequence[int] = 0,
 ) -> Identified:
     """Fit ``x[k+1] = A x[k] + B u[k] + E d[k] + c`` to measured episodes by least squares.
 
@@ -102,19 +104,25 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
         the fitted model's steady state. An integrating state keeps its mean, which the inputs hold.
     offset : bool, default True
         Fit c too. Without it, c is 0, and the default operating point is zero.
-    ridge : float, default 0
+    ridge : float or "auto", default "auto"
         Weight of the squared entries, each in units of the spread of its regressor, relative to one
         step's. It makes poor excitation usable; the standard errors leave out its bias to zero.
+        "auto" is 0 for a well excited log. For a weak one, of an excitation below 0.01, free runs
+        over held-out data choose.
     held_out : float, default 0.2
         Fraction of all steps, the last ones, that tests the fit instead of making the model.
     time : array_like, shape (T+1,), or a sequence of such, optional
         When each row of the states was measured, in the unit of ``dt``. Steps whose time differs
         from ``dt`` by more than 10 % are left out.
+    delay : int, sequence of int, or "auto", default 0
+        Dead time of the inputs, or of each, in samples: so many past inputs become states, newest
+        first, input by input. "auto" finds it, up to 10 samples.
 
     Raises
     ------
     ValueError
         For data in which some combination of states and inputs does not move: the message names it.
+        Also for a log so weak that with any ridge free runs tell no more than the mean.
 
     Examples
     --------
@@ -127,7 +135,7 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     """
     found = fit_log(
         states, actions, dt, disturbances=disturbances, x_ss=x_ss, u_ss=u_ss, d_ss=d_ss,
-        offset=offset, ridge=ridge, held_out=held_out, time=time,
+        offset=offset, ridge=ridge, held_out=held_out, time=time, delay=delay,
     )  # fmt: skip
     model, step = LinearModel(**vars(found.system)), found.regression
     n = model.n_states

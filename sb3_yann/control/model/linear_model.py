@@ -12,17 +12,19 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, as_array, as_positive, as_vector
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.logs import Log
-from sb3_yann.control.linear_system import LinearSystem, zero_order_hold
-from sb3_yann.control.linearization.linearize import linearize_dynamics, linearize_env
-from sb3_yann.control.model.report import describe
+from sb3_yann.control.linear_system import names, zero_order_hold
+from sb3_yann.control.linearization.dynamics import linearize_dynamics
+from sb3_yann.control.linearization.linearize import linearize_env
+from sb3_yann.control.model.labels import Units, as_names, as_units
+from sb3_yann.control.model.plant import Plant
 from sb3_yann.control.model.statespace import from_control
 
 if TYPE_CHECKING:
     import gymnasium
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class LinearModel(LinearSystem):
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class LinearModel(Plant):
     """The plant near an operating point: ``x[k+1] = A x[k] + B u[k] + E d[k]``, every ``dt``.
 
     ``x``, ``u`` and the measured disturbances ``d`` are deviations from the operating point
@@ -41,6 +43,10 @@ class LinearModel(LinearSystem):
     drift : array_like, shape (n,), optional
         Measured motion in one sample at the operating point, which the model leaves out. Zeros
         where it is within its uncertainty. Ignored and dropped as the notes are.
+    state_names, input_names : sequence of str, optional
+        Names for reports, n and m of them. Equality ignores them.
+    units : mapping from name to str, or sequence of n + m str, optional
+        Units of states and inputs, for reports.
 
     Examples
     --------
@@ -52,6 +58,9 @@ class LinearModel(LinearSystem):
 
     notes: tuple[str, ...] = field(init=False, repr=False, compare=False)
     drift: Array = field(init=False, repr=False, compare=False)
+    state_names: tuple[str, ...] = field(default=(), compare=False)
+    input_names: tuple[str, ...] = field(default=(), compare=False)
+    units: tuple[str, ...] = field(default=(), compare=False)
 
     def __init__(  # noqa: PLR0913 (the matrices of a plant and its operating point)
         self,
@@ -65,6 +74,9 @@ class LinearModel(LinearSystem):
         *,
         notes: Sequence[str] = (),
         drift: ArrayLike | None = None,
+        state_names: Sequence[str] = (),
+        input_names: Sequence[str] = (),
+        units: Units = (),
     ) -> None:
         A = as_array("A", A, ("n", "n"))
         n = A.shape[0]
@@ -78,7 +90,13 @@ class LinearModel(LinearSystem):
             raise ValueError(f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E.")
         x, u = as_vector("x_ss", x_ss, n), as_vector("u_ss", u_ss, B.shape[1])
         d, moved = as_vector("d_ss", d_ss, E.shape[1]), as_vector("drift", drift, n)
-        super().__init__(A, B, as_positive("dt", dt), x, u, E, d, tuple(notes), moved)
+        named = (
+            as_names("state_names", state_names, n),
+            as_names("input_names", input_names, u.size),
+        )
+        labels = [*(named[0] or names((n,))), *(named[1] or names((0, u.size)))]
+        step, kept = as_positive("dt", dt), as_units(units, labels)
+        super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept)
 
     @classmethod
     def from_continuous(
@@ -126,9 +144,11 @@ class LinearModel(LinearSystem):
         Parameters
         ----------
         f : callable
-            Takes x (n,) and u (m,), with ``d_ss`` also d (d,); returns dx/dt (n,).
+            Takes x (n,) and u (m,), with ``d_ss`` also d (d,); returns dx/dt (n,). Functions of
+            columns (n, 1) are called with such.
         x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,)
-            The operating point, a steady state of ``f``; d_ss is optional.
+            The operating point, a steady state of ``f``; d_ss is optional. Entries of x_ss and u_ss
+            that are NaN are solved for; the notes name other solutions that were met.
         dt : float
             Sampling time.
         scale : array_like, shape (n,) or (n + m + d,), or float, optional
@@ -139,13 +159,14 @@ class LinearModel(LinearSystem):
         ------
         ValueError
             If ``f`` returns another shape or NaN at the operating point, has a kink or a jump
-            there, or the state moves by more than 0.1 % of ``scale`` within one sample.
+            there, or the state moves by more than 0.1 % of ``scale`` within one sample. Also if no
+            steady state is found.
 
         Examples
         --------
-        >>> tank = LinearModel.from_dynamics(lambda x, u: u - x**0.5, [4], [2], dt=1)
-        >>> tank.A.round(3).tolist(), tank.B.round(3).tolist()  # e^(-1/4) and 4 (1 - e^(-1/4))
-        ([[0.779]], [[0.885]])
+        >>> tank = LinearModel.from_dynamics(lambda x, u: u - x**0.5, [4], [np.nan], dt=1)
+        >>> tank.u_ss.round(6).tolist(), tank.A.round(3).tolist()  # e^(-1/4)
+        ([2.0], [[0.779]])
         """
         return cls(**vars(linearize_dynamics(f, x_ss, u_ss, dt, d_ss, scale)))
 
@@ -164,7 +185,8 @@ class LinearModel(LinearSystem):
         """Linearize one step of a simulator and its wrappers by central differences.
 
         An environment is deep-copied. One that cannot be copied is used itself and needs a reset
-        afterwards; the notes then say so.
+        afterwards; the notes then say so. Noise of an adaptive integrator lengthens the steps. An
+        env that ignores seeds, or terminates at a time limit, is warned of.
 
         Parameters
         ----------
@@ -180,10 +202,12 @@ class LinearModel(LinearSystem):
             or ``DT`` of its module. Pass it if a wrapper repeats actions.
         set_state : callable, optional
             ``set_state(env, x)`` puts the environment into the state x. The default is the first of
-            ``env.reset(options={"state": x})`` and ``env.unwrapped.state = x`` that works.
+            ``env.reset(options={"state": x})``, ``env.unwrapped.state = x`` and MuJoCo's
+            ``env.unwrapped.set_state(qpos, qvel)`` that works.
         get_state : callable, optional
             ``get_state(env)`` returns the state, shape (n,). The default is the first that works of
-            ``info["state"]``, ``env.unwrapped.state`` and the observation.
+            ``info["state"]``, ``env.unwrapped.state``, MuJoCo's ``[qpos, qvel]`` and the
+            observation.
         scale : array_like, shape (n,), or float, optional
             Range in which each state moves in use. Steps are at most 1 % of it, 5 % for float32
             states; a given steady state may be 1 % off. The default is half the width of the
@@ -269,16 +293,3 @@ class LinearModel(LinearSystem):
         """
         A, B, E, step, notes = from_control(system, dt, disturbances)
         return cls(A, B, step, x_ss, u_ss, E, d_ss, notes=notes)
-
-    def step(self, x: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> Array:
-        """Return ``A x + B u + E d``; each is a vector or a batch of them, (batch, size)."""
-        moved = np.asarray(x) @ self.A.T + np.asarray(u) @ self.B.T
-        return moved if d is None else moved + np.asarray(d) @ self.E.T
-
-    def report(self) -> str:
-        """Return an account in words: poles, controllability, scaling, sampling and notes."""
-        return describe(self)
-
-    def __hash__(self) -> int:
-        """Return a hash that equal models share."""
-        return hash((self.A.tobytes(), self.B.tobytes(), self.dt, self.E.tobytes()))

@@ -6,7 +6,8 @@ import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.linear_system import LinearSystem, combination, names
+from sb3_yann.control.linear_system import LinearSystem, combination
+from sb3_yann.control.model.labels import labels_of, with_units
 
 ON_CIRCLE = 1e-6  # distance of a pole's magnitude from 1 below which it neither grows nor decays
 UNREACHED, HARDLY_REACHED = 1e-6, 1e-3
@@ -34,7 +35,11 @@ def _head(model: LinearSystem) -> list[str]:
     point = f"x_ss = {_vector(model.x_ss)}, u_ss = {_vector(model.u_ss)}"
     if model.n_disturbances:
         point += f", d_ss = {_vector(model.d_ss)}"
-    return [f"Linear model: {sizes}, sampled every {model.dt:.4g}.", f"Operating point: {point}."]
+    head = [f"Linear model: {sizes}, sampled every {model.dt:.4g}.", f"Operating point: {point}."]
+    if model.state_names or model.input_names or model.units:
+        states, inputs = with_units(model)
+        head.insert(1, f"States: {', '.join(states)}. Inputs: {', '.join(inputs)}.")
+    return head
 
 
 def poles(model: LinearSystem) -> Array:
@@ -109,7 +114,7 @@ def _reach(model: LinearSystem) -> list[str]:
     sizes, axes = reach(model)
     axes = np.array([axis / axis[np.argmax(np.abs(axis))] for axis in axes])
     axes[np.abs(axes) <= 1e-3] = 0.0
-    words = [combination(axis, names([sizes.size]), 3) for axis in axes]
+    words = [combination(axis, labels_of(model)[0], 3) for axis in axes]
     rank = int(np.sum(sizes > UNREACHED))
     lines = [f"Controllability: the inputs reach {rank} of {sizes.size} directions of the state."]
     if rank < sizes.size:
@@ -117,7 +122,7 @@ def _reach(model: LinearSystem) -> list[str]:
     elif sizes[-1] < HARDLY_REACHED:
         lines.append(f"  {words[-1]} is moved {sizes[-1]:.1e} times as far as the most.")
     idle = np.flatnonzero(~np.any(model.B, axis=0))
-    return lines + [f"  u[{i}] has no effect." for i in idle]
+    return lines + [f"  {labels_of(model)[1][i]} has no effect." for i in idle]
 
 
 def _scaling(model: LinearSystem) -> list[str]:
@@ -138,7 +143,10 @@ def _scaling(model: LinearSystem) -> list[str]:
         # An unstable plant has this steady state but does not approach it.
         stable = np.all(np.abs(poles(model)) < 1 - ON_CIRCLE)
         verb = "moves the state to" if stable else "would balance the state at"
-        lines += [f"  Held at 1, u[{j}] {verb} {_vector(g)}." for j, g in enumerate(gain.T)]
+        lines += [
+            f"  Held at 1, {labels_of(model)[1][j]} {verb} {_vector(g)}."
+            for j, g in enumerate(gain.T)
+        ]
     return lines
 
 

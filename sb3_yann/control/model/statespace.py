@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from sb3_yann._validation import Array, as_array, as_positive
-from sb3_yann.control.linear_system import zero_order_hold
+from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
+from sb3_yann.control.model.labels import labels_of
 
 
 def from_control(
@@ -32,6 +33,27 @@ def from_control(
     sampled = "sampled with a zero-order hold" if continuous else "taken as it is, discrete"
     notes = [f"From a control.StateSpace, {sampled}.", *_dropped(system, A)]
     return A, B, E, step, notes
+
+
+def to_control(model: LinearSystem) -> Any:
+    """Return the `control.StateSpace` of `LinearModel.to_statespace`."""
+    import control
+
+    states, inputs = labels_of(model)
+    driven, size = np.hstack([model.B, model.E]), model.n_states
+    labels = [*inputs, *names((0, 0, model.n_disturbances))]
+    plain = {
+        "states": [_label(each) for each in states],
+        "inputs": [_label(each) for each in labels],
+        "outputs": [_label(each) for each in states],
+    }
+    C, D = np.eye(size), np.zeros((size, driven.shape[1]))
+    return control.ss(model.A, driven, C, D, model.dt, **plain)
+
+
+def _label(name: str) -> str:
+    """Return a name that python-control takes: it forbids dots."""
+    return name.replace(".", "_")
 
 
 def _sample_time(own: float | bool | None, dt: float | None) -> tuple[float, bool]:

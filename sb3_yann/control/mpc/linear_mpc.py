@@ -18,9 +18,10 @@ from sb3_yann.control.explicit.solve import solve_explicit
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
-from sb3_yann.control.mpc import reachability
+from sb3_yann.control.mpc import reachability, simulation
 from sb3_yann.control.mpc import value as quadratic_value
 from sb3_yann.control.mpc._arguments import Given
+from sb3_yann.control.mpc.absolute import Boxes
 from sb3_yann.control.mpc.choice import LAWS, Law, choose
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.groups import (
@@ -92,6 +93,8 @@ class LinearMPC(MPCProblem):
         Which bounds may be broken. The penalty is no part of :meth:`stage_cost`.
     terminal : Terminal, optional
         The terminal cost, by default the Riccati solution, and the terminal set.
+    absolute : bool, default False
+        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations.
 
     Raises
     ------
@@ -128,14 +131,18 @@ class LinearMPC(MPCProblem):
         outputs: OutputBounds | None = None,
         soft: SoftBounds | None = None,
         terminal: Terminal | None = None,
+        absolute: bool = False,
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
+        sides = (x_min, x_max), (u_min, u_max), (theta_min, theta_max)
+        given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute)
+        tracking, disturbances, outputs = given.tracking, given.disturbances, given.outputs
         n, m = model.n_states, model.n_inputs
         horizon, gamma = arguments.as_horizon(horizon), check.as_discount(gamma)
         infeasible = check.as_choice("infeasible", infeasible, INFEASIBLE)
         Q, R = as_symmetric("Q", Q, n), as_symmetric("R", R, m, definite=True)
-        x, u = as_bounds("x", x_min, x_max, n), as_bounds("u", u_min, u_max, m)
+        x, u = as_bounds("x", *given.x, n), as_bounds("u", *given.u, m)
         tracking = _as_group("tracking", tracking, Tracking).sized(n)
         d = _as_group("disturbances", disturbances, DisturbanceBounds).sized(model.n_disturbances)
         rate = _as_group("rate", rate, RateLimits).sized(m)
@@ -146,7 +153,7 @@ class LinearMPC(MPCProblem):
         rest = [(tracking.r_min, tracking.r_max), (d.d_min, d.d_max)]
         rest += [u] if layout.n_previous else []
         fallback = arguments.softened_box(x, soft.x)
-        theta = arguments.theta_box(layout, (theta_min, theta_max), fallback, rest)
+        theta = arguments.theta_box(layout, given.theta, fallback, rest)
         states = theta[0][:n], theta[1][:n]
         if not layout.has_constants:  # otherwise there are other places to rest
             arguments.warn_of_no_rest(*u)
@@ -162,6 +169,10 @@ class LinearMPC(MPCProblem):
         """Return the next theta on the model; theta is (n_theta,) or (batch, n_theta)."""
         A, B = self.prediction
         return np.asarray(theta) @ A.T + np.asarray(u) @ B.T
+
+    def simulate(self, theta0: ArrayLike, steps: int) -> tuple[Array, Array]:
+        """Return thetas (steps + 1, n_theta) and inputs (steps, m) of the law on its own model."""
+        return simulation.simulate(self, self.explicit(), theta0, steps)
 
     def is_reachable(self, r: Given = None, d: Given = None) -> NDArray[np.bool_]:
         """Tell whether the steady state for r (p,) and d (d,) lies within the bounds of x, u and y.

@@ -114,10 +114,30 @@ class MPCProblem(ReadOnlyArrays):
         return hash((self.model, self.horizon, self.Q.tobytes(), self.R.tobytes()))
 
     def __repr__(self) -> str:
-        """Name the sizes."""
+        """Name the sizes, the bounds and what else there is."""
         sizes = f"states={self.model.n_states}, inputs={self.model.n_inputs}"
         options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
-        return f"{type(self).__name__}({sizes}, {options})"
+        tracking, d, rate, outputs = self.tracking, self.disturbances, self.rate, self.outputs
+        bounds = {
+            "x": (self.x_min, self.x_max),
+            "u": (self.u_min, self.u_max),
+            "r": (tracking.r_min, tracking.r_max),
+            "d": (d.d_min, d.d_max),
+            "du": (rate.du_min, rate.du_max),
+            "y": (outputs.y_min, outputs.y_max),
+        }
+        told = [_bounds_in_words(name, *sides) for name, sides in bounds.items()]
+        return f"{type(self).__name__}({', '.join([sizes, options, *filter(None, told)])})"
+
+
+def _bounds_in_words(name: str, lower: Array, upper: Array) -> str:
+    """Return ``name_min=[...], name_max=[...]``, empty where nothing is bounded."""
+    sides = ((f"{name}_min", lower), (f"{name}_max", upper))
+    return ", ".join(
+        f"{side}=[{', '.join(f'{value:.4g}' for value in values)}]"
+        for side, values in sides
+        if np.any(np.isfinite(values))
+    )
 
 
 def layout_of(model: LinearModel, tracking: Tracking, rate: RateLimits) -> ThetaLayout:

@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
+from sb3_yann.control.model.labels import with_units
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.problem import MPCProblem
@@ -49,7 +50,17 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
     bounds = zip(problem.layout.names, problem.theta_min, problem.theta_max, strict=True)
     for name, low, high in bounds:
         kind, index = name[:-1].split("[")
-        yield f"  {name:<10} {low:>10.4g} to {high:<10.4g} {meanings[kind]} {index}"
+        called = f"  {name:<10} {low:>10.4g} to {high:<10.4g} {meanings[kind]} {index}"
+        yield called + _own_name(problem, kind, int(index))
+
+
+def _own_name(problem: MPCProblem, kind: str, index: int) -> str:
+    """Return the model's name and unit of a state or input, empty where there is none."""
+    model = problem.model
+    states, inputs = with_units(model)
+    given = {"x": (model.state_names, states), "u_prev": (model.input_names, inputs)}
+    named, whole = given.get(kind, ((), []))
+    return f": {whole[index]}" if whole and (named or model.units) else ""
 
 
 def _size(problem: MPCProblem, law: Law) -> Iterator[str]:

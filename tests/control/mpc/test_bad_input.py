@@ -54,12 +54,12 @@ def test_bad_argument_of_a_model_is_named(
 
 
 BAD_DYNAMICS: list[tuple[dict[str, Any], type[Exception], str]] = [
-    ({"f": lambda x, u: [1, 2, 3]}, ValueError, r"f\(x_ss, u_ss\) has shape \(3,\), expected \(2,"),
+    ({"f": lambda x, u: [1, 2, 3]}, ValueError, r"f returned the shape \(3,\), expected \(2,"),
     ({"f": lambda x, u: x * NAN}, ValueError, r"f\(x_ss, u_ss\) holds NaN"),
-    ({"f": lambda x, u: x + 1j}, TypeError, r"f\(x_ss, u_ss\) = .* is not an array of real"),
-    ({"x_ss": [NAN, 0]}, ValueError, "x_ss holds NaN"),
-    ({"u_ss": 0.0}, ValueError, r"u_ss has shape \(\), expected \(m,\)"),
-    ({"f": lambda x, u: [1, 0]}, ValueError, "is no steady state.*Solve f"),
+    ({"f": lambda x, u: x + 1j}, TypeError, r"f\(x, u\) = .* is not an array of real"),
+    ({"x_ss": [np.inf, 0]}, ValueError, r"x_ss has .* expected a vector of finite numbers, or NaN"),
+    ({"u_ss": 0.0}, ValueError, r"u_ss has shape \(\) .* expected a vector"),
+    ({"f": lambda x, u: [1, 0]}, ValueError, "is no steady state.*NaN to have them solved"),
     ({"f": 3}, TypeError, "f = 3 must be a function"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
 ]

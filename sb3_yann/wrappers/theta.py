@@ -4,74 +4,22 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, NonFiniteWarning, as_number, as_whole
-from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann._validation import Array, NonFiniteWarning, as_whole
+from sb3_yann.control import DisturbanceObserver
+from sb3_yann.wrappers.appending import Appending, joined
+from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
-Vector = NDArray[np.floating[Any]]
-Env = gym.Env[Vector, Vector]
 Schedule = Callable[[int], ArrayLike]
 """The reference after so many steps of an episode."""
 
 
-class _Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
-    """Appends a vector between ``low`` and ``high`` to the observation.
-
-    The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
-    """
-
-    def __init__(
-        self, env: Env, low: ArrayLike, high: ArrayLike, n_replaced: int = 0, n_new: int = 0
-    ) -> None:
-        super().__init__(env)
-        inner = _require_vector(self, "observation_space")
-        self.inputs = _require_vector(self, "action_space")
-        self.low, self.high = (np.atleast_1d(np.array(side, np.float64)) for side in (low, high))
-        if self.low.ndim != 1 or self.low.shape != self.high.shape:
-            raise ValueError(
-                f"low has shape {self.low.shape} and high {self.high.shape}; give the bounds of "
-                "each appended entry as two vectors of the same length."
-            )
-        if not np.all(self.low <= self.high):  # nor is NaN
-            raise ValueError(
-                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, and "
-                "no entry of low may exceed that of high."
-            )
-        free = np.full(n_new, np.inf)
-        self.observation_space = spaces.Box(
-            np.concatenate([-free, inner.low[n_replaced:], self.low]).astype(np.float32),
-            np.concatenate([free, inner.high[n_replaced:], self.high]).astype(np.float32),
-            dtype=np.float32,
-        )
-
-    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
-        """Start an episode."""
-        observation, info = self.env.reset(**kwargs)  # seeds the generator that draws
-        return self._observe(observation, None, info), info
-
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Step; the observation is the completed one."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
-        return self._observe(observation, u, info), float(reward), terminated, truncated, info
-
-    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        """Return what is observed after an input u (m,), None at the start of an episode."""
-        raise NotImplementedError
-
-
-def _joined(*parts: Vector) -> Vector:
-    return np.concatenate(parts).astype(np.float32)
-
-
-class PreviousInput(_Appending):
+class PreviousInput(Appending):
     """Appends the input of the step before, ``u_prev`` (m,), for bounds or weights on its rate.
 
     Parameters
@@ -83,13 +31,14 @@ class PreviousInput(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> env = PreviousInput(gym.make("CSTR-v0"))
     >>> env.reset(seed=0)[0].shape, float(env.step(np.float32([1]))[0][-1])
     ((5,), 1.0)
     """
 
     def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
-        bounds = _require_vector(env, "action_space")
+        bounds = require_vector(env, "action_space")
         super().__init__(env, bounds.low, bounds.high)
         start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
         if start.shape != bounds.shape:
@@ -102,10 +51,60 @@ class PreviousInput(_Appending):
         self.initial: Array = np.clip(start, bounds.low, bounds.high)
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
-        return _joined(observation, self.initial if u is None else u)
+        return joined(observation, self.initial if u is None else u)
 
 
-class SetPoint(_Appending):
+class PastInputs(Appending):
+    """Appends the inputs on their way, which are states of a model with dead time.
+
+    They belong to x: wrap the env in this first. ``LinearModel.from_data(..., delay=)`` makes such
+    a model, and its report names the delays.
+
+    Parameters
+    ----------
+    env : gymnasium.Env, with one-dimensional Box spaces
+    delays : sequence of int, length m
+        For each input, how many of its past values are appended, newest first.
+    initial : array_like, shape (m,), optional
+        What was on its way at the start of an episode: zeros by default, the operating point.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> env = PastInputs(gym.make("CSTR-v0"), delays=[2])
+    >>> _ = env.reset(seed=0), env.step(np.float32([1]))
+    >>> env.step(np.float32([-1]))[0][-2:].tolist()
+    [-1.0, 1.0]
+    """
+
+    def __init__(self, env: Env, delays: Sequence[int], initial: ArrayLike | None = None) -> None:
+        bounds = require_vector(env, "action_space")
+        hint = "It counts past values of an input."
+        self.delays = [as_whole("delays", each, 0, hint) for each in delays]
+        if len(self.delays) != bounds.shape[0]:
+            raise ValueError(
+                f"delays = {self.delays} must have one entry for each of the {bounds.shape[0]} "
+                "inputs, 0 for one without dead time."
+            )
+        low, high = np.repeat(bounds.low, self.delays), np.repeat(bounds.high, self.delays)
+        super().__init__(env, low, high)
+        start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
+        if start.shape != bounds.shape:
+            raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
+        self.initial: Array = np.clip(start, bounds.low, bounds.high)
+        self.past: list[Array] = []
+
+    def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+        longest = max(self.delays, default=0)
+        if u is None:
+            self.past = [self.initial] * longest
+        else:
+            self.past = [u, *self.past][:longest]
+        shown = [self.past[k][j] for j, delay in enumerate(self.delays) for k in range(delay)]
+        return joined(observation, np.array(shown, np.float64))
+
+
+class SetPoint(Appending):
     """Appends the reference r (p,) for the next action: drawn uniformly, or of a schedule.
 
     Parameters
@@ -120,6 +119,7 @@ class SetPoint(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> plant = gym.make("CSTR-v0")
     >>> env = SetPoint(plant, 0, 9, schedule=lambda step: step)
     >>> float(env.reset(seed=0)[0][-1]), float(env.step(np.float32([0]))[0][-1])
@@ -148,7 +148,7 @@ class SetPoint(_Appending):
         scheduled, held = self.schedule is not None, self.hold and self.steps % self.hold == 0
         if u is None or scheduled or held:
             self.reference = self._next()
-        return _joined(observation, self.reference)
+        return joined(observation, self.reference)
 
     def _next(self) -> Array:
         if self.schedule is None:
@@ -162,7 +162,7 @@ class SetPoint(_Appending):
         return r
 
 
-class MeasuredDisturbance(_Appending):
+class MeasuredDisturbance(Appending):
     """Appends a disturbance d (d,) that the env measures and reports in ``info``.
 
     An entry that is no finite number is named, and the last one that was holds: at first 0, the
@@ -178,6 +178,7 @@ class MeasuredDisturbance(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> class Told(gym.Wrapper):
     ...     def reset(self, **kwargs):
     ...         return self.env.reset(**kwargs)[0], {"disturbance": 0.25}
@@ -213,10 +214,10 @@ class MeasuredDisturbance(_Appending):
                 stacklevel=3,
             )
         self.failing = failing
-        return _joined(observation, self.held)
+        return joined(observation, self.held)
 
 
-class ObserveDisturbance(_Appending):
+class ObserveDisturbance(Appending):
     """Puts the estimated state in place of the measurement, and appends the disturbance d (d,).
 
     The first entries of the env's observation are the measured outputs y (q,) of the observer; what
@@ -232,6 +233,7 @@ class ObserveDisturbance(_Appending):
 
     Examples
     --------
+    >>> import gymnasium as gym
     >>> from sb3_yann.control import LinearModel
     >>> model = LinearModel(np.eye(4) / 2, np.ones((4, 1)), dt=1, E=np.ones((4, 1)))
     >>> env = ObserveDisturbance(gym.make("CSTR-v0"), DisturbanceObserver(model), -1, 1)
@@ -265,79 +267,4 @@ class ObserveDisturbance(_Appending):
             expected = np.zeros(len(failing)) if u is None else observer.expected(u)
             measured[failing] = expected[failing]
         x_hat, d_hat = observer.reset(measured) if u is None else observer.update(measured, u)
-        return _joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
-
-
-class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
-    """Makes the reward minus the stage cost of the problem, for which the critic is exact.
-
-    The cost is that of the observed theta and of the input played there. A step in which the input
-    moves by more than the problem allows reports ``info["violation"]``.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        Its observation is the theta of the problem.
-    problem : LinearMPC
-    violation_cost : float, default 0
-        Added to the cost of a step that reports ``info["violation"]``.
-
-    Examples
-    --------
-    >>> plant = gym.make("CSTR-v0")
-    >>> env = StageCost(plant, plant.observation_space.problem, violation_cost=10)
-    >>> _ = env.reset(seed=0)
-    >>> env.step(np.zeros(1, np.float32))[1] < 0
-    True
-    """
-
-    def __init__(self, env: Env, problem: LinearMPC, violation_cost: float = 0.0) -> None:
-        super().__init__(env)
-        space = _require_vector(env, "observation_space")
-        self.inputs = _require_vector(env, "action_space")
-        names = problem.layout.names
-        if space.shape != (problem.n_theta,):
-            raise ValueError(
-                f"The observation has shape {space.shape}, but theta = [{', '.join(names)}] has "
-                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order."
-            )
-        self.problem, self.violation_cost = problem, as_number("violation_cost", violation_cost)
-        self.theta: Array = np.zeros(problem.n_theta)
-
-    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
-        """Start an episode."""
-        observation, info = self.env.reset(**kwargs)
-        self.theta = np.asarray(observation, np.float64)
-        return observation, info
-
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
-        """Step; the reward is the one of this wrapper."""
-        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
-        cost = float(self.problem.stage_cost(self.theta, u))
-        observation, _, terminated, truncated, info = self.env.step(action)
-        if self._too_fast(u):
-            info = {**info, "violation": True}
-        cost += self.violation_cost if info.get("violation") else 0.0
-        self.theta = np.asarray(observation, np.float64)
-        return observation, -cost, terminated, truncated, info
-
-    def _too_fast(self, u: Array) -> bool:
-        """Tell whether u moves from u_prev by more than its bounds, and rounding, allow."""
-        mpc = self.problem
-        if not mpc.has_rate_bounds:
-            return False
-        moved = u - self.theta[mpc.layout.previous]
-        rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
-        low, high = mpc.rate.du_min - rounding, mpc.rate.du_max + rounding
-        return bool(np.any((moved < low) | (moved > high)))
-
-
-def _require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:
-    """Return a space of the env, a Box with one dimension."""
-    space = getattr(env, name)
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise TypeError(
-            f"{name} is {space}, the wrappers need a Box with one dimension. Wrap the env in "
-            "gymnasium.wrappers.FlattenObservation, or observe the plant's state."
-        )
-    return space
+        return joined(x_hat, rest, np.clip(d_hat, self.low, self.high))

@@ -13,6 +13,7 @@ from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, NonFiniteWarni
 from sb3_yann.wrappers import (
     MeasuredDisturbance,
     ObserveDisturbance,
+    PastInputs,
     PreviousInput,
     SetPoint,
     StageCost,
@@ -235,3 +236,18 @@ def test_a_measurement_that_is_not_finite_is_named_and_predicted() -> None:
         observation = env.step(np.zeros(1))[0]
     np.testing.assert_allclose(env.observer.estimate, env.observer.A @ before)
     assert np.all(np.isfinite(observation))
+
+
+def test_inputs_on_their_way_are_shown_newest_first() -> None:
+    env = PastInputs(gym.make("CSTR-v0"), [3], initial=[0.5])
+    assert env.reset(seed=0)[0][4:].tolist() == [0.5, 0.5, 0.5]
+    env.step(np.float32([1]))
+    assert env.step(np.float32([-1]))[0][4:].tolist() == [-1, 1, 0.5]
+    assert env.reset(seed=0)[0][4:].tolist() == [0.5, 0.5, 0.5]
+    assert env.observation_space.shape == (7,)
+
+
+@pytest.mark.parametrize("delays", [[1, 2], [-1], [0.5]])
+def test_delays_that_do_not_fit_are_named(delays: list[int]) -> None:
+    with pytest.raises(ValueError, match=r"delays = .* must"):
+        PastInputs(gym.make("CSTR-v0"), delays)

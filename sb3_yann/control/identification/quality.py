@@ -1,0 +1,94 @@
+"""Notes on what a fit is worth: residuals, held-out data, excitation, bias and poles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.control.identification.curvature import bent
+from sb3_yann.control.identification.least_squares import Regression, neighbors
+from sb3_yann.control.identification.logs import Episode
+from sb3_yann.control.identification.pole_errors import pole_note
+from sb3_yann.control.identification.shrinkage import WEAK
+
+AHEAD = 10  # steps of the longer prediction whose fit is stated
+MUCH = 0.5  # share of the residuals from which on curvature explains their colour too
+POOR = 50.0  # percent of the longer prediction's fit below which a model is called poor
+
+
+def quality_notes(
+    found: Regression,
+    fitted: list[Episode],
+    tested: list[Episode],
+    fits: tuple[Array, Array],
+    ridge: float,
+) -> list[str]:
+    """Return notes on residuals, fit, excitation, bias and poles.
+
+    Parameters
+    ----------
+    found, fitted, tested : Regression and lists of Episode
+        The fit, what it was fitted to, and what was held out.
+    fits, ridge : pair of ndarray (n,), and float
+        The fits one and more steps ahead in percent, and the penalty.
+    """
+    notes = [
+        f"Fitted to {found.steps} steps; one step differs from the prediction by "
+        f"{listed(np.sqrt(np.diag(found.covariance)))} (standard deviation of each state)."
+    ]
+    if tested:
+        notes.append(_words_for(fits, sum(map(len, tested))))
+    if found.excitation < WEAK:
+        notes.append(
+            f"Weakly excited: {found.weakest} moved {found.excitation:.1e} times as much as the "
+            "most excited combination. Entries along it are uncertain."
+        )
+    if ridge > 0:
+        notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
+    return [*notes, *_residual_notes(found, fitted), pole_note(found, found.reached.size)]
+
+
+def _residual_notes(found: Regression, fitted: list[Episode]) -> list[str]:
+    """Return notes on what the residuals hold beside white noise: curvature, or colour."""
+    share, rest = bent(found, fitted)
+    colored = np.abs(found.autocorrelation) > 3 / np.sqrt(found.steps)
+    notes = []
+    if np.any(share > 0):
+        notes.append(
+            f"Curvature: squares and products of states and inputs explain {listed(100 * share)} % "
+            "of the residuals' variance. The plant is not linear over this log: record closer to "
+            "the operating point, or learn what is missing (PlantTwin)."
+        )
+        # What curvature explains is no noise.
+        colored &= np.abs(neighbors(rest, fitted)) > 3 / np.sqrt(found.steps)
+        # Where it explains much, what it leaves is curvature of higher order.
+        colored &= share < MUCH
+    if np.any(colored):
+        notes.append(
+            f"The residuals of neighboring steps are correlated ({listed(found.autocorrelation)}): "
+            "there is sensor noise, which biases A towards zero, or an unmodeled state. The "
+            "standard errors do not tell that."
+        )
+    return notes
+
+
+def _words_for(fits: tuple[Array, Array], steps: int) -> str:
+    """Return a note on the fits to held-out data."""
+    words = [
+        f"{listed(fit)} % {ahead} ahead"
+        for fit, ahead in zip(fits, ("one step", f"{AHEAD} steps"), strict=True)
+        if not np.all(np.isnan(fit))
+    ]
+    if not words:
+        return f"The {steps} steps held out tell no fit: they are too few, or nothing moves."
+    text = f"Fit over {steps} steps held out, 100 % is perfect: {', '.join(words)}."
+    if len(words) < len(fits):
+        text += f" No episode of them is {AHEAD} steps long."
+    if np.any(fits[1] < POOR):
+        text += f" Poor: {AHEAD} steps ahead the model says little of the plant."
+    return text
+
+
+def listed(values: Array) -> str:
+    """Return numbers with three digits, separated by commas."""
+    return ", ".join(f"{value:.3g}" for value in values)

@@ -1,0 +1,82 @@
+"""Names and units of states and inputs: checked, and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sb3_yann.control.linear_system import LinearSystem, names
+
+Units = Mapping[str, str] | Sequence[str]
+
+
+def as_names(what: str, given: Sequence[str], size: int) -> tuple[str, ...]:
+    """Return so many different names, or none."""
+    if isinstance(given, str) or not all(isinstance(each, str) for each in given):
+        raise TypeError(f"{what} = {given!r} must be a list of str, one for each of the {size}.")
+    found = tuple(given)
+    if found and (len(found) != size or len(set(found)) != size or not all(found)):
+        raise ValueError(
+            f"{what} = {list(found)} must be {size} different names, or none: leave it out."
+        )
+    return found
+
+
+def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
+    """Return the unit of each state and input, "" where there is none.
+
+    Parameters
+    ----------
+    given : mapping from name to unit, or sequence of str
+        Names are those of states and inputs, ``x[0]`` where there are no others.
+    labels : sequence of str
+        The names.
+
+    Examples
+    --------
+    >>> as_units({"T": "K"}, ["T", "u[0]"])
+    ('K', '')
+    """
+    if isinstance(given, Mapping):
+        if unknown := [each for each in given if each not in labels]:
+            raise ValueError(f"units has {unknown}, but the names are {list(labels)}.")
+        given = [given.get(each, "") for each in labels]
+    if isinstance(given, str) or not all(isinstance(each, str) for each in given):
+        raise TypeError(f"units = {given!r} must map names to str, or list one for each.")
+    found = tuple(given)
+    if found and len(found) != len(labels):
+        raise ValueError(f"units = {list(found)} must have one entry for each of {list(labels)}.")
+    return found if any(found) else ()
+
+
+def labels_of(model: LinearSystem) -> tuple[list[str], list[str]]:
+    """Return the names of the states and of the inputs, ``x[0]`` and ``u[0]`` where none is given.
+
+    Examples
+    --------
+    >>> from sb3_yann.control import LinearModel
+    >>> labels_of(LinearModel([[1]], [[1]], dt=1, state_names=["level"]))
+    (['level'], ['u[0]'])
+    """
+    plain = names((model.n_states, model.n_inputs))
+    n = model.n_states
+    return list(model.state_names) or plain[:n], list(model.input_names) or plain[n:]
+
+
+def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
+    """Return the names of states and inputs, each with its unit in parentheses where it has one."""
+    states, inputs = labels_of(model)
+    units = model.units or ("",) * (len(states) + len(inputs))
+    whole = [
+        f"{name} ({unit})" if unit else name
+        for name, unit in zip([*states, *inputs], units, strict=True)
+    ]
+    return whole[: len(states)], whole[len(states) :]
+
+
+def short_repr(model: Any) -> str:
+    """Return the sizes, names and operating point of a model, for one line."""
+    states, inputs = with_units(model)
+    sizes = f"states={states}, inputs={inputs}, disturbances={model.n_disturbances}"
+    point = f"x_ss={model.x_ss.tolist()}, u_ss={model.u_ss.tolist()}"
+    return f"{type(model).__name__}({sizes}, dt={model.dt:g}, {point})"

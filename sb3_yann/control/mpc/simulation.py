@@ -1,0 +1,33 @@
+"""The closed loop of a law on its own model."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import Array, as_array, as_whole
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.mpc.problem import MPCProblem
+
+
+def simulate(
+    problem: MPCProblem, law: PiecewiseAffine, theta0: ArrayLike, steps: int
+) -> tuple[Array, Array]:
+    """Return what `LinearMPC.simulate` does.
+
+    Parameters
+    ----------
+    problem, law : MPCProblem and PiecewiseAffine
+        The model, and what is played on it.
+    theta0, steps : array_like, shape (n_theta,), and int
+        The start, and the number of inputs.
+    """
+    theta = as_array("theta0", theta0, (problem.n_theta,))
+    count = as_whole("steps", steps, hint="It counts the inputs that are played.")
+    A, B = problem.prediction
+    thetas, inputs = np.empty((count + 1, len(theta))), np.empty((count, problem.model.n_inputs))
+    thetas[0] = theta
+    for k in range(count):
+        inputs[k] = law(thetas[k])
+        thetas[k + 1] = A @ thetas[k] + B @ inputs[k]
+    return thetas, inputs

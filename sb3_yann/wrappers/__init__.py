@@ -1,0 +1,24 @@
+"""Wrappers that complete theta, set the reward, shift units, and cure faults of episodes."""
+
+from sb3_yann.wrappers.episodes import SeededGlobals, TimeLimitIsNoTermination
+from sb3_yann.wrappers.stage_cost import StageCost
+from sb3_yann.wrappers.theta import (
+    MeasuredDisturbance,
+    ObserveDisturbance,
+    PastInputs,
+    PreviousInput,
+    SetPoint,
+)
+from sb3_yann.wrappers.units import Deviations
+
+__all__ = [
+    "Deviations",
+    "MeasuredDisturbance",
+    "ObserveDisturbance",
+    "PastInputs",
+    "PreviousInput",
+    "SeededGlobals",
+    "SetPoint",
+    "StageCost",
+    "TimeLimitIsNoTermination",
+]

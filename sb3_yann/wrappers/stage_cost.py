@@ -1,0 +1,98 @@
+"""The reward that the critic is exact for: minus the stage cost of the problem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import Array, as_number
+from sb3_yann.control import LinearMPC
+from sb3_yann.wrappers.spaces import Env, Vector, require_vector
+
+
+class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
+    """Makes the reward minus the stage cost of the problem, for which the critic is exact.
+
+    The cost is that of the observed theta and of the input played there. A step in which the input
+    moves by more than the problem allows reports ``info["violation"]``.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        Its observation is the theta of the problem, or what ``observation`` makes theta of.
+    problem : LinearMPC
+    violation_cost : float, default 0
+        Added to the cost of a step that reports ``info["violation"]``.
+    observation : AffineObservation, optional
+        The map from an observation, absolute or normalized, to theta: the one of the policy. The
+        action is in deviations all the same.
+
+    Examples
+    --------
+    >>> plant = gym.make("CSTR-v0")
+    >>> env = StageCost(plant, plant.observation_space.problem, violation_cost=10)
+    >>> _ = env.reset(seed=0)
+    >>> env.step(np.zeros(1, np.float32))[1] < 0
+    True
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        problem: LinearMPC,
+        violation_cost: float = 0.0,
+        observation: Callable[[ArrayLike], Array] | None = None,
+    ) -> None:
+        super().__init__(env)
+        space = require_vector(env, "observation_space")
+        self.inputs = require_vector(env, "action_space")
+        names = problem.layout.names
+        if observation is not None and not callable(observation):
+            raise TypeError(f"observation = {observation!r} must be an AffineObservation or None.")
+        self.seen: Callable[[ArrayLike], Array] = observation or _as_it_is
+        shape = np.shape(self.seen(np.zeros(space.shape)))
+        if shape != (problem.n_theta,):
+            what = "The observation" if observation is None else "What the map makes of it"
+            raise ValueError(
+                f"{what} has shape {shape}, but theta = [{', '.join(names)}] has "
+                f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order, or "
+                "pass observation=AffineObservation(matrix, offset)."
+            )
+        self.problem, self.violation_cost = problem, as_number("violation_cost", violation_cost)
+        self.theta: Array = np.zeros(problem.n_theta)
+
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode."""
+        observation, info = self.env.reset(**kwargs)
+        self.theta = self.seen(observation)
+        return observation, info
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Step; the reward is the one of this wrapper."""
+        u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
+        cost = float(self.problem.stage_cost(self.theta, u))
+        observation, _, terminated, truncated, info = self.env.step(action)
+        if self._too_fast(u):
+            info = {**info, "violation": True}
+        cost += self.violation_cost if info.get("violation") else 0.0
+        self.theta = self.seen(observation)
+        return observation, -cost, terminated, truncated, info
+
+    def _too_fast(self, u: Array) -> bool:
+        """Tell whether u moves from u_prev by more than its bounds, and rounding, allow."""
+        mpc = self.problem
+        if not mpc.has_rate_bounds:
+            return False
+        moved = u - self.theta[mpc.layout.previous]
+        rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
+        low, high = mpc.rate.du_min - rounding, mpc.rate.du_max + rounding
+        return bool(np.any((moved < low) | (moved > high)))
+
+
+def _as_it_is(observation: ArrayLike) -> Array:
+    """Return the observation as theta."""
+    return np.asarray(observation, np.float64)

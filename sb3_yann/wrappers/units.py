@@ -1,0 +1,70 @@
+"""A plant that shows and takes absolute values, in deviations from the operating point."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearModel
+from sb3_yann.wrappers.spaces import Env, Vector, require_vector
+
+
+class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
+    """Shows ``x - x_ss`` and takes ``u - u_ss``, in boxes that are shifted likewise.
+
+    Wrap the plant in it first; what other wrappers append then counts from the operating point too.
+    Entries of the observation after the n states stay as they are.
+
+    Parameters
+    ----------
+    env : gymnasium.Env, with one-dimensional Box spaces
+        Its observation begins with the model's n states, its action is the m inputs.
+    model : LinearModel
+        Its operating point is taken off.
+
+    Examples
+    --------
+    >>> model = LinearModel(np.eye(4) / 2, np.ones((4, 1)), dt=1, x_ss=[1, 2, 3, 4], u_ss=[0.5])
+    >>> env = Deviations(gym.make("CSTR-v0"), model)
+    >>> env.action_space.high - gym.make("CSTR-v0").action_space.high
+    array([-0.5])
+    """
+
+    def __init__(self, env: Env, model: LinearModel) -> None:
+        super().__init__(env)
+        if not isinstance(model, LinearModel):
+            raise TypeError(f"model = {model!r} must be a LinearModel, e.g. mpc.model.")
+        seen, taken = (require_vector(env, f"{k}_space") for k in ("observation", "action"))
+        n, m = model.n_states, model.n_inputs
+        if seen.shape[0] < n or taken.shape != (m,):
+            raise ValueError(
+                f"The env shows {seen.shape} and takes {taken.shape}, but the model has {n} states "
+                f"and {m} inputs. Wrap the plant before other wrappers, or pass its own model."
+            )
+        self.x_ss: Array = np.concatenate([model.x_ss, np.zeros(seen.shape[0] - n)])
+        self.u_ss: Array = model.u_ss
+        self.taken = taken
+        self.observation_space = _shifted(seen, self.x_ss)
+        self.action_space = _shifted(taken, self.u_ss)
+
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode."""
+        observation, info = self.env.reset(**kwargs)
+        return np.asarray(observation, np.float64) - self.x_ss, info
+
+    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
+        """Step with ``u_ss`` added to the action, and ``x_ss`` taken off the observation."""
+        # Rounding must not leave the space of the env.
+        u = np.clip(np.asarray(action, np.float64) + self.u_ss, self.taken.low, self.taken.high)
+        observation, reward, terminated, truncated, info = self.env.step(u.astype(self.taken.dtype))
+        shown = np.asarray(observation, np.float64) - self.x_ss
+        return shown, float(reward), terminated, truncated, info
+
+
+def _shifted(space: spaces.Box, point: Array) -> Any:
+    """Return the box of what is seen minus the point."""
+    return spaces.Box(space.low - point, space.high - point, dtype=np.float64)

@@ -1,0 +1,108 @@
+"""Dead time is found, and held as states of the model; curvature is not taken for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel, LinearMPC, identify
+
+A = np.array([[0.9, 0.2], [0.0, 0.7]])
+B = np.array([[0.0, 0.5], [1.0, 0.0]])
+
+
+def late(delays: tuple[int, int], noise: float, hold: int = 1, mean: float = 0.0) -> Any:
+    """Return states and actions of a plant whose inputs act late; noise in units of the state."""
+    rng = np.random.default_rng(sum(delays) + hold)
+    u = mean + np.repeat(rng.choice([-1.0, 1.0], (600 // hold, 2)), hold, axis=0)
+    x = np.zeros((601, 2))
+    for k in range(600):
+        acting = np.array([u[k - L, j] if k >= L else 0.0 for j, L in enumerate(delays)])
+        x[k + 1] = A @ x[k] + B @ acting + noise * rng.normal(size=2)
+    return x, u
+
+
+@pytest.mark.parametrize("delays", [(0, 0), (1, 0), (2, 5), (3, 3), (0, 8)])
+@pytest.mark.parametrize(("noise", "hold"), [(0.0, 1), (0.02, 5), (0.1, 1)])
+def test_dead_time_is_found_for_each_input(
+    delays: tuple[int, int], noise: float, hold: int
+) -> None:
+    found = identify(*late(delays, noise, hold), dt=1, delay="auto")
+    assert found.model.n_states == 2 + sum(delays)
+    if any(delays):
+        assert f"inputs act for {list(delays)} samples" in found.model.report()
+
+
+def test_a_model_with_dead_time_predicts_and_rests() -> None:
+    x, u = late((2, 0), 0.0, mean=0.3)
+    model = LinearModel.from_data(x, u, dt=1, delay=[2, 0])
+    np.testing.assert_allclose(model.A[:2, :2], A, atol=1e-6)
+    np.testing.assert_allclose(model.A[:2, 3], B[:, 0], atol=1e-6)  # the older of the two acts
+    np.testing.assert_array_equal(model.A[2:], [[0, 0, 0, 0], [0, 0, 1, 0]])
+    np.testing.assert_array_equal(model.B[2:], [[1, 0], [0, 0]])
+    np.testing.assert_allclose(model.x_ss[2:], model.u_ss[0], atol=1e-6)
+    np.testing.assert_allclose(A @ model.x_ss[:2] + B @ model.u_ss, model.x_ss[:2], atol=1e-6)
+
+
+def test_a_given_steady_state_is_completed_by_the_inputs_that_rest_there() -> None:
+    x, u = late((1, 0), 0.0)
+    model = LinearModel.from_data(x, u, dt=1, delay=[1, 0], x_ss=[0, 0], u_ss=[0, 0])
+    assert model.x_ss.shape == (3,)
+    with pytest.raises(ValueError, match=r"x_ss is given without u_ss.*pass both, or neither"):
+        identify(x, u, dt=1, delay=1, x_ss=[0, 0])
+
+
+def test_a_law_with_dead_time_is_better_than_one_that_ignores_it() -> None:
+    x, u = late((2, 0), 0.01)
+    weights = {"Q": np.eye(2), "R": np.eye(2), "horizon": 2, "u_min": -1, "u_max": 1}
+
+    def cost(delay: Any) -> float:
+        with np.errstate(all="ignore"):
+            model = LinearModel.from_data(x, u, dt=1, delay=delay, x_ss=[0, 0], u_ss=[0, 0])
+        weights["Q"] = np.diag([1.0, 1.0, *[0.0] * (model.n_states - 2)])
+        mpc = LinearMPC(model, **weights, theta_min=-20, theta_max=20)
+        law, at, way, total = mpc.explicit(), np.array([5.0, 2.0]), [np.zeros(2)] * 2, 0.0
+        for _ in range(40):
+            memory = [each[0] for each in way] if model.n_states > 2 else []
+            v = np.clip(law(np.r_[at, memory]), -1, 1)
+            total += float(at @ at + v @ v)
+            at = A @ at + B @ np.array([way[1][0], v[1]])
+            way = [v, way[0]]
+        return total
+
+    with pytest.warns(UserWarning, match=r"acts 2 samples late\. Pass delay=2"):
+        ignorant = cost(0)
+    assert cost([2, 0]) < 0.97 * ignorant
+
+
+def test_curvature_is_called_by_its_name() -> None:
+    rng = np.random.default_rng(0)
+    x, u = np.zeros((401, 2)), np.repeat(rng.uniform(-1, 1, (80, 1)), 5, axis=0)
+    for k in range(400):
+        a, b = x[k]
+        x[k + 1] = a + 0.2 * (b - a**3 - 0.5 * a * b), 0.8 * b + 0.5 * np.exp(u[k, 0])
+    model = LinearModel.from_data(x, u, dt=1)  # warns of no dead time
+    assert "Curvature: squares and products" in model.report()
+    assert "sensor noise" not in model.report()
+    assert identify(x, u, dt=1, delay="auto").model.n_states == 2
+
+
+@pytest.mark.parametrize("delay", [0, 2, 5])
+def test_dead_time_of_a_curved_plant_is_found(delay: int) -> None:
+    rng = np.random.default_rng(delay)
+    u = np.repeat(rng.uniform(-1, 1, (125, 1)), 4, axis=0)
+    x = np.zeros((501, 2))
+    for k in range(500):
+        a, b = x[k]
+        acting = u[k - delay, 0] if k >= delay else 0.0
+        x[k + 1] = a + 0.2 * (b - a**3 - 0.5 * a * b), 0.8 * b + 0.5 * np.exp(acting) - 0.5
+    x = x + 0.005 * rng.normal(size=x.shape)
+    assert identify(x, u, dt=1, delay="auto").model.n_states == 2 + delay
+
+
+@pytest.mark.parametrize("delay", ["soon", -1, [1, 2, 3], 1.5, True])
+def test_a_bad_delay_is_named(delay: Any) -> None:
+    with pytest.raises(ValueError, match=r"delay = .* must be"):
+        identify(*late((0, 0), 0.0), dt=1, delay=delay)

@@ -1,0 +1,128 @@
+"""A weakly excited log is regularized by free runs, or refused; poles come with their errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel, identify
+from sb3_yann.control import lqr
+
+LIQUID, GAS, DT = 50.0, 100.0, 0.02
+
+
+def column(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the next state of an extraction column of five stages, by small Runge-Kutta steps.
+
+    Its ten concentrations move together: ten states that hardly differ in what they say.
+    """
+
+    def rate(x: np.ndarray) -> np.ndarray:
+        liquid, gas = x[:5], x[5:]
+        passed = 5 * (liquid - gas**2)
+        dl = u[0] / 5 * (np.r_[0.6, liquid[:-1]] - liquid) - passed
+        return np.r_[dl, u[1] / 5 * (np.r_[gas[1:], 0.05] - gas) + passed]
+
+    h = DT / 4
+    for _ in range(4):
+        a = rate(x)
+        b = rate(x + h / 2 * a)
+        c = rate(x + h / 2 * b)
+        x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c))
+    return x
+
+
+U_SS = np.array([LIQUID, GAS])
+
+
+def rest() -> np.ndarray:
+    x = np.full(10, 0.3)
+    for _ in range(300):
+        x = column(x, U_SS)
+    return x
+
+
+X_SS = rest()
+Q, R = np.eye(10) / 0.02**2, 0.09 * np.diag(1 / U_SS**2)
+
+
+def weak_log(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a log in which the liquid moves by 30 %, and the gas by 2 %."""
+    rng = np.random.default_rng(seed)
+    moves = np.repeat(rng.uniform(-1, 1, (20, 2)), 10, axis=0)
+    u, x = U_SS * (1 + moves * [0.3, 0.02]), [X_SS]
+    for each in u:
+        x.append(column(x[-1], each))
+    return np.array(x), u
+
+
+def closed_loop_cost(K: np.ndarray) -> float:
+    x, total = X_SS + 0.02 * np.random.default_rng(9).normal(size=10), 0.0
+    for _ in range(60):
+        u = np.clip(U_SS + K @ (x - X_SS), 0.2 * U_SS, 3 * U_SS)
+        total += float((x - X_SS) @ Q @ (x - X_SS) + (u - U_SS) @ R @ (u - U_SS))
+        x = column(x, u)
+    return total
+
+
+def gain(model: LinearModel) -> np.ndarray:
+    P = lqr.riccati(model, Q, R, 1.0)
+    return -np.linalg.solve(R + model.B.T @ P @ model.B, model.B.T @ P @ model.A)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_weak_log_of_a_column_gives_a_law_as_good_as_its_equations(seed: int) -> None:
+    x, u = weak_log(seed)
+    idle = closed_loop_cost(np.zeros((2, 10)))
+    plain = identify(x, u, dt=DT, x_ss=X_SS, u_ss=U_SS, ridge=0)
+    found = identify(x, u, dt=DT, x_ss=X_SS, u_ss=U_SS)
+    assert plain.ten_step_fit.min() > 80  # and yet the law of it is worse than none
+    assert closed_loop_cost(gain(plain.model)) > 1.5 * idle
+    assert closed_loop_cost(gain(found.model)) < 0.8 * idle
+    assert "was chosen by free runs" in found.model.report()
+    assert "Curvature" in found.model.report()
+
+
+def test_a_log_that_says_nothing_is_refused_with_what_did_not_move() -> None:
+    rng = np.random.default_rng(0)
+    x, u = np.zeros((101, 1)), np.zeros((100, 1))
+    for k in range(100):  # feedback alone ties the input to the state, until it is opened
+        u[k] = -0.9 * x[k] + 1e-4 * rng.normal() if k < 80 else 1.0
+        x[k + 1] = 0.99 * x[k] + u[k] + 0.1 * rng.normal()
+    with pytest.raises(ValueError, match=r"too weakly excited: .* moved .*test signal.*ridge=0"):
+        identify(x, u, dt=1)
+    with pytest.warns(UserWarning, match="no effect on the next state"):
+        assert identify(x, u, dt=1, ridge=0).excitation < 0.01
+
+
+def test_a_perfect_log_that_is_weak_is_left_as_it_is() -> None:
+    plant = LinearModel.from_continuous([[0, 1], [-2, -0.3]], [[0], [1]], 0.001)
+    u, x = np.random.default_rng(0).normal(size=(300, 1)), [np.zeros(2)]
+    for each in u:
+        x.append(plant.step(x[-1], each))
+    found = identify(np.array(x), u, dt=0.001)
+    np.testing.assert_allclose(found.model.A, plant.A, atol=1e-7)
+
+
+def test_intervals_of_the_poles_hold_the_truth() -> None:
+    inside = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        x, u = np.zeros((301, 2)), rng.normal(size=(300, 1))
+        for k in range(300):
+            x[k + 1] = (
+                [[0.9, 0.2], [0.0, 0.7]] @ x[k] + [0.0, 1.0] * u[k] + 0.1 * rng.normal(size=2)
+            )
+        note = next(n for n in identify(x, u, dt=1).model.notes if n.startswith("Poles with 95 %"))
+        first = note.partition(": ")[2].partition(";")[0]
+        value, _, width = first.partition(" within ")
+        inside += abs(float(value) - 0.9) <= float(width)
+    assert 50 <= inside <= 60
+
+
+def test_a_pole_that_may_be_unstable_is_told() -> None:
+    rng = np.random.default_rng(0)
+    x, u = np.zeros((61, 1)), rng.normal(size=(60, 1))
+    for k in range(60):
+        x[k + 1] = 0.999 * x[k] + u[k] + 0.5 * rng.normal()
+    assert "may be unstable in the plant" in LinearModel.from_data(x, u, dt=1).report()

@@ -1,0 +1,78 @@
+"""Equations in whatever shape they are written, and their steady state where it is not given."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel
+from sb3_yann_envs import cstr
+
+NAN = np.nan
+A, B = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.0], [1.0]])
+
+
+def flat(x: Any, u: Any) -> Any:
+    return A @ x + B @ u
+
+
+def columns(x: Any, u: Any) -> Any:
+    return np.array([[x[1, 0]], [-2 * x[0, 0] - 0.3 * x[1, 0] + u[0, 0]]])
+
+
+def ragged(x: Any, u: Any) -> Any:
+    return [x[1], -2 * x[0] - 0.3 * x[1] + u]  # a number, and an array with one entry
+
+
+def stacked(x: Any, u: Any) -> Any:
+    return np.vstack([x[1], -2 * x[0] - 0.3 * x[1] + u[0]])  # vectors in, a column out
+
+
+@pytest.mark.parametrize("f", [columns, ragged, stacked])
+def test_columns_and_lists_are_taken_as_vectors_are(f: Any) -> None:
+    model, same = (LinearModel.from_dynamics(each, [0, 0], [0], 0.1) for each in (f, flat))
+    np.testing.assert_allclose(model.A, same.A, atol=1e-9)
+    np.testing.assert_allclose(model.B, same.B, atol=1e-9)
+
+
+def test_a_function_that_fails_for_both_shows_its_own_error() -> None:
+    with pytest.raises(IndexError, match="index 7 is out of bounds"):
+        LinearModel.from_dynamics(lambda x, u: [x[7]], [0.0], [0.0], 0.1)
+
+
+def test_a_wrong_number_of_derivatives_is_named() -> None:
+    with pytest.raises(ValueError, match=r"f returned the shape \(3,\), expected \(2,\)"):
+        LinearModel.from_dynamics(lambda x, u: [0.0, 0.0, 0.0], [0, 0], [0], 0.1)
+
+
+def test_the_state_of_the_reactor_is_solved_for() -> None:
+    model = LinearModel.from_dynamics(cstr.dynamics, [NAN] * 4, cstr.U_SS, cstr.DT)
+    np.testing.assert_allclose(cstr.dynamics(model.x_ss, model.u_ss), 0, atol=1e-6)
+    assert "4 entries were solved for" in model.notes[0]
+
+
+def test_the_input_that_holds_a_level_is_solved_for() -> None:
+    def tanks(x: Any, u: Any) -> Any:
+        q = math.sqrt(x[0])  # raises below 0, where numpy's returns NaN
+        return [u[0] - q, q - math.sqrt(x[1])]
+
+    model = LinearModel.from_dynamics(tanks, [4, NAN], [NAN], 1.0)
+    np.testing.assert_allclose([*model.x_ss, *model.u_ss], [4, 4, 2], atol=1e-6)
+
+
+def test_several_steady_states_are_told() -> None:
+    model = LinearModel.from_dynamics(lambda x, u: x - x**3 + u, [NAN], [0], 0.1)
+    assert "There are others, [1.0, 0.0]; [-1.0, 0.0]" in model.notes[0]
+
+
+def test_more_unknowns_than_equations_are_told() -> None:
+    model = LinearModel.from_dynamics(lambda x, u: u - x, [NAN], [NAN], 0.1)
+    assert "one of many" in model.notes[0]
+
+
+def test_no_steady_state_is_an_error_that_says_how_near() -> None:
+    with pytest.raises(ValueError, match=r"No steady state was found\. The best is x_ss = "):
+        LinearModel.from_dynamics(lambda x, u: 1 + x**2, [NAN], [0], 0.1)

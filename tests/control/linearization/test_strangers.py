@@ -1,0 +1,191 @@
+"""Simulators of strangers: adaptive integrators, MuJoCo's interface, plants that forget."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann.control.linearization.noise import noise_of
+from sb3_yann.wrappers import SeededGlobals, TimeLimitIsNoTermination
+from sb3_yann_envs import cstr
+
+
+class Adaptive(gym.Env):
+    """The reactor of the package, stepped by an adaptive integrator with tolerances of its own."""
+
+    dt = cstr.DT
+
+    def __init__(self, rtol: float, method: str) -> None:
+        half = 0.2 * np.abs(cstr.X_SS)
+        self.observation_space = gym.spaces.Box(cstr.X_SS - half, cstr.X_SS + half, dtype=float)
+        width = np.maximum(np.abs(cstr.U_SS), 1.0)
+        self.action_space = gym.spaces.Box(cstr.U_SS - width, cstr.U_SS + width, dtype=float)
+        self.options = {"rtol": rtol, "atol": rtol, "method": method}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.array(cstr.X_SS, dtype=float)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        u = np.asarray(action, dtype=float)
+        found = solve_ivp(
+            lambda t, x: cstr.dynamics(x, u), (0, self.dt), self.state, **self.options
+        )
+        self.state = found.y[:, -1]
+        return self.state.copy(), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(("rtol", "method"), [(1e-3, "RK45"), (1e-5, "LSODA")])
+def test_an_adaptive_integrator_is_linearized_through_its_noise(rtol: float, method: str) -> None:
+    truth = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
+    model = LinearModel.from_env(Adaptive(rtol, method), action=cstr.U_SS)
+    for found, exact in ((model.A, truth.A), (model.B, truth.B)):
+        assert np.abs(found - exact).max() < 0.01 * np.abs(exact).max()
+
+
+class Rough(gym.Env):
+    """A plant of two states whose result is rounded to a grid, as a loose tolerance does."""
+
+    dt = 0.1
+
+    def __init__(self, grid: float) -> None:
+        self.observation_space = gym.spaces.Box(-1, 1, (2,), np.float64)
+        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+        self.grid = grid
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.zeros(2)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        x, v = self.state
+        u = float(np.asarray(action)[0])
+        exact = np.array([x + 0.1 * v, 0.9 * v - 0.05 * np.sin(x) + 0.1 * u])
+        noise = self.grid * np.sin(1e9 * np.array([x + 2 * v + 3 * u + 0.1, 5 * x + v + u + 0.2]))
+        self.state = exact + noise
+        return self.state.copy(), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("grid", [1e-7, 1e-5, 1e-4])
+def test_noise_of_a_simulator_is_measured_and_stepped_over(grid: float) -> None:
+    model = LinearModel.from_env(Rough(grid), action=[0.0])
+    np.testing.assert_allclose(model.A, [[1, 0.1], [-0.05, 0.9]], atol=5 * grid / 0.1 + 1e-6)
+    np.testing.assert_allclose(model.B, [[0], [0.1]], atol=5 * grid / 0.1 + 1e-6)
+    assert "as adaptive integrators do" in model.report()
+
+
+def test_noise_is_told_from_a_kink() -> None:
+    point, scale = np.array([0.3]), np.ones(1)
+    assert noise_of(lambda z: np.abs(z - 0.3001), point, scale)[0] == 0
+    assert noise_of(lambda z: np.sin(z), point, scale)[0] < 1e-14
+
+
+class Body(gym.Env):
+    """A cart with the interface of Gymnasium's MuJoCo environments; it observes other things."""
+
+    dt = 0.1
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+        self.init_qpos, self.init_qvel = np.zeros(1), np.zeros(1)
+        self.data = SimpleNamespace(qpos=np.zeros(1), qvel=np.zeros(1))
+
+    def set_state(self, qpos: Any, qvel: Any) -> None:
+        assert qpos.shape == (1,)
+        assert qvel.shape == (1,)
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        noise = self.np_random.uniform(-0.01, 0.01, 2)
+        self.set_state(self.init_qpos + noise[:1], self.init_qvel + noise[1:])
+        return self._observe(), {}
+
+    def step(self, action):
+        self.data.qvel += self.dt * (-np.sin(self.data.qpos) + float(np.asarray(action)[0]))
+        self.data.qpos += self.dt * self.data.qvel
+        return self._observe(), 0.0, False, False, {}
+
+    def _observe(self) -> np.ndarray:
+        q, v = self.data.qpos[0], self.data.qvel[0]
+        return np.array([np.sin(q), np.cos(q), v])
+
+
+def test_the_interface_of_mujoco_is_taken() -> None:
+    model = LinearModel.from_env(Body())
+    np.testing.assert_allclose(model.x_ss, [0, 0], atol=1e-6)
+    np.testing.assert_allclose(model.A, [[0.99, 0.1], [-0.1, 1]], atol=1e-8)
+    np.testing.assert_allclose(model.B, [[0.01], [0.1]], atol=1e-6)
+    assert "set by env.unwrapped.set_state(qpos, qvel)" in model.report()
+    assert "The observation is not this state" in model.report()
+
+
+class Forgets(gym.Env):
+    """A plant whose next state does not depend on this one: it settles within a sample."""
+
+    dt = 1.0
+
+    def __init__(self, pole: float = 0.0) -> None:
+        self.observation_space = gym.spaces.Box(-5, 5, (1,), np.float64)
+        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+        self.pole = pole
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.zeros(1)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        self.state = self.pole * self.state + 2 * np.asarray(action, dtype=float)
+        return self.state.copy(), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("pole", [0.0, 1e-9])
+def test_a_plant_that_forgets_within_a_sample_has_a_model_and_a_law(pole: float) -> None:
+    model = LinearModel.from_env(Forgets(pole))
+    np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [pole, 2], atol=1e-10)
+    assert "gone within one sample" in model.report()
+    mpc = LinearMPC(model, Q=[[1]], R=[[1]], horizon=2, x_min=-5, x_max=5, u_min=-1, u_max=1)
+    assert abs(mpc.explicit()([3.0])[0]) < 1e-6
+
+
+class Careless(Forgets):
+    """Draws its start from the global generator, and calls its time limit a termination."""
+
+    def __init__(self, globals_: bool = False, limit: int = 10**6) -> None:
+        super().__init__(0.5)
+        self.globals_, self.limit = globals_, limit
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        if self.globals_:
+            self.state = np.random.normal(size=1)  # noqa: NPY002 (the fault that is tested)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        observation, *_ = super().step(action)
+        self.steps += 1
+        return observation, 0.0, self.steps >= self.limit, False, {}
+
+
+def test_an_environment_that_ignores_its_seed_is_named_and_cured() -> None:
+    with pytest.warns(UserWarning, match=r"ignores its seed.*wrappers\.SeededGlobals"):
+        model = LinearModel.from_env(Careless(globals_=True))
+    assert "ignores its seed" in model.notes[-1]
+    LinearModel.from_env(SeededGlobals(Careless(globals_=True)))  # nothing warns
+
+
+def test_a_time_limit_that_terminates_is_named_and_cured() -> None:
+    with pytest.warns(UserWarning, match=r"after 30 steps whatever.*NoTermination\(env, 30\)"):
+        LinearModel.from_env(Careless(limit=30))
+    LinearModel.from_env(TimeLimitIsNoTermination(Careless(limit=30), 30))  # nothing warns

@@ -1,0 +1,71 @@
+"""Bounds as the plant shows them give the same problem as deviations."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_yann import (
+    DisturbanceBounds,
+    LinearModel,
+    LinearMPC,
+    OutputBounds,
+    RateLimits,
+    SoftBounds,
+    Tracking,
+)
+
+X_SS, U_SS, D_SS = np.array([350.0, 2.0]), np.array([10.0]), np.array([5.0])
+MODEL = LinearModel(
+    [[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0, X_SS, U_SS, E=[[0.1], [0.0]], d_ss=D_SS
+)
+WEIGHTS: dict[str, Any] = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "rate": RateLimits(-0.5, 0.5)}
+SOFT = SoftBounds(x=[1, 0], penalty=100)
+
+
+def deviations() -> LinearMPC:
+    return LinearMPC(
+        MODEL, **WEIGHTS, x_min=[-20, -1], x_max=[20, 3], u_min=-2, u_max=5,
+        tracking=Tracking([0], -5, 5), disturbances=DisturbanceBounds(-1, 2),
+        outputs=OutputBounds([[1, 1]], y_max=30), soft=SOFT,
+    )  # fmt: skip
+
+
+def shown() -> LinearMPC:
+    return LinearMPC(
+        MODEL, **WEIGHTS, x_min=[330, 1], x_max=[370, 5], u_min=8, u_max=15,
+        tracking=Tracking([0], 345, 355), disturbances=DisturbanceBounds(4, 7),
+        outputs=OutputBounds([[1, 1]], y_max=382), soft=SOFT, absolute=True,
+    )  # fmt: skip
+
+
+def test_absolute_bounds_make_the_same_problem() -> None:
+    assert shown() == deviations()
+
+
+def test_a_changed_copy_of_it_is_not_shifted_again() -> None:
+    again = dataclasses.replace(shown(), horizon=3)
+    assert again == dataclasses.replace(deviations(), horizon=3)
+
+
+def test_a_box_of_theta_and_what_is_not_given() -> None:
+    mpc = LinearMPC(
+        MODEL, **WEIGHTS, theta_min=[300, 0], theta_max=[400, 4], u_min=8, u_max=15,
+        disturbances=DisturbanceBounds(4, 7), absolute=True,
+    )  # fmt: skip
+    assert mpc.theta_min[:2].tolist() == [-50, -2]
+    assert np.all(np.isinf(mpc.x_max))
+
+
+def test_the_report_calls_states_by_their_names() -> None:
+    mpc = dataclasses.replace(deviations(), model=MODEL.named(["T", "c"], units={"T": "K"}))
+    assert ": T (K)\n" in mpc.report(samples=50)
+    assert ": " not in deviations().report(samples=50).splitlines()[1]
+
+
+def test_absolute_is_a_flag() -> None:
+    with pytest.raises(TypeError, match="absolute = 1 must be True or False"):
+        LinearMPC(MODEL, Q=np.eye(2), R=[[1]], horizon=2, absolute=1)  # type: ignore[arg-type]

@@ -1,0 +1,93 @@
+"""A plant in its own units is seen in deviations, and its cost is that of the problem."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_yann import AffineObservation, LinearModel, LinearMPC
+from sb3_yann.wrappers import Deviations, StageCost
+
+X_SS, U_SS = np.array([350.0, 2.0]), np.array([10.0])
+MODEL = LinearModel([[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0, X_SS, U_SS)
+MPC = LinearMPC(
+    MODEL, Q=np.eye(2), R=[[1]], horizon=2, u_min=8, u_max=15, theta_min=[300, 0],
+    theta_max=[400, 4], absolute=True,
+)  # fmt: skip
+
+
+class Reactor(gym.Env):
+    """The model, as a plant that shows temperatures and takes flows, and perhaps more."""
+
+    def __init__(self, extra: int = 0) -> None:
+        low, high = [300.0, 0.0, *[-1.0] * extra], [400.0, 4.0, *[1.0] * extra]
+        self.observation_space = gym.spaces.Box(np.array(low), np.array(high), dtype=np.float64)
+        self.action_space = gym.spaces.Box(np.float32([8]), np.float32([15]))
+        self.extra = extra
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = X_SS + np.array([5.0, 0.5])
+        return self._show(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.x = X_SS + MODEL.step(self.x - X_SS, action - U_SS)
+        return self._show(), 0.0, False, False, {}
+
+    def _show(self) -> np.ndarray:
+        return np.r_[self.x, np.full(self.extra, 0.5)]
+
+
+def test_the_plant_is_seen_in_deviations() -> None:
+    env = Deviations(Reactor(), MODEL)
+    assert env.observation_space.low.tolist() == [-50, -2]
+    assert env.action_space.high.tolist() == MPC.u_max.tolist() == [5]
+    assert env.reset(seed=0)[0].tolist() == [5, 0.5]
+    x = env.step(np.array([1.0]))[0]
+    np.testing.assert_allclose(x, MODEL.step([5, 0.5], [1.0]), atol=1e-9)
+    env.step(np.array([5.0 + 1e-9]))  # rounding does not leave the plant's own space
+
+
+def test_what_comes_after_the_states_is_left_alone() -> None:
+    env = Deviations(Reactor(extra=2), MODEL)
+    assert env.reset(seed=0)[0].tolist() == [5, 0.5, 0.5, 0.5]
+    assert env.observation_space.high[2:].tolist() == [1, 1]
+
+
+def test_a_model_of_another_plant_is_named() -> None:
+    other = LinearModel(np.eye(3), np.ones((3, 1)), 1.0)
+    with pytest.raises(ValueError, match=r"shows \(2,\) and takes \(1,\), but .* 3 states"):
+        Deviations(Reactor(), other)
+    with pytest.raises(TypeError, match="must be a LinearModel"):
+        Deviations(Reactor(), MPC)  # type: ignore[arg-type]
+
+
+class AbsoluteShow(gym.ObservationWrapper):
+    """Shows absolute states of a plant that takes deviations."""
+
+    def observation(self, observation: Any) -> Any:
+        return observation + X_SS
+
+
+def test_the_stage_cost_of_absolute_observations_is_that_of_deviations() -> None:
+    plain = StageCost(Deviations(Reactor(), MODEL), MPC)
+    shown = AbsoluteShow(Deviations(Reactor(), MODEL))
+    mapped = StageCost(shown, MPC, observation=AffineObservation.deviation(X_SS))
+    for env in (plain, mapped):
+        env.reset(seed=0)
+    for u in ([1.0], [-0.5]):
+        costs = [env.step(np.array(u))[1] for env in (plain, mapped)]
+        assert costs[0] == pytest.approx(costs[1], abs=1e-9)
+        assert costs[0] < -1
+
+
+def test_a_map_that_does_not_fit_is_named() -> None:
+    env = Deviations(Reactor(), MODEL)
+    with pytest.raises(ValueError, match=r"What the map makes of it has shape \(1,\)"):
+        StageCost(env, MPC, observation=AffineObservation([[1, 0]]))
+    with pytest.raises(TypeError, match="observation = 3 must be an AffineObservation"):
+        StageCost(env, MPC, observation=3)  # type: ignore[arg-type]
