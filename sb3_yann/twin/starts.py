@@ -60,14 +60,16 @@ class Starts:
     def draw_around(self, count: int, rng: np.random.Generator) -> Array:
         """Return thetas (count, n_theta) from boxes up to three times as wide: nothing is known.
 
-        How wide is drawn as :meth:`rareness` has it: the fewer starts there are in the log, the
-        wider. Those that the law has no solution for are replaced by logged ones.
+        How wide is drawn evenly, and wider where :meth:`rareness` says so: the fewer starts there
+        are in the log, the wider. Those that the law has no solution for are replaced by logged
+        ones.
         """
         drawn, n, k = self.draw(count, rng), len(self.low), len(self.first)
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
         nearest = (1 + _widened(k)) / 2
         ranges = 2 * nearest * rng.uniform(size=(count, 1)) ** (-1 / max(k - 1, 1)) - 1
-        reach = np.minimum(ranges / _widened(k), AROUND) * half
+        wide = np.maximum(ranges / _widened(k), rng.uniform(1, AROUND, (count, 1)))
+        reach = np.minimum(wide, AROUND) * half
         drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
         drawn = np.clip(drawn, self.problem.theta_min, self.problem.theta_max)
         outside = ~self.problem.law().in_domain(drawn)
