@@ -32,6 +32,7 @@ PRINTED = {
         "50 unseen starts",
         "dearer episodes",
     ],
+    "quadrotor": ["OnlineLaw(constraints=241", "100 unseen starts", "dearer episodes"],
 }
 
 
