@@ -59,9 +59,14 @@ def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, f
 
 
 def farthest_point(A: Array, b: Array, direction: Array, inside: Array | None = None) -> Array:
-    """Return the point of a bounded polyhedron that is farthest in one direction.
+    """Return the point (n,) of a bounded polyhedron that is farthest in one direction.
 
-    With a point inside it is found faster.
+    Parameters
+    ----------
+    A, b, direction : ndarray, shapes (q, n), (q,) and (n,)
+        The polyhedron, and where to.
+    inside : ndarray, shape (n,), optional
+        A point of it, with which it is found faster.
     """
     cost = np.array(direction, dtype=float)
     start = largest_ball(*_unit_rows(A, b))[0] if inside is None else inside
@@ -71,9 +76,12 @@ def farthest_point(A: Array, b: Array, direction: Array, inside: Array | None = 
 
 
 def farthest_points(A: Array, b: Array, inside: Array, directions: Array) -> Array:
-    """Return the points (k, n) of a bounded polyhedron that are farthest in each direction (k, n).
+    """Return the points (k, n) of a bounded polyhedron that are farthest in each direction.
 
-    ``inside`` (n,) is a point of it.
+    Parameters
+    ----------
+    A, b, inside, directions : ndarray, shapes (q, n), (q,), (n,) and (k, n)
+        The polyhedron, a point of it, and where to.
     """
     from sb3_yann.control import _kernels
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control.mpc.choice import Law
-from sb3_yann.networks._kernels.mlp import as_array
 from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
 
@@ -97,6 +96,8 @@ class SharedYannLayer(LawLayer):
 
     def inputs(self, theta: th.Tensor) -> tuple[Array, NDArray[np.bool_]]:
         """Return the law's inputs (batch, m), zeros where theta is not finite, and where it is."""
+        from sb3_yann.networks._kernels.mlp import as_array  # which loads numba
+
         points = as_array(theta, np.float64)
         finite = np.isfinite(points).all(axis=1)
         if finite.all():

@@ -31,10 +31,22 @@ DEPENDENT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A critical region, its law ``U = law [theta; 1]`` and the constraint of each row.
+    """A critical region.
 
-    ``beyond`` has the active sets that lie across the rows of constraints that depend on the active
-    ones.
+    Attributes
+    ----------
+    active : int
+        Its active set.
+    law : ndarray, shape (v, n + 1)
+        ``U = law [theta; 1]``.
+    A, b : ndarray, shapes (q, n) and (q,)
+        Its half-spaces.
+    labels : list of int
+        The constraint of each row, or OUTER or SHARED.
+    inside : ndarray, shape (n,)
+        A point well inside.
+    beyond : dict
+        The active sets across the rows of constraints that depend on the active ones.
     """
 
     active: int

@@ -60,9 +60,8 @@ def choose(problem: Solvable, solved: Mapping[str, PiecewiseAffine], kind: str) 
         if isinstance(found, PiecewiseAffine):
             return found
         warnings.warn(
-            f"The program will be solved online, at each point: {found}. For the explicit law call "
-            "problem.explicit() before, which has no limit by default; to skip the search, and "
-            "this warning, choose law='online'.",
+            f"The program will be solved online, at each point. {found} To skip the search, and "
+            "this warning, choose problem.law('online'), or law='online' of a policy.",
             OnlineLawWarning,
             stacklevel=3,
         )
@@ -74,8 +73,10 @@ def _searched(problem: Solvable) -> PiecewiseAffine | str:
     """Return the explicit law if it is found within the budget, else why it is not."""
     rows, n = problem.condensed().S.shape
     if rows * n > LARGE:
-        return f"it has {rows} constraints on {n} parameters, too many to look for regions"
+        return f"It has {rows} constraints on {n} parameters, too many to look for regions."
     try:
         return problem.explicit(time_limit=SECONDS, region_limit=REGIONS)
-    except (ExplicitLimitError, ExplicitSolutionError) as error:
-        return str(error).partition(": ")[0]
+    except ExplicitLimitError as error:
+        return f"{error} Or call problem.explicit() before, which has no limit by default."
+    except ExplicitSolutionError as error:
+        return str(error)

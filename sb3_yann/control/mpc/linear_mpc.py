@@ -172,7 +172,7 @@ class LinearMPC(MPCProblem):
 
     def simulate(self, theta0: ArrayLike, steps: int) -> tuple[Array, Array]:
         """Return thetas (steps + 1, n_theta) and inputs (steps, m) of the law on its own model."""
-        return simulation.simulate(self, self.explicit(), theta0, steps)
+        return simulation.simulate(self, self.law(), theta0, steps)
 
     def is_reachable(self, r: Given = None, d: Given = None) -> NDArray[np.bool_]:
         """Tell whether the steady state for r (p,) and d (d,) lies within the bounds of x, u and y.

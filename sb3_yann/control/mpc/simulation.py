@@ -6,18 +6,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, as_array, as_whole
-from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.mpc.choice import Law
 from sb3_yann.control.mpc.problem import MPCProblem
 
 
-def simulate(
-    problem: MPCProblem, law: PiecewiseAffine, theta0: ArrayLike, steps: int
-) -> tuple[Array, Array]:
+def simulate(problem: MPCProblem, law: Law, theta0: ArrayLike, steps: int) -> tuple[Array, Array]:
     """Return what `LinearMPC.simulate` does.
 
     Parameters
     ----------
-    problem, law : MPCProblem and PiecewiseAffine
+    problem, law : MPCProblem, and PiecewiseAffine or OnlineLaw
         The model, and what is played on it.
     theta0, steps : array_like, shape (n_theta,), and int
         The start, and the number of inputs.

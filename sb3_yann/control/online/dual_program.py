@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from sb3_yann._numba import Integers
 from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
+
+if TYPE_CHECKING:
+    from sb3_yann._numba import Integers
 
 SOFT = 1e6
 """Cost of the square of a violation, in units of the curvature of the cost, where none is free."""

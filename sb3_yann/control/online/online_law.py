@@ -190,7 +190,8 @@ class OnlineLaw(ReadOnlyArrays):
         """Return inputs, what is feasible, the answers, and those of infeasible rows softened."""
         from sb3_yann.control.online import _kernels
 
-        found = self.dual.solve(rows)
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = self.dual.solve(rows)
         u, feasible = self.dual.inputs(rows, found), found.status == _kernels.SOLVED
         if not len(self.dual.fixed[1]) and feasible.all():  # mostly: the rest takes microseconds
             return u, feasible, found, None
@@ -204,6 +205,7 @@ class OnlineLaw(ReadOnlyArrays):
             again = np.ascontiguousarray(rows[lost])
             softened = self.dual.solve(again, soft=True)
             u[lost] = self.dual.inputs(again, softened)
+        u = np.nan_to_num(u, nan=0.0)  # inf - inf, far from everything
         return np.clip(u, self.u_min, self.u_max), feasible, found, softened
 
     def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:
