@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 SOFT = 1e6
 """Cost of the square of a violation, in units of the curvature of the cost, where none is free."""
+STIFF = 1e13
+"""How many times as much as the inputs a slack may cost."""
 LEAST_SOFT = 1e-8
 """So much at least is added to the unit diagonal where a constraint is softened."""
 
@@ -143,6 +145,29 @@ def scaled_program(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[P
     scaled = program.scaled(np.zeros(len(half)), half, reach)
     # Rows are of unit length in these units; theta itself comes in those of the plant.
     return replace(scaled, F=scaled.F / half, S=scaled.S / half), reach
+
+
+def require_soluble(program: ParametricQP, u_min: Array, u_max: Array) -> None:
+    """Raise ValueError where slacks cost so much more than inputs that float64 has no digits left.
+
+    Both are compared where they are largest in theta's box: a slack in which a bound is broken by
+    all that it can be.
+    """
+    half = half_widths(program.theta_min, program.theta_max)
+    inputs, sizes = len(program.c) - program.n_slacks, np.diag(program.H)
+    reach = np.tile(half_widths(u_min, u_max), inputs // len(u_min))
+    extent = np.abs(program.S) @ half + np.abs(program.G[:, :inputs]) @ reach
+    own = np.mean(sizes[:inputs] * reach**2)
+    for k in range(inputs, len(sizes)):
+        rows = (program.G[:, k] != 0) & (extent > 0)
+        broken = np.max(extent[rows] / np.abs(program.G[rows, k]), initial=0.0)
+        if sizes[k] * broken**2 > STIFF * own:
+            raise ValueError(
+                f"The penalty of soft bounds is too steep: with {broken:.3g} units of violation, "
+                f"which the box of theta has, it is {sizes[k] * broken**2 / own:.1g} times the "
+                f"inputs' own cost, and {STIFF:g} are the most. Give SoftBounds larger units (x=, "
+                "y=: the violation that counts as one), or a smaller penalty."
+            )
 
 
 def _hard(program: ParametricQP) -> NDArray[np.bool_]:

@@ -17,7 +17,12 @@ from sb3_yann._validation import Array, ReadOnlyArrays, as_array
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.law._files import read_arrays, write_arrays
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, as_points
-from sb3_yann.control.online.dual_program import Answers, DualProgram, scaled_program
+from sb3_yann.control.online.dual_program import (
+    Answers,
+    DualProgram,
+    require_soluble,
+    scaled_program,
+)
 from sb3_yann.control.online.known_points import KnownPoints
 
 _KEPT = ("dual", "known", "program")
@@ -105,7 +110,13 @@ class OnlineLaw(ReadOnlyArrays):
             Whose first variables are the inputs.
         u_min, u_max, infeasible
             As in :class:`OnlineLaw`.
+
+        Raises
+        ------
+        ValueError
+            If the penalty of soft bounds is too steep for float64.
         """
+        require_soluble(program, u_min, u_max)
         parts = {field.name: getattr(program, field.name) for field in fields(program)}
         return cls(**parts, u_min=u_min, u_max=u_max, infeasible=infeasible)
 
