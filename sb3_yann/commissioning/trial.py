@@ -131,8 +131,8 @@ class Trial:
 
     def room(self) -> Array:
         """Return what each start may cost more than with the MPC."""
-        likely = self.twin.starts.rareness(self.starts).ravel()
-        rare = np.clip(RARE / np.maximum(likely, 1e-300), 1.0, RAREST)
+        chance = self.twin.starts.chance_beyond(self.starts).ravel()
+        rare = np.clip(RARE / np.maximum(chance, 1e-300), 1.0, RAREST)
         more = AROUND * rare * np.abs(self.mpc[0]) * ~self.known
         return np.asarray(MARGIN * self.mean + more)
 

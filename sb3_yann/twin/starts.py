@@ -60,9 +60,9 @@ class Starts:
     def draw_around(self, count: int, rng: np.random.Generator) -> Array:
         """Return thetas (count, n_theta) from boxes up to three times as wide: nothing is known.
 
-        How wide is drawn evenly, and wider where :meth:`rareness` says so: the fewer starts there
-        are in the log, the wider. Those that the law has no solution for are replaced by logged
-        ones.
+        How wide is drawn evenly, and wider where :meth:`chance_beyond` says so: the fewer starts
+        there are in the log, the wider. Those that the law has no solution for are replaced by
+        logged ones.
         """
         drawn, n, k = self.draw(count, rng), len(self.low), len(self.first)
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
@@ -76,7 +76,7 @@ class Starts:
         drawn[outside] = self.draw_logged(int(outside.sum()), rng)
         return drawn
 
-    def rareness(self, thetas: Array) -> Array:
+    def chance_beyond(self, thetas: Array) -> Array:
         """Return how likely a start lies so far out or farther, in one coordinate: (...,).
 
         For thetas (..., n_theta), in the one that lies farthest out. Of k draws from a uniform

@@ -42,7 +42,7 @@ def test_a_start_is_the_rarer_the_farther_it_lies_outside_the_range_of_the_log()
     middle, half = (starts.high + starts.low) / 2, np.ptp(starts.first[:, :2], axis=0) / 2
     at = middle + half * np.array([[0.0, 0.0], [0.9, -1.0], [0.0, 2.0], [-3.0, 0.5]])
     expected = 2 / (k + 1) * np.array([1, 1, 1.5 ** (1 - k), 2.0 ** (1 - k)])
-    np.testing.assert_allclose(starts.rareness(at), expected)
+    np.testing.assert_allclose(starts.chance_beyond(at), expected)
     # That is how often it happens, in each coordinate alone.
     drawn = rng.uniform(-1, 1, (20_000, k + 1))
     seen, new = drawn[:, :k], drawn[:, k]

@@ -21,6 +21,14 @@ def test_a_simulation_is_the_law_on_its_model() -> None:
     assert np.abs(thetas[-1]).max() < 0.1
 
 
+def test_it_plays_the_law_that_was_chosen(monkeypatch) -> None:
+    mpc = LinearMPC(CART, Q=np.eye(2), R=[[1]], horizon=2, **BOUNDS)
+    online = mpc.law("online")
+    monkeypatch.setattr(LinearMPC, "explicit", None)  # nothing is searched for
+    thetas, inputs = mpc.simulate([-3, 1], 5)
+    np.testing.assert_array_equal(inputs, online(thetas[:-1]))
+
+
 def test_r_stays_and_u_prev_follows() -> None:
     mpc = LinearMPC(
         CART, Q=np.eye(2), R=[[1]], horizon=2, **BOUNDS,
