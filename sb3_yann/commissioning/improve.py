@@ -14,6 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.critic import refit_critic
 from sb3_yann.commissioning.distillation import distill
+from sb3_yann.commissioning.grounds import Grounds
 from sb3_yann.commissioning.incumbent import all_or_nothing
 from sb3_yann.commissioning.search import Pace, Search
 from sb3_yann.commissioning.trial import Check
@@ -87,7 +88,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     twin and actor, with the linear-quadratic value at the end. Every so many steps the policy is
     checked against the MPC, from seeded starts on every member of the twin. It is accepted if no
     start costs more than with the MPC by 0.05 % of the mean, none violates more, and the mean is
-    not above that of the accepted policy. A start outside the log may cost 2 % of its own more,
+    not above that of the accepted policy. A start outside the log may cost 0.5 % of its own more,
     and up to ten times as much the rarer it is. Of what is refused, a half and a quarter are
     tried. What passes is confirmed on new starts, and must gain 0.2 % in the end, or 0.02 % where
     the twin errs less than half as much as the given model. Starts that it loses, or nearly, are
@@ -157,12 +158,12 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     as_flag("progress_bar", progress_bar)
     as_flag("reidentify", reidentify)
     twin.require_trust()
-    layer, size = copy.deepcopy(policy.actor.mu).cpu(), (batch, n_starts, seed)
-    searches = [Search(layer, twin, Pace(iterations, learning_rate, check_every, patience), *size)]
+    layer, grounds = copy.deepcopy(policy.actor.mu).cpu(), Grounds(twin, batch, n_starts, seed)
+    searches = [Search(layer, grounds, Pace(iterations, learning_rate, check_every, patience))]
     today = copy.deepcopy(layer)
     if reidentify and distill(today, twin, seed):
         slower = replace(searches[0].pace, learning_rate=REFINED * learning_rate)
-        searches.append(Search(today, twin, slower, *size))
+        searches.append(Search(today, grounds, slower))
     before = None if layer.network.is_zero() else searches[0].checks[0]
     leg = min(iterations, max(check_every, -(-iterations // RACE)))
     total = iterations + (len(searches) - 1) * leg

@@ -11,18 +11,12 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.commissioning.trial import Check, Trial
-from sb3_yann.control import LinearMPC, lqr
+from sb3_yann.commissioning.grounds import Grounds, Valued
+from sb3_yann.commissioning.trial import Check
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.law_layer import LawLayer
-from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.gradient import Objective, accumulate_gradient, actor_inputs
-from sb3_yann.twin.plant_twin import PlantTwin
+from sb3_yann.twin.gradient import accumulate_gradient, actor_inputs
 
-LONGEST = 150
-"""Steps of an unrolled run, at most."""
-SETTLED = 0.05
-"""A run is so long that a deviation shrinks to this, if it may."""
 PLATEAU = 1e-4
 """A gain from one check to the next, relative to the MPC's cost, that is not worth another."""
 MOST = 3.0
@@ -33,13 +27,6 @@ HARDEST, SHARE = 50, 0.6
 """How many new hard starts each member keeps; the share of hard ones in a gradient's runs."""
 RETREATS = 1.0, 0.5, 0.25
 """Of the way from the accepted policy to the present one: what is checked until one passes."""
-POOL = 400
-"""Starts of each member that gradients draw from; what they cost with the MPC is known."""
-PENALTY = 10.0
-"""Of a step one half-width beyond a limit, in mean costs of a run."""
-
-Valued = tuple[Array, Array]
-"""Starts (rows, n_theta), and costs (rows,)."""
 
 
 @dataclass(frozen=True)
@@ -71,40 +58,18 @@ class Search:
     ----------
     layer : LawLayer
         On the CPU; it is moved.
-    twin : PlantTwin
+    grounds : Grounds
+        Where it runs; not changed.
     pace : Pace
-    batch : int
-        Runs in each gradient, shared out among the members.
-    n_starts : int
-        Of a check, for each member, twice: as the log begins, and around.
-    seed : int
     """
 
-    def __init__(
-        self,
-        layer: LawLayer,
-        twin: PlantTwin,
-        pace: Pace,
-        batch: int,
-        n_starts: int,
-        seed: int,
-    ) -> None:
-        self.layer, self.twin, self.pace, problem = layer, twin, pace, twin.problem
-        members, checked = len(twin.dynamics.members), np.random.default_rng([seed, 1])
-        self.shape, self.rng = (members, max(1, batch // members)), np.random.default_rng(seed)
-        longest = max(map(len, twin.episodes))
-        self.length = min(LONGEST, longest, settling_steps(problem))
-        self.n_starts, self.checked, self.longest = n_starts, checked, longest
-        self.trial = self._draw()
-        self.outcome = self.trial.mpc
-        nothing: list[Array] = [np.empty((0, problem.n_theta))] * members
+    def __init__(self, layer: LawLayer, grounds: Grounds, pace: Pace) -> None:
+        self.layer, self.grounds, self.pace, twin = layer, grounds, pace, grounds.twin
+        self.rng, self.drawing = copy.deepcopy(grounds.rng), copy.deepcopy(grounds.drawing)
+        self.outcome = grounds.trial.mpc
+        nothing: list[Array] = [np.empty((0, twin.problem.n_theta))] * len(twin.dynamics.members)
         self.known_hard = self.new_hard = nothing
-        penalty, value = PENALTY * self.trial.mean, _value(problem)
-        self.objective = Objective(problem, value, twin.limits.low, twin.limits.high, penalty)
-        drawn = self.rng.permutation(twin.starts.draw_anywhere(members * POOL, self.rng))
-        starts = drawn.reshape(members, POOL, -1)
-        self.pool = [*zip(starts, self._costs_of_mpc(starts), strict=True)]
-        self.hard = [(each[:0], costs[:0]) for each, costs in self.pool]
+        self.hard = [(each[:0], costs[:0]) for each, costs in grounds.pool]
         self.accepted = copy.deepcopy(layer.state_dict())
         kind = RowAdam if layer.row_gradients else th.optim.Adam
         self.optimizer: Any = kind(layer.network.weights())
@@ -138,13 +103,6 @@ class Search:
         """Mean cost of the accepted weights against the MPC's in the twin; 0 where none are."""
         return next((each.change for each in reversed(self.checks) if each.accepted), 0.0)
 
-    def _draw(self) -> Trial:
-        """Return a trial on new starts, the same for every member."""
-        count, starts = self.n_starts, self.twin.starts
-        drawn = starts.draw(count, self.checked), starts.draw_around(count, self.checked)
-        rows = np.repeat(np.concatenate(drawn)[None], len(self.twin.dynamics.members), axis=0)
-        return Trial(self.twin, rows, count, self.longest)
-
     def _check(self) -> bool:
         """Check the present actor, else what lies between it and the accepted one."""
         present = copy.deepcopy(self.layer.state_dict())
@@ -161,12 +119,13 @@ class Search:
 
     def _try(self) -> Check:
         """Check the layer on the known starts, then on new ones; learn from what it loses."""
-        played = self.trial.play(self._inputs)
-        found = self.trial.check(self.iteration, played, self.outcome)
-        self.known_hard = self.trial.hard(played)
+        trial = self.grounds.trial
+        played = trial.play(self._inputs)
+        found = trial.check(self.iteration, played, self.outcome)
+        self.known_hard = trial.hard(played)
         if not found.accepted:
             return found
-        new = self._draw()
+        new = self.grounds.draw(self.drawing)
         there = new.play(self._inputs)
         pairs = zip(new.hard(there), self.new_hard, strict=True)
         self.new_hard = [np.concatenate(each)[:HARDEST] for each in pairs]
@@ -178,58 +137,36 @@ class Search:
 
     def _step(self) -> None:
         self.optimizer.zero_grad()
-        chosen = [self._chosen(*each) for each in zip(self.pool, self.hard, strict=True)]
+        grounds = self.grounds
+        chosen = [self._chosen(*each) for each in zip(grounds.pool, self.hard, strict=True)]
         starts, mpc = (np.array(each) for each in zip(*chosen, strict=True))
         # Relative costs count: starts around the log may be many times as dear as those in it.
-        weights = np.minimum(MOST, self.trial.mean / np.maximum(np.abs(mpc), 1e-300))
+        weights = np.minimum(MOST, grounds.trial.mean / np.maximum(np.abs(mpc), 1e-300))
         reference = mpc, weights, weights * (1 + EMPHASIS)
-        dynamics, length = self.twin.dynamics, self.length
+        dynamics, objective, length = grounds.twin.dynamics, grounds.objective, grounds.length
         with np.errstate(all="ignore"):
-            accumulate_gradient(self.layer, dynamics, self.objective, starts, length, reference)
+            accumulate_gradient(self.layer, dynamics, objective, starts, length, reference)
         if all(each.grad is None or _finite(each.grad) for each in self.layer.network.weights()):
             self.optimizer.step()
 
     def _chosen(self, pool: Valued, hard: Valued) -> Valued:
         """Return the starts of one member's runs, and what they cost with the MPC."""
-        batch = self.shape[1]
+        batch = self.grounds.batch
         first = self.rng.permutation(len(hard[0]))[: int(SHARE * batch)]
         rest = self.rng.permutation(len(pool[0]))[: batch - len(first)]
         starts, costs = ((a[first], b[rest]) for a, b in zip(hard, pool, strict=True))
         return np.concatenate(starts), np.concatenate(costs)
 
-    def _costs_of_mpc(self, starts: Array) -> Array:
-        with np.errstate(all="ignore"):
-            runs = self.twin.dynamics.roll_out(law_of(self.twin.problem), starts, self.length)
-            return self.objective.costs(*runs)
-
     def _value_hard_starts(self) -> None:
         hard = [np.concatenate(each) for each in zip(self.known_hard, self.new_hard, strict=True)]
         most = max(map(len, hard))
-        filled = zip(hard, self.pool, strict=True)  # every member runs as many
+        filled = zip(hard, self.grounds.pool, strict=True)  # every member runs as many
         starts = np.array([[*rows, *pool[0][: most - len(rows)]] for rows, pool in filled])
-        costs = self._costs_of_mpc(starts) if most else np.empty((len(hard), 0))
+        costs = self.grounds.costs_of_mpc(starts) if most else np.empty((len(hard), 0))
         self.hard = [(rows, known[: len(rows)]) for rows, known in zip(hard, costs, strict=True)]
 
     def _inputs(self, theta: Array) -> Array:
-        return actor_inputs(self.layer, self.twin.problem, theta)
-
-
-def settling_steps(problem: LinearMPC) -> int:
-    """Return after how many steps of the linear closed loop little is left of a deviation."""
-    law, layout, numbers = problem.law(), problem.layout, np.arange(problem.n_theta)
-    A, B = problem.prediction
-    moving = np.concatenate([numbers[layout.state], numbers[layout.previous]])
-    gain = law.gain(np.zeros(problem.n_theta))
-    radius = lqr.spectral_radius((A + B @ gain)[np.ix_(moving, moving)])
-    return int(np.ceil(np.log(SETTLED) / np.log(radius))) if 0 < radius < 1 else LONGEST
-
-
-def _value(problem: LinearMPC) -> Array:
-    """Return the undiscounted value of the law, or one discounted a little where there is none."""
-    try:
-        return problem.value_matrix(1.0)
-    except ValueError:
-        return problem.value_matrix(0.99)
+        return actor_inputs(self.layer, self.grounds.twin.problem, theta)
 
 
 def _finite(gradient: th.Tensor) -> bool:

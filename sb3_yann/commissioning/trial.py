@@ -15,7 +15,7 @@ from sb3_yann.twin.plant_twin import PlantTwin
 
 MARGIN = 5e-4
 """What one start may cost more than with the MPC on one member, in mean costs of the MPC."""
-AROUND, RARE, RAREST = 0.02, 0.1, 10.0
+AROUND, RARE, RAREST = 0.005, 0.1, 10.0
 """What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; the
 probability below which it may cost more yet, and how many times as much at most."""
 FURTHER = 0.01

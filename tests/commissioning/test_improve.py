@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import NoActionNoise, PlantTwin, UntrustedTwinError, YannPolicy, improve
+from sb3_yann.commissioning.grounds import Grounds
 from sb3_yann.commissioning.search import Pace, Search
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.evaluation import evaluate
@@ -139,7 +140,7 @@ def test_what_gains_next_to_nothing_changes_nothing(monkeypatch) -> None:
 
 def test_of_what_is_refused_a_half_and_a_quarter_are_tried(monkeypatch) -> None:
     layer = copy.deepcopy(DDPG(YannPolicy, Cart(), seed=0, device="cpu").policy.actor.mu)
-    search = Search(layer, twin(), Pace(1, 1e-3, 1, 1), batch=5, n_starts=2, seed=0)
+    search = Search(layer, Grounds(twin(), n_runs=5, n_starts=2, seed=0), Pace(1, 1e-3, 1, 1))
     mpc = copy.deepcopy(search.accepted)
     for each in layer.network.parameters():
         th.nn.init.normal_(each, std=0.3)

@@ -9,7 +9,7 @@ import pytest
 from stable_baselines3 import DDPG
 
 from sb3_yann import LinearMPC, PlantTwin, YannPolicy, improve
-from sb3_yann.commissioning.search import settling_steps
+from sb3_yann.commissioning.grounds import settling_steps
 from sb3_yann.twin.gradient import _slopes_of_actor
 from twin_samples import Cart, log, problem
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 
 import numpy as np
@@ -19,8 +18,7 @@ from sb3_yann import (
     UntrustedTwinError,
     YannPolicy,
 )
-from sb3_yann.commissioning.search import Pace, Search
-from sb3_yann.networks import YannLayer
+from sb3_yann.commissioning.grounds import Grounds
 from twin_samples import Cart, log, problem, twin
 
 
@@ -137,11 +135,7 @@ def test_a_short_piece_of_a_log_changes_nothing_that_matters() -> None:
     states, actions = log(1, first=70)[0]
     found = PlantTwin.fit(problem(), [*log(5), (states[:8], actions[:7])])
     assert found.trusted and found.trust.runs.horizons[-1] == 60
-    layer = YannLayer(problem().explicit())
-    whole, cut = (
-        Search(copy.deepcopy(layer), each, Pace(1, 1e-3, 1, 1), 5, 2, 0).length
-        for each in (twin(), found)
-    )
+    whole, cut = (Grounds(each, 5, 2, 0).length for each in (twin(), found))
     assert whole == cut > 7
 
 

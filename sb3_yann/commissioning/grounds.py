@@ -1,0 +1,101 @@
+"""Where searches in a twin run: starts, what the MPC costs from them, what is minimized."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.commissioning.trial import Trial
+from sb3_yann.control import LinearMPC, lqr
+from sb3_yann.twin.dynamics import law_of
+from sb3_yann.twin.gradient import Objective
+from sb3_yann.twin.plant_twin import PlantTwin
+
+LONGEST = 150
+"""Steps of an unrolled run, at most."""
+SETTLED = 0.05
+"""A run is so long that a deviation shrinks to this, if it may."""
+POOL = 400
+"""Starts of each member that gradients draw from; what they cost with the MPC is known."""
+PENALTY = 10.0
+"""Of a step one half-width beyond a limit, in mean costs of a run."""
+
+Valued = tuple[Array, Array]
+"""Starts (rows, n_theta), and costs (rows,)."""
+
+
+@dataclass
+class Grounds:
+    """What all searches in a twin share: one trial, and a pool of starts for gradients.
+
+    Attributes
+    ----------
+    twin : PlantTwin
+    n_runs : int
+        Runs in each gradient, shared out among the members: ``batch`` for each.
+    n_starts : int
+        Of a trial, for each member, twice: as the log begins, and around.
+    seed : int
+    """
+
+    twin: PlantTwin
+    n_runs: int
+    n_starts: int
+    seed: int
+    drawing: np.random.Generator = field(init=False)
+    rng: np.random.Generator = field(init=False)
+    length: int = field(init=False)
+    trial: Trial = field(init=False)
+    objective: Objective = field(init=False)
+    pool: list[Valued] = field(init=False)
+
+    def __post_init__(self) -> None:
+        twin, problem, members = self.twin, self.twin.problem, len(self.twin.dynamics.members)
+        self.drawing, self.rng = (
+            np.random.default_rng(each) for each in ([self.seed, 1], self.seed)
+        )
+        self.length = min(LONGEST, max(map(len, twin.episodes)), settling_steps(problem))
+        self.trial = self.draw(self.drawing)
+        penalty, value = PENALTY * self.trial.mean, _value(problem)
+        self.objective = Objective(problem, value, twin.limits.low, twin.limits.high, penalty)
+        drawn = self.rng.permutation(twin.starts.draw_anywhere(members * POOL, self.rng))
+        starts = drawn.reshape(members, POOL, -1)
+        self.pool = [*zip(starts, self.costs_of_mpc(starts), strict=True)]
+
+    @property
+    def batch(self) -> int:
+        """Runs of each member in a gradient."""
+        return max(1, self.n_runs // len(self.twin.dynamics.members))
+
+    def draw(self, rng: np.random.Generator) -> Trial:
+        """Return a trial on new starts, the same for every member."""
+        count, starts, twin = self.n_starts, self.twin.starts, self.twin
+        drawn = starts.draw(count, rng), starts.draw_around(count, rng)
+        rows = np.repeat(np.concatenate(drawn)[None], len(twin.dynamics.members), axis=0)
+        return Trial(twin, rows, count, max(map(len, twin.episodes)))
+
+    def costs_of_mpc(self, starts: Array) -> Array:
+        """Return the MPC's costs (members, starts) of the runs of a gradient."""
+        with np.errstate(all="ignore"):
+            runs = self.twin.dynamics.roll_out(law_of(self.twin.problem), starts, self.length)
+            return self.objective.costs(*runs)
+
+
+def settling_steps(problem: LinearMPC) -> int:
+    """Return after how many steps of the linear closed loop little is left of a deviation."""
+    law, layout, numbers = problem.law(), problem.layout, np.arange(problem.n_theta)
+    A, B = problem.prediction
+    moving = np.concatenate([numbers[layout.state], numbers[layout.previous]])
+    gain = law.gain(np.zeros(problem.n_theta))
+    radius = lqr.spectral_radius((A + B @ gain)[np.ix_(moving, moving)])
+    return int(np.ceil(np.log(SETTLED) / np.log(radius))) if 0 < radius < 1 else LONGEST
+
+
+def _value(problem: LinearMPC) -> Array:
+    """Return the undiscounted value of the law, or one discounted a little where there is none."""
+    try:
+        return problem.value_matrix(1.0)
+    except ValueError:
+        return problem.value_matrix(0.99)
