@@ -159,6 +159,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     as_flag("reidentify", reidentify)
     twin.require_trust()
     layer, grounds = copy.deepcopy(policy.actor.mu).cpu(), Grounds(twin, batch, n_starts, seed)
+    layer.confine(*twin.starts.shown)
     searches = [Search(layer, grounds, Pace(iterations, learning_rate, check_every, patience))]
     today = copy.deepcopy(layer)
     if reidentify and distill(today, twin, seed):

@@ -14,6 +14,10 @@ from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.zero_output import ZeroOutputNetwork, register_constants
 
 Rate = tuple[Array, Array]
+ALL, NONE = 1.0, 1.5
+"""Within how many half-widths of a box a correction counts in full, and beyond how many not."""
+LEAST = 0.01
+"""The least half-width of such a box, in those of the problem's."""
 
 
 class LawLayer(nn.Module):
@@ -23,6 +27,7 @@ class LawLayer(nn.Module):
     middle: th.Tensor
     half_range: th.Tensor
     change: th.Tensor
+    confines: th.Tensor
     network: ZeroOutputNetwork
     reach: float | None
     constants: tuple[Array, Array, float]
@@ -51,6 +56,34 @@ class LawLayer(nn.Module):
         self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
         self.constants = (*self.constants[:2], np.inf if self.reach is None else self.reach)
 
+    def confine(self, low: Array | None, high: Array | None) -> None:
+        """Let the network's output count in a box of theta only, or everywhere for None.
+
+        It counts in full within, and falls to nothing at half a half-width beyond.
+        """
+        size = len(self.theta_half)
+        middle, inverse = np.zeros(size), np.zeros(size)
+        if low is not None and high is not None:
+            least = LEAST * self.theta_half.double().cpu().numpy()
+            middle, inverse = (high + low) / 2, 1 / np.maximum((high - low) / 2, least)
+        self.confines.copy_(th.as_tensor(np.stack([middle, inverse])))
+        self._keep_confines()
+
+    def confined(self, theta: th.Tensor) -> th.Tensor:
+        """Return the part (batch, 1), from 1 to 0, of the network's output that counts."""
+        beyond = ((theta - self.confines[0]).abs() * self.confines[1]).amax(1, keepdim=True)
+        return ((NONE - beyond) / (NONE - ALL)).clamp(0, 1).to(self.theta_half)
+
+    def _keep_confines(self) -> None:
+        scaling = self.constants[0][: -self.confines.numel()]
+        both = np.concatenate([scaling, self.confines.cpu().numpy().ravel()])
+        self.constants = (both, *self.constants[1:])
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
+        state_dict.setdefault(f"{prefix}confines", self.confines)  # saved before there were any
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+        self._keep_confines()
+
     def _set_ranges(self, law: Law, rate: Rate | None, always: bool = False) -> None:
         """Keep the ranges of a law and, with a rate, by how much an input may change.
 
@@ -72,7 +105,8 @@ class LawLayer(nn.Module):
             room = np.maximum(np.stack([-rate[0], rate[1]]) / reach - 1e-6, 0.0)
             change = room * [[-1.0], [1.0]]
             register_constants(self, middle=middle, half_range=reach, change=change)
-        scaling = np.concatenate([1 / half, middle, 1 / reach])
+        self.register_buffer("confines", th.zeros((2, law.n_theta), dtype=th.float64))
+        scaling = np.concatenate([1 / half, middle, 1 / reach, np.zeros(2 * law.n_theta)])
         change = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
         self.constants = (scaling, change, np.inf)  # for compiled code
 
@@ -84,7 +118,8 @@ class LawLayer(nn.Module):
             # The bound holds for weights that overflow, or are no numbers, as well.
             correction = correction.nan_to_num(0.0, self.reach, -self.reach)
             correction = clamp_with_inward_gradient(correction, -self.reach, self.reach)
-        output = law + correction
+        part = self.confined(theta)
+        output = law + th.where(part > 0, correction * part, 0.0)
         # As compiled: where theta is not finite nothing is passed off as an input.
         output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
         bounds = self.reachable(theta) if self.rated else (-1.0, 1.0)

@@ -158,9 +158,15 @@ def _slopes_of_network(layer: LawLayer, at: th.Tensor, region: Any) -> Array:
         for k in range(m)
     ]
     slopes = th.stack(rows, dim=1).double().numpy()
+    added = correction.detach().double().numpy()
     if layer.reach is not None:
-        slopes[np.abs(correction.detach().numpy()) >= layer.reach] = 0.0
-    return np.asarray(slopes)
+        slopes[np.abs(added) >= layer.reach] = 0.0
+        added = np.clip(added, -layer.reach, layer.reach)
+    points = at.double().clone().requires_grad_()
+    part = layer.confined(points)
+    (of_part,) = th.autograd.grad(part.sum(), points)
+    slopes *= part.detach().double().numpy()[:, :, None]
+    return np.asarray(slopes + added[:, :, None] * of_part.numpy()[:, None])
 
 
 def _moved_by_bounds(

@@ -47,6 +47,14 @@ class Starts:
         high = np.minimum(middle + half, problem.theta_max[:n])
         return cls(problem, low, high, first, rows)
 
+    @property
+    def shown(self) -> tuple[Array, Array]:
+        """The box of theta (n_theta,), twice, that the log shows: all rows, and where it began."""
+        low, high = self.first.min(0), self.first.max(0)
+        further = (high - low) / 2 * (_widened(len(self.first)) - 1)
+        low, high = np.minimum(self.rows.min(0), low - further), high + further
+        return low, np.maximum(self.rows.max(0), high)
+
     def draw(self, count: int, rng: np.random.Generator) -> Array:
         """Return thetas (count, n_theta) where episodes begin: in the box, the rest as logged."""
         drawn = self.first[rng.integers(len(self.first), size=count)].copy()

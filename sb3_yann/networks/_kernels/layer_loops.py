@@ -9,6 +9,7 @@ import numpy as np
 from sb3_yann._numba import Integers, Single, compiled
 from sb3_yann._validation import Array
 from sb3_yann.control.law._kernels import input_at
+from sb3_yann.networks.law_layer import ALL, NONE
 from sb3_yann.networks._kernels.mlp import WEIGHTS, network, network_backward
 
 _KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
@@ -44,6 +45,15 @@ def _between(value: Any, low: Any, high: Any) -> Any:
 
 
 @compiled()
+def _confined(theta: Any, box: Any) -> Any:
+    """Return the part, from 1 to 0, of a correction that counts at theta (n,)."""
+    n, beyond = len(theta), 0.0
+    for j in range(n):
+        beyond = max(beyond, abs(theta[j] - box[j]) * box[n + j])
+    return np.float32(min(max((NONE - beyond) / (NONE - ALL), 0.0), 1.0))
+
+
+@compiled()
 def _act(
     u: Array,
     theta: Array,
@@ -67,9 +77,10 @@ def _act(
     Parameters
     ----------
     u, theta : ndarray, shapes (batch, m) and (batch, n)
-    scaling : ndarray, shape (n + 2 m,)
+    scaling : ndarray, shape (3 n + 2 m,)
         One over the half-widths of the box of theta; the middles of the input ranges; one over
-        their half-widths.
+        their half-widths; the middle of the box that corrections are confined to; one over its
+        half-widths, 0 where there is none.
     change : ndarray, shape (2, m) or (0, m)
         By how much an action may differ from the previous input, the last m entries of theta.
     limit : float
@@ -77,17 +88,18 @@ def _act(
     nodes, second, last, pinned, used, slot
         As in :func:`network`.
     actions, x, hidden1, hidden2, outputs : ndarray
-        What is written; the last one, (4, batch, m), are the networks' outputs, the actions before
-        they are clamped, and the lower and upper bounds.
+        What is written; the last one, (5, batch, m), are the networks' outputs, the actions before
+        they are clamped, the lower and upper bounds, and the part of the correction that counts.
     """
     (batch, n), m = theta.shape, last.shape[1]
     for row in range(batch):
         for j in range(n):
             x[row, j] = theta[row, j] * scaling[j]
-    out, total, bounds = outputs[0], outputs[1], outputs[2:]
+    out, total, bounds, part = outputs[0], outputs[1], outputs[2:4], outputs[4]
     network(x, used, slot, nodes, second, last, pinned, hidden1, hidden2, out)
     bounds[0], bounds[1] = -1, 1
     for row in range(batch):
+        part[row] = _confined(theta[row], scaling[n + 2 * m :])
         for k in range(m):
             for side in range(len(change)):
                 previous = (theta[row, n - m + k] - scaling[n + k]) * scaling[n + m + k]
@@ -98,6 +110,8 @@ def _act(
             if limit < np.inf:  # which NaN and infinite weights do not pass either
                 correction = np.float32(min(max(correction, -limit), limit))
                 correction = correction if out[row, k] == out[row, k] else np.float32(0)
+            if part[row, k] < 1:  # at the full part a NaN stays what it is
+                correction = correction * part[row, k] if part[row, k] > 0 else np.float32(0)
             total[row, k] = _between(law, low, high) + correction
             actions[row, k] = _between(total[row, k], low, high)
 
@@ -189,7 +203,8 @@ def backward(
     ``gradient`` (batch, m) is that of the loss by the actions. What would push an action, or a
     correction, further beyond its bound is stopped: descent moves against the gradient.
     """
-    out, total, bounds, back = outputs[0], outputs[1], outputs[2:], gradient.copy()
+    out, total, bounds, part = outputs[0], outputs[1], outputs[2:4], outputs[4]
+    back = gradient * part
     for row in range(len(back)):
         for k in range(back.shape[1]):
             above = total[row, k] >= bounds[1, row, k] or out[row, k] >= limit

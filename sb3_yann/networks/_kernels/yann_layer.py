@@ -52,7 +52,7 @@ def shared_layer_on_cpu(
 
     What else it takes is in :func:`layer_on_cpu`.
     """
-    _require_width(theta, len(constants[0]) - 2 * u.shape[1])
+    _require_width(theta, (len(constants[0]) - 2 * u.shape[1]) // 3)
     known = (u, as_array(theta, np.float64), *constants)
     return _run(forward_shared, known, weights, pinned, by_row=False)
 
@@ -83,7 +83,7 @@ def _actions(loops: Any, given: list[Any]) -> tuple[Single, list[Any]]:
     x = np.empty((batch, n), np.float32)
     hidden1 = np.empty((batch, second.shape[2] - 1), np.float32)
     hidden2 = np.empty((batch, columns - 1), np.float32)
-    actions, outputs = np.empty((batch, m), np.float32), np.empty((4, batch, m), np.float32)
+    actions, outputs = np.empty((batch, m), np.float32), np.empty((5, batch, m), np.float32)
     written: list[Any] = [actions, x, used, slot, hidden1, hidden2, outputs]
     slots = loops(*given, *written)
     return actions, [x, used[:slots], slot, hidden1, hidden2, outputs]
