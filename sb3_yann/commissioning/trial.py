@@ -12,12 +12,13 @@ from sb3_yann._validation import Array
 from sb3_yann.guard.statistics import PairedEpisodes
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
+from sb3_yann.twin.starts import RARE
 
 MARGIN = 5e-4
 """What one start may cost more than with the MPC on one member, in mean costs of the MPC."""
-AROUND, RARE, RAREST = 0.005, 0.1, 10.0
-"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; the
-probability below which it may cost more yet, and how many times as much at most."""
+AROUND, RAREST = 0.005, 10.0
+"""What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; how
+many times as much at most where it is rare."""
 FURTHER = 0.01
 """How much farther than the MPC a run may leave what the log shows, in its widths."""
 NEARLY = 0.5

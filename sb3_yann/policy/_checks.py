@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
-from sb3_yann._validation import as_whole
+from sb3_yann._validation import Array, as_whole
 from sb3_yann.control import LinearMPC
 from sb3_yann.policy.observations import AffineObservation, require_frozen, require_outermost
 
@@ -222,3 +222,20 @@ def as_net_arch(
                 f"layers, such as {known[name]}."
             )
     return {**known, **value}
+
+
+def as_box(
+    low: ArrayLike | None, high: ArrayLike | None, size: int
+) -> tuple[Array, Array] | tuple[None, None]:
+    """Return the edges of a box of theta, each (size,), or None for both."""
+    if low is None and high is None:
+        return None, None
+    edges = [np.asarray(each, np.float64) for each in (low, high)]
+    if any(each.shape != (size,) or not np.all(np.isfinite(each)) for each in edges):
+        raise ValueError(
+            f"low = {low!r} and high = {high!r} must be the edges of a box of theta: {size} "
+            "finite entries each, or None for both."
+        )
+    if np.any(edges[0] > edges[1]):
+        raise ValueError(f"low = {low!r} must not be above high = {high!r}.")
+    return edges[0], edges[1]

@@ -244,6 +244,26 @@ class YannPolicy(TD3Policy):
             actor.options["max_correction"] = self.max_correction
             actor.mu.limit(self.max_correction)
 
+    def confine_correction(self, low: ArrayLike | None, high: ArrayLike | None) -> None:
+        """Let the actor's networks count in a box of theta only; None is everywhere.
+
+        They count in full within. Beyond they fade, and from half a half-width on the law acts
+        alone. :func:`improve` sets it to what the log shows. It is saved with the weights.
+
+        Parameters
+        ----------
+        low, high : array_like, shape (n_theta,)
+            Edges of the box, or None for both.
+
+        Raises
+        ------
+        ValueError
+            If an edge has another shape or is not finite, or ``low`` is above ``high``.
+        """
+        box = _checks.as_box(low, high, self.problem.n_theta)
+        for actor in (self.actor, self.actor_target):
+            actor.mu.confine(*box)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),

@@ -38,6 +38,12 @@ def test_on_the_reactor_five_episodes_are_enough_and_the_model_goes_on(tmp_path)
     assert np.mean(ours.costs) < 0.99 * np.mean(mpc.costs)
     assert ours.violations.sum() == 0
     assert np.max(ours.costs - mpc.costs) < 0.005 * np.mean(mpc.costs)
+    low, high = reactor(range(5)).starts.shown  # beyond what the log shows the MPC acts
+    far = np.float32((low + high) / 2 + 0.8 * (high - low) * np.eye(4))
+    plain = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    np.testing.assert_array_equal(model.predict(far)[0], plain.predict(far)[0])
+    near = np.float32((low + high) / 2 + 0.4 * (high - low) * np.eye(4))
+    assert not np.array_equal(model.predict(near)[0], plain.predict(near)[0])
     target, actor = model.actor_target.state_dict(), model.actor.state_dict()
     assert all(th.equal(target[name], value) for name, value in actor.items())
     model.save(tmp_path / "model")

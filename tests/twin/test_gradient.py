@@ -82,7 +82,10 @@ def test_a_limit_pushes_back_and_runs_above_a_reference_count_more() -> None:
 
 @pytest.mark.parametrize("options", [{}, {"max_correction": 0.02}])
 @pytest.mark.parametrize("make", [twin, rated])
-def test_the_actor_s_slopes_are_those_of_differences_on_bounds_as_well(make, options) -> None:
+@pytest.mark.parametrize("confined", [False, True])
+def test_the_actor_s_slopes_are_those_of_differences_on_bounds_as_well(
+    make, options, confined
+) -> None:
     problem_ = make().problem
     rate = None
     if problem_.has_rate_bounds:
@@ -93,6 +96,8 @@ def test_the_actor_s_slopes_are_those_of_differences_on_bounds_as_well(make, opt
         for each in layer.network.weights():
             each.add_(0.3 * th.randn(each.shape, generator=generator))
     low, high = problem_.theta_min, problem_.theta_max
+    if confined:
+        layer.confine(0.2 * low, 0.4 * high)
     theta = 0.5 * np.random.default_rng(0).uniform(low, high, (400, problem_.n_theta))
     found, step = _slopes_of_actor(layer, theta), 1e-6
 
