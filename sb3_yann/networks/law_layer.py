@@ -62,11 +62,11 @@ class LawLayer(nn.Module):
         It counts in full within, and falls to nothing at half a half-width beyond.
         """
         size = len(self.theta_half)
-        middle, inverse = np.zeros(size), np.zeros(size)
+        box: Array = np.zeros((2, size))  # its middle, and one over its half-widths
         if low is not None and high is not None:
             least = LEAST * self.theta_half.double().cpu().numpy()
-            middle, inverse = (high + low) / 2, 1 / np.maximum((high - low) / 2, least)
-        self.confines.copy_(th.as_tensor(np.stack([middle, inverse])))
+            box = np.stack([(high + low) / 2, 1 / np.maximum((high - low) / 2, least)])
+        self.confines.copy_(th.as_tensor(box))
         self._keep_confines()
 
     def confined(self, theta: th.Tensor) -> th.Tensor:
