@@ -11,14 +11,13 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.explicit.steep import SteepQP, solvable
 
 if TYPE_CHECKING:
     from sb3_yann._numba import Integers
 
 SOFT = 1e6
 """Cost of the square of a violation, in units of the curvature of the cost, where none is free."""
-STIFF = 1e13
-"""How many times as much as the inputs a slack may cost."""
 LEAST_SOFT = 1e-8
 """So much at least is added to the unit diagonal where a constraint is softened."""
 
@@ -77,6 +76,11 @@ class DualProgram:
     def of(cls, program: ParametricQP, u_min: Array, u_max: Array) -> DualProgram:
         """Return the dual form of a program whose first variables are the inputs (m,)."""
         scaled, reach = scaled_program(program, u_min, u_max)
+        half = half_widths(program.theta_min, program.theta_max)
+        if isinstance(scaled, SteepQP):
+            scaled = scaled.mild
+        # Rows are of unit length in these units; theta itself comes in those of the plant.
+        scaled = replace(scaled, F=scaled.F / half, S=scaled.S / half)
         m, unit = len(u_min), reach[: len(u_min), None]
         G, factor = scaled.G, linalg.cho_factor(scaled.H)
         by_theta, by_one, by_row = (
@@ -142,32 +146,7 @@ def scaled_program(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[P
     reach = np.tile(half_widths(u_min, u_max), steps)
     reach = np.concatenate([reach, np.ones(program.n_slacks)])
     half = half_widths(program.theta_min, program.theta_max)
-    scaled = program.scaled(np.zeros(len(half)), half, reach)
-    # Rows are of unit length in these units; theta itself comes in those of the plant.
-    return replace(scaled, F=scaled.F / half, S=scaled.S / half), reach
-
-
-def require_soluble(program: ParametricQP, u_min: Array, u_max: Array) -> None:
-    """Raise ValueError where slacks cost so much more than inputs that float64 has no digits left.
-
-    Both are compared where they are largest in theta's box: a slack in which a bound is broken by
-    all that it can be.
-    """
-    half = half_widths(program.theta_min, program.theta_max)
-    inputs, sizes = len(program.c) - program.n_slacks, np.diag(program.H)
-    reach = np.tile(half_widths(u_min, u_max), inputs // len(u_min))
-    extent = np.abs(program.S) @ half + np.abs(program.G[:, :inputs]) @ reach
-    own = np.mean(sizes[:inputs] * reach**2)
-    for k in range(inputs, len(sizes)):
-        rows = (program.G[:, k] != 0) & (extent > 0)
-        broken = np.max(extent[rows] / np.abs(program.G[rows, k]), initial=0.0)
-        if sizes[k] * broken**2 > STIFF * own:
-            raise ValueError(
-                f"The penalty of soft bounds is too steep: with {broken:.3g} units of violation, "
-                f"which the box of theta has, it is {sizes[k] * broken**2 / own:.1g} times the "
-                f"inputs' own cost, and {STIFF:g} are the most. Give SoftBounds larger units (x=, "
-                "y=: the violation that counts as one), or a smaller penalty."
-            )
+    return solvable(program.scaled(np.zeros(len(half)), half, reach)), reach
 
 
 def _hard(program: ParametricQP) -> NDArray[np.bool_]:

@@ -6,26 +6,29 @@ import copy
 from dataclasses import dataclass, fields
 from functools import cached_property
 from os import PathLike, fspath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array
-from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array, half_widths
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
+from sb3_yann.control.explicit.steep import SteepQP
 from sb3_yann.control.law._files import read_arrays, write_arrays
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, as_points
 from sb3_yann.control.online.dual_program import (
     Answers,
     DualProgram,
-    require_soluble,
     scaled_program,
 )
 from sb3_yann.control.online.known_points import KnownPoints
 
-_KEPT = ("dual", "known", "program")
+if TYPE_CHECKING:
+    from sb3_yann._numba import Integers
+
+_KEPT = ("dual", "known", "program", "scaled", "half")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +113,7 @@ class OnlineLaw(ReadOnlyArrays):
             Whose first variables are the inputs.
         u_min, u_max, infeasible
             As in :class:`OnlineLaw`.
-
-        Raises
-        ------
-        ValueError
-            If the penalty of soft bounds is too steep for float64.
         """
-        require_soluble(program, u_min, u_max)
         parts = {field.name: getattr(program, field.name) for field in fields(program)}
         return cls(**parts, u_min=u_min, u_max=u_max, infeasible=infeasible)
 
@@ -160,7 +157,9 @@ class OnlineLaw(ReadOnlyArrays):
                 gains[i] = 0.0
                 continue
             own, at = (found, i) if solved or softened is None else (softened, place[i])
-            gains[i] = self.dual.gain(own.active[at, : own.sizes[at]], soft=not solved)
+            active = own.active[at, : own.sizes[at]]
+            exact = self._exact_gain(active) if solved else None
+            gains[i] = self.dual.gain(active, soft=not solved) if exact is None else exact
         return gains if points.ndim == 2 else gains[0]
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -193,6 +192,16 @@ class OnlineLaw(ReadOnlyArrays):
         return DualProgram.of(self.program, self.u_min, self.u_max)
 
     @cached_property
+    def scaled(self) -> tuple[ParametricQP, Array]:
+        """The program in units of the input range and theta's box, and those of U (v,)."""
+        return scaled_program(self.program, self.u_min, self.u_max)
+
+    @cached_property
+    def half(self) -> Array:
+        """The half-widths of theta's box."""
+        return half_widths(self.theta_min, self.theta_max)
+
+    @cached_property
     def known(self) -> KnownPoints:
         """The law as a function of contiguous rows (batch, n), with what it remembers."""
         return KnownPoints(lambda rows: self._answers(rows)[0], self.n_inputs)
@@ -204,9 +213,13 @@ class OnlineLaw(ReadOnlyArrays):
         with np.errstate(over="ignore", invalid="ignore"):
             found = self.dual.solve(rows)
         u, feasible = self.dual.inputs(rows, found), found.status == _kernels.SOLVED
-        if not len(self.dual.fixed[1]) and feasible.all():  # mostly: the rest takes microseconds
+        settled = not (len(self.dual.fixed[1]) or self.scaled[0].steep)
+        if settled and feasible.all():  # mostly: the rest takes microseconds
             return u, feasible, found, None
-        for i in np.flatnonzero(found.status == _kernels.UNKNOWN):
+        asked = found.status == _kernels.UNKNOWN
+        if self.scaled[0].steep:
+            asked |= feasible  # of a milder program
+        for i in np.flatnonzero(asked):
             feasible[i] = self._ask_daqp(rows[i], u[i], found, i)
         feasible &= self.dual.meets_fixed(rows)
         softened, lost = None, np.flatnonzero(~feasible)
@@ -220,15 +233,30 @@ class OnlineLaw(ReadOnlyArrays):
         return np.clip(u, self.u_min, self.u_max), feasible, found, softened
 
     def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:
-        """Write DAQP's input and active set where the compiled method has no certificate."""
-        scaled, reach = scaled_program(self.program, self.u_min, self.u_max)
-        U, multipliers = scaled.solve_with_multipliers(theta)
-        if U is None:
-            return False
-        active = np.flatnonzero(multipliers[self.dual.rows] > 0)[: found.active.shape[1]]
+        """Write the input and active set where the compiled method has no certificate."""
+        (scaled, reach), place = self.scaled, theta / self.half
+        start = self.dual.rows[found.active[at, : found.sizes[at]]]
+        each = scaled.conditions_at(place, as_bits(start)) if isinstance(scaled, SteepQP) else None
+        if each is not None:
+            U, tight = each.law @ np.append(place, 1.0), np.isin(self.dual.rows, each.active)
+        else:
+            answer, multipliers = scaled.solve_with_multipliers(place)
+            if answer is None:
+                return False
+            U, tight = answer, multipliers[self.dual.rows] > 0
+        active = np.flatnonzero(tight)[: found.active.shape[1]]
         found.sizes[at], found.active[at, : len(active)] = len(active), active
         u[:] = (reach * U)[: len(u)]
         return True
+
+    def _exact_gain(self, active: Integers) -> Array | None:
+        """Return the gain of an active set of a steep program, None of others."""
+        scaled, reach = self.scaled
+        if not isinstance(scaled, SteepQP):
+            return None
+        found = scaled.conditions_of(as_bits(self.dual.rows[active]))
+        m = self.n_inputs
+        return None if found is None else reach[:m, None] * found.law[:m, :-1] / self.half
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""
