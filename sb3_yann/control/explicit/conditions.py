@@ -128,10 +128,8 @@ class Conditions:
         if len(self.kept) == 0:
             return 0
         if self.steep is not None:
-            moved = (
-                replace(self.steep, w=self.steep.w + apart * self.apart) if apart else self.steep
-            )
-            U, found = moved.solve_with_multipliers(theta)
+            moved = replace(self.steep, w=self.steep.w + apart * self.apart)
+            U, found = (moved if apart else self.steep).solve_with_multipliers(theta)
             return None if U is None else as_bits(np.flatnonzero(found > 0))
         import daqp
 

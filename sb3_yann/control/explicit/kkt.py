@@ -134,7 +134,7 @@ def equations(
         terms = np.abs(np.linalg.inv(K)) @ np.abs(right[:, :, : n + 1])
         noise = np.linalg.norm(np.abs(limit) + np.abs(G) @ np.abs(laws), axis=2)
         noise[each, active] = np.linalg.norm(terms[:, v:], axis=2)
-    return laws, rows, np.asarray(noise), factors, np.asarray(depends)
+    return np.asarray(laws), np.asarray(rows), np.asarray(noise), factors, np.asarray(depends)
 
 
 def _of_unit_length(rows: Array, noise: Array) -> Array:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, fields
 from functools import cached_property
-from os import PathLike, fspath
+from os import PathLike
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +15,7 @@ from sb3_yann import _validation as check
 from sb3_yann._validation import Array, ReadOnlyArrays, as_array, half_widths
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
 from sb3_yann.control.explicit.steep import SteepQP
-from sb3_yann.control.law._files import read_arrays, write_arrays
+from sb3_yann.control.law._files import read_law, write_arrays
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, as_points
 from sb3_yann.control.online.dual_program import (
     Answers,
@@ -101,6 +100,7 @@ class OnlineLaw(ReadOnlyArrays):
                 f"The program has {v} variables, {slacks} of them slacks: the others must be the "
                 f"{m} inputs of each step."
             )
+        _require_positive_definite(values["H"])
         self._store(F=F, G=G, **values)
 
     @classmethod
@@ -169,15 +169,14 @@ class OnlineLaw(ReadOnlyArrays):
     @classmethod
     def load(cls, path: str | PathLike[str]) -> OnlineLaw:
         """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
-        try:
-            data = read_arrays(path)
-            values = {field.name: data[field.name] for field in fields(cls)}
-            for name, kind in (("infeasible", str), ("n_slacks", int)):
-                values[name] = kind(values[name])
-            return cls(**values)
-        except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
-            what = f"{fspath(path)} does not hold an OnlineLaw ({error})"
-            raise ValueError(f"{what}. Write it with law.save(path).") from None
+        return read_law("an OnlineLaw", path, cls._from_arrays)
+
+    @classmethod
+    def _from_arrays(cls, data: dict[str, Any]) -> OnlineLaw:
+        values = {field.name: data[field.name] for field in fields(cls)}
+        for name, kind in (("infeasible", str), ("n_slacks", int)):
+            values[name] = kind(values[name])
+        return cls(**values)
 
     @cached_property
     def program(self) -> ParametricQP:
@@ -276,3 +275,17 @@ class OnlineLaw(ReadOnlyArrays):
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what follows from the rest, and what is remembered."""
         return {name: each for name, each in vars(self).items() if name not in _KEPT}
+
+
+def _require_positive_definite(H: Array) -> None:
+    scale = np.sqrt(np.abs(np.diag(H)))  # in units in which all variables count alike
+    unit = H / np.maximum(np.outer(scale, scale), 1e-300)
+    symmetric = np.max(np.abs(unit - unit.T), initial=0.0) < 1e-9
+    try:
+        np.linalg.cholesky(unit)
+    except np.linalg.LinAlgError:
+        symmetric = False
+    if not symmetric:
+        raise ValueError(
+            "H must be symmetric and positive definite: else the program has no unique solution."
+        )

@@ -43,8 +43,8 @@ def test_steep_penalties_of_states_in_small_units_are_solved_to_rounding(unit: f
         exact = solved_in_fractions(program, theta / law.half, np.flatnonzero(multipliers > 0))
         assert abs(u[0] - reach[0] * exact[0]) < 1e-12
     np.testing.assert_allclose(explicit(points), law(points), rtol=0, atol=1e-12)
-    step = 1e-7 * unit
-    slope = (law(points + [step, 0]) - law(points - [step, 0])) / (2 * step)
+    step = np.array([1e-7 * unit, 0.0])
+    slope = (law(points + step) - law(points - step)) / (2 * step[0])
     gains = law.gain(points)[:, 0, 0] * (np.abs(law(points)[:, 0]) < 1)
     assert np.mean(np.abs(slope[:, 0] - gains) < 1e-6 / unit) > 0.95  # all but at a facet
 
