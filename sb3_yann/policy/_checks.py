@@ -170,7 +170,7 @@ def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None)
         warnings.warn(
             f"The model's operating point u_ss = {u_ss.tolist()} lies between the bounds of the "
             f"env's own actions. If the env takes absolute inputs, give the MPC u_min = {low} and "
-            f"u_max = {high}, and wrap the env in gymnasium.wrappers.RescaleAction with these. If "
+            f"u_max = {high}, and wrap the env: sb3_yann.wrappers.Deviations(env, mpc.model). If "
             "it takes deviations, leave u_ss out of the model.",
             stacklevel=2,
         )
