@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 SOFT = 1e6
 """Cost of the square of a violation, in units of the curvature of the cost, where none is free."""
+ROUGH = 1e-6
+"""How exact a softened program must be solved, relative to the largest distance to a constraint."""
 LEAST_SOFT = 1e-8
 """So much at least is added to the unit diagonal where a constraint is softened."""
 
@@ -125,6 +127,28 @@ class DualProgram:
         u = np.empty((len(theta), len(self.k0)))
         lam = found.multipliers, found.active, found.sizes
         inputs_of_batch(theta, self.K, self.k0, self.E, *lam, self.bounds, u)
+        return u
+
+    def soft_inputs(self, theta: Array, found: Answers) -> Array:
+        """Return the inputs (batch, m) of softened programs: saturated where none is solved.
+
+        Far from the box multipliers are so large that the certificate's tolerances are their
+        rounding. There the conditions must hold to ROUGH of the largest distance.
+        """
+        from sb3_yann.control.online._kernels import SOLVED
+
+        u = self.inputs(theta, found)
+        for i in np.flatnonzero(found.status != SOLVED):
+            active, lam = found.active[i, : found.sizes[i]], np.zeros(len(self.d0))
+            lam[active] = found.multipliers[i, : found.sizes[i]]
+            with np.errstate(over="ignore", invalid="ignore"):
+                d = self.d0 + theta[i] @ self.D
+                slack = d + self.gram @ lam + self.softness * lam
+                most = ROUGH * (1 + np.abs(d).max())
+                held = slack.min() >= -most and np.abs(slack[active]).max(initial=0.0) <= most
+                law = self.k0 + self.K @ theta[i]
+            if not held:
+                u[i] = np.clip(np.nan_to_num(law, nan=0.0), *self.bounds)
         return u
 
     def meets_fixed(self, theta: Array) -> NDArray[np.bool_]:

@@ -41,7 +41,8 @@ class OnlineLaw(ReadOnlyArrays):
     Where the program has no solution, ``infeasible`` decides:
 
     - ``"nearest_region"``: all constraints but those of single inputs give way as little as
-      possible, at a large cost of the squares of their violations.
+      possible, at a large cost of the squares of their violations. So far from the box that
+      float64 cannot solve this either, the inputs that nothing constrains are clipped.
     - ``"zero_input"``: no deviation of the input, clipped to the bounds.
 
     Other than :class:`PiecewiseAffine`, it does not end at the box of theta.
@@ -227,7 +228,7 @@ class OnlineLaw(ReadOnlyArrays):
         elif len(lost):
             again = np.ascontiguousarray(rows[lost])
             softened = self.dual.solve(again, soft=True)
-            u[lost] = self.dual.inputs(again, softened)
+            u[lost] = self.dual.soft_inputs(again, softened)
         u = np.nan_to_num(u, nan=0.0)  # inf - inf, far from everything
         return np.clip(u, self.u_min, self.u_max), feasible, found, softened
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from fractions import Fraction
 from operator import mul
 
+import daqp
 import numpy as np
 import pytest
 
 from sb3_yann.control import ExplicitSolutionError, LinearModel, LinearMPC, SoftBounds
+from sb3_yann.control.online._kernels import UNKNOWN
 
 STEEP = SoftBounds(x=True, penalty=1e3)
 
@@ -29,6 +31,34 @@ def test_numbers_that_overflow_give_an_input_within_its_bounds(infeasible: str) 
     for theta in ([1e308, -1e308], [1.7e308, 1.7e308]):
         u = law(theta)
         assert np.all(np.isfinite(u)) and np.all(np.abs(u) <= 1)
+
+
+def test_far_outside_a_softened_program_is_solved_or_the_inputs_are_saturated() -> None:
+    model = LinearModel([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], 0.1)
+    mpc = LinearMPC(
+        model, Q=np.eye(2), R=[[0.03]], horizon=12, u_min=-1, u_max=1, x_min=[-5, -2], x_max=[5, 2]
+    )
+    law, rng = mpc.online(), np.random.default_rng(0)
+    dual = law.dual
+    eye, bounds = np.eye(len(dual.d0)), np.full(len(dual.d0), -1e30)
+    values, vectors = np.linalg.eigh(dual.gram + np.diag(dual.softness))
+    rows = np.ascontiguousarray(-vectors * np.sqrt(np.maximum(values, 0.0)))
+    points = 100 * rng.uniform(mpc.theta_min, mpc.theta_max, (40, 2))
+    found = law._answers(points)[3]
+    assert found is not None and np.any(found.status == UNKNOWN)  # what is at stake
+    for theta in points[~law.in_domain(points)]:
+        d = dual.d0 + theta @ dual.D
+        size, sense = 1 + np.abs(d).max(), np.zeros(len(d), dtype=np.intc)
+        _, _, status, info = daqp.solve(eye, 0 * d, rows, d / size, bounds, sense, primal_tol=1e-11)
+        assert status == 1
+        u = dual.k0 + dual.K @ theta - dual.E.T @ (np.asarray(info["lam"]) * size)
+        np.testing.assert_allclose(law(theta), np.clip(u, -1, 1), atol=1e-6)
+    # Where nothing can be solved, the inputs are those of no constraint, clipped.
+    found.multipliers[:] = 1e30
+    found.status[:] = UNKNOWN
+    rough = dual.soft_inputs(points[: len(found.status)], found)
+    unbound = dual.k0 + points[: len(found.status)] @ dual.K.T
+    np.testing.assert_array_equal(rough, np.clip(unbound, -1, 1))
 
 
 @pytest.mark.parametrize("unit", [1e2, 1e4, 1e5, 1e6])
