@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,14 +93,15 @@ class Conditions:
     ``N z <= w + S theta``: the active rows are then all that a region needs to factor.
     """
 
-    def __init__(self, program: ParametricQP) -> None:
+    def __init__(self, program: ParametricQP, tick: Callable[[], None]) -> None:
+        self.tick = tick  # raises when the time is over
         moving, n = np.flatnonzero(np.any(program.G, axis=1)), program.F.shape[1]
         self.outer_A, self.outer_b = program.theta_rows()
         joint = _joint(program, moving, self.outer_A, self.outer_b)
         inside, _ = largest_ball(*joint)
         # Points of the feasible set that span it.
         self.corners, self.middle = _corners(*joint, inside, n), inside[-n:]
-        self.kept = moving[_irredundant(*joint, inside, len(moving))]
+        self.kept = moving[_irredundant(*joint, inside, len(moving), tick)]
         L = np.linalg.cholesky(program.H)
         self.back = np.linalg.inv(L).T
         self.Y = np.linalg.solve(L, np.column_stack([program.F, program.c]))
@@ -168,6 +169,7 @@ class Conditions:
         ok &= ~ruled_out & ~np.any((b < THINNEST - reach) & ~constant, axis=1)
         needed = (b < reach - 1e-12) & ~constant
         for i in np.flatnonzero(ok):
+            self.tick()
             label = np.flatnonzero(needed[i])
             one = self._region(actives[i], laws[i], A[i, label], b[i, label], label)
             if one is not None:
@@ -283,10 +285,13 @@ def _corners(A: Array, b: Array, inside: Array, n: int) -> Array:
     return farthest_points(A, b, inside, axes)[:, -n:]
 
 
-def _irredundant(A: Array, b: Array, inside: Array, count: int) -> list[int]:
+def _irredundant(
+    A: Array, b: Array, inside: Array, count: int, tick: Callable[[], None]
+) -> list[int]:
     """Return which of the first rows bound a polyhedron; of those that say the same, the first."""
     alive = np.ones(len(b), dtype=bool)
     for k in reversed(range(count)):
+        tick()
         relaxed = b.copy()
         relaxed[k] += 1.0
         farthest = farthest_point(A[alive], relaxed[alive], A[k], inside)
