@@ -44,9 +44,8 @@ class Incumbent:
         return not self.policy.actor.mu.network.is_zero()
 
     def limit(self, max_correction: float | None) -> None:
-        """Bound it, also in what :meth:`save` of the model writes."""
+        """Bound it, for good: a model that is saved keeps it."""
         self.policy.limit_correction(max_correction)
-        self.model.policy_kwargs = {**self.model.policy_kwargs, "max_correction": max_correction}
 
     def give_back(self) -> None:
         """Make it the MPC."""

@@ -16,6 +16,7 @@ from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import actor_inputs
+from sb3_yann.twin.replay_buffer import normalization_of
 
 Inputs = Callable[[Array], Array]
 LONGEST = 1_000_000
@@ -71,6 +72,7 @@ class Plant:
         self.env, self.model = env, model
         self.yann = require_yann_policy(model.policy, "Commissioning")
         self.problem = self.yann.problem
+        normalization_of(model)  # or raise, before anything acts on the plant
         for name in ("observation_space", "action_space"):
             own, its = getattr(model, name), getattr(env, name)
             if own.shape != its.shape or (

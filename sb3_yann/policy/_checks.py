@@ -18,6 +18,7 @@ from torch import nn
 from sb3_yann._validation import Array, as_whole
 from sb3_yann.control import LinearMPC
 from sb3_yann.policy.observations import AffineObservation, require_frozen, require_outermost
+from sb3_yann.twin.replay_buffer import LOST_STATISTICS
 
 SB3_KWARGS = (
     "n_critics features_extractor_class features_extractor_kwargs normalize_images "
@@ -68,8 +69,12 @@ def require_undone_normalization(
     problem: LinearMPC, algorithm: BaseAlgorithm | None, observation: AffineObservation | None
 ) -> None:
     """Raise unless ``observation`` can undo what a VecNormalize does to the observations."""
-    normalize = None if algorithm is None else algorithm.get_vec_normalize_env()
-    if normalize is None or algorithm is None:
+    if algorithm is None:
+        return
+    normalize = algorithm.get_vec_normalize_env()
+    if normalize is None:
+        if getattr(algorithm, "sees_normalized", False) and algorithm.get_env() is not None:
+            warnings.warn(LOST_STATISTICS, stacklevel=4)
         return
     require_frozen(normalize)
     if not normalize.norm_obs:
@@ -80,6 +85,7 @@ def require_undone_normalization(
             "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}."
         )
     require_outermost(normalize, algorithm.observation_space.shape)
+    vars(algorithm)["sees_normalized"] = True  # it is saved with the model
     largest = _largest_observation(problem, observation)
     if largest > normalize.clip_obs:
         raise ValueError(
@@ -170,7 +176,7 @@ def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None)
         warnings.warn(
             f"The model's operating point u_ss = {u_ss.tolist()} lies between the bounds of the "
             f"env's own actions. If the env takes absolute inputs, give the MPC u_min = {low} and "
-            f"u_max = {high}, and wrap the env in gymnasium.wrappers.RescaleAction with these. If "
+            f"u_max = {high}, and wrap the env: sb3_yann.wrappers.Deviations(env, mpc.model). If "
             "it takes deviations, leave u_ss out of the model.",
             stacklevel=2,
         )

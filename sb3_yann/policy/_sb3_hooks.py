@@ -22,6 +22,14 @@ def algorithm_under_construction() -> BaseAlgorithm | None:
     return caller if isinstance(caller, BaseAlgorithm) else None
 
 
+def own_policy_kwargs(algorithm: BaseAlgorithm | None) -> dict[str, Any]:
+    """Return the keywords that an algorithm saves, to be changed; no longer the user's own dict."""
+    if algorithm is None:
+        return {}
+    algorithm.policy_kwargs = dict(algorithm.policy_kwargs)
+    return algorithm.policy_kwargs
+
+
 def multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:
     """Make one step use ``factor`` times the rate that SB3 keeps setting."""
     for group in optimizer.param_groups:

@@ -132,9 +132,10 @@ class YannPolicy(TD3Policy):
         _checks.require_box("observation_space", observation_space, flattened)
         _checks.require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
-        if algorithm is not None and isinstance(problem, str):
+        self.saved_kwargs = _sb3_hooks.own_policy_kwargs(algorithm)
+        if isinstance(problem, str):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
-            algorithm.policy_kwargs = {**algorithm.policy_kwargs, "problem": self.problem}
+            self.saved_kwargs["problem"] = self.problem
         _checks.require_matching(self.problem, observation_space, action_space, observation)
         _checks.warn_of_absolute_inputs(self.problem, algorithm)
         _checks.require_undone_normalization(self.problem, algorithm, observation)
@@ -238,8 +239,12 @@ class YannPolicy(TD3Policy):
         return YannCritic(self.problem, self.gamma, options, pinned, **kwargs).to(self.device)
 
     def limit_correction(self, max_correction: float | None) -> None:
-        """Bound what the actor's networks may add to the law, as a fraction of the input range."""
+        """Bound what the actor's networks may add to the law, as a fraction of the input range.
+
+        A model that is saved and loaded keeps this bound.
+        """
         self.max_correction = _as_correction(max_correction)
+        self.saved_kwargs["max_correction"] = self.max_correction
         for actor in (self.actor, self.actor_target):
             actor.options["max_correction"] = self.max_correction
             actor.mu.limit(self.max_correction)

@@ -9,6 +9,26 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.twin.log import SHORTEST
 
+LOST_STATISTICS = (
+    "The model takes observations as a VecNormalize shows them, and its env has none: Stable-"
+    "Baselines3 saves its statistics apart. Keep them with venv.save(path), and load the model "
+    "with env=VecNormalize.load(path, venv)."
+)
+
+
+def normalization_of(model: Any) -> Any:
+    """Return a model's VecNormalize, None where it does without.
+
+    Raises
+    ------
+    ValueError
+        If the model has been trained with one that is lost.
+    """
+    normalize = model.get_vec_normalize_env()
+    if normalize is None and getattr(model, "sees_normalized", False):
+        raise ValueError(LOST_STATISTICS)
+    return normalize
+
 
 def episodes_of(model: Any) -> list[tuple[Array, Array]]:
     """Return the episodes (thetas, actions) that a model's replay buffer holds, whole or in part.
@@ -31,7 +51,7 @@ def episodes_of(model: Any) -> list[tuple[Array, Array]]:
     order = np.arange(buffer.size())
     if buffer.full:  # the oldest row is the one that comes next
         order = np.roll(order, -buffer.pos)
-    normalize = model.get_vec_normalize_env()
+    normalize = normalization_of(model)
 
     def theta(observations: Any) -> Array:
         seen = observations if normalize is None else normalize.normalize_obs(observations)

@@ -17,7 +17,8 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Shows ``x - x_ss`` and takes ``u - u_ss``, in boxes that are shifted likewise.
 
     Wrap the plant in it first; what other wrappers append then counts from the operating point too.
-    Entries of the observation after the n states stay as they are.
+    Entries of the observation after the n states stay as they are. An env that is wrapped in it
+    already is refused, and so is an action that is NaN.
 
     Parameters
     ----------
@@ -38,6 +39,7 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
         super().__init__(env)
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. mpc.model.")
+        _require_absolute(env)
         seen, taken = (require_vector(env, f"{k}_space") for k in ("observation", "action"))
         n, m = model.n_states, model.n_inputs
         if seen.shape[0] < n or taken.shape != (m,):
@@ -60,9 +62,22 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
         """Step with ``u_ss`` added to the action, and ``x_ss`` taken off the observation."""
         # Rounding must not leave the space of the env.
         u = np.clip(np.asarray(action, np.float64) + self.u_ss, self.taken.low, self.taken.high)
+        if np.isnan(u).any():
+            raise ValueError(f"action = {np.asarray(action).tolist()} must not be NaN.")
         observation, reward, terminated, truncated, info = self.env.step(u.astype(self.taken.dtype))
         shown = np.asarray(observation, np.float64) - self.x_ss
         return shown, float(reward), terminated, truncated, info
+
+
+def _require_absolute(env: gym.Env[Any, Any]) -> None:
+    """Raise if a wrapper has taken an operating point off before."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, Deviations):
+            raise ValueError(
+                "The env is wrapped in Deviations already: the operating point would be taken off "
+                "twice. Wrap it once."
+            )
+        env = env.env
 
 
 def _shifted(space: spaces.Box, point: Array) -> Any:

@@ -13,6 +13,8 @@ from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
+import sb3_yann
+import sb3_yann.wrappers
 from policy_samples import (
     actions,
     build,
@@ -85,6 +87,17 @@ def test_bounds_that_are_not_deviations_are_warned_of() -> None:
     kwargs = {"problem": heater_mpc(0, 10)}
     with pytest.warns(UserWarning, match=r"u_min = \[-3.0\] and u_max = \[7.0\], and wrap"):
         DDPG(YannPolicy, Heater(), policy_kwargs=kwargs)
+
+
+def test_the_wrapper_that_the_warning_names_is_the_cure() -> None:
+    with pytest.warns(UserWarning, match="wrap the env") as caught:
+        DDPG(YannPolicy, Heater(), policy_kwargs={"problem": heater_mpc(0, 10)})
+    mpc, line = heater_mpc(-3, 7), str(caught[0].message).partition("wrap the env: ")[2]
+    env = eval(line.partition(". If")[0], {"sb3_yann": sb3_yann, "mpc": mpc, "env": Heater()})
+    theta, _ = env.reset(seed=0)
+    model = DDPG(YannPolicy, env, policy_kwargs={"problem": mpc})
+    reached = env.step(model.predict(theta)[0])[0]
+    assert reached == pytest.approx(mpc.model.step(theta, mpc.explicit()(theta)), abs=1e-6)
 
 
 def test_a_law_without_input_bounds_is_no_policy() -> None:

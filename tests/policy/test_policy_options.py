@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch as th
@@ -17,7 +19,7 @@ from policy_samples import (
     updates,
     with_full_buffer,
 )
-from sample_plants import two_input_mpc
+from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import CriticOptions, LinearMPC, YannPolicy
 
 # --- max_correction ----------------------------------------------------------------------------
@@ -77,6 +79,40 @@ def test_a_bound_survives_saving(tmp_path) -> None:
     states = starts(scalar_mpc())
     for loaded in (DDPG.load(tmp_path / "model"), YannPolicy.load(tmp_path / "policy")):
         np.testing.assert_array_equal(loaded.predict(states)[0], model.predict(states)[0])
+
+
+@POLICIES
+@pytest.mark.parametrize(("first", "then"), [(None, 0.1), (0.1, 0.3), (0.3, None)])
+def test_a_bound_that_is_set_later_survives_saving_as_well(
+    algorithm, first, then, tmp_path
+) -> None:
+    mpc, given = scalar_mpc(), {"max_correction": first, "pin_equilibrium": False}
+    model, states = build(algorithm, mpc, given), starts(mpc)
+    scramble(model)
+    model.policy.limit_correction(then)
+    for _ in range(2):  # saved again, it is still there
+        model.save(tmp_path / "model")
+        model.policy.save(tmp_path / "policy")
+        loaded = algorithm.load(tmp_path / "model")
+        for policy in (loaded.policy, YannPolicy.load(tmp_path / "policy")):
+            assert policy.max_correction == policy.actor.options["max_correction"] == then
+            np.testing.assert_array_equal(policy.predict(states)[0], model.predict(states)[0])
+        model = loaded
+    assert given == {"max_correction": first, "pin_equilibrium": False}
+
+
+def test_a_bound_is_that_of_one_model_alone(tmp_path) -> None:
+    options = {"problem": scalar_mpc(), "max_correction": 0.1}
+    one, two = (
+        DDPG(YannPolicy, LinearPlant(scalar_mpc()), policy_kwargs=options) for _ in range(2)
+    )
+    again = copy.deepcopy(one)
+    again.policy.limit_correction(0.4)
+    one.policy.limit_correction(0.2)
+    assert options["max_correction"] == 0.1
+    for i, (model, bound) in enumerate([(one, 0.2), (two, 0.1), (again, 0.4)]):
+        model.save(tmp_path / str(i))
+        assert DDPG.load(tmp_path / str(i)).policy.max_correction == bound
 
 
 # --- pin_equilibrium ---------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from sb3_yann import (
     ImprovementGuard,
     NoActionNoise,
 )
+from sb3_yann.commissioning.plant import Plant
 
 
 def normalize(frozen: bool = True, n_envs: int = 1, **kwargs) -> VecNormalize:
@@ -47,6 +48,26 @@ def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> Non
     model.save(tmp_path / "model")
     loaded = DDPG.load(tmp_path / "model", env=env)
     np.testing.assert_array_equal(loaded.predict(obs)[0], model.predict(obs)[0])
+
+
+def test_a_loaded_model_whose_statistics_are_lost_is_named(tmp_path) -> None:
+    env, plain = normalize(), Seen(lambda x: x + STEADY, 3)
+    build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env)).save(tmp_path / "model")
+    env.save(tmp_path / "statistics")
+    with pytest.warns(UserWarning, match=r"its env has none.*VecNormalize\.load"):
+        DDPG.load(tmp_path / "model", env=plain)
+    loaded = DDPG.load(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"its env has none.*VecNormalize\.load"):
+        Plant(plain, loaded)
+    venv = VecNormalize.load(tmp_path / "statistics", DummyVecEnv([lambda: plain]))
+    whole = DDPG.load(tmp_path / "model", env=venv)
+    obs = env.normalize_obs((states() + STEADY).astype(np.float32))
+    assert error(whole, obs, states()) < 1e-5
+    theta = Plant(plain, whole)._theta((states()[0] + STEADY).astype(np.float32))
+    np.testing.assert_allclose(theta, states()[0], atol=1e-4)
+    whole.save(tmp_path / "again")
+    with pytest.warns(UserWarning, match="its env has none"):
+        DDPG.load(tmp_path / "again", env=plain)
 
 
 def mpc_costs(seeds) -> list[float]:

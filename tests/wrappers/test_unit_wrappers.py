@@ -66,6 +66,20 @@ def test_a_model_of_another_plant_is_named() -> None:
         Deviations(Reactor(), MPC)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("between", [lambda env: env, lambda env: gym.wrappers.TimeLimit(env, 9)])
+def test_the_operating_point_is_not_taken_off_twice(between) -> None:
+    with pytest.raises(ValueError, match="wrapped in Deviations already"):
+        Deviations(between(Deviations(Reactor(), MODEL)), MODEL)
+
+
+def test_an_action_that_is_nan_does_not_reach_the_plant() -> None:
+    env = Deviations(Reactor(), MODEL)
+    before, _ = env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action = \[nan\] must not be NaN"):
+        env.step(np.array([np.nan]))
+    np.testing.assert_allclose(env.step(np.array([0.0]))[0], MODEL.step(before, [0.0]), atol=1e-9)
+
+
 class AbsoluteShow(gym.ObservationWrapper):
     """Shows absolute states of a plant that takes deviations."""
 

@@ -245,9 +245,11 @@ class Certificate:
                 self._fail(f"region {min(i, j)} and region {max(i, j)} are the same", middle)
 
     def _fail(self, what: str, theta: Array) -> NoReturn:
-        place = theta * self.half + self.center
+        place, advice = theta * self.half + self.center, "shorten the horizon"
+        if self.program.steep:
+            advice = "give SoftBounds larger units or a smaller penalty"
         raise ExplicitSolutionError(
             f"The explicit solution failed its check: {what}, at theta = {place.tolist()}. The "
-            "problem is likely to be badly conditioned: shorten the horizon, or bring states and "
-            "weights to similar magnitudes."
+            f"problem is likely to be badly conditioned: {advice}, or bring states and weights to "
+            "similar magnitudes."
         )

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.explicit.kkt import equations
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches, row_units
+from sb3_yann.control.explicit.steep import SteepQP
 from sb3_yann.control.polyhedra import (
     equal_rows,
     farthest_point,
@@ -91,14 +93,15 @@ class Conditions:
     ``N z <= w + S theta``: the active rows are then all that a region needs to factor.
     """
 
-    def __init__(self, program: ParametricQP) -> None:
+    def __init__(self, program: ParametricQP, tick: Callable[[], None]) -> None:
+        self.tick = tick  # raises when the time is over
         moving, n = np.flatnonzero(np.any(program.G, axis=1)), program.F.shape[1]
         self.outer_A, self.outer_b = program.theta_rows()
         joint = _joint(program, moving, self.outer_A, self.outer_b)
         inside, _ = largest_ball(*joint)
         # Points of the feasible set that span it.
         self.corners, self.middle = _corners(*joint, inside, n), inside[-n:]
-        self.kept = moving[_irredundant(*joint, inside, len(moving))]
+        self.kept = moving[_irredundant(*joint, inside, len(moving), tick)]
         L = np.linalg.cholesky(program.H)
         self.back = np.linalg.inv(L).T
         self.Y = np.linalg.solve(L, np.column_stack([program.F, program.c]))
@@ -114,6 +117,9 @@ class Conditions:
         self.degenerate: set[int] = set()
         self.units = row_units(self.N)
         self._shortest = (np.eye(v), np.zeros(v), self.N * self.units[:, None])
+        # What is solved in place of all this where slacks are too costly for it.
+        own = {each: getattr(program, each)[self.kept] for each in "GwS"}
+        self.steep = replace(program, **own) if isinstance(program, SteepQP) else None
         self._options = (np.full(rows, -1e30), np.zeros(rows, dtype=np.intc))
 
     def active_at(self, theta: Array, apart: float = 0.0) -> int | None:
@@ -122,6 +128,10 @@ class Conditions:
             return None
         if len(self.kept) == 0:
             return 0
+        if self.steep is not None:
+            moved = replace(self.steep, w=self.steep.w + apart * self.apart)
+            U, found = (moved if apart else self.steep).solve_with_multipliers(theta)
+            return None if U is None else as_bits(np.flatnonzero(found > 0))
         import daqp
 
         n = len(theta)
@@ -145,8 +155,7 @@ class Conditions:
         factors, full = self._factored(members, size)
         self.degenerate.update(one for one, good in zip(members, full, strict=True) if not good)
         actives = [one for one, good in zip(members, full, strict=True) if good]
-        W, rows, noise = self._rows(factors)
-        laws = self.back @ (factors.Q @ W - self.Y)
+        laws, rows, noise = self._rows(factors)
         constant = np.linalg.norm(rows[:, :, :-1], axis=2) <= 1e-12 * noise
         ok = self._not_weak(factors, rows, noise, constant)
         ruled_out = ok & self._ruled_out(
@@ -160,6 +169,7 @@ class Conditions:
         ok &= ~ruled_out & ~np.any((b < THINNEST - reach) & ~constant, axis=1)
         needed = (b < reach - 1e-12) & ~constant
         for i in np.flatnonzero(ok):
+            self.tick()
             label = np.flatnonzero(needed[i])
             one = self._region(actives[i], laws[i], A[i, label], b[i, label], label)
             if one is not None:
@@ -182,8 +192,10 @@ class Conditions:
         return _Factors(index, Q, inverse, np.swapaxes(inverse, 1, 2), NQ, depends), full
 
     def _rows(self, factors: _Factors) -> tuple[Array, Array, Array]:
-        """Return W; slacks, or multipliers of active rows, as [S w]; the size of their terms."""
+        """Return laws; slacks, or multipliers of active rows, as [S w]; the size of their terms."""
         index, inverse, NQ = factors.index, factors.inverse, factors.NQ
+        if self.steep is not None:
+            return equations(self.steep, index)[:3]
         W = factors.right @ self.D[index]
         rows = self.D - NQ @ W
         width = np.linalg.norm(W, axis=(1, 2))[:, None]
@@ -191,7 +203,7 @@ class Conditions:
         each = np.arange(len(index))[:, None]
         rows[each, index] = -inverse @ W
         noise[each, index] = np.linalg.norm(inverse, axis=2) * width
-        return W, rows, noise
+        return self.back @ (factors.Q @ W - self.Y), rows, noise
 
     def _not_weak(
         self, factors: _Factors, rows: Array, noise: Array, constant: NDArray[np.bool_]
@@ -273,10 +285,13 @@ def _corners(A: Array, b: Array, inside: Array, n: int) -> Array:
     return farthest_points(A, b, inside, axes)[:, -n:]
 
 
-def _irredundant(A: Array, b: Array, inside: Array, count: int) -> list[int]:
+def _irredundant(
+    A: Array, b: Array, inside: Array, count: int, tick: Callable[[], None]
+) -> list[int]:
     """Return which of the first rows bound a polyhedron; of those that say the same, the first."""
     alive = np.ones(len(b), dtype=bool)
     for k in reversed(range(count)):
+        tick()
         relaxed = b.copy()
         relaxed[k] += 1.0
         farthest = farthest_point(A[alive], relaxed[alive], A[k], inside)

@@ -43,7 +43,7 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
 class _Walk:
     def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
         self.program, self.timer = program, timer
-        self.conditions = Conditions(program)
+        self.conditions = Conditions(program, timer.tick)
         self.found: dict[int, Found] = {}
         self.seen: set[int] = set()
         self.random = np.random.default_rng(0)

@@ -70,16 +70,41 @@ class Optimality:
         return [bool(each) for each in self.depends]
 
 
-def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> list[Optimality]:
+def optimality(
+    program: ParametricQP, members: Sequence[tuple[int, ...]], everywhere: bool = False
+) -> list[Optimality]:
     """Return the KKT conditions of active sets of one size, from LU factors of the KKT matrices.
+
+    Those that hold in all of the unit box are left out, unless ``everywhere``.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         If the constraints of an active set depend on each other.
     """
-    (v, n), size, count = program.F.shape, len(members[0]), len(members)
+    n, count, size = program.F.shape[1], len(members), len(members[0])
     active = np.array(members, dtype=int).reshape(count, size)
+    laws, rows, noise, factors, depends = equations(program, active)
+    rows = _of_unit_length(rows, noise)
+    reach = np.abs(rows[:, :, :n]).sum(axis=2)
+    binding = rows[:, :, n] < (np.where(reach > 0, np.inf, 0.0) if everywhere else reach)
+    return [
+        Optimality(
+            members[i], laws[i], rows[i, held], np.flatnonzero(held),
+            factors[i, held], depends[i, held],
+        )
+        for i, held in enumerate(binding)
+    ]  # fmt: skip
+
+
+def equations(
+    program: ParametricQP, active: NDArray[np.intp]
+) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Return laws, slacks or multipliers as [S w], the size of their terms, factors and depends.
+
+    All are for active sets (count, size), as in :class:`Optimality`.
+    """
+    (v, n), (count, size) = program.F.shape, active.shape
     length = np.linalg.norm(program.G, axis=1)
     length[length == 0] = 1.0
     # In unit length, however little U a constraint holds.
@@ -105,15 +130,11 @@ def optimality(program: ParametricQP, members: Sequence[tuple[int, ...]]) -> lis
     depends[each, active] = False
     rows[each, active] = multipliers
     noise[each, active] = np.abs(multipliers).max(axis=(1, 2), initial=0.0)[:, None]
-    rows = _of_unit_length(rows, noise)
-    binding = rows[:, :, n] < np.abs(rows[:, :, :n]).sum(axis=2)
-    return [
-        Optimality(
-            members[i], laws[i], rows[i, held], np.flatnonzero(held),
-            factors[i, held], depends[i, held],
-        )
-        for i, held in enumerate(binding)
-    ]  # fmt: skip
+    if program.steep:  # slacks and their multipliers are far larger than all the rest
+        terms = np.abs(np.linalg.inv(K)) @ np.abs(right[:, :, : n + 1])
+        noise = np.linalg.norm(np.abs(limit) + np.abs(G) @ np.abs(laws), axis=2)
+        noise[each, active] = np.linalg.norm(terms[:, v:], axis=2)
+    return np.asarray(laws), np.asarray(rows), np.asarray(noise), factors, np.asarray(depends)
 
 
 def _of_unit_length(rows: Array, noise: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,7 @@ class ParametricQP:
     theta_min: Array
     theta_max: Array
     n_slacks: int = 0
+    steep: ClassVar[bool] = False
 
     def solve(self, theta: Array) -> Array | None:
         """Return the optimal U (v,) at one theta (n,) from DAQP, or None where none is feasible."""

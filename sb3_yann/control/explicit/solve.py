@@ -14,6 +14,7 @@ from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionE
 from sb3_yann.control.explicit.facet_walk import walk
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
+from sb3_yann.control.explicit.steep import solvable
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
 
@@ -83,7 +84,7 @@ class ProgramUnits:
         most = np.maximum(np.abs(u_min), np.abs(u_max)) / reach[: len(u_min)]
         most = np.concatenate([np.tile(most, steps), np.full(program.n_slacks, np.inf)])
         scaled = program.scaled(self.center, self.half, self.reach)
-        self.scaled = scaled.without_faint_rows(most)
+        self.scaled = solvable(scaled.without_faint_rows(most))
 
     def law(self, regions: list[Region], infeasible: str) -> PiecewiseAffine:
         """Return the law of the first inputs in the units of the problem."""

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
-from os import PathLike, fspath
+from os import PathLike
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
 from sb3_yann._validation import Array, ReadOnlyArrays, as_array
-from sb3_yann.control.law._files import read_arrays, write_arrays
+from sb3_yann.control.law._files import read_law, write_arrays
 from sb3_yann.control.polyhedra import largest_ball
 
 if TYPE_CHECKING:
@@ -188,22 +187,21 @@ class PiecewiseAffine(ReadOnlyArrays):
     @classmethod
     def load(cls, path: str | PathLike[str]) -> PiecewiseAffine:
         """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
-        try:
-            data = read_arrays(path)
-            data.setdefault("neighbors", _none())  # files of before
-            values = {field.name: data[field.name] for field in fields(cls)}
-            for name, kind in (("infeasible", str), ("disjoint", bool)):
-                values[name] = kind(values[name])
-            tree = {name[5:]: each for name, each in data.items() if name.startswith("tree_")}
-            law = cls(**values)
-            if tree:
-                from sb3_yann.control.law.search_tree import SearchTree
+        return read_law("a PiecewiseAffine", path, cls._from_arrays)
 
-                law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
-            return law
-        except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
-            what = f"{fspath(path)} does not hold a PiecewiseAffine ({error})"
-            raise ValueError(f"{what}. Write it with law.save(path).") from None
+    @classmethod
+    def _from_arrays(cls, data: dict[str, Any]) -> PiecewiseAffine:
+        data.setdefault("neighbors", _none())  # files of before
+        values = {field.name: data[field.name] for field in fields(cls)}
+        for name, kind in (("infeasible", str), ("disjoint", bool)):
+            values[name] = kind(values[name])
+        tree = {name[5:]: each for name, each in data.items() if name.startswith("tree_")}
+        law = cls(**values)
+        if tree:
+            from sb3_yann.control.law.search_tree import SearchTree
+
+            law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
+        return law
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""

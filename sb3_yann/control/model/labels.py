@@ -22,6 +22,12 @@ def as_names(what: str, given: Sequence[str], size: int) -> tuple[str, ...]:
     return found
 
 
+def require_different(labels: Sequence[str]) -> None:
+    """Raise ValueError if a name stands for a state and for an input."""
+    if both := sorted({each for each in labels if labels.count(each) > 1}):
+        raise ValueError(f"{both} name a state and an input: each needs a name of its own.")
+
+
 def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
     """Return the unit of each state and input, "" where there is none.
 

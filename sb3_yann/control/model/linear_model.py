@@ -15,7 +15,7 @@ from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.linear_system import names, zero_order_hold
 from sb3_yann.control.linearization.dynamics import linearize_dynamics
 from sb3_yann.control.linearization.linearize import linearize_env
-from sb3_yann.control.model.labels import Units, as_names, as_units
+from sb3_yann.control.model.labels import Units, as_names, as_units, require_different
 from sb3_yann.control.model.plant import Plant
 from sb3_yann.control.model.statespace import from_control
 
@@ -95,6 +95,7 @@ class LinearModel(Plant):
             as_names("input_names", input_names, u.size),
         )
         labels = [*(named[0] or names((n,))), *(named[1] or names((0, u.size)))]
+        require_different(labels)
         step, kept = as_positive("dt", dt), as_units(units, labels)
         super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept)
 

@@ -11,14 +11,15 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.explicit.steep import SteepQP, solvable
 
 if TYPE_CHECKING:
     from sb3_yann._numba import Integers
 
 SOFT = 1e6
 """Cost of the square of a violation, in units of the curvature of the cost, where none is free."""
-STIFF = 1e13
-"""How many times as much as the inputs a slack may cost."""
+ROUGH = 1e-6
+"""How exact a softened program must be solved, relative to the largest distance to a constraint."""
 LEAST_SOFT = 1e-8
 """So much at least is added to the unit diagonal where a constraint is softened."""
 
@@ -77,6 +78,11 @@ class DualProgram:
     def of(cls, program: ParametricQP, u_min: Array, u_max: Array) -> DualProgram:
         """Return the dual form of a program whose first variables are the inputs (m,)."""
         scaled, reach = scaled_program(program, u_min, u_max)
+        half = half_widths(program.theta_min, program.theta_max)
+        if isinstance(scaled, SteepQP):
+            scaled = scaled.mild
+        # Rows are of unit length in these units; theta itself comes in those of the plant.
+        scaled = replace(scaled, F=scaled.F / half, S=scaled.S / half)
         m, unit = len(u_min), reach[: len(u_min), None]
         G, factor = scaled.G, linalg.cho_factor(scaled.H)
         by_theta, by_one, by_row = (
@@ -123,6 +129,28 @@ class DualProgram:
         inputs_of_batch(theta, self.K, self.k0, self.E, *lam, self.bounds, u)
         return u
 
+    def soft_inputs(self, theta: Array, found: Answers) -> Array:
+        """Return the inputs (batch, m) of softened programs: saturated where none is solved.
+
+        Far from the box multipliers are so large that the certificate's tolerances are their
+        rounding. There the conditions must hold to ROUGH of the largest distance.
+        """
+        from sb3_yann.control.online._kernels import SOLVED
+
+        u = self.inputs(theta, found)
+        for i in np.flatnonzero(found.status != SOLVED):
+            active, lam = found.active[i, : found.sizes[i]], np.zeros(len(self.d0))
+            lam[active] = found.multipliers[i, : found.sizes[i]]
+            with np.errstate(over="ignore", invalid="ignore"):
+                d = self.d0 + theta[i] @ self.D
+                slack = d + self.gram @ lam + self.softness * lam
+                most = ROUGH * (1 + np.abs(d).max())
+                held = slack.min() >= -most and np.abs(slack[active]).max(initial=0.0) <= most
+                law = self.k0 + self.K @ theta[i]
+            if not held:
+                u[i] = np.clip(np.nan_to_num(law, nan=0.0), *self.bounds)
+        return u
+
     def meets_fixed(self, theta: Array) -> NDArray[np.bool_]:
         """Tell of each row whether it keeps what no input can change."""
         S, w = self.fixed
@@ -142,32 +170,7 @@ def scaled_program(program: ParametricQP, u_min: Array, u_max: Array) -> tuple[P
     reach = np.tile(half_widths(u_min, u_max), steps)
     reach = np.concatenate([reach, np.ones(program.n_slacks)])
     half = half_widths(program.theta_min, program.theta_max)
-    scaled = program.scaled(np.zeros(len(half)), half, reach)
-    # Rows are of unit length in these units; theta itself comes in those of the plant.
-    return replace(scaled, F=scaled.F / half, S=scaled.S / half), reach
-
-
-def require_soluble(program: ParametricQP, u_min: Array, u_max: Array) -> None:
-    """Raise ValueError where slacks cost so much more than inputs that float64 has no digits left.
-
-    Both are compared where they are largest in theta's box: a slack in which a bound is broken by
-    all that it can be.
-    """
-    half = half_widths(program.theta_min, program.theta_max)
-    inputs, sizes = len(program.c) - program.n_slacks, np.diag(program.H)
-    reach = np.tile(half_widths(u_min, u_max), inputs // len(u_min))
-    extent = np.abs(program.S) @ half + np.abs(program.G[:, :inputs]) @ reach
-    own = np.mean(sizes[:inputs] * reach**2)
-    for k in range(inputs, len(sizes)):
-        rows = (program.G[:, k] != 0) & (extent > 0)
-        broken = np.max(extent[rows] / np.abs(program.G[rows, k]), initial=0.0)
-        if sizes[k] * broken**2 > STIFF * own:
-            raise ValueError(
-                f"The penalty of soft bounds is too steep: with {broken:.3g} units of violation, "
-                f"which the box of theta has, it is {sizes[k] * broken**2 / own:.1g} times the "
-                f"inputs' own cost, and {STIFF:g} are the most. Give SoftBounds larger units (x=, "
-                "y=: the violation that counts as one), or a smaller penalty."
-            )
+    return solvable(program.scaled(np.zeros(len(half)), half, reach)), reach
 
 
 def _hard(program: ParametricQP) -> NDArray[np.bool_]:

@@ -5,27 +5,29 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, fields
 from functools import cached_property
-from os import PathLike, fspath
-from typing import Any
-from zipfile import BadZipFile
+from os import PathLike
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array
-from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.law._files import read_arrays, write_arrays
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array, half_widths
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
+from sb3_yann.control.explicit.steep import SteepQP
+from sb3_yann.control.law._files import read_law, write_arrays
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, as_points
 from sb3_yann.control.online.dual_program import (
     Answers,
     DualProgram,
-    require_soluble,
     scaled_program,
 )
 from sb3_yann.control.online.known_points import KnownPoints
 
-_KEPT = ("dual", "known", "program")
+if TYPE_CHECKING:
+    from sb3_yann._numba import Integers
+
+_KEPT = ("dual", "known", "program", "scaled", "half")
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +41,8 @@ class OnlineLaw(ReadOnlyArrays):
     Where the program has no solution, ``infeasible`` decides:
 
     - ``"nearest_region"``: all constraints but those of single inputs give way as little as
-      possible, at a large cost of the squares of their violations.
+      possible, at a large cost of the squares of their violations. So far from the box that
+      float64 cannot solve this either, the inputs that nothing constrains are clipped.
     - ``"zero_input"``: no deviation of the input, clipped to the bounds.
 
     Other than :class:`PiecewiseAffine`, it does not end at the box of theta.
@@ -98,6 +101,7 @@ class OnlineLaw(ReadOnlyArrays):
                 f"The program has {v} variables, {slacks} of them slacks: the others must be the "
                 f"{m} inputs of each step."
             )
+        _require_positive_definite(values["H"])
         self._store(F=F, G=G, **values)
 
     @classmethod
@@ -110,13 +114,7 @@ class OnlineLaw(ReadOnlyArrays):
             Whose first variables are the inputs.
         u_min, u_max, infeasible
             As in :class:`OnlineLaw`.
-
-        Raises
-        ------
-        ValueError
-            If the penalty of soft bounds is too steep for float64.
         """
-        require_soluble(program, u_min, u_max)
         parts = {field.name: getattr(program, field.name) for field in fields(program)}
         return cls(**parts, u_min=u_min, u_max=u_max, infeasible=infeasible)
 
@@ -160,7 +158,9 @@ class OnlineLaw(ReadOnlyArrays):
                 gains[i] = 0.0
                 continue
             own, at = (found, i) if solved or softened is None else (softened, place[i])
-            gains[i] = self.dual.gain(own.active[at, : own.sizes[at]], soft=not solved)
+            active = own.active[at, : own.sizes[at]]
+            exact = self._exact_gain(active) if solved else None
+            gains[i] = self.dual.gain(active, soft=not solved) if exact is None else exact
         return gains if points.ndim == 2 else gains[0]
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -170,15 +170,14 @@ class OnlineLaw(ReadOnlyArrays):
     @classmethod
     def load(cls, path: str | PathLike[str]) -> OnlineLaw:
         """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
-        try:
-            data = read_arrays(path)
-            values = {field.name: data[field.name] for field in fields(cls)}
-            for name, kind in (("infeasible", str), ("n_slacks", int)):
-                values[name] = kind(values[name])
-            return cls(**values)
-        except (KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
-            what = f"{fspath(path)} does not hold an OnlineLaw ({error})"
-            raise ValueError(f"{what}. Write it with law.save(path).") from None
+        return read_law("an OnlineLaw", path, cls._from_arrays)
+
+    @classmethod
+    def _from_arrays(cls, data: dict[str, Any]) -> OnlineLaw:
+        values = {field.name: data[field.name] for field in fields(cls)}
+        for name, kind in (("infeasible", str), ("n_slacks", int)):
+            values[name] = kind(values[name])
+        return cls(**values)
 
     @cached_property
     def program(self) -> ParametricQP:
@@ -193,6 +192,16 @@ class OnlineLaw(ReadOnlyArrays):
         return DualProgram.of(self.program, self.u_min, self.u_max)
 
     @cached_property
+    def scaled(self) -> tuple[ParametricQP, Array]:
+        """The program in units of the input range and theta's box, and those of U (v,)."""
+        return scaled_program(self.program, self.u_min, self.u_max)
+
+    @cached_property
+    def half(self) -> Array:
+        """The half-widths of theta's box."""
+        return half_widths(self.theta_min, self.theta_max)
+
+    @cached_property
     def known(self) -> KnownPoints:
         """The law as a function of contiguous rows (batch, n), with what it remembers."""
         return KnownPoints(lambda rows: self._answers(rows)[0], self.n_inputs)
@@ -204,9 +213,13 @@ class OnlineLaw(ReadOnlyArrays):
         with np.errstate(over="ignore", invalid="ignore"):
             found = self.dual.solve(rows)
         u, feasible = self.dual.inputs(rows, found), found.status == _kernels.SOLVED
-        if not len(self.dual.fixed[1]) and feasible.all():  # mostly: the rest takes microseconds
+        settled = not (len(self.dual.fixed[1]) or self.scaled[0].steep)
+        if settled and feasible.all():  # mostly: the rest takes microseconds
             return u, feasible, found, None
-        for i in np.flatnonzero(found.status == _kernels.UNKNOWN):
+        asked = found.status == _kernels.UNKNOWN
+        if self.scaled[0].steep:
+            asked |= feasible  # of a milder program
+        for i in np.flatnonzero(asked):
             feasible[i] = self._ask_daqp(rows[i], u[i], found, i)
         feasible &= self.dual.meets_fixed(rows)
         softened, lost = None, np.flatnonzero(~feasible)
@@ -215,20 +228,35 @@ class OnlineLaw(ReadOnlyArrays):
         elif len(lost):
             again = np.ascontiguousarray(rows[lost])
             softened = self.dual.solve(again, soft=True)
-            u[lost] = self.dual.inputs(again, softened)
+            u[lost] = self.dual.soft_inputs(again, softened)
         u = np.nan_to_num(u, nan=0.0)  # inf - inf, far from everything
         return np.clip(u, self.u_min, self.u_max), feasible, found, softened
 
     def _ask_daqp(self, theta: Array, u: Array, found: Answers, at: int) -> bool:
-        """Write DAQP's input and active set where the compiled method has no certificate."""
-        scaled, reach = scaled_program(self.program, self.u_min, self.u_max)
-        U, multipliers = scaled.solve_with_multipliers(theta)
-        if U is None:
-            return False
-        active = np.flatnonzero(multipliers[self.dual.rows] > 0)[: found.active.shape[1]]
+        """Write the input and active set where the compiled method has no certificate."""
+        (scaled, reach), place = self.scaled, theta / self.half
+        start = self.dual.rows[found.active[at, : found.sizes[at]]]
+        each = scaled.conditions_at(place, as_bits(start)) if isinstance(scaled, SteepQP) else None
+        if each is not None:
+            U, tight = each.law @ np.append(place, 1.0), np.isin(self.dual.rows, each.active)
+        else:
+            answer, multipliers = scaled.solve_with_multipliers(place)
+            if answer is None:
+                return False
+            U, tight = answer, multipliers[self.dual.rows] > 0
+        active = np.flatnonzero(tight)[: found.active.shape[1]]
         found.sizes[at], found.active[at, : len(active)] = len(active), active
         u[:] = (reach * U)[: len(u)]
         return True
+
+    def _exact_gain(self, active: Integers) -> Array | None:
+        """Return the gain of an active set of a steep program, None of others."""
+        scaled, reach = self.scaled
+        if not isinstance(scaled, SteepQP):
+            return None
+        found = scaled.conditions_of(as_bits(self.dual.rows[active]))
+        m = self.n_inputs
+        return None if found is None else reach[:m, None] * found.law[:m, :-1] / self.half
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""
@@ -248,3 +276,17 @@ class OnlineLaw(ReadOnlyArrays):
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what follows from the rest, and what is remembered."""
         return {name: each for name, each in vars(self).items() if name not in _KEPT}
+
+
+def _require_positive_definite(H: Array) -> None:
+    scale = np.sqrt(np.abs(np.diag(H)))  # in units in which all variables count alike
+    unit = H / np.maximum(np.outer(scale, scale), 1e-300)
+    symmetric = np.max(np.abs(unit - unit.T), initial=0.0) < 1e-9
+    try:
+        np.linalg.cholesky(unit)
+    except np.linalg.LinAlgError:
+        symmetric = False
+    if not symmetric:
+        raise ValueError(
+            "H must be symmetric and positive definite: else the program has no unique solution."
+        )

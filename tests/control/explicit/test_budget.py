@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from sample_problems import PROBLEMS, benchmark, box_points, solved
 from sb3_yann.control import ExplicitLimitError
-from sb3_yann.control.explicit import certificate
+from sb3_yann.control.explicit import budget, certificate, conditions
 from sb3_yann.control.law import search_tree
 
 
@@ -46,6 +47,21 @@ def test_too_many_regions_are_an_error_that_says_what_to_change(solver: str) -> 
 def test_too_long_a_search_is_an_error_that_says_what_to_change(solver: str) -> None:
     with pytest.raises(ExplicitLimitError, match=r"not solved in time_limit = 1e-06 s: .* horizon"):
         benchmark().explicit(solver, time_limit=1e-6)
+
+
+def test_the_time_is_looked_at_before_the_first_region_as_well(monkeypatch) -> None:
+    clock, programs, solve = itertools.count(), itertools.count(), conditions.farthest_point
+    monkeypatch.setattr(budget.time, "monotonic", lambda: float(next(clock)))
+
+    def counted(*arguments: Any) -> Any:
+        next(programs)
+        return solve(*arguments)
+
+    monkeypatch.setattr(conditions, "farthest_point", counted)
+    with pytest.raises(ExplicitLimitError) as error:
+        benchmark().explicit(time_limit=3)
+    assert error.value.n_regions == 0
+    assert next(programs) <= 4
 
 
 def test_a_limit_that_is_not_reached_changes_nothing() -> None:

@@ -248,6 +248,21 @@ def test_file_that_holds_no_law_is_a_value_error(content: str, tmp_path: Path) -
         PiecewiseAffine.load(path)
 
 
+def test_a_damaged_file_is_a_value_error_or_still_the_law(tmp_path: Path) -> None:
+    law, path, rng = law_of("pendulum"), tmp_path / "law.npz", np.random.default_rng(0)
+    law.save(path)
+    content = path.read_bytes()
+    for _ in range(300):
+        broken = bytearray(content[: rng.integers(len(content))] if rng.random() < 0.3 else content)
+        for at in rng.integers(max(len(broken), 1), size=3 if broken else 0):
+            broken[at] = rng.integers(256)
+        path.write_bytes(broken)
+        try:
+            assert PiecewiseAffine.load(path) == law
+        except ValueError as error:
+            assert "law.npz does not hold a PiecewiseAffine" in str(error)
+
+
 def test_missing_file_stays_a_file_not_found_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         PiecewiseAffine.load(tmp_path / "nowhere.npz")

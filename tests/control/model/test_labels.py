@@ -59,6 +59,8 @@ def test_a_direction_that_nothing_moves_is_named() -> None:
         ({"state_names": "ab"}, TypeError, "state_names = 'ab' must be a list of str"),
         ({"state_names": ["a"]}, ValueError, "must be 2 different names"),
         ({"state_names": ["a", "a"]}, ValueError, "must be 2 different names"),
+        ({"state_names": ["a", "b"], "input_names": ["a"]}, ValueError, "'a'. name a state and an"),
+        ({"state_names": ["u[0]", "b"]}, ValueError, "name a state and an input"),
         ({"input_names": [1]}, TypeError, "input_names = .* must be a list of str"),
         ({"units": {"speed": "m"}}, ValueError, "units has .'speed'., but the names are"),
         ({"units": ["m"]}, ValueError, "must have one entry for each of"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -163,6 +163,43 @@ def test_a_file_without_a_law_is_named(tmp_path) -> None:
     solved("servo").explicit().save(tmp_path / "other.npz")
     with pytest.raises(ValueError, match="does not hold an OnlineLaw"):
         OnlineLaw.load(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"not an archive", b"PK", b"\x93NUMPY\x01\x00nothing", b"\x80\x04K\x01."],
+    ids=["empty", "text", "start", "array", "pickle"],
+)
+def test_a_file_that_is_no_archive_is_named(content: bytes, tmp_path) -> None:
+    path = tmp_path / "law.npz"
+    path.write_bytes(content)
+    expected = r"law\.npz does not hold an OnlineLaw \(it is no \.npz file.*law\.save"
+    with pytest.raises(ValueError, match=expected):
+        OnlineLaw.load(path)
+
+
+def test_a_damaged_file_is_a_value_error_or_still_the_law(tmp_path) -> None:
+    law, path, rng = regulator().online(), tmp_path / "law.npz", np.random.default_rng(0)
+    law.save(path)
+    content = path.read_bytes()
+    for _ in range(300):
+        broken = bytearray(content[: rng.integers(len(content))] if rng.random() < 0.3 else content)
+        for at in rng.integers(max(len(broken), 1), size=3 if broken else 0):
+            broken[at] = rng.integers(256)
+        path.write_bytes(broken)
+        try:
+            assert OnlineLaw.load(path) == law
+        except ValueError as error:
+            assert "law.npz does not hold an OnlineLaw" in str(error)
+
+
+@pytest.mark.parametrize("H", [[[-1.0]], [[0.0]]])
+def test_a_program_that_is_not_convex_is_refused(H, tmp_path) -> None:
+    law = LinearMPC(LinearModel([[0.5]], [[1]], 1.0), Q=[[1]], R=[[1]], horizon=1, u_max=1).online()
+    arrays = {each.name: getattr(law, each.name) for each in fields(law)}
+    np.savez(tmp_path / "law.npz", **{**arrays, "H": np.array(H)})
+    with pytest.raises(ValueError, match=r"law\.npz does not hold .*H must be .*positive definite"):
+        OnlineLaw.load(tmp_path / "law.npz")
 
 
 @pytest.mark.parametrize(
