@@ -76,6 +76,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     batch: int = 50,
     learning_rate: float = 5e-3,
     reidentify: bool = True,
+    confine: bool = True,
     n_starts: int = 40,
     check_every: int = 20,
     patience: int = 5,
@@ -92,7 +93,8 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     and up to ten times as much the rarer it is. Of what is refused, a half and a quarter are
     tried. What passes is confirmed on new starts, and must gain 0.2 % in the end, or 0.02 % where
     the twin errs less than half as much as the given model. Starts that it loses, or nearly, are
-    played in the gradients to come. What the model has learnt before is checked first.
+    played in the gradients to come. What the model has learnt before is checked first. Beyond what
+    the log shows the MPC acts alone: no member of the twin knows the plant there.
 
     Two searches run, one from the present policy and one from the re-identified MPC. After a third
     of the iterations the better one goes on.
@@ -115,6 +117,9 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     reidentify : bool, default True
         Whether a search begins at the re-identified MPC (:meth:`PlantTwin.reidentified`), if its
         law has at most ten times as many regions.
+    confine : bool, default True
+        Whether the MPC acts alone beyond what the log shows: see
+        :meth:`YannPolicy.confine_correction`.
     n_starts : int, default 40
         Starts of a check, for each member: so many as the log begins, and as many around.
     check_every : int, default 20
@@ -157,9 +162,10 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     as_whole("seed", seed, 0)
     as_flag("progress_bar", progress_bar)
     as_flag("reidentify", reidentify)
+    as_flag("confine", confine)
     twin.require_trust()
     layer, grounds = copy.deepcopy(policy.actor.mu).cpu(), Grounds(twin, batch, n_starts, seed)
-    layer.confine(*twin.starts.shown)
+    layer.confine(*twin.starts.shown) if confine else layer.confine(None, None)
     searches = [Search(layer, grounds, Pace(iterations, learning_rate, check_every, patience))]
     today = copy.deepcopy(layer)
     if reidentify and distill(today, twin, seed):

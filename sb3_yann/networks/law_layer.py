@@ -14,7 +14,7 @@ from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.zero_output import ZeroOutputNetwork, register_constants
 
 Rate = tuple[Array, Array]
-ALL, NONE = 1.0, 1.5
+ALL, NONE = 1.0, 1.25
 """Within how many half-widths of a box a correction counts in full, and beyond how many not."""
 LEAST = 0.01
 """The least half-width of such a box, in those of the problem's."""
@@ -59,7 +59,7 @@ class LawLayer(nn.Module):
     def confine(self, low: Array | None, high: Array | None) -> None:
         """Let the network's output count in a box of theta only, or everywhere for None.
 
-        It counts in full within, and falls to nothing at half a half-width beyond.
+        It counts in full within, and falls to nothing at a quarter of a half-width beyond.
         """
         size = len(self.theta_half)
         box: Array = np.zeros((2, size))  # its middle, and one over its half-widths

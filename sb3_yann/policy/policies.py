@@ -252,8 +252,8 @@ class YannPolicy(TD3Policy):
     def confine_correction(self, low: ArrayLike | None, high: ArrayLike | None) -> None:
         """Let the actor's networks count in a box of theta only; None is everywhere.
 
-        They count in full within. Beyond they fade, and from half a half-width on the law acts
-        alone. :func:`improve` sets it to what the log shows. It is saved with the weights.
+        They count in full within. Beyond they fade, and from a quarter of a half-width on the law
+        acts alone. :func:`improve` sets it to what the log shows. It is saved with the weights.
 
         Parameters
         ----------

@@ -10,7 +10,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.log import Episode
 
-AROUND, WIDEST, RARE = 3.0, 2.0, 0.1
+AROUND, WIDEST, RARE = 3.0, 2.0, 0.05
 """How many boxes wide starts are drawn at most; how much wider than the log's starts their box is
 at most; how likely a start is, in one coordinate, beyond what the log shows."""
 
@@ -53,7 +53,7 @@ class Starts:
     def shown(self) -> tuple[Array, Array]:
         """The box of theta (n_theta,), twice, that the log shows: all rows, and where it may begin.
 
-        Beyond the latter, in one coordinate, lies one start in ten: see :meth:`chance_beyond`.
+        Beyond the latter, in one coordinate, lies one start in twenty: see :meth:`chance_beyond`.
         """
         k, low, high = len(self.first), self.first.min(0), self.first.max(0)
         ranges = 2 * (2 / (k + 1) / RARE) ** (1 / max(k - 1, 1)) - 1

@@ -58,9 +58,9 @@ def test_what_a_log_shows_are_its_rows_and_where_it_may_begin() -> None:
     assert np.all((starts.rows >= low) & (starts.rows <= high))
     k, half = len(starts.first), np.ptp(starts.first, axis=0) / 2
     middle = (starts.first.max(0) + starts.first.min(0)) / 2
-    assert 2 / (k + 1) > 0.1  # so many starts lie beyond the range of the log itself
-    beyond = middle + half * (2 * (20 / (k + 1)) ** (1 / (k - 1)) - 1) * np.eye(2)
-    np.testing.assert_allclose(starts.chance_beyond(beyond), 0.1)
+    assert 2 / (k + 1) > 0.05  # so many starts lie beyond the range of the log itself
+    beyond = middle + half * (2 * (40 / (k + 1)) ** (1 / (k - 1)) - 1) * np.eye(2)
+    np.testing.assert_allclose(starts.chance_beyond(beyond), 0.05)
     further = beyond.max(0) - middle
     np.testing.assert_allclose(low, np.minimum(starts.rows.min(0), middle - further))
     np.testing.assert_allclose(high, np.maximum(starts.rows.max(0), middle + further))
