@@ -128,6 +128,7 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
             f"{np.median(each):+.2f} ({each.min():+.2f} to {each.max():+.2f})"
             for each in (change, free, linear)
         ]
+        worst_free = max((each.extra["unconfined"] - base).max() for each in of)
         seconds = [each.seconds for each in of if each.extra["trusted"]]
         found.append((
             case,
@@ -136,7 +137,7 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
             f"{100 * np.median(change) / best + 0.0:.0f}",
             f"{np.sum(change < -1.9)}",
             f"{more[case].max():+.2f}",
-            f"{max(100 * (each.extra['unconfined'] - base).max() / base.mean() for each in of):+.2f}",
+            f"{100 * worst_free / mpc:+.2f}",
             f"{sum(int(each.test_violations.sum()) for each in of)}",
             f"{np.median(seconds):.0f}" if seconds else "",
         ))  # fmt: skip

@@ -328,25 +328,25 @@ def from_a_log() -> dict[Run, Outcome]:
             better,
             extra={
                 "trusted": np.array(True),
-                "alone": 0.98 * MPC_COSTS,
+                "unconfined": 0.98 * MPC_COSTS + [3, 0],
                 "reidentified": 0.97 * MPC_COSTS,
             },
             seconds=7.0 + seed,
         )
         found[Run(twin.PLANT, "two episodes", seed, 0)] = dataclasses.replace(
             fixed(MPC_COSTS),
-            extra={"trusted": np.array(False), "alone": MPC_COSTS, "reidentified": MPC_COSTS},
+            extra={"trusted": np.array(False), "unconfined": MPC_COSTS, "reidentified": MPC_COSTS},
         )
     return found
 
 
 def test_the_table_from_a_log_says_what_was_gained_of_what_was_possible() -> None:
     five, two, optimum = twin.rows(from_a_log())
-    alone, linear = "-2.00 (-2.00 to -2.00)", "-3.00 (-3.00 to -3.00)"
+    free, linear = "-1.25 (-1.25 to -1.25)", "-3.00 (-3.00 to -3.00)"
     none = "+0.00 (+0.00 to +0.00)"
-    spreads = "-3.00 (-4.00 to -2.00)", alone, linear
-    assert five[1:] == ("2 of 2", *spreads, "60", "2", "+4.00", "0", "8")
-    assert two[1:] == ("0 of 2", none, none, none, "0", "0", "+0.00", "0", "")
+    spreads = "-3.00 (-4.00 to -2.00)", free, linear
+    assert five[1:] == ("2 of 2", *spreads, "60", "2", "+4.00", "+0.50", "0", "8")
+    assert two[1:] == ("0 of 2", none, none, none, "0", "0", "+0.00", "+0.00", "0", "")
     assert optimum[2:6] == ("-5.00", "", "", "100")
 
 
