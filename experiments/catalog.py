@@ -155,6 +155,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "two gradient steps": {"gradient_steps": 2},
     "target rate 0.02": {"tau": 0.02},
     "nearest outside": {"infeasible": "nearest_region"},
+    "one network": {"networks": "shared"},
 }
 """What is changed of YANN-RL, one thing at a time."""
 LEARNERS: dict[str, Callable[..., Learner]] = {
@@ -290,7 +291,7 @@ def execute(run: Run) -> Outcome:
     learner.model.learn(
         2 * plant.steps * run.episodes, callback=[*learner.callbacks, checkpoints, stop]
     )
-    checkpoints.tests[run.episodes] = test(learner.policy)
+    checkpoints.tests[run.episodes] = final = test(learner.policy)
     e = run.episodes
     starts = recorder.starts[:e]
     mpc = evaluate(plant.problem().explicit(), plant.env_id, range(e), starts)
@@ -302,7 +303,7 @@ def execute(run: Run) -> Outcome:
         training_costs=np.array(recorder.costs[:e]),
         training_mpc_costs=mpc.costs,
         training_violations=np.array(recorder.violations[:e]),
-        extra=_decisions(learner.model),
+        extra={**_decisions(learner.model), **_changes_of_input(final)},
         seconds=time.perf_counter() - began,
     )
 
@@ -326,6 +327,15 @@ def _decisions(model: Any) -> dict[str, Any]:
     return {"guard_verdicts": np.array(verdicts), "guard_accepted_costs": np.array(costs)}
 
 
+def _changes_of_input(episodes: Episodes) -> dict[str, Any]:
+    """Return how far the input moves in each episode: at most in one step, and in all of them."""
+    changes = [np.abs(np.diff(each, axis=0)) for each in episodes.actions]
+    return {
+        "largest_step": np.array([each.max() for each in changes]),
+        "variation": np.array([each.sum() for each in changes]),
+    }
+
+
 @lru_cache
 def _test_starts(env_id: str) -> Any:
     env = gym.make(env_id)
@@ -334,6 +344,7 @@ def _test_starts(env_id: str) -> Any:
 
 def _fixed(name: str, plant: Plant, test: Callable[..., Episodes]) -> Outcome:
     """Return the outcome of a controller that does not learn."""
+    extra: dict[str, Any] = {}
     if name == "optimum":
         costs = plant.optimum(_test_starts(plant.env_id), plant.steps)
         violations = np.zeros(len(costs), dtype=int)
@@ -341,5 +352,6 @@ def _fixed(name: str, plant: Plant, test: Callable[..., Episodes]) -> Outcome:
         problem = plant.problem()
         episodes = test(problem.explicit() if name == "MPC" else yardsticks.lqr(problem))
         costs, violations = episodes.costs, episodes.violations
+        extra = _changes_of_input(episodes)
     none = np.zeros(0)
-    return Outcome(np.zeros(1), costs[None], violations[None], none, none, none)
+    return Outcome(np.zeros(1), costs[None], violations[None], none, none, none, extra)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fresh_process import run_python
 from sample_problems import PROBLEMS, benchmark, box_points, solved
 from sb3_yann.control import ExplicitLimitError
 from sb3_yann.control.explicit import budget, certificate, conditions
@@ -144,3 +145,29 @@ def test_a_law_that_was_solved_builds_nothing_when_it_is_called(monkeypatch) -> 
     monkeypatch.setattr(search_tree, "build_tree", None)
     assert law.tree is not None
     law(np.zeros(law.n_theta))
+
+
+def test_nothing_is_compiled_while_the_clock_runs() -> None:
+    # A new machine compiles what is imported first, for longer than ten seconds: a policy would
+    # then have an online law for want of time.
+    found = run_python(
+        """
+import sys
+from sb3_yann.control.explicit import solve
+
+class Timer(solve.BudgetTimer):
+    def __enter__(self):
+        self.before = set(sys.modules)
+        return super().__enter__()
+    def __exit__(self, *error):
+        loaded = [sys.modules[name] for name in set(sys.modules) - self.before]
+        compiled = [each.__name__ for each in loaded if hasattr(each, "compiled")]
+        print("compiled meanwhile:", compiled)
+        return super().__exit__(*error)
+
+solve.BudgetTimer = Timer
+from sb3_yann_envs import problems
+problems.cstr().law()
+"""
+    )
+    assert found.stdout.decode().strip() == "compiled meanwhile: []", found.stderr.decode()
