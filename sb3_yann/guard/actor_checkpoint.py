@@ -75,14 +75,29 @@ class ActorCheckpoint:
         return not self.changed_regions(other).any()
 
     def changed_regions(self, other: ActorCheckpoint) -> NDArray[np.bool_]:
+        """Return in which regions both may act differently, shape (regions,).
+
+        Where their networks count in different boxes of theta, in all.
+        """
+        return self.changed_networks(other) | (not self.is_confined_as(other))
+
+    def changed_networks(self, other: ActorCheckpoint) -> NDArray[np.bool_]:
         """Return in which regions the networks of both differ, shape (regions,)."""
         networks = other.networks()
         pairs = ((value, networks[name]) for name, value in self.networks().items())
         different = [(ours != theirs).flatten(1).any(1) for ours, theirs in pairs]
         return np.asarray(th.stack(different).any(0).numpy())
 
+    def is_confined_as(self, other: ActorCheckpoint) -> bool:
+        """Return whether the networks of both count in the same box of theta."""
+        boxes = [name for name in self.actor if name.endswith("confines")]
+        return all(th.equal(self.actor[name], other.actor[name]) for name in boxes)
+
     def with_regions(self, other: ActorCheckpoint, regions: Iterable[int]) -> ActorCheckpoint:
-        """Return a copy with the networks of some regions, and their moments, from another."""
+        """Return a copy with the networks of some regions, and their moments, from another.
+
+        They count in the same box of theta as before.
+        """
         index = th.tensor(sorted(regions), dtype=th.long)
         mixed = copy.deepcopy(self)
         for name in ("actor", "target"):

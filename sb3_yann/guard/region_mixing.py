@@ -16,9 +16,13 @@ MOST_LOST = 0.2
 
 
 def accept_visited(session: GuardSession, candidate: ActorCheckpoint, outcome: Outcome) -> None:
-    """Accept the candidate in those regions that its episodes come through."""
+    """Accept the candidate in those regions that its episodes come through.
+
+    In all of them where its networks count in another box of theta: a mixture was not played.
+    """
     state, visited = session.state, outcome.visits.any(0)
-    if np.any(state.accepted.changed_regions(candidate) & ~visited):
+    alike = state.accepted.is_confined_as(candidate)
+    if alike and np.any(state.accepted.changed_regions(candidate) & ~visited):
         candidate = state.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
     state.accept(candidate, replace(state.evidence, accepted=outcome))
 
@@ -27,7 +31,8 @@ def accept_parts(
     session: GuardSession, candidate: ActorCheckpoint, outcome: Outcome | None
 ) -> None:
     """Accept regions of a refused candidate; its outcome is None where it cannot be played."""
-    if outcome is not None:
+    alike = session.state.accepted.is_confined_as(candidate)
+    if outcome is not None and alike:  # else no mixture is what was played, anywhere
         _accept_all_but_losing(session, candidate, outcome)
     _accept_one_by_one(session, candidate, outcome)
 
@@ -113,5 +118,5 @@ def accepted_regions(
     before: ActorCheckpoint, candidate: ActorCheckpoint, accepted: ActorCheckpoint
 ) -> list[int]:
     """Return the regions in which the accepted networks are new, and the candidate's."""
-    new = before.changed_regions(accepted) & ~candidate.changed_regions(accepted)
+    new = before.changed_networks(accepted) & ~candidate.changed_networks(accepted)
     return [int(region) for region in np.flatnonzero(new)]

@@ -174,3 +174,26 @@ def test_moments_that_the_accepted_policy_has_not_got_are_zero_elsewhere() -> No
         for region in (REGION[LEFT], REGION[CENTER]):
             assert not state["exp_avg"][region].any()
             assert not state["exp_avg_sq"][region].any()
+
+
+def test_a_candidate_in_another_box_is_accepted_with_it_or_mixed_within_the_old() -> None:
+    box = 2 * np.ones(build().policy.problem.n_theta)
+
+    def confined(change, policy) -> None:
+        change(policy)
+        policy.confine_correction(-box, box)
+
+    for change, verdict, kept in ((half_good, "accepted in part", False), (good, "accepted", True)):
+        model, guard = build(gradient_steps=0), make_guard()
+        before = ActorCheckpoint.of(model.policy)
+        train(model, STEPS + 1, At([STEPS], partial(confined, change)), guard)
+        assert guard.decisions[0].verdict == verdict
+        assert bool(model.actor.mu.confines.any()) == kept
+        assert float(last_layer(model)[REGION[RIGHT], 0, -1].detach()) == 0.5
+        other = ActorCheckpoint.of(build(gradient_steps=0).policy)
+        assert before.changed_regions(guard.state.accepted).all() == kept
+        assert not before.changed_regions(other)[REGION[LEFT]]
+
+
+def good(policy: YannPolicy) -> None:
+    correct(policy, RIGHT, 0.5)
