@@ -135,7 +135,8 @@ def yann(  # noqa: PLR0913 (what the variants vary)
         callbacks = []
     if guard is not None:
         simulator = None if plant_alone else plant.env_id
-        callbacks.append(ImprovementGuard(simulator, **{**plant.guard, **guard}))
+        rule = {**plant.guard.get("rule", {}), **guard.get("rule", {})}
+        callbacks.append(ImprovementGuard(simulator, **{**plant.guard, **guard, "rule": rule}))
     return Learner(model, model.policy, callbacks)
 
 
@@ -156,6 +157,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "target rate 0.02": {"tau": 0.02},
     "nearest outside": {"infeasible": "nearest_region"},
     "one network": {"networks": "shared"},
+    "input steps bounded": {"guard": {"rule": {"largest_step": 1.5}}},
 }
 """What is changed of YANN-RL, one thing at a time."""
 LEARNERS: dict[str, Callable[..., Learner]] = {

@@ -99,7 +99,7 @@ class Trial:
             costs = twin.problem.stage_cost(thetas[:-1], inputs).sum(axis=0).ravel()
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
         broken = twin.limits.broken(thetas[1:]).sum(axis=0).ravel()
-        unsafe = np.column_stack([left + broken, 0 * broken, ~np.isfinite(costs)])
+        unsafe = np.column_stack([left + broken, 0 * broken, ~np.isfinite(costs), 0 * broken])
         return costs, unsafe.astype(np.int64)
 
     def _run(self, act: Inputs) -> tuple[Array, Array]:

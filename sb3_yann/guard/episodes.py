@@ -26,8 +26,9 @@ VIOLATES: Final = "violates a limit"
 class Outcome(NamedTuple):
     """What came of a policy's episodes, in the order of their seeds.
 
-    The columns of ``unsafe`` (episodes, 3) are steps with a violation, whether the env terminated
-    the episode, and whether its cost or an observation is not finite. ``visits`` (episodes,
+    The columns of ``unsafe`` (episodes, 4) are steps with a violation, whether the env terminated
+    the episode, whether its cost or an observation is not finite, and steps in which an input moves
+    farther than the rule allows. ``visits`` (episodes,
     regions) tells which regions it comes through: other networks have no effect on it.
     """
 
@@ -181,7 +182,11 @@ def outcome_of(session: GuardSession, episodes: Episodes) -> Outcome:
     """Return what matters of the episodes."""
     finite = [np.all(np.isfinite(each)) for each in episodes.observations]
     lost = ~(np.isfinite(episodes.costs) & finite)
-    unsafe = np.column_stack([episodes.violations, episodes.terminated, lost]).astype(np.int64)
+    bound = session.state.input_step
+    moved = [np.abs(np.diff(each, axis=0)) for each in episodes.actions]
+    far = [0 if bound is None else np.any(each > bound, axis=1).sum() for each in moved]
+    counts: Any = [episodes.violations, episodes.terminated, lost, far]
+    unsafe = np.column_stack(counts).astype(np.int64)
     layer = session.policy.actor.mu
     visits = np.zeros((len(episodes.costs), layer.n_networks), dtype=bool)
     for visited, states in zip(visits, episodes.observations, strict=True):

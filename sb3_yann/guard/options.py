@@ -24,6 +24,9 @@ class AcceptanceRule:
         Plant alone: training episodes of a block, at least 3.
     significance : float, default 0.05
         Plant alone: probability that a run accepts a policy that is no better, at most.
+    largest_step : float, optional
+        In a simulator: how far an input may move from one sample to the next, in multiples of the
+        MPC's largest step on the known starts, at least 1. The default is no bound.
 
     Examples
     --------
@@ -36,9 +39,13 @@ class AcceptanceRule:
     by_region: bool = True
     trial_episodes: int = 10
     significance: float = 0.05
+    largest_step: float | None = None
 
     def __post_init__(self) -> None:
         as_between("margin", self.margin, 0, np.inf)
+        if self.largest_step is not None:
+            hint = "It is a multiple of the MPC's largest step, or None."
+            as_between("largest_step", self.largest_step, 1, np.inf, hint=hint)
         as_flag("by_region", self.by_region)
         as_whole("trial_episodes", self.trial_episodes, 3)
         as_between("significance", self.significance, 0, 0.5)

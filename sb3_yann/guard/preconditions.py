@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
@@ -11,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann.control import LinearMPC
 from sb3_yann.evaluation.episodes import Episodes, one_env
-from sb3_yann.guard.episodes import Outcome, outcome_of, play_episodes
+from sb3_yann.guard.episodes import ROUNDING, Outcome, outcome_of, play_episodes
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin
@@ -77,8 +78,12 @@ def _event_above(
     return next((each for each in found if each is not None), None)
 
 
-def first_episodes(session: GuardSession, name: str, seeds: Sequence[int]) -> Outcome:
+def first_episodes(
+    session: GuardSession, name: str, seeds: Sequence[int], largest_step: float | None
+) -> Outcome:
     """Return what comes of the MPC; raise ValueError if the simulator cannot compare policies.
+
+    Sets how far inputs may move, ``largest_step`` times as far as the MPC's, if it is not None.
 
     The actor plays, not the law in float64: the MPC must be no worse than itself to the last bit.
     """
@@ -103,6 +108,12 @@ def first_episodes(session: GuardSession, name: str, seeds: Sequence[int]) -> Ou
             "ignores its seed. What the guard accepts is compared from this start only.",
             stacklevel=2,
         )
+    if largest_step is not None:
+        moved = [np.abs(np.diff(each, axis=0)) for each in mpc.actions if len(each) > 1]
+        most = np.max([each.max(axis=0) for each in moved], axis=0) if moved else np.inf
+        inputs: Any = session.policy.action_space
+        room = ROUNDING * (inputs.high - inputs.low)
+        session.state.input_step = np.asarray(largest_step * most + room)
     return outcome_of(session, mpc)
 
 

@@ -58,7 +58,9 @@ class SimulatorAcceptance:
     @property
     def settings(self) -> dict[str, Any]:
         """What the evidence depends on."""
-        return {"env": self.name, "seeds": self.seeds, "margin": self.rule.margin}
+        bound = self.rule.largest_step
+        steps = {} if bound is None else {"largest_step": bound}
+        return {"env": self.name, "seeds": self.seeds, "margin": self.rule.margin, **steps}
 
     def start(self, session: GuardSession) -> None:
         """Check that the simulator is another env than the training env, and a like one."""
@@ -94,7 +96,7 @@ class SimulatorAcceptance:
             state.next_start = max(known.next_start, self.seeds.stop)
             hard = set(getattr(known.evidence, "seeds", ())) - {*known.settings.get("seeds", ())}
             seeds = (*seeds, *sorted(hard - {*seeds}))
-        mpc = first_episodes(session, self.name, seeds)
+        mpc = first_episodes(session, self.name, seeds, self.rule.largest_step)
         margin = self.rule.margin * float(np.median(np.abs(mpc.costs[: len(self.seeds)])))
         state.accept(session.mpc, Evidence(seeds, mpc, margin, mpc))
         leading = session.mpc

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_yann._validation import Array
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.statistics import ErrorBudget
 
@@ -75,6 +76,7 @@ class GuardState:
         Earlier accepted checkpoints, with their outcomes on the first of the known starts.
     decisions : list of Decision, all so far
     budget : ErrorBudget, what is left to the tests on a plant alone
+    input_step : ndarray, shape (m,), or None, how far inputs may move from one sample to the next
     """
 
     settings: dict[str, Any]
@@ -88,6 +90,7 @@ class GuardState:
     passed: list[tuple[ActorCheckpoint, Any]] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     budget: ErrorBudget = ErrorBudget()  # noqa: RUF009 (frozen)
+    input_step: Array | None = None
 
     def accept(self, checkpoint: ActorCheckpoint, evidence: Any) -> None:
         """Make a checkpoint the accepted one."""

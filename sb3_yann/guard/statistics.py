@@ -16,6 +16,7 @@ UNSAFE = (
     "violations",
     "an episode that the env terminates",
     "a cost or an observation that is no finite number",
+    "an input that moves too far in one step",
 )
 
 
@@ -26,7 +27,7 @@ class PairedEpisodes:
     Attributes
     ----------
     mpc_costs, costs : ndarray, shape (episodes,), those of the MPC and of the accepted policy
-    unsafe : ndarray of int, shape (episodes, 3), the accepted policy's
+    unsafe : ndarray of int, shape (episodes, 4), the accepted policy's
         The columns, named in ``UNSAFE``, are compared one by one: an episode cut short has fewer
         steps to violate in.
     margin : float, what one start may cost more than with the MPC
