@@ -20,6 +20,8 @@ HARDEST = 10
 """New starts that join those of every later candidate at a time."""
 ROUNDING = 1e-6
 """Relative difference of mean costs that float32 makes between batches of other sizes."""
+BREAKS = 3
+"""The first columns of what is unsafe: after these there is no patience."""
 VIOLATES: Final = "violates a limit"
 
 
@@ -35,6 +37,10 @@ class Outcome(NamedTuple):
     costs: Array
     unsafe: NDArray[np.int64]
     visits: NDArray[np.bool_]
+
+    def breaks_more_than(self, other: Outcome) -> bool:
+        """Return whether it is less safe: a large step of an input wears, and breaks nothing."""
+        return bool(np.any((self.unsafe > other.unsafe)[:, :BREAKS]))
 
     def at(self, index: Any) -> Outcome:
         """Return some of the episodes."""

@@ -180,7 +180,7 @@ class SimulatorAcceptance:
         state = session.state
         before: tuple[ActorCheckpoint, Evidence] = state.accepted, state.evidence
         outcome, reason = evaluate_candidate(session, candidate)
-        hopeless = outcome is None or bool(np.any(outcome.unsafe > before[1].accepted.unsafe))
+        hopeless = outcome is None or outcome.breaks_more_than(before[1].accepted)
         if outcome is not None and not reason:
             accept_visited(session, candidate, outcome)
         elif outcome is not None and not hopeless:

@@ -23,7 +23,7 @@ def probability_of_chance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> 
     return analyze_covariance(candidate, accepted)[1]
 
 
-NONE = np.zeros((3, 3), dtype=np.int64)
+NONE = np.zeros((3, 4), dtype=np.int64)
 NAN, INF = np.nan, np.inf
 
 
@@ -64,7 +64,7 @@ def test_without_a_margin_no_start_may_cost_more() -> None:
 
 def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_costs() -> None:
     def violations(*steps: int):
-        return np.column_stack([steps, [0, 0, 0], [0, 0, 0]])
+        return np.column_stack([steps, np.zeros((3, 3), np.int64)])
 
     message = "1 starts with violations, the first is number 2"
     assert message in objection([1, 1, 1], violations(0, 0, 1))
@@ -76,11 +76,13 @@ def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_co
 
 
 def test_an_episode_that_is_terminated_is_refused_though_it_has_fewer_violations() -> None:
-    accepted = np.array([[2, 0, 0], [0, 1, 0]])
+    accepted = np.array([[2, 0, 0, 0], [0, 1, 0, 0]])
     paired = PairedEpisodes(np.ones(2), np.ones(2), accepted, 1.0)
-    assert "the env terminates" in paired.objection(np.zeros(2), np.array([[1, 1, 0], [0, 1, 0]]))
+    assert "the env terminates" in paired.objection(
+        np.zeros(2), np.array([[1, 1, 0, 0], [0, 1, 0, 0]])
+    )
     assert paired.objection(np.zeros(2), accepted) == ""
-    assert "violations" in paired.objection(np.zeros(2), np.array([[2, 0, 0], [1, 0, 0]]))
+    assert "violations" in paired.objection(np.zeros(2), np.array([[2, 0, 0, 0], [1, 0, 0, 0]]))
 
 
 def episodes(costs, predicted=None) -> PlantEpisodes:
