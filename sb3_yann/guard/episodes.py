@@ -97,7 +97,8 @@ class Starts:
         lost, excess = self.lost(outcome), self.excess(outcome)
         if lost.any():
             first = self.hardest(outcome)[0]
-            also = f" and {VIOLATES}" if self.more_unsafe(outcome).any() else ""
+            unsafe, breaks = self.more_unsafe(outcome).any(), outcome.breaks_more_than(self.mpc)
+            also = f" and {VIOLATES if breaks else 'moves an input too far'}" if unsafe else ""
             return (
                 f"{lost.sum()} of {len(self.seeds)} new starts lose against the MPC, seed "
                 f"{self.seeds[first]} costs {excess[first]:.4g} more{also}"
