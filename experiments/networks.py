@@ -19,11 +19,7 @@ from experiments.runner import Outcome, Run, run_all
 
 FOLDER = Path("out/networks")
 PLANTS = "CSTR", "pendulum, Q = diag(1, 0.1)"
-FORMS = {
-    "per region": OURS,
-    "per region, steps bounded": f"{OURS}, input steps bounded",
-    "shared": f"{OURS}, one network",
-}
+FORMS = {"per region": OURS, "shared": f"{OURS}, one network"}
 SEEDS = range(40, 50)
 EPISODES = 50
 
