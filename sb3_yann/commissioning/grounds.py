@@ -72,7 +72,7 @@ class Grounds:
     def draw(self, rng: np.random.Generator) -> Trial:
         """Return a trial on new starts, the same for every member."""
         count, starts, twin = self.n_starts, self.twin.starts, self.twin
-        drawn = starts.draw(count, rng), starts.draw_around(count, rng)
+        drawn = starts.draw_between(count, rng), starts.draw_around(count, rng)
         rows = np.repeat(np.concatenate(drawn)[None], len(twin.dynamics.members), axis=0)
         return Trial(twin, rows, count, max(map(len, twin.episodes)))
 

@@ -67,8 +67,9 @@ class ActorCheckpoint:
 
     def is_actor_of(self, policy: YannPolicy) -> bool:
         """Return whether the policy's actor is still that of the checkpoint, bit for bit."""
-        now = policy.actor.state_dict()
-        return all(th.equal(value, now[name].cpu()) for name, value in self.actor.items())
+        now = {name: value.cpu() for name, value in policy.actor.state_dict().items()}
+        alike = all(th.equal(value, now[name]) for name, value in self.actor.items())
+        return alike and _are_confined_alike(self.actor, now)
 
     def has_networks_of(self, other: ActorCheckpoint) -> bool:
         """Return whether both hold the same networks, whatever their optimizers remember."""
@@ -90,8 +91,7 @@ class ActorCheckpoint:
 
     def is_confined_as(self, other: ActorCheckpoint) -> bool:
         """Return whether the networks of both count in the same box of theta."""
-        boxes = [name for name in self.actor if name.endswith("confines")]
-        return all(th.equal(self.actor[name], other.actor[name]) for name in boxes)
+        return _are_confined_alike(self.actor, other.actor)
 
     def with_regions(self, other: ActorCheckpoint, regions: Iterable[int]) -> ActorCheckpoint:
         """Return a copy with the networks of some regions, and their moments, from another.
@@ -120,6 +120,15 @@ def diverged(parameters: Iterable[th.Tensor]) -> bool:
     """Return whether a parameter is not a finite number, or too large."""
     largest = [each.detach().abs().max() for each in parameters]
     return not all(bool(each <= LARGEST) for each in largest)  # nor does nan pass
+
+
+def _are_confined_alike(ours: Tensors, theirs: Tensors) -> bool:
+    """Return whether two actors have the same box; one saved before there were boxes has none."""
+    first, second = (
+        {key: box for key, box in each.items() if key.endswith("confines") and box.any()}
+        for each in (ours, theirs)
+    )
+    return first.keys() == second.keys() and all(th.equal(first[key], second[key]) for key in first)
 
 
 def _copied(value: Any) -> Any:

@@ -80,7 +80,8 @@ class LawLayer(nn.Module):
         self.constants = (both, *self.constants[1:])
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
-        state_dict.setdefault(f"{prefix}confines", self.confines)  # saved before there were any
+        nowhere = th.zeros_like(self.confines)  # weights that were saved before there were boxes
+        state_dict.setdefault(f"{prefix}confines", nowhere)
         super()._load_from_state_dict(state_dict, prefix, *rest)
         self._keep_confines()
 

@@ -67,6 +67,22 @@ class Starts:
         drawn[:, : len(self.low)] = rng.uniform(self.low, self.high, (count, len(self.low)))
         return drawn
 
+    def draw_between(self, count: int, rng: np.random.Generator) -> Array:
+        """Return thetas (count, n_theta) where episodes begin, at other set-points as well.
+
+        Every other one has references and disturbances from the box that the log shows: what
+        passes at the few of the log may fail between them.
+        """
+        drawn, layout = self.draw(count, rng), self.problem.layout
+        if not layout.has_constants:
+            return drawn
+        held, some = slice(layout.n_states, layout.previous.start), drawn[::2].copy()
+        low, high = np.clip(self.shown, self.problem.theta_min, self.problem.theta_max)
+        some[:, held] = rng.uniform(low[held], high[held], some[:, held].shape)
+        inside = self.problem.law().in_domain(some)
+        drawn[::2][inside] = some[inside]
+        return drawn
+
     def draw_logged(self, count: int, rng: np.random.Generator) -> Array:
         """Return thetas (count, n_theta) from amid the log."""
         return self.rows[rng.integers(len(self.rows), size=count)]
@@ -78,7 +94,7 @@ class Starts:
         there are in the log, the wider. Those that the law has no solution for are replaced by
         logged ones.
         """
-        drawn, n, k = self.draw(count, rng), len(self.low), len(self.first)
+        drawn, n, k = self.draw_between(count, rng), len(self.low), len(self.first)
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
         nearest = (1 + _widened(k)) / 2
         ranges = 2 * nearest * rng.uniform(size=(count, 1)) ** (-1 / max(k - 1, 1)) - 1
@@ -107,7 +123,7 @@ class Starts:
         """Return thetas (count, n_theta), a third each of beginnings, of logged and of around."""
         third = count // 3
         parts = self.draw_logged(third, rng), self.draw_around(third, rng)
-        return np.concatenate([self.draw(count - 2 * third, rng), *parts])
+        return np.concatenate([self.draw_between(count - 2 * third, rng), *parts])
 
 
 def _widened(k: int) -> float:

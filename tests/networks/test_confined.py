@@ -79,9 +79,10 @@ def test_the_box_travels_with_the_weights_and_older_weights_have_none(kind) -> N
     before = {key: each for key, each in layer.state_dict().items() if key != "confines"}
     fresh = layer_of(kind)[1]
     fresh.load_state_dict(before)
-    assert not fresh.confines.any()
+    other.load_state_dict(before)  # which had a box
+    assert not fresh.confines.any() and not other.confines.any()
     layer.confine(None, None)
-    assert th.equal(fresh(theta), layer(theta))
+    assert th.equal(fresh(theta), layer(theta)) and th.equal(other(theta), layer(theta))
 
 
 def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from general_problems import solved
 from sb3_yann import PlantTwin
+from sb3_yann.twin.log import Episode
+from sb3_yann.twin.starts import Starts
 from twin_samples import log, problem, twin
 
 
@@ -64,3 +67,23 @@ def test_what_a_log_shows_are_its_rows_and_where_it_may_begin() -> None:
     further = beyond.max(0) - middle
     np.testing.assert_allclose(low, np.minimum(starts.rows.min(0), middle - further))
     np.testing.assert_allclose(high, np.maximum(starts.rows.max(0), middle + further))
+
+
+def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
+    mpc, rng = solved("servo with rates"), np.random.default_rng(0)
+    held = mpc.layout.reference
+    thetas = 0.2 * mpc.theta_half * rng.uniform(-1, 1, (4, mpc.n_theta))
+    episodes = (
+        Episode(np.tile(each, (7, 1)), np.zeros((6, mpc.model.n_inputs))) for each in thetas
+    )
+    starts = Starts.of(mpc, tuple(episodes))
+    low, high = starts.shown
+    for draw in (starts.draw_between, starts.draw_around):
+        drawn = draw(200, rng)[:, held]
+        assert np.all((drawn >= low[held]) & (drawn <= high[held]))
+        logged = np.isin(drawn, thetas[:, held]).all(axis=1)
+        assert 0.4 < logged.mean() < 0.7
+    assert not np.isin(starts.draw_anywhere(200, rng)[:, held], thetas[:, held]).all()
+    assert np.isin(starts.draw(200, rng)[:, held], thetas[:, held]).all()
+    never_moved = Starts(mpc, starts.low, starts.high, thetas[:1], thetas[:1])
+    assert np.isin(never_moved.draw_between(50, rng)[:, held], thetas[0, held]).all()
