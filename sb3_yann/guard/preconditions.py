@@ -83,9 +83,18 @@ def first_episodes(
 ) -> Outcome:
     """Return what comes of the MPC; raise ValueError if the simulator cannot compare policies.
 
-    Sets how far inputs may move, ``largest_step`` times as far as the MPC's, if it is not None.
-
     The actor plays, not the law in float64: the MPC must be no worse than itself to the last bit.
+
+    Parameters
+    ----------
+    session : GuardSession
+        Its state is told how far inputs may move.
+    name : str
+        The env's, for messages.
+    seeds : sequence of int
+        Of the starts.
+    largest_step : float or None
+        That in multiples of the MPC's largest step, None for any.
     """
     mpc = play_episodes(session, session.mpc, seeds)
     for seed, cost in zip(seeds, mpc.costs, strict=True):

@@ -75,9 +75,10 @@ class LawLayer(nn.Module):
         return ((NONE - beyond) / (NONE - ALL)).clamp(0, 1).to(self.theta_half)
 
     def _keep_confines(self) -> None:
-        scaling = self.constants[0][: -self.confines.numel()]
-        both = np.concatenate([scaling, self.confines.cpu().numpy().ravel()])
-        self.constants = (both, *self.constants[1:])
+        confines = self.confines.cpu().numpy().ravel()
+        scaling = self.constants[0][: -len(confines) - 2]
+        # As data: a constant of another file stays what it was in code that has been compiled.
+        self.constants = (np.concatenate([scaling, confines, [ALL, NONE]]), *self.constants[1:])
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
         nowhere = th.zeros_like(self.confines)  # weights that were saved before there were boxes
@@ -107,7 +108,8 @@ class LawLayer(nn.Module):
             change = room * [[-1.0], [1.0]]
             register_constants(self, middle=middle, half_range=reach, change=change)
         self.register_buffer("confines", th.zeros((2, law.n_theta), dtype=th.float64))
-        scaling = np.concatenate([1 / half, middle, 1 / reach, np.zeros(2 * law.n_theta)])
+        nowhere = np.zeros(2 * law.n_theta)
+        scaling = np.concatenate([1 / half, middle, 1 / reach, nowhere, [ALL, NONE]])
         change = self.change.numpy() if self.rated else np.empty((0, law.n_inputs))
         self.constants = (scaling, change, np.inf)  # for compiled code
 

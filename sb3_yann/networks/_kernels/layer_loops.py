@@ -10,7 +10,6 @@ from sb3_yann._numba import Integers, Single, compiled
 from sb3_yann._validation import Array
 from sb3_yann.control.law._kernels import input_at
 from sb3_yann.networks._kernels.mlp import WEIGHTS, network, network_backward
-from sb3_yann.networks.law_layer import ALL, NONE
 
 _KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
 _KEPT += ", float32[:, :, ::1]"
@@ -46,11 +45,15 @@ def _between(value: Any, low: Any, high: Any) -> Any:
 
 @compiled()
 def _confined(theta: Any, box: Any) -> Any:
-    """Return the part, from 1 to 0, of a correction that counts at theta (n,)."""
-    n, beyond = len(theta), 0.0
+    """Return the part, from 1 to 0, of a correction that counts at theta (n,).
+
+    ``box`` (2 n + 2,) holds its middle, one over its half-widths, and within how many of these a
+    correction counts in full, and beyond how many not.
+    """
+    n, beyond, full, none = len(theta), 0.0, box[-2], box[-1]
     for j in range(n):
         beyond = max(beyond, abs(theta[j] - box[j]) * box[n + j])
-    return np.float32(min(max((NONE - beyond) / (NONE - ALL), 0.0), 1.0))
+    return np.float32(min(max((none - beyond) / (none - full), 0.0), 1.0))
 
 
 @compiled()
@@ -77,10 +80,9 @@ def _act(
     Parameters
     ----------
     u, theta : ndarray, shapes (batch, m) and (batch, n)
-    scaling : ndarray, shape (3 n + 2 m,)
+    scaling : ndarray, shape (3 n + 2 m + 2,)
         One over the half-widths of the box of theta; the middles of the input ranges; one over
-        their half-widths; the middle of the box that corrections are confined to; one over its
-        half-widths, 0 where there is none.
+        their half-widths; what :func:`_confined` takes, with zeros for half-widths without end.
     change : ndarray, shape (2, m) or (0, m)
         By how much an action may differ from the previous input, the last m entries of theta.
     limit : float

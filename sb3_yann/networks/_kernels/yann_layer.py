@@ -52,7 +52,7 @@ def shared_layer_on_cpu(
 
     What else it takes is in :func:`layer_on_cpu`.
     """
-    _require_width(theta, (len(constants[0]) - 2 * u.shape[1]) // 3)
+    _require_width(theta, (len(constants[0]) - 2 - 2 * u.shape[1]) // 3)
     known = (u, as_array(theta, np.float64), *constants)
     return _run(forward_shared, known, weights, pinned, by_row=False)
 
