@@ -37,6 +37,6 @@ def test_every_controller_meets_the_same_starts_and_set_points() -> None:
 def test_the_improved_policy_recovers_most_of_what_the_wear_costs() -> None:
     found = run(WEAR["pump 1 lost 20 %"], 2)
     assert found.accepted
-    assert found.recovered > 0.8  # what lies beyond the set-points of the log is left to the old MPC
+    assert found.recovered > 0.8  # beyond the set-points of the log the old MPC acts
     assert found.by_reidentification > 0.9
-    assert found.worst < 0
+    assert found.worst < 1e-6
