@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.guard.statistics import PairedEpisodes
+from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.starts import RARE
@@ -119,7 +119,7 @@ class Trial:
         allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
         safe = not np.any(unsafe > allowed)
         paired = PairedEpisodes(
-            self.mpc[0][known], accepted[0][known], allowed[known], MARGIN * mean
+            self.mpc[0][known], accepted[0][known], allowed[known], Tolerance(MARGIN * mean)
         )
         reason = paired.objection(costs[known], unsafe[known])
         if not reason and not safe:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -113,6 +113,26 @@ class ActorCheckpoint:
                     known[entry][index] = value[index]
                 else:  # the number of steps, which all regions share
                     known[entry].copy_(value)
+        return mixed
+
+    def part_way(self, other: ActorCheckpoint, share: float) -> ActorCheckpoint:
+        """Return a copy whose networks' weights are a share of the way to another's.
+
+        The optimizer is the other's.
+        """
+        mixed = replace(copy.deepcopy(self), optimizer=copy.deepcopy(other.optimizer))
+        for name in ("actor", "target"):
+            ours, theirs = getattr(mixed, name), getattr(other, name)
+            for key in self.networks():
+                ours[key] = th.lerp(ours[key], theirs[key], share)
+        return mixed
+
+    def shrunk(self, share: float) -> ActorCheckpoint:
+        """Return a copy whose networks add a share of what they add to the MPC's law."""
+        mixed = copy.deepcopy(self)
+        last = [key for key in self.networks() if ".network.rest." in key][-1]
+        for tensors in (mixed.actor, mixed.target):
+            tensors[last] = share * tensors[last]
         return mixed
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from sb3_yann.evaluation.episodes import Episodes, evaluate
 from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
-from sb3_yann.guard.statistics import PairedEpisodes
+from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
 
 HARDEST = 10
 """New starts that join those of every later candidate at a time."""
@@ -60,24 +60,35 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Starts:
-    """Starts, and what came of them under the MPC."""
+    """Starts, and what came of them under the MPC.
+
+    Attributes
+    ----------
+    seeds, mpc : tuple of int and Outcome
+    tolerance : Tolerance, what they may cost more than with the MPC
+    n_starts : int, of so many they are those that count
+    sure : float, how many standard errors the mean cost, and the tail's, must be clear of the MPC's
+    """
 
     seeds: tuple[int, ...]
     mpc: Outcome
-    margin: float
+    tolerance: Tolerance
+    n_starts: int
+    sure: float = 0.0
 
     def at(self, index: Any) -> Starts:
-        """Return some of them."""
+        """Return some of them, which stand for as many."""
         seeds = tuple(np.array(self.seeds)[index].tolist())
-        return Starts(seeds, self.mpc.at(index), self.margin)
+        return Starts(seeds, self.mpc.at(index), self.tolerance, self.n_starts, self.sure)
 
     def joined_with(self, other: Starts) -> Starts:
         """Return the starts of both."""
-        return Starts((*self.seeds, *other.seeds), self.mpc.extended_by(other.mpc), self.margin)
+        seeds, count = (*self.seeds, *other.seeds), self.n_starts + other.n_starts
+        return Starts(seeds, self.mpc.extended_by(other.mpc), self.tolerance, count)
 
     def excess(self, outcome: Outcome) -> Array:
-        """Return what each costs more than with the MPC; inf where that cannot be told."""
-        return np.asarray(np.nan_to_num(outcome.costs - self.mpc.costs, nan=np.inf))
+        """Return what each costs more than with the MPC, in what it may; inf for nan."""
+        return self.tolerance.excess(self.mpc.costs, outcome.costs)
 
     def more_unsafe(self, outcome: Outcome) -> NDArray[np.bool_]:
         """Return which break a limit, end early or are not finite, more often than with the MPC."""
@@ -85,27 +96,40 @@ class Starts:
 
     def lost(self, outcome: Outcome) -> NDArray[np.bool_]:
         """Return which a policy loses against the MPC."""
-        return (self.excess(outcome) > self.margin) | self.more_unsafe(outcome)
+        return (self.excess(outcome) > 1.0) | self.more_unsafe(outcome)
+
+    def loses(self, outcome: Outcome) -> bool:
+        """Return whether a policy loses too many or too much of them, or is less safe."""
+        excess = self.excess(outcome)
+        costly = bool(self.tolerance.objection(excess, self.n_starts, self.sure))
+        return costly or bool(self.more_unsafe(outcome).any())
 
     def mean_is_above(self, outcome: Outcome) -> bool:
-        """Return whether the mean cost is above the MPC's, by more than rounding."""
+        """Return whether the mean cost is above the MPC's, by more than rounding.
+
+        Where it must be clear of it, the bound is its upper confidence limit.
+        """
         rounding = ROUNDING * np.abs(self.mpc.costs).mean()
-        return not outcome.costs.mean() <= self.mpc.costs.mean() + rounding
+        more = outcome.costs - self.mpc.costs
+        error = self.sure * more.std() / np.sqrt(len(more)) if self.sure else 0.0
+        return not more.mean() + error <= rounding
 
     def objection(self, outcome: Outcome) -> str:
         """Return why a policy is refused on these starts, empty where it is not."""
-        lost, excess = self.lost(outcome), self.excess(outcome)
-        if lost.any():
+        if self.loses(outcome):
             first = self.hardest(outcome)[0]
             unsafe, breaks = self.more_unsafe(outcome).any(), outcome.breaks_more_than(self.mpc)
             also = f" and {VIOLATES if breaks else 'moves an input too far'}" if unsafe else ""
+            more = (outcome.costs - self.mpc.costs)[first]
             return (
-                f"{lost.sum()} of {len(self.seeds)} new starts lose against the MPC, seed "
-                f"{self.seeds[first]} costs {excess[first]:.4g} more{also}"
+                f"{self.lost(outcome).sum()} of {len(self.seeds)} new starts lose against the MPC, "
+                f"seed {self.seeds[first]} costs {more:.4g} more{also}"
             )
         if self.mean_is_above(outcome):
             mean, mpc = outcome.costs.mean(), self.mpc.costs.mean()
-            return f"mean cost {mean:.6g} on {len(self.seeds)} new starts, MPC {mpc:.6g}"
+            surely = "surely " if mean <= mpc else ""
+            found = f"mean cost {mean:.6g} on {len(self.seeds)} new starts, MPC {mpc:.6g}"
+            return f"{found}: not {surely}below" if surely else found
         return ""
 
     def hardest(self, outcome: Outcome | None) -> NDArray[np.int64]:
@@ -126,16 +150,17 @@ class Evidence(Starts):
     ----------
     seeds : tuple of int, the known starts
     mpc, accepted : Outcome, what came of the MPC and of the accepted policy
-    margin : float, what one start may cost more than with the MPC
+    tolerance : Tolerance, what they may cost more than with the MPC
+    n_starts : int, of so many they are those that count
     """
 
-    accepted: Outcome
+    accepted: Outcome = field(kw_only=True)
 
     @property
     def paired(self) -> PairedEpisodes:
         """The costs that a candidate's are compared with."""
-        accepted = self.accepted
-        return PairedEpisodes(self.mpc.costs, accepted.costs, accepted.unsafe, self.margin)
+        costs = self.mpc.costs, self.accepted.costs
+        return PairedEpisodes(*costs, self.accepted.unsafe, self.tolerance, self.n_starts)
 
     @property
     def visits(self) -> NDArray[np.bool_]:

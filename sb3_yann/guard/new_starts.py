@@ -7,28 +7,45 @@ from numpy.typing import NDArray
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.episodes import Evidence, Outcome, Starts, Unplayable, play
+from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.region_mixing import accept_parts
 from sb3_yann.guard.session import GuardSession
 
 ROUNDS = 3
 """How often the parts of what lost on new starts are played from others."""
+SMALLER = 0.5, 0.25
+"""Shares of its correction that a policy keeps which lost on new starts."""
 MEMORY, MOST_KEPT = 10_000_000, 20
 """Bytes and number of earlier accepted checkpoints that are kept."""
 
 
-def confirm_on_new_starts(session: GuardSession, n_starts: int, by_region: bool) -> str:
+def confirm_on_new_starts(
+    session: GuardSession, n_starts: int, rule: AcceptanceRule, sure: float = 0.0
+) -> str:
     """Play what is accepted from new starts; return why it was refused, empty where it was not.
 
-    The latest earlier checkpoint that passes all of these starts is accepted instead, else the MPC.
-    The hardest starts join those of every later candidate. With ``by_region``, single regions of
-    what lost may still be accepted, and are confirmed on other new starts.
+    Of half or a quarter of its correction, and the latest earlier checkpoint that passes all of
+    these starts, the better one is accepted instead; else the MPC.
+    The hardest starts join those of every later candidate. Where the rule says so, single regions
+    of what lost may still be accepted, and are confirmed on other new starts.
+
+    Parameters
+    ----------
+    session : GuardSession
+        Its accepted policy is tried.
+    n_starts : int
+        Number of new starts.
+    rule : AcceptanceRule
+        Whether regions, and smaller corrections, are tried.
+    sure : float, default 0
+        How many standard errors its mean cost, and the tail's, must be clear of the MPC's.
     """
     first, state = "", session.state
     for _ in range(ROUNDS):
         lost, evidence = state.accepted, state.evidence
         if n_starts == 0 or not session.has_learned(lost):
             return first
-        new = _new_starts(session, n_starts)
+        new = _new_starts(session, n_starts, sure)
         outcome: Outcome | None = None
         try:
             outcome = play(session, lost, new.seeds)
@@ -41,9 +58,9 @@ def confirm_on_new_starts(session: GuardSession, n_starts: int, by_region: bool)
         first = first or reason
         drop_passed(session, lost)
         hard = new.hardest(outcome)
-        _accept_earlier(session, new, hard)
+        _accept_less(session, lost if rule.retreat else session.mpc, new, hard)
         safe = state.accepted, state.evidence
-        if by_region:
+        if rule.by_region:
             known = None if outcome is None else evidence.accepted.extended_by(outcome.at(hard))
             accept_parts(session, lost, known)
         if state.accepted is safe[0]:
@@ -71,13 +88,14 @@ def drop_passed(session: GuardSession, checkpoint: ActorCheckpoint) -> None:
     passed[:] = [each for each in passed if not each[0].has_networks_of(checkpoint)]
 
 
-def _new_starts(session: GuardSession, n_starts: int) -> Starts:
+def _new_starts(session: GuardSession, n_starts: int, sure: float) -> Starts:
     """Return as many new starts, without those where the MPC's own cost is not finite."""
     state = session.state
     seeds = range(state.next_start, state.next_start + n_starts)
     state.new_starts, state.next_start = state.new_starts + n_starts, seeds.stop
-    new = Starts((*seeds,), play(session, session.mpc, seeds), state.evidence.margin)
-    new = new.at(np.flatnonzero(np.isfinite(new.mpc.costs)))
+    mpc, tolerance = play(session, session.mpc, seeds), state.evidence.tolerance
+    finite = np.flatnonzero(np.isfinite(mpc.costs))
+    new = Starts((*seeds,), mpc, tolerance, len(finite), sure).at(finite)
     if not new.seeds:
         raise ValueError(
             f"The MPC's own cost is a finite number on none of {n_starts} new starts of the "
@@ -86,19 +104,33 @@ def _new_starts(session: GuardSession, n_starts: int) -> Starts:
     return new
 
 
-def _accept_earlier(session: GuardSession, new: Starts, hard: NDArray[np.int64]) -> None:
-    """Accept the latest earlier checkpoint that loses on no new start, else the MPC."""
+def _accept_less(
+    session: GuardSession, lost: ActorCheckpoint, new: Starts, hard: NDArray[np.int64]
+) -> None:
+    """Accept a smaller correction or the latest earlier checkpoint that passes, else the MPC.
+
+    It is tried on new starts, of which ``hard`` join the known ones.
+    """
     state = session.state
     known = state.evidence.joined_with(new.at(hard))
-    for checkpoint, outcome in reversed(state.passed):
-        try:
-            everywhere = _passing(session, checkpoint, outcome, new, hard)
-        except Unplayable:
-            continue
-        state.accept(checkpoint, Evidence(known.seeds, known.mpc, known.margin, everywhere))
-        keep_passed(session, checkpoint, everywhere)
-        return
-    state.accept(session.mpc, Evidence(known.seeds, known.mpc, known.margin, known.mpc))
+    smaller = [(lost.shrunk(share), None) for share in SMALLER if session.has_learned(lost)]
+    best, least, outcome = session.mpc, known.mpc.costs.mean(), known.mpc
+    for group in (smaller, [*reversed(state.passed)]):
+        for checkpoint, had in group:
+            try:
+                found = _passing(session, checkpoint, had, new, hard)
+            except Unplayable:
+                continue
+            if found.costs.mean() <= least:
+                best, least, outcome = checkpoint, found.costs.mean(), found
+            break
+    state.accept(best, _evidence(known, outcome))
+    if best is not session.mpc:
+        keep_passed(session, best, outcome)
+
+
+def _evidence(known: Starts, accepted: Outcome) -> Evidence:
+    return Evidence(known.seeds, known.mpc, known.tolerance, known.n_starts, accepted=accepted)
 
 
 def _passing(
@@ -117,26 +149,26 @@ def _passing(
     others = np.setdiff1d(np.arange(len(new.seeds)), hard)
     on_hard = _play_unless_lost(session, checkpoint, new.at(hard))
     on_new = on_hard.extended_by(_play_unless_lost(session, checkpoint, new.at(others)))
-    _check_mean(new.at(np.concatenate([hard, others])), on_new)
+    _check(new.at(np.concatenate([hard, others])), on_new)
     had = 0 if outcome is None else len(outcome.costs)
     on_known = _play_unless_lost(session, checkpoint, known.at(np.arange(had, len(known.seeds))))
     if outcome is not None:
         on_known = outcome.extended_by(on_known)
     everywhere = on_known.extended_by(on_hard)
-    _check_mean(known.joined_with(new.at(hard)), everywhere)
+    _check(known.joined_with(new.at(hard)), everywhere)
     return everywhere
 
 
 def _play_unless_lost(
     session: GuardSession, checkpoint: ActorCheckpoint, starts: Starts
 ) -> Outcome:
-    """Return a checkpoint's outcome; raise Unplayable where it loses one of the starts."""
+    """Return a checkpoint's outcome; raise Unplayable where it loses already by these starts."""
     outcome = play(session, checkpoint, starts.seeds) if starts.seeds else starts.mpc
-    if starts.lost(outcome).any():
-        raise Unplayable("a start is lost")
+    if starts.seeds and starts.loses(outcome):
+        raise Unplayable("it loses against the MPC")
     return outcome
 
 
-def _check_mean(starts: Starts, outcome: Outcome) -> None:
-    if starts.mean_is_above(outcome):
-        raise Unplayable("the mean cost is above the MPC's")
+def _check(starts: Starts, outcome: Outcome) -> None:
+    if starts.loses(outcome) or starts.mean_is_above(outcome):
+        raise Unplayable("it is worse than the MPC")

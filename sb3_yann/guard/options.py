@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from sb3_yann._validation import as_between, as_flag, as_whole
 
@@ -16,14 +17,23 @@ class AcceptanceRule:
     Parameters
     ----------
     margin : float, default 0.01
-        What one start may cost more than with the MPC, as a fraction of the MPC's median cost.
-        Plant alone: what it may cost beyond its prediction limit, of the accepted median.
+        What the worst starts may cost more than with the MPC on average, as a fraction of the
+        MPC's median cost, or of its cost of that start where that is more. No single start may
+        cost ten times as much more. Plant alone: what an episode may cost beyond its prediction
+        limit, of the accepted median.
+    tail : float, default 0.05
+        In a simulator: share of the starts that count as the worst ones. 0 is strict: no single
+        start may cost more than the margin, of the median.
     by_region : bool, default True
         Whether single regions are tried where the whole candidate is refused.
+    retreat : bool, default True
+        In a simulator: whether half and a quarter of the way are tried where no region is accepted
+        either, and half and a quarter of the correction where a policy loses on new starts.
     trial_episodes : int, default 10
         Plant alone: training episodes of a block, at least 3.
     significance : float, default 0.05
-        Plant alone: probability that a run accepts a policy that is no better, at most.
+        Plant alone: probability that a run accepts a policy that is no better, at most. In a
+        simulator: that the final trial does, on average over all starts.
     largest_step : float, optional
         In a simulator: how far an input may move from one sample to the next, in multiples of the
         MPC's largest step on the known starts, at least 1. The default is no bound.
@@ -36,19 +46,30 @@ class AcceptanceRule:
     """
 
     margin: float = 0.01
+    tail: float = 0.05
     by_region: bool = True
+    retreat: bool = True
     trial_episodes: int = 10
     significance: float = 0.05
     largest_step: float | None = None
 
     def __post_init__(self) -> None:
         as_between("margin", self.margin, 0, np.inf)
+        as_between(
+            "tail", self.tail, 0, 1, hint="It is a share of the starts, 0 for the worst one."
+        )
         if self.largest_step is not None:
             hint = "It is a multiple of the MPC's largest step, or None."
             as_between("largest_step", self.largest_step, 1, np.inf, hint=hint)
         as_flag("by_region", self.by_region)
+        as_flag("retreat", self.retreat)
         as_whole("trial_episodes", self.trial_episodes, 3)
         as_between("significance", self.significance, 0, 0.5)
+
+    @property
+    def standard_errors(self) -> float:
+        """How many standard errors a mean cost must be below the MPC's in the final trial."""
+        return float(special.ndtri(1 - self.significance)) if self.tail else 0.0
 
 
 @dataclass(frozen=True)

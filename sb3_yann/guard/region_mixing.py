@@ -14,6 +14,9 @@ from sb3_yann.guard.session import GuardSession
 MOST_LOST = 0.2
 """Share of losing starts beyond which no part of a candidate is looked for."""
 
+PART_WAY = 0.5, 0.25
+"""How far towards a refused candidate what lies between is tried."""
+
 
 def accept_visited(session: GuardSession, candidate: ActorCheckpoint, outcome: Outcome) -> None:
     """Accept the candidate in those regions that its episodes come through.
@@ -53,7 +56,7 @@ def _accept_all_but_losing(
         lost = paired.lost(outcome.costs)
         if not lost.any() or lost.mean() > MOST_LOST:
             break
-        won = outcome.costs < paired.costs - paired.margin
+        won = outcome.costs < paired.costs - paired.tolerance.margin
         blame, credit = outcome.visits[lost].sum(0)[kept], outcome.visits[won].sum(0)[kept]
         if not blame.any():
             break
@@ -86,8 +89,8 @@ def _accept_one_by_one(
             other = mixed.changed_regions(candidate)
             known = starts[~outcome.visits[starts][:, other].any(1)]
             trial = trial.replaced(known, outcome.at(known))
-            lost = evidence.paired.lost(trial.costs)[known]
-            if lost.any() or np.any(trial.unsafe[known] > evidence.accepted.unsafe[known]):
+            lost = len(known) and evidence.at(known).loses(outcome.at(known))
+            if lost or np.any(trial.unsafe[known] > evidence.accepted.unsafe[known]):
                 continue  # whatever the others cost
         others = np.setdiff1d(starts, known)
         try:
@@ -96,6 +99,24 @@ def _accept_one_by_one(
             continue
         if _improves(evidence, trial):
             state.accept(mixed, replace(evidence, accepted=trial))
+
+
+def accept_part_way(session: GuardSession, candidate: ActorCheckpoint) -> float:
+    """Accept what lies half or a quarter of the way to a refused candidate; return the share.
+
+    0 where neither is better than what is accepted.
+    """
+    before, evidence = session.state.accepted, session.state.evidence
+    for share in PART_WAY:
+        between = before.part_way(candidate, share)
+        try:
+            outcome = play(session, between, evidence.seeds)
+        except Unplayable:
+            continue
+        if _improves(evidence, outcome):
+            accept_visited(session, between, outcome)
+            return share
+    return 0.0
 
 
 def _improves(evidence: Evidence, outcome: Outcome) -> bool:

@@ -115,12 +115,13 @@ class GuardSession:
         costs: tuple[float, float, float],
         worst_start: float = math.nan,
         regions: tuple[int, ...] = (),
+        share: float = 0.0,
     ) -> None:
         """Set the step size, and log a Decision.
 
         Parameters
         ----------
-        verdict, reason, restored, worst_start, regions
+        verdict, reason, restored, worst_start, regions, share
             Fields of the :class:`Decision`.
         costs : triple of float
             Mean costs of the candidate, the policy accepted now and the MPC.
@@ -132,7 +133,16 @@ class GuardSession:
             step = max(min(self.step_size.smallest, step), step * self.step_size.shrink)
         state.step = self.policy.actor_step = step
         decision = Decision(
-            steps, state.episodes, verdict, reason, restored, *costs, worst_start, regions, step
+            steps,
+            state.episodes,
+            verdict,
+            reason,
+            restored,
+            *costs,
+            worst_start,
+            regions,
+            step,
+            share,
         )
         state.decisions.append(decision)
         log_last(state.decisions, self.model, self.log_path, self.verbose)

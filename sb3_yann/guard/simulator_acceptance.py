@@ -25,9 +25,15 @@ from sb3_yann.guard.episodes import (
 from sb3_yann.guard.new_starts import confirm_on_new_starts, keep_passed
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.preconditions import check_simulator, first_episodes
-from sb3_yann.guard.region_mixing import accept_parts, accept_visited, accepted_regions
+from sb3_yann.guard.region_mixing import (
+    accept_part_way,
+    accept_parts,
+    accept_visited,
+    accepted_regions,
+)
 from sb3_yann.guard.session import GuardSession
 from sb3_yann.guard.state import GuardState, Verdict
+from sb3_yann.guard.statistics import Tolerance
 
 PART: Final = "accepted in part"
 REPLAYED = 5
@@ -60,7 +66,8 @@ class SimulatorAcceptance:
         """What the evidence depends on."""
         bound = self.rule.largest_step
         steps = {} if bound is None else {"largest_step": bound}
-        return {"env": self.name, "seeds": self.seeds, "margin": self.rule.margin, **steps}
+        tolerance = {"margin": self.rule.margin, "tail": self.rule.tail}
+        return {"env": self.name, "seeds": self.seeds, **tolerance, **steps}
 
     def start(self, session: GuardSession) -> None:
         """Check that the simulator is another env than the training env, and a like one."""
@@ -79,7 +86,9 @@ class SimulatorAcceptance:
             again = outcome_of(session, play_episodes(session, session.state.accepted, seeds))
         except Unplayable:
             return False
-        close = np.allclose(again.costs, expected.costs, rtol=1e-5, atol=1e-3 * evidence.margin)
+        close = np.allclose(
+            again.costs, expected.costs, rtol=1e-5, atol=1e-3 * evidence.tolerance.margin
+        )
         return close and np.array_equal(again.unsafe, expected.unsafe)
 
     def first_evidence(self, session: GuardSession, known: GuardState | None) -> None:
@@ -97,8 +106,9 @@ class SimulatorAcceptance:
             hard = set(getattr(known.evidence, "seeds", ())) - {*known.settings.get("seeds", ())}
             seeds = (*seeds, *sorted(hard - {*seeds}))
         mpc = first_episodes(session, self.name, seeds, self.rule.largest_step)
-        margin = self.rule.margin * float(np.median(np.abs(mpc.costs[: len(self.seeds)])))
-        state.accept(session.mpc, Evidence(seeds, mpc, margin, mpc))
+        typical = float(np.median(np.abs(mpc.costs[: len(self.seeds)])))
+        tolerance = Tolerance(self.rule.margin * typical, self.rule.tail, typical)
+        state.accept(session.mpc, Evidence(seeds, mpc, tolerance, len(seeds), accepted=mpc))
         leading = session.mpc
         for candidate in candidates:
             if not candidate.has_networks_of(leading):
@@ -150,7 +160,9 @@ class SimulatorAcceptance:
         if last is self.final:  # the Zoo ends its first callback a second time
             return
         with session.all_or_nothing():
-            reason = confirm_on_new_starts(session, self.n_final_starts, self.rule.by_region)
+            reason = confirm_on_new_starts(
+                session, self.n_final_starts, self.rule, self.rule.standard_errors
+            )
         self.final = accepted = state.accepted
         accepted.restore(session.policy)
         if reason:
@@ -167,36 +179,41 @@ class SimulatorAcceptance:
         if not candidate.has_diverged() and not np.any(changed & state.evidence.visits.any(0)):
             return  # it differs only where no episode of the accepted policy comes through
         with session.all_or_nothing():
-            outcome, reason, restored = self._judge(session, candidate)
+            outcome, reason, restored, share = self._judge(session, candidate)
         if restored:
             state.accepted.restore(session.policy)
         regions = accepted_regions(before, candidate, state.accepted) if reason else []
-        self._report(session, outcome, reason, regions, restored)
+        self._report(session, outcome, reason, regions, restored, share)
 
     def _judge(
         self, session: GuardSession, candidate: ActorCheckpoint
-    ) -> tuple[Outcome | None, str, bool]:
-        """Return a candidate's episodes, why it is refused, and whether to restore the accepted."""
-        state = session.state
+    ) -> tuple[Outcome | None, str, bool, float]:
+        """Return a candidate's episodes, why it is refused, whether to restore, and the share."""
+        state, rule = session.state, self.rule
         before: tuple[ActorCheckpoint, Evidence] = state.accepted, state.evidence
         outcome, reason = evaluate_candidate(session, candidate)
         hopeless = outcome is None or outcome.breaks_more_than(before[1].accepted)
+        share = 0.0 if reason else 1.0
         if outcome is not None and not reason:
             accept_visited(session, candidate, outcome)
         elif outcome is not None and not hopeless:
             hopeless = not self.keep_if_worse and before[1].paired.loses_to_the_mpc(outcome.costs)
-            if self.rule.by_region:
+            if rule.by_region:
                 accept_parts(session, candidate, outcome)
-        lost = ""
-        if not before[0].has_networks_of(state.accepted):
-            lost = confirm_on_new_starts(session, self.n_new_starts, self.rule.by_region)
+        untouched = reason and before[0].has_networks_of(state.accepted)
+        if untouched and rule.retreat and not candidate.has_diverged():
+            share = accept_part_way(session, candidate)
+        on_trial, lost = state.accepted, ""
+        if not before[0].has_networks_of(on_trial):
+            lost = confirm_on_new_starts(session, self.n_new_starts, rule)
         refused = bool(reason or lost)
         state.rejections = state.rejections + 1 if refused else 0
         out_of_patience = state.rejections >= self.patience or hopeless or VIOLATES in lost
         restored = refused and out_of_patience
         if restored:
             state.rejections = 0
-        return outcome, reason or lost, restored
+        kept = on_trial.has_networks_of(state.accepted)
+        return outcome, reason or lost, restored, share if kept else 0.0
 
     def _report(
         self,
@@ -205,13 +222,14 @@ class SimulatorAcceptance:
         reason: str,
         regions: list[int],
         restored: bool,
+        share: float = 0.0,
     ) -> None:
         paired = session.state.evidence.paired
-        verdict: Verdict = "accepted" if not reason else PART if regions else "rejected"
+        verdict: Verdict = "accepted" if not reason else PART if regions or share else "rejected"
         cost = np.nan if outcome is None else float(outcome.costs.mean())
         costs = cost, float(paired.costs.mean()), float(paired.mpc_costs.mean())
         worst_start = float(np.max(paired.costs - paired.mpc_costs))
-        session.decide(verdict, reason, restored, costs, worst_start, tuple(regions))
+        session.decide(verdict, reason, restored, costs, worst_start, tuple(regions), share)
 
 
 def name_of(env: Any) -> str:

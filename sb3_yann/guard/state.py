@@ -39,6 +39,8 @@ class Decision:
         Regions whose networks were accepted, where it was a part.
     step : float
         Factor of the actor's learning rate from now on.
+    share : float
+        How far towards the candidate what was accepted lies: 1, a half, a quarter, or 0.
 
     Examples
     --------
@@ -58,6 +60,7 @@ class Decision:
     worst_start: float
     regions: tuple[int, ...]
     step: float
+    share: float = 0.0
 
 
 @dataclass

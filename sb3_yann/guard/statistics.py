@@ -12,12 +12,97 @@ from sb3_yann._validation import Array
 
 OUTLIER = 1e-3
 """Probability that one episode of a policy like the accepted one is taken for far outside."""
+MOST = 10.0
+"""With a tail: how many times as much as its average one start may cost more."""
 UNSAFE = (
     "violations",
     "an episode that the env terminates",
     "a cost or an observation that is no finite number",
     "an input that moves too far in one step",
 )
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What starts may cost more than with the MPC.
+
+    Attributes
+    ----------
+    margin : float
+        In units of cost: what a start may cost more. With a ``tail``, what the worst of them may on
+        average.
+    tail : float, share of all starts that the average is over; 0 is the worst single start
+        With a tail, a start that costs the MPC more than ``typical`` may cost more in proportion,
+        and no start may cost more than ``MOST`` times as much as the average may.
+    typical : float, the MPC's median cost
+    """
+
+    margin: float
+    tail: float = 0.0
+    typical: float = np.inf
+
+    def excess(self, mpc_costs: Array, costs: Array) -> Array:
+        """Return what each start costs more than with the MPC, in units of what it may.
+
+        A cost that is not a number is inf.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            more = (costs - mpc_costs) / self.allowed(mpc_costs)
+        more = np.where(costs <= mpc_costs, np.fmin(more, 0.0), more)  # also without any margin
+        return np.asarray(np.nan_to_num(more, nan=np.inf, posinf=np.inf, neginf=-np.inf))
+
+    def allowed(self, mpc_costs: Array) -> Array:
+        """Return what each start may cost more."""
+        if not self.tail:
+            return np.full(len(mpc_costs), self.margin)
+        return np.asarray(self.margin * np.maximum(1.0, np.abs(mpc_costs) / self.typical))
+
+    def objection(self, excess: Array, n_starts: int | None = None, sure: float = 0.0) -> str:
+        """Return what speaks against such an excess over the MPC, empty where nothing does.
+
+        Parameters
+        ----------
+        excess : ndarray, shape (starts,)
+            As :meth:`excess` returns it.
+        n_starts : int, optional
+            Number of starts of which these are the worst ones. The default is all of them.
+        sure : float, default 0
+            How many standard errors of the tail's average count as well.
+        """
+        worst = int(np.argmax(excess))
+        if not excess[worst] > 1.0:
+            return ""
+        if not self.tail or excess[worst] > MOST:
+            return f"start {worst}"
+        average, error = tail_average(excess, self.tail, n_starts or len(excess))
+        if average + sure * error <= 1.0:
+            return ""
+        return f"the worst {100 * self.tail:g} % of the starts cost too much, start {worst}"
+
+
+def tail_average(excess: Array, tail: float, n_starts: int) -> tuple[float, float]:
+    """Return the average of the worst share of values, and its standard error.
+
+    The conditional value at risk q + E(x - q)+ / tail at the quantile q, with the deviation of the
+    second part (Rockafellar and Uryasev, *Optimization of conditional value-at-risk*, Journal of
+    Risk 2, 2000). At least one value counts.
+
+    Parameters
+    ----------
+    excess : ndarray, shape (values,)
+        The worst ones of ``n_starts``.
+    tail : float
+        The share.
+    n_starts : int
+        So many values there are.
+    """
+    count = min(max(1.0, tail * n_starts), float(len(excess)))
+    ranked = np.sort(excess)[::-1]
+    level = ranked[int(np.ceil(count)) - 1]
+    beyond = np.maximum(ranked - level, 0.0)
+    mean = beyond.sum() / count
+    deviation = np.sqrt(max(0.0, np.sum(beyond**2) / n_starts - (beyond.sum() / n_starts) ** 2))
+    return float(level + mean), float(deviation * np.sqrt(n_starts) / count)
 
 
 @dataclass(frozen=True)
@@ -30,17 +115,19 @@ class PairedEpisodes:
     unsafe : ndarray of int, shape (episodes, 4), the accepted policy's
         The columns, named in ``UNSAFE``, are compared one by one: an episode cut short has fewer
         steps to violate in.
-    margin : float, what one start may cost more than with the MPC
+    tolerance : Tolerance, what starts may cost more than with the MPC
+    n_starts : int, optional, the number of starts that these are the worst ones of
     """
 
     mpc_costs: Array
     costs: Array
     unsafe: NDArray[np.int64]
-    margin: float
+    tolerance: Tolerance
+    n_starts: int | None = None
 
     def lost(self, costs: Array) -> NDArray[np.bool_]:
-        """Return which starts cost more than with the MPC by more than the margin."""
-        return np.asarray(~(costs - self.mpc_costs <= self.margin))
+        """Return which starts cost more than with the MPC by more than they may."""
+        return np.asarray(self.tolerance.excess(self.mpc_costs, costs) > 1.0)
 
     def loses_to_the_mpc(self, costs: Array) -> bool:
         """Return whether the mean cost is above the MPC's."""
@@ -55,10 +142,11 @@ class PairedEpisodes:
             more = np.flatnonzero(now > before)
             if len(more):
                 return f"{len(more)} starts with {what}, the first is number {more[0]}"
-        excess = costs - self.mpc_costs
-        worst = int(np.argmax(np.where(np.isnan(excess), np.inf, excess)))
-        if not excess[worst] <= self.margin:
-            return f"start {worst} costs {excess[worst]:.4g} more than with the MPC"
+        relative = self.tolerance.excess(self.mpc_costs, costs)
+        why = self.tolerance.objection(relative, self.n_starts)
+        if why:
+            worst = np.argmax(relative)
+            return f"{why} costs {costs[worst] - self.mpc_costs[worst]:.4g} more than with the MPC"
         if not costs.mean() <= self.costs.mean():
             return f"mean cost {costs.mean():.6g}, accepted {self.costs.mean():.6g}"
         return ""

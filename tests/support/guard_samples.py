@@ -108,8 +108,14 @@ def build(algorithm=DDPG, env: Any = None, actor: dict[str, Any] | None = None, 
     return algorithm(YannPolicy, env, policy_kwargs=policy | (actor or {}), **(options | kwargs))
 
 
-def make_guard(env: Any = Slide, **kwargs) -> ImprovementGuard:
-    return ImprovementGuard(env, **({"n_starts": 10, "patience": 1} | kwargs))
+STRICT = {"tail": 0, "retreat": False}
+"""No single start may lose, and nothing but regions of a candidate is tried."""
+
+
+def make_guard(env: Any = Slide, *, rule: Any = {}, **kwargs) -> ImprovementGuard:  # noqa: B006
+    if isinstance(rule, dict):
+        rule = STRICT | rule
+    return ImprovementGuard(env, rule=rule, **({"n_starts": 10, "patience": 1} | kwargs))
 
 
 def guard_alone(
