@@ -64,6 +64,9 @@ def _fit(
     points = th.cat([th.as_tensor(theta), th.as_tensor(actions)], dim=1).to(device)
     wanted = th.as_tensor(returns, dtype=th.float32)[:, None].to(device)
     unit = float(np.std(returns)) or 1.0
+    if critic.scales_itself and policy.critic_updates == 0:
+        critic.batch = points
+        critic.scale_values(critic.stage_cost_of_batch())
     optimizer = th.optim.Adam(critic.parameters(), lr=RATE)
     for k in range(UPDATES):
         for group in optimizer.param_groups:

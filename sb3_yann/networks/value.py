@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -161,8 +162,9 @@ class AfterstateValue(nn.Module):
     gamma : float
     ranges, hidden, activation, pinned
         As in :class:`QuadraticStateActionValue`.
-    scale : float, default 30
-        The network's output is multiplied by it: its units are those of the cost-to-go.
+    scale : float, optional
+        The network's output is multiplied by it: its units are those of the cost-to-go. The default
+        is 1, until :attr:`value_scale` is set.
 
     Examples
     --------
@@ -176,6 +178,7 @@ class AfterstateValue(nn.Module):
     to_input: th.Tensor
     middle: th.Tensor
     network_scale: th.Tensor
+    value_scale: th.Tensor
     W: th.Tensor
 
     def __init__(  # noqa: PLR0913 (a user's options of the critic)
@@ -188,12 +191,12 @@ class AfterstateValue(nn.Module):
         hidden: tuple[int, ...] = (64, 64),
         activation: Activation = th.tanh,
         pinned: bool = True,
-        scale: float = 30.0,
+        scale: float | None = None,
     ) -> None:
         super().__init__()
         import_module("sb3_yann.networks._kernels.afterstate_value")  # see YannLayer
         self.model = _untrained(model) if isinstance(model, nn.Module) else model
-        self.gamma, self.scale = gamma, scale
+        self.gamma = gamma
         self.quadratic = QuadraticForm(P)
         register_constants(
             self,
@@ -201,6 +204,7 @@ class AfterstateValue(nn.Module):
             to_input=ranges.u_half,
             middle=ranges.u_middle,
             network_scale=1 / ranges.theta_half,
+            value_scale=np.array(np.nan if scale is None else scale),
         )
         n, m = len(ranges.theta_half), len(ranges.u_min)
         _check_prediction(self.model, n, m)
@@ -208,6 +212,18 @@ class AfterstateValue(nn.Module):
         self.network = ZeroOutputNetwork(n, 1, hidden, activation=activation, pinned=kept)
         self._constants: tuple[Array, Array, Array, Array]
         self._constants_of: tuple[list[Any], tuple[th.Tensor, ...]] = ([], ())
+
+    @property
+    def scale(self) -> float:
+        """Factor of the network's output, 1 where it is not known yet."""
+        buffers: Any = self._buffers
+        scale: float = buffers["value_scale"].item()
+        return 1.0 if math.isnan(scale) else scale
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
+        # Weights that were saved without a scale had that of the options, else 30.
+        state_dict.setdefault(f"{prefix}value_scale", self.value_scale.nan_to_num(30.0))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
     def compiles(self) -> bool:
@@ -247,11 +263,22 @@ class AfterstateValue(nn.Module):
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
         if self.compiles and theta_and_action.device.type == "cpu":
             return self._compiled(theta_and_action, self._weights())
-        theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
-        u = action * self.to_input + self.middle
-        z = th.cat([theta, u], 1)
-        stage = ((z @ self.W) * z).sum(-1, keepdim=True)
+        theta, u = self._theta_and_input(theta_and_action)
+        stage = self._stage_cost(theta, u)
         return -(stage + self.gamma * self.value(self.model(theta, u))).float()
+
+    @th.no_grad()
+    def mean_stage_cost(self, theta_and_action: th.Tensor) -> float:
+        """Return the mean of the stage cost's absolute values, over rows ``[theta, a]``."""
+        return float(self._stage_cost(*self._theta_and_input(theta_and_action)).abs().mean())
+
+    def _theta_and_input(self, theta_and_action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
+        return theta, action * self.to_input + self.middle
+
+    def _stage_cost(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+        z = th.cat([theta, u], 1)
+        return ((z @ self.W) * z).sum(-1, keepdim=True)
 
     def compiled_with_fixed_weights(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q where :attr:`compiles`, with a gradient by the rows, but not by the weights."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
@@ -25,6 +25,8 @@ from sb3_yann.policy._features import SeesTheta, without_entries
 from sb3_yann.policy._finite import what_is_not_finite
 from sb3_yann.policy.critic_options import CriticOptions
 
+LONGEST = 100
+"""Samples that a cost counts for good as, at most."""
 NETWORKS = ("per_region", "shared")
 
 
@@ -160,7 +162,10 @@ class YannCritic(SeesTheta, ContinuousCritic):
     ) -> None:
         sb3_kwargs |= {"activation_fn": activation_fn, "n_critics": n_critics}
         super().__init__(net_arch=[], **sb3_kwargs)
+        self.gamma = gamma
         self.scale, self.offset = float(options.reward_scale), options.offset_of_return(gamma)
+        self.scales_itself = options.scales_itself
+        self.batch: th.Tensor | None = None  # the latest points to learn from
         common: dict[str, Any] = {
             "ranges": networks.Ranges(problem.theta_half, problem.u_min, problem.u_max),
             "hidden": tuple(net_arch),
@@ -176,7 +181,42 @@ class YannCritic(SeesTheta, ContinuousCritic):
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """Return Q of each critic, all (batch, 1), in units of the env's reward."""
         theta = self.extract_features(obs, self.features_extractor)  # never trained
-        return self.values(th.cat([theta, actions], dim=1))
+        points = th.cat([theta, actions], dim=1)
+        if self.scales_itself and th.is_grad_enabled():
+            self.batch, first = points.detach(), cast("Any", self.q_networks[0])
+            if first.value_scale.isnan():
+                self.scale_values(self.stage_cost_of_batch())
+        return self.values(points)
+
+    def stage_cost_of_batch(self) -> float:
+        """Return the mean stage cost of the latest points to learn from."""
+        first: Any = self.q_networks[0]
+        return 0.0 if self.batch is None else float(first.mean_stage_cost(self.batch))
+
+    def scale_values(self, stage_cost: float) -> None:
+        """Set the factor of networks that are zero to that cost for good, or to 1."""
+        for q_network in cast("list[Any]", self.q_networks):
+            scale = stage_cost / max(1 - self.gamma, 1 / LONGEST)
+            q_network.value_scale.fill_(scale if scale > 0 else 1.0)
+
+    def rescale(self, stage_cost: float, optimizer: th.optim.Optimizer | None = None) -> float:
+        """Double or halve the factor where that cost for good is beyond; return the factor.
+
+        What the networks put out stays as it is, and their last layer's moments stay true.
+        """
+        scale: float = cast("Any", self.q_networks[0]).scale
+        wanted = stage_cost / max(1 - self.gamma, 1 / LONGEST)
+        exponent = round(math.log2(wanted / scale)) if wanted > 0 else 0
+        factor = 2.0**exponent
+        for q_network in cast("list[Any]", self.q_networks if factor != 1 else []):
+            q_network.value_scale.mul_(factor)
+            last = q_network.network.weights()[-1]
+            last.data.div_(factor)
+            moments = {} if optimizer is None else optimizer.state.get(last, {})
+            for power, name in enumerate(("exp_avg", "exp_avg_sq"), start=1):
+                if name in moments:
+                    moments[name].mul_(factor**power)
+        return scale * factor
 
     def values(self, points: th.Tensor) -> tuple[th.Tensor, ...]:
         """Return Q of each critic, all (batch, 1), at points ``[theta, action]``."""
@@ -236,5 +276,5 @@ def _initial_value(
     model = options.prediction_model
     if model is None:
         model = networks.LinearPrediction(*problem.prediction)
-    W, P, scale = problem.stage_matrix, problem.value_matrix(gamma), float(options.value_scale)
+    W, P, scale = problem.stage_matrix, problem.value_matrix(gamma), options.value_scale
     return AfterstateValue(W, P, model, gamma, scale=scale, **common)

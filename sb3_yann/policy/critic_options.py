@@ -24,8 +24,10 @@ class CriticOptions:
     prediction_model : callable, optional
         ``(theta, u) -> next theta`` for the afterstate critic, differentiable, of float64 tensors
         (batch, n) and (batch, m) in physical units. The default is the MPC's ``A theta + B u``.
-    value_scale : float, default 30
-        Factor of the afterstate critic's network: the order of the changes of V to be learnt.
+    value_scale : float, optional
+        Factor of the afterstate critic's network: the order of the changes of V to be learnt. The
+        default is the mean stage cost of what is learnt from while the actor is still the MPC
+        (``critic_warmup``), over ``1 - gamma``, or 0.01 where that is more.
     reward_scale, reward_offset : float, default 1 and 0
         The env's reward is ``reward_scale * (-c) + reward_offset`` for the problem's stage cost c.
         :class:`CostAudit` finds these numbers.
@@ -38,7 +40,7 @@ class CriticOptions:
 
     kind: str = "afterstate"
     prediction_model: PredictionModel | None = None
-    value_scale: float = 30.0
+    value_scale: float | None = None
     reward_scale: float = 1.0
     reward_offset: float = 0.0
 
@@ -51,9 +53,15 @@ class CriticOptions:
             )
         if self.prediction_model is not None and self.kind == "state_action":
             raise ValueError("prediction_model is for kind='afterstate', not for 'state_action'.")
-        as_positive("value_scale", self.value_scale, "It multiplies the network; give e.g. 30.")
+        if self.value_scale is not None:
+            as_positive("value_scale", self.value_scale, "It multiplies the network, or is None.")
         as_positive("reward_scale", self.reward_scale, "Give 1 for the cost as it is.")
         as_number("reward_offset", self.reward_offset)
+
+    @property
+    def scales_itself(self) -> bool:
+        """Whether the scale of the values comes from what is learnt from."""
+        return self.value_scale is None and self.kind == "afterstate"
 
     def offset_of_return(self, gamma: float) -> float:
         """Return what ``reward_offset`` adds up to; ValueError if that is no finite number."""

@@ -30,6 +30,11 @@ from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
 from sb3_yann.policy.observations import AffineObservation
 from sb3_yann.policy.problem_registry import resolve_problem
 
+EPS = 1e-8
+"""Of Adam, for gradients in units of the values' scale."""
+FOLLOWS, RECENT = 10, 0.1
+"""Updates after which the values' scale is looked at; share of that batch in the mean cost."""
+
 
 class YannPolicy(TD3Policy):
     """A TD3 or DDPG policy that starts as a linear MPC, exactly, with the critic that goes with it.
@@ -103,6 +108,7 @@ class YannPolicy(TD3Policy):
     critic: YannCritic
     critic_target: YannCritic
     critic_updates: th.Tensor
+    mean_stage_cost: th.Tensor
 
     def __init__(  # noqa: PLR0913 (a user's policy_kwargs)
         self,
@@ -177,6 +183,7 @@ class YannPolicy(TD3Policy):
             mu.row_gradients = True
         # A buffer travels with the parameters: a model that is loaded goes on where it was.
         self.register_buffer("critic_updates", th.zeros((), dtype=th.int64))
+        self.register_buffer("mean_stage_cost", th.zeros((), dtype=th.float64))
         self._attach_hooks()
 
     def _attach_hooks(self) -> None:
@@ -205,8 +212,33 @@ class YannPolicy(TD3Policy):
     def _before_critic_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
         self.batch_is_finite = not self._refuses("critic", optimizer)
         if self.batch_is_finite:
+            taken = int(self.critic_updates)
+            if self.critic_options.scales_itself and taken % FOLLOWS == 0:
+                self._follow_scale(taken)
             self.critic_updates.add_(1)
         _sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
+
+    def _follow_scale(self, taken: int) -> None:
+        """Let the factor of the critic's networks follow the mean stage cost, by factors of two.
+
+        What they put out stays, to the bit: Pop-Art (van Hasselt et al., *Learning values across
+        many orders of magnitude*, 2016). The optimizers' ``eps`` are in units of gradients.
+        """
+        cost, share = self.critic.stage_cost_of_batch(), max(FOLLOWS / (taken + FOLLOWS), RECENT)
+        self.mean_stage_cost.add_(share * (cost - self.mean_stage_cost))
+        if taken == 0:  # the critic has taken its first batch for the unit, the target had none
+            self.critic_target.scale_values(cost)
+        scale = self.critic.rescale(float(self.mean_stage_cost), self.critic.optimizer)
+        self.critic_target.rescale(float(self.mean_stage_cost))
+        eps = self.optimizer_kwargs.get("eps", EPS)
+        for optimizer, power in ((self.actor.optimizer, 1), (self.critic.optimizer, 2)):
+            for group in optimizer.param_groups:
+                group["eps"] = eps * (self.critic.scale * scale) ** power
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
+        # Weights that were saved when the scale was a setting.
+        state_dict.setdefault(f"{prefix}mean_stage_cost", th.zeros_like(self.mean_stage_cost))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or a pickle; torch drops the hooks of optimizers on the way."""

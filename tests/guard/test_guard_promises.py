@@ -65,7 +65,7 @@ def test_what_is_put_back_at_the_end_is_tried_on_all_of_the_new_starts() -> None
     assert guard.decisions[-1].reason.startswith("at the end, 120 of 200 new starts lose")
     seeds = range(FIRST + 10 + 40, FIRST + 10 + 40 + 200)
     costs, mpc = (evaluate(each, LateLosses, seeds).costs for each in (model, build()))
-    assert np.all(costs <= mpc + guard.state.evidence.margin)
+    assert np.all(costs <= mpc + guard.state.evidence.tolerance.margin)
     assert costs.mean() <= mpc.mean() + 1e-6
 
 
@@ -88,7 +88,7 @@ def test_a_policy_whose_mean_cost_on_new_starts_is_above_the_mpc_s_is_refused() 
     train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     assert "mean cost 4.0375 on 50 new starts, MPC 4" in guard.decisions[0].reason
     assert is_mpc(model)
-    assert guard.state.evidence.margin > 0.0375  # no single start would have been refused
+    assert guard.state.evidence.tolerance.margin > 0.0375  # no single start would have been refused
 
 
 @pytest.mark.parametrize("how", ["one learn", "two", "a load in between"])

@@ -14,6 +14,7 @@ from guard_samples import (
     MPC,
     RIGHT,
     STEPS,
+    STRICT,
     At,
     Slide,
     accepted_bits,
@@ -224,7 +225,7 @@ def test_with_patience_the_actor_goes_on_until_the_last_of_so_many_rejections(
 
 @pytest.mark.parametrize("sabotage", [worse, randomize, partial(overwrite, value=np.nan)])
 def test_with_the_default_patience_what_is_worse_than_the_mpc_returns_at_once(sabotage) -> None:
-    model, guard = build(gradient_steps=0), ImprovementGuard(Slide, n_starts=10)
+    model, guard = build(gradient_steps=0), ImprovementGuard(Slide, n_starts=10, rule=STRICT)
     before = actor_bits(model.policy)
     seen: list[bool] = []
     look = At([2 * STEPS], lambda policy: seen.append(actor_bits(policy) == before))

@@ -35,7 +35,7 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"rule": {"significance": 0.6}}, ValueError, "significance = 0.6 must be between 0 and 0.5"),
     ({"rule": {"by_region": "no"}}, TypeError, "by_region = 'no' must be True or False"),
     ({"rule": 0.01}, TypeError, r"rule = 0.01 .*=AcceptanceRule\(\.\.\.\), or a m"),
-    ({"rule": {"fresh": 3}}, TypeError, "rule has no 'fresh'. .* margin, by_region"),
+    ({"rule": {"fresh": 3}}, TypeError, "rule has no 'fresh'. .* margin, tail, by_region"),
     ({"rule": StepSize()}, TypeError, "rule = StepSize.* must be"),
     ({"step_size": {"shrink": 1.5}}, ValueError, "shrink = 1.5 must be between 0 and 1"),
     ({"step_size": {"grow": 0.9}}, ValueError, "grow = 0.9 must be a finite number of at least 1"),

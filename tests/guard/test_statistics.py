@@ -13,6 +13,7 @@ from sb3_yann.guard.statistics import (
     ErrorBudget,
     PairedEpisodes,
     PlantEpisodes,
+    Tolerance,
     analyze_covariance,
     excess_of_an_outlier,
     is_promising,
@@ -29,7 +30,7 @@ NAN, INF = np.nan, np.inf
 
 def objection(costs, violations=NONE, accepted=(10.0, 20.0, 30.0), margin=1.0) -> str:
     mpc = np.array([10.0, 20.0, 30.0])
-    return PairedEpisodes(mpc, np.array(accepted), NONE, margin).objection(
+    return PairedEpisodes(mpc, np.array(accepted), NONE, Tolerance(margin)).objection(
         np.array(costs, float), violations
     )
 
@@ -68,7 +69,7 @@ def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_co
 
     message = "1 starts with violations, the first is number 2"
     assert message in objection([1, 1, 1], violations(0, 0, 1))
-    paired = PairedEpisodes(np.ones(3), np.ones(3), violations(0, 2, 0), 1.0)
+    paired = PairedEpisodes(np.ones(3), np.ones(3), violations(0, 2, 0), Tolerance(1.0))
     assert paired.objection(np.ones(3), violations(0, 2, 0)) == ""
     assert paired.objection(np.ones(3), violations(0, 1, 0)) == ""
     assert "violations" in paired.objection(np.zeros(3), violations(0, 3, 0))
@@ -77,7 +78,7 @@ def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_co
 
 def test_an_episode_that_is_terminated_is_refused_though_it_has_fewer_violations() -> None:
     accepted = np.array([[2, 0, 0, 0], [0, 1, 0, 0]])
-    paired = PairedEpisodes(np.ones(2), np.ones(2), accepted, 1.0)
+    paired = PairedEpisodes(np.ones(2), np.ones(2), accepted, Tolerance(1.0))
     assert "the env terminates" in paired.objection(
         np.zeros(2), np.array([[1, 1, 0, 0], [0, 1, 0, 0]])
     )
