@@ -24,6 +24,7 @@ from sb3_yann.guard.preconditions import check_not_nested, check_twin
 from sb3_yann.guard.session import GuardSession, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, write_csv
+from sb3_yann.guard.summary import summary_of
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -146,6 +147,12 @@ class ImprovementGuard(BaseCallback):
     def decisions(self) -> list[Decision]:
         """All decisions so far, those before a resumed run included."""
         return self.state.decisions
+
+    def summary(self) -> str:
+        """Return some lines: what is accepted, what was refused most often, and what may help."""
+        evidence = self.state.evidence
+        known = evidence.accepted or evidence.mpc
+        return summary_of(self.decisions, 0 if known is None else len(known.costs))
 
     @property
     def state(self) -> GuardState:

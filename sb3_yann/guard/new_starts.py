@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.episodes import Evidence, Outcome, Starts, Unplayable, play
 from sb3_yann.guard.options import AcceptanceRule
-from sb3_yann.guard.region_mixing import accept_parts
+from sb3_yann.guard.region_mixing import accept_parts, accepted_regions
 from sb3_yann.guard.session import GuardSession
 
 ROUNDS = 3
@@ -40,6 +40,12 @@ def confirm_on_new_starts(
     sure : float, default 0
         How many standard errors its mean cost, and the tail's, must be clear of the MPC's.
     """
+    tried = session.state.accepted
+    reason = _confirm(session, n_starts, rule, sure)
+    return f"{reason}; {_what_acts(session, tried)}" if reason else ""
+
+
+def _confirm(session: GuardSession, n_starts: int, rule: AcceptanceRule, sure: float) -> str:
     first, state = "", session.state
     for _ in range(ROUNDS):
         lost, evidence = state.accepted, state.evidence
@@ -67,6 +73,19 @@ def confirm_on_new_starts(
             return first
     state.accept(*safe)  # what has not been confirmed on new starts is not accepted
     return first
+
+
+def _what_acts(session: GuardSession, tried: ActorCheckpoint) -> str:
+    """Say what is accepted in the place of a policy that lost."""
+    accepted = session.state.accepted
+    if not session.has_learned(accepted):
+        return "the guard falls back to the MPC"
+    for share in SMALLER:
+        if accepted.has_networks_of(tried.shrunk(share)):
+            return f"{100 * share:g} % of its correction is kept"
+    if accepted_regions(session.mpc, tried, accepted):
+        return "what it has learnt in other regions is kept"
+    return "an earlier policy is restored"
 
 
 def keep_passed(

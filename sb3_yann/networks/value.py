@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -204,7 +203,7 @@ class AfterstateValue(nn.Module):
             to_input=ranges.u_half,
             middle=ranges.u_middle,
             network_scale=1 / ranges.theta_half,
-            value_scale=np.array(np.nan if scale is None else scale),
+            value_scale=np.array(scale or 0.0),  # 0: not known yet
         )
         n, m = len(ranges.theta_half), len(ranges.u_min)
         _check_prediction(self.model, n, m)
@@ -217,12 +216,12 @@ class AfterstateValue(nn.Module):
     def scale(self) -> float:
         """Factor of the network's output, 1 where it is not known yet."""
         buffers: Any = self._buffers
-        scale: float = buffers["value_scale"].item()
-        return 1.0 if math.isnan(scale) else scale
+        return float(buffers["value_scale"].item()) or 1.0
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
         # Weights that were saved without a scale had that of the options, else 30.
-        state_dict.setdefault(f"{prefix}value_scale", self.value_scale.nan_to_num(30.0))
+        own = th.where(self.value_scale > 0, self.value_scale, 30.0)
+        state_dict.setdefault(f"{prefix}value_scale", own)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property

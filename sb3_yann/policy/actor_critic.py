@@ -184,7 +184,7 @@ class YannCritic(SeesTheta, ContinuousCritic):
         points = th.cat([theta, actions], dim=1)
         if self.scales_itself and th.is_grad_enabled():
             self.batch, first = points.detach(), cast("Any", self.q_networks[0])
-            if first.value_scale.isnan():
+            if not first.value_scale > 0:
                 self.scale_values(self.stage_cost_of_batch())
         return self.values(points)
 
@@ -194,10 +194,9 @@ class YannCritic(SeesTheta, ContinuousCritic):
         return 0.0 if self.batch is None else float(first.mean_stage_cost(self.batch))
 
     def scale_values(self, stage_cost: float) -> None:
-        """Set the factor of networks that are zero to that cost for good, or to 1."""
-        for q_network in cast("list[Any]", self.q_networks):
-            scale = stage_cost / max(1 - self.gamma, 1 / LONGEST)
-            q_network.value_scale.fill_(scale if scale > 0 else 1.0)
+        """Set the factor of networks that are zero to that cost for good, where it is known."""
+        for q_network in cast("list[Any]", self.q_networks if stage_cost > 0 else []):
+            q_network.value_scale.fill_(stage_cost / max(1 - self.gamma, 1 / LONGEST))
 
     def rescale(self, stage_cost: float, optimizer: th.optim.Optimizer | None = None) -> float:
         """Double or halve the factor where that cost for good is beyond; return the factor.

@@ -213,7 +213,8 @@ class YannPolicy(TD3Policy):
         self.batch_is_finite = not self._refuses("critic", optimizer)
         if self.batch_is_finite:
             taken = int(self.critic_updates)
-            if self.critic_options.scales_itself and taken % FOLLOWS == 0:
+            follows = self.critic_options.scales_itself and self.lr_mult["critic"] > 0
+            if follows and taken % FOLLOWS == 0:
                 self._follow_scale(taken)
             self.critic_updates.add_(1)
         _sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
@@ -226,8 +227,8 @@ class YannPolicy(TD3Policy):
         """
         cost, share = self.critic.stage_cost_of_batch(), max(FOLLOWS / (taken + FOLLOWS), RECENT)
         self.mean_stage_cost.add_(share * (cost - self.mean_stage_cost))
-        if taken == 0:  # the critic has taken its first batch for the unit, the target had none
-            self.critic_target.scale_values(cost)
+        if taken == 0:  # the critic has taken its first batch's for the unit, the target had none
+            self.critic_target.load_state_dict(self.critic.state_dict())
         scale = self.critic.rescale(float(self.mean_stage_cost), self.critic.optimizer)
         self.critic_target.rescale(float(self.mean_stage_cost))
         eps = self.optimizer_kwargs.get("eps", EPS)

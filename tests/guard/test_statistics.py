@@ -17,6 +17,7 @@ from sb3_yann.guard.statistics import (
     analyze_covariance,
     excess_of_an_outlier,
     is_promising,
+    tail_average,
 )
 
 
@@ -320,3 +321,37 @@ def test_of_runs_with_thirty_candidates_that_are_no_better_few_accept_any(name, 
     rng, pair = np.random.default_rng(77), PAIRS[name]
     wrong = sum(a_run_errs(*pair, rng) for _ in range(runs))
     assert wrong <= (0.05 * runs if runs == 1000 else stats.binom.ppf(0.999, runs, 0.05))
+
+
+def test_with_a_tail_the_worst_starts_count_on_average() -> None:
+    mpc, allowed = np.full(100, 20.0), Tolerance(margin=0.2, tail=0.05, typical=20.0)
+    costs = mpc - 0.5
+
+    def reason(worst: list[float], rule: Tolerance = allowed) -> str:
+        policy = costs.copy()
+        policy[: len(worst)] = mpc[: len(worst)] + worst
+        nothing = np.zeros((100, 4), np.int64)
+        return PairedEpisodes(mpc, mpc, nothing, rule).objection(policy, nothing)
+
+    assert reason([0.9, 0.1]) == ""  # (.9 + .1 - 3 * .5) / 5 is below .2
+    assert "start 0 costs 0.9 more" in reason([0.9, 0.1], Tolerance(0.2))
+    assert "the worst 5 % of the starts cost too much, start 4" in reason([0.9, 0.9, 0.9, 0.9, 1.0])
+    assert reason([2.1]).startswith("start 0 costs 2.1")  # ten times what the average may
+    assert reason([1.9]) == ""
+    assert "start 0" in reason([NAN])
+
+
+def test_with_a_tail_a_dear_start_may_cost_more_in_proportion() -> None:
+    mpc, rule = np.array([10.0, 20.0, 200.0]), Tolerance(margin=0.2, tail=0.05, typical=20.0)
+    assert rule.excess(mpc, mpc + 1.9) == pytest.approx([9.5, 9.5, 0.95])
+    assert Tolerance(0.2).excess(mpc, mpc + 1.9) == pytest.approx([9.5, 9.5, 9.5])
+
+
+def test_the_worst_of_many_starts_stand_for_all_of_them() -> None:
+    excess = np.array([3.0, 2.0, 1.0, 0.0])
+    assert tail_average(excess, 0.05, 40)[0] == pytest.approx(2.5)  # two of forty
+    assert tail_average(excess, 0.05, 4)[0] == 3.0  # one at least
+    draws = np.random.default_rng(0).standard_normal((400, 1000))
+    found, errors = np.transpose([tail_average(each, 0.05, 1000) for each in draws])
+    assert found.mean() == pytest.approx(stats.norm.pdf(stats.norm.isf(0.05)) / 0.05, abs=0.02)
+    assert errors.mean() == pytest.approx(found.std(), rel=0.15)

@@ -158,7 +158,7 @@ def test_network_counts_by_its_scale() -> None:
     small, large = critic("pendulum", scale=1.0), critic("pendulum", scale=100.0)
     th.nn.init.normal_(last_layer(small))
     th.nn.init.normal_(first_layer(small))
-    large.load_state_dict(small.state_dict())
+    large.load_state_dict(small.state_dict() | {"value_scale": large.value_scale})
     theta = box_points(law_of("pendulum"), 100).double()
     with th.no_grad():
         learnt = [each.value(theta) - each.quadratic(theta) for each in (small, large)]

@@ -109,9 +109,9 @@ def test_it_is_so_without_any_callback(what) -> None:
 def test_what_is_not_finite_from_the_first_step_on_is_not_learnt_from(what) -> None:
     model = build(pendulum(range(4), what), policy={"critic_warmup": 0})
     networks = th.nn.ModuleList([model.actor, model.critic])
-    before = copy.deepcopy(networks.state_dict())
+    before = copy.deepcopy(dict(networks.named_parameters()))
     assert told(model.learn, 3, callback=NoActionNoise())
-    assert all(th.equal(value, before[name]) for name, value in networks.state_dict().items())
+    assert all(th.equal(value, before[name]) for name, value in networks.named_parameters())
     told(model.learn, 20, callback=NoActionNoise(), reset_num_timesteps=False)
     assert is_finite(model) and np.all(np.isfinite(stored(model)))
     assert int(model.policy.critic_updates) > 10

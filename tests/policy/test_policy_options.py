@@ -235,5 +235,4 @@ def test_a_saved_model_may_predict_with_a_lambda(tmp_path) -> None:
 
 
 def test_value_scale_is_that_of_the_critic_s_network() -> None:
-    assert build().critic.qf0.scale == 30
     assert build(policy_kwargs={"critic": {"value_scale": 7.0}}).critic.qf0.scale == 7
