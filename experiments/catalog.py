@@ -61,12 +61,14 @@ def printed_pendulum() -> LinearMPC:
     return replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=None)
 
 
+STRICT = {"tail": 0, "retreat": False}
+"""No start may lose: the rule that the published runs had, and their critics a scale of 30."""
 _REACTOR = Plant(
     "CSTR-v0",
     400,
     problems.cstr,
     optimum.cstr_optimum,
-    guard={"rule": {"margin": 0.015}},
+    guard={"rule": {**STRICT, "margin": 0.015}},
 )
 # The way from a pendulum that hangs to one that swings leads through worse policies.
 _PENDULUM = Plant(
@@ -76,7 +78,13 @@ _PENDULUM = Plant(
     optimum.clipped_pendulum_optimum,
     gradient_steps=2,
     critic_warmup=4000,
-    guard={"n_new_starts": 100, "n_final_starts": 10_000, "patience": 10, "keep_if_worse": True},
+    guard={
+        "n_new_starts": 100,
+        "n_final_starts": 10_000,
+        "patience": 10,
+        "keep_if_worse": True,
+        "rule": STRICT,
+    },
 )
 PLANTS = {
     "CSTR": _REACTOR,
@@ -87,7 +95,7 @@ PLANTS = {
         _PENDULUM,
         problem=printed_pendulum,
         gradient_steps=4,
-        guard={**_PENDULUM.guard, "n_final_starts": 1000, "rule": {"margin": 0.03}},
+        guard={**_PENDULUM.guard, "n_final_starts": 1000, "rule": {**STRICT, "margin": 0.03}},
     ),
 }
 
@@ -104,9 +112,18 @@ def yann(  # noqa: PLR0913 (what the variants vary)
     plant_alone: bool = False,
     gradient_steps: int | None = None,
     tau: float = 0.005,
+    critic: Any = "afterstate",
+    defaults: bool = False,
     **policy_kwargs: Any,
 ) -> Learner:
-    """Return a YANN learner, with the plant's gradient steps; None as guard trains without one."""
+    """Return a YANN learner, with the plant's settings; None as guard trains without one.
+
+    With ``defaults`` nothing is set for a plant.
+    """
+    if defaults:
+        plant = replace(plant, gradient_steps=1, critic_warmup=2000, guard={})
+    elif critic == "afterstate":
+        critic = {"value_scale": 30.0}
     problem = plant.problem()
     if infeasible is not None:
         problem = replace(problem, infeasible=infeasible)
@@ -123,6 +140,7 @@ def yann(  # noqa: PLR0913 (what the variants vary)
         policy_kwargs={
             "problem": problem,
             "critic_warmup": plant.critic_warmup,
+            "critic": critic,
             **policy_kwargs,
         },
         **({"target_policy_noise": 0.0} if algorithm is TD3 else {}),
@@ -157,6 +175,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "target rate 0.02": {"tau": 0.02},
     "nearest outside": {"infeasible": "nearest_region"},
     "one network": {"networks": "shared"},
+    "no settings": {"defaults": True, "tau": 0.02},
     "input steps bounded": {"guard": {"rule": {"largest_step": 1.5}}},
 }
 """What is changed of YANN-RL, one thing at a time."""
