@@ -15,7 +15,7 @@ from sb3_yann.commissioning.grounds import Grounds, Valued
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.law_layer import LawLayer
-from sb3_yann.twin.gradient import accumulate_gradient, actor_inputs
+from sb3_yann.twin.gradient import Actor, accumulate_gradient
 
 PLATEAU = 1e-4
 """A gain from one check to the next, relative to the MPC's cost, that is not worth another."""
@@ -120,13 +120,13 @@ class Search:
     def _try(self) -> Check:
         """Check the layer on the known starts, then on new ones; learn from what it loses."""
         trial = self.grounds.trial
-        played = trial.play(self._inputs)
+        played = trial.play(self._actor)
         found = trial.check(self.iteration, played, self.outcome)
         self.known_hard = trial.hard(played)
         if not found.accepted:
             return found
         new = self.grounds.draw(self.drawing)
-        there = new.play(self._inputs)
+        there = new.play(self._actor)
         pairs = zip(new.hard(there), self.new_hard, strict=True)
         self.new_hard = [np.concatenate(each)[:HARDEST] for each in pairs]
         confirmed = new.check(self.iteration, there, new.mpc)
@@ -165,8 +165,9 @@ class Search:
         costs = self.grounds.costs_of_mpc(starts) if most else np.empty((len(hard), 0))
         self.hard = [(rows, known[: len(rows)]) for rows, known in zip(hard, costs, strict=True)]
 
-    def _inputs(self, theta: Array) -> Array:
-        return actor_inputs(self.layer, self.grounds.twin.problem, theta)
+    @property
+    def _actor(self) -> Actor:
+        return Actor(self.layer, self.grounds.twin.problem)
 
 
 def _finite(gradient: th.Tensor) -> bool:

@@ -10,6 +10,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
@@ -105,6 +106,11 @@ class SharedYannLayer(LawLayer):
         u = np.zeros((len(points), self.given.n_inputs))
         u[finite] = self.given(points[finite])
         return u, finite
+
+    @property
+    def explicit_law(self) -> PiecewiseAffine | None:
+        """The law in use; None where it is solved online."""
+        return self.given if isinstance(self.given, PiecewiseAffine) else None
 
     def slopes_of_law(self, theta: Array) -> Array:
         """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""

@@ -128,6 +128,11 @@ class YannLayer(LawLayer):
         u = u.clamp(-1, 1).to(self.theta_half)
         return u.clamp(*self.reachable(theta)) if self.rated else u
 
+    @property
+    def explicit_law(self) -> PiecewiseAffine | None:
+        """The law in use; None where weights with another one have been loaded."""
+        return self.piecewise_affine if self.has_its_law else None
+
     def slopes_of_law(self, theta: Array) -> Array:
         """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""
         region = self.regions(th.as_tensor(theta))

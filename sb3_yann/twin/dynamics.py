@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import LinearMPC, PiecewiseAffine
+from sb3_yann.control.mpc.choice import Law
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.residuals import Residual, as_polynomials
 
 MARGIN = 0.25
 """How far the residual reaches beyond the data, in widths of the data."""
@@ -53,17 +54,38 @@ class Coordinates:
         return np.asarray(np.clip(features, self.low, self.high) / self.scale)
 
 
-def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
-    """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
-    law, m = problem.law(), problem.model.n_inputs
+@dataclass(frozen=True)
+class LawInputs:
+    """A law as a function of rows (batch, n_theta); NaN where one is not finite.
 
-    def act(rows: Array) -> Array:
+    Attributes
+    ----------
+    law : PiecewiseAffine or OnlineLaw
+    """
+
+    law: Law
+
+    def __call__(self, rows: Array) -> Array:
+        """Return the inputs (batch, m)."""
         finite = np.isfinite(rows).all(axis=1)
-        u = np.full((len(rows), m), np.nan)
-        u[finite] = law(rows[finite])
+        u = np.full((len(rows), self.law.n_inputs), np.nan)
+        u[finite] = self.law(rows[finite])
         return u
 
-    return act
+    @property
+    def packed(self) -> tuple[Any, ...] | None:
+        """The law for compiled roll-outs, without a network; None for an online one."""
+        law, m = self.law, self.law.n_inputs
+        if not isinstance(law, PiecewiseAffine):
+            return None
+        sizes = (0, 2, 1, 1), (0, 1, 1), (0, m, 1), (0,)
+        network = [np.empty(size, np.float32) for size in sizes]
+        return (*law.packed, np.empty(0), np.empty((0, m)), np.inf, *network, np.zeros((2, m)))
+
+
+def law_of(problem: LinearMPC) -> LawInputs:
+    """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
+    return LawInputs(problem.law())
 
 
 def features(problem: LinearMPC, theta: Array, u: Array) -> Array:
@@ -93,6 +115,18 @@ class Dynamics:
         """All members as one that maps (members, batch, k), of a kind that can."""
         stack = getattr(type(self.members[0]), "stack", None)
         return stack and stack(self.members)
+
+    @cached_property
+    def packed(self) -> tuple[Any, ...] | None:
+        """The twin as arrays for compiled code; None where a residual is no polynomial."""
+        problem, parts, box = self.problem, self.problem.layout, self.coordinates
+        number = np.arange(parts.size + self.m)
+        columns = features(problem, number[: parts.size], number[parts.size :])
+        found = as_polynomials(self.members, len(columns))
+        if found is None:
+            return None
+        linear = np.concatenate(problem.prediction, axis=1)
+        return linear, columns, np.stack([box.low, box.high, box.scale]), *found
 
     def residual(self, theta: Array, u: Array) -> Array:
         """Return the residuals (members, batch, n) at theta (members, batch, n_theta)."""
@@ -155,7 +189,8 @@ class Dynamics:
         Parameters
         ----------
         act : callable
-            From theta (rows, n_theta) to inputs (rows, m).
+            From theta (rows, n_theta) to inputs (rows, m). One with arrays as ``packed``, as
+            :class:`LawInputs` has, runs as compiled code in a twin with polynomials.
         starts : ndarray, shape (members, batch, n_theta)
             Where the runs begin.
         steps : int
@@ -164,6 +199,13 @@ class Dynamics:
         k, batch, size = starts.shape
         thetas, inputs = np.empty((steps + 1, *starts.shape)), np.empty((steps, k, batch, self.m))
         thetas[0] = starts
+        policy: Any = getattr(act, "packed", None)
+        if policy is not None and self.packed is not None and k == len(self.members):
+            from sb3_yann.twin._kernels import roll_out  # compiled once
+
+            rows = thetas.reshape(steps + 1, -1, size), inputs.reshape(steps, -1, self.m)
+            roll_out(*policy, *self.packed, *rows)
+            return thetas, inputs
         for t in range(steps):
             u = np.asarray(act(thetas[t].reshape(-1, size)), np.float64).reshape(k, batch, self.m)
             inputs[t] = u

@@ -44,7 +44,7 @@ class Objective:
         """Return the derivatives of the cost of each step by theta and by the input."""
         W, size = self.problem.stage_matrix, self.problem.n_theta
         both = 2 * np.concatenate([thetas, inputs], axis=-1) @ W
-        by_theta, by_u = both[..., :size].copy(), both[..., size:]
+        by_theta, by_u = both[..., :size].copy(), both[..., size:].copy()
         state = self.problem.layout.state
         by_theta[..., state] += 2 * self.penalty * self._beyond(thetas[..., state])
         return by_theta, by_u
@@ -67,6 +67,32 @@ def actor_inputs(layer: LawLayer, problem: LinearMPC, theta: Array) -> Array:
         actions = layer(th.as_tensor(theta)).double().numpy()
     middle, half = (problem.u_max + problem.u_min) / 2, (problem.u_max - problem.u_min) / 2
     return np.asarray(middle + half * actions)
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A layer as a function from theta (rows, n_theta) to inputs (rows, m) of a problem.
+
+    Attributes
+    ----------
+    layer : LawLayer
+        On the CPU.
+    problem : LinearMPC
+    """
+
+    layer: LawLayer
+    problem: LinearMPC
+
+    def __call__(self, theta: Array) -> Array:
+        """Return the inputs (rows, m)."""
+        return actor_inputs(self.layer, self.problem, theta)
+
+    @property
+    def packed(self) -> tuple[Any, ...] | None:
+        """What compiled roll-outs take; None for layers that have no compiled code."""
+        found, problem = self.layer.packed, self.problem
+        low, high = problem.u_min, problem.u_max
+        return found and (*found, np.stack([(high + low) / 2, (high - low) / 2]))
 
 
 def accumulate_gradient(
@@ -94,33 +120,57 @@ def accumulate_gradient(
     reference : three of ndarray, shape (members, batch), optional
         Costs that no run should exceed; how much each counts below them, and above.
     """
-    problem = objective.problem
-    half = (problem.u_max - problem.u_min) / 2
-    thetas, inputs = dynamics.roll_out(
-        lambda rows: actor_inputs(layer, problem, rows), starts, steps
-    )
-    flat = thetas[:-1].reshape(-1, problem.n_theta)
-    A, B = dynamics.jacobians(*_by_member(thetas[:-1], inputs))
-    shape = (steps, *starts.shape[:2])
-    A, B = (
-        np.moveaxis(each.reshape(len(each), steps, -1, *each.shape[2:]), 0, 1) for each in (A, B)
-    )
-    K = half[:, None] * _slopes_of_actor(layer, flat).reshape(*shape, len(half), -1)
+    problem, actor = objective.problem, Actor(layer, objective.problem)
+    thetas, inputs = dynamics.roll_out(actor, starts, steps)
     by_theta, by_u = objective.slopes(thetas[:-1], inputs)
+    by_theta = np.concatenate([by_theta, 2 * thetas[-1:] @ objective.value])
     costs = objective.costs(thetas, inputs)
     weights = np.ones_like(costs)
     if reference is not None:
         weights = np.where(costs > reference[0], reference[2], reference[1])
-    costate = 2 * thetas[-1] @ objective.value
-    by_action = np.empty_like(inputs)
-    for t in reversed(range(steps)):
-        row = costate[..., None, :]
-        by_action[t] = by_u[t] + (row @ B[t])[..., 0, :]
-        costate = by_theta[t] + (row @ A[t] + by_action[t][..., None, :] @ K[t])[..., 0, :]
+    policy, twin = actor.packed, dynamics.packed
+    if policy is not None and twin is not None:
+        from sb3_yann.twin._kernels import costates  # compiled once
+
+        both = thetas, inputs, by_theta, by_u
+        costates(*policy, *twin, *(each.reshape(len(each), -1, each.shape[-1]) for each in both))
+    else:
+        _costates(layer, dynamics, thetas, inputs, by_theta, by_u)
+    half, flat = (problem.u_max - problem.u_min) / 2, thetas[:-1].reshape(-1, problem.n_theta)
+    upstream = (by_u * weights[..., None] * half / weights.size).reshape(len(flat), -1)
     actions = layer(th.as_tensor(flat))
-    upstream = by_action * weights[..., None] * half / weights.size
-    upstream = upstream.reshape(len(flat), -1)
     actions.backward(th.as_tensor(upstream).to(actions))
+
+
+def _costates(
+    layer: LawLayer,
+    dynamics: Dynamics,
+    thetas: Array,
+    inputs: Array,
+    by_theta: Array,
+    by_u: Array,
+) -> None:
+    """Add to the slopes of each step's own cost those of the costs to come, along runs.
+
+    Parameters
+    ----------
+    layer, dynamics, thetas, inputs
+        As in :func:`accumulate_gradient`, and what :meth:`Dynamics.roll_out` makes of them.
+    by_theta, by_u : ndarray, shapes (steps + 1, members, batch, n_theta) and (steps, ..., m)
+        Overwritten from the end to the beginning.
+    """
+    problem, steps = dynamics.problem, len(inputs)
+    A, B = dynamics.jacobians(*_by_member(thetas[:-1], inputs))
+    A, B = (
+        np.moveaxis(each.reshape(len(each), steps, -1, *each.shape[2:]), 0, 1) for each in (A, B)
+    )
+    half = (problem.u_max - problem.u_min) / 2
+    slopes = _slopes_of_actor(layer, thetas[:-1].reshape(-1, problem.n_theta))
+    K = half[:, None] * slopes.reshape(*inputs.shape, problem.n_theta)
+    for t in reversed(range(steps)):
+        row = by_theta[t + 1][..., None, :]
+        by_u[t] += (row @ B[t])[..., 0, :]
+        by_theta[t] += (row @ A[t] + by_u[t][..., None, :] @ K[t])[..., 0, :]
 
 
 def _by_member(thetas: Array, inputs: Array) -> tuple[Array, Array]:

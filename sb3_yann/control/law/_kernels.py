@@ -194,13 +194,24 @@ def _walked(floats: Array, whole: Integers, theta: Array, at: int) -> int:
 
 
 @compiled()
-def _choose(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, float]:
-    """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite."""
+def _choose(
+    floats: Array, whole: Integers, theta: Array, at: int, near: int = -1
+) -> tuple[int, float]:
+    """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite.
+
+    Region ``near``, if that is not negative, is asked first: of disjoint ones no other is as good.
+    """
     n = whole[0]
     for j in range(n):
         if not np.isfinite(theta[at, j]):
             return -1, np.nan
     known = -np.inf
+    if near >= 0 and whole[7] == 1:
+        first, last = whole[HEADER + near], whole[HEADER + near + 1]
+        known = _slack(floats, n, first, last, theta, at, SURELY_INSIDE)
+        if known >= SURELY_INSIDE:
+            return near, known
+        known = -np.inf
     if whole[8] > 0:
         region = _walked(floats, whole, theta, at)
         first, last = whole[HEADER + region], whole[HEADER + region + 1]
@@ -216,13 +227,16 @@ def _choose(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int,
 
 
 @compiled()
-def input_at(floats: Array, whole: Integers, theta: Array, out: Array, at: int) -> int:
+def input_at(
+    floats: Array, whole: Integers, theta: Array, out: Array, at: int, near: int = -1
+) -> int:
     """Write the input at one row of theta to that of ``out``, and return the region, -1 for none.
 
-    Functions take the array and the row: numba counts references to a row of its own.
+    Region ``near`` is asked first. Functions take the array and the row: numba counts references to
+    a row of its own.
     """
     n, m, p, q = whole[0], whole[1], whole[2], whole[3]
-    region, largest = _choose(floats, whole, theta, at)
+    region, largest = _choose(floats, whole, theta, at, near)
     if region < 0:
         return -1
     gains = ROWS + q * (n + 1)
@@ -237,6 +251,32 @@ def input_at(floats: Array, whole: Integers, theta: Array, out: Array, at: int) 
             u += floats[offsets + region * m + k]
         u = u if u == u else 0.0  # inf - inf, far from everything
         out[at, k] = min(max(u, floats[bounds + k]), floats[bounds + m + k])
+    return region
+
+
+@compiled()
+def slopes_at(
+    floats: Array, whole: Integers, theta: Array, out: Array, at: int, near: int = -1
+) -> int:
+    """Write the slopes (m, n) of the input at one row of theta to ``out``; return as `input_at`.
+
+    They are zero where the input is clipped, and where it is zero as the MPC has no solution.
+    """
+    n, m, p, q = whole[0], whole[1], whole[2], whole[3]
+    region, largest = _choose(floats, whole, theta, at, near)
+    gains = ROWS + q * (n + 1)
+    offsets = gains + p * m * n
+    bounds = offsets + p * m
+    zero = region < 0 or (whole[6] == 1 and largest < -floats[0])
+    for k in range(m):
+        u = 0.0
+        if not zero:
+            for j in range(n):
+                u += floats[gains + (region * m + k) * n + j] * theta[at, j]
+            u += floats[offsets + region * m + k]
+        free = not zero and floats[bounds + k] < u < floats[bounds + m + k]
+        for j in range(n):
+            out[k, j] = floats[gains + (region * m + k) * n + j] if free else 0.0
     return region
 
 
