@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC, PiecewiseAffine
-from sb3_yann.control.mpc.choice import Law
+from sb3_yann.control import LinearMPC
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.residuals import Residual, as_polynomials
 
@@ -54,38 +53,17 @@ class Coordinates:
         return np.asarray(np.clip(features, self.low, self.high) / self.scale)
 
 
-@dataclass(frozen=True)
-class LawInputs:
-    """A law as a function of rows (batch, n_theta); NaN where one is not finite.
+def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
+    """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
+    law, m = problem.law(), problem.model.n_inputs
 
-    Attributes
-    ----------
-    law : PiecewiseAffine or OnlineLaw
-    """
-
-    law: Law
-
-    def __call__(self, rows: Array) -> Array:
-        """Return the inputs (batch, m)."""
+    def act(rows: Array) -> Array:
         finite = np.isfinite(rows).all(axis=1)
-        u = np.full((len(rows), self.law.n_inputs), np.nan)
-        u[finite] = self.law(rows[finite])
+        u = np.full((len(rows), m), np.nan)
+        u[finite] = law(rows[finite])
         return u
 
-    @property
-    def packed(self) -> tuple[Any, ...] | None:
-        """The law for compiled roll-outs, without a network; None for an online one."""
-        law, m = self.law, self.law.n_inputs
-        if not isinstance(law, PiecewiseAffine):
-            return None
-        sizes = (0, 2, 1, 1), (0, 1, 1), (0, m, 1), (0,)
-        network = [np.empty(size, np.float32) for size in sizes]
-        return (*law.packed, np.empty(0), np.empty((0, m)), np.inf, *network, np.zeros((2, m)))
-
-
-def law_of(problem: LinearMPC) -> LawInputs:
-    """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
-    return LawInputs(problem.law())
+    return act
 
 
 def features(problem: LinearMPC, theta: Array, u: Array) -> Array:
@@ -120,12 +98,12 @@ class Dynamics:
     def packed(self) -> tuple[Any, ...] | None:
         """The twin as arrays for compiled code; None where a residual is no polynomial."""
         problem, parts, box = self.problem, self.problem.layout, self.coordinates
-        number = np.arange(parts.size + self.m)
-        columns = features(problem, number[: parts.size], number[parts.size :])
+        number = np.arange(parts.size + self.m, dtype=np.float64)
+        columns = features(problem, number[: parts.size], number[parts.size :]).astype(np.int64)
         found = as_polynomials(self.members, len(columns))
         if found is None:
             return None
-        linear = np.concatenate(problem.prediction, axis=1)
+        linear = np.ascontiguousarray(np.concatenate(problem.prediction, axis=1))
         return linear, columns, np.stack([box.low, box.high, box.scale]), *found
 
     def residual(self, theta: Array, u: Array) -> Array:
@@ -141,6 +119,14 @@ class Dynamics:
 
     def step(self, theta: Array, u: Array) -> Array:
         """Return the next theta (members, batch, n_theta); r and d stay as they are."""
+        if self.packed is not None and theta.shape[0] == len(self.members):
+            from sb3_yann.twin._kernels.step import step  # compiled once
+
+            after = np.empty(theta.shape)
+            rows = *(np.array(each, np.float64, order="C") for each in (theta, u)), after
+            given: Any = (*self.packed, *(each.reshape(-1, each.shape[-1]) for each in rows))
+            step(*given)
+            return after
         A, B = self.problem.prediction
         after = theta @ A.T + u @ B.T
         after[..., self.problem.layout.state] += self.residual(theta, u)
@@ -189,8 +175,7 @@ class Dynamics:
         Parameters
         ----------
         act : callable
-            From theta (rows, n_theta) to inputs (rows, m). One with arrays as ``packed``, as
-            :class:`LawInputs` has, runs as compiled code in a twin with polynomials.
+            From theta (rows, n_theta) to inputs (rows, m).
         starts : ndarray, shape (members, batch, n_theta)
             Where the runs begin.
         steps : int
@@ -199,13 +184,6 @@ class Dynamics:
         k, batch, size = starts.shape
         thetas, inputs = np.empty((steps + 1, *starts.shape)), np.empty((steps, k, batch, self.m))
         thetas[0] = starts
-        policy: Any = getattr(act, "packed", None)
-        if policy is not None and self.packed is not None and k == len(self.members):
-            from sb3_yann.twin._kernels import roll_out  # compiled once
-
-            rows = thetas.reshape(steps + 1, -1, size), inputs.reshape(steps, -1, self.m)
-            roll_out(*policy, *self.packed, *rows)
-            return thetas, inputs
         for t in range(steps):
             u = np.asarray(act(thetas[t].reshape(-1, size)), np.float64).reshape(k, batch, self.m)
             inputs[t] = u

@@ -7,6 +7,7 @@ of the actor over all steps at once takes what the costate makes of each action.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,38 +62,16 @@ class Objective:
         return np.asarray(stage + np.sum((end @ self.value) * end, axis=-1))
 
 
+def actor(layer: LawLayer, problem: LinearMPC) -> Callable[[Array], Array]:
+    """Return an actor of now as a function from theta (rows, n_theta) to inputs (rows, m)."""
+    middle, half = (problem.u_max + problem.u_min) / 2, (problem.u_max - problem.u_min) / 2
+    act = layer.frozen()
+    return lambda theta: np.asarray(middle + half * act(theta))
+
+
 def actor_inputs(layer: LawLayer, problem: LinearMPC, theta: Array) -> Array:
     """Return the inputs (rows, m) of an actor at theta (rows, n_theta)."""
-    with th.no_grad():
-        actions = layer(th.as_tensor(theta)).double().numpy()
-    middle, half = (problem.u_max + problem.u_min) / 2, (problem.u_max - problem.u_min) / 2
-    return np.asarray(middle + half * actions)
-
-
-@dataclass(frozen=True)
-class Actor:
-    """A layer as a function from theta (rows, n_theta) to inputs (rows, m) of a problem.
-
-    Attributes
-    ----------
-    layer : LawLayer
-        On the CPU.
-    problem : LinearMPC
-    """
-
-    layer: LawLayer
-    problem: LinearMPC
-
-    def __call__(self, theta: Array) -> Array:
-        """Return the inputs (rows, m)."""
-        return actor_inputs(self.layer, self.problem, theta)
-
-    @property
-    def packed(self) -> tuple[Any, ...] | None:
-        """What compiled roll-outs take; None for layers that have no compiled code."""
-        found, problem = self.layer.packed, self.problem
-        low, high = problem.u_min, problem.u_max
-        return found and (*found, np.stack([(high + low) / 2, (high - low) / 2]))
+    return actor(layer, problem)(theta)
 
 
 def accumulate_gradient(
@@ -120,26 +99,55 @@ def accumulate_gradient(
     reference : three of ndarray, shape (members, batch), optional
         Costs that no run should exceed; how much each counts below them, and above.
     """
-    problem, actor = objective.problem, Actor(layer, objective.problem)
-    thetas, inputs = dynamics.roll_out(actor, starts, steps)
+    problem = objective.problem
+    thetas, inputs = dynamics.roll_out(actor(layer, problem), starts, steps)
     by_theta, by_u = objective.slopes(thetas[:-1], inputs)
     by_theta = np.concatenate([by_theta, 2 * thetas[-1:] @ objective.value])
     costs = objective.costs(thetas, inputs)
     weights = np.ones_like(costs)
     if reference is not None:
         weights = np.where(costs > reference[0], reference[2], reference[1])
-    policy, twin = actor.packed, dynamics.packed
-    if policy is not None and twin is not None:
-        from sb3_yann.twin._kernels import costates  # compiled once
-
-        both = thetas, inputs, by_theta, by_u
-        costates(*policy, *twin, *(each.reshape(len(each), -1, each.shape[-1]) for each in both))
+    flat = thetas[:-1].reshape(-1, problem.n_theta)
+    actions = layer(th.as_tensor(flat))
+    if layer.packed is not None and dynamics.packed is not None:
+        _compiled_costates(layer, dynamics, actions, flat, inputs, by_theta, by_u)
     else:
         _costates(layer, dynamics, thetas, inputs, by_theta, by_u)
-    half, flat = (problem.u_max - problem.u_min) / 2, thetas[:-1].reshape(-1, problem.n_theta)
+    half = (problem.u_max - problem.u_min) / 2
     upstream = (by_u * weights[..., None] * half / weights.size).reshape(len(flat), -1)
-    actions = layer(th.as_tensor(flat))
     actions.backward(th.as_tensor(upstream).to(actions))
+
+
+def _compiled_costates(
+    layer: LawLayer,
+    dynamics: Dynamics,
+    actions: th.Tensor,
+    flat: Array,
+    inputs: Array,
+    by_theta: Array,
+    by_u: Array,
+) -> None:
+    """Do what :func:`_costates` does, for thetas that are ``flat`` and the layer's actions there.
+
+    Parameters
+    ----------
+    layer, dynamics
+        With arrays for compiled code.
+    actions : Tensor, shape (rows, m)
+        With its gradient, for which it keeps what the layer has come by.
+    flat : ndarray, shape (rows, n_theta)
+        Without those at the end.
+    inputs, by_theta, by_u
+        As in :func:`_costates`.
+    """
+    from sb3_yann.networks._kernels.yann_layer import kept_for_gradient  # which load numba
+    from sb3_yann.twin._kernels.costates import costates
+
+    law, problem = layer.explicit_law, dynamics.problem
+    policy: Any = (*layer.packed, (problem.u_max - problem.u_min) / 2)  # type: ignore[misc]
+    twin: Any = (*dynamics.packed, law.locate(np.where(np.isfinite(flat), flat, 0.0)))  # type: ignore[misc, union-attr]
+    rows = (each.reshape(-1, each.shape[-1]) for each in (flat, inputs, by_theta, by_u))
+    costates(*policy, *twin, *kept_for_gradient(actions), *rows)
 
 
 def _costates(

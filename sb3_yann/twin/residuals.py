@@ -193,7 +193,7 @@ class Polynomial:
         return np.asarray(np.swapaxes(slopes, -1, -2))
 
 
-def as_polynomials(members: Sequence[Any], k: int) -> tuple[Array, Array, Array] | None:
+def as_polynomials(members: Sequence[Any], k: int) -> tuple[Any, Any, Array] | None:
     """Return residuals of k variables as arrays for compiled code, None where one is no polynomial.
 
     Monomial k + i is monomial ``parents[i]`` times variable ``variables[i]``, its weights are

@@ -256,28 +256,28 @@ def input_at(
 
 @compiled()
 def slopes_at(
-    floats: Array, whole: Integers, theta: Array, out: Array, at: int, near: int = -1
-) -> int:
-    """Write the slopes (m, n) of the input at one row of theta to ``out``; return as `input_at`.
+    floats: Array, whole: Integers, region: int, theta: Array, u: Array, slopes: Array, at: int
+) -> None:
+    """Write the input (m,) at one row of theta, whose region is known, and its slopes (m, n).
 
     They are zero where the input is clipped, and where it is zero as the MPC has no solution.
     """
     n, m, p, q = whole[0], whole[1], whole[2], whole[3]
-    region, largest = _choose(floats, whole, theta, at, near)
     gains = ROWS + q * (n + 1)
     offsets = gains + p * m * n
     bounds = offsets + p * m
-    zero = region < 0 or (whole[6] == 1 and largest < -floats[0])
+    first, last = whole[HEADER + region], whole[HEADER + region + 1]
+    zero = whole[6] == 1 and _slack(floats, n, first, last, theta, at, -np.inf) < -floats[0]
     for k in range(m):
-        u = 0.0
-        if not zero:
-            for j in range(n):
-                u += floats[gains + (region * m + k) * n + j] * theta[at, j]
-            u += floats[offsets + region * m + k]
-        free = not zero and floats[bounds + k] < u < floats[bounds + m + k]
+        value = floats[offsets + region * m + k]
         for j in range(n):
-            out[k, j] = floats[gains + (region * m + k) * n + j] if free else 0.0
-    return region
+            value += floats[gains + (region * m + k) * n + j] * theta[at, j]
+        value = 0.0 if zero else value
+        low, high = floats[bounds + k], floats[bounds + m + k]
+        for j in range(n):
+            free = not zero and low < value < high
+            slopes[k, j] = floats[gains + (region * m + k) * n + j] if free else 0.0
+        u[k] = min(max(value, low), high)
 
 
 @compiled("boolean(float64[::1], int64[::1], float64[::1], float64[::1])")
@@ -291,8 +291,9 @@ def law_at(floats: Array, whole: Integers, theta: Array, out: Array) -> bool:
 @compiled("void(float64[::1], int64[::1], float64[:, ::1], float64[:, ::1])")
 def law_of_batch(floats: Array, whole: Integers, theta: Array, out: Array) -> None:
     """Write the inputs (batch, m) at the rows of theta (batch, n), all finite."""
+    near = -1
     for i in range(len(theta)):
-        input_at(floats, whole, theta, out, i)
+        near = input_at(floats, whole, theta, out, i, near)
 
 
 @compiled("void(float64[::1], int64[::1], float64[:, ::1], int64[::1], float64[::1])")
@@ -300,5 +301,7 @@ def locate_batch(
     floats: Array, whole: Integers, theta: Array, region: Integers, inside: Array
 ) -> None:
     """Write the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
+    near = -1
     for i in range(len(theta)):
-        region[i], inside[i] = _choose(floats, whole, theta, i)
+        near, inside[i] = _choose(floats, whole, theta, i, near)
+        region[i] = near

@@ -11,8 +11,9 @@ from sb3_yann._validation import Array
 from sb3_yann.control.law._kernels import input_at
 from sb3_yann.networks._kernels.mlp import WEIGHTS, network, network_backward, prepared
 
-_KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
-_KEPT += ", float32[:, :, ::1]"
+KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
+KEPT += ", float32[:, :, ::1]"
+"""Types of what a forward pass keeps: x, used, slot, two hidden layers, outputs, see `act`."""
 
 
 @compiled()
@@ -24,9 +25,9 @@ def _locate(
     Write which these are, and each row's place among them.
     """
     u, slot_of = np.empty((len(theta), whole[1])), np.full(p, -1)
-    slots = 0
+    slots, region = 0, -1
     for row in range(len(theta)):
-        region = input_at(floats, whole, theta, u, row)
+        region = input_at(floats, whole, theta, u, row, region)
         if region < 0:
             u[row], region = np.nan, 0
         if slot_of[region] < 0:
@@ -120,7 +121,7 @@ def act(
 _REST = f"float64[:, ::1], float64[::1], float64[:, ::1], float64, {WEIGHTS}, float32[:, ::1]"
 
 
-@compiled(f"int64(float64[::1], int64[::1], {_REST}, {_KEPT})")
+@compiled(f"int64(float64[::1], int64[::1], {_REST}, {KEPT})")
 def forward(
     floats: Array,
     whole: Integers,
@@ -150,7 +151,7 @@ def forward(
     return slots
 
 
-@compiled(f"int64(float64[:, ::1], {_REST}, {_KEPT})")
+@compiled(f"int64(float64[:, ::1], {_REST}, {KEPT})")
 def forward_shared(
     u: Array,
     theta: Array,
@@ -180,7 +181,7 @@ def forward_shared(
 
 
 @compiled(
-    f"void(float32[:, ::1], boolean, float64, {WEIGHTS}, {_KEPT}, "
+    f"void(float32[:, ::1], boolean, float64, {WEIGHTS}, {KEPT}, "
     "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1])"
 )
 def backward(

@@ -39,11 +39,11 @@ def add_slopes(
     ----------
     back : ndarray, shape (m,)
         The gradient by the actions.
-    theta, u, scaling, change, limit, hidden1, hidden2, outputs
+    theta, scaling, change, limit, hidden1, hidden2, outputs
         As in `layer_loops.act`, which has written the last three.
     row : int
-    of_law : ndarray, shape (m, n)
-        Slopes of the law's inputs, zero where they are clipped.
+    u, of_law : ndarray, shapes (m,) and (m, n)
+        The law's inputs, and their slopes: zero where they are clipped.
     by_network : ndarray, shape (m,)
         Overwritten.
     s, ready, last, i
@@ -59,7 +59,7 @@ def add_slopes(
             if len(change) and abs(low if total <= low else high) < 1:
                 by_theta[row, previous + k] += back[k] * scaling[n + m + k]
             continue
-        law = np.float32((u[row, k] - scaling[n + k]) * scaling[n + m + k])
+        law = np.float32((u[k] - scaling[n + k]) * scaling[n + m + k])
         if law <= low or law >= high:
             if len(change) and abs(low if law <= low else high) < 1:
                 by_theta[row, previous + k] += back[k] * scaling[n + m + k]
