@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 
 import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
+from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.policy.policies import YannPolicy
-from sb3_yann.twin.gradient import actor
+from sb3_yann.twin.gradient import actor, actor_inputs
 from sb3_yann.twin.plant_twin import PlantTwin
 
 SAMPLES, STEPS, BATCH, UPDATES, RATE = 1000, 100, 256, 200, 1e-3
@@ -21,14 +21,13 @@ SPREAD = 0.1
 def refit_critic(policy: YannPolicy, twin: PlantTwin, seed: int) -> None:
     """Fit the critics to the returns of the policy in the twin, from inputs near its own."""
     problem, rng = policy.problem, np.random.default_rng([seed, 2])
-    half = (problem.u_max - problem.u_min) / 2
-    act = actor(copy.deepcopy(policy.actor.mu).cpu(), problem)
+    layer, half = copy.deepcopy(policy.actor.mu).cpu(), (problem.u_max - problem.u_min) / 2
     members = len(twin.dynamics.members)
     starts = twin.starts.draw_logged(SAMPLES // members * members, rng)
-    first = act(starts)
+    first = actor_inputs(layer, problem, starts)
     first = first + SPREAD * half * rng.standard_normal(first.shape)
     first = np.clip(first, problem.u_min, problem.u_max)
-    costs = _costs(policy, twin, act, starts, first)
+    costs = _costs(policy, twin, layer, starts, first)
     options = policy.critic_options
     returns = options.offset_of_return(policy.gamma) - options.reward_scale * costs
     known = np.isfinite(returns)
@@ -39,15 +38,14 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin, seed: int) -> None:
     policy.critic_target.load_state_dict(policy.critic.state_dict())
 
 
-def _costs(
-    policy: YannPolicy, twin: PlantTwin, act: Callable[[Array], Array], at: Array, u: Array
-) -> Array:
+def _costs(policy: YannPolicy, twin: PlantTwin, layer: LawLayer, at: Array, u: Array) -> Array:
     """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
     problem, gamma, dynamics = policy.problem, policy.gamma, twin.dynamics
     shape = len(dynamics.members), -1
     starts, u = at.reshape(*shape, problem.n_theta), u.reshape(*shape, problem.model.n_inputs)
     with np.errstate(all="ignore"):
-        thetas, inputs = dynamics.roll_out(act, dynamics.step(starts, u), STEPS)
+        first = dynamics.step(starts, u)
+        thetas, inputs = dynamics.roll_out(actor(layer, problem), first, STEPS)
         stage = problem.stage_cost(thetas[:-1], inputs)
         end = np.sum((thetas[-1] @ problem.value_matrix(gamma)) * thetas[-1], axis=-1)
         later = np.tensordot(gamma ** np.arange(STEPS), stage, axes=1) + gamma**STEPS * end
