@@ -11,9 +11,11 @@ from sb3_yann.control.law import _kernels, search_tree
 from sb3_yann.control.online import _kernels as online
 from sb3_yann.control.online import _table_kernels as table
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
+from sb3_yann.twin._kernels import costates, step
 from sb3_yann_envs import cstr
 
-MODULES = (_kernels, search_tree, online, table, yann_layer, afterstate_value, cstr)
+LAWS = _kernels, search_tree, online, table
+MODULES = (*LAWS, yann_layer, afterstate_value, step, costates, cstr)
 CALLED = {
     f"{module.__name__}.{name}": function
     for module in MODULES
@@ -37,7 +39,7 @@ def test_all_that_is_known_to_be_called_is_looked_at() -> None:
     assert names >= {"law_at", "law_of_batch", "locate_batch", "_hits", "_sides", "forward"}
     assert names >= {"forward_shared", "solve_batch", "inputs_of_batch", "recall", "remember"}
     assert names >= {"backward", "_forms", "_output", "_output_backward", "_forms_backward"}
-    assert names >= {"_rates", "advance", "advance_all", "is_rich"}
+    assert names >= {"_rates", "advance", "advance_all", "is_rich", "step", "costates"}
 
 
 @pytest.mark.slow

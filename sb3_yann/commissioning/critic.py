@@ -8,8 +8,9 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
+from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.policy.policies import YannPolicy
-from sb3_yann.twin.gradient import actor_inputs
+from sb3_yann.twin.gradient import actor, actor_inputs
 from sb3_yann.twin.plant_twin import PlantTwin
 
 SAMPLES, STEPS, BATCH, UPDATES, RATE = 1000, 100, 256, 200, 1e-3
@@ -37,17 +38,14 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin, seed: int) -> None:
     policy.critic_target.load_state_dict(policy.critic.state_dict())
 
 
-def _costs(policy: YannPolicy, twin: PlantTwin, layer: th.nn.Module, at: Array, u: Array) -> Array:
+def _costs(policy: YannPolicy, twin: PlantTwin, layer: LawLayer, at: Array, u: Array) -> Array:
     """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
     problem, gamma, dynamics = policy.problem, policy.gamma, twin.dynamics
     shape = len(dynamics.members), -1
     starts, u = at.reshape(*shape, problem.n_theta), u.reshape(*shape, problem.model.n_inputs)
     with np.errstate(all="ignore"):
-        thetas, inputs = dynamics.roll_out(
-            lambda rows: actor_inputs(layer, problem, rows),  # type: ignore[arg-type]
-            dynamics.step(starts, u),
-            STEPS,
-        )
+        first = dynamics.step(starts, u)
+        thetas, inputs = dynamics.roll_out(actor(layer, problem), first, STEPS)
         stage = problem.stage_cost(thetas[:-1], inputs)
         end = np.sum((thetas[-1] @ problem.value_matrix(gamma)) * thetas[-1], axis=-1)
         later = np.tensordot(gamma ** np.arange(STEPS), stage, axes=1) + gamma**STEPS * end

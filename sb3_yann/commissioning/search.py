@@ -15,7 +15,7 @@ from sb3_yann.commissioning.grounds import Grounds, Valued
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.law_layer import LawLayer
-from sb3_yann.twin.gradient import accumulate_gradient, actor_inputs
+from sb3_yann.twin.gradient import accumulate_gradient, actor
 
 PLATEAU = 1e-4
 """A gain from one check to the next, relative to the MPC's cost, that is not worth another."""
@@ -23,6 +23,8 @@ MOST = 3.0
 """How many times as much a run may count at most that costs less than the mean one."""
 EMPHASIS = 100.0
 """How many times as much a run counts that costs more than with the MPC."""
+ROUNDING = 1e-9
+"""Of a cost: so much more is the same."""
 HARDEST, SHARE = 50, 0.6
 """How many new hard starts each member keeps; the share of hard ones in a gradient's runs."""
 RETREATS = 1.0, 0.5, 0.25
@@ -119,14 +121,14 @@ class Search:
 
     def _try(self) -> Check:
         """Check the layer on the known starts, then on new ones; learn from what it loses."""
-        trial = self.grounds.trial
-        played = trial.play(self._inputs)
+        trial, act = self.grounds.trial, actor(self.layer, self.grounds.twin.problem)
+        played = trial.play(act)
         found = trial.check(self.iteration, played, self.outcome)
         self.known_hard = trial.hard(played)
         if not found.accepted:
             return found
         new = self.grounds.draw(self.drawing)
-        there = new.play(self._inputs)
+        there = new.play(act)
         pairs = zip(new.hard(there), self.new_hard, strict=True)
         self.new_hard = [np.concatenate(each)[:HARDEST] for each in pairs]
         confirmed = new.check(self.iteration, there, new.mpc)
@@ -142,7 +144,8 @@ class Search:
         starts, mpc = (np.array(each) for each in zip(*chosen, strict=True))
         # Relative costs count: starts around the log may be many times as dear as those in it.
         weights = np.minimum(MOST, grounds.trial.mean / np.maximum(np.abs(mpc), 1e-300))
-        reference = mpc, weights, weights * (1 + EMPHASIS)
+        # Rounding must not tell which runs cost more: at first all cost what the MPC costs.
+        reference = mpc + ROUNDING * np.abs(mpc), weights, weights * (1 + EMPHASIS)
         dynamics, objective, length = grounds.twin.dynamics, grounds.objective, grounds.length
         with np.errstate(all="ignore"):
             accumulate_gradient(self.layer, dynamics, objective, starts, length, reference)
@@ -164,9 +167,6 @@ class Search:
         starts = np.array([[*rows, *pool[0][: most - len(rows)]] for rows, pool in filled])
         costs = self.grounds.costs_of_mpc(starts) if most else np.empty((len(hard), 0))
         self.hard = [(rows, known[: len(rows)]) for rows, known in zip(hard, costs, strict=True)]
-
-    def _inputs(self, theta: Array) -> Array:
-        return actor_inputs(self.layer, self.grounds.twin.problem, theta)
 
 
 def _finite(gradient: th.Tensor) -> bool:

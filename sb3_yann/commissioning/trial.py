@@ -77,9 +77,9 @@ class Trial:
     mpc: Outcome = field(init=False)
 
     def __post_init__(self) -> None:
-        thetas, _ = self._run(law_of(self.twin.problem))
-        self.far = np.nan_to_num(self._beyond(thetas), nan=np.inf)
-        self.mpc = self.play(law_of(self.twin.problem))
+        runs = self._run(law_of(self.twin.problem))
+        self.far = np.nan_to_num(self._beyond(runs[0]), nan=np.inf)
+        self.mpc = self._outcome(*runs)
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -93,8 +93,10 @@ class Trial:
 
     def play(self, act: Inputs) -> Outcome:
         """Return what comes of a policy."""
+        return self._outcome(*self._run(act))
+
+    def _outcome(self, thetas: Array, inputs: Array) -> Outcome:
         twin = self.twin
-        thetas, inputs = self._run(act)
         with np.errstate(all="ignore"):
             costs = twin.problem.stage_cost(thetas[:-1], inputs).sum(axis=0).ravel()
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known

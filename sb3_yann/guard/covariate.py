@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
 from sb3_yann.guard.statistics import Logged, PlantEpisodes
-from sb3_yann.twin.gradient import actor_inputs
+from sb3_yann.twin.gradient import actor
 from sb3_yann.twin.log import SHORTEST
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -99,7 +98,7 @@ def costs_in_twin(
     """
     with session.playing(checkpoint) as policy:
         layer = copy.deepcopy(policy.actor.mu).cpu()
-    act = partial(actor_inputs, layer, twin.problem)
+    act = actor(layer, twin.problem)
     starts = np.array([[thetas[0] for thetas, _ in log]], np.float64)
     lengths = np.array([len(actions) for _, actions in log])
     with np.errstate(all="ignore"):

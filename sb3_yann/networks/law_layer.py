@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_yann._validation import Array, half_widths
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.zero_output import ZeroOutputNetwork, register_constants
 
@@ -48,6 +50,43 @@ class LawLayer(nn.Module):
 
     def slopes_of_law(self, theta: Array) -> Array:
         """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""
+        raise NotImplementedError
+
+    @property
+    def explicit_law(self) -> PiecewiseAffine | None:
+        """The law in use; None where it is solved online, or no longer that of the constructor."""
+        raise NotImplementedError
+
+    @property
+    def packed(self) -> tuple[Any, ...] | None:
+        """Law, ranges and networks for compiled code, None where there is none for them.
+
+        They are as `layer_loops.forward` takes them, and those of now: weights share their memory.
+        """
+        law, network = self.explicit_law, self.network
+        if law is None or not network.compiles:
+            return None
+        from sb3_yann.networks._kernels.mlp import as_array  # which loads numba
+
+        weights = map(as_array, network.weights())
+        return (*law.packed, *self.constants, *weights, network.pinned_array)
+
+    def frozen(self) -> Callable[[Array], NDArray[Any]]:
+        """Return the layer of now, on the CPU, as a function of theta (batch, n): (batch, m).
+
+        It is faster for small batches where there is compiled code: it does without torch.
+        """
+        if self.packed is not None:
+            return self._frozen(*self.packed)
+
+        @th.no_grad()
+        def act(theta: Array) -> NDArray[Any]:
+            found: NDArray[Any] = self(th.as_tensor(theta)).double().numpy()
+            return found
+
+        return act
+
+    def _frozen(self, *packed: Any) -> Callable[[Array], NDArray[Any]]:
         raise NotImplementedError
 
     def limit(self, max_correction: float | None) -> None:

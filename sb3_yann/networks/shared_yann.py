@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
@@ -73,9 +75,7 @@ class SharedYannLayer(LawLayer):
         from sb3_yann.networks._kernels.yann_layer import shared_layer_on_cpu  # compiled once
 
         network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
-        u, finite = self.inputs(theta)
-        if not finite.all():
-            u[~finite] = np.nan
+        u = self._inputs_or_nan(theta)
         own = network.weights(), network.pinned_array
         return shared_layer_on_cpu(theta, u, self.constants, *own)
 
@@ -94,11 +94,17 @@ class SharedYannLayer(LawLayer):
         """Return zeros: all rows of theta (batch, n) go through the one network."""
         return np.zeros(len(theta), np.int64)
 
-    def inputs(self, theta: th.Tensor) -> tuple[Array, NDArray[np.bool_]]:
+    def _inputs_or_nan(self, theta: th.Tensor | Array) -> Array:
+        u, finite = self.inputs(theta)
+        if not finite.all():
+            u[~finite] = np.nan
+        return u
+
+    def inputs(self, theta: th.Tensor | Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return the law's inputs (batch, m), zeros where theta is not finite, and where it is."""
         from sb3_yann.networks._kernels.mlp import as_array  # which loads numba
 
-        points = as_array(theta, np.float64)
+        points = as_array(th.as_tensor(theta), np.float64)
         finite = np.isfinite(points).all(axis=1)
         if finite.all():
             return self.given(points), finite
@@ -106,11 +112,23 @@ class SharedYannLayer(LawLayer):
         u[finite] = self.given(points[finite])
         return u, finite
 
+    @property
+    def explicit_law(self) -> PiecewiseAffine | None:
+        """The law in use; None where it is solved online."""
+        return self.given if isinstance(self.given, PiecewiseAffine) else None
+
+    def _frozen(self, *packed: Any) -> Callable[[Array], NDArray[Any]]:
+        from sb3_yann.networks._kernels.yann_layer import frozen_shared_layer
+
+        return frozen_shared_layer(self._inputs_or_nan, *packed[2:])
+
     def slopes_of_law(self, theta: Array) -> Array:
         """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""
         middle, half = self.middle.cpu().numpy(), self.half_range.cpu().numpy()
         slopes: Array = self.given.gain(theta) / half[:, None]
         slopes[np.abs((self.given(theta) - middle) / half) >= 1] = 0.0
+        if isinstance(self.given, PiecewiseAffine) and self.given.infeasible == "zero_input":
+            slopes[~self.given.in_domain(theta)] = 0.0  # as the gain of an online law is
         return slopes
 
 

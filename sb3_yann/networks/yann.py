@@ -5,6 +5,7 @@ It puts out actions in [-1, 1], which stand for ``u_min`` and ``u_max`` of the l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -127,6 +128,16 @@ class YannLayer(LawLayer):
             u = th.where(inside[:, None], u, self.resting)
         u = u.clamp(-1, 1).to(self.theta_half)
         return u.clamp(*self.reachable(theta)) if self.rated else u
+
+    @property
+    def explicit_law(self) -> PiecewiseAffine | None:
+        """The law in use; None where weights with another one have been loaded."""
+        return self.piecewise_affine if self.has_its_law else None
+
+    def _frozen(self, *packed: Any) -> Callable[[Array], NDArray[Any]]:
+        from sb3_yann.networks._kernels.yann_layer import frozen_layer
+
+        return frozen_layer(*packed)
 
     def slopes_of_law(self, theta: Array) -> Array:
         """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""

@@ -12,7 +12,7 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.residuals import Residual, as_polynomials
 
 MARGIN = 0.25
 """How far the residual reaches beyond the data, in widths of the data."""
@@ -94,6 +94,18 @@ class Dynamics:
         stack = getattr(type(self.members[0]), "stack", None)
         return stack and stack(self.members)
 
+    @cached_property
+    def packed(self) -> tuple[Any, ...] | None:
+        """The twin as arrays for compiled code; None where a residual is no polynomial."""
+        problem, parts, box = self.problem, self.problem.layout, self.coordinates
+        number = np.arange(parts.size + self.m, dtype=np.float64)
+        columns = features(problem, number[: parts.size], number[parts.size :]).astype(np.int64)
+        found = as_polynomials(self.members, len(columns))
+        if found is None:
+            return None
+        linear = np.ascontiguousarray(np.concatenate(problem.prediction, axis=1))
+        return linear, columns, np.stack([box.low, box.high, box.scale]), *found
+
     def residual(self, theta: Array, u: Array) -> Array:
         """Return the residuals (members, batch, n) at theta (members, batch, n_theta)."""
         return self._each("predict", self.coordinates.scaled(features(self.problem, theta, u)))
@@ -107,6 +119,14 @@ class Dynamics:
 
     def step(self, theta: Array, u: Array) -> Array:
         """Return the next theta (members, batch, n_theta); r and d stay as they are."""
+        if self.packed is not None and theta.shape[0] == len(self.members):
+            from sb3_yann.twin._kernels.step import step  # compiled once
+
+            after = np.empty(theta.shape)
+            rows = *(np.array(each, np.float64, order="C") for each in (theta, u)), after
+            given: Any = (*self.packed, *(each.reshape(-1, each.shape[-1]) for each in rows))
+            step(*given)
+            return after
         A, B = self.problem.prediction
         after = theta @ A.T + u @ B.T
         after[..., self.problem.layout.state] += self.residual(theta, u)

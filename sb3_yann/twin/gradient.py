@@ -7,6 +7,7 @@ of the actor over all steps at once takes what the costate makes of each action.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,7 +45,7 @@ class Objective:
         """Return the derivatives of the cost of each step by theta and by the input."""
         W, size = self.problem.stage_matrix, self.problem.n_theta
         both = 2 * np.concatenate([thetas, inputs], axis=-1) @ W
-        by_theta, by_u = both[..., :size].copy(), both[..., size:]
+        by_theta, by_u = both[..., :size].copy(), both[..., size:].copy()
         state = self.problem.layout.state
         by_theta[..., state] += 2 * self.penalty * self._beyond(thetas[..., state])
         return by_theta, by_u
@@ -61,12 +62,16 @@ class Objective:
         return np.asarray(stage + np.sum((end @ self.value) * end, axis=-1))
 
 
+def actor(layer: LawLayer, problem: LinearMPC) -> Callable[[Array], Array]:
+    """Return an actor of now as a function from theta (rows, n_theta) to inputs (rows, m)."""
+    middle, half = (problem.u_max + problem.u_min) / 2, (problem.u_max - problem.u_min) / 2
+    act = layer.frozen()
+    return lambda theta: np.asarray(middle + half * act(theta))
+
+
 def actor_inputs(layer: LawLayer, problem: LinearMPC, theta: Array) -> Array:
     """Return the inputs (rows, m) of an actor at theta (rows, n_theta)."""
-    with th.no_grad():
-        actions = layer(th.as_tensor(theta)).double().numpy()
-    middle, half = (problem.u_max + problem.u_min) / 2, (problem.u_max - problem.u_min) / 2
-    return np.asarray(middle + half * actions)
+    return actor(layer, problem)(theta)
 
 
 def accumulate_gradient(
@@ -95,32 +100,85 @@ def accumulate_gradient(
         Costs that no run should exceed; how much each counts below them, and above.
     """
     problem = objective.problem
-    half = (problem.u_max - problem.u_min) / 2
-    thetas, inputs = dynamics.roll_out(
-        lambda rows: actor_inputs(layer, problem, rows), starts, steps
-    )
-    flat = thetas[:-1].reshape(-1, problem.n_theta)
-    A, B = dynamics.jacobians(*_by_member(thetas[:-1], inputs))
-    shape = (steps, *starts.shape[:2])
-    A, B = (
-        np.moveaxis(each.reshape(len(each), steps, -1, *each.shape[2:]), 0, 1) for each in (A, B)
-    )
-    K = half[:, None] * _slopes_of_actor(layer, flat).reshape(*shape, len(half), -1)
+    thetas, inputs = dynamics.roll_out(actor(layer, problem), starts, steps)
     by_theta, by_u = objective.slopes(thetas[:-1], inputs)
+    by_theta = np.concatenate([by_theta, 2 * thetas[-1:] @ objective.value])
     costs = objective.costs(thetas, inputs)
     weights = np.ones_like(costs)
     if reference is not None:
         weights = np.where(costs > reference[0], reference[2], reference[1])
-    costate = 2 * thetas[-1] @ objective.value
-    by_action = np.empty_like(inputs)
-    for t in reversed(range(steps)):
-        row = costate[..., None, :]
-        by_action[t] = by_u[t] + (row @ B[t])[..., 0, :]
-        costate = by_theta[t] + (row @ A[t] + by_action[t][..., None, :] @ K[t])[..., 0, :]
+    flat = thetas[:-1].reshape(-1, problem.n_theta)
     actions = layer(th.as_tensor(flat))
-    upstream = by_action * weights[..., None] * half / weights.size
-    upstream = upstream.reshape(len(flat), -1)
+    if layer.packed is not None and dynamics.packed is not None:
+        _compiled_costates(layer, dynamics, actions, flat, inputs, by_theta, by_u)
+    else:
+        _costates(layer, dynamics, thetas, inputs, by_theta, by_u)
+    half = (problem.u_max - problem.u_min) / 2
+    upstream = (by_u * weights[..., None] * half / weights.size).reshape(len(flat), -1)
     actions.backward(th.as_tensor(upstream).to(actions))
+
+
+def _compiled_costates(
+    layer: LawLayer,
+    dynamics: Dynamics,
+    actions: th.Tensor,
+    flat: Array,
+    inputs: Array,
+    by_theta: Array,
+    by_u: Array,
+) -> None:
+    """Do what :func:`_costates` does, for thetas that are ``flat`` and the layer's actions there.
+
+    Parameters
+    ----------
+    layer, dynamics
+        With arrays for compiled code.
+    actions : Tensor, shape (rows, m)
+        With its gradient, for which it keeps what the layer has come by.
+    flat : ndarray, shape (rows, n_theta)
+        Without those at the end.
+    inputs, by_theta, by_u
+        As in :func:`_costates`.
+    """
+    from sb3_yann.networks._kernels.yann_layer import kept_for_gradient  # which load numba
+    from sb3_yann.twin._kernels.costates import costates
+
+    law, problem = layer.explicit_law, dynamics.problem
+    policy: Any = (*layer.packed, (problem.u_max - problem.u_min) / 2)  # type: ignore[misc]
+    twin: Any = (*dynamics.packed, law.locate(np.where(np.isfinite(flat), flat, 0.0)))  # type: ignore[misc, union-attr]
+    rows = (each.reshape(-1, each.shape[-1]) for each in (flat, inputs, by_theta, by_u))
+    costates(*policy, *twin, *kept_for_gradient(actions), *rows)
+
+
+def _costates(
+    layer: LawLayer,
+    dynamics: Dynamics,
+    thetas: Array,
+    inputs: Array,
+    by_theta: Array,
+    by_u: Array,
+) -> None:
+    """Add to the slopes of each step's own cost those of the costs to come, along runs.
+
+    Parameters
+    ----------
+    layer, dynamics, thetas, inputs
+        As in :func:`accumulate_gradient`, and what :meth:`Dynamics.roll_out` makes of them.
+    by_theta, by_u : ndarray, shapes (steps + 1, members, batch, n_theta) and (steps, ..., m)
+        Overwritten from the end to the beginning.
+    """
+    problem, steps = dynamics.problem, len(inputs)
+    A, B = dynamics.jacobians(*_by_member(thetas[:-1], inputs))
+    A, B = (
+        np.moveaxis(each.reshape(len(each), steps, -1, *each.shape[2:]), 0, 1) for each in (A, B)
+    )
+    half = (problem.u_max - problem.u_min) / 2
+    slopes = _slopes_of_actor(layer, thetas[:-1].reshape(-1, problem.n_theta))
+    K = half[:, None] * slopes.reshape(*inputs.shape, problem.n_theta)
+    for t in reversed(range(steps)):
+        row = by_theta[t + 1][..., None, :]
+        by_u[t] += (row @ B[t])[..., 0, :]
+        by_theta[t] += (row @ A[t] + by_u[t][..., None, :] @ K[t])[..., 0, :]
 
 
 def _by_member(thetas: Array, inputs: Array) -> tuple[Array, Array]:

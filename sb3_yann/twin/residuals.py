@@ -193,6 +193,25 @@ class Polynomial:
         return np.asarray(np.swapaxes(slopes, -1, -2))
 
 
+def as_polynomials(members: Sequence[Any], k: int) -> tuple[Any, Any, Array] | None:
+    """Return residuals of k variables as arrays for compiled code, None where one is no polynomial.
+
+    Monomial k + i is monomial ``parents[i]`` times variable ``variables[i]``, its weights are
+    ``weights[:, k + i]`` (members, n). A constant one comes last, if there is one.
+    """
+    none, first = np.empty(0, np.int64), members[0]
+    if all(isinstance(each, Nothing) for each in members):
+        return none, none, np.zeros((len(members), k, first.n))
+    if not all(isinstance(each, Polynomial) for each in members):
+        return None
+    below, parents, found = 0, [none], first.monomials
+    for each, size in zip(found.parents, [k, *map(len, found.parents)], strict=False):
+        parents.append(below + each)
+        below += size
+    weights = np.array([each.weights for each in members])
+    return np.concatenate(parents), np.concatenate([none, *found.variables]), weights
+
+
 class Regressor:
     """Anything with ``fit`` and ``predict``, as scikit-learn has it; differences for derivatives.
 

@@ -194,13 +194,24 @@ def _walked(floats: Array, whole: Integers, theta: Array, at: int) -> int:
 
 
 @compiled()
-def _choose(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, float]:
-    """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite."""
+def _choose(
+    floats: Array, whole: Integers, theta: Array, at: int, near: int = -1
+) -> tuple[int, float]:
+    """Return the region in use and how far inside it theta lies: (-1, nan) if it is not finite.
+
+    Region ``near``, if that is not negative, is asked first: of disjoint ones no other is as good.
+    """
     n = whole[0]
     for j in range(n):
         if not np.isfinite(theta[at, j]):
             return -1, np.nan
     known = -np.inf
+    if near >= 0 and whole[7] == 1:
+        first, last = whole[HEADER + near], whole[HEADER + near + 1]
+        known = _slack(floats, n, first, last, theta, at, SURELY_INSIDE)
+        if known >= SURELY_INSIDE:
+            return near, known
+        known = -np.inf
     if whole[8] > 0:
         region = _walked(floats, whole, theta, at)
         first, last = whole[HEADER + region], whole[HEADER + region + 1]
@@ -216,13 +227,16 @@ def _choose(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int,
 
 
 @compiled()
-def input_at(floats: Array, whole: Integers, theta: Array, out: Array, at: int) -> int:
+def input_at(
+    floats: Array, whole: Integers, theta: Array, out: Array, at: int, near: int = -1
+) -> int:
     """Write the input at one row of theta to that of ``out``, and return the region, -1 for none.
 
-    Functions take the array and the row: numba counts references to a row of its own.
+    Region ``near`` is asked first. Functions take the array and the row: numba counts references to
+    a row of its own.
     """
     n, m, p, q = whole[0], whole[1], whole[2], whole[3]
-    region, largest = _choose(floats, whole, theta, at)
+    region, largest = _choose(floats, whole, theta, at, near)
     if region < 0:
         return -1
     gains = ROWS + q * (n + 1)
@@ -240,6 +254,32 @@ def input_at(floats: Array, whole: Integers, theta: Array, out: Array, at: int) 
     return region
 
 
+@compiled()
+def slopes_at(
+    floats: Array, whole: Integers, region: int, theta: Array, u: Array, slopes: Array, at: int
+) -> None:
+    """Write the input (m,) at one row of theta, whose region is known, and its slopes (m, n).
+
+    They are zero where the input is clipped, and where it is zero as the MPC has no solution.
+    """
+    n, m, p, q = whole[0], whole[1], whole[2], whole[3]
+    gains = ROWS + q * (n + 1)
+    offsets = gains + p * m * n
+    bounds = offsets + p * m
+    first, last = whole[HEADER + region], whole[HEADER + region + 1]
+    zero = whole[6] == 1 and _slack(floats, n, first, last, theta, at, -np.inf) < -floats[0]
+    for k in range(m):
+        value = floats[offsets + region * m + k]
+        for j in range(n):
+            value += floats[gains + (region * m + k) * n + j] * theta[at, j]
+        value = 0.0 if zero else value
+        low, high = floats[bounds + k], floats[bounds + m + k]
+        for j in range(n):
+            free = not zero and low < value < high
+            slopes[k, j] = floats[gains + (region * m + k) * n + j] if free else 0.0
+        u[k] = min(max(value, low), high)
+
+
 @compiled("boolean(float64[::1], int64[::1], float64[::1], float64[::1])")
 def law_at(floats: Array, whole: Integers, theta: Array, out: Array) -> bool:
     """Write the input (m,) at one theta (n,); False where theta is not finite or too long."""
@@ -251,8 +291,9 @@ def law_at(floats: Array, whole: Integers, theta: Array, out: Array) -> bool:
 @compiled("void(float64[::1], int64[::1], float64[:, ::1], float64[:, ::1])")
 def law_of_batch(floats: Array, whole: Integers, theta: Array, out: Array) -> None:
     """Write the inputs (batch, m) at the rows of theta (batch, n), all finite."""
+    near = -1
     for i in range(len(theta)):
-        input_at(floats, whole, theta, out, i)
+        near = input_at(floats, whole, theta, out, i, near)
 
 
 @compiled("void(float64[::1], int64[::1], float64[:, ::1], int64[::1], float64[::1])")
@@ -260,5 +301,7 @@ def locate_batch(
     floats: Array, whole: Integers, theta: Array, region: Integers, inside: Array
 ) -> None:
     """Write the region in use (batch,) and how far inside it each row of theta lies (batch,)."""
+    near = -1
     for i in range(len(theta)):
-        region[i], inside[i] = _choose(floats, whole, theta, i)
+        near, inside[i] = _choose(floats, whole, theta, i, near)
+        region[i] = near

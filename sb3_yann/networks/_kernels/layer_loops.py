@@ -9,10 +9,11 @@ import numpy as np
 from sb3_yann._numba import Integers, Single, compiled
 from sb3_yann._validation import Array
 from sb3_yann.control.law._kernels import input_at
-from sb3_yann.networks._kernels.mlp import WEIGHTS, network, network_backward
+from sb3_yann.networks._kernels.mlp import WEIGHTS, network, network_backward, prepared
 
-_KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
-_KEPT += ", float32[:, :, ::1]"
+KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"
+KEPT += ", float32[:, :, ::1]"
+"""Types of what a forward pass keeps: x, used, slot, two hidden layers, outputs, see `act`."""
 
 
 @compiled()
@@ -24,9 +25,9 @@ def _locate(
     Write which these are, and each row's place among them.
     """
     u, slot_of = np.empty((len(theta), whole[1])), np.full(p, -1)
-    slots = 0
+    slots, region = 0, -1
     for row in range(len(theta)):
-        region = input_at(floats, whole, theta, u, row)
+        region = input_at(floats, whole, theta, u, row, region)
         if region < 0:
             u[row], region = np.nan, 0
         if slot_of[region] < 0:
@@ -57,14 +58,13 @@ def _confined(theta: Any, box: Any) -> Any:
 
 
 @compiled()
-def _act(
+def act(
     u: Array,
     theta: Array,
     scaling: Array,
     change: Array,
     limit: float,
-    nodes: Single,
-    second: Single,
+    ready: Any,
     last: Single,
     pinned: Single,
     actions: Single,
@@ -87,7 +87,7 @@ def _act(
         By how much an action may differ from the previous input, the last m entries of theta.
     limit : float
         The network's output is clamped to [-limit, limit].
-    nodes, second, last, pinned, used, slot
+    ready, last, pinned, used, slot
         As in :func:`network`.
     actions, x, hidden1, hidden2, outputs : ndarray
         What is written; the last one, (5, batch, m), are the networks' outputs, the actions before
@@ -98,7 +98,7 @@ def _act(
         for j in range(n):
             x[row, j] = theta[row, j] * scaling[j]
     out, total, bounds, part = outputs[0], outputs[1], outputs[2:4], outputs[4]
-    network(x, used, slot, nodes, second, last, pinned, hidden1, hidden2, out)
+    network(x, used, slot, ready, last, pinned, hidden1, hidden2, out)
     bounds[0], bounds[1] = -1, 1
     for row in range(batch):
         part[row] = _confined(theta[row], scaling[n + 2 * m :])
@@ -121,7 +121,7 @@ def _act(
 _REST = f"float64[:, ::1], float64[::1], float64[:, ::1], float64, {WEIGHTS}, float32[:, ::1]"
 
 
-@compiled(f"int64(float64[::1], int64[::1], {_REST}, {_KEPT})")
+@compiled(f"int64(float64[::1], int64[::1], {_REST}, {KEPT})")
 def forward(
     floats: Array,
     whole: Integers,
@@ -141,16 +141,17 @@ def forward(
     hidden2: Single,
     outputs: Single,
 ) -> int:
-    """Write what :func:`_act` does for a packed law; return how much of ``used`` is in use."""
+    """Write what :func:`act` does for a packed law; return how much of ``used`` is in use."""
     u, slots = _locate(floats, whole, theta, len(pinned), used, slot)
-    _act(
-        u, theta, scaling, change, limit, nodes, second, last, pinned, actions,
+    ready = prepared(used[:slots], nodes, second, pinned)
+    act(
+        u, theta, scaling, change, limit, ready, last, pinned, actions,
         x, used[:slots], slot, hidden1, hidden2, outputs,
     )  # fmt: skip
     return slots
 
 
-@compiled(f"int64(float64[:, ::1], {_REST}, {_KEPT})")
+@compiled(f"int64(float64[:, ::1], {_REST}, {KEPT})")
 def forward_shared(
     u: Array,
     theta: Array,
@@ -169,17 +170,18 @@ def forward_shared(
     hidden2: Single,
     outputs: Single,
 ) -> int:
-    """Write what :func:`_act` does for inputs u (batch, m) and one network; return 1."""
+    """Write what :func:`act` does for inputs u (batch, m) and one network; return 1."""
     used[0], slot[:] = 0, 0
-    _act(
-        u, theta, scaling, change, limit, nodes, second, last, pinned, actions,
+    ready = prepared(used[:1], nodes, second, pinned)
+    act(
+        u, theta, scaling, change, limit, ready, last, pinned, actions,
         x, used[:1], slot, hidden1, hidden2, outputs,
     )  # fmt: skip
     return 1
 
 
 @compiled(
-    f"void(float32[:, ::1], boolean, float64, {WEIGHTS}, {_KEPT}, "
+    f"void(float32[:, ::1], boolean, float64, {WEIGHTS}, {KEPT}, "
     "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1])"
 )
 def backward(

@@ -105,13 +105,20 @@ def hidden_layer(x: Single, row: int, matrices: Single, s: int, zero: Single, ou
         out[row, a] = tanh(out[row, a]) - zero[s, a]
 
 
+@compiled()
+def prepared(used: Integers, nodes: Single, second: Single, pinned: Single) -> Any:
+    """Return the two hidden layers of the networks in use, transposed, and what each is at zero."""
+    matrices1 = transposed(first_layers(nodes, used), np.arange(len(used)))
+    matrices2 = transposed(second, used)
+    return matrices1, matrices2, at_zero(matrices1, used, pinned), at_zero(matrices2, used, pinned)
+
+
 @compiled(fastmath=True)
 def network(
     x: Single,
     used: Integers,
     slot: Integers,
-    nodes: Single,
-    second: Single,
+    ready: Any,
     last: Single,
     pinned: Single,
     hidden1: Single,
@@ -127,9 +134,9 @@ def network(
         The networks in use.
     slot : ndarray of int, shape (batch,)
         Where in ``used`` each row's network is.
-    nodes : ndarray, shape (p, k, h1, n + 1)
-        First layers, whose k nodes are summed.
-    second : ndarray, shape (p, h2, h1 + 1)
+    ready : tuple of ndarray
+        From :func:`prepared`, for nodes (p, k, h1, n + 1), of which the k are summed, and for
+        second layers (p, h2, h1 + 1).
     last : ndarray, shape (p, m, h2 + 1)
     pinned : ndarray, shape (p,)
         1 where the network stays zero at the origin, else 0.
@@ -137,9 +144,7 @@ def network(
         What is written.
     """
     batch, m, h2 = len(x), last.shape[1], last.shape[2] - 1
-    matrices1 = transposed(first_layers(nodes, used), np.arange(len(used)))
-    matrices2 = transposed(second, used)
-    zero1, zero2 = at_zero(matrices1, used, pinned), at_zero(matrices2, used, pinned)
+    matrices1, matrices2, zero1, zero2 = ready
     for row in range(batch):
         s = slot[row]
         i = used[s]
@@ -235,3 +240,42 @@ def network_backward(
             for a in range(by_first.shape[1]):
                 for j in range(by_first.shape[2]):
                     by_nodes[s, node, a, j] = by_first[s, a, j]
+
+
+@compiled(fastmath=True)
+def slopes_by_x(
+    back: Single,
+    row: int,
+    s: int,
+    ready: Any,
+    last: Single,
+    i: int,
+    hidden1: Single,
+    hidden2: Single,
+    out: Single,
+) -> None:
+    """Write ``back @ slopes`` (n,) of network i, which is number s of :func:`prepared`, at a row.
+
+    ``back`` (m,) is the gradient by the output; hidden layers are those of :func:`network`.
+    """
+    one = np.float32(1)
+    matrices1, matrices2, zero1, zero2 = ready
+    through1 = np.empty(matrices1.shape[2], np.float32)
+    through2 = np.zeros(matrices2.shape[2], np.float32)
+    for k in range(len(back)):
+        for a in range(len(through2)):
+            through2[a] += back[k] * last[i, k, a]
+    for a in range(len(through2)):
+        b = hidden2[row, a] + zero2[s, a]
+        through2[a] *= one - b * b
+    for j in range(len(through1)):
+        total = np.float32(0)
+        for a in range(len(through2)):
+            total += matrices2[s, j, a] * through2[a]
+        b = hidden1[row, j] + zero1[s, j]
+        through1[j] = total * (one - b * b)
+    for j in range(len(out)):
+        total = np.float32(0)
+        for a in range(len(through1)):
+            total += matrices1[s, j, a] * through1[a]
+        out[j] = total

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,40 @@ def shared_layer_on_cpu(
     _require_width(theta, (len(constants[0]) - 2 - 2 * u.shape[1]) // 3)
     known = (u, as_array(theta, np.float64), *constants)
     return _run(forward_shared, known, weights, pinned, by_row=False)
+
+
+def frozen_layer(floats: Array, whole: Integers, *rest: Any) -> Callable[[Array], Single]:
+    """Return a YANN layer, packed, as a function from theta (batch, n) to actions (batch, m)."""
+
+    def act(theta: Array) -> Single:
+        rows = _as_rows(theta, int(whole[0]))
+        return _actions(forward, [floats, whole, rows, *rest])[0]
+
+    return act
+
+
+def frozen_shared_layer(law: Callable[[Array], Array], *rest: Any) -> Callable[[Array], Single]:
+    """Return what :func:`frozen_layer` does, for inputs of a law and one network."""
+    n = rest[3].shape[3] - 1
+
+    def act(theta: Array) -> Single:
+        rows = _as_rows(theta, n)
+        return _actions(forward_shared, [law(rows), rows, *rest])[0]
+
+    return act
+
+
+def _as_rows(theta: Array, n: int) -> Array:
+    if theta.ndim != 2 or theta.shape[1] != n:  # compiled code does not look
+        raise ValueError(f"theta has shape {theta.shape}, expected (batch, {n}).")
+    return np.ascontiguousarray(theta, np.float64)
+
+
+def kept_for_gradient(actions: th.Tensor) -> list[Any]:
+    """Return what a forward pass has kept: x, used, slot, two hidden layers, outputs."""
+    node: Any = actions.grad_fn
+    found: list[Any] = node.kept
+    return found
 
 
 def _require_width(theta: th.Tensor, n: int) -> None:
