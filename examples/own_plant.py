@@ -53,8 +53,8 @@ def main() -> None:
     mpc = LinearMPC(plant, **weights, **wishes, **limits, absolute=True)  # as the plant shows them
     console.print(plant.report(), mpc.report(), sep="\n")
     make = partial(make_env, mpc)
-    # Five per cent of the pumps' range is more than the wear takes; V differs by about ten.
-    policy = {"problem": mpc, "max_correction": 0.05, "critic": {"value_scale": 10.0}}
+    # Five per cent of the pumps' range is more than the wear takes.
+    policy = {"problem": mpc, "max_correction": 0.05}
     settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed}
     model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
     before = evaluate(model, make, TEST_SEEDS)
