@@ -176,6 +176,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "nearest outside": {"infeasible": "nearest_region"},
     "one network": {"networks": "shared"},
     "no settings": {"defaults": True, "tau": 0.02},
+    "no settings, one network": {"defaults": True, "tau": 0.02, "networks": "shared"},
     "input steps bounded": {"guard": {"rule": {"largest_step": 1.5}}},
 }
 """What is changed of YANN-RL, one thing at a time."""
@@ -225,6 +226,8 @@ def _runs() -> list[Run]:
 
     add(reactor, [OURS, "residual RL"], ten)
     add(reactor, [f"{OURS}, two gradient steps", f"{OURS}, target rate 0.02"], ten)
+    for plant in (reactor, pendulum, printed):
+        add(plant, [f"{OURS}, no settings"], ten)
     add(reactor, ["DDPG"], five)
     add(reactor, [OURS], long, episodes=200)
     add(reactor, ["DDPG"], range(50, 55), episodes=200)
