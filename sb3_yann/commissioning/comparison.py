@@ -15,6 +15,9 @@ from sb3_yann.twin.plant_twin import PlantTwin
 
 ENOUGH = 0.5
 """Of the gain that the twin promised, so much lets the bound of the correction grow."""
+SURELY, MOST = 1.645, 0.05
+"""Standard errors by which a policy's cost must be above the MPC's to be taken back, a one-sided
+test of five per cent; what it may not exceed in any case, as a fraction of the MPC's cost."""
 ALARMS = 0.25
 """Share of a policy's episodes with an alarm from which on it is taken back, two at least."""
 
@@ -31,12 +34,15 @@ class Costs(NamedTuple):
     mpc : float
         The MPC's from the same starts: what the twin that has learnt from them predicts, and what
         the MPC's own episodes cost beyond that. With sensor noise a plant costs more than any twin.
+    error : float, default 0
+        Standard error of ``actual - mpc``.
     """
 
     actual: float
     predicted: float
     promised: float
     mpc: float
+    error: float = 0.0
 
 
 def compare(
@@ -59,14 +65,19 @@ def compare(
         return Costs(np.nan, np.nan, np.nan, np.nan)
     problem, act = plant.problem, plant.policy if by_policy else plant.mpc
     predicted = promised = mpc = np.nan
+    error, actual = 0.0, _costs(problem, own)
     if before is not None:
         predicted = predicted_costs(before, own, act).mean()
         promised = predicted_costs(before, own, plant.mpc).mean() - predicted
     if now is not None:
         length = np.mean([len(each.actions) for each in own])
-        mpc = predicted_costs(now, own, plant.mpc).mean() + length * _beyond(journal, plant, now)
-    actual = _costs(problem, own).mean()
-    return Costs(*map(float, (actual, predicted, promised, mpc)))
+        as_mpc, (beyond, unsure) = (
+            predicted_costs(now, own, plant.mpc),
+            _beyond(journal, plant, now),
+        )
+        mpc = as_mpc.mean() + length * beyond
+        error = np.hypot(_standard_error(actual - as_mpc), length * unsure)
+    return Costs(*map(float, (actual.mean(), predicted, promised, mpc, error)))
 
 
 def why_taken_back(journal: Journal, costs: Costs) -> str:
@@ -81,7 +92,8 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     alarms = sum(each.alarm is not None for each in played)
     if alarms >= max(2.0, ALARMS * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
-    if not costs.actual <= costs.mpc < np.inf:  # nor does NaN pass
+    room = min(SURELY * costs.error, MOST * abs(costs.mpc))
+    if not costs.actual <= costs.mpc + room < np.inf:  # nor does NaN pass
         return f"it cost {costs.actual:.5g}, the MPC would have {costs.mpc:.5g}"
     return ""
 
@@ -93,14 +105,19 @@ def is_confirmed(journal: Journal, costs: Costs) -> bool:
     return quiet and 0 < ENOUGH * costs.promised <= gained < np.inf
 
 
-def _beyond(journal: Journal, plant: Plant, twin: PlantTwin) -> float:
-    """Return how much more than in the twin a step of the MPC has cost."""
+def _beyond(journal: Journal, plant: Plant, twin: PlantTwin) -> tuple[float, float]:
+    """Return how much more than in the twin a step of the MPC has cost, and the standard error."""
     own = [journal.episodes[i] for i in journal.log if not journal.by_policy[i]]
     own = [each for each in own if each.alarm is None]
     if not own:
-        return 0.0
+        return 0.0, 0.0
     more = _costs(plant.problem, own) - predicted_costs(twin, own, plant.mpc)
-    return float(more.sum() / sum(len(each.actions) for each in own))
+    steps = sum(len(each.actions) for each in own)
+    return float(more.sum() / steps), len(own) * _standard_error(more) / steps
+
+
+def _standard_error(values: Array) -> float:
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
 
 
 def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> Array:

@@ -64,7 +64,8 @@ class Improvement:
         """Why nothing was accepted; empty where something was."""
         if self.accepted:
             return ""
-        last = self.checks[-1].reason or f"{100 * self.change:+.2g} % is not worth a change"
+        gain = f"a gain of {100 * abs(self.change):.2g} %" if self.change < 0 else "no gain"
+        last = self.checks[-1].reason or f"{gain} in the twin is not worth a change"
         return f"Nothing better was found: {last}."
 
 

@@ -152,6 +152,7 @@ class Evidence(Starts):
     mpc, accepted : Outcome, what came of the MPC and of the accepted policy
     tolerance : Tolerance, what they may cost more than with the MPC
     n_starts : int, of so many they are those that count
+    sure : float, as of all starts
     """
 
     accepted: Outcome = field(kw_only=True)

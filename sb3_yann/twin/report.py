@@ -25,14 +25,19 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
     trust : Trust
         The evidence.
     """
-    parts = _data(episodes), _errors(kind, trust), _costs(trust), _inputs(problem, trust)
+    parts = _data(problem, episodes), _errors(kind, trust), _costs(trust), _inputs(problem, trust)
     lines = [line for part in (*parts, _noise(problem, trust), _verdict(trust)) for line in part]
     return "\n".join(lines)
 
 
-def _data(episodes: tuple[Episode, ...]) -> Iterator[str]:
+def _data(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Iterator[str]:
     steps = sum(map(len, episodes))
     yield f"The log: {len(episodes)} episodes, {steps} steps."
+    constant = problem.layout.constant
+    seen = np.concatenate([each.thetas[:, constant] for each in episodes])
+    names = np.array(problem.layout.names)[constant]
+    if still := [*names[np.ptp(seen, axis=0) == 0]]:
+        yield f"The log shows one value alone of {', '.join(still)}: elsewhere the MPC will act."
 
 
 def _errors(kind: str, trust: Trust) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,12 @@ from stable_baselines3 import DDPG
 
 from sb3_yann import Commissioning, Improvement, YannPolicy
 from sb3_yann.commissioning import Check, commissioning
-from sb3_yann.commissioning.comparison import Costs, is_confirmed, predicted_costs
+from sb3_yann.commissioning.comparison import (
+    Costs,
+    is_confirmed,
+    predicted_costs,
+    why_taken_back,
+)
 from sb3_yann.commissioning.plant import Plant
 from sb3_yann.commissioning.watchdog import Alarm
 from sb3_yann.evaluation.episodes import one_env
@@ -192,7 +198,7 @@ def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> Non
     run.run(1)
     with th.no_grad():  # what was accepted turns out to be bad: the plant says so
         for each in run.policy.actor.parameters():
-            each.add_(0.2 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
+            each.add_(0.5 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
     run.incumbent.hold()
     monkeypatch.setattr(commissioning, "improve", lambda *_, **__: found)
     found = Improvement((Check(1, False, "nothing", 0.0, 0.0, True),), 0.0, False)
@@ -306,6 +312,18 @@ def test_the_bound_grows_only_with_what_was_promised() -> None:
     assert not is_confirmed(journal, Costs(100.0, 101.0, -1.0, 100.0))
     for unknown in (Costs(*4 * (np.nan,)), Costs(100.0, 90.0, np.inf, np.inf)):
         assert not is_confirmed(journal, unknown)
+
+
+def test_a_policy_is_taken_back_where_it_surely_costs_more() -> None:
+    played = SimpleNamespace(violations=0, alarm=None)
+    journal = SimpleNamespace(batch=[(played, True)], cut_off=0)
+    costs = Costs(10.3, 10.0, 0.5, 10.0)
+    assert "it cost 10.3, the MPC would have 10" in why_taken_back(journal, costs)
+    assert why_taken_back(journal, costs._replace(error=0.2)) == ""  # 1.5 standard errors
+    assert why_taken_back(journal, costs._replace(error=0.18)) != ""
+    dear = costs._replace(actual=10.6, error=1.0)  # more than five per cent in any case
+    assert why_taken_back(journal, dear) != ""
+    assert why_taken_back(journal, costs._replace(mpc=np.nan)) != ""
 
 
 def test_shadow_computes_and_does_not_act() -> None:
