@@ -24,12 +24,13 @@ import sb3_yann_envs
 __version__ = "0.1.0"
 
 _NAMES = {
-    "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning",
+    "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning Headroom "
+    "headroom",
     "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
     "sb3_yann.commissioning": "Batch Commissioning ImproveInTwin Improvement improve",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
     "ExplicitSolutionError Identified LinearMPC LinearModel OnlineLaw OnlineLawWarning "
-    "OutputBounds PiecewiseAffine RateLimits SoftBounds Terminal Tracking identify",
+    "OutputBounds PiecewiseAffine RateLimits SoftBounds Terminal Tracking identify offset_free",
     "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "
     "YannPolicy register_problem",

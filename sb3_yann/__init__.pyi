@@ -2,6 +2,8 @@ from sb3_yann.audit import CostAudit as CostAudit
 from sb3_yann.audit import CostFinding as CostFinding
 from sb3_yann.audit import CostMismatchError as CostMismatchError
 from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
+from sb3_yann.audit import Headroom as Headroom
+from sb3_yann.audit import headroom as headroom
 from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
 from sb3_yann.commissioning import Batch as Batch
@@ -25,6 +27,7 @@ from sb3_yann.control import SoftBounds as SoftBounds
 from sb3_yann.control import Terminal as Terminal
 from sb3_yann.control import Tracking as Tracking
 from sb3_yann.control import identify as identify
+from sb3_yann.control import offset_free as offset_free
 from sb3_yann.guard import AcceptanceRule as AcceptanceRule
 from sb3_yann.guard import Decision as Decision
 from sb3_yann.guard import ImprovementGuard as ImprovementGuard

@@ -1,6 +1,14 @@
-"""The callback that compares the env's reward with the stage cost of the problem."""
+"""What to know before training: whether the reward is the MPC's cost, and what there is to gain."""
 
 from sb3_yann.audit.callback import CostAudit
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
+from sb3_yann.audit.headroom import Headroom, headroom
 
-__all__ = ["CostAudit", "CostFinding", "CostMismatchError", "CostMismatchWarning"]
+__all__ = [
+    "CostAudit",
+    "CostFinding",
+    "CostMismatchError",
+    "CostMismatchWarning",
+    "Headroom",
+    "headroom",
+]

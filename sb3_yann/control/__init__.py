@@ -16,6 +16,7 @@ from sb3_yann.control.mpc.groups import (
     Tracking,
 )
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
+from sb3_yann.control.mpc.offset_free import offset_free
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
 from sb3_yann.control.observer import DisturbanceObserver
 from sb3_yann.control.online.online_law import OnlineLaw
@@ -39,4 +40,5 @@ __all__ = [
     "ThetaLayout",
     "Tracking",
     "identify",
+    "offset_free",
 ]

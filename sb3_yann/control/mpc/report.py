@@ -36,7 +36,8 @@ def report(problem: MPCProblem, law: Law, samples: int = 500, seed: int = 0) -> 
     rng = np.random.default_rng(seed)
     points = rng.uniform(problem.theta_min, problem.theta_max, (samples, problem.n_theta))
     feasible = points[law.in_domain(points)]
-    parts = _parameters(problem), _size(problem, law), _shares(problem, law, points, feasible)
+    size = chain(_size(problem, law), _offset(problem))
+    parts = _parameters(problem), size, _shares(problem, law, points, feasible)
     return "\n".join(chain(*parts, _active(problem, feasible), _values(problem, law, feasible)))
 
 
@@ -75,6 +76,13 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
         groups = ("x", problem.soft.x), ("y", problem.soft.y)
         soft = [f"{name}[{i}]" for name, units in groups for i in np.flatnonzero(units)]
         yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
+
+
+def _offset(problem: MPCProblem) -> Iterator[str]:
+    if problem.layout.n_references and not problem.layout.n_disturbances:
+        yield "Where the plant is not its model, it settles beside its set-points. Two lines mend it:"
+        yield "  mpc, observer = offset_free(mpc)"
+        yield "  env = ObserveDisturbance(env, observer, mpc.disturbances.d_min, mpc.disturbances.d_max)"
 
 
 def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> Iterator[str]:

@@ -1,0 +1,75 @@
+"""The same MPC with a disturbance that an observer estimates: no offset where the model errs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import as_positive_vector
+from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.mpc.groups import DisturbanceBounds, Terminal
+from sb3_yann.control.mpc.linear_mpc import LinearMPC
+from sb3_yann.control.observer import DisturbanceObserver
+
+SHARE = 0.05
+"""Of the half-widths of the box of states: what a disturbance moves in a sample, at most."""
+
+
+def offset_free(
+    mpc: LinearMPC, d_max: ArrayLike | None = None
+) -> tuple[LinearMPC, DisturbanceObserver]:
+    """Return the MPC with a disturbance of each state, and the observer that estimates it.
+
+    Where the plant is not its model, the MPC settles beside its set-points. A constant disturbance
+    in each state accounts for that: tracked outputs then settle without offset (Pannocchia and
+    Rawlings, AIChE J. 49, 2003). All states must be measured.
+
+    Parameters
+    ----------
+    mpc : LinearMPC
+        Without disturbances of its own.
+    d_max : array_like, shape (n,), optional
+        Largest disturbance, in units of the states per sample. The default is 5 % of the
+        half-widths of the box of states.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the MPC knows disturbances already: give an observer of yours its model.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from sb3_yann.wrappers import ObserveDisturbance
+    >>> mpc = gym.make("CSTR-v0").observation_space.problem
+    >>> mpc, observer = offset_free(mpc)
+    >>> bounds = mpc.disturbances.d_min, mpc.disturbances.d_max
+    >>> env = ObserveDisturbance(gym.make("CSTR-v0"), observer, *bounds)
+    >>> env.observation_space.shape
+    (8,)
+    """
+    if not isinstance(mpc, LinearMPC):
+        raise TypeError(f"mpc = {mpc!r} must be a LinearMPC.")
+    old, n = mpc.model, mpc.model.n_states
+    if old.n_disturbances:
+        raise ValueError(
+            f"The MPC has {old.n_disturbances} disturbances already. Give their observer the "
+            "model: DisturbanceObserver(mpc.model)."
+        )
+    largest = SHARE * mpc.theta_half[mpc.layout.state] if d_max is None else d_max
+    bound = as_positive_vector("d_max", largest, n, "In units of the states.")
+    names = {"state_names": old.state_names, "input_names": old.input_names, "units": old.units}
+    model = LinearModel(old.A, old.B, old.dt, old.x_ss, old.u_ss, np.eye(n), **names)
+    terminal = Terminal(set="invariant" if len(mpc.terminal.set[1]) else None)
+    states = mpc.layout.state
+    found = dataclasses.replace(
+        mpc,
+        model=model,
+        disturbances=DisturbanceBounds(-bound, bound),
+        terminal=terminal,
+        theta_min=mpc.theta_min[states],
+        theta_max=mpc.theta_max[states],
+    )
+    return found, DisturbanceObserver(model)

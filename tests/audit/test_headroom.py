@@ -1,0 +1,161 @@
+"""What there is to gain over an MPC is told before anybody trains, and of what kind it is."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import TimeLimit
+
+from experiments.optimum import cstr_optimum
+from sample_plants import LinearPlant
+from sb3_yann import (
+    Headroom,
+    LinearModel,
+    LinearMPC,
+    PlantTwin,
+    Tracking,
+    UntrustedTwinError,
+    headroom,
+    offset_free,
+)
+from sb3_yann.evaluation import evaluate
+from sb3_yann.wrappers import ObserveDisturbance
+from sb3_yann_envs import problems
+
+
+def heater(**changes) -> LinearMPC:
+    """One state that follows a set-point, its input within bounds."""
+    design = {"Q": [[1.0]], "R": [[0.1]], "horizon": 3, "u_min": -2, "u_max": 2}
+    tracking = Tracking([0], -1, 1)
+    box = {"theta_min": -5, "theta_max": 5}
+    model = LinearModel([[0.8]], [[0.5]], dt=1.0)
+    return LinearMPC(model, **{**design, "tracking": tracking, **box, **changes})
+
+
+class Heater(gym.Env):
+    """x+ = .8 x + .5 u + load + bend u^2; the set-point changes in the middle of an episode."""
+
+    def __init__(self, load: float = 0.0, bend: float = 0.0, steps: int = 60) -> None:
+        self.mpc, self.load, self.bend, self.steps = heater(), load, bend, steps
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.action_space = gym.spaces.Box(-2, 2, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.theta, self.later = self.np_random.uniform(-1, 1, 2), self.np_random.uniform(-1, 1)
+        self.t = 0
+        return self.theta.astype(np.float32), {}
+
+    def step(self, action):
+        u = float(np.asarray(action)[0])
+        cost = float(self.mpc.stage_cost(self.theta, [u]))
+        self.theta[0] = 0.8 * self.theta[0] + 0.5 * u + self.load + self.bend * u**2
+        self.t += 1
+        if self.t == self.steps // 2:
+            self.theta[1] = self.later
+        over = self.t == self.steps
+        return self.theta.astype(np.float32), -cost, False, over, {"violation": False}
+
+
+@cache
+def reactor() -> Headroom:
+    return headroom(problems.cstr(), "CSTR-v0", n_starts=4, seed=2000)
+
+
+def test_where_the_model_is_the_plant_there_is_nothing_to_gain() -> None:
+    found = headroom(heater(), Heater(), n_starts=5)
+    assert found.verdict == "do not bother" and 0 <= found.total < 1e-3
+    assert "Verdict: do not bother" in str(found)
+
+
+def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:
+    found = headroom(heater(), partial(Heater, load=0.2), n_starts=6)
+    assert found.verdict == "add ObserveDisturbance first"
+    assert found.offset > 0.9 * found.total > 0.05
+    mpc, observer = offset_free(heater())
+    low, high = mpc.disturbances.d_min, mpc.disturbances.d_max
+    env = ObserveDisturbance(Heater(load=0.2), observer, low, high)
+    episode = evaluate(mpc.online(), env, [0])
+    measured, wanted = episode.observations[0][:, :2].T
+    assert abs(measured[-1] - wanted[-1]) < 1e-3
+    without = evaluate(heater().explicit(), Heater(load=0.2), [0]).observations[0]
+    assert abs(without[-1, 0] - without[-1, 1]) > 0.02
+
+
+def test_the_reactor_s_figure_is_that_of_its_optimum() -> None:
+    found = reactor()
+    starts = evaluate(problems.cstr().explicit(), "CSTR-v0", range(2000, 2004)).observations
+    best = cstr_optimum([each[0] for each in starts])
+    np.testing.assert_allclose(found.best_costs, best, rtol=2e-3)
+    assert np.all(found.best_costs <= found.mpc_costs)
+    assert found.offset + found.model_error + found.nonlinearity == pytest.approx(found.total)
+    assert found.total == pytest.approx(1 - best.mean() / found.mpc_costs.mean(), rel=0.02)
+
+
+def test_what_a_linear_model_cannot_do_is_left_to_learning() -> None:
+    # This start swings: the torque cannot lift the pendulum, and no linear model says so.
+    found = headroom(problems.clipped_pendulum(), "ClippedPendulum-v0", n_starts=3, seed=2001)
+    assert found.verdict == "learn"
+    assert found.nonlinearity == pytest.approx(found.total) and found.total > 0.005
+
+
+def test_changes_of_a_set_point_are_not_known_before() -> None:
+    """With preview the optimum would move before the change; the plan costs what the MPC costs."""
+    found = headroom(heater(), Heater(steps=40), n_starts=6, seed=20)
+    np.testing.assert_allclose(found.best_costs, found.mpc_costs, rtol=2e-3)
+
+
+def test_in_a_twin() -> None:
+    mpc = problems.cstr()
+    runs = evaluate(mpc.explicit(), "CSTR-v0", range(3000, 3005))
+    twin = PlantTwin.fit(mpc, [*zip(runs.observations, runs.actions, strict=True)])
+    found = headroom(mpc, twin, n_starts=3)
+    assert found.total > 0.005 and "the twin" in found.report()
+    with pytest.raises(ValueError, match="another MPC's plant"):
+        headroom(heater(), twin)
+
+
+def test_a_twin_that_cannot_be_trusted_is_refused() -> None:
+    mpc = problems.cstr()
+    runs = evaluate(mpc.explicit(), "CSTR-v0", [3000])
+    states = runs.observations[0] + np.random.default_rng(0).normal(0, 0.5, (401, 4))
+    twin = PlantTwin.fit(mpc, [(states, runs.actions[0])])
+    with pytest.raises(UntrustedTwinError):
+        headroom(mpc, twin)
+
+
+def test_what_it_cannot_use_is_named() -> None:
+    with pytest.raises(ValueError, match=r"The env shows \(4,\).*Deviations"):
+        headroom(heater(), "CSTR-v0")
+    with pytest.raises(TypeError, match="mpc = 3"):
+        headroom(3, "CSTR-v0")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="n_starts = 1"):
+        headroom(heater(), Heater(), n_starts=1)
+
+    class Random(Heater):
+        def step(self, action):
+            self.load = 0.1 * np.random.default_rng().standard_normal()
+            return super().step(action)
+
+    with pytest.raises(ValueError, match="does not repeat it"):
+        headroom(heater(), Random())
+
+
+def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:
+    mpc, observer = offset_free(heater())
+    with pytest.raises(ValueError, match="1 disturbances already"):
+        offset_free(mpc)
+    with pytest.raises(ValueError, match="d_max"):
+        offset_free(heater(), -1.0)
+    env = ObserveDisturbance(Heater(load=0.1), observer, -0.25, 0.25)
+    found = headroom(mpc, env, n_starts=3)
+    assert found.offset == 0 and np.array_equal(found.observer_costs, found.mpc_costs)
+
+
+def test_a_plant_without_a_time_limit_may_be_given_one() -> None:
+    bounds = {"u_min": -1, "u_max": 1, "theta_min": -3, "theta_max": 3}
+    mpc = LinearMPC(LinearModel([[0.9]], [[1.0]], 1.0), Q=[[1]], R=[[1]], horizon=2, **bounds)
+    assert headroom(mpc, TimeLimit(LinearPlant(mpc), 30), n_starts=3).verdict == "do not bother"
