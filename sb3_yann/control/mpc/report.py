@@ -80,9 +80,9 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
 
 def _offset(problem: MPCProblem) -> Iterator[str]:
     if problem.layout.n_references and not problem.layout.n_disturbances:
-        yield "Where the plant is not its model, it settles beside its set-points. Two lines mend it:"
-        yield "  mpc, observer = offset_free(mpc)"
-        yield "  env = ObserveDisturbance(env, observer, mpc.disturbances.d_min, mpc.disturbances.d_max)"
+        yield "Where the plant is not its model, it settles beside its set-points. This mends it:"
+        yield "  mpc, observer = offset_free(mpc); d = mpc.disturbances"
+        yield "  env = ObserveDisturbance(env, observer, d.d_min, d.d_max)"
 
 
 def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> Iterator[str]:
