@@ -262,7 +262,8 @@ class LinearMPC(MPCProblem):
         budget = SolveBudget(time_limit, region_limit, progress)
         if solver not in self._laws:
             program, limits = self.condensed(), (self.u_min, self.u_max)
-            self._laws[solver] = solve_explicit(program, *limits, self.infeasible, solver, budget)
+            law = solve_explicit(program, *limits, self.infeasible, solver, budget)
+            self._laws[solver] = law.on_plant(self.model, self.theta_ss)
         budget.require(self._laws[solver].n_regions)
         return self._laws[solver]
 
@@ -280,7 +281,8 @@ class LinearMPC(MPCProblem):
 
     @cached_property
     def _online(self) -> OnlineLaw:
-        return OnlineLaw.of(self.condensed(), self.u_min, self.u_max, self.infeasible)
+        law = OnlineLaw.of(self.condensed(), self.u_min, self.u_max, self.infeasible)
+        return law.on_plant(self.model, self.theta_ss)
 
     @cached_property
     def _laws(self) -> dict[str, PiecewiseAffine]:
