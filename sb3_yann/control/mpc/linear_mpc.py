@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -94,7 +94,8 @@ class LinearMPC(MPCProblem):
     terminal : Terminal, optional
         The terminal cost, by default the Riccati solution, and the terminal set.
     absolute : bool, default False
-        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations.
+        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations, so
+        `dataclasses.replace` takes and returns a problem in deviations.
 
     Raises
     ------
@@ -109,6 +110,8 @@ class LinearMPC(MPCProblem):
     >>> mpc.explicit()([-5.0, 0.0])
     array([1.])
     """
+
+    absolute: bool = field(default=False, init=False, compare=False)
 
     def __init__(  # noqa: PLR0913 (the user's arguments)
         self,
@@ -164,6 +167,7 @@ class LinearMPC(MPCProblem):
             tracking, d, rate, outputs, soft,
         )  # fmt: skip
         super().__init__(*checked, _completed(MPCProblem(*checked, terminal)))
+        self._store(absolute=bool(absolute))
 
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the next theta on the model; theta is (n_theta,) or (batch, n_theta)."""
