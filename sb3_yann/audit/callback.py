@@ -149,7 +149,7 @@ class CostAudit(BaseCallback):
         return Sample(
             theta=theta("observation"),
             following=theta("following"),
-            u=column("action"),
+            u=self.policy.inputs(column("action")),
             rewards=column("reward"),
             counted=~(column("violation") | terminated),
             terminated=terminated,

@@ -84,6 +84,7 @@ class Plant:
                 )
         self.law, self.device = law_of(self.problem), self.yann.device
         self.range = self.problem.u_max - self.problem.u_min
+        self.as_is = self.yann.input_units.kind == "deviation"
 
     def policy(self, theta: Array) -> Array:
         """Return the policy's inputs (rows, m); the MPC's where they are not finite."""
@@ -130,7 +131,8 @@ class Plant:
             wanted = u if act == self.policy else self.policy(known[None])[0]
             law = self.mpc(known[None])[0]
             apart = max(apart, float(np.max(np.abs(wanted - law) / self.range)))
-            observation, gained, terminated, over, info = self.env.step(u)
+            action = u if self.as_is else self.yann.input_units.action(u).astype(np.float32)
+            observation, gained, terminated, over, info = self.env.step(action)
             unsafe = bool(info.get("violation", False)) or terminated
             reward, violations = reward + float(gained), violations + unsafe
             over, read = over or terminated, self._theta(observation)

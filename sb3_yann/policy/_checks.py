@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -17,7 +17,14 @@ from torch import nn
 
 from sb3_yann._validation import Array, as_whole
 from sb3_yann.control import LinearMPC
-from sb3_yann.policy.observations import AffineObservation, require_frozen, require_outermost
+from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.mpc.plant_units import InputUnits, misread_state
+from sb3_yann.policy.observations import (
+    SAY,
+    AffineObservation,
+    require_frozen,
+    require_outermost,
+)
 from sb3_yann.twin.replay_buffer import LOST_STATISTICS
 
 SB3_KWARGS = (
@@ -82,7 +89,8 @@ def require_undone_normalization(
     if observation is None:
         raise ValueError(
             "VecNormalize normalizes observations, and the law takes the state. Undo it: "
-            "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}."
+            "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}. Where it "
+            "normalizes absolute values: AffineObservation.deviation(mpc.theta_ss) @ that."
         )
     require_outermost(normalize, algorithm.observation_space.shape)
     vars(algorithm)["sees_normalized"] = True  # it is saved with the model
@@ -120,51 +128,63 @@ def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) ->
         )
 
 
-def require_matching(
-    problem: LinearMPC,
-    observation_space: spaces.Space[Any],
-    action_space: spaces.Box,
-    observation: AffineObservation | None = None,
-) -> None:
-    """Raise unless the spaces are those of the law: theta in, inputs between its bounds out."""
-    _require_theta(problem, observation_space, observation)
+def as_input_units(problem: LinearMPC, action_space: spaces.Box, told: bool) -> InputUnits:
+    """Return how the env takes inputs; raise unless its bounds are those of the problem.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        With finite bounds of the inputs.
+    action_space : gymnasium.spaces.Box
+        Of deviations, of absolute inputs, or [-1, 1].
+    told : bool
+        Whether the user said what the env shows. Else only an absolute problem has absolute inputs.
+    """
     if not np.issubdtype(action_space.dtype, np.floating):
         dtype = action_space.dtype
         raise TypeError(f"action_space has dtype {dtype}: inputs are real, use numpy.float32.")
     if not action_space.is_bounded():
         raise ValueError(f"action_space = {action_space} must have finite bounds.")
-    law, env = (problem.u_min, problem.u_max), (action_space.low, action_space.high)
-    reach = np.where(np.isfinite(law[1] - law[0]), law[1] - law[0], 1.0)
-    u_ss, given = problem.model.u_ss, action_space.shape == law[0].shape
-
-    def same(shift: NDArray[np.floating[Any]]) -> bool:
-        sides = zip(law, env, strict=True)
-        return all(np.all(np.abs(b + shift - limit) <= 1e-6 * reach) for b, limit in sides)
-
-    if given and same(0 * u_ss):
-        return
-    low, high = law[0].tolist(), law[1].tolist()
+    units = InputUnits.of(problem, action_space.low, action_space.high)
+    if units is not None and (units.kind != "absolute" or told or problem.absolute):
+        return units
+    low, high, u_ss = problem.u_min.tolist(), problem.u_max.tolist(), problem.model.u_ss
     advice = (
         "They must be the same: build the LinearMPC with the bounds of the env, as deviations from "
-        "u_ss of its model, and leave out wrappers that rescale actions."
+        "u_ss of its model, or as absolute inputs with absolute=True. Or rescale actions to [-1, 1]"
+        " in all entries."
     )
-    if given and same(u_ss):
+    if units is not None:
         advice = (
             f"The env takes absolute inputs, and the MPC deviations from u_ss = {u_ss.tolist()}. "
-            "Before its observation is completed, wrap it: env = gymnasium.wrappers."
+            f"{SAY}. Or, before its observation is completed, wrap it: env = gymnasium.wrappers."
             f"RescaleAction(env, numpy.float32({low}), numpy.float32({high}))."
         )
-    space = f"[{env[0].tolist()}, {env[1].tolist()}]"
+    space = f"[{action_space.low.tolist()}, {action_space.high.tolist()}]"
     raise ValueError(
-        f"The action space is {space}, but the MPC has u_min = {low} and u_max = {high}. {advice}"
+        f"The action space is {space}, but the MPC has u_min = {low} and u_max = {high}"
+        f"{_in_absolute(problem)}. {advice}"
     )
 
 
-def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None) -> None:
-    """Warn where an unwrapped plant seems to take absolute inputs, and the MPC deviations."""
+def _in_absolute(problem: LinearMPC) -> str:
+    u_ss = problem.model.u_ss
+    if not np.any(u_ss):
+        return ""
+    low, high = (problem.u_min + u_ss).tolist(), (problem.u_max + u_ss).tolist()
+    return f", in absolute values {low} and {high}"
+
+
+def warn_of_absolute_inputs(
+    problem: LinearMPC, algorithm: BaseAlgorithm | None, units: InputUnits
+) -> None:
+    """Warn where an unwrapped plant seems to take absolute inputs, and the MPC deviations.
+
+    Where the bounds are its absolute ones, or [-1, 1], there is nothing to doubt.
+    """
     venv = None if algorithm is None else algorithm.get_env()
     plain = None if venv is None else venv.unwrapped
-    if venv is None or not isinstance(plain, DummyVecEnv):
+    if units.kind != "deviation" or venv is None or not isinstance(plain, DummyVecEnv):
         return
     space, u_ss = venv.action_space, problem.model.u_ss
     if not (isinstance(space, spaces.Box) and plain.envs[0].unwrapped.action_space == space):
@@ -182,7 +202,38 @@ def warn_of_absolute_inputs(problem: LinearMPC, algorithm: BaseAlgorithm | None)
         )
 
 
-def _require_theta(
+def warn_of_misread_states(problem: LinearMPC, theta: Array) -> None:
+    """Warn where theta (batch, n_theta) holds absolute states, or lacks the operating point twice.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        The policy's.
+    theta : ndarray, shape (batch, n_theta)
+        What the policy made of its first observations.
+    """
+    for sign in (1, -1):
+        i = misread_state(problem, theta, sign)
+        if i is None:
+            continue
+        name, point = labels_of(problem.model)[0][i], problem.model.x_ss[i]
+        shown = theta[0, i] + (0 if sign == 1 else point)
+        said = f"state {name!r} = {shown:.6g} is shown, and the operating point is {point:.6g}: "
+        if sign == 1:
+            said += (
+                "the env shows absolute values, and the policy takes deviations. Wrap the plant in "
+                "sb3_yann.wrappers.Deviations(env, mpc.model), or pass "
+                "policy_kwargs={'observation': 'absolute'}."
+            )
+        else:
+            said += (
+                "the env shows deviations, and the policy takes absolute values. Pass "
+                "policy_kwargs={'observation': 'deviation'}."
+            )
+        warnings.warn(said, stacklevel=4)
+
+
+def require_theta(
     problem: LinearMPC,
     observation_space: spaces.Space[Any],
     observation: AffineObservation | None,
@@ -198,8 +249,6 @@ def _require_theta(
                 "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
             )
         return
-    if not isinstance(observation, AffineObservation):
-        raise TypeError(f"observation = {observation!r} must be an AffineObservation or None.")
     given = f"The map to theta has a matrix of shape {observation.matrix.shape}, but the"
     if shape is None or observation.n_obs != np.prod(shape):
         raise ValueError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_whole
+from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_choice, as_whole
+from sb3_yann.control import LinearMPC
+from sb3_yann.control.mpc.plant_units import InputUnits
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +176,65 @@ class AffineObservation(ReadOnlyArrays):
     def __repr__(self) -> str:
         """Name the matrix and the offset, so that it can be pasted."""
         return f"AffineObservation(matrix={self.matrix.tolist()}, offset={self.offset.tolist()})"
+
+
+Shown = AffineObservation | str | Mapping[str, ArrayLike]
+"""What may be said of an observation, see :func:`as_observation`."""
+SAY = (
+    "Say what it shows: policy_kwargs={'observation': 'deviation'}, 'absolute', or "
+    "{'center': ..., 'scale': ...} for (absolute - center) / scale"
+)
+
+
+def as_observation(
+    given: Shown | None, problem: LinearMPC, inputs: InputUnits
+) -> AffineObservation | None:
+    """Return the map from what an env shows to theta, None for the identity.
+
+    Parameters
+    ----------
+    given : AffineObservation, {"deviation", "absolute"} or mapping, optional
+        The mapping has a ``center`` in absolute values and a ``scale``, both (n_theta,): the env
+        shows ``(absolute - center) / scale``. By default an env that takes deviations shows them;
+        it shows absolute values where it takes them and the problem was stated in them.
+    problem : LinearMPC
+        Its operating point is taken off what is absolute.
+    inputs : InputUnits
+        What the env takes.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If ``given`` is none of these, or nobody can tell what the env shows.
+    """
+    if given is None:
+        given = _default(problem, inputs.kind)
+    if isinstance(given, AffineObservation):
+        return given
+    if isinstance(given, Mapping):
+        if set(given) != {"center", "scale"}:
+            raise ValueError(f"observation = {dict(given)} must have a 'center' and a 'scale'.")
+        center = as_array("observation['center']", given["center"], (problem.n_theta,))
+        return AffineObservation.normalized(center - problem.theta_ss, given["scale"])
+    if not isinstance(given, str):
+        raise TypeError(
+            f"observation = {given!r} must be an AffineObservation, 'deviation', 'absolute', a "
+            "mapping with 'center' and 'scale', or None."
+        )
+    absolute = as_choice("observation", given, ("deviation", "absolute")) == "absolute"
+    shifted = absolute and bool(np.any(problem.theta_ss))
+    return AffineObservation.deviation(problem.theta_ss) if shifted else None
+
+
+def _default(problem: LinearMPC, takes: str) -> str:
+    """Return what an env shows of which nothing is said."""
+    if takes == "absolute" and problem.absolute:
+        return "absolute"
+    unknown = problem.absolute and np.any(problem.theta_ss) and not np.any(problem.model.u_ss)
+    if takes == "deviation" and not unknown:
+        return "deviation"
+    why = "u_ss is zero: absolute inputs are deviations" if unknown else f"it takes {takes} inputs"
+    raise ValueError(f"What the env shows cannot be told from what it takes ({why}). {SAY}.")
 
 
 def require_frozen(normalize: VecNormalize) -> None:

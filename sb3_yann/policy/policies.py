@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_yann._validation import as_between, as_choice, as_discount, as_flag, as_whole
+from sb3_yann._validation import Array, as_between, as_choice, as_discount, as_flag, as_whole
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.choice import LAWS
 from sb3_yann.networks import RowAdam, SharedYannLayer
@@ -27,7 +27,7 @@ from sb3_yann.policy._features import AffineFeatures
 from sb3_yann.policy._finite import finite_gradient, warn_of_refused_step, watch_buffer
 from sb3_yann.policy.actor_critic import YannActor, YannCritic, layer_for
 from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
-from sb3_yann.policy.observations import AffineObservation
+from sb3_yann.policy.observations import AffineObservation, Shown, as_observation
 from sb3_yann.policy.problem_registry import resolve_problem
 
 EPS = 1e-8
@@ -51,7 +51,7 @@ class YannPolicy(TD3Policy):
     observation_space : gymnasium.spaces.Box
         The parameter theta of the law, shape (n_theta,), or what ``observation`` makes theta of.
     action_space : gymnasium.spaces.Box, shape (m,)
-        Its bounds must be ``u_min`` and ``u_max`` of the problem.
+        Its bounds are ``u_min`` and ``u_max`` of the problem, these in absolute values, or [-1, 1].
     lr_schedule : callable
         SB3's learning rate schedule.
     problem : LinearMPC or str, optional
@@ -76,8 +76,11 @@ class YannPolicy(TD3Policy):
     pin_equilibrium : bool, optional
         Whether actor and critic keep their value at ``theta = 0`` for good: not where the model's
         steady-state input is wrong. False for problems with references or disturbances, else True.
-    observation : AffineObservation, optional
-        The map from an observation to theta. The default is the identity.
+    observation : AffineObservation, {"deviation", "absolute"} or mapping, optional
+        What the env shows, or its map to theta. A mapping has a ``center``, in absolute values, and
+        a ``scale`` of ``(absolute - center) / scale``. An env that takes deviations shows them by
+        default. One that takes absolute inputs shows absolute values, if the problem has
+        ``absolute=True``.
     law : {"auto", "explicit", "online"}, default "auto"
         The explicit law, or the one whose program is solved at each point: see
         :meth:`LinearMPC.law`.
@@ -125,7 +128,7 @@ class YannPolicy(TD3Policy):
         critic_warmup: int = 2000,
         max_correction: float | None = None,
         pin_equilibrium: bool | None = None,
-        observation: AffineObservation | None = None,
+        observation: Shown | None = None,
         law: str = "auto",
         networks: str | None = None,
         **sb3_kwargs: Any,
@@ -134,18 +137,24 @@ class YannPolicy(TD3Policy):
         _checks.require_plain_td3(algorithm)
         names = [*inspect.signature(YannPolicy).parameters]
         _checks.require_sb3_kwargs(sb3_kwargs, own=names[names.index("problem") : -1])
-        flattened = observation is not None
-        _checks.require_box("observation_space", observation_space, flattened)
+        _checks.require_box("observation_space", observation_space, observation is not None)
         _checks.require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
         self.saved_kwargs = _sb3_hooks.own_policy_kwargs(algorithm)
         if isinstance(problem, str):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             self.saved_kwargs["problem"] = self.problem
-        _checks.require_matching(self.problem, observation_space, action_space, observation)
-        _checks.warn_of_absolute_inputs(self.problem, algorithm)
-        _checks.require_undone_normalization(self.problem, algorithm, observation)
-        self.observation = observation
+        told = observation is not None
+        self.input_units = _checks.as_input_units(self.problem, action_space, told)
+        self.observation = as_observation(observation, self.problem, self.input_units)
+        _checks.require_theta(self.problem, observation_space, self.observation)
+        _checks.warn_of_absolute_inputs(self.problem, algorithm, self.input_units)
+        undone = isinstance(observation, AffineObservation | Mapping)
+        given = self.observation if undone else None
+        _checks.require_undone_normalization(self.problem, algorithm, given)
+        if told or self.observation is not None:
+            self.saved_kwargs["observation"] = self.observation or "deviation"
+        self.looked = False  # at the first observation
         self.gamma = as_discount(getattr(algorithm, "gamma", 0.99) if gamma is None else gamma)
         self.lr_mult = {
             "actor": as_between("actor_lr_mult", actor_lr_mult, 0, np.inf, "[)"),
@@ -252,6 +261,21 @@ class YannPolicy(TD3Policy):
         with th.no_grad():
             return self.actor.extract_features(obs, self.actor.features_extractor)
 
+    def inputs(self, actions: ArrayLike) -> Array:
+        """Return the inputs in deviations, (batch, m), of actions as the env takes them."""
+        return self.input_units.input(actions)
+
+    def predict(
+        self, observation: Any, *args: Any, **kwargs: Any
+    ) -> tuple[Any, tuple[Any, ...] | None]:
+        """Return SB3's prediction; name an absolute observation that is taken for a deviation."""
+        predicted = super().predict(observation, *args, **kwargs)
+        if not self.looked:
+            self.looked = True
+            rows = np.reshape(observation, (-1, *cast(Any, self.observation_space.shape)))
+            _checks.warn_of_misread_states(self.problem, self.theta(rows).double().cpu().numpy())
+        return predicted
+
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Return the map from an observation to theta."""
         if self.observation is None:
@@ -313,7 +337,7 @@ class YannPolicy(TD3Policy):
             "critic_warmup": self.critic_warmup,
             "max_correction": self.max_correction,
             "pin_equilibrium": self.pin_equilibrium,
-            "observation": self.observation,
+            "observation": self.observation or "deviation",
             "law": self.law,
             "networks": self.networks,
         }

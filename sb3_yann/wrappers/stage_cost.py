@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, as_number
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.mpc.plant_units import InputUnits
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
 
@@ -27,9 +28,10 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     problem : LinearMPC
     violation_cost : float, default 0
         Added to the cost of a step that reports ``info["violation"]``.
-    observation : AffineObservation, optional
-        The map from an observation, absolute or normalized, to theta: the one of the policy. The
-        action is in deviations all the same.
+    observation : AffineObservation, {"deviation", "absolute"} or mapping, optional
+        What the env shows, or its map to theta: as in :class:`YannPolicy`. By default it is theta,
+        or absolute where the env takes absolute inputs and the problem has ``absolute=True``. The
+        cost counts absolute inputs, and those in [-1, 1], as the problem does.
 
     Examples
     --------
@@ -45,14 +47,20 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         env: Env,
         problem: LinearMPC,
         violation_cost: float = 0.0,
-        observation: Callable[[ArrayLike], Array] | None = None,
+        observation: Callable[[ArrayLike], Array] | str | Mapping[str, ArrayLike] | None = None,
     ) -> None:
         super().__init__(env)
         space = require_vector(env, "observation_space")
         self.inputs = require_vector(env, "action_space")
         names = problem.layout.names
+        units = InputUnits.of(problem, self.inputs.low, self.inputs.high)
+        self.units = units or InputUnits("deviation", np.ones(1), np.zeros(1))
+        if observation is None and problem.absolute and self.units.kind == "absolute":
+            observation = "absolute"
         if observation is not None and not callable(observation):
-            raise TypeError(f"observation = {observation!r} must be an AffineObservation or None.")
+            from sb3_yann.policy.observations import as_observation  # loads PyTorch
+
+            observation = as_observation(observation, problem, self.units)
         self.seen: Callable[[ArrayLike], Array] = observation or _as_it_is
         shape = np.shape(self.seen(np.zeros(space.shape)))
         if shape != (problem.n_theta,):
@@ -74,6 +82,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Step; the reward is the one of this wrapper."""
         u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
+        u = self.units.input(u)
         cost = float(self.problem.stage_cost(self.theta, u))
         observation, _, terminated, truncated, info = self.env.step(action)
         if self._too_fast(u):

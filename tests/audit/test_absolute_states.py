@@ -6,6 +6,7 @@ import dataclasses
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from gymnasium import wrappers
 
 from audit_samples import audited
@@ -30,7 +31,8 @@ def shown(mpc: LinearMPC) -> gym.Env:
 
 
 def test_absolute_states_are_named_though_the_reward_agrees() -> None:
-    finding = audited(shown(problem()), mpc=problem()).finding
+    with pytest.warns(UserWarning, match=r"state 'x\[0\]' = 47\d.* the operating point is 475"):
+        finding = audited(shown(problem()), mpc=problem()).finding
     assert (finding.matches, finding.cause) == (False, "absolute observation")
     assert "wrappers.Deviations(env, mpc.model)" in finding.message
     assert "The reward is not" not in finding.message

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array
+from sb3_yann._validation import Array, as_array
 from sb3_yann.control.law._files import read_law, write_arrays
+from sb3_yann.control.law.on_plant import OnPlant, plant_arrays, with_plant
 from sb3_yann.control.polyhedra import largest_ball
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def _none() -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True, eq=False)
-class PiecewiseAffine(ReadOnlyArrays):
+class PiecewiseAffine(OnPlant):
     """The law ``u = gains[i] theta + offsets[i]`` for theta in region i, total and bounded.
 
     The region at theta is the one whose smallest slack ``b - A theta`` is largest, the first of
@@ -178,8 +179,12 @@ class PiecewiseAffine(ReadOnlyArrays):
         return np.asarray(self._choose(theta)[1] >= -self.tolerance)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the law, and its search tree, to ``path`` as an ``.npz`` file of plain arrays."""
+        """Write the law to ``path`` as an ``.npz`` file of plain arrays.
+
+        Its search tree and its plant go along: operating point, dt, names and units.
+        """
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        arrays |= plant_arrays(self)
         if self.tree is not None:
             arrays.update({f"tree_{name}": each for name, each in vars(self.tree).items()})
         write_arrays(path, arrays)
@@ -201,7 +206,7 @@ class PiecewiseAffine(ReadOnlyArrays):
             from sb3_yann.control.law.search_tree import SearchTree
 
             law.__dict__["tree"] = SearchTree(**tree).checked(law.n_theta, law.n_regions)
-        return law
+        return with_plant(law, data)
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -94,7 +94,8 @@ class LinearMPC(MPCProblem):
     terminal : Terminal, optional
         The terminal cost, by default the Riccati solution, and the terminal set.
     absolute : bool, default False
-        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations.
+        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations, so
+        `dataclasses.replace` takes and returns a problem in deviations.
 
     Raises
     ------
@@ -109,6 +110,8 @@ class LinearMPC(MPCProblem):
     >>> mpc.explicit()([-5.0, 0.0])
     array([1.])
     """
+
+    absolute: bool = field(default=False, init=False, compare=False)
 
     def __init__(  # noqa: PLR0913 (the user's arguments)
         self,
@@ -164,6 +167,7 @@ class LinearMPC(MPCProblem):
             tracking, d, rate, outputs, soft,
         )  # fmt: skip
         super().__init__(*checked, _completed(MPCProblem(*checked, terminal)))
+        self._store(absolute=bool(absolute))
 
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the next theta on the model; theta is (n_theta,) or (batch, n_theta)."""
@@ -262,7 +266,8 @@ class LinearMPC(MPCProblem):
         budget = SolveBudget(time_limit, region_limit, progress)
         if solver not in self._laws:
             program, limits = self.condensed(), (self.u_min, self.u_max)
-            self._laws[solver] = solve_explicit(program, *limits, self.infeasible, solver, budget)
+            law = solve_explicit(program, *limits, self.infeasible, solver, budget)
+            self._laws[solver] = law.on_plant(self.model, self.theta_ss)
         budget.require(self._laws[solver].n_regions)
         return self._laws[solver]
 
@@ -280,7 +285,8 @@ class LinearMPC(MPCProblem):
 
     @cached_property
     def _online(self) -> OnlineLaw:
-        return OnlineLaw.of(self.condensed(), self.u_min, self.u_max, self.infeasible)
+        law = OnlineLaw.of(self.condensed(), self.u_min, self.u_max, self.infeasible)
+        return law.on_plant(self.model, self.theta_ss)
 
     @cached_property
     def _laws(self) -> dict[str, PiecewiseAffine]:

@@ -71,6 +71,16 @@ class MPCProblem(ReadOnlyArrays):
         return self.layout.size
 
     @cached_property
+    def theta_ss(self) -> Array:
+        """Theta at the operating point as the plant shows it (n_theta,): x_ss, C x_ss, d_ss, u_ss.
+
+        Theta itself is what the plant shows less this.
+        """
+        model = self.model
+        parts = model.x_ss, self.tracking.C @ model.x_ss, model.d_ss
+        return np.concatenate([*parts, model.u_ss[: self.layout.n_previous]])
+
+    @cached_property
     def theta_half(self) -> Array:
         """The half-widths of the box of theta (n_theta,), 1 where it is unbounded."""
         return half_widths(self.theta_min, self.theta_max)

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, half_widths
+from sb3_yann._validation import Array, as_array, half_widths
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
 from sb3_yann.control.explicit.steep import SteepQP
 from sb3_yann.control.law._files import read_law, write_arrays
+from sb3_yann.control.law.on_plant import OnPlant, plant_arrays, with_plant
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, as_points
 from sb3_yann.control.online.dual_program import (
     Answers,
@@ -31,7 +32,7 @@ _KEPT = ("dual", "known", "program", "scaled", "half")
 
 
 @dataclass(frozen=True, eq=False)
-class OnlineLaw(ReadOnlyArrays):
+class OnlineLaw(OnPlant):
     """The first input of a condensed program, which is solved at each theta; total and bounded.
 
     A compiled dual active-set method solves it, and an answer counts where all optimality
@@ -164,8 +165,9 @@ class OnlineLaw(ReadOnlyArrays):
         return gains if points.ndim == 2 else gains[0]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the program to ``path`` as an ``.npz`` file of plain arrays."""
-        write_arrays(path, {field.name: getattr(self, field.name) for field in fields(self)})
+        """Write the program to ``path`` as an ``.npz`` file of plain arrays, with its plant."""
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        write_arrays(path, arrays | plant_arrays(self))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> OnlineLaw:
@@ -177,7 +179,7 @@ class OnlineLaw(ReadOnlyArrays):
         values = {field.name: data[field.name] for field in fields(cls)}
         for name, kind in (("infeasible", str), ("n_slacks", int)):
             values[name] = kind(values[name])
-        return cls(**values)
+        return with_plant(cls(**values), data)
 
     @cached_property
     def program(self) -> ParametricQP:

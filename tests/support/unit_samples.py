@@ -1,0 +1,75 @@
+"""A linear plant in its own units, absolute or normalized, and the MPC of it."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import TimeLimit
+
+from sb3_yann import LinearModel, LinearMPC
+
+X_SS, U_SS = np.array([350.0, 2.0]), np.array([40.0])
+MODEL = LinearModel(
+    [[0.9, 0.2], [0, 0.7]], [[0], [0.5]], 0.1, X_SS, U_SS, state_names=["temperature", "level"]
+)
+LIMITS = {"x_min": [340, 0], "x_max": [360, 4], "u_min": 38, "u_max": 45}
+CENTER, SCALE = np.array([345.0, 2.0]), np.array([10.0, 2.0])
+
+
+def absolute_mpc() -> LinearMPC:
+    return LinearMPC(MODEL, Q=np.eye(2), R=[[0.1]], horizon=3, gamma=0.99, absolute=True, **LIMITS)
+
+
+def deviation_mpc() -> LinearMPC:
+    """Return the same problem, as one that was stated in deviations."""
+    x, u = np.array([LIMITS["x_min"], LIMITS["x_max"]]) - X_SS, np.array([38, 45]) - U_SS[0]
+    bounds = {"x_min": x[0], "x_max": x[1], "u_min": u[0], "u_max": u[1]}
+    return LinearMPC(MODEL, Q=np.eye(2), R=[[0.1]], horizon=3, gamma=0.99, **bounds)
+
+
+SHOWS = {
+    "deviation": lambda x: x,
+    "absolute": lambda x: x + X_SS,
+    "normalized": lambda x: (x + X_SS - CENTER) / SCALE,
+}
+SAYS = {
+    "deviation": "deviation",
+    "absolute": "absolute",
+    "normalized": {"center": CENTER.tolist(), "scale": SCALE.tolist()},
+}
+TAKES = {"deviation": (-2.0, 5.0, 0.0), "absolute": (38.0, 45.0, 40.0), "normalized": (-1, 1, None)}
+
+
+class OwnUnits(gym.Env):
+    """The model as a plant; it shows and takes what it is told to."""
+
+    def __init__(self, shows: str, takes: str, dtype: type = np.float64) -> None:
+        self.shows, self.takes, self.dtype = SHOWS[shows], takes, dtype
+        low, high, _ = TAKES[takes]
+        self.action_space = gym.spaces.Box(dtype(low), dtype(high), (1,), dtype)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), dtype)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(-1, 1, 2)
+        return self.shows(self.x).astype(self.dtype), {}
+
+    def input(self, action) -> np.ndarray:
+        """Return the input in deviations."""
+        action = np.asarray(action, np.float64)
+        return 1.5 + 3.5 * action if self.takes == "normalized" else action - TAKES[self.takes][2]
+
+    def step(self, action):
+        u = self.input(action)
+        cost = self.x @ self.x + 0.1 * u @ u
+        self.x = MODEL.step(self.x, u)
+        return self.shows(self.x).astype(self.dtype), -float(cost), False, False, {}
+
+
+def plant(shows: str, takes: str, dtype: type = np.float64) -> gym.Env:
+    return TimeLimit(OwnUnits(shows, takes, dtype), 20)
+
+
+def states(count: int, seed: int, reach: float = 1.0) -> np.ndarray:
+    """Return deviations of the state within the box of the law, or a part of it."""
+    return np.random.default_rng(seed).uniform([-10, -2], [10, 2], (count, 2)) * reach
