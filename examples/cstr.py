@@ -12,8 +12,8 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from sb3_yann import ControlDiagnostics, ImprovementGuard, NoActionNoise, YannPolicy
-from sb3_yann.evaluation import comparison_table, evaluate, save_trajectories
-from sb3_yann_envs.cstr import DT, TEMPERATURE_LIMIT, X_SS
+from sb3_yann.evaluation import comparison_table, evaluate, save_plant_trajectories
+from sb3_yann_envs.cstr import TEMPERATURE_LIMIT
 
 STEPS = 400  # of one episode
 TEST_SEEDS = range(1000, 1010)  # starts that training never sees
@@ -46,14 +46,13 @@ def main() -> None:
         f"The guard accepted {taken} of {len(guard.decisions)} candidates, whole or in part; "
         "each decision is in out/guard.csv."
     )
-    picture = save_trajectories(
+    picture = save_plant_trajectories(
         "out/cstr.png",
         {"before (linear MPC)": before, "after training": after},
-        states={3: "ΔT [K]", 0: "ΔC_A [mol/L]"},
-        inputs=["ΔU [kJ/(h m² K)]"],
-        dt=DT,
-        time_unit="h",
-        limits={3: (TEMPERATURE_LIMIT - X_SS[3], f"limit, {TEMPERATURE_LIMIT:g} K")},
+        model.policy.problem,
+        "h",
+        entries=[3, 0],
+        limits={3: (TEMPERATURE_LIMIT, f"limit, {TEMPERATURE_LIMIT:g} K")},
     )
     console.print(f"Trajectories: {picture}    Curves: tensorboard --logdir out/tensorboard")
 

@@ -12,8 +12,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import ControlDiagnostics, ImprovementGuard, NoActionNoise, YannPolicy
-from sb3_yann.evaluation import comparison_table, evaluate, save_trajectories
-from sb3_yann_envs.clipped_pendulum import DT
+from sb3_yann.evaluation import comparison_table, evaluate, save_plant_trajectories
 
 STEPS = 200  # of one episode
 TEST_SEEDS = range(1000, 1010)  # starts that training never sees
@@ -47,14 +46,8 @@ def main() -> None:
     after = evaluate(model, "ClippedPendulum-v0", TEST_SEEDS)
 
     console.print(comparison_table("Cost of ten test episodes, ClippedPendulum-v0", before, after))
-    picture = save_trajectories(
-        "out/pendulum.png",
-        {"before (linear MPC)": before, "after training": after},
-        states={0: "angle [rad]", 1: "speed [rad/s]"},
-        inputs=["torque [N m]"],
-        dt=DT,
-        time_unit="s",
-    )
+    runs = {"before (linear MPC)": before, "after training": after}
+    picture = save_plant_trajectories("out/pendulum.png", runs, model.policy.problem, "s")
     console.print(f"Trajectories: {picture}")
 
 

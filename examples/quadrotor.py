@@ -18,17 +18,20 @@ from stable_baselines3 import DDPG
 from quadrotor_plant import DT, MAX_THRUST, STARTS, Quadrotor, derivative
 from sb3_yann import ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import LinearModel, LinearMPC, SoftBounds
-from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
+from sb3_yann.evaluation import evaluate, save_plant_trajectories, summary_table
 from sb3_yann.wrappers import Deviations, StageCost
 
 STEPS = 100  # of one episode: 5 s
 TEST_SEEDS = range(3000, 3100)  # starts that training and guard never see
 SOFT_TILT = 0.5  # rad
+STATES = "x y z roll pitch yaw vx vy vz p q r".split()
 
 
 def hover() -> LinearMPC:
     """Return the MPC that hovers: a second ahead, with a soft bound on the tilt."""
     model = LinearModel.from_dynamics(derivative, np.zeros(12), [np.nan] * 4, DT)
+    units = [*np.repeat(["m", "rad", "m/s", "rad/s"], 3), *["N"] * 4]
+    model = model.named(STATES, [f"rotor {k}" for k in range(4)], units)
     tilt = np.full(12, np.inf)
     tilt[3:5] = SOFT_TILT
     soft = SoftBounds(np.where(np.isfinite(tilt), 0.1, 0.0), penalty=300.0)
@@ -66,8 +69,7 @@ def main() -> None:
     console.print(f"The guard accepted {taken} of {len(guard.decisions)} candidates.")
     both = {"before (linear MPC)": mpc.online(), "after training": model}
     runs = {name: evaluate(each, make, TEST_SEEDS[:1]) for name, each in both.items()}
-    names = {0: "x [m]", 2: "z [m]", 4: "pitch [rad]"}, [f"Δrotor {k} [N]" for k in range(4)]
-    path = save_trajectories("out/quadrotor.png", runs, *names, DT, "s")
+    path = save_plant_trajectories("out/quadrotor.png", runs, mpc, "s", entries=[0, 2, 4])
     console.print(f"Picture: {path}    The guard's decisions: out/quadrotor.csv")
 
 

@@ -24,6 +24,7 @@ def clipped_pendulum() -> LinearMPC:
     array([0.])
     """
     model = LinearModel(pendulum.PRINTED_A, pendulum.PRINTED_B, pendulum.DT)
+    model = model.named(["angle", "speed"], ["torque"], ["rad", "rad/s", "N m"])
     return LinearMPC(
         model,
         Q=pendulum.Q,
@@ -51,6 +52,8 @@ def cstr() -> LinearMPC:
     model = LinearModel(
         reactor.PRINTED_A, reactor.PRINTED_B, reactor.DT, reactor.X_SS, reactor.U_SS
     )
+    units = [*["mol/L"] * 3, "K", "kJ/(h m² K)"]
+    model = model.named(["C_A", "C_B", "C_S", "T"], ["U"], units)
     return LinearMPC(
         model,
         Q=reactor.Q,

@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_yann._validation import Array, as_array
 from sb3_yann.commissioning.bands import GAINS, Act, Bands, Tracks
+from sb3_yann.control.model.labels import name_of
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -187,7 +188,10 @@ class Watchdog:
         noisy = bands.noisy & (stands >= FROZEN * (1 + bands.repeats))
         moving = np.abs(episode.moved) > MOVED * stands * bands.error
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
-            said = f"reading {i} has been {after[i]:.6g} for {stands[i]} samples"
+            model = self.dynamics.problem.model
+            name, shown = model.state_names, after[i] + model.x_ss[i]
+            said = f"{name[i] if name else f'reading {i}'} has been {shown:.6g}"
+            said += f" for {stands[i]} samples"
             return episode.alarm("frozen sensor", f"{said}; the twin moves or the sensor is noisy")
         return None
 
@@ -198,14 +202,18 @@ class Watchdog:
             return None
         gain, i = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
         mean, times = episode.tracks.charts[gain, i], ratios[gain, i]
-        said = f"state {i} is off the twin's prediction by {mean:.3g}"
+        model = self.dynamics.problem.model
+        said = f"{name_of(model, 'state', int(i))} is off the twin's prediction by {mean:.3g}"
         if GAINS[gain] < 1.0:
             said += f" on an average of {1 / GAINS[gain]:.0f} samples"
         said += f", {times:.3g} bands"
         stuck = self._stuck(episode)
         if stuck is not None:
             j, value = stuck
-            return episode.alarm("actuator", f"{said}: as if input {j} stuck at {value:.4g}")
+            value += model.u_ss[j]
+            return episode.alarm(
+                "actuator", f"{said}: as if {name_of(model, 'input', j)} stuck at {value:.4g}"
+            )
         return episode.alarm("outside the band" if GAINS[gain] == 1.0 else "drift", said)
 
     def _dear(self, episode: _Episode) -> Alarm | None:

@@ -1,7 +1,14 @@
 """Seeded episodes, tables and pictures."""
 
 from sb3_yann.evaluation.episodes import Episodes, evaluate
-from sb3_yann.evaluation.plots import save_trajectories
+from sb3_yann.evaluation.plots import save_plant_trajectories, save_trajectories
 from sb3_yann.evaluation.tables import comparison_table, summary_table
 
-__all__ = ["Episodes", "comparison_table", "evaluate", "save_trajectories", "summary_table"]
+__all__ = [
+    "Episodes",
+    "comparison_table",
+    "evaluate",
+    "save_plant_trajectories",
+    "save_trajectories",
+    "summary_table",
+]

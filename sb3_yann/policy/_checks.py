@@ -239,7 +239,7 @@ def require_theta(
     observation: AffineObservation | None,
 ) -> None:
     """Raise unless theta is what is observed, or what ``observation`` makes of it."""
-    shape, names = observation_space.shape, ", ".join(problem.layout.names)
+    shape, names = observation_space.shape, ", ".join(problem.labels())
     takes = f"takes theta of shape ({problem.n_theta},), that is {names}"
     if observation is None:
         if shape != (problem.n_theta,):

@@ -44,6 +44,14 @@ def without_entries(
     return theta.masked_fill(lost | ~theta.isfinite(), 0.0)
 
 
+def keeps_entries(extractor: BaseFeaturesExtractor | nn.Module) -> bool:
+    """Tell whether each entry of theta is that of the observation, in whatever units."""
+    if not isinstance(extractor, AffineFeatures):
+        return True
+    matrix = extractor.matrix
+    return matrix.shape[0] == matrix.shape[1] and bool(th.equal(matrix, matrix.diag().diag()))
+
+
 class SeesTheta(BaseModel):
     """An actor or critic of SB3 whose features are theta, not rounded on the way."""
 

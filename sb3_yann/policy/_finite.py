@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 import weakref
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -127,9 +128,13 @@ def warn_of_refused_step(name: str, optimizer: th.optim.Optimizer, refused: int)
     )
 
 
-def what_is_not_finite(lost: NDArray[np.bool_]) -> str:
-    """Say what an actor did without: entries of observations (batch, n), or its networks."""
+def what_is_not_finite(lost: NDArray[np.bool_], names: Sequence[str] = ()) -> str:
+    """Say what an actor did without: entries of observations (batch, n), or its networks.
+
+    ``names`` are those of the entries, where they are known.
+    """
     if entries := np.flatnonzero(lost.any(0)).tolist():
-        where = f"The observation is not finite in entries {entries}"
+        called = f" ({', '.join(names[i] for i in entries)})" if names else ""
+        where = f"The observation is not finite in entries {entries}{called}"
         return f"{where}: the law acts, at the operating point in what depends on them."
     return "The actor's networks put out what is not finite: the law acts alone."

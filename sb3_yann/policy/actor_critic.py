@@ -21,7 +21,7 @@ from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks import AfterstateValue, SharedYannLayer, YannLayer
 from sb3_yann.networks.law_layer import LawLayer
-from sb3_yann.policy._features import SeesTheta, without_entries
+from sb3_yann.policy._features import SeesTheta, keeps_entries, without_entries
 from sb3_yann.policy._finite import what_is_not_finite
 from sb3_yann.policy.critic_options import CriticOptions
 
@@ -108,7 +108,10 @@ class YannActor(SeesTheta, Actor):
         theta = without_entries(theta, lost, self.features_extractor)
         actions: th.Tensor = self.mu(theta)
         whole = (~lost.any(1, keepdim=True)) & actions.detach().isfinite().all(1, keepdim=True)
-        said = what_is_not_finite(lost.cpu().numpy())
+        problem: LinearMPC = self.options["problem"]  # type: ignore[assignment]
+        named = problem.model.state_names and keeps_entries(self.features_extractor)
+        names = problem.labels() if named else ()
+        said = what_is_not_finite(lost.cpu().numpy(), names)
         if said != self.named:  # once, for a sensor that stays so
             warnings.warn(said, NonFiniteWarning, stacklevel=3)
         self.named = said

@@ -292,7 +292,8 @@ def _trust(
     costs = held_out_costs(problem, coordinates, log, choices[chosen])
     inputs = excitation(problem, log)
     beyond = beyond_the_box(problem, log)
-    problems, advice = judge(runs, standing, costs, inputs, len(log), beyond)
+    names = problem.model.input_names
+    problems, advice = judge(runs, standing, costs, inputs, len(log), beyond, names)
     problems += foreign_previous(problem, log)
     n, first = problem.model.n_states, Dynamics(problem, coordinates, dynamics.members[:1])
     left = np.concatenate(

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.trust import ALONE, Trust
 
@@ -73,11 +74,12 @@ def _inputs(problem: LinearMPC, trust: Trust) -> Iterator[str]:
         if trust.excitation[k] < ALONE:
             known = "its gain rests on the given B"
         moves, share = 100 * trust.moves[k], 100 * trust.excitation[k]
-        yield f"  u[{k}]: {moves:.3g} % of half the range, {share:.3g} %: {known}"
+        name = labels_of(problem.model)[1][k]
+        yield f"  {name}: {moves:.3g} % of half the range, {share:.3g} %: {known}"
 
 
 def _noise(problem: LinearMPC, trust: Trust) -> Iterator[str]:
-    names = problem.layout.names[: problem.model.n_states]
+    names = labels_of(problem.model)[0]
     found = ", ".join(f"{n} {s:.2g}" for n, s in zip(names, trust.noise, strict=True))
     yield f"Sensor noise, at most (standard deviations): {found}."
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -188,6 +189,7 @@ def judge(
     inputs: tuple[Array, Array],
     n_episodes: int,
     beyond: float,
+    names: Sequence[str] = (),
 ) -> tuple[list[str], list[str]]:
     """Return what speaks against a twin, and what would help.
 
@@ -205,6 +207,8 @@ def judge(
         In the log.
     beyond : float
         Share of logged rows beyond the box of theta.
+    names : sequence of str, optional
+        Those of the inputs.
     """
     problems, advice = [], []
     share, moves = inputs
@@ -213,11 +217,13 @@ def judge(
         advice.append("Log at least one episode more; five are a good number.")
     still: NDArray[np.bool_] = moves < STILL
     for k in np.flatnonzero(still):
-        problems.append(f"Input {k} never moves: what it does is not in the log.")
-        advice.append(f"Make a small step test on input {k}, or log another set-point.")
+        which, what = (names[k] if names else f"{each} {k}" for each in ("Input", "input"))
+        problems.append(f"{which} never moves: what it does is not in the log.")
+        advice.append(f"Make a small step test on {what}, or log another set-point.")
     for k in np.flatnonzero(~still & (share < ALONE)):
+        which = names[k] if names else f"Input {k}"
         advice.append(
-            f"Input {k} follows the state ({100 * share[k]:.2g} % of its variance is its own), so "
+            f"{which} follows the state ({100 * share[k]:.2g} % of its variance is its own), so "
             "its gain rests on the given B. A small step test on it would tell."
         )
     if n_episodes > 1 and runs.errors[0][0] > FOREIGN * standing[0]:

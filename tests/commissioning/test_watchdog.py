@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -181,3 +182,17 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         Watchdog.of(PlantTwin.fit(problem(), log(1)))
     with pytest.raises(ValueError, match="theta has shape"):
         watchdog().start(np.zeros(3), problem().explicit())
+
+
+def test_an_alarm_calls_sensors_by_their_names_and_shows_what_they_read() -> None:
+    plain = problem()
+    model = replace(plain.model.named(["place", "speed"], ["force"]), x_ss=[100, 0])
+    twin = PlantTwin.fit(replace(plain, model=model), log(6, 0.002))
+    rng, u = np.random.default_rng(0), np.zeros(1)
+    x = 1e-3 * rng.standard_normal((12, 2))
+    x[6:, 0] = x[5, 0]
+    alarm = barks(Watchdog.of(twin), [(x[k], u, x[k + 1]) for k in range(11)])[1]
+    assert f"place has been {100 + x[5, 0]:.6g} for" in alarm.message
+    theta, u, after = drive(2)[0]
+    alarm = barks(Watchdog.of(twin), [(theta, u, after + np.array([0.2, 0.0]))])[1]
+    assert "place is off the twin's prediction" in alarm.message

@@ -18,7 +18,7 @@ PRINTED = {
     "pendulum": ["regions=7", "mean"],
     "own_plant": [
         "sampled every 10",
-        "r[1]",
+        "set-point of h2 (cm)",
         "regions and",
         "The reward is the cost of the problem in all of",
         "50 unseen set-point sequences",

@@ -22,6 +22,7 @@ from sb3_yann import (
     ImprovementGuard,
     LinearMPC,
     NoActionNoise,
+    NonFiniteWarning,
     YannPolicy,
 )
 from sb3_yann.commissioning.plant import Plant
@@ -210,3 +211,14 @@ def test_what_is_read_rightly_is_not_named(shows: str, takes: str) -> None:
         warnings.simplefilter("error")
         build(env, units.SAYS[shows]).predict(env.reset(seed=0)[0])
         build(Deviations(units.OwnUnits("absolute", "absolute"), MPC.model)).predict(np.zeros(2))
+
+
+@pytest.mark.parametrize("shows", units.SHOWS)
+def test_a_reading_that_is_lost_is_called_by_its_name(shows: str) -> None:
+    """The law then acts at the operating point of that state, in any units."""
+    env = units.plant(shows, "absolute")
+    model, x = build(env, units.SAYS[shows]), np.array([0.0, 0.7])
+    seen = np.where([True, False], np.nan, env.unwrapped.shows(x))
+    with pytest.warns(NonFiniteWarning, match=r"not finite in entries \[0\] \(temperature\)"):
+        action = model.predict(seen)[0]
+    assert env.unwrapped.input(action) == pytest.approx(MPC.explicit()(x), abs=1e-5)

@@ -34,6 +34,15 @@ def test_it_predicts_episodes_that_it_has_not_seen() -> None:
         np.testing.assert_allclose(after, states[None, 1:].repeat(5, 0), atol=5e-3)
 
 
+def test_an_input_that_rests_is_called_by_its_name() -> None:
+    plain = problem()
+    named = plain.model.named(["place", "speed"], ["force"])
+    mpc = dataclasses.replace(plain, model=named)
+    text = PlantTwin.fit(mpc, log(3, act=lambda x: [0.5])).report()
+    assert "force never moves" in text and "a small step test on force" in text
+    assert "  force: " in text and "deviations): place " in text
+
+
 def test_the_jacobians_are_those_of_differences_inside_the_data_and_outside() -> None:
     dynamics, rng = twin().dynamics, np.random.default_rng(0)
     theta, u = rng.uniform(-4, 4, (5, 20, 2)), rng.uniform(-1, 1, (5, 20, 1))

@@ -105,3 +105,17 @@ def test_a_map_that_does_not_fit_is_named() -> None:
         StageCost(env, MPC, observation=AffineObservation([[1, 0]]))
     with pytest.raises(TypeError, match="observation = 3 must be an AffineObservation"):
         StageCost(env, MPC, observation=3)  # type: ignore[arg-type]
+
+
+def test_the_stage_cost_of_an_absolute_plant_follows_its_problem() -> None:
+    """What is shown and taken are absolute values, where the problem and the bounds say so."""
+    env = StageCost(Reactor(), MPC)
+    x = env.reset(seed=0)[0]
+    reward = env.step(np.array([11.5], np.float32))[1]
+    assert reward == pytest.approx(-float(MPC.stage_cost(x - X_SS, [1.5])))
+    plain = gym.wrappers.RescaleAction(Reactor(), np.float32([-1]), np.float32([1]))
+    env = StageCost(plain, MPC, observation={"center": np.zeros(2), "scale": np.ones(2)})
+    env.reset(seed=0)
+    assert env.step(np.array([0.0], np.float32))[1] == pytest.approx(
+        -float(MPC.stage_cost(x - X_SS, [1.5]))
+    )

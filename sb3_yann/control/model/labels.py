@@ -80,6 +80,29 @@ def with_units(model: LinearSystem) -> tuple[list[str], list[str]]:
     return whole[: len(states)], whole[len(states) :]
 
 
+def name_of(model: LinearSystem, kind: str, index: int) -> str:
+    """Return the name of a state or input, else ``state 0`` or ``input 0``.
+
+    Parameters
+    ----------
+    model : LinearModel
+        With or without names.
+    kind : {"state", "input"}
+        What it is.
+    index : int
+        Which one.
+
+    Examples
+    --------
+    >>> from sb3_yann.control import LinearModel
+    >>> model = LinearModel([[1]], [[1]], dt=1, state_names=["level"])
+    >>> name_of(model, "state", 0), name_of(model, "input", 0)
+    ('level', 'input 0')
+    """
+    given = model.state_names if kind == "state" else model.input_names
+    return given[index] if given else f"{kind} {index}"
+
+
 def short_repr(model: Any) -> str:
     """Return the sizes, names and operating point of a model, for one line."""
     states, inputs = with_units(model)

@@ -143,8 +143,11 @@ def _scaling(model: LinearSystem) -> list[str]:
         # An unstable plant has this steady state but does not approach it.
         stable = np.all(np.abs(poles(model)) < 1 - ON_CIRCLE)
         verb = "moves the state to" if stable else "would balance the state at"
+        held, away = "Held at 1", ""
+        if np.any(model.x_ss) or np.any(model.u_ss):  # what follows are deviations
+            held, away = "Held at u_ss + 1", "x_ss + "
         lines += [
-            f"  Held at 1, {labels_of(model)[1][j]} {verb} {_vector(g)}."
+            f"  {held}, {labels_of(model)[1][j]} {verb} {away}{_vector(g)}."
             for j, g in enumerate(gain.T)
         ]
     return lines

@@ -10,6 +10,7 @@ from scipy import linalg
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc._arguments import Bounds
 from sb3_yann.control.mpc.problem import MPCProblem
 
@@ -47,19 +48,28 @@ class _Rows:
         self.names: list[str] = []
 
     def add(
-        self, name: str, G: Array, w: Array, S: Array, softness: Array | None = None, kind: str = ""
+        self,
+        names: str | Sequence[str],
+        G: Array,
+        w: Array,
+        S: Array,
+        softness: Array | None = None,
+        kind: str = "",
     ) -> None:
-        """Add rows; the name may hold {} for the number of the row."""
+        """Add rows, of one name or with a name for each."""
         soft = np.zeros((len(w), len(self.slacks)))
         if kind in self.slacks and softness is not None:
             soft[:, self.slacks.index(kind)] = -softness
         self.parts.append((np.hstack([G, soft]), w, S))
-        self.names += [name.format(i) for i in range(len(w))]
+        self.names += [names] * len(w) if isinstance(names, str) else names
 
-    def add_bounds(self, name: str, G: Array, bounds: Bounds, S: Array, *softness: Any) -> None:
-        """Add rows for ``low <= G U + S theta <= high``."""
-        self.add(f"{name} at its upper bound", G, bounds[1], -S, *softness)
-        self.add(f"{name} at its lower bound", -G, -bounds[0], S, *softness)
+    def add_bounds(
+        self, names: Sequence[str], G: Array, bounds: Bounds, S: Array, *softness: Any
+    ) -> None:
+        """Add rows for ``low <= G U + S theta <= high``, with a name for each."""
+        upper, lower = ([f"{name} at its {k} bound" for name in names] for k in ("upper", "lower"))
+        self.add(upper, G, bounds[1], -S, *softness)
+        self.add(lower, -G, -bounds[0], S, *softness)
 
     def stacked(self) -> tuple[Array, Array, Array, tuple[str, ...]]:
         """Return G, w, S and the names of the rows that bound something."""
@@ -109,25 +119,26 @@ def _constraints(
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
     n, m, N = problem.n_theta, problem.model.n_inputs, problem.horizon
     free, rows = np.zeros((N * m, n)), _Rows(slacks)
-    inputs = [f"u[{i}] at its {{}} bound" for _ in range(N) for i in range(m)]
-    rows.add("", np.eye(N * m), np.tile(problem.u_max, N), free)
-    rows.add("", -np.eye(N * m), -np.tile(problem.u_min, N), free)
-    rows.names = [name.format(side) for side in ("upper", "lower") for name in inputs]
+    called, inputs = labels_of(problem.model)
+    limits = np.tile(problem.u_min, N), np.tile(problem.u_max, N)
+    rows.add_bounds(inputs * N, np.eye(N * m), limits, free)
 
     states, rate = slice(0, problem.model.n_states), problem.rate
     x = problem.x_min, problem.x_max
     for k in range(1, N + 1):
         forced, powers = prediction.forced[k][states], prediction.powers[k][states]
-        rows.add_bounds("x[{}]", forced, x, powers, problem.soft.x, "x")
+        rows.add_bounds(called, forced, x, powers, problem.soft.x, "x")
     last, upper = problem.terminal.set
     rows.add("the terminal set", last @ prediction.forced[N], upper, -last @ prediction.powers[N])
     for k in range(N) if problem.layout.n_previous else ():
         change, start = prediction.rate(problem, k)
-        rows.add_bounds("the rate of u[{}]", change, (rate.du_min, rate.du_max), start)
+        rates = [f"the rate of {each}" for each in inputs]
+        rows.add_bounds(rates, change, (rate.du_min, rate.du_max), start)
     C, y = problem.outputs.C, (problem.outputs.y_min, problem.outputs.y_max)
     for k in range(1, N + 1) if len(C) else ():
         forced, powers = prediction.forced[k][states], prediction.powers[k][states]
-        rows.add_bounds("y[{}]", C @ forced, y, C @ powers, problem.soft.y, "y")
+        outputs = [f"y[{i}]" for i in range(len(C))]
+        rows.add_bounds(outputs, C @ forced, y, C @ powers, problem.soft.y, "y")
     for kind in slacks:
         none = np.zeros((1, N * m)), np.zeros(1), np.zeros((1, n))
         rows.add(f"no violation of the soft bounds of {kind}", *none, np.ones(1), kind)

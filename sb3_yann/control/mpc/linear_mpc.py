@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -110,8 +110,6 @@ class LinearMPC(MPCProblem):
     >>> mpc.explicit()([-5.0, 0.0])
     array([1.])
     """
-
-    absolute: bool = field(default=False, init=False, compare=False)
 
     def __init__(  # noqa: PLR0913 (the user's arguments)
         self,

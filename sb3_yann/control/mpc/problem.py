@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from sb3_yann._validation import Array, ReadOnlyArrays, half_widths
+from sb3_yann.control.model.labels import labels_of, with_units
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.error_coordinates import ErrorSystem, error_system
 from sb3_yann.control.mpc.groups import (
@@ -34,6 +35,8 @@ class MPCProblem(ReadOnlyArrays):
         Infinite where there is no bound.
     tracking, disturbances, rate, outputs, soft, terminal : Tracking, DisturbanceBounds, ...
         Never None, and in the sizes of the model.
+    absolute : bool
+        Whether they were given as the plant shows them; all here are deviations.
     """
 
     model: LinearModel
@@ -54,6 +57,7 @@ class MPCProblem(ReadOnlyArrays):
     outputs: OutputBounds
     soft: SoftBounds
     terminal: Terminal
+    absolute: bool = field(default=False, init=False, compare=False)
 
     @property
     def has_rate_bounds(self) -> bool:
@@ -79,6 +83,29 @@ class MPCProblem(ReadOnlyArrays):
         model = self.model
         parts = model.x_ss, self.tracking.C @ model.x_ss, model.d_ss
         return np.concatenate([*parts, model.u_ss[: self.layout.n_previous]])
+
+    @property
+    def set_points(self) -> dict[int, int]:
+        """The entry of theta that is the reference of a state, by the state's index."""
+        rows = enumerate(self.tracking.C, start=self.model.n_states)
+        single = (each for each in rows if np.count_nonzero(each[1]) == 1 == np.max(each[1]))
+        return {int(np.argmax(row)): at for at, row in single}
+
+    def labels(self, units: bool = False) -> tuple[str, ...]:
+        """Return what each entry of theta is called: by the model's names, else as in the layout.
+
+        A set-point is called after the state that it is for. Units stand in parentheses.
+        """
+        model, found = self.model, list(self.layout.names)
+        states, inputs = with_units(model) if units else labels_of(model)
+        if model.state_names or (units and model.units):
+            found[self.layout.state] = states
+            for state, at in self.set_points.items():
+                found[at] = f"set-point of {states[state]}"
+        if model.input_names or (units and model.units):
+            previous = inputs[: self.layout.n_previous]
+            found[self.layout.previous] = [f"previous {each}" for each in previous]
+        return tuple(found)
 
     @cached_property
     def theta_half(self) -> Array:
@@ -128,15 +155,20 @@ class MPCProblem(ReadOnlyArrays):
         sizes = f"states={self.model.n_states}, inputs={self.model.n_inputs}"
         options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
         tracking, d, rate, outputs = self.tracking, self.disturbances, self.rate, self.outputs
-        bounds = {
-            "x": (self.x_min, self.x_max),
-            "u": (self.u_min, self.u_max),
-            "r": (tracking.r_min, tracking.r_max),
-            "d": (d.d_min, d.d_max),
-            "du": (rate.du_min, rate.du_max),
-            "y": (outputs.y_min, outputs.y_max),
+        model, whole = self.model, int(self.absolute)  # as they were given
+        bounds: dict[str, tuple[Array, Array, Array]] = {
+            "x": (self.x_min, self.x_max, model.x_ss),
+            "u": (self.u_min, self.u_max, model.u_ss),
+            "r": (tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
+            "d": (d.d_min, d.d_max, model.d_ss),
+            "du": (rate.du_min, rate.du_max, 0 * model.u_ss),
+            "y": (outputs.y_min, outputs.y_max, outputs.C @ model.x_ss),
         }
-        told = [_bounds_in_words(name, *sides) for name, sides in bounds.items()]
+        told = [
+            _bounds_in_words(name, low + whole * point, high + whole * point)
+            for name, (low, high, point) in bounds.items()
+        ]
+        told.append("absolute=True" if whole else "")
         return f"{type(self).__name__}({', '.join([sizes, options, *filter(None, told)])})"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.solve import ProgramUnits
-from sb3_yann.control.model.labels import with_units
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.problem import MPCProblem
@@ -47,21 +47,17 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
         "d": "disturbance, constant over the horizon",
         "u_prev": "input of the step before",
     }
-    yield f"Parameters of the law, {problem.n_theta}, as deviations from the operating point:"
-    bounds = zip(problem.layout.names, problem.theta_min, problem.theta_max, strict=True)
-    for name, low, high in bounds:
+    points, rests = problem.theta_ss, np.any(problem.theta_ss)
+    how = "as the plant shows them; theta counts from what is in brackets" if rests else "in theta"
+    yield f"Parameters of the law, {problem.n_theta}, {how}:"
+    labels, names = problem.labels(units=True), problem.layout.names
+    width = max(10, *map(len, labels))
+    low, high = problem.theta_min + points, problem.theta_max + points
+    for i, (label, name) in enumerate(zip(labels, names, strict=True)):
         kind, index = name[:-1].split("[")
-        called = f"  {name:<10} {low:>10.4g} to {high:<10.4g} {meanings[kind]} {index}"
-        yield called + _own_name(problem, kind, int(index))
-
-
-def _own_name(problem: MPCProblem, kind: str, index: int) -> str:
-    """Return the model's name and unit of a state or input, empty where there is none."""
-    model = problem.model
-    states, inputs = with_units(model)
-    given = {"x": (model.state_names, states), "u_prev": (model.input_names, inputs)}
-    named, whole = given.get(kind, ((), []))
-    return f": {whole[index]}" if whole and (named or model.units) else ""
+        point = f"[{points[i]:.4g}]" if rests else ""
+        meaning = f"{point:<{10 * rests}}{meanings[kind]} {index}"
+        yield f"  {label:<{width}} {low[i]:>10.4g} to {high[i]:<10.4g} {meaning}"
 
 
 def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
@@ -73,8 +69,10 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
     rows = len(problem.terminal.set[1])
     yield f"The terminal set has {rows} half-spaces." if rows else "There is no terminal set."
     if problem.soft.penalty:
-        groups = ("x", problem.soft.x), ("y", problem.soft.y)
-        soft = [f"{name}[{i}]" for name, units in groups for i in np.flatnonzero(units)]
+        states, outputs = labels_of(problem.model)[0], range(len(problem.soft.y))
+        names = [*states, *(f"y[{i}]" for i in outputs)]
+        units = np.concatenate([problem.soft.x, problem.soft.y])
+        soft = [names[i] for i in np.flatnonzero(units)]
         yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
 
 
@@ -130,10 +128,14 @@ def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
 
 
 def _values(problem: MPCProblem, law: Law, feasible: Array) -> Iterator[str]:
-    yield f"The law at a few parameters [{', '.join(problem.layout.names)}]:"
+    inputs = ", ".join(labels_of(problem.model)[1])
+    u, u_ss = inputs if problem.model.input_names else "u", problem.model.u_ss
+    # In parentheses: rich would take names in brackets for its markup.
+    yield f"The law at a few parameters ({', '.join(problem.labels())}):"
     for theta in np.vstack([np.zeros((1, problem.n_theta)), feasible[:3]]):
         where = "" if law.in_domain(theta) else " (not feasible)"
-        yield f"  {_numbers(theta)} -> u = {_numbers(law(theta))}{where}"
+        shown, taken = _numbers(theta + problem.theta_ss), _numbers(law(theta) + u_ss)
+        yield f"  {shown} -> {u} = {taken}{where}"
 
 
 def _numbers(values: Array) -> str:

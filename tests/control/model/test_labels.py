@@ -79,3 +79,9 @@ def test_a_model_becomes_a_statespace_and_comes_back() -> None:
     assert system.input_labels == ["pump", "d[0]"]
     assert system.state_labels == ["level", "T_top"]
     assert LinearModel.from_statespace(system, disturbances=["d[0]"]) == model
+
+
+def test_deviations_in_the_report_say_that_they_are() -> None:
+    """A gain is no state: one unit more than u_ss moves the state from x_ss."""
+    model = LinearModel(A, B, dt=1.0, x_ss=[12, 350], u_ss=[3], **NAMES)
+    assert "Held at u_ss + 1, pump moves the state to x_ss + (12.5, 2.5)." in model.report()

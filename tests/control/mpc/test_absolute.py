@@ -62,8 +62,33 @@ def test_a_box_of_theta_and_what_is_not_given() -> None:
 
 def test_the_report_calls_states_by_their_names() -> None:
     mpc = dataclasses.replace(deviations(), model=MODEL.named(["T", "c"], units={"T": "K"}))
-    assert ": T (K)\n" in mpc.report(samples=50)
-    assert ": " not in deviations().report(samples=50).splitlines()[1]
+    text = mpc.report(samples=50)
+    for line in (
+        "T (K)                     310 to 390        [350]     state 0",
+        "set-point of T (K)        345 to 355        [350]     reference of tracked output 0",
+        "d[0]                        4 to 7          [5]       disturbance",
+        "previous u[0]               8 to 15         [10]      input of the step before 0",
+        "few parameters (T, c, set-point of T, d[0], u_prev[0]):",
+        "  [350, 2, 350, 5, 10] -> u = [10]",
+    ):
+        assert line in text
+    assert "x[0] " in deviations().report(samples=50).splitlines()[1]
+
+
+def test_what_limits_the_plan_is_called_by_its_name() -> None:
+    mpc = shown()
+    named = dataclasses.replace(mpc, model=MODEL.named(["T", "c"], ["flow"]))
+    text = named.report(samples=50)
+    assert "% the rate of flow at its lower bound" in text and "never: flow at its" in text
+    assert "Soft bounds: T; a unit costs 100." in text
+    assert "u[0]" not in text and "x[0]" not in text and "-> flow = [10]" in text
+
+
+def test_a_problem_shows_its_bounds_as_they_were_given() -> None:
+    text = repr(shown())
+    assert "x_min=[330, 1], x_max=[370, 5], u_min=[8], u_max=[15], r_min=[345]" in text
+    assert "du_max=[0.5]" in text and "y_max=[382]" in text and "absolute=True" in text
+    assert "x_min=[-20, -1]" in repr(deviations()) and "absolute" not in repr(deviations())
 
 
 def test_absolute_is_a_flag() -> None:

@@ -57,7 +57,7 @@ def test_soft_bounds_and_their_cost_are_named() -> None:
 
 def test_it_shows_the_law_at_the_origin_first() -> None:
     text = solved("servo").report(samples=20)
-    assert "[x[0], x[1], r[0]]:\n  [0, 0, 0] -> u = [0]" in text.replace("-0]", "0]")
+    assert "(x[0], x[1], r[0]):\n  [0, 0, 0] -> u = [0]" in text.replace("-0]", "0]")
 
 
 def test_the_same_seed_gives_the_same_text() -> None:
