@@ -1,8 +1,8 @@
 """One network for each region of the law, or one for all: `python -m experiments.networks`.
 
-Both learn with no setting but a target rate of 0.02, from the same starts. Beside the costs it is measured
-how far the input moves in closed loop, since actuators wear. Prints the table of docs/policy.md;
-runs that are done are kept in `out/networks`.
+Both learn with no setting but a target rate of 0.02, from the same starts. Beside the costs it is
+measured how far the input moves in closed loop, since actuators wear. Prints the table; runs that
+are done are kept in `out/networks`.
 """
 
 from __future__ import annotations
