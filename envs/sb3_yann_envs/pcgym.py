@@ -5,6 +5,7 @@ PC-Gym is optional: ``pip install 'sb3-yann[pcgym]'``. Importing this module doe
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,15 +17,11 @@ from scipy.optimize import least_squares
 
 from sb3_yann.control import LinearModel
 from sb3_yann_envs._problem_env import asked_start, not_reset
+from sb3_yann_envs.pcgym_cases import UNITS, checked, ranges
 from sb3_yann_envs.pcgym_flow import flow_of, rate_of
-from sb3_yann_envs.pcgym_cases import CASES, UNITS, Parameters
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
-
-NEEDED = ("N", "tsim", "SP", "o_space", "a_space", "x0")
-NOT_HERE = ("a_delta", "disturbances", "uncertainty_percentages")
-"""What PC-Gym adds to theta or to the plant in ways of its own."""
 
 
 class PCGymEnv(gymnasium.Env[Single, Single]):
@@ -95,20 +92,23 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         set_points: Mapping[str, tuple[float, float]] | None = None,
         draw: bool = True,
     ) -> None:
-        given = _parameters(parameters)
-        self.plant = _make_env()(given)
-        info = self.plant.model.info()
+        given = checked(parameters)
+        # do-mpc warns of what of it is not installed, CasADi of the way PC-Gym calls it.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.plant = _make_env()(given)
+            info = self.plant.model.info()
+            self._rate = rate_of(self.plant.model, len(info["states"]), len(info["inputs"]))
         self.state_names, self.input_names = tuple(info["states"]), tuple(info["inputs"])
         self.units = UNITS.get(given.get("model", ""), {})
         n, self.dt, self.draw = len(self.state_names), float(self.plant.dt), draw
         self.x0: Array = np.array(given["x0"], np.float64)[:n]
         self.outputs = [self.state_names.index(name) for name in given["SP"]]
         self.schedule: Array = np.array([*given["SP"].values()], np.float64).T  # (N, p)
-        self.r_min, self.r_max = _ranges(given["SP"], set_points)
+        self.r_min, self.r_max = ranges(given["SP"], set_points)
         self.x_min, self.x_max = (np.array(given["o_space"][s][:n], float) for s in ("low", "high"))
         self.u_min, self.u_max = (np.array(given["a_space"][s], float) for s in ("low", "high"))
         self.noise = float(given.get("noise_percentage", 0)) if given.get("noise") else 0.0
-        self._rate = rate_of(self.plant.model, n, len(self.u_min))
         self._flow = flow_of(self._rate, self.dt, self.x0, *self._box())
         self.observation_space = spaces.Box(
             np.concatenate([self.x_min, self.r_min]).astype(np.float32),
@@ -229,9 +229,8 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         """Return set-points (N, p), drawn anew where a schedule changes."""
         moves = np.any(np.diff(self.schedule, axis=0) != 0, axis=1)
         piece = np.concatenate([[0], np.cumsum(moves)])
-        return np.asarray(
-            self.np_random.uniform(self.r_min, self.r_max, (piece[-1] + 1, len(self.r_min)))
-        )[piece]
+        drawn = self.np_random.uniform(self.r_min, self.r_max, (piece[-1] + 1, len(self.r_min)))
+        return np.array(drawn[piece])
 
     def _seen(self) -> Single:
         """Return what is observed: the states, and the set-points for the next action."""
@@ -239,7 +238,7 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         x = self.state
         if self.noise:
             x = x * (1 + self.noise * self.np_random.standard_normal(x.shape))
-        return np.concatenate([x, self.wanted[self.taken]]).astype(np.float32)
+        return np.asarray(np.concatenate([x, self.wanted[self.taken]]), np.float32)
 
     def _violates(self, u: Array) -> bool:
         """Tell whether PC-Gym finds a constraint violated, by its own function."""
@@ -253,7 +252,7 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         """Return PC-Gym's reward, by its own function."""
         plant, shown = self.plant, self.wanted[self.taken - 1]
         plant.t = self.taken
-        state = np.concatenate([self.state, shown])  # type: ignore[list-item]
+        state = np.concatenate([self.state, shown])
         if plant.custom_reward:
             return float(np.squeeze(plant.custom_reward_f(plant, state, u, violation)))
         return float(np.squeeze(plant.reward_fn(state, violation)))
@@ -269,41 +268,3 @@ def _make_env() -> Any:
             "pip install 'sb3-yann[pcgym]'."
         ) from error
     return make_env
-
-
-def _parameters(given: str | Mapping[str, Any]) -> Parameters:
-    """Return PC-Gym's parameters, checked, for absolute values and its CasADi integrator."""
-    if isinstance(given, str):
-        if given not in CASES:
-            raise ValueError(
-                f"parameters = {given!r} must be one of {sorted(CASES)}, or the mapping that "
-                "pcgym.make_env takes."
-            )
-        given = CASES[given]()
-    if not isinstance(given, Mapping):
-        raise TypeError(f"parameters = {given!r} must be a name or a mapping.")
-    missing = [key for key in NEEDED if key not in given]
-    unknown = [key for key in NOT_HERE if given.get(key) is not None]
-    if missing or unknown:
-        raise ValueError(
-            f"parameters lack {missing} and hold {unknown}, which is not supported here. Give what "
-            "is missing; for the rest pass a custom_model of the plant as it is."
-        )
-    return {**given, "normalise_a": False, "normalise_o": False, "integration_method": "casadi"}
-
-
-def _ranges(
-    schedules: Mapping[str, ArrayLike], asked: Mapping[str, tuple[float, float]] | None
-) -> tuple[Array, Array]:
-    """Return the lowest and highest set-points (p,)."""
-    asked = {} if asked is None else asked
-    unknown = sorted(set(asked) - set(schedules))
-    if unknown:
-        raise ValueError(f"set_points holds {unknown}; the plant's are {sorted(schedules)}.")
-    both = [asked.get(k, (np.min(v), np.max(v))) for k, v in schedules.items()]
-    low, high = np.array(both, np.float64).T
-    if not np.all(low <= high):  # nor is NaN
-        raise ValueError(f"set_points = {dict(asked)} must hold pairs (low, high) in this order.")
-    return low, high
-
-

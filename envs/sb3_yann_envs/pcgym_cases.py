@@ -1,18 +1,20 @@
-"""The parameters of three plants of PC-Gym, as its authors' comparison has them, and their units."""
+"""The parameters of three plants of PC-Gym, as its authors compare them, and checks of others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+Array = NDArray[np.float64]
 Parameters = dict[str, Any]
 
 
 def _stairs(values: Sequence[float], steps: int) -> list[float]:
     """Return a schedule of ``steps`` entries that holds each value equally long."""
-    return np.repeat(values, steps // len(values)).tolist()
+    return [value for value in values for _ in range(steps // len(values))]
 
 
 def _cstr() -> Parameters:
@@ -74,3 +76,43 @@ UNITS: dict[str, dict[str, str]] = {
     },
 }
 """Units of the states and inputs of PC-Gym's models, by the model's name."""
+
+NEEDED = ("N", "tsim", "SP", "o_space", "a_space", "x0")
+NOT_HERE = ("a_delta", "disturbances", "uncertainty_percentages")
+"""What PC-Gym adds to theta or to the plant in ways of its own."""
+
+
+def checked(given: str | Mapping[str, Any]) -> Parameters:
+    """Return PC-Gym's parameters, checked, for absolute values and its CasADi integrator."""
+    if isinstance(given, str):
+        if given not in CASES:
+            raise ValueError(
+                f"parameters = {given!r} must be one of {sorted(CASES)}, or the mapping that "
+                "pcgym.make_env takes."
+            )
+        given = CASES[given]()
+    if not isinstance(given, Mapping):
+        raise TypeError(f"parameters = {given!r} must be a name or a mapping.")
+    missing = [key for key in NEEDED if key not in given]
+    unknown = [key for key in NOT_HERE if given.get(key) is not None]
+    if missing or unknown:
+        raise ValueError(
+            f"parameters lack {missing} and hold {unknown}, which is not supported here. Give what "
+            "is missing; for the rest pass a custom_model of the plant as it is."
+        )
+    return {**given, "normalise_a": False, "normalise_o": False, "integration_method": "casadi"}
+
+
+def ranges(
+    schedules: Mapping[str, ArrayLike], asked: Mapping[str, tuple[float, float]] | None
+) -> tuple[Array, Array]:
+    """Return the lowest and highest set-points (p,)."""
+    asked = {} if asked is None else asked
+    unknown = sorted(set(asked) - set(schedules))
+    if unknown:
+        raise ValueError(f"set_points holds {unknown}; the plant's are {sorted(schedules)}.")
+    both = [asked.get(k, (np.min(v), np.max(v))) for k, v in schedules.items()]
+    low, high = np.array(both, np.float64).T
+    if not np.all(low <= high):  # nor is NaN
+        raise ValueError(f"set_points = {dict(asked)} must hold pairs (low, high) in this order.")
+    return low, high

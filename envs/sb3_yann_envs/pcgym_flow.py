@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Flow = Callable[[ArrayLike, ArrayLike], Array]
+Floats = tuple[float, ...]
 
 STEPS = (8, 16, 32, 64, 128, 256)
 """Steps of the Runge-Kutta method in a sample, the fewest that are accurate."""
 ACCURATE = 1e-7
-"""Largest error after a sample, relative to the ranges of the states; PC-Gym's own is about 1e-5."""
+"""Largest error after a sample, relative to the states' ranges; PC-Gym's own is about 1e-5."""
 TRIED = 40  # samples of a trial, half of them with inputs on their bounds
 TOLERANCES = {"reltol": 1e-11, "abstol": 1e-12}
 
@@ -41,29 +43,45 @@ def flow_of(rate: Any, dt: float, x0: Array, low: Array, width: Array) -> Flow:
     low, width : ndarray, shape (n + m,)
         The ranges of states and inputs.
     """
+    # Envs are made by the hundred, for each episode one, and the trial takes up to a second.
+    return _chosen(rate.serialize(), dt, *(tuple(each.tolist()) for each in (x0, low, width)))
+
+
+@lru_cache(maxsize=64)
+def _chosen(equations: str, dt: float, x0: Floats, low: Floats, width: Floats) -> Flow:
+    """Return the flow that the trial chooses."""
     import casadi
 
-    n = len(x0)
-    x, u = casadi.SX.sym("x", n), casadi.SX.sym("u", len(low) - n)
-    ode = {"x": x, "p": u, "ode": rate(x, u)}
-    cvodes = casadi.integrator("flow", "cvodes", ode, 0.0, dt, TOLERANCES)
-
-    def exact(x: ArrayLike, u: ArrayLike) -> Array:
-        try:
-            return np.array(cvodes(x0=x, p=u)["xf"], np.float64).ravel()
-        except RuntimeError:  # CVODES met no value
-            return np.full(n, np.nan)
-
-    inputs = low[n:] + width[n:] * _trial(len(low) - n)
-    states = [x0]
+    rate, n = casadi.Function.deserialize(equations), len(x0)
+    exact = _cvodes(rate, dt)
+    ranges = np.array(width)
+    inputs = np.array(low[n:]) + ranges[n:] * _trial(len(low) - n)
+    states = [np.array(x0)]
     for each in inputs:
         states.append(exact(states[-1], each))
     for steps in STEPS:
         flow = _runge_kutta(rate, dt, steps)
         found = [flow(x, u) for x, u in zip(states[:-1], inputs, strict=True)]
-        if np.all(np.abs(np.array(found) - states[1:]) <= ACCURATE * width[:n]):
+        if np.all(np.abs(np.array(found) - states[1:]) <= ACCURATE * ranges[:n]):
             return flow
     return exact
+
+
+def _cvodes(rate: Any, dt: float) -> Flow:
+    """Return CasADi's adaptive integrator, made once."""
+    import casadi
+
+    x, u = casadi.SX.sym("x", rate.size1_in(0)), casadi.SX.sym("u", rate.size1_in(1))
+    ode = {"x": x, "p": u, "ode": rate(x, u)}
+    sample = casadi.integrator("sample", "cvodes", ode, 0.0, dt, TOLERANCES)
+
+    def flow(x: ArrayLike, u: ArrayLike) -> Array:
+        try:
+            return np.array(sample(x0=x, p=u)["xf"], np.float64).ravel()
+        except RuntimeError:  # CVODES met no value
+            return np.full(rate.size1_in(0), np.nan)
+
+    return flow
 
 
 def _trial(m: int) -> Array:
