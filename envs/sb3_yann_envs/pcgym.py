@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -15,13 +16,15 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from sb3_yann.control import LinearModel
+from sb3_yann.control import LinearModel, Tracking
 from sb3_yann_envs._problem_env import asked_start, not_reset
 from sb3_yann_envs.pcgym_cases import UNITS, checked, ranges
 from sb3_yann_envs.pcgym_flow import flow_of, rate_of
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
+
+DISTURBED = 0.1  # of half a state's range: what a disturbance of 1 adds to it in a sample
 
 
 class PCGymEnv(gymnasium.Env[Single, Single]):
@@ -208,8 +211,28 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         x, u = np.split(low + width * z, [n])
         return x, u
 
-    def linear_model(self, set_point: ArrayLike | None = None) -> LinearModel:
+    @property
+    def tracking(self) -> Tracking:
+        """The outputs that follow set-points, and the box of these; absolute."""
+        return Tracking(self.outputs, self.r_min, self.r_max)
+
+    @property
+    def bounds(self) -> dict[str, Array]:
+        """Bounds of a :class:`LinearMPC`: of the inputs, and the box of states; absolute."""
+        return {
+            "u_min": self.u_min,
+            "u_max": self.u_max,
+            "theta_min": self.x_min,
+            "theta_max": self.x_max,
+        }
+
+    def linear_model(
+        self, set_point: ArrayLike | None = None, *, offset_free: bool = False
+    ) -> LinearModel:
         """Return the plant's equations, linearized at :meth:`steady_state`, with names and units.
+
+        With ``offset_free`` each state has an unmeasured disturbance d, for an observer to
+        estimate; d = 1 moves it in a sample by a twentieth of its range.
 
         Examples
         --------
@@ -217,7 +240,11 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         ('Ca', 'T')
         """
         x, u = self.steady_state(set_point)
-        model = LinearModel.from_dynamics(self.rate, x, u, self.dt, scale=self._box()[1] / 2)
+        scale = self._box()[1] / 2
+        model = LinearModel.from_dynamics(self.rate, x, u, self.dt, scale=scale)
+        if offset_free:
+            E = np.diag(DISTURBED * scale[: len(x)])
+            model = replace(model, E=E, d_ss=np.zeros(len(x)))
         return model.named(self.state_names, self.input_names, self.units)
 
     def _box(self) -> tuple[Array, Array]:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from sb3_yann import LinearModel
+from sb3_yann import DisturbanceBounds, DisturbanceObserver, LinearModel, LinearMPC
+from sb3_yann.wrappers import Deviations, ObserveDisturbance
 from sb3_yann_envs import pcgym, pcgym_flow
 from sb3_yann_envs.pcgym import PCGymEnv
 from sb3_yann_envs.pcgym_cases import CASES
@@ -126,6 +127,32 @@ def test_the_linear_model_of_the_equations_is_that_of_the_simulator(name: str) -
     np.testing.assert_allclose(model.x_ss[env.outputs], middle, atol=1e-6)
     np.testing.assert_allclose(env.advance(model.x_ss, model.u_ss), model.x_ss, atol=1e-6)
     LinearModel.from_env(env)  # from wherever the middle of the inputs rests
+
+
+@needs_pcgym
+@pytest.mark.parametrize("name", NAMES)
+def test_an_observer_rests_an_mpc_of_the_plant_at_its_set_points(name: str) -> None:
+    plant, offsets = PCGymEnv(name), []
+    for offset_free in (False, True):
+        model = plant.linear_model(offset_free=offset_free)
+        weights = {"Q": np.diag(np.isin(range(len(plant.x0)), plant.outputs) * 1e3), "horizon": 1}
+        box = {"disturbances": DisturbanceBounds(-1, 1)} if offset_free else {}
+        R = np.diag(0.1 / (plant.u_max - plant.u_min) ** 2)
+        mpc = LinearMPC(
+            model, R=R, tracking=plant.tracking, absolute=True, **weights, **plant.bounds, **box
+        )  # fmt: skip
+        env = Deviations(PCGymEnv(name), mpc)
+        if offset_free:
+            w = np.diag(model.E)
+            noise = {"state_noise": w, "measurement_noise": 0.01 * w, "disturbance_noise": 10}
+            d = mpc.disturbances
+            env = ObserveDisturbance(env, DisturbanceObserver(model, **noise), d.d_min, d.d_max)
+        law, (theta, _) = mpc.explicit(), env.reset(seed=4)
+        for _ in range(19):  # the set-point stays
+            theta, *_ = env.step(law(theta))
+        n = len(plant.x0)
+        offsets.append(np.abs(theta[plant.outputs] - theta[n : n + len(plant.outputs)]).max())
+    assert offsets[1] < 0.2 * offsets[0]
 
 
 @needs_pcgym
