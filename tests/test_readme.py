@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -62,13 +63,20 @@ def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> Non
     run(f"docs/{name}.md")
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("pcgym") is None, reason="PC-Gym is not installed")
+def test_the_code_in_the_page_of_pcgym_runs() -> None:
+    run("docs/pcgym.md")
+
+
 def test_the_code_in_the_page_of_the_environments_runs() -> None:
     run("docs/environments.md")
 
 
 def test_every_page_with_code_is_run_by_a_test() -> None:
     found = {path.stem for path in PAGES if blocks(path.read_text(encoding="utf-8"))}
-    assert found == {*("README", "commissioning", "environments", "guard", "mpc", "policy", "twin")}
+    known = ("README", "commissioning", "environments", "guard", "mpc", "pcgym", "policy", "twin")
+    assert found == {*known}
 
 
 def test_the_tracking_problem_of_the_page_ends_at_its_reference(tmp_path, monkeypatch) -> None:

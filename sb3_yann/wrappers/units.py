@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearModel
+from sb3_yann.control import LinearModel, LinearMPC
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
 
@@ -17,15 +17,17 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Shows ``x - x_ss`` and takes ``u - u_ss``, in boxes that are shifted likewise.
 
     Wrap the plant in it first; what other wrappers append then counts from the operating point too.
-    Entries of the observation after the n states stay as they are. An env that is wrapped in it
-    already is refused, and so is an action that is NaN.
+    Entries of the observation after the n states stay as they are, but for the set-points of a
+    plant that shows its own: pass the problem for those. An env that is wrapped in it already is
+    refused, and so is an action that is NaN.
 
     Parameters
     ----------
     env : gymnasium.Env, with one-dimensional Box spaces
         Its observation begins with the model's n states, its action is the m inputs.
-    model : LinearModel
-        Its operating point is taken off.
+    model : LinearModel or LinearMPC
+        Its operating point is taken off. With a problem that has ``tracking``, the p entries after
+        the states are set-points, and ``C x_ss`` is taken off them.
 
     Examples
     --------
@@ -35,10 +37,13 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
     array([-0.5])
     """
 
-    def __init__(self, env: Env, model: LinearModel) -> None:
+    def __init__(self, env: Env, model: LinearModel | LinearMPC) -> None:
         super().__init__(env)
+        tracked: Array = np.zeros((0, 0))
+        if isinstance(model, LinearMPC):
+            tracked, model = model.tracking.C, model.model
         if not isinstance(model, LinearModel):
-            raise TypeError(f"model = {model!r} must be a LinearModel, e.g. mpc.model.")
+            raise TypeError(f"model = {model!r} must be a LinearModel or a LinearMPC.")
         _require_absolute(env)
         seen, taken = (require_vector(env, f"{k}_space") for k in ("observation", "action"))
         n, m = model.n_states, model.n_inputs
@@ -47,7 +52,10 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"The env shows {seen.shape} and takes {taken.shape}, but the model has {n} states "
                 f"and {m} inputs. Wrap the plant before other wrappers, or pass its own model."
             )
-        self.x_ss: Array = np.concatenate([model.x_ss, np.zeros(seen.shape[0] - n)])
+        self.x_ss: Array = np.zeros(seen.shape[0])
+        self.x_ss[:n] = model.x_ss
+        if tracked.size and seen.shape[0] > n:
+            self.x_ss[n : n + len(tracked)] = tracked @ model.x_ss
         self.u_ss: Array = model.u_ss
         self.taken = taken
         self.observation_space = _shifted(seen, self.x_ss)

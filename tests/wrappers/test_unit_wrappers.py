@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_yann import AffineObservation, LinearModel, LinearMPC
+from sb3_yann import AffineObservation, LinearModel, LinearMPC, Tracking
 from sb3_yann.wrappers import Deviations, StageCost
 
 X_SS, U_SS = np.array([350.0, 2.0]), np.array([10.0])
@@ -52,6 +52,17 @@ def test_the_plant_is_seen_in_deviations() -> None:
     env.step(np.array([5.0 + 1e-9]))  # rounding does not leave the plant's own space
 
 
+def test_set_points_that_the_plant_shows_count_from_the_operating_point_of_a_problem() -> None:
+    wanted = Tracking([0], 349.5, 352)
+    mpc = LinearMPC(
+        MODEL, Q=np.eye(2), R=[[1]], horizon=2, u_min=8, u_max=15, tracking=wanted, absolute=True
+    )  # fmt: skip
+    env = Deviations(Reactor(extra=2), mpc)
+    assert env.reset(seed=0)[0].tolist() == [5, 0.5, 0.5 - 350, 0.5]
+    assert env.observation_space.low[2:].tolist() == [-1 - 350, -1]
+    assert Deviations(Reactor(), mpc).reset(seed=0)[0].tolist() == [5, 0.5]
+
+
 def test_what_comes_after_the_states_is_left_alone() -> None:
     env = Deviations(Reactor(extra=2), MODEL)
     assert env.reset(seed=0)[0].tolist() == [5, 0.5, 0.5, 0.5]
@@ -63,7 +74,7 @@ def test_a_model_of_another_plant_is_named() -> None:
     with pytest.raises(ValueError, match=r"shows \(2,\) and takes \(1,\), but .* 3 states"):
         Deviations(Reactor(), other)
     with pytest.raises(TypeError, match="must be a LinearModel"):
-        Deviations(Reactor(), MPC)  # type: ignore[arg-type]
+        Deviations(Reactor(), MODEL.A)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("between", [lambda env: env, lambda env: gym.wrappers.TimeLimit(env, 9)])

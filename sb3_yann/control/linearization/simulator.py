@@ -155,13 +155,17 @@ class Simulator:
         return np.clip(u, space.low, space.high).astype(space.dtype).astype(np.float64)
 
     def next_state(self, x: Array, u: Array) -> Array:
-        """Return the state one step later, NaN where the environment refuses to start from x."""
+        """Return the state one step later, NaN where the environment cannot go from x."""
         try:
             self.put(x)
         except (ValueError, AssertionError) as error:
             self.refusal = str(error)
             return np.full(x.size, np.nan)
-        reached = self.go_on(u)
+        try:
+            reached = self.go_on(u)
+        except ArithmeticError as error:  # the equations have no value there
+            self.refusal = str(error)
+            return np.full(x.size, np.nan)
         if reached.shape != x.shape:
             raise ValueError(f"{self.reader} holds no state of shape {x.shape} after a step.")
         return reached

@@ -158,6 +158,40 @@ def test_a_plant_that_forgets_within_a_sample_has_a_model_and_a_law(pole: float)
     assert abs(mpc.explicit()([3.0])[0]) < 1e-6
 
 
+class Rounds(Forgets):
+    """Forgets too, but its next state is rounded as hundreds of operations round."""
+
+    def step(self, action):
+        settled = 2 * np.asarray(action, dtype=float) + 0.5
+        self.state = settled + 4e-16 * np.sin(1e6 * self.state)
+        return self.state.copy(), 0.0, False, False, {}
+
+
+def test_rounding_is_no_slope_of_a_state_that_is_forgotten() -> None:
+    model = LinearModel.from_env(Rounds(), [0.5], [0.0])
+    np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [0, 2], atol=1e-9)
+
+
+class Root(Forgets):
+    """A tank whose outflow has no value below the outlet."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.ones(1)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        if self.state[0] < 0.1:
+            raise FloatingPointError("below the outlet")
+        self.state = self.state + 0.5 * (1 + np.asarray(action, float) - np.sqrt(self.state))
+        return self.state.copy(), 0.0, False, False, {}
+
+
+def test_a_plant_without_a_value_there_turns_the_search_for_a_steady_state_back() -> None:
+    model = LinearModel.from_env(Root(), action=[-0.5])
+    np.testing.assert_allclose(model.x_ss, [0.25], atol=1e-6)
+
+
 class Careless(Forgets):
     """Draws its start from the global generator, and calls its time limit a termination."""
 

@@ -1,0 +1,297 @@
+"""The plants of PC-Gym for a linear MPC and for learners: seeded, absolute, truncated, fast.
+
+PC-Gym is optional: ``pip install 'sb3-yann[pcgym]'``. Importing this module does not import it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from sb3_yann.control import LinearModel, Tracking
+from sb3_yann_envs._problem_env import asked_start, not_reset
+from sb3_yann_envs.pcgym_cases import UNITS, checked, ranges
+from sb3_yann_envs.pcgym_flow import flow_of, rate_of
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+DISTURBED = 0.1  # of half a state's range: what a disturbance of 1 adds to it in a sample
+
+
+class PCGymEnv(gymnasium.Env[Single, Single]):
+    """A plant of PC-Gym, in its own units, with set-points that are drawn in each episode.
+
+    ## Description
+
+    The equations, the input bounds, the start and the metric are PC-Gym's. A Runge-Kutta method
+    replaces its integrator where it is as accurate. ``reset(seed=...)`` determines an episode.
+
+    ## Action Space
+
+    The plant's inputs (m,), float32, between ``a_space``'s bounds; clipped to them.
+
+    ## Observation Space
+
+    The plant's states (n,), then the set-points (p,) in force, float32. With ``noise`` in the
+    parameters each shown state is off by a normal ``noise_percentage`` of itself, as in PC-Gym.
+
+    ## Rewards
+
+    PC-Gym's metric: ``r_scale`` times the squared distance from the set-points at the end of the
+    step, or its ``custom_reward``. ``sb3_yann.wrappers.StageCost`` puts an MPC's stage cost in its
+    place. The `info` of a step holds ``pcgym_cost`` (minus that reward), ``violation`` (whether a
+    constraint of the parameters is violated) and ``state``, the states in float64.
+
+    ## Starting State
+
+    PC-Gym's ``x0``. ``reset(options={"state": x})`` starts from x, shape (n,).
+
+    ## Episode End
+
+    Truncated after N - 1 steps, where PC-Gym terminates.
+
+    Parameters
+    ----------
+    parameters : str or mapping
+        A name in ``sb3_yann_envs.pcgym_cases.CASES``, or the mapping that ``pcgym.make_env`` takes.
+        ``normalise_a`` and ``normalise_o`` play no part.
+    set_points : mapping from name to (low, high), optional
+        Ranges to draw from, uniformly. The default is the range of each one's schedule ``SP``.
+    draw : bool, default True
+        Whether set-points are drawn anew where the schedules change; else the schedules are played.
+
+    Raises
+    ------
+    ImportError
+        If PC-Gym is not installed.
+    ValueError, TypeError
+        For an unknown name, missing parameters, and parameters that are not supported here.
+
+    Examples
+    --------
+    >>> env = PCGymEnv("cstr")
+    >>> observation, _ = env.reset(seed=0)
+    >>> env.state_names, env.input_names, observation.shape
+    (('Ca', 'T'), ('Tc',), (3,))
+    >>> env.linear_model().A.shape
+    (2, 2)
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(
+        self,
+        parameters: str | Mapping[str, Any],
+        *,
+        set_points: Mapping[str, tuple[float, float]] | None = None,
+        draw: bool = True,
+    ) -> None:
+        given = checked(parameters)
+        # do-mpc warns of what of it is not installed, CasADi of the way PC-Gym calls it.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.plant = _make_env()(given)
+            info = self.plant.model.info()
+            self._rate = rate_of(self.plant.model, len(info["states"]), len(info["inputs"]))
+        self.state_names, self.input_names = tuple(info["states"]), tuple(info["inputs"])
+        self.units = UNITS.get(given.get("model", ""), {})
+        n, self.dt, self.draw = len(self.state_names), float(self.plant.dt), draw
+        self.x0: Array = np.array(given["x0"], np.float64)[:n]
+        self.outputs = [self.state_names.index(name) for name in given["SP"]]
+        self.schedule: Array = np.array([*given["SP"].values()], np.float64).T  # (N, p)
+        self.r_min, self.r_max = ranges(given["SP"], set_points)
+        self.x_min, self.x_max = (np.array(given["o_space"][s][:n], float) for s in ("low", "high"))
+        self.u_min, self.u_max = (np.array(given["a_space"][s], float) for s in ("low", "high"))
+        self.noise = float(given.get("noise_percentage", 0)) if given.get("noise") else 0.0
+        self._flow = flow_of(self._rate, self.dt, self.x0, *self._box())
+        self.observation_space = spaces.Box(
+            np.concatenate([self.x_min, self.r_min]).astype(np.float32),
+            np.concatenate([self.x_max, self.r_max]).astype(np.float32),
+            dtype=np.float32,
+        )
+        self.action_space = spaces.Box(
+            self.u_min.astype(np.float32), self.u_max.astype(np.float32), dtype=np.float32
+        )
+        self.state: Array | None = None
+        self.taken, self.wanted = 0, self.schedule
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Single, dict[str, Any]]:
+        """Start an episode, from PC-Gym's x0 or from ``options["state"]``, shape (n,)."""
+        super().reset(seed=seed)
+        start = asked_start(options)
+        x = self.x0.copy() if start is None else np.array(start, np.float64)
+        if x.shape != self.x0.shape or not np.all(np.isfinite(x)):
+            raise ValueError(
+                f"options['state'] = {x.tolist()} must be {len(self.x0)} finite numbers: "
+                f"{', '.join(self.state_names)}."
+            )
+        self.state, self.taken, self.wanted = x, 0, self._drawn() if self.draw else self.schedule
+        names = self.plant.SP
+        self.plant.SP = dict(zip(names, self.wanted.T, strict=True))  # PC-Gym's reward reads it
+        return self._seen(), {"state": x.copy()}
+
+    def step(self, action: Single) -> tuple[Single, float, bool, bool, dict[str, Any]]:
+        """Hold the inputs (m,) for one sample; the reward is minus PC-Gym's cost."""
+        if self.state is None:
+            raise not_reset("step", "there is no state yet")
+        u = np.clip(np.asarray(action, np.float64), self.u_min, self.u_max)
+        if u.shape != self.u_min.shape or np.isnan(u).any():
+            raise ValueError(
+                f"action = {np.asarray(action).tolist()} must be {len(self.u_min)} numbers: "
+                f"{', '.join(self.input_names)}."
+            )
+        self.state = self.advance(self.state, u)
+        violation = self._violates(u)
+        self.taken += 1
+        reward = self._reward(u, violation)
+        info = {"pcgym_cost": -reward, "violation": violation, "state": self.state.copy()}
+        return self._seen(), reward, False, self.taken >= len(self.schedule) - 1, info
+
+    def advance(self, x: ArrayLike, u: ArrayLike) -> Array:
+        """Return the state (n,) one sample after x (n,), with the inputs u (m,) held.
+
+        Raises FloatingPointError where the equations have no value.
+        """
+        reached = self._flow(x, u)
+        if not np.all(np.isfinite(reached)):
+            raise FloatingPointError(
+                f"The plant cannot be integrated from x = {np.asarray(x).tolist()} with u = "
+                f"{np.asarray(u).tolist()}: its equations have no value there. Start elsewhere, or "
+                "narrow the inputs."
+            )
+        return reached
+
+    def rate(self, x: ArrayLike, u: ArrayLike) -> Array:
+        """Return dx/dt (n,), by PC-Gym's equations; for :meth:`LinearModel.from_dynamics`."""
+        return np.array(self._rate(x, u), np.float64).ravel()
+
+    def steady_state(self, set_point: ArrayLike | None = None) -> tuple[Array, Array]:
+        """Return x (n,) and u (m,) that rest at a set-point (p,), by default the middle one.
+
+        Of several steady states the one near the start is returned, with inputs near the middle of
+        their ranges. Raises ValueError where none is found within the bounds.
+
+        Examples
+        --------
+        >>> x, u = PCGymEnv("four_tank").steady_state([0.3, 0.25])
+        >>> x.round(3).tolist()[2:]
+        [0.3, 0.25]
+        """
+        n, (low, width) = len(self.x0), self._box()
+        r = (self.r_min + self.r_max) / 2 if set_point is None else np.asarray(set_point, float)
+
+        def errors(z: Array, pull: float) -> Array:
+            x, u = np.split(low + width * z, [n])
+            # A state drifts over a sample; the rest is relative to what it may be.
+            drift = self.dt * self.rate(x, u) / width[:n]
+            return np.concatenate(
+                [drift, (x[self.outputs] - r) / width[self.outputs], pull * (z[n:] - 0.5)]
+            )
+
+        z = np.concatenate([(self.x0 - low[:n]) / width[:n], np.full(len(self.u_min), 0.5)])
+        for pull in (1e-3, 0.0):  # towards the middle of the inputs, then exactly
+            z = np.clip(z, 1e-6, 1 - 1e-6)
+            z = least_squares(errors, z, bounds=(0, 1), args=(pull,), xtol=1e-14, ftol=1e-15).x
+        if np.max(np.abs(errors(z, 0.0))) > 1e-6:
+            raise ValueError(
+                f"No steady state was found at the set-point {r.tolist()}, within o_space and "
+                "a_space. Pass another set_point, or wider spaces."
+            )
+        x, u = np.split(low + width * z, [n])
+        return x, u
+
+    @property
+    def tracking(self) -> Tracking:
+        """The outputs that follow set-points, and the box of these; absolute."""
+        return Tracking(self.outputs, self.r_min, self.r_max)
+
+    @property
+    def bounds(self) -> dict[str, Array]:
+        """Bounds of a :class:`LinearMPC`: of the inputs, and the box of states; absolute."""
+        return {
+            "u_min": self.u_min,
+            "u_max": self.u_max,
+            "theta_min": self.x_min,
+            "theta_max": self.x_max,
+        }
+
+    def linear_model(
+        self, set_point: ArrayLike | None = None, *, offset_free: bool = False
+    ) -> LinearModel:
+        """Return the plant's equations, linearized at :meth:`steady_state`, with names and units.
+
+        With ``offset_free`` each state has an unmeasured disturbance d, for an observer to
+        estimate; d = 1 moves it in a sample by a twentieth of its range.
+
+        Examples
+        --------
+        >>> print(PCGymEnv("cstr").linear_model().state_names)
+        ('Ca', 'T')
+        """
+        x, u = self.steady_state(set_point)
+        scale = self._box()[1] / 2
+        model = LinearModel.from_dynamics(self.rate, x, u, self.dt, scale=scale)
+        if offset_free:
+            E = np.diag(DISTURBED * scale[: len(x)])
+            model = replace(model, E=E, d_ss=np.zeros(len(x)))
+        return model.named(self.state_names, self.input_names, self.units)
+
+    def _box(self) -> tuple[Array, Array]:
+        """Return the lowest states and inputs (n + m,), and the width of their ranges."""
+        low = np.concatenate([self.x_min, self.u_min])
+        return low, np.concatenate([self.x_max, self.u_max]) - low
+
+    def _drawn(self) -> Array:
+        """Return set-points (N, p), drawn anew where a schedule changes."""
+        moves = np.any(np.diff(self.schedule, axis=0) != 0, axis=1)
+        piece = np.concatenate([[0], np.cumsum(moves)])
+        drawn = self.np_random.uniform(self.r_min, self.r_max, (piece[-1] + 1, len(self.r_min)))
+        return np.array(drawn[piece])
+
+    def _seen(self) -> Single:
+        """Return what is observed: the states, and the set-points for the next action."""
+        assert self.state is not None  # after a reset
+        x = self.state
+        if self.noise:
+            x = x * (1 + self.noise * self.np_random.standard_normal(x.shape))
+        return np.asarray(np.concatenate([x, self.wanted[self.taken]]), np.float32)
+
+    def _violates(self, u: Array) -> bool:
+        """Tell whether PC-Gym finds a constraint violated, by its own function."""
+        plant = self.plant
+        if not (plant.constraint_active or plant.custom_constraint_active):
+            return False
+        plant.t = self.taken
+        return bool(plant.constraint_check(self.state, u))
+
+    def _reward(self, u: Array, violation: bool) -> float:
+        """Return PC-Gym's reward, by its own function."""
+        plant, shown = self.plant, self.wanted[self.taken - 1]
+        plant.t = self.taken
+        state = np.concatenate([self.state, shown])
+        if plant.custom_reward:
+            return float(np.squeeze(plant.custom_reward_f(plant, state, u, violation)))
+        return float(np.squeeze(plant.reward_fn(state, violation)))
+
+
+def _make_env() -> Any:
+    """Return PC-Gym's class of environments."""
+    try:
+        from pcgym import make_env
+    except ImportError as error:
+        raise ImportError(
+            f"PC-Gym cannot be imported ({error}). It needs Python 3.11 or newer: "
+            "pip install 'sb3-yann[pcgym]'."
+        ) from error
+    return make_env
