@@ -23,7 +23,7 @@ from sb3_yann.audit.closed_loops import (
 )
 from sb3_yann.audit.gains import ADVICE, Headroom, gain
 from sb3_yann.audit.plants import Plant, TwinPlant, simulated
-from sb3_yann.audit.task import Task
+from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.control import LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.evaluation.episodes import Source
 from sb3_yann.twin.dynamics import Coordinates
@@ -175,7 +175,7 @@ class _Search:
         plant, low, high = self._plant()
         base = self.base
         unit = max(float(np.abs(base.costs).sum() / base.lengths.sum()), 1e-300)
-        task = Task(self.mpc, low, high, _value(self.mpc), unit)
+        task = Task(self.mpc, low, high, _value(self.mpc), WEIGHT * unit)
         controller = Planning(plant, task, int(base.lengths.max()))
         self.others["plan"] = play(self.mpc, self.make, self.seeds, controller)
 

@@ -27,15 +27,15 @@ class Task:
         Bounds of the states besides, infinite where there are none.
     end : ndarray, shape (n_theta, n_theta)
         ``theta' end theta`` is the cost of what comes after the last step.
-    unit : float
-        A typical stage cost.
+    weight : float
+        What one half-width beyond a bound costs in a step, `WEIGHT` typical stage costs.
     """
 
     problem: LinearMPC
     low: Array
     high: Array
     end: Array
-    unit: float
+    weight: float
 
     @cached_property
     def _bounded(self) -> tuple[Array, Array, Array, Array]:
@@ -61,7 +61,7 @@ class Task:
             stage = self.problem.stage_cost(thetas[:-1], inputs).sum(axis=0)
             end = np.sum((thetas[-1] @ self.end) * thetas[-1], axis=-1)
             outside = np.sum(self.beyond(thetas[1:], INSIDE) ** 2, axis=(0, 2))
-            total = stage + end + WEIGHT * self.unit * outside
+            total = stage + end + self.weight * outside
         return np.where(np.isfinite(total), total, np.inf)
 
     def limits(self, thetas: Array) -> tuple[Array, Array]:
@@ -78,7 +78,7 @@ class Task:
     def penalty(self, thetas: Array) -> tuple[Array, Array]:
         """Return gradient (..., n) and curvature (..., n, n) of what is beyond bounds."""
         C, _, _, half = self._bounded
-        over, weight = self.beyond(thetas, INSIDE), 2 * WEIGHT * self.unit
+        over, weight = self.beyond(thetas, INSIDE), 2 * self.weight
         scaled = C / half[:, None]
         active = (over != 0).astype(float)
         curvature = np.einsum("ki,...k,kj->...ij", scaled, active, scaled)

@@ -6,6 +6,7 @@ and E. Todorov, ICRA 2014). A bound of several inputs that is met once stays act
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ from sb3_yann._validation import Array
 from sb3_yann.audit.plants import Plant, Rows
 from sb3_yann.audit.task import Task
 
+Mask = NDArray[np.bool_]
 Policy = Callable[[int, Array], Array]  # step and thetas (k, n_theta) -> inputs (k, m)
 
 SIZES = (1.0, 0.5, 0.2, 0.05)
@@ -25,7 +27,9 @@ SETTLED = 1e-5
 """A start is done when a correction saves less than this part of its cost."""
 ROUNDS, RACE = 40, 4
 """Corrections at most; after how many the best of several beginnings goes on."""
-DAMPED, PATIENCE = 10.0, 3
+SOFT = 1e-2
+"""Bounds count so much less at first: stiff ones would end a search where it meets them."""
+DAMPED, PATIENCE = 10.0, 5
 """Factor of the damping where no correction helps; how often in a row, at most."""
 
 
@@ -73,7 +77,7 @@ class Plans:
     gains: Array
     costs: Array
 
-    def of(self, chosen: Rows | NDArray[np.bool_]) -> Plans:
+    def of(self, chosen: Rows | Mask) -> Plans:
         """Return some of the starts."""
         return Plans(
             self.thetas[:, chosen],
@@ -108,22 +112,20 @@ def planned(
     rows : ndarray of int, shape (k,)
         Numbers of the starts, as the plant knows them.
     """
-    found = []
+    found, every = [], np.arange(len(starts))
+    soft = dataclasses.replace(task, weight=SOFT * task.weight)
     for policy in policies:
         thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
         gains = np.zeros((*inputs.shape, starts.shape[1]))
-        first = Plans(thetas, inputs, gains, task.costs(thetas, inputs))
-        found.append(improved(plant, task, first, rows, RACE if len(policies) > 1 else ROUNDS))
-    if len(found) == 1:
-        return found[0]
+        first = Plans(thetas, inputs, gains, soft.costs(thetas, inputs))
+        found.append(improved(plant, soft, first, rows, RACE if len(policies) > 1 else ROUNDS))
     best = np.argmin([each.costs for each in found], axis=0)
-    every = np.arange(len(starts))
-    parts = {
-        name: np.stack([getattr(each, name) for each in found], axis=1)[:, best, every]
-        for name in ("thetas", "inputs", "gains")
-    }
+    names = "thetas", "inputs", "gains"
+    kept = {k: np.stack([getattr(each, k) for each in found], 1)[:, best, every] for k in names}
     costs = np.array([each.costs for each in found])[best, every]
-    return improved(plant, task, Plans(**parts, costs=costs), rows, ROUNDS)
+    plans = improved(plant, soft, Plans(**kept, costs=costs), rows, ROUNDS)
+    hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
+    return improved(plant, task, hard, rows, ROUNDS)
 
 
 def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
@@ -186,7 +188,10 @@ def _backward(
     W = 2 * problem.stage_matrix
     slopes = np.concatenate([thetas[:-1], inputs], axis=-1) @ W
     gradient, curvature = task.penalty(thetas[1:])
-    low, high = (each - inputs for each in task.limits(thetas[:-1]))
+    limits = task.limits(thetas[:-1])
+    low, high = (each - inputs for each in limits)
+    # A bound of the rate moves with the previous input.
+    moving = np.stack([limits[0] > problem.u_min, limits[1] < problem.u_max], axis=1)
     v, V = 2 * thetas[-1] @ task.end, np.tile(2 * task.end, (len(rows), 1, 1))
     corrections, gains = np.empty_like(inputs), np.empty_like(plans.gains)
     damped = damping[:, None, None] * W[size:, size:]
@@ -198,7 +203,8 @@ def _backward(
         H = W + Ft @ V @ F[t]
         qx, qu = q[:, :size], q[:, size:]
         Hxx, Hux, Huu = H[:, :size, :size], H[:, size:, :size], H[:, size:, size:]
-        move, K = _bounded_step(Huu + damped, qu, Hux, low[t], high[t])
+        move = _bounded_step(Huu + damped, qu, low[t], high[t])
+        K = _feedback(Huu + damped, Hux, move <= low[t], move >= high[t], moving[t])
         Kt = K.swapaxes(1, 2)
         v = qx + (Kt @ (qu + (Huu @ move[..., None])[..., 0])[..., None])[..., 0]
         v += (Hux.swapaxes(1, 2) @ move[..., None])[..., 0]
@@ -208,29 +214,43 @@ def _backward(
     return corrections, gains
 
 
-def _bounded_step(H: Array, g: Array, G: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the minimizers (k, m) of ``u'Hu / 2 + g'u`` in a box, and gains (k, m, n_theta).
+def _bounded_step(H: Array, g: Array, low: Array, high: Array) -> Array:
+    """Return the minimizers (k, m) of ``u'Hu / 2 + g'u`` in a box, for H (k, m, m), g (k, m).
 
-    A bound is active once it is met, and the other inputs are solved for anew.
+    Projected Newton steps: an input on its bound is held there while the slope presses it on.
+    """
+    move: Array = np.clip(np.zeros_like(g), low, high)
+    for _ in range(2 * g.shape[1] + 1):
+        slope = g + (H @ move[..., None])[..., 0]
+        held = ((move <= low) & (slope > 0)) | ((move >= high) & (slope < 0))
+        step = np.linalg.solve(_reduced(H, held), np.where(held, 0.0, slope)[..., None])[..., 0]
+        before, move = move, np.clip(move - step, low, high)
+        if np.array_equal(before, move):
+            break
+    return move
+
+
+def _feedback(H: Array, G: Array, at_low: Mask, at_high: Mask, moving: Mask) -> Array:
+    """Return the gains (k, m, n_theta) of the minimizers in a box whose sides may move.
 
     Parameters
     ----------
-    H, g, G : ndarray, shapes (k, m, m), (k, m) and (k, m, n_theta)
-        Curvature and gradient; how the gradient changes with theta.
-    low, high : ndarray, shape (k, m)
-        The box.
+    H, G : ndarray, shapes (k, m, m) and (k, m, n_theta)
+        Curvature; how the gradient changes with theta.
+    at_low, at_high : ndarray of bool, shape (k, m)
+        Inputs on a bound.
+    moving : ndarray of bool, shape (2, k, m)
+        Whether the lower and the upper bound move with the previous input, theta's last entries.
     """
-    k, m = g.shape
-    free = np.ones((k, m), dtype=bool)
-    move: Array = np.zeros((k, m))
-    while True:  # at most m + 1 times
-        both = free[:, :, None] & free[:, None, :]
-        reduced = np.where(both, H, 0.0) + np.where(free, 0.0, 1.0)[:, :, None] * np.eye(m)
-        held = np.where(free, 0.0, move)
-        right = np.where(free, -g - (H @ held[..., None])[..., 0], held)
-        wanted = np.linalg.solve(reduced, right[..., None])[..., 0]
-        move = np.clip(wanted, low, high)
-        met = free & ((wanted < low) | (wanted > high))
-        if not met.any():
-            return move, -np.linalg.solve(reduced, np.where(free[:, :, None], G, 0.0))
-        free &= ~met
+    held, m = at_low | at_high, H.shape[1]
+    fixed: Array = np.zeros_like(G)
+    row, j = np.nonzero((at_low & moving[0]) | (at_high & moving[1]))
+    fixed[row, j, G.shape[2] - m + j] = 1.0
+    right = np.where(held[:, :, None], fixed, -G - H @ fixed)
+    return np.asarray(np.linalg.solve(_reduced(H, held), right))
+
+
+def _reduced(H: Array, held: Mask) -> Array:
+    """Return H (k, m, m) with the rows and columns of inputs that are held replaced by ones."""
+    free = ~held[:, :, None] & ~held[:, None, :]
+    return np.where(free, H, held[:, :, None] * np.eye(H.shape[1]))
