@@ -2,7 +2,8 @@
 
 from sb3_yann.audit.callback import CostAudit
 from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
-from sb3_yann.audit.headroom import Headroom, headroom
+from sb3_yann.audit.gains import Headroom
+from sb3_yann.audit.headroom import headroom
 
 __all__ = [
     "CostAudit",

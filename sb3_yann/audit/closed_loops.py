@@ -1,0 +1,285 @@
+"""Episodes of controllers that remember: those of a plan, of an observer, of another model."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.audit.plants import Plant
+from sb3_yann.audit.task import Task
+from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
+from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.evaluation.episodes import LONGEST, Source
+from sb3_yann.twin.dynamics import law_of
+
+Controller = Callable[[int, Array, NDArray[np.bool_]], Array]
+"""From the step, thetas (k, n_theta) and who still runs (k,) to inputs (k, m)."""
+CHANGED = 0.05
+"""A reference or disturbance that has moved by so many half-widths is planned for anew."""
+DITHER, HELD = 0.1, 5
+"""Half-widths by which a log for a twin is excited, and for how many steps each time."""
+BURSTS = 25
+"""Some searches begin with all inputs on a bound, for this part of the episode."""
+
+
+@dataclass(frozen=True)
+class Loops:
+    """What came of k episodes that were played side by side.
+
+    Attributes
+    ----------
+    costs, violations, lengths : ndarray, shape (k,)
+        Sums of stage costs; steps that the env reports, or that exceed the problem's
+        bounds by a thousandth of their half-width; steps.
+    thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
+        After its end an episode stays where it is.
+    """
+
+    costs: Array
+    violations: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    thetas: Array
+    inputs: Array
+
+    def no_worse(self, others: Loops) -> NDArray[np.bool_]:
+        """Tell which episodes are as long as others, and violate no more."""
+        return (self.lengths >= others.lengths) & (self.violations <= others.violations)
+
+    def steps(self) -> tuple[Array, Array, Array]:
+        """Return thetas, inputs and following thetas of all steps, (steps, ...)."""
+        taken = np.arange(len(self.inputs))[:, None] < self.lengths
+        return self.thetas[:-1][taken], self.inputs[taken], self.thetas[1:][taken]
+
+    def episodes(self) -> list[tuple[Array, Array]]:
+        """Return thetas (T + 1, n_theta) and inputs (T, m) of each episode."""
+        return [
+            (self.thetas[: length + 1, i], self.inputs[:length, i])
+            for i, length in enumerate(self.lengths)
+        ]
+
+
+def maker(env: Source) -> Callable[[], gym.Env[Any, Any]]:
+    """Return a function that makes envs like the one that is given, named or made."""
+    if isinstance(env, str):
+        return partial(gym.make, env, disable_env_checker=True)
+    if isinstance(env, gym.Env):
+        try:
+            copy.deepcopy(env)
+        except Exception as error:  # whatever a simulator raises that cannot be copied
+            raise TypeError(
+                f"env_or_twin = {env!r} cannot be copied ({error}). Pass a function that makes "
+                "such an env: the starts are played side by side."
+            ) from error
+        return partial(copy.deepcopy, env)
+    if not callable(env):
+        raise TypeError(
+            f"env_or_twin = {env!r} must be a single gymnasium.Env, its id, a function that makes "
+            "one, or a PlantTwin."
+        )
+    return env
+
+
+def play(
+    problem: LinearMPC,
+    make: Callable[[], gym.Env[Any, Any]],
+    seeds: Sequence[int],
+    controller: Controller,
+) -> Loops:
+    """Return one episode for each seed, side by side.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta the env shows.
+    make : callable
+        Makes an env.
+    seeds : sequence of int
+        Of the k episodes.
+    controller : callable
+        What acts in all of them.
+    """
+    with ExitStack() as stack:
+        envs = [stack.enter_context(closing(make())) for _ in seeds]
+        begun = (env.reset(seed=s)[0] for env, s in zip(envs, seeds, strict=True))
+        now = np.array([_theta(problem, seen) for seen in begun])
+        thetas, running = [now], np.ones(len(envs), dtype=bool)
+        inputs: list[Array] = []
+        violations, lengths = np.zeros((2, len(envs)), dtype=np.int64)
+        while running.any():
+            u = controller(len(inputs), now, running)
+            now = now.copy()
+            for i in np.flatnonzero(running):
+                action = u[i].astype(envs[i].action_space.dtype)
+                seen, _, terminated, truncated, info = envs[i].step(action)
+                now[i] = _theta(problem, seen)
+                violations[i] += bool(info.get("violation", False)) or _outside(problem, now[i])
+                running[i] = not (terminated or truncated)
+                lengths[i] += 1
+            thetas.append(now)
+            inputs.append(u)
+            if len(inputs) >= LONGEST:
+                raise RuntimeError(
+                    f"An episode of {envs[0]} has not ended after {LONGEST} steps. Wrap the env in "
+                    "gymnasium.wrappers.TimeLimit."
+                )
+    states, played = np.array(thetas), np.array(inputs)
+    taken = np.arange(len(inputs))[:, None] < lengths
+    costs = np.sum(problem.stage_cost(states[:-1], played), axis=0, where=taken)
+    return Loops(costs, violations, lengths, states, played)
+
+
+def _theta(problem: LinearMPC, observation: Any) -> Array:
+    theta = np.array(observation, dtype=np.float64)
+    if theta.shape != (problem.n_theta,):
+        raise ValueError(
+            f"The env shows an observation of shape {theta.shape}, but theta = "
+            f"[{', '.join(problem.layout.names)}] has {problem.n_theta} entries. Wrap the env so "
+            "that it shows all of theta: see sb3_yann.wrappers."
+        )
+    return theta
+
+
+def _outside(problem: LinearMPC, theta: Array) -> bool:
+    """Tell whether a state or an output breaks a bound of the problem."""
+    x, C = theta[problem.layout.state], problem.outputs.C
+    half = problem.theta_half[problem.layout.state]
+    y = np.concatenate([x, C @ x])
+    room = 1e-3 * np.concatenate([half, np.abs(C) @ half])
+    low = np.concatenate([problem.x_min, problem.outputs.y_min]) - room
+    high = np.concatenate([problem.x_max, problem.outputs.y_max]) + room
+    return bool(np.any((y < low) | (y > high)))
+
+
+def of_law(problem: LinearMPC) -> Controller:
+    """Return the MPC itself."""
+    law = law_of(problem)
+    return lambda t, theta, running: np.nan_to_num(law(theta))
+
+
+def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:
+    """Return an MPC with another model and operating point, in the units of the problem."""
+    law, layout = other.online(), problem.layout
+    u = other.model.u_ss - problem.model.u_ss
+    point = np.zeros(problem.n_theta)
+    point[layout.state] = other.model.x_ss - problem.model.x_ss
+    point[layout.reference] = problem.tracking.C @ point[layout.state]
+    point[layout.previous] = u[: layout.n_previous]
+    limits = problem.u_min, problem.u_max
+    return lambda t, theta, running: np.clip(u + law(np.nan_to_num(theta) - point), *limits)
+
+
+class Excited:
+    """The MPC with inputs that are moved at random, each for some steps.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+    seed : int
+    """
+
+    def __init__(self, problem: LinearMPC, seed: int) -> None:
+        self.problem, self.rng, self.law = problem, np.random.default_rng(seed), of_law(problem)
+        self.moved: Array = np.zeros((0, 0))
+
+    def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
+        """Return the inputs (k, m)."""
+        problem, shape = self.problem, (len(theta), len(self.problem.R))
+        if t % HELD == 0:
+            self.moved = DITHER * problem.u_half * self.rng.uniform(-1, 1, shape)
+        u = self.law(t, theta, running) + self.moved
+        return np.asarray(np.clip(u, problem.u_min, problem.u_max))
+
+
+class Observing:
+    """The offset-free MPC, with an observer for each episode.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta the env shows.
+    other : LinearMPC
+        The same with disturbances.
+    observer : DisturbanceObserver
+        Of all states.
+    """
+
+    def __init__(self, problem: LinearMPC, other: LinearMPC, observer: DisturbanceObserver) -> None:
+        self.problem, self.other, self.observer = problem, other, observer
+        self.estimates: Array = np.zeros((0, 0))
+        self.u: Array = np.zeros((0, 0))
+
+    def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
+        """Return the inputs (k, m)."""
+        layout, observer = self.problem.layout, self.observer
+        x, n = theta[:, layout.state], layout.n_states
+        if t == 0:
+            self.estimates = np.pad(x, ((0, 0), (0, observer.model.n_disturbances)))
+        else:
+            expected = self.estimates @ observer.A.T + self.u @ observer.B.T
+            self.estimates = expected + (x - expected @ observer.seen.T) @ observer.gain.T
+        bounds = self.other.disturbances
+        d = np.clip(self.estimates[:, n:], bounds.d_min, bounds.d_max)
+        parts = self.estimates[:, :n], theta[:, layout.reference], d, theta[:, layout.previous]
+        self.u = np.asarray(self.other.online()(np.concatenate(parts, axis=1)))
+        return self.u
+
+
+class Planning:
+    """Plans for the rest of the episode, anew where a reference or disturbance changes.
+
+    Nothing is known of changes before they come. Feedback keeps the plant on its plan.
+
+    Parameters
+    ----------
+    plant, task : Plant and Task
+        What the plans are made with.
+    steps : int
+        Length of an episode.
+    """
+
+    def __init__(self, plant: Plant, task: Task, steps: int) -> None:
+        self.plant, self.task, self.steps = plant, task, steps
+        self._plans: list[tuple[int, Plans]] = []
+        self._constants: Array = np.zeros((0, 0))
+
+    def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
+        """Return the inputs (k, m)."""
+        problem, constant = self.task.problem, self.task.problem.layout.constant
+        if t == 0:
+            self._constants = np.full_like(theta[:, constant], np.nan)
+            self._plans = [(0, None)] * len(theta)  # type: ignore[list-item]
+        away = np.abs(theta[:, constant] - self._constants) / problem.theta_half[constant]
+        stale = running & (np.any(~(away <= CHANGED), axis=1) | (t == 0))
+        if stale.any() and t < self.steps:
+            self._plan(t, theta, np.flatnonzero(stale))
+        u = np.empty((len(theta), problem.model.n_inputs))
+        for i, (begun, plan) in enumerate(self._plans):
+            at = min(t, self.steps - 1) - begun
+            u[i] = np.nan_to_num(follow(plan, 0.0, at, theta[i : i + 1])[0])
+        return np.clip(u, *self.task.limits(theta))
+
+    def _plan(self, t: int, theta: Array, rows: NDArray[np.intp]) -> None:
+        problem, left = self.task.problem, self.steps - t
+        law = law_of(problem)
+        policies: list[Policy] = [lambda _, at: law(at)]
+        if t == 0:
+            policies += [partial(_burst, law, u, left // BURSTS)
+                         for u in (problem.u_min, problem.u_max)]  # fmt: skip
+        found = planned(self.plant, self.task, policies, theta[rows], left, rows)
+        for k, row in enumerate(rows):
+            self._plans[row] = t, found.of(np.array([k]))
+        self._constants[rows] = theta[rows, problem.layout.constant]
+
+
+def _burst(law: Callable[[Array], Array], u: Array, until: int, t: int, theta: Array) -> Array:
+    """Return inputs u (m,) for some steps, those of the law after them."""
+    return np.tile(u, (len(theta), 1)) if t < until else law(theta)

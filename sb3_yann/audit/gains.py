@@ -1,0 +1,96 @@
+"""What there is to gain over an MPC, in figures and words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_yann._validation import Array
+
+ADVICE = {
+    "do not bother": "the MPC is nearly optimal here.",
+    "add ObserveDisturbance first": "that brings most of it: mpc, observer = offset_free(mpc), and "
+    "env = ObserveDisturbance(env, observer, low, high).",
+    "re-identify": "a linear model of the plant as it is brings most of it: see "
+    "LinearModel.from_data, PlantTwin.reidentified, improve(model, twin).",
+    "learn": "most of it is beyond a linear model: improve(model, twin), or DDPG under an "
+    "ImprovementGuard.",
+}
+
+
+@dataclass(frozen=True)
+class Headroom:
+    """What there is to gain over an MPC, as :func:`headroom` has found it.
+
+    Attributes
+    ----------
+    mpc_costs, observer_costs, reidentified_costs, best_costs : ndarray, shape (starts,)
+        Costs of the MPC; with a disturbance observer (:func:`offset_free`); with a model that is
+        re-identified from these episodes (the MPC's own where those are worse on average); of the
+        best that was found.
+    offset, model_error, nonlinearity : float
+        Parts of the gain, relative to the MPC's mean cost: what the observer gains, which removes
+        the offset of a plant that is not its model; what the re-identified model gains beyond
+        that; the rest.
+    verdict : str
+        What to do: one of "do not bother", "add ObserveDisturbance first", "re-identify", "learn".
+    source : str
+        Where it was found.
+
+    Examples
+    --------
+    >>> costs = np.array([10.0, 20.0])
+    >>> found = Headroom(costs, costs, costs, costs - 0.5, 0.0, 0.0, 1 / 30, "learn", "a simulator")
+    >>> round(found.total, 4)
+    0.0333
+    """
+
+    mpc_costs: Array
+    observer_costs: Array
+    reidentified_costs: Array
+    best_costs: Array
+    offset: float
+    model_error: float
+    nonlinearity: float
+    verdict: str
+    source: str
+
+    @property
+    def total(self) -> float:
+        """The whole gain, relative to the MPC's mean cost."""
+        return gain(self.mpc_costs, self.best_costs)
+
+    @property
+    def standard_error(self) -> float:
+        """How far the total may be off because there are only so many starts."""
+        spread = np.std(self.mpc_costs - self.best_costs, ddof=1) / np.sqrt(len(self.mpc_costs))
+        return float(spread / (abs(self.mpc_costs.mean()) or 1.0))
+
+    def report(self) -> str:
+        """Return the figures, and what to do, in words."""
+        mpc, best = self.mpc_costs.mean(), self.best_costs.mean()
+        each = 100 * (self.best_costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
+        parts = (
+            ("offset, which a disturbance observer removes", self.offset),
+            ("model error beyond that", self.model_error),
+            ("nonlinearity and constraints", self.nonlinearity),
+        )
+        lines = [
+            f"The MPC costs {mpc:.5g} from {len(self.mpc_costs)} starts of {self.source}; "
+            f"the best that was found {best:.5g}: {-100 * self.total:+.2f} % +- "
+            f"{100 * self.standard_error:.2f} (from {each.min():+.2f} to {each.max():+.2f} % by "
+            "start).",
+            *(f"  {name}: {-100 * part:+.2f} %" for name, part in parts),
+            f"An MPC with a re-identified model: "
+            f"{-100 * gain(self.mpc_costs, self.reidentified_costs):+.2f} %.",
+            f"Verdict: {self.verdict}; {ADVICE[self.verdict]}",
+        ]
+        return "\n".join(lines)
+
+    __str__ = report
+
+
+def gain(before: Array, after: Array) -> float:
+    """Return by how much mean costs fall, relative to those before."""
+    return float((before.mean() - after.mean()) / (abs(before.mean()) or 1.0))

@@ -1,0 +1,181 @@
+"""Plants that a plan may try out: a simulator whose state can be set, and the members of a twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import product
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC
+from sb3_yann.control.linearization.simulator import Simulator, borrow
+from sb3_yann.twin.dynamics import Dynamics
+from sb3_yann.twin.plant_twin import PlantTwin
+
+Rows = NDArray[np.intp]
+CELL = 0.02
+"""A derivative holds where states and inputs differ by less than this, in half-widths."""
+STEP = 1e-3
+"""Of forward differences, in half-widths."""
+AGREES, TRIED = 1e-4, 100
+"""How far a simulator may err in a step of the plant, in half-widths; steps that are compared."""
+
+
+class Plant(Protocol):
+    """What a plan may ask of a plant. The rows are numbers of starts."""
+
+    def step(self, theta: Array, u: Array, rows: Rows) -> Array:
+        """Return the next theta (k, n_theta) from theta and u (k, m); r and d stay."""
+
+    def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return the derivatives of the step at theta (T, k, n_theta) and u (T, k, m)."""
+
+
+class TwinPlant:
+    """The members of a twin, one for each start.
+
+    Parameters
+    ----------
+    twin : PlantTwin
+    members : sequence of int
+        Which acts after each start.
+    """
+
+    def __init__(self, twin: PlantTwin, members: Iterable[int]) -> None:
+        self.twin, self.members = twin, [*members]
+        self._known: dict[bytes, Dynamics] = {}
+
+    def _acting(self, rows: Rows) -> Dynamics:
+        key, every = rows.tobytes(), self.twin.dynamics
+        if key not in self._known:
+            chosen = tuple(every.members[self.members[row]] for row in rows)
+            self._known[key] = Dynamics(every.problem, every.coordinates, chosen)
+        return self._known[key]
+
+    def step(self, theta: Array, u: Array, rows: Rows) -> Array:
+        """Return the next theta (k, n_theta)."""
+        return self._acting(rows).step(theta[:, None], u[:, None])[:, 0]
+
+    def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
+        swapped = np.swapaxes(theta, 0, 1), np.swapaxes(u, 0, 1)
+        A, B = self._acting(rows).jacobians(*swapped)
+        return np.swapaxes(A, 0, 1), np.swapaxes(B, 0, 1)
+
+
+class SimulatedPlant:
+    """A simulator whose state can be set.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta the env shows.
+    simulator : Simulator
+        Of the env.
+    shift : ndarray, shape (n,)
+        What the state of the simulator has more than that of theta.
+    """
+
+    def __init__(self, problem: LinearMPC, simulator: Simulator, shift: Array) -> None:
+        self.problem, self.simulator, self.shift = problem, simulator, shift
+        self._known: dict[bytes, tuple[Array, Array]] = {}
+
+    def after(self, x: Array, u: Array) -> Array:
+        """Return the state (n,) of theta one step later."""
+        return self.simulator.next_state(x + self.shift, u) - self.shift
+
+    def step(self, theta: Array, u: Array, rows: Rows) -> Array:
+        """Return the next theta (k, n_theta)."""
+        A, B = self.problem.prediction
+        following = theta @ A.T + u @ B.T
+        states = self.problem.layout.state
+        for i, x in enumerate(theta[:, states]):
+            following[i, states] = self.after(x, u[i])
+        return np.asarray(following)
+
+    def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return forward differences; one that is known of nearby holds."""
+        problem, n = self.problem, self.problem.model.n_states
+        A, B = (np.tile(M, (*theta.shape[:2], 1, 1)) for M in problem.prediction)
+        A[:, :, :n, n : problem.layout.disturbance.stop] = 0.0
+        unit = np.concatenate([problem.theta_half[:n], problem.u_half])
+        points = np.concatenate([theta[..., :n], u], axis=-1)
+        cells = np.round(points / (CELL * unit)).astype(np.int64)
+        for at in np.ndindex(theta.shape[:2]):
+            key = cells[at].tobytes()
+            if key not in self._known:
+                self._known[key] = self._differences(points[at], unit)
+            A[at][:n, :n], B[at][:n] = self._known[key]
+        return A, B
+
+    def _differences(self, point: Array, unit: Array) -> tuple[Array, Array]:
+        """Return the derivatives by x (n, n) and by u (n, m) at ``[x, u]``."""
+        n = self.problem.model.n_states
+        limit = np.concatenate([np.full(n, np.inf), self.problem.u_max])
+        steps = np.where(point + STEP * unit < limit, STEP, -STEP) * unit
+        base = self.after(point[:n], point[n:])
+        J: Array = np.empty((n, len(unit)))
+        for i, moved in enumerate(point + np.diag(steps)):
+            taken = steps[i]
+            if i >= n:  # in the precision of the action space
+                taken = (self.simulator.actual(moved[n:]) - self.simulator.actual(point[n:]))[i - n]
+            J[:, i] = (self.after(moved[:n], moved[n:]) - base) / taken
+        J = np.nan_to_num(J, posinf=0.0, neginf=0.0)
+        return J[:, :n], J[:, n:]
+
+
+def simulated(
+    problem: LinearMPC, env: Any, thetas: Array, inputs: Array, following: Array
+) -> SimulatedPlant | None:
+    """Return a simulator of the env that repeats its steps, None where there is none.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta the env shows.
+    env : callable
+        Makes an env.
+    thetas, inputs, following : ndarray, shapes (steps, n_theta), (steps, m) and (steps, n_theta)
+        Steps of the env.
+    """
+    n, x_ss = problem.model.n_states, problem.model.x_ss
+    simulator = Simulator(borrow(env), None, None)
+    chosen = np.unique(np.linspace(0, len(inputs) - 1, TRIED).astype(int))
+    steps = thetas[chosen, :n], inputs[chosen], following[chosen, :n]
+    for setter, reader in product(simulator.setters, simulator.readers):
+        simulator.setter, simulator.reader = setter, reader
+        for shift in (np.zeros(n), x_ss):
+            plant = SimulatedPlant(problem, simulator, shift)
+            if _error(plant.after, *steps, problem.theta_half[:n]) <= AGREES:
+                return plant
+    simulator.env.close()
+    return None
+
+
+def _error(
+    after: Callable[[Array, Array], Array], x: Array, u: Array, following: Array, size: Array
+) -> float:
+    """Return the largest error of the steps in half-widths, infinite where one fails.
+
+    Parameters
+    ----------
+    after : callable
+        From a state (n,) and an input (m,) to the next state.
+    x, u, following : ndarray, shapes (steps, n), (steps, m) and (steps, n)
+        Steps of the env.
+    size : ndarray, shape (n,)
+        Half-widths.
+    """
+    worst = 0.0
+    for start, action, wanted in zip(x, u, following, strict=True):
+        try:
+            error = float(np.max(np.abs(after(start, action) - wanted) / size))
+        except Exception:  # whatever an env raises that cannot be put into this state
+            return np.inf
+        worst = max(worst, error)
+        if not worst <= AGREES:
+            return np.inf
+    return worst

@@ -1,0 +1,85 @@
+"""What a trajectory is to minimize, and within which bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC
+
+INSIDE, WEIGHT = 1e-3, 1e4
+"""How far inside of the bounds plans stay, in half-widths; what one half-width beyond that costs in
+a step, in mean costs of a step."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a trajectory is to minimize: stage costs, the value at the end, what is beyond bounds.
+
+    Attributes
+    ----------
+    problem : LinearMPC
+        Its stage cost; its bounds of states, outputs, inputs and rates, soft ones too.
+    low, high : ndarray, shape (n,)
+        Bounds of the states besides, infinite where there are none.
+    end : ndarray, shape (n_theta, n_theta)
+        ``theta' end theta`` is the cost of what comes after the last step.
+    weight : float
+        What one half-width beyond a bound costs in a step, `WEIGHT` typical stage costs.
+    """
+
+    problem: LinearMPC
+    low: Array
+    high: Array
+    end: Array
+    weight: float
+
+    @cached_property
+    def _bounded(self) -> tuple[Array, Array, Array, Array]:
+        """Rows (k, n) of bounded combinations of states, their bounds (k,) and half-widths."""
+        problem, outputs = self.problem, self.problem.outputs
+        size = problem.theta_half[problem.layout.state]
+        C = np.vstack([np.eye(len(size)), outputs.C])
+        low = np.concatenate([np.maximum(problem.x_min, self.low), outputs.y_min])
+        high = np.concatenate([np.minimum(problem.x_max, self.high), outputs.y_max])
+        half = np.concatenate([size, np.abs(outputs.C) @ size])
+        used = np.isfinite(low) | np.isfinite(high)
+        return C[used], low[used], high[used], half[used]
+
+    def beyond(self, thetas: Array, inside: float = 0.0) -> Array:
+        """Return by how much bounds, moved inside, are exceeded (..., bounds), in half-widths."""
+        C, low, high, half = self._bounded
+        y, room = thetas[..., self.problem.layout.state] @ C.T, inside * half
+        return np.asarray((np.maximum(y - high + room, 0) - np.maximum(low + room - y, 0)) / half)
+
+    def costs(self, thetas: Array, inputs: Array) -> Array:
+        """Return the costs (k,) of thetas (T + 1, k, n_theta) and inputs (T, k, m); inf for NaN."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            stage = self.problem.stage_cost(thetas[:-1], inputs).sum(axis=0)
+            end = np.sum((thetas[-1] @ self.end) * thetas[-1], axis=-1)
+            outside = np.sum(self.beyond(thetas[1:], INSIDE) ** 2, axis=(0, 2))
+            total = stage + end + self.weight * outside
+        return np.where(np.isfinite(total), total, np.inf)
+
+    def limits(self, thetas: Array) -> tuple[Array, Array]:
+        """Return the bounds (..., m) of the inputs at thetas (..., n_theta)."""
+        problem = self.problem
+        low, high = (np.broadcast_to(each, (*thetas.shape[:-1], len(each)))
+                     for each in (problem.u_min, problem.u_max))  # fmt: skip
+        if problem.has_rate_bounds:
+            before = thetas[..., problem.layout.previous]
+            low = np.maximum(low, before + problem.rate.du_min)
+            high = np.maximum(np.minimum(high, before + problem.rate.du_max), low)
+        return low, high
+
+    def penalty(self, thetas: Array) -> tuple[Array, Array]:
+        """Return gradient (..., n) and curvature (..., n, n) of what is beyond bounds."""
+        C, _, _, half = self._bounded
+        over, weight = self.beyond(thetas, INSIDE), 2 * self.weight
+        scaled = C / half[:, None]
+        active = (over != 0).astype(float)
+        curvature = np.einsum("ki,...k,kj->...ij", scaled, active, scaled)
+        return weight * over @ scaled, weight * curvature

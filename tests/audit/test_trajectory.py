@@ -1,0 +1,87 @@
+"""Plans are optimal, within bounds, from every start of a batch."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel, LinearMPC, RateLimits, Terminal, Tracking
+from sb3_yann.audit.task import WEIGHT, Task
+from sb3_yann.audit.trajectory import planned
+
+STEPS = 30
+
+
+class Exact:
+    """The prediction model as the plant."""
+
+    def __init__(self, mpc: LinearMPC) -> None:
+        self.mpc = mpc
+
+    def step(self, theta, u, rows):
+        return self.mpc.predict(theta, u)
+
+    def jacobians(self, theta, u, rows):
+        return tuple(np.tile(M, (*theta.shape[:2], 1, 1)) for M in self.mpc.prediction)
+
+
+def cart(**changes) -> LinearMPC:
+    bounds = {"u_min": -1, "u_max": 1, "x_min": [-4, -0.5], "x_max": [4, 0.5]}
+    model, weights = LinearModel([[1, 1], [0, 1]], [[0.5], [1]], 1.0), {"R": [[0.1]], "horizon": 12}
+    return LinearMPC(model, Q=np.diag([1, 0.01]), **{**weights, **bounds, **changes})
+
+
+def plan(mpc: LinearMPC, starts: np.ndarray):
+    free = np.full(mpc.model.n_states, np.inf)
+    task = Task(mpc, -free, free, mpc.value_matrix(1.0), WEIGHT)
+    rows = np.arange(len(starts))
+    return planned(
+        Exact(mpc), task, [lambda _, x: np.zeros((len(x), len(mpc.R)))], starts, STEPS, rows
+    )
+
+
+@pytest.mark.parametrize("rate", [None, RateLimits(-0.3, 0.3)])
+def test_a_plan_costs_what_a_long_horizon_costs_and_keeps_bounds(rate) -> None:
+    mpc = cart(rate=rate)
+    starts = np.zeros((3, mpc.n_theta))
+    starts[:, :2] = [3.0, 0.2], [-2.0, 0.0], [0.1, 0.1]
+    found = plan(mpc, starts)
+    assert np.abs(found.thetas[1:, :, 1]).max() <= 0.5 and np.abs(found.inputs).max() <= 1
+    assert np.abs(found.thetas[..., 1]).max() > 0.49  # the bound is felt
+    if rate is not None:
+        moved = np.diff(found.inputs, axis=0, prepend=0.0)
+        assert 0.299 < np.abs(moved).max() <= 0.3 + 1e-9
+    cost = mpc.stage_cost(found.thetas[:-1], found.inputs).sum(axis=0)
+    for start, reached in zip(starts, cost, strict=True):
+        thetas, inputs = simulated(mpc, start)
+        assert reached <= 1.005 * mpc.stage_cost(thetas[:-1], inputs).sum()
+
+
+def simulated(mpc: LinearMPC, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    law, thetas, inputs = mpc.online(), [start], []
+    for _ in range(STEPS):
+        inputs.append(law(thetas[-1]))
+        thetas.append(mpc.predict(thetas[-1], inputs[-1]))
+    return np.array(thetas), np.array(inputs)
+
+
+def test_two_inputs_of_which_one_is_on_its_bound() -> None:
+    model = LinearModel([[0.95, 0.1], [0.0, 0.9]], [[0.2, 0.1], [0.0, 0.3]], 1.0)
+    bounds = {"u_min": [-0.1, -2], "u_max": [0.1, 2], "theta_min": -5, "theta_max": 5}
+    mpc = LinearMPC(model, Q=np.eye(2), R=0.1 * np.eye(2), horizon=20, **bounds)
+    starts = np.array([[3.0, -2.0], [-4.0, 1.0]])
+    found = plan(mpc, starts)
+    assert np.isclose(np.abs(found.inputs[..., 0]).max(), 0.1) and np.all(found.gains[0, :, 0] == 0)
+    cost = mpc.stage_cost(found.thetas[:-1], found.inputs).sum(axis=0)
+    for start, reached in zip(starts, cost, strict=True):
+        thetas, inputs = simulated(mpc, start)
+        assert reached == pytest.approx(mpc.stage_cost(thetas[:-1], inputs).sum(), rel=1e-3)
+
+
+def test_a_reference_is_reached() -> None:
+    mpc = cart(tracking=Tracking([0], -2, 2), horizon=3)
+    mpc = dataclasses.replace(mpc, terminal=Terminal())
+    found = plan(mpc, np.array([[0.0, 0.0, 1.5]]))
+    np.testing.assert_allclose(found.thetas[-1, 0], [1.5, 0.0, 1.5], atol=1e-3)
