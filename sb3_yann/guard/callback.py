@@ -150,6 +150,12 @@ class ImprovementGuard(BaseCallback):
 
     def summary(self) -> str:
         """Return some lines: what is accepted, what was refused most often, and what may help."""
+        updates, needed = int(self.session.policy.critic_updates), self.session.policy.critic_warmup
+        if not self.decisions and updates <= needed:
+            return (
+                f"The policy is still the MPC: the critic has had {updates} updates, and the actor "
+                f"moves after critic_warmup = {needed}. Train longer, or lower critic_warmup."
+            )
         evidence = self.state.evidence
         known = evidence.accepted or evidence.mpc
         return summary_of(self.decisions, 0 if known is None else len(known.costs))

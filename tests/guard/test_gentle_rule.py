@@ -95,3 +95,10 @@ def test_a_mean_that_is_not_surely_below_the_mpc_s_does_not_pass_the_final_trial
         starts = Starts((*range(200),), Outcome(mpc, *nothing), tolerance, 200, errors)
         assert reason in starts.objection(outcome)
         assert bool(starts.objection(outcome)) == bool(reason)
+
+
+def test_a_run_that_ends_within_the_warm_up_says_so() -> None:
+    model, guard = build(actor={"critic_warmup": 500}), make_guard(rule=GENTLE)
+    train(model, STEPS, guard)
+    assert not guard.decisions and is_mpc(model)
+    assert "lower critic_warmup" in guard.summary() and "= 500" in guard.summary()
