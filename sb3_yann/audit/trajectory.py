@@ -88,7 +88,19 @@ class Plans:
 
 
 def follow(plans: Plans, corrections: Array | float, t: int, theta: Array) -> Array:
-    """Return the inputs (k, m) of plans, with corrections (T, k, m) and feedback, at step t."""
+    """Return the inputs (k, m) of plans at a step.
+
+    Parameters
+    ----------
+    plans : Plans
+        With their feedback.
+    corrections : ndarray, shape (T, k, m), or float
+        What is added.
+    t : int
+        The step.
+    theta : ndarray, shape (k, n_theta)
+        Where the plant is.
+    """
     away = theta - plans.thetas[t]
     moved = corrections if isinstance(corrections, float) else corrections[t]
     return np.asarray(plans.inputs[t] + moved + (plans.gains[t] @ away[..., None])[..., 0])
