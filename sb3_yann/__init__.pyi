@@ -3,6 +3,7 @@ from sb3_yann.audit import CostFinding as CostFinding
 from sb3_yann.audit import CostMismatchError as CostMismatchError
 from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
 from sb3_yann.audit import Headroom as Headroom
+from sb3_yann.audit import SteadyOffsetWarning as SteadyOffsetWarning
 from sb3_yann.audit import headroom as headroom
 from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise

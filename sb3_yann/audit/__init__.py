@@ -1,7 +1,12 @@
 """What to know before training: whether the reward is the MPC's cost, and what there is to gain."""
 
 from sb3_yann.audit.callback import CostAudit
-from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning
+from sb3_yann.audit.finding import (
+    CostFinding,
+    CostMismatchError,
+    CostMismatchWarning,
+    SteadyOffsetWarning,
+)
 from sb3_yann.audit.gains import Headroom
 from sb3_yann.audit.headroom import headroom
 
@@ -11,5 +16,6 @@ __all__ = [
     "CostMismatchError",
     "CostMismatchWarning",
     "Headroom",
+    "SteadyOffsetWarning",
     "headroom",
 ]

@@ -13,7 +13,14 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import Array, as_flag, as_positive, as_whole
 from sb3_yann.audit.absolute import absolute_observation
 from sb3_yann.audit.causes import Cause, likely_cause, not_finite
-from sb3_yann.audit.finding import CostFinding, CostMismatchError, CostMismatchWarning, judged
+from sb3_yann.audit.finding import (
+    CostFinding,
+    CostMismatchError,
+    CostMismatchWarning,
+    SteadyOffsetWarning,
+    judged,
+)
+from sb3_yann.audit.offset import steady_offset
 from sb3_yann.audit.sample import FEWEST, Sample
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import require_frozen
@@ -26,7 +33,8 @@ class CostAudit(BaseCallback):
     Actor and critic are exact only where the reward is minus the stage cost, scaled and shifted as
     the policy's :class:`CriticOptions` say. The audit compares the first steps of every `learn`,
     and names a likely cause and wrappers of the env. Steps with ``info["violation"]``, and those
-    that terminate an episode, may cost more. While the plant rests it sees nothing.
+    that terminate an episode, may cost more. While the plant rests it sees nothing. Outputs that
+    come to rest beside their references get a :class:`SteadyOffsetWarning` with its cure.
 
     Parameters
     ----------
@@ -121,7 +129,10 @@ class CostAudit(BaseCallback):
             cause = absolute_observation(self.policy.problem, sample.theta) or cause
         if lost.any():
             cause = not_finite(lost, records, cause)
-        self.finding = judged(sample, cause, self.training_env)
+        beside = steady_offset(self.policy.problem, sample) if enough else ""
+        self.finding = judged(sample, cause, self.training_env, beside)
+        if beside:
+            warnings.warn(beside, SteadyOffsetWarning, stacklevel=2)
         if cause is not None:
             if self.strict:
                 raise CostMismatchError(self.finding.message)

@@ -26,6 +26,10 @@ class CostMismatchWarning(UserWarning):
     """The env's reward is not minus the stage cost of the problem."""
 
 
+class SteadyOffsetWarning(UserWarning):
+    """Tracked outputs come to rest beside their references."""
+
+
 class CostMismatchError(RuntimeError):
     """The same as an error, where `CostAudit` is strict.
 
@@ -51,6 +55,8 @@ class CostFinding:
         Steps that were compared.
     wrappers : tuple of str
         Wrappers of the env that may have to do with it.
+    rest : str
+        How far tracked outputs rest beside their references, and the cure; empty where none does.
 
     Examples
     --------
@@ -66,15 +72,28 @@ class CostFinding:
     r2: float
     steps: int
     wrappers: tuple[str, ...]
+    rest: str = ""
 
 
-def judged(sample: Sample, cause: Cause | None, venv: VecEnv) -> CostFinding:
-    """Return what a cause of a mismatch says, or that there is none."""
+def judged(sample: Sample, cause: Cause | None, venv: VecEnv, rest: str = "") -> CostFinding:
+    """Return what a cause of a mismatch says, or that there is none.
+
+    Parameters
+    ----------
+    sample : Sample
+        The steps.
+    cause : Cause, optional
+        The likely one.
+    venv : VecEnv
+        Whose wrappers are looked at.
+    rest : str
+        What is said of a steady offset.
+    """
     steps = int(sample.counted.sum())
     line = Line.through(sample) if steps else Line(np.nan, np.nan, np.nan)
     if cause is None:
         message = f"The reward is the cost of the problem in all of {steps} steps."
-        return CostFinding(True, "", message, line.scale, line.offset, line.r2, steps, ())
+        return CostFinding(True, "", message, line.scale, line.offset, line.r2, steps, (), rest)
     wrappers = _suspects(venv)
     if cause.name == "not finite":
         message = f"The rewards cannot all be compared: {cause.explanation}"
@@ -83,7 +102,7 @@ def judged(sample: Sample, cause: Cause | None, venv: VecEnv) -> CostFinding:
     else:
         message = " ".join(_in_words(sample, cause, wrappers, line))
     numbers = line.scale, line.offset, line.r2, steps
-    return CostFinding(False, cause.name, message, *numbers, wrappers)
+    return CostFinding(False, cause.name, message, *numbers, wrappers, rest)
 
 
 def _in_words(sample: Sample, cause: Cause, wrappers: tuple[str, ...], line: Line) -> Iterator[str]:

@@ -198,15 +198,12 @@ class _Search:
         """Return the figures."""
         base = self.base
         fair = {
-            name: np.where(loops.no_worse(base), loops.costs, np.inf)
+            name: np.where(loops.no_worse(base), loops.costs, base.costs)
             for name, loops in self.others.items()
         }
         observer, model = (_whole(fair.get(name), base.costs) for name in ("observer", "model"))
-        plan = np.where(np.isinf(fair["plan"]), base.costs, fair["plan"])
-        if self.random:
-            best = min((base.costs, observer, model, plan), key=np.mean)
-        else:
-            best = np.min([base.costs, *fair.values()], axis=0)
+        every = (base.costs, *fair.values())
+        best = min(every, key=np.mean) if self.random else np.min(every, axis=0)
         total, offset, known = (gain(base.costs, each) for each in (best, observer, model))
         offset, known = min(offset, total), min(known, total)
         parts = offset, max(0.0, known - offset), total - max(offset, known)

@@ -16,7 +16,7 @@ from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.plant_twin import PlantTwin
 
 Rows = NDArray[np.intp]
-CELL = 0.02
+CELL = 0.05
 """A derivative holds where states and inputs differ by less than this, in half-widths."""
 STEP = 1e-3
 """Of forward differences, in half-widths."""
