@@ -71,10 +71,8 @@ def compare(
         promised = predicted_costs(before, own, plant.mpc).mean() - predicted
     if now is not None:
         length = np.mean([len(each.actions) for each in own])
-        as_mpc, (beyond, unsure) = (
-            predicted_costs(now, own, plant.mpc),
-            _beyond(journal, plant, now),
-        )
+        as_mpc = predicted_costs(now, own, plant.mpc)
+        beyond, unsure = _beyond(journal, plant, now)
         mpc = as_mpc.mean() + length * beyond
         error = np.hypot(_standard_error(actual - as_mpc), length * unsure)
     return Costs(*map(float, (actual.mean(), predicted, promised, mpc, error)))

@@ -10,7 +10,7 @@ import torch as th
 from sb3_yann._validation import Array
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.policy.policies import YannPolicy
-from sb3_yann.twin.gradient import actor, actor_inputs
+from sb3_yann.twin.gradient import actor
 from sb3_yann.twin.plant_twin import PlantTwin
 
 SAMPLES, STEPS, BATCH, UPDATES, RATE = 1000, 100, 256, 200, 1e-3
@@ -21,10 +21,10 @@ SPREAD = 0.1
 def refit_critic(policy: YannPolicy, twin: PlantTwin, seed: int) -> None:
     """Fit the critics to the returns of the policy in the twin, from inputs near its own."""
     problem, rng = policy.problem, np.random.default_rng([seed, 2])
-    layer, half = copy.deepcopy(policy.actor.mu).cpu(), (problem.u_max - problem.u_min) / 2
+    layer, half = copy.deepcopy(policy.actor.mu).cpu(), problem.u_half
     members = len(twin.dynamics.members)
     starts = twin.starts.draw_logged(SAMPLES // members * members, rng)
-    first = actor_inputs(layer, problem, starts)
+    first = actor(layer, problem)(starts)
     first = first + SPREAD * half * rng.standard_normal(first.shape)
     first = np.clip(first, problem.u_min, problem.u_max)
     costs = _costs(policy, twin, layer, starts, first)

@@ -15,7 +15,7 @@ from sb3_yann._validation import Array
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.gradient import actor_inputs
+from sb3_yann.twin.gradient import actor
 from sb3_yann.twin.replay_buffer import normalization_of
 
 Inputs = Callable[[Array], Array]
@@ -90,7 +90,7 @@ class Plant:
         """Return the policy's inputs (rows, m); the MPC's where they are not finite."""
         layer = self.yann.actor.mu
         if self.device.type == "cpu":
-            u = actor_inputs(layer, self.problem, theta)
+            u = actor(layer, self.problem)(theta)
         else:
             with th.no_grad():
                 actions = layer(th.as_tensor(theta, device=self.device)).double().cpu().numpy()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_yann._validation import as_choice, as_number, as_options, as_positive
-from sb3_yann.networks.value import PredictionModel
+from sb3_yann.networks.prediction import PredictionModel
 
 KINDS = ("afterstate", "state_action")
 

@@ -29,11 +29,7 @@ from sb3_yann.policy.actor_critic import YannActor, YannCritic, layer_for
 from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
 from sb3_yann.policy.observations import AffineObservation, Shown, as_observation
 from sb3_yann.policy.problem_registry import resolve_problem
-
-EPS = 1e-8
-"""Of Adam, for gradients in units of the values' scale."""
-FOLLOWS, RECENT = 10, 0.1
-"""Updates after which the values' scale is looked at; share of that batch in the mean cost."""
+from sb3_yann.policy.value_scale import EPS, follow_scale
 
 
 class YannPolicy(TD3Policy):
@@ -221,29 +217,12 @@ class YannPolicy(TD3Policy):
     def _before_critic_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
         self.batch_is_finite = not self._refuses("critic", optimizer)
         if self.batch_is_finite:
-            taken = int(self.critic_updates)
-            follows = self.critic_options.scales_itself and self.lr_mult["critic"] > 0
-            if follows and taken % FOLLOWS == 0:
-                self._follow_scale(taken)
+            if self.critic_options.scales_itself and self.lr_mult["critic"] > 0:
+                networks = self.actor, self.critic, self.critic_target
+                taken, eps = int(self.critic_updates), self.optimizer_kwargs.get("eps", EPS)
+                follow_scale(*networks, self.mean_stage_cost, taken, eps)
             self.critic_updates.add_(1)
         _sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
-
-    def _follow_scale(self, taken: int) -> None:
-        """Let the factor of the critic's networks follow the mean stage cost, by factors of two.
-
-        What they put out stays, to the bit: Pop-Art (van Hasselt et al., *Learning values across
-        many orders of magnitude*, 2016). The optimizers' ``eps`` are in units of gradients.
-        """
-        cost, share = self.critic.stage_cost_of_batch(), max(FOLLOWS / (taken + FOLLOWS), RECENT)
-        self.mean_stage_cost.add_(share * (cost - self.mean_stage_cost))
-        if taken == 0:  # the critic has taken its first batch's for the unit, the target had none
-            self.critic_target.load_state_dict(self.critic.state_dict())
-        scale = self.critic.rescale(float(self.mean_stage_cost), self.critic.optimizer)
-        self.critic_target.rescale(float(self.mean_stage_cost))
-        eps = self.optimizer_kwargs.get("eps", EPS)
-        for optimizer, power in ((self.actor.optimizer, 1), (self.critic.optimizer, 2)):
-            for group in optimizer.param_groups:
-                group["eps"] = eps * (self.critic.scale * scale) ** power
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
         # Weights that were saved when the scale was a setting.

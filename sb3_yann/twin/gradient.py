@@ -64,14 +64,9 @@ class Objective:
 
 def actor(layer: LawLayer, problem: LinearMPC) -> Callable[[Array], Array]:
     """Return an actor of now as a function from theta (rows, n_theta) to inputs (rows, m)."""
-    middle, half = (problem.u_max + problem.u_min) / 2, (problem.u_max - problem.u_min) / 2
+    middle, half = (problem.u_max + problem.u_min) / 2, problem.u_half
     act = layer.frozen()
     return lambda theta: np.asarray(middle + half * act(theta))
-
-
-def actor_inputs(layer: LawLayer, problem: LinearMPC, theta: Array) -> Array:
-    """Return the inputs (rows, m) of an actor at theta (rows, n_theta)."""
-    return actor(layer, problem)(theta)
 
 
 def accumulate_gradient(
@@ -113,8 +108,7 @@ def accumulate_gradient(
         _compiled_costates(layer, dynamics, actions, flat, inputs, by_theta, by_u)
     else:
         _costates(layer, dynamics, thetas, inputs, by_theta, by_u)
-    half = (problem.u_max - problem.u_min) / 2
-    upstream = (by_u * weights[..., None] * half / weights.size).reshape(len(flat), -1)
+    upstream = (by_u * weights[..., None] * problem.u_half / weights.size).reshape(len(flat), -1)
     actions.backward(th.as_tensor(upstream).to(actions))
 
 
@@ -144,7 +138,7 @@ def _compiled_costates(
     from sb3_yann.twin._kernels.costates import costates
 
     law, problem = layer.explicit_law, dynamics.problem
-    policy: Any = (*layer.packed, (problem.u_max - problem.u_min) / 2)  # type: ignore[misc]
+    policy: Any = (*layer.packed, problem.u_half)  # type: ignore[misc]
     twin: Any = (*dynamics.packed, law.locate(np.where(np.isfinite(flat), flat, 0.0)))  # type: ignore[misc, union-attr]
     rows = (each.reshape(-1, each.shape[-1]) for each in (flat, inputs, by_theta, by_u))
     costates(*policy, *twin, *kept_for_gradient(actions), *rows)
@@ -172,9 +166,8 @@ def _costates(
     A, B = (
         np.moveaxis(each.reshape(len(each), steps, -1, *each.shape[2:]), 0, 1) for each in (A, B)
     )
-    half = (problem.u_max - problem.u_min) / 2
     slopes = _slopes_of_actor(layer, thetas[:-1].reshape(-1, problem.n_theta))
-    K = half[:, None] * slopes.reshape(*inputs.shape, problem.n_theta)
+    K = problem.u_half[:, None] * slopes.reshape(*inputs.shape, problem.n_theta)
     for t in reversed(range(steps)):
         row = by_theta[t + 1][..., None, :]
         by_u[t] += (row @ B[t])[..., 0, :]

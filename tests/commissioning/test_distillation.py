@@ -11,7 +11,7 @@ from stable_baselines3 import DDPG
 from sb3_yann import YannPolicy, improve
 from sb3_yann.commissioning import distillation
 from sb3_yann.commissioning.distillation import distill, law_today
-from sb3_yann.twin.gradient import actor_inputs
+from sb3_yann.twin.gradient import actor
 from twin_samples import Cart, problem, twin
 from weights import is_mpc
 
@@ -32,7 +32,7 @@ def test_a_layer_learns_it_where_it_comes() -> None:
     assert law is not None and distill(layer, twin(), seed=0)
     starts = twin().starts.draw(20, np.random.default_rng(5))
     rows = twin().dynamics.roll_out(law, starts[None].repeat(5, 0), 40)[0].reshape(-1, 2)
-    left = actor_inputs(layer, problem(), rows) - law(rows)
+    left = actor(layer, problem())(rows) - law(rows)
     apart = problem().explicit()(rows) - law(rows)
     assert np.sqrt(np.mean(left**2)) < 0.2 * np.sqrt(np.mean(apart**2))
 

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits
 from sb3_yann_envs import ProblemBox
 
 DT = 0.1
@@ -80,3 +80,13 @@ def mean_cost(act: Any, seeds: range = range(900, 940)) -> np.ndarray:
             cost -= reward
         costs.append(cost)
     return np.array(costs)
+
+
+def rated() -> PlantTwin:
+    """The cart's twin with bounds on the rate of its input."""
+    plain = problem()
+    mpc = LinearMPC(
+        plain.model, Q=plain.Q, R=plain.R, horizon=3, u_min=-1, u_max=1, theta_min=[-3, -3],
+        theta_max=[3, 3], rate=RateLimits(-0.3, 0.3),
+    )  # fmt: skip
+    return PlantTwin.fit(mpc, log(4))

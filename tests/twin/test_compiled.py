@@ -10,23 +10,13 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits
+from sb3_yann import LinearModel, LinearMPC, PlantTwin
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.gradient import Objective, accumulate_gradient, actor
 from sb3_yann.twin.residuals import Nothing, Polynomial
-from twin_samples import log, problem, twin
-
-
-def rated() -> PlantTwin:
-    """The cart's twin with bounds on the rate of its input."""
-    plain = problem()
-    mpc = LinearMPC(
-        plain.model, Q=plain.Q, R=plain.R, horizon=3, u_min=-1, u_max=1, theta_min=[-3, -3],
-        theta_max=[3, 3], rate=RateLimits(-0.3, 0.3),
-    )  # fmt: skip
-    return PlantTwin.fit(mpc, log(4))
+from twin_samples import log, problem, rated, twin
 
 
 def two_inputs() -> PlantTwin:

@@ -6,25 +6,14 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_yann import LinearMPC, PlantTwin, RateLimits
 from sb3_yann.networks import YannLayer
 from sb3_yann.twin.gradient import (
     Objective,
     _slopes_of_actor,
     accumulate_gradient,
-    actor_inputs,
+    actor,
 )
-from twin_samples import log, problem, twin
-
-
-def rated() -> PlantTwin:
-    """The cart's twin with bounds on the rate of its input."""
-    plain = problem()
-    mpc = LinearMPC(
-        plain.model, Q=plain.Q, R=plain.R, horizon=3, u_min=-1, u_max=1, theta_min=[-3, -3],
-        theta_max=[3, 3], rate=RateLimits(-0.3, 0.3),
-    )  # fmt: skip
-    return PlantTwin.fit(mpc, log(4))
+from twin_samples import rated, twin
 
 
 @pytest.mark.parametrize("make", [twin, rated])
@@ -43,7 +32,7 @@ def test_it_is_the_directional_derivative_of_the_mean_cost(make) -> None:
     nowhere = np.full(mpc.model.n_states, np.inf)
     objective = Objective(mpc, np.eye(mpc.n_theta), -nowhere, nowhere, 0.0)
     accumulate_gradient(layer, found.dynamics, objective, starts, 12)
-    rolled = found.dynamics.roll_out(lambda rows: actor_inputs(layer, mpc, rows), starts, 12)
+    rolled = found.dynamics.roll_out(actor(layer, mpc), starts, 12)
     assert np.abs(rolled[1]).max() < 1
     direction = [th.randn(each.shape, generator=generator, dtype=th.float64) for each in weights]
     slope = sum(float((g.grad * d).sum()) for g, d in zip(weights, direction, strict=True))
@@ -52,7 +41,7 @@ def test_it_is_the_directional_derivative_of_the_mean_cost(make) -> None:
         with th.no_grad():
             for each, d in zip(weights, direction, strict=True):
                 each.add_(step * d)
-        rolled = found.dynamics.roll_out(lambda rows: actor_inputs(layer, mpc, rows), starts, 12)
+        rolled = found.dynamics.roll_out(actor(layer, mpc), starts, 12)
         with th.no_grad():
             for each, d in zip(weights, direction, strict=True):
                 each.sub_(step * d)

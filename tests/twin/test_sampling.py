@@ -119,6 +119,9 @@ def test_the_cart_s_log_in_other_units_is_refused_or_not_trusted(change) -> None
 
 def test_what_is_missing_in_a_poor_log_is_advised() -> None:
     one, still = reactor()[:1], [(x, 0 * u + 0.1) for x, u in reactor()]
-    for episodes, advice in ((one, "Log at least one episode more"), (still, "Make a small step test on U,")):
+    for episodes, advice in (
+        (one, "Log at least one episode more"),
+        (still, "Make a small step test on U,"),
+    ):
         found = PlantTwin.fit(problems.cstr(), episodes, residuals=["none", "linear"])
         assert not found.trusted and advice in found.report()
