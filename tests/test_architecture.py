@@ -27,6 +27,8 @@ FLOORS = [
     {"sb3_yann.audit", "sb3_yann.guard"},
     {"sb3_yann.commissioning"},
     {"sb3_yann.export"},
+    {"sb3_yann.command_line"},
+    {"sb3_yann.__main__"},
     {"sb3_yann"},
 ]
 """Each floor may import from those before it: control -> networks -> twin -> the parts for

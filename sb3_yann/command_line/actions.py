@@ -1,0 +1,135 @@
+"""What each command of ``sb3-yann`` does; each loads no more than it needs."""
+
+from __future__ import annotations
+
+import zipfile
+from argparse import Namespace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+
+def solve(options: Namespace) -> None:
+    """Solve a problem, print its report, and save the law."""
+    problem = problem_of(options.problem)
+    law = problem.explicit(
+        time_limit=options.time_limit, region_limit=options.region_limit, progress=True
+    )
+    print(problem.report())
+    if options.save:
+        law.save(options.save)
+        print(f"Written: {options.save}")
+
+
+def evaluate(options: Namespace) -> None:
+    """Play the same episodes with a model's MPC and with the model, and print how they compare."""
+    from rich.console import Console
+
+    from sb3_yann import evaluation
+
+    model = model_of(options.model)
+    env, seeds = env_of(options.env), range(options.seed, options.seed + options.episodes)
+    policy = evaluation.evaluate(model, env, seeds)
+    model.policy.limit_correction(0.0)  # what is left is the MPC
+    mpc = evaluation.evaluate(model, env, seeds)
+    title = f"{options.episodes} episodes from seed {options.seed}: the MPC, and {options.model}"
+    Console().print(evaluation.summary_table(title, mpc, policy))
+
+
+def plot(options: Namespace) -> None:
+    """Draw the regions of a law."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(layout="constrained")
+    law_of(options.law).plot(axes=tuple(options.axes), ax=figure.subplots())
+    figure.savefig(options.picture, dpi=150)
+    print(f"Written: {options.picture}")
+
+
+def report(options: Namespace) -> None:
+    """Write the report on a model."""
+    from sb3_yann import report as write
+
+    env = env_of(options.env) if options.env else None
+    written = write(model_of(options.model), options.page, env=env, seeds=range(options.episodes))
+    print(f"Written: {written}")
+
+
+def export(options: Namespace) -> None:
+    """Write a model or a law for other machines."""
+    from sb3_yann import export as write
+
+    given = options.model
+    subject = model_of(given) if _is_model(given) else law_of(given)
+    print(write(subject, options.file, format=options.format))
+
+
+def commission(options: Namespace) -> None:
+    """Run a commissioning, or go on with one, and print its batches."""
+    from sb3_yann import Commissioning
+
+    model = model_of(options.model)
+    found = Commissioning(
+        model,
+        env_of(options.env),
+        batch=options.batch,
+        max_correction=options.max_correction,
+        log_path=options.record,
+        shadow=options.shadow,
+        verbose=1,
+    )
+    found.run(options.batches)
+    print(found.report())
+    if options.save:
+        model.save(options.save)
+        print(f"Written: {options.save}")
+
+
+def problem_of(given: str) -> Any:
+    """Return the LinearMPC that a name or ``"module:attribute"`` stands for."""
+    from sb3_yann.policy.problem_registry import resolve_problem
+
+    return resolve_problem(given, None)
+
+
+def env_of(given: str) -> Any:
+    """Return an env's id as it is, and what ``"module:attribute"`` names, if there is such."""
+    module, _, attribute = given.partition(":")
+    # "module:Env-v0" is Gymnasium's own: import the module, then look the id up.
+    return getattr(import_module(module), attribute, given) if attribute else given
+
+
+def model_of(path: str) -> Any:
+    """Return a saved model.
+
+    DDPG is TD3 with other defaults: what TD3 loads acts and learns as it was saved.
+    """
+    from stable_baselines3 import TD3
+
+    from sb3_yann.policy.policies import require_yann_policy
+
+    if not Path(path).exists() and not Path(f"{path}.zip").exists():
+        raise FileNotFoundError(f"There is no model {path}: model.save(path) writes one.")
+    model = TD3.load(path, device="cpu")
+    require_yann_policy(model.policy, "sb3-yann")
+    return model
+
+
+def law_of(given: str) -> Any:
+    """Return a law from its file, from a model, or from a problem."""
+    from sb3_yann import OnlineLaw, PiecewiseAffine
+
+    if _is_model(given):
+        policy = model_of(given).policy
+        return policy.problem.law(policy.law)
+    if not Path(given).suffix == ".npz":
+        return problem_of(given).law()
+    try:
+        return PiecewiseAffine.load(given)
+    except ValueError:
+        return OnlineLaw.load(given)
+
+
+def _is_model(given: str) -> bool:
+    """Tell whether a file is a model's: a zip archive that is no .npz."""
+    return Path(given).suffix != ".npz" and zipfile.is_zipfile(given)

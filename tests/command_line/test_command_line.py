@@ -1,0 +1,132 @@
+"""The command `sb3-yann`: what it prints and writes, and what its exit codes say."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG, TD3
+
+from sb3_yann import LinearMPC, PiecewiseAffine, YannPolicy
+from sb3_yann.command_line import main
+from twin_samples import Cart, problem
+
+PLANT = """
+from twin_samples import Cart, problem
+cart = problem
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A user's folder, with a module of his own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "my_cart.py").write_text(PLANT)
+    return tmp_path
+
+
+@pytest.fixture
+def model(folder):
+    """A saved model whose correction is not zero."""
+    model = DDPG(YannPolicy, Cart(), device="cpu", seed=0, learning_starts=10)
+    model.policy.critic_warmup = 0
+    model.learn(130)
+    model.save(folder / "cart")
+    return model
+
+
+def test_solve_prints_the_report_and_saves_the_law(folder, capsys) -> None:
+    assert main(["solve", "my_cart:cart", "--save", "law.npz"]) == 0
+    law = PiecewiseAffine.load(folder / "law.npz")
+    assert f"The law has {law.n_regions} regions" in capsys.readouterr().out
+    assert law == problem().explicit()
+
+
+def test_a_limit_that_is_too_small_is_said(folder, capsys) -> None:
+    assert main(["solve", "my_cart:cart", "--region-limit", "1", "--save", "law.npz"]) == 1
+    assert "region" in capsys.readouterr().err
+    assert not (folder / "law.npz").exists()
+
+
+def test_evaluate_plays_the_mpc_beside_the_model(model, capsys) -> None:
+    assert main(["evaluate", "cart.zip", "--env", "my_cart:Cart", "--episodes", "3"]) == 0
+    printed = capsys.readouterr().out
+    assert "3 episodes from seed 0" in printed
+    costs = [episode_cost(problem().explicit(), seed) for seed in range(3)]
+    assert f"{np.mean(costs):,.2f}" in printed
+
+
+def episode_cost(act, seed: int) -> float:
+    env = Cart()
+    x, over, cost = env.reset(seed=seed)[0], False, 0.0
+    while not over:
+        x, reward, _, over, _ = env.step(act(x))
+        cost -= reward
+    return cost
+
+
+def test_td3_s_models_are_read_too(folder) -> None:
+    TD3(YannPolicy, Cart(), device="cpu", target_policy_noise=0.0).save(folder / "td3")
+    assert main(["evaluate", "td3", "--env", "my_cart:Cart", "--episodes", "1"]) == 0
+
+
+def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys) -> None:
+    again = ["commission", "cart", "--env", "my_cart:Cart", "--record", "record", "--batch", "2"]
+    assert main([*again, "--batches", "1", "--save", "done"]) == 0
+    assert (folder / "record").exists() and (folder / "done.zip").exists()
+    assert "batch" in capsys.readouterr().out.lower()
+    assert main([*again, "--batches", "1"]) == 0  # nothing is left to do
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["solve", "nowhere"], "No problem is registered"),
+        (["solve", "no_such_module:mpc"], "no module"),
+        (["solve", "my_cart:Cart"], "expected a LinearMPC"),
+        (["evaluate", "none.zip", "--env", "my_cart:Cart"], "There is no model none.zip"),
+        (["evaluate", "mlp", "--env", "Pendulum-v1"], "needs a YannPolicy"),
+        (["commission", "none", "--env", "my_cart:Cart", "--record", "r"], "There is no model"),
+    ],
+)
+def test_what_cannot_be_done_is_an_exit_code_of_one_and_a_sentence(
+    arguments, said, folder, capsys
+) -> None:
+    if "mlp" in arguments:
+        DDPG("MlpPolicy", "Pendulum-v1", device="cpu").save(folder / "mlp")
+    assert main(arguments) == 1
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"sb3-yann {arguments[0]}: ") and said in printed
+    assert "Traceback" not in printed
+
+
+def test_traceback_shows_where_an_error_came_from(folder) -> None:
+    with pytest.raises(ValueError, match="No problem is registered"):
+        main(["--traceback", "solve", "nowhere"])
+
+
+def test_ctrl_c_is_an_exit_code(folder, monkeypatch, capsys) -> None:
+    def interrupted(*_, **__) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LinearMPC, "explicit", interrupted)
+    assert main(["solve", "my_cart:cart"]) == 130
+    assert "Interrupted" in capsys.readouterr().err
+
+
+def test_wrong_arguments_are_argparse_s(folder, capsys) -> None:
+    with pytest.raises(SystemExit) as found:
+        main(["evaluate"])
+    assert found.value.code == 2
+    assert "usage: sb3-yann" in capsys.readouterr().err
+
+
+def test_it_runs_as_a_module(folder) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "sb3_yann", "solve", "CSTR-v0"], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "The law has 7 regions" in done.stdout
