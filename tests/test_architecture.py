@@ -27,13 +27,14 @@ FLOORS = [
     {"sb3_yann.audit", "sb3_yann.guard"},
     {"sb3_yann.commissioning"},
     {"sb3_yann.export"},
+    {"sb3_yann"},
     {"sb3_yann.command_line"},
     {"sb3_yann.__main__"},
-    {"sb3_yann"},
 ]
 """Each floor may import from those before it: control -> networks -> twin -> the parts for
 Stable-Baselines3 -> export. Rooms to come (twin, commissioning, export) have their floor already.
-`sb3_yann` itself, which only names what there is, comes last."""
+`sb3_yann` itself only names what
+there is; the command line uses it as any other script does."""
 
 FORBIDDEN = {
     "sb3_yann._validation": {"torch", "stable_baselines3", "gymnasium"},
