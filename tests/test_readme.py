@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from sb3_yann import LinearModel
 
@@ -30,7 +31,11 @@ def blocks(text: str) -> list[str]:
 
 def run(name: str) -> dict[str, object]:
     """Run the blocks of a page one after the other, with a shorter training; return its names."""
-    code = "\n".join(blocks(page(name)))
+    return run_code(name, "\n".join(blocks(page(name))))
+
+
+def run_code(name: str, code: str) -> dict[str, object]:
+    """Run code with a shorter training; return its names."""
     shortened = code.replace("20_000", "500").replace(", progress_bar=True", "")
     # A number that nothing here knows would train in full.
     steps = re.findall(r"\.learn\(\s*(?:total_timesteps\s*=\s*)?([^\s,)]*)", shortened)
@@ -69,14 +74,29 @@ def test_the_code_in_the_page_of_pcgym_runs() -> None:
     run("docs/pcgym.md")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("at", "needs"), [(0, "gymnasium"), (1, "mujoco")])
+def test_an_environment_of_gymnasium_takes_twelve_lines(at, needs) -> None:
+    if find_spec(needs) is None:
+        pytest.skip(f"{needs} is not installed")
+    code = blocks(page("docs/gymnasium.md"))[at]
+    assert len(code.splitlines()) <= 12
+    names = run_code("docs/gymnasium.md", code)
+    model, mpc = names["model"], names["mpc"]
+    theta = 0.02 * mpc.theta_max  # type: ignore[attr-defined]
+    action = model.policy.actor_target.mu(torch.as_tensor(theta)[None])  # type: ignore[attr-defined]
+    wanted = mpc.law()(theta) / mpc.u_half  # type: ignore[attr-defined]
+    np.testing.assert_allclose(action.detach().numpy()[0], wanted, atol=0.02)
+
+
 def test_the_code_in_the_page_of_the_environments_runs() -> None:
     run("docs/environments.md")
 
 
 def test_every_page_with_code_is_run_by_a_test() -> None:
     found = {path.stem for path in PAGES if blocks(path.read_text(encoding="utf-8"))}
-    known = ("README", "commissioning", "environments", "guard", "headroom", "mpc", "pcgym")
-    known += ("policy", "twin")
+    known = ("README", "commissioning", "environments", "guard", "gymnasium", "headroom", "mpc")
+    known += ("pcgym", "policy", "twin")
     assert found == {*known}
 
 
