@@ -92,7 +92,8 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     start costs more than with the MPC by 0.05 % of the mean, none violates more, and the mean is
     not above that of the accepted policy. A start outside the log may cost 0.5 % of its own more,
     and up to ten times as much the rarer it is. Of what is refused, a half and a quarter are
-    tried. What passes is confirmed on new starts, and must gain 0.2 % in the end, or 0.02 % where
+    tried. What passes is confirmed on new starts, where the twin's second opinion, a model without
+    a form, must see a gain as well and no start dearer by 1 %. It must gain 0.2 % in the end, or 0.02 % where
     the twin errs less than half as much as the given model. Starts that it loses, or nearly, are
     played in the gradients to come. What the model has learnt before is checked first. Beyond what
     the log shows the MPC acts alone: no member of the twin knows the plant there.

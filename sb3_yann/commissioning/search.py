@@ -134,6 +134,8 @@ class Search:
         confirmed = new.check(self.iteration, there, new.mpc)
         if not confirmed.accepted:
             return replace(found, accepted=False, reason=f"on new starts, {confirmed.reason}")
+        if doubt := new.second_objection(act):
+            return replace(found, accepted=False, reason=doubt)
         self.outcome = played
         return found
 

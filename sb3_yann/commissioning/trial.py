@@ -19,6 +19,8 @@ MARGIN = 5e-4
 AROUND, RAREST = 0.005, 10.0
 """What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; how
 many times as much at most where it is rare."""
+OTHERWISE = 0.01
+"""What one start may cost more by the second opinion, in mean costs of the MPC."""
 FURTHER = 0.01
 """How much farther than the MPC a run may leave what the log shows, in its widths."""
 NEARLY = 0.5
@@ -77,7 +79,8 @@ class Trial:
     mpc: Outcome = field(init=False)
 
     def __post_init__(self) -> None:
-        runs = self._run(law_of(self.twin.problem))
+        self._law = law_of(self.twin.problem)
+        runs = self._run(self._law)
         self.far = np.nan_to_num(self._beyond(runs[0]), nan=np.inf)
         self.mpc = self._outcome(*runs)
 
@@ -103,6 +106,24 @@ class Trial:
         broken = twin.limits.broken(thetas[1:]).sum(axis=0).ravel()
         unsafe = np.column_stack([left + broken, 0 * broken, ~np.isfinite(costs), 0 * broken])
         return costs, unsafe.astype(np.int64)
+
+    def second_objection(self, act: Inputs) -> str:
+        """Return what the twin's second opinion says against a policy; empty where nothing.
+
+        From the starts that begin as the log does it must gain, and none may cost much more.
+        """
+        opinion, starts = self.twin.second_opinion, self.starts[:1, : self.n_known]
+        runs = (opinion.roll_out(each, starts, self.steps) for each in (self._law, act))
+        with np.errstate(all="ignore"):
+            mpc, costs = (
+                self.twin.problem.stage_cost(thetas[:-1], u).sum(axis=0)[0] for thetas, u in runs
+            )
+            change, mean = costs - mpc, np.abs(mpc).mean()
+            if not change.mean() < 0:
+                return f"by a second model it costs {100 * change.mean() / mean:+.2g} %"
+            if not change.max() <= OTHERWISE * mean:
+                return f"by a second model a start costs {change.max():.4g} more"
+        return ""
 
     def _run(self, act: Inputs) -> tuple[Array, Array]:
         with np.errstate(all="ignore"):

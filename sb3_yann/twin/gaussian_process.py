@@ -14,7 +14,7 @@ POINTS = 150
 """Points that carry the fitted function: the time of a prediction grows with their number."""
 ROWS = 200
 """Rows of the log, evenly drawn, that the lengths and noises are fitted to."""
-LENGTHS, NOISES = (2.0, 20.0), (1e-8, 1e3)
+SHORTEST, LONGEST, NOISES = 2.0, 20.0, (1e-8, 1e3)
 """Bounds of the lengths, in scaled coordinates, and of the noise, in variances of the function."""
 SMALLEST = 1e-9
 """A point that leaves less of the variance unexplained adds nothing but rounding."""
@@ -33,14 +33,18 @@ class GaussianProcess:
         Whether the function may differ from zero at zero, where the equilibrium is.
     stiffness : float, default 1
         How many times the fitted variance of the noise is taken: more leads to the linear model.
+    shortest : float, default 2
+        The least length, in scaled coordinates: the shorter, the nearer to the data it is zero.
     """
 
     lengths: Array
     points: Array
     weights: Array
 
-    def __init__(self, offset: bool = False, stiffness: float = 1.0) -> None:
-        self.offset, self.stiffness = offset, stiffness
+    def __init__(
+        self, offset: bool = False, stiffness: float = 1.0, shortest: float = SHORTEST
+    ) -> None:
+        self.offset, self.stiffness, self.shortest = offset, stiffness, shortest
 
     @classmethod
     def stack(cls, members: Sequence[GaussianProcess]) -> GaussianProcess:
@@ -112,7 +116,7 @@ class GaussianProcess:
         )  # one drawn twice is no proof
         rows = distinct[np.linspace(0, len(distinct) - 1, min(ROWS, len(distinct))).astype(int)]
         k, n = z.shape[1], y.shape[1]
-        bounds = [np.log(LENGTHS)] * k + [np.log(NOISES)] * n
+        bounds = [np.log((self.shortest, LONGEST))] * k + [np.log(NOISES)] * n
         start = np.concatenate([np.full(k, np.log(2.0)), np.full(n, np.log(1e-2))])
         found = minimize(
             self._unlikeliness, start, (z[rows], y[rows]), "L-BFGS-B", jac=True, bounds=bounds,

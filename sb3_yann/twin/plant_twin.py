@@ -15,6 +15,7 @@ from sb3_yann._validation import as_whole
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.env import TwinEnv
+from sb3_yann.twin.gaussian_process import GaussianProcess
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from sb3_yann.twin.reidentification import reidentified
@@ -39,6 +40,8 @@ from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
 KINDS = ("none", "linear", "quadratic", "cubic")
+SHORT = 0.1
+"""The least length of a second opinion, relative to the largest values in the log."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -227,6 +230,18 @@ class PlantTwin:
         """
         self.require_trust()
         return reidentified(self.problem, self.dynamics.coordinates, self.episodes)
+
+    @cached_property
+    def second_opinion(self) -> Dynamics:
+        """A model of the log whose residual has no form: away from the data it is zero.
+
+        All members of a twin are of one form. Where an input follows the state as in a closed loop
+        without excitation, they may agree on what is wrong, and where the plant is not smooth.
+        """
+        problem, coordinates = self.problem, self.dynamics.coordinates
+        process = GaussianProcess(problem.layout.has_constants, shortest=SHORT)
+        residual = fitted(problem, coordinates, self.episodes, [process])
+        return Dynamics(problem, coordinates, tuple(residual))
 
     @cached_property
     def starts(self) -> Starts:
