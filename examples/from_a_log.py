@@ -45,6 +45,7 @@ def save_picture(changes: np.ndarray) -> Path:
     axes.axhline(0, color="black", linewidth=1, label="MPC")
     axes.axhline(changes.mean(), color="C1", linestyle="--", label="mean")
     axes.set(xticks=[], xlabel="test episodes, sorted", ylabel="change of the cost, %")
+    axes.set_ylim(top=max(0, changes.max()) + 0.05 * np.ptp(changes))
     axes.legend()
     figure.savefig(path := OUT / "from_a_log.png", dpi=120)
     return path

@@ -5,13 +5,16 @@ from sb3_yann.commissioning.commissioning import Commissioning
 from sb3_yann.commissioning.improve import Improvement, improve
 from sb3_yann.commissioning.journal import Batch
 from sb3_yann.commissioning.trial import Check
+from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 
 __all__ = [
+    "Alarm",
     "Attempt",
     "Batch",
     "Check",
     "Commissioning",
     "ImproveInTwin",
     "Improvement",
+    "Watchdog",
     "improve",
 ]

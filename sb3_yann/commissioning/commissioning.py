@@ -137,6 +137,13 @@ class Commissioning:
         ----------
         batches : int
             Those of a resumed record count.
+
+        Raises
+        ------
+        ValueError
+            If the first reading of an episode is not finite. It does not count: run again.
+        RuntimeError
+            If an episode does not end in a million steps.
         """
         as_whole("batches", batches)
         if len(self.batches) < batches:
@@ -158,10 +165,11 @@ class Commissioning:
         doubted = unsafe or journal.doubted or journal.cut_off >= 2
         acts = journal.accepted and not (self.shadow or doubted)
         self.incumbent.restore()
+        first = plant.begin(self.seed + len(journal.episodes))
         journal.begin(acts)
         try:
-            act, seed = plant.policy if acts else plant.mpc, self.seed + len(journal.episodes)
-            played = plant.play(seed, act, self.watchdog)
+            act = plant.policy if acts else plant.mpc
+            played = plant.play(first, act, self.watchdog)
         except KeyboardInterrupt:
             journal.interrupt()
             raise

@@ -107,21 +107,34 @@ class Plant:
         low, high = previous + problem.rate.du_min, previous + problem.rate.du_max
         return np.clip(np.clip(u, low, high), problem.u_min, problem.u_max)
 
-    def play(self, seed: int, act: Inputs, watchdog: Watchdog | None) -> PlantEpisode:
+    def begin(self, seed: int) -> Array:
+        """Reset the plant, and return the first theta (n_theta,).
+
+        Raises
+        ------
+        ValueError
+            If it is not finite: no prediction could take its place.
+        """
+        known = self._theta(self.env.reset(seed=seed)[0])
+        if not np.isfinite(known).all():
+            raise ValueError(
+                f"The plant's first reading has {self._not_finite(known)}. Nothing has been "
+                "played; mend the sensor, and run again."
+            )
+        return known
+
+    def play(self, known: Array, act: Inputs, watchdog: Watchdog | None) -> PlantEpisode:
         """Play an episode; after an alarm the MPC acts, from the very sample on.
 
         Parameters
         ----------
-        seed : int
-            Of the env's reset.
+        known : ndarray, shape (n_theta,)
+            From :meth:`begin`.
         act : callable
             The one that acts until then: :meth:`policy` or :meth:`mpc`.
         watchdog : Watchdog, optional
             Without one only violations and readings that are not finite are seen.
         """
-        known = self._theta(self.env.reset(seed=seed)[0])
-        if not np.isfinite(known).all():
-            raise ValueError(f"The plant's first reading, {known.tolist()}, is not finite.")
         if watchdog is not None:
             watchdog.start(known, act)
         thetas, actions, reward, violations, apart = [known], list[Array](), 0.0, 0, 0.0
@@ -137,7 +150,7 @@ class Plant:
             reward, violations = reward + float(gained), violations + unsafe
             over, read = over or terminated, self._theta(observation)
             if alarm is None:
-                found = _look(watchdog, known, u, read, unsafe)
+                found = self._look(watchdog, known, u, read, unsafe)
                 if found is not None:
                     alarm, step, act = found, len(actions), self.mpc
             known = self._known(known, u, read)
@@ -161,13 +174,18 @@ class Plant:
         return np.where(np.isfinite(read), read, predicted)
 
 
-def _look(
-    watchdog: Watchdog | None, known: Array, u: Array, read: Array, unsafe: bool
-) -> Alarm | None:
-    if not np.isfinite(read).all():
-        return Alarm("not a number", f"theta was read as {read.tolist()}.")
-    if unsafe:
-        return Alarm("violation", "The plant reports a violation.")
-    if watchdog is None:
-        return None
-    return watchdog.watch(known, u.astype(np.float64), read)
+    def _look(
+        self, watchdog: Watchdog | None, known: Array, u: Array, read: Array, unsafe: bool
+    ) -> Alarm | None:
+        if not np.isfinite(read).all():
+            return Alarm("not a number", f"It reads {self._not_finite(read)}.")
+        if unsafe:
+            return Alarm("violation", "The plant reports a violation.")
+        if watchdog is None:
+            return None
+        return watchdog.watch(known, u.astype(np.float64), read)
+
+    def _not_finite(self, theta: Array) -> str:
+        """Return which entries are not finite, by name."""
+        wrong = np.flatnonzero(~np.isfinite(theta))
+        return ", ".join(f"{self.problem.labels()[i]} = {theta[i]}" for i in wrong)

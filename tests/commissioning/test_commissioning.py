@@ -175,7 +175,7 @@ def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once() -> Non
     run.run(2)
     episode, law = run.episodes[6], problem().explicit()
     assert episode.alarm is not None and episode.alarm.kind == "not a number"
-    assert episode.step == 0
+    assert episode.alarm.message == "It reads x[0] = nan, x[1] = nan." and episode.step == 0
     u = np.clip(law(episode.thetas[1:-1]), -1, 1)  # on what the model predicts
     np.testing.assert_allclose(episode.actions[1:], u, atol=1e-5)
     assert np.isfinite(episode.thetas).all()
@@ -375,11 +375,14 @@ def test_a_path_without_a_suffix_is_a_folder(tmp_path) -> None:
     assert (tmp_path / "plant" / "commissioning.jsonl").exists()
 
 
-def test_a_first_reading_that_is_no_number_is_an_error() -> None:
+def test_a_first_reading_that_is_no_number_is_an_error(tmp_path) -> None:
     class Blind(Cart):
         def reset(self, **kwargs):
             observation, info = super().reset(**kwargs)
             return np.full_like(observation, np.nan), info
 
-    with pytest.raises(ValueError, match="first reading"):
-        commission(env=Blind).run(1)
+    run = commission(tmp_path, env=Blind)
+    with pytest.raises(ValueError, match=r"first reading has x\[0\] = nan, x\[1\] = nan"):
+        run.run(1)
+    assert not run.episodes
+    assert "start" not in (tmp_path / "commissioning.jsonl").read_text()  # nothing was played
