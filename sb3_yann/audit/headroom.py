@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import gymnasium as gym
@@ -24,10 +25,11 @@ from sb3_yann.audit.closed_loops import (
 from sb3_yann.audit.gains import ADVICE, Headroom, gain
 from sb3_yann.audit.plants import Plant, TwinPlant, simulated
 from sb3_yann.audit.task import WEIGHT, Task
-from sb3_yann.control import LinearMPC, OnlineLawWarning, offset_free
+from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.evaluation.episodes import Source
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import as_episodes
+from sb3_yann.twin.observers import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.reidentification import reidentified
 
@@ -191,8 +193,12 @@ class _Search:
         self.random = True  # or so it must be taken to be
         others = play(self.mpc, self.make, self.seeds, Excited(self.mpc, self.seeds[0]))
         log = [*self.base.episodes(), *others.episodes()]
-        twin = PlantTwin.fit(self.mpc, log, n_members=1)
+        twin = PlantTwin.fit(self.mpc, log, observer=self._observer(), n_members=1)
         return TwinPlant(twin, [0] * len(self.seeds)), twin.limits.low, twin.limits.high
+
+    def _observer(self) -> DisturbanceObserver | None:
+        with closing(self.make()) as env:
+            return observer_of(env)
 
     def found(self) -> Headroom:
         """Return the figures."""

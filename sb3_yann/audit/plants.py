@@ -56,14 +56,31 @@ class TwinPlant:
         return self._known[key]
 
     def step(self, theta: Array, u: Array, rows: Rows) -> Array:
-        """Return the next theta (k, n_theta)."""
-        return self._acting(rows).step(theta[:, None], u[:, None])[:, 0]
+        """Return the next theta (k, n_theta); an estimated d stays, as in an env's plan."""
+        row, acting = self.twin.dynamics.row, self._acting(rows)
+        after = acting.step(row.begin(theta)[:, None], u[:, None])[:, 0]
+        found, parts = row.shown(after).copy(), self.twin.problem.layout
+        if row.observer is not None:
+            found[:, parts.state] = after[:, row.state]
+            found[:, parts.disturbance] = theta[:, parts.disturbance]
+        return found
 
     def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
-        swapped = np.swapaxes(theta, 0, 1), np.swapaxes(u, 0, 1)
-        A, B = self._acting(rows).jacobians(*swapped)
-        return np.swapaxes(A, 0, 1), np.swapaxes(B, 0, 1)
+        row, parts = self.twin.dynamics.row, self.twin.problem.layout
+        swapped = row.begin(np.swapaxes(theta, 0, 1)), np.swapaxes(u, 0, 1)
+        A, B = (np.swapaxes(each, 0, 1) for each in self._acting(rows).jacobians(*swapped))
+        if row.observer is None:
+            return A, B
+        number, n = np.arange(parts.size), parts.size
+        to = np.where(number < parts.n_states, number + row.state.start, number)
+        of_x, B = A[..., to, :], B[..., to, :]
+        found = of_x[..., :n].copy()
+        found[..., parts.state] += of_x[..., row.state]
+        found[..., parts.disturbance, :] = np.eye(n)[parts.disturbance]
+        B = B.copy()
+        B[..., parts.disturbance, :] = 0.0
+        return found, B
 
 
 class SimulatedPlant:

@@ -48,8 +48,8 @@ class Tracks:
     dynamics : Dynamics
         The first member is the observers' model.
     familiarity : Familiarity
-    theta : ndarray, shape (n_theta,)
-        The first one.
+    theta : ndarray, shape (size,)
+        The first row.
     act : callable
         The policy, from theta (rows, n_theta) to inputs (rows, m).
     """
@@ -71,18 +71,19 @@ class Tracks:
         self.charts, self._gathered, self.doubts = np.zeros((3, len(GAINS), n))
 
     def step(self, theta: Array, u: Array, after: Array) -> None:
-        """Take in one transition of the plant."""
-        problem, rows = self.dynamics.problem, self.rows
-        state, constant = problem.layout.state, problem.layout.constant
-        rows[:, -1, constant] = theta[constant]
-        rows[:, :-1, state.stop :] = theta[state.stop :]
+        """Take in one transition of the plant, from row to row."""
+        problem, row, rows = self.dynamics.problem, self.dynamics.row, self.rows
+        state, followed = row.state, rows[:, :-1, row.state].copy()
+        rows[:, -1, row.given] = theta[row.given]
+        rows[:, :-1] = theta
+        rows[:, :-1, state] = followed
         inputs = np.empty((*rows.shape[:2], len(u)))
         inputs[:] = u
         if np.isfinite(rows[:, -1]).all():  # else the twin ran away, and its costs are not known
-            inputs[:, -1] = self.act(rows[:, -1].copy())
+            inputs[:, -1] = self.act(row.shown(rows[:, -1]).copy())
             np.clip(inputs[:, -1], problem.u_min, problem.u_max, out=inputs[:, -1])
         at = np.vstack([rows[:, -1], theta]), np.vstack([inputs[:, -1], u])
-        cost = problem.stage_cost(*at)
+        cost = problem.stage_cost(row.shown(at[0]), at[1])
         self.costs += cost[:-1]
         self.cost += float(cost[-1])
         self.steps += 1
@@ -162,7 +163,7 @@ class Bands:
             spread=spread,
             most=np.maximum(most, LEAST_RATIO),
             noisy=lag < NOISY,
-            repeats=np.max([_repeats(e.thetas[:, : len(error)]) for e in log], axis=0),
+            repeats=np.max([_repeats(e.thetas[:, twin.dynamics.row.state]) for e in log], axis=0),
             cost_offset=offset,
             cost_most=max(float(ratios.max()), 1.0),
             factor=FACTOR + FACTOR_OF_FEW / whole,
@@ -201,7 +202,7 @@ def _one_step(dynamics: Dynamics, episode: Episode) -> Array:
     """Return one-step errors (T, n) of the first member."""
     first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
     after = first.step(episode.thetas[None, :-1], episode.actions[None])[0]
-    return np.asarray((episode.thetas[1:] - after)[:, dynamics.problem.layout.state])
+    return np.asarray((episode.thetas[1:] - after)[:, dynamics.row.state])
 
 
 def _errors(left: list[Array]) -> tuple[Array, Array]:
@@ -220,7 +221,7 @@ def _played(
     The run on its own gets the logged inputs, corrected by what the law makes of its deviation.
     """
     law = law_of(dynamics.problem)
-    changes = episode.actions - law(episode.thetas[:-1])
+    changes = episode.actions - law(dynamics.row.shown(episode.thetas[:-1]))
     tracks = Tracks(dynamics, familiarity, episode.thetas[0], law)
     charts, doubts, ratios = [], [], []
     for theta, after, u, change in zip(

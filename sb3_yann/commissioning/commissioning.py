@@ -24,6 +24,7 @@ from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.evaluation.episodes import Source, one_env
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.twin.observers import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 
 
@@ -112,6 +113,7 @@ class Commissioning:
         self.iterations, self.seed = as_whole("iterations", iterations), as_whole("seed", seed, 0)
         self.twin: PlantTwin | None = None
         self.watchdog: Watchdog | None = None
+        self.observer = observer_of(model.get_env())
         record = Record(None if log_path is None else Path(log_path))
         bound = 1.0 if self.policy.max_correction is None else self.policy.max_correction
         # A model that was saved meanwhile has the bound of then.
@@ -148,6 +150,7 @@ class Commissioning:
         as_whole("batches", batches)
         if len(self.batches) < batches:
             with one_env(self.plant_env) as env:
+                self._take_observer(env)
                 plant = Plant(env, self.model)
                 while len(self.batches) < batches:
                     while not self._batch_is_over():
@@ -263,7 +266,7 @@ class Commissioning:
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]
         log = [(each.thetas, each.actions) for each in episodes]
-        return PlantTwin.fit(self.policy.problem, log, seed=seed)
+        return PlantTwin.fit(self.policy.problem, log, observer=self.observer, seed=seed)
 
     @property
     def _first_bound(self) -> float:
@@ -307,6 +310,15 @@ class Commissioning:
             self.journal.record.load(outlook.model, self.model)
         self.incumbent.candidate = None
         self.incumbent.hold()
+        self._restore_twin(outlook)
+
+    def _restore_twin(self, outlook: Outlook) -> None:
         if outlook.twin is not None:
             self.twin = self._fit(outlook.twin, outlook.twin_seed)
             self.watchdog = Watchdog.of(self.twin)
+
+    def _take_observer(self, env: gym.Env[Any, Any]) -> None:
+        """Take the plant's observer where the model's env has none; a restored twin needs it."""
+        if self.observer is None and (found := observer_of(env)) is not None:
+            self.observer = found
+            self._restore_twin(self.journal.outlook)

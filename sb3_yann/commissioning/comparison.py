@@ -126,17 +126,18 @@ def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> Array:
 def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inputs) -> Array:
     """Return what a policy would have cost from each episode's start, by the members' mean.
 
-    References and disturbances are those of the episodes.
+    References and measured disturbances are those of the episodes.
     """
-    dynamics, constant = twin.dynamics, twin.problem.layout.constant
+    dynamics, row = twin.dynamics, twin.dynamics.row
     lengths, members = np.array([len(each.actions) for each in episodes]), len(dynamics.members)
-    theta = np.repeat(np.array([[each.thetas[0] for each in episodes]]), members, axis=0)
+    first = row.begin(np.array([[each.thetas[0] for each in episodes]]))
+    theta = np.repeat(first, members, axis=0)
     shape, costs = theta.shape, np.zeros(theta.shape[:2])
     with np.errstate(all="ignore"):
         for k in range(lengths.max()):
             now = [each.thetas[min(k, last)] for each, last in zip(episodes, lengths, strict=True)]
-            theta[..., constant] = np.array(now)[:, constant]
-            u = act(theta.reshape(-1, shape[-1])).reshape(*shape[:2], -1)
-            costs += np.where(k < lengths, twin.problem.stage_cost(theta, u), 0.0)
+            theta[..., row.given] = np.array(now)[:, row.given]
+            u = act(row.shown(theta.reshape(-1, shape[-1]))).reshape(*shape[:2], -1)
+            costs += np.where(k < lengths, twin.problem.stage_cost(row.shown(theta), u), 0.0)
             theta = dynamics.step(theta, u)
     return np.asarray(costs.mean(axis=0))

@@ -24,7 +24,8 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin, seed: int) -> None:
     layer, half = copy.deepcopy(policy.actor.mu).cpu(), problem.u_half
     members = len(twin.dynamics.members)
     starts = twin.starts.draw_logged(SAMPLES // members * members, rng)
-    first = actor(layer, problem)(starts)
+    seen = twin.dynamics.row.shown(starts)
+    first = actor(layer, problem)(seen)
     first = first + SPREAD * half * rng.standard_normal(first.shape)
     first = np.clip(first, problem.u_min, problem.u_max)
     costs = _costs(policy, twin, layer, starts, first)
@@ -34,7 +35,7 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin, seed: int) -> None:
     if np.count_nonzero(known) < BATCH:  # too few to say anything
         return
     scaled = (first - problem.u_min) / half - 1
-    _fit(policy, starts[known], scaled[known], returns[known], rng)
+    _fit(policy, seen[known], scaled[known], returns[known], rng)
     policy.critic_target.load_state_dict(policy.critic.state_dict())
 
 
@@ -42,16 +43,18 @@ def _costs(policy: YannPolicy, twin: PlantTwin, layer: LawLayer, at: Array, u: A
     """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
     problem, gamma, dynamics = policy.problem, policy.gamma, twin.dynamics
     shape = len(dynamics.members), -1
-    starts, u = at.reshape(*shape, problem.n_theta), u.reshape(*shape, problem.model.n_inputs)
+    starts, u = at.reshape(*shape, at.shape[-1]), u.reshape(*shape, problem.model.n_inputs)
+    shown = dynamics.row.shown
     with np.errstate(all="ignore"):
         first = dynamics.step(starts, u)
-        thetas, inputs = dynamics.roll_out(actor(layer, problem), first, STEPS)
+        rows, inputs = dynamics.roll_out(actor(layer, problem), first, STEPS)
+        thetas = shown(rows)
         stage = problem.stage_cost(thetas[:-1], inputs)
         end = np.sum((thetas[-1] @ problem.value_matrix(gamma)) * thetas[-1], axis=-1)
         later = np.tensordot(gamma ** np.arange(STEPS), stage, axes=1) + gamma**STEPS * end
         # What leaves the log is not known, and may be many times as dear as all the rest.
-        later = np.where(twin.limits.violated(thetas).any(axis=0), np.nan, later)
-        return np.asarray(problem.stage_cost(starts, u) + gamma * later).ravel()
+        later = np.where(twin.limits.violated(rows).any(axis=0), np.nan, later)
+        return np.asarray(problem.stage_cost(shown(starts), u) + gamma * later).ravel()
 
 
 def _fit(

@@ -23,8 +23,11 @@ STARTS, STEPS, BATCH, UPDATES, RATE = 60, 100, 512, 600, 1e-2
 def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
     """Return the law of the re-identified MPC, of theta and for inputs of the given problem.
 
-    None where no linear model predicts better than the given one, or the new one has no MPC.
+    None where no linear model predicts better than the given one, or the new one has no MPC; nor
+    with an observer, which would have to know the new model.
     """
+    if twin.dynamics.row.observer is not None:
+        return None
     try:
         today = twin.reidentified()
         if today is twin.problem:

@@ -9,11 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC
-from sb3_yann.twin.dynamics import features
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.residuals import Monomials
+from sb3_yann.twin.row_layout import RowLayout
 
 MOST_MONOMIALS = 200
 INPUT_SHARE = 0.2
@@ -33,7 +32,7 @@ class Familiarity:
 
     Attributes
     ----------
-    problem : LinearMPC
+    row : RowLayout
     scale, low, high : ndarray, shape (k,)
         Of the features ``[x, d, u]``: magnitudes, and the log's box.
     monomials : Monomials
@@ -45,7 +44,7 @@ class Familiarity:
         What the residual explains.
     """
 
-    problem: LinearMPC
+    row: RowLayout
     scale: Array
     low: Array
     high: Array
@@ -69,13 +68,13 @@ class Familiarity:
         error, white : ndarray, shape (n,)
             Root mean squares of held-out one-step errors, and the share of samples that count.
         """
-        problem, scale = twin.problem, twin.dynamics.coordinates.scale
-        seen = np.concatenate([features(problem, e.thetas[:-1], e.actions) for e in episodes])
+        row, scale = twin.dynamics.row, twin.dynamics.coordinates.scale
+        seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in episodes])
         degree = 3
         while degree > 1 and Monomials(len(scale), degree).values(scale).size > MOST_MONOMIALS:
             degree -= 1
         monomials = Monomials(len(scale), degree)
-        inputs = monomials.holding(len(scale) - problem.model.n_inputs)
+        inputs = monomials.holding(len(scale) - twin.problem.model.n_inputs)
         share = np.where(inputs, INPUT_SHARE, 1.0)
         F = monomials.values(seen / scale) * share
         values, axes = np.linalg.eigh(F.T @ F)
@@ -85,15 +84,15 @@ class Familiarity:
         known = np.maximum(values, 0.0)[:, None] * white / error**2
         low, high = seen.min(axis=0), seen.max(axis=0)
         variances = 1.0 / (known + 1.0 / size**2)
-        return cls(problem, scale, low, high, monomials, share[:, None] * axes, variances, size)
+        return cls(row, scale, low, high, monomials, share[:, None] * axes, variances, size)
 
     @cached_property
     def _width(self) -> Array:
         return np.maximum(self.high - self.low, 1e-6 * self.scale)
 
     def doubt(self, theta: Array, u: Array) -> Array:
-        """Return standard deviations (n,) at theta (n_theta,) and u (m,)."""
-        z = features(self.problem, theta, u)
+        """Return standard deviations (n,) at a row (size,) and u (m,)."""
+        z = self.row.features(theta, u)
         beyond = np.maximum(np.maximum(z - self.high, self.low - z), 0.0)
         far = (beyond / self._width).sum()
         far += far**2  # a twin of a narrow log underrates what is far away

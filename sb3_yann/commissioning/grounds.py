@@ -70,11 +70,21 @@ class Grounds:
         return max(1, self.n_runs // len(self.twin.dynamics.members))
 
     def draw(self, rng: np.random.Generator) -> Trial:
-        """Return a trial on new starts, the same for every member."""
+        """Return a trial on new starts, the same for every member.
+
+        Those that begin as the log does go on so, one logged episode after the other: a policy that
+        gains at set-points that stay may lose where they change. Every other one has set-points
+        between those of the log, which stay.
+        """
         count, starts, twin = self.n_starts, self.twin.starts, self.twin
-        drawn = starts.draw_between(count, rng), starts.draw_around(count, rng)
-        rows = np.repeat(np.concatenate(drawn)[None], len(twin.dynamics.members), axis=0)
-        return Trial(twin, rows, count, max(map(len, twin.episodes)))
+        drawn = np.concatenate([starts.draw_between(count, rng), starts.draw_around(count, rng)])
+        between = twin.dynamics.row.given.start < twin.dynamics.row.given.stop
+        follow = np.full(len(drawn), -1)
+        logged = np.arange(count)[int(between) :: 1 + between]
+        follow[logged] = np.arange(len(logged)) % len(twin.episodes)
+        drawn[logged] = starts.draw(len(logged), rng, follow[logged])
+        rows = np.repeat(drawn[None], len(twin.dynamics.members), axis=0)
+        return Trial(twin, rows, count, follow)
 
     def costs_of_mpc(self, starts: Array) -> Array:
         """Return the MPC's costs (members, starts) of the runs of a gradient."""

@@ -21,10 +21,6 @@ from sb3_yann.commissioning.trial import Check
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
-LEAST, SURELY = 2e-3, 2e-4
-"""What a policy must gain in the twin, relative to the MPC's mean cost, to be worth a change; the
-same where the twin errs less than half as much as the given model."""
-
 RACE = 3
 """Of two searches the better one goes on after such a part of the iterations."""
 
@@ -43,8 +39,8 @@ class Improvement:
     change : float
         The accepted policy's mean cost in the twin against the MPC's: -0.02 is 2 % less.
     accepted : bool
-        Whether a policy passed that gains at least 0.2 %, or 0.02 % where the twin errs less than
-        half as much as the given model; if none did, the model is as it was.
+        Whether a policy passed that gains at least 0.2 %, and two standard errors on episodes like
+        the log's; if none did, the model is as it was.
     before : Check, optional
         Of what the model had learnt before, if it had.
 
@@ -93,9 +89,9 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     not above that of the accepted policy. A start outside the log may cost 0.5 % of its own more,
     and up to ten times as much the rarer it is. Of what is refused, a half and a quarter are
     tried. What passes is confirmed on new starts, where the twin's second opinion, a model without
-    a form, must see a gain as well and no start dearer by 1 %. It must gain 0.2 % in the end, or 0.02 % where
-    the twin errs less than half as much as the given model. Starts that it loses, or nearly, are
-    played in the gradients to come. What the model has learnt before is checked first. Beyond what
+    a form, must see a gain as well and no start dearer by 1 %. In the end it must gain 0.2 %, and
+    twice the standard error on episodes like the log's. Starts that it loses, or nearly, are played
+    in the gradients to come. What the model has learnt before is checked first. Beyond what
     the log shows the MPC acts alone: no member of the twin knows the plant there.
 
     Two searches run, one from the present policy and one from the re-identified MPC. After a third
@@ -176,14 +172,12 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     before = None if layer.network.is_zero() else searches[0].checks[0]
     leg = min(iterations, max(check_every, -(-iterations // RACE)))
     total = iterations + (len(searches) - 1) * leg
-    for _ in track(
-        _race(searches, leg, _least(twin)), "improving", total, disable=not progress_bar
-    ):
+    for _ in track(_race(searches, leg), "improving", total, disable=not progress_bar):
         pass
     search = min(searches, key=lambda each: each.change)
     change, own = search.change, policy.actor.mu.state_dict()
     moved = any(not th.equal(own[key].cpu(), each) for key, each in search.accepted.items())
-    if not moved or change > -_least(twin):
+    if not moved or not search.is_worth_it:
         return Improvement(tuple(search.checks), 0.0 if moved else change, False, before)
     with all_or_nothing(policy):
         policy.actor.mu.load_state_dict(search.accepted)
@@ -194,7 +188,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     return Improvement(tuple(search.checks), change, True, before)
 
 
-def _race(searches: list[Search], leg: int, least: float) -> Iterator[int]:
+def _race(searches: list[Search], leg: int) -> Iterator[int]:
     """Yield after each gradient step: of all searches in the first leg, then of the best one.
 
     The others follow where that finds nothing worth a change.
@@ -204,9 +198,5 @@ def _race(searches: list[Search], leg: int, least: float) -> Iterator[int]:
             yield from each.steps(leg)
     for each in sorted(searches, key=lambda each: each.change):
         yield from each.steps(each.pace.iterations)
-        if each.change <= -least:
+        if each.is_worth_it:
             break
-
-
-def _least(twin: PlantTwin) -> float:
-    return SURELY if twin.trust.error_ratio < 0.5 else LEAST

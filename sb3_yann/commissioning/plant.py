@@ -173,7 +173,6 @@ class Plant:
         predicted = np.asarray(self.problem.predict(before, u.astype(np.float64)))
         return np.where(np.isfinite(read), read, predicted)
 
-
     def _look(
         self, watchdog: Watchdog | None, known: Array, u: Array, read: Array, unsafe: bool
     ) -> Alarm | None:

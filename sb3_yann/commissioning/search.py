@@ -69,7 +69,7 @@ class Search:
         self.layer, self.grounds, self.pace, twin = layer, grounds, pace, grounds.twin
         self.rng, self.drawing = copy.deepcopy(grounds.rng), copy.deepcopy(grounds.drawing)
         self.outcome = grounds.trial.mpc
-        nothing: list[Array] = [np.empty((0, twin.problem.n_theta))] * len(twin.dynamics.members)
+        nothing: list[Array] = [np.empty((0, twin.dynamics.row.size))] * len(twin.dynamics.members)
         self.known_hard = self.new_hard = nothing
         self.hard = [(each[:0], costs[:0]) for each, costs in grounds.pool]
         self.accepted = copy.deepcopy(layer.state_dict())
@@ -103,7 +103,17 @@ class Search:
     @property
     def change(self) -> float:
         """Mean cost of the accepted weights against the MPC's in the twin; 0 where none are."""
-        return next((each.change for each in reversed(self.checks) if each.accepted), 0.0)
+        return self.best.change if self.best else 0.0
+
+    @property
+    def best(self) -> Check | None:
+        """The check of the accepted weights; None where none are."""
+        return next((each for each in reversed(self.checks) if each.accepted), None)
+
+    @property
+    def is_worth_it(self) -> bool:
+        """Whether the accepted weights surely gain enough."""
+        return self.best is not None and self.best.is_worth_it
 
     def _check(self) -> bool:
         """Check the present actor, else what lies between it and the accepted one."""

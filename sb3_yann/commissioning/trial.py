@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,11 @@ FURTHER = 0.01
 NEARLY = 0.5
 """A start that loses so much of what it may lose is a hard one."""
 
+LEAST = 2e-3
+"""What a policy must gain in the twin, relative to the MPC's mean cost, to be worth a change."""
+SURELY = 2.0
+"""Standard errors by which episodes that go on as those of the log must gain."""
+
 Inputs = Callable[[Array], Array]
 Outcome = tuple[Array, NDArray[np.int64]]
 """Costs, and what is unsafe, of all starts."""
@@ -47,6 +53,9 @@ class Check:
         The largest increase of one start on one member, in mean costs of the MPC.
     safe : bool
         Whether no start violates more than with the MPC.
+    logged, error : float
+        Mean cost against the MPC's of the episodes that go on as those of the log, and its standard
+        error: over the logged episodes, and over the members.
     """
 
     iteration: int
@@ -55,6 +64,13 @@ class Check:
     change: float
     worst: float
     safe: bool
+    logged: float = 0.0
+    error: float = 0.0
+
+    @property
+    def is_worth_it(self) -> bool:
+        """Whether the gain is large enough for a change, and sure on episodes like the log's."""
+        return self.change <= -LEAST and self.logged + SURELY * self.error < 0
 
 
 @dataclass
@@ -66,19 +82,30 @@ class Trial:
     act : callable
         The actor, from theta (rows, n_theta) to inputs (rows, m).
     twin : PlantTwin
-    starts : ndarray, shape (members, starts, n_theta)
+    starts : ndarray, shape (members, starts, size)
         The first ``n_known`` of each member begin as the log does, the others around it.
-    n_known, steps : int
+    n_known : int
+    follow : ndarray of int, shape (starts,)
+        The logged episode with whose references and disturbances each goes on; with -1 its own
+        stay.
     """
 
     twin: PlantTwin
     starts: Array
     n_known: int
-    steps: int
+    follow: Any
+    steps: int = field(init=False)
+    given: Array = field(init=False)
     far: Array = field(init=False)
     mpc: Outcome = field(init=False)
 
     def __post_init__(self) -> None:
+        episodes, part = self.twin.episodes, self.twin.dynamics.row.given
+        self.steps = max(map(len, episodes))
+        self.given = np.repeat(self.starts[:1, :, part], self.steps, axis=0)
+        for number, each in enumerate(episodes):
+            rows = each.thetas[np.minimum(np.arange(self.steps), len(each)), part]
+            self.given[:, self.follow == number] = rows[:, None]
         self._law = law_of(self.twin.problem)
         runs = self._run(self._law)
         self.far = np.nan_to_num(self._beyond(runs[0]), nan=np.inf)
@@ -91,7 +118,7 @@ class Trial:
 
     @property
     def mean(self) -> float:
-        """The MPC's mean cost from them."""
+        """The MPC's mean cost from the known starts."""
         return float(np.abs(self.mpc[0][self.known]).mean())
 
     def play(self, act: Inputs) -> Outcome:
@@ -100,8 +127,9 @@ class Trial:
 
     def _outcome(self, thetas: Array, inputs: Array) -> Outcome:
         twin = self.twin
+        shown = twin.dynamics.row.shown(thetas[:-1])
         with np.errstate(all="ignore"):
-            costs = twin.problem.stage_cost(thetas[:-1], inputs).sum(axis=0).ravel()
+            costs = twin.problem.stage_cost(shown, inputs).sum(axis=0).ravel()
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
         broken = twin.limits.broken(thetas[1:]).sum(axis=0).ravel()
         unsafe = np.column_stack([left + broken, 0 * broken, ~np.isfinite(costs), 0 * broken])
@@ -113,10 +141,11 @@ class Trial:
         From the starts that begin as the log does it must gain, and none may cost much more.
         """
         opinion, starts = self.twin.second_opinion, self.starts[:1, : self.n_known]
-        runs = (opinion.roll_out(each, starts, self.steps) for each in (self._law, act))
+        given, stage_cost = self.given[:, : self.n_known], self.twin.problem.stage_cost
         with np.errstate(all="ignore"):
+            runs = (opinion.roll_out(each, starts, self.steps, given) for each in (self._law, act))
             mpc, costs = (
-                self.twin.problem.stage_cost(thetas[:-1], u).sum(axis=0)[0] for thetas, u in runs
+                stage_cost(opinion.row.shown(rows[:-1]), u).sum(axis=0)[0] for rows, u in runs
             )
             change, mean = costs - mpc, np.abs(mpc).mean()
             if not change.mean() < 0:
@@ -127,11 +156,11 @@ class Trial:
 
     def _run(self, act: Inputs) -> tuple[Array, Array]:
         with np.errstate(all="ignore"):
-            return self.twin.dynamics.roll_out(act, self.starts, self.steps)
+            return self.twin.dynamics.roll_out(act, self.starts, self.steps, self.given)
 
     def _beyond(self, thetas: Array) -> Array:
         """Return how far each run gets beyond what the log shows, in its widths; 0 inside."""
-        limits, x = self.twin.limits, thetas[1:][..., self.twin.problem.layout.state]
+        limits, x = self.twin.limits, thetas[1:][..., self.twin.dynamics.row.state]
         over = np.maximum(x - limits.high, limits.low - x) / (limits.high - limits.low)
         return np.asarray(np.maximum(over, 0.0).max(axis=(0, -1)).ravel())
 
@@ -145,13 +174,31 @@ class Trial:
             self.mpc[0][known], accepted[0][known], allowed[known], Tolerance(MARGIN * mean)
         )
         reason = paired.objection(costs[known], unsafe[known])
+        (logged, error), (before, _) = map(self._as_logged, (excess, accepted[0] - self.mpc[0]))
+        if not reason and not logged <= before:
+            reason = f"episodes like the log's cost {100 * (logged - before) / mean:.2g} % more"
         if not reason and not safe:
             reason = "a start outside the log breaks a bound of the problem"
         beyond = (excess - self.room())[~known]
         if not reason and not np.all(beyond <= 0):
             reason = f"a start outside the log costs {excess[~known][np.argmax(beyond)]:.4g} more"
         change, worst = float(excess[known].mean()), float(excess[known].max())
-        return Check(iteration, not reason, reason, change / mean, worst / mean, safe)
+        shown = change / mean, worst / mean, safe, logged / mean, error / mean
+        return Check(iteration, not reason, reason, *shown)
+
+    def _as_logged(self, excess: Array) -> tuple[float, float]:
+        """Return the mean of the starts that go on as the log does, and its standard error.
+
+        The episodes of the log are a sample of the plant's, the members one of the twins that such
+        a log could have made.
+        """
+        by_member = excess.reshape(self.starts.shape[:2])
+        numbers, count = self.follow[self.follow >= 0], len(self.starts)
+        by_start = by_member[:, self.follow >= 0]
+        means = np.array([by_start[:, numbers == each].mean() for each in np.unique(numbers)])
+        by_episodes = means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else 0.0
+        by_members = by_start.mean(axis=1).std(ddof=1) if count > 1 else 0.0
+        return float(by_start.mean()), float(np.hypot(by_episodes, by_members))
 
     def room(self) -> Array:
         """Return what each start may cost more than with the MPC."""

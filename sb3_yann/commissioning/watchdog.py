@@ -136,8 +136,9 @@ class Watchdog:
         """
         problem = self.dynamics.problem
         first = as_array("theta", theta, (problem.n_theta,))
+        first = self.dynamics.row.begin(first)
         tracks = Tracks(self.dynamics, self.bands.familiarity, first, act)
-        self.alarm, self._episode = None, _Episode(tracks, problem.model.n_states)
+        self.alarm, self._episode = None, _Episode(tracks, first)
 
     def watch(self, theta: Array, u: Array, after: Array, violation: bool = False) -> Alarm | None:
         """Return an alarm, or None: after one the episode's alarm stays as it is.
@@ -174,9 +175,9 @@ class Watchdog:
         if violation:
             return episode.alarm("violation", "the plant reports a violation")
         episode.take(theta, u, after)
-        return self._frozen(episode, after) or self._beyond(episode) or self._dear(episode)
+        return self._frozen(episode) or self._beyond(episode) or self._dear(episode)
 
-    def _frozen(self, episode: _Episode, after: Array) -> Alarm | None:
+    def _frozen(self, episode: _Episode) -> Alarm | None:
         """Return an alarm where a reading repeats itself as it would not.
 
         A noisy sensor does so never, or as the log shows. A settled one may for ever: there the
@@ -189,7 +190,7 @@ class Watchdog:
         moving = np.abs(episode.moved) > MOVED * stands * bands.error
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             model = self.dynamics.problem.model
-            name, shown = model.state_names, after[i] + model.x_ss[i]
+            name, shown = model.state_names, episode.reading[i] + model.x_ss[i]
             said = f"{name[i] if name else f'reading {i}'} has been {shown:.6g}"
             said += f" for {stands[i]} samples"
             return episode.alarm("frozen sensor", f"{said}; the twin moves or the sensor is noisy")
@@ -231,7 +232,7 @@ class Watchdog:
         value: one means that it did.
         """
         theta, u, after = (np.array(each) for each in zip(*episode.last, strict=True))
-        dynamics, x = self.dynamics, self.dynamics.problem.layout.state
+        dynamics, x = self.dynamics, self.dynamics.row.state
         first = Dynamics(dynamics.problem, dynamics.coordinates, dynamics.members[:1])
         predicted = first.step(theta[None], u[None])[0]
         errors = (after - predicted)[:, x] / self.bands.error
@@ -254,19 +255,27 @@ class Watchdog:
 class _Episode:
     """What is remembered within an episode."""
 
-    def __init__(self, tracks: Tracks, n: int) -> None:
-        self.tracks = tracks
+    def __init__(self, tracks: Tracks, row: Array) -> None:
+        self.tracks, self.row, n = tracks, row, tracks.dynamics.problem.model.n_states
         self.stands, self.moved = np.zeros(n, np.int64), np.zeros(n)
         self.last: deque[tuple[Array, Array, Array]] = deque(maxlen=WINDOW)
 
     def take(self, theta: Array, u: Array, after: Array) -> None:
         """Take in a transition, of which all is finite."""
-        self.last.append((theta, u, after))
-        self.tracks.step(theta, u, after)
-        n = len(self.stands)
-        same = after[:n] == theta[:n]
+        layout = self.tracks.dynamics.row
+        if not np.array_equal(layout.shown(self.row), theta):  # one that does not follow the last
+            self.row = layout.begin(theta)
+        before, self.row = self.row, layout.after(self.row, u, after)
+        self.last.append((before, u, self.row))
+        self.tracks.step(before, u, self.row)
+        same = self.reading == before[layout.state]
         self.stands = (self.stands + 1) * same
         self.moved = (self.moved + self.tracks.innovation) * same
+
+    @property
+    def reading(self) -> Array:
+        """The plant's state (n,) as it was measured last."""
+        return self.row[self.tracks.dynamics.row.state]
 
     def alarm(self, kind: str, said: str) -> Alarm:
         """Return an alarm that names the step."""

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.residuals import Residual, as_polynomials
+from sb3_yann.twin.row_layout import RowLayout
 
 MARGIN = 0.25
 """How far the residual reaches beyond the data, in widths of the data."""
@@ -25,28 +26,38 @@ class Coordinates:
     Attributes
     ----------
     low, high : ndarray, shape (k,)
-        The box of the logged ``[x, d, u]``, a quarter of its width beyond the data.
+        The box of the logged ``[x, d, u]``, or ``[x, u]`` where an observer estimates d, a quarter
+        of its width beyond the data.
     scale : ndarray, shape (k,)
         The largest magnitudes.
     units : ndarray, shape (n,)
         How far the states move in the log: standard deviations.
+    row : RowLayout
+        What a row of the twin holds: theta alone, unless an observer is a part of it.
     """
 
     low: Array
     high: Array
     scale: Array
     units: Array
+    row: RowLayout
 
     @classmethod
-    def of(cls, problem: LinearMPC, episodes: Sequence[Episode]) -> Coordinates:
-        """Return those of a log."""
-        seen = np.concatenate([features(problem, e.thetas[:-1], e.actions) for e in episodes])
-        half = features(problem, problem.theta_half, problem.u_half)
+    def of(
+        cls,
+        problem: LinearMPC,
+        episodes: Sequence[Episode],
+        observer: DisturbanceObserver | None = None,
+    ) -> Coordinates:
+        """Return those of a log, whose episodes hold rows of this layout."""
+        row = RowLayout(problem, observer)
+        seen = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in episodes])
+        half = row.half
         low, high = seen.min(0), seen.max(0)
         width = np.maximum(high - low, 1e-6 * half)
         scale = np.maximum(np.abs(seen).max(0), 1e-3 * half)
         units = np.maximum(np.std(seen, axis=0), 1e-6 * half)[: problem.model.n_states]
-        return cls(low - MARGIN * width, high + MARGIN * width, scale, units)
+        return cls(low - MARGIN * width, high + MARGIN * width, scale, units, row)
 
     def scaled(self, features: Array) -> Array:
         """Return what residuals are fed, inside the box."""
@@ -66,15 +77,12 @@ def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
     return act
 
 
-def features(problem: LinearMPC, theta: Array, u: Array) -> Array:
-    """Return ``[x, d, u]`` (..., k): what the next state depends on."""
-    parts = problem.layout
-    return np.concatenate([theta[..., parts.state], theta[..., parts.disturbance], u], axis=-1)
-
-
 @dataclass(frozen=True)
 class Dynamics:
     """``theta+ = A_bar theta + B_bar u + residual``, with one residual for each member.
+
+    Where an observer estimates d, a row holds what it remembers behind theta: see
+    :class:`RowLayout`. It steps with the plant.
 
     Attributes
     ----------
@@ -97,18 +105,24 @@ class Dynamics:
     @cached_property
     def packed(self) -> tuple[Any, ...] | None:
         """The twin as arrays for compiled code; None where a residual is no polynomial."""
-        problem, parts, box = self.problem, self.problem.layout, self.coordinates
-        number = np.arange(parts.size + self.m, dtype=np.float64)
-        columns = features(problem, number[: parts.size], number[parts.size :]).astype(np.int64)
-        found = as_polynomials(self.members, len(columns))
+        box, row = self.coordinates, self.row
+        found = as_polynomials(self.members, len(row.inputs))
         if found is None:
             return None
-        linear = np.ascontiguousarray(np.concatenate(problem.prediction, axis=1))
-        return linear, columns, np.stack([box.low, box.high, box.scale]), *found
+        *order, weights = found
+        if row.observer is not None:
+            weights = np.ascontiguousarray(weights @ row.spread.T)
+        limits = np.stack([box.low, box.high, box.scale])
+        return row.linear, row.inputs, limits, *order, weights
+
+    @property
+    def row(self) -> RowLayout:
+        """What a row holds."""
+        return self.coordinates.row
 
     def residual(self, theta: Array, u: Array) -> Array:
-        """Return the residuals (members, batch, n) at theta (members, batch, n_theta)."""
-        return self._each("predict", self.coordinates.scaled(features(self.problem, theta, u)))
+        """Return the residuals (members, batch, n) at rows (members, batch, size)."""
+        return self._each("predict", self.coordinates.scaled(self.row.features(theta, u)))
 
     def _each(self, method: str, z: Array) -> Array:
         """Return what the members say of z (members, batch, k)."""
@@ -118,7 +132,7 @@ class Dynamics:
         return np.array([getattr(member, method)(rows) for member, rows in pairs])
 
     def step(self, theta: Array, u: Array) -> Array:
-        """Return the next theta (members, batch, n_theta); r and d stay as they are."""
+        """Return the next rows (members, batch, size); r and a measured d stay as they are."""
         if self.packed is not None and theta.shape[0] == len(self.members):
             from sb3_yann.twin._kernels.step import step  # compiled once
 
@@ -126,24 +140,24 @@ class Dynamics:
             rows = *(np.array(each, np.float64, order="C") for each in (theta, u)), after
             given: Any = (*self.packed, *(each.reshape(-1, each.shape[-1]) for each in rows))
             step(*given)
-            return after
-        A, B = self.problem.prediction
-        after = theta @ A.T + u @ B.T
-        after[..., self.problem.layout.state] += self.residual(theta, u)
+        else:
+            after = np.concatenate([theta, u], axis=-1) @ self.row.linear.T
+            after += self.residual(theta, u) @ self.row.spread.T
+        self.row.clip(after)
         return np.asarray(after)
 
     def jacobians(self, theta: Array, u: Array) -> tuple[Array, Array]:
         """Return the derivatives of the step by theta and by u, for each member and row."""
-        problem, at = self.problem, features(self.problem, theta, u)
-        z, parts, m = self.coordinates.scaled(at), problem.layout, problem.model.n_inputs
-        J = self._each("jacobian", z)
+        row, at = self.row, self.row.features(theta, u)
+        J = self._each("jacobian", self.coordinates.scaled(at))
         inside = (at > self.coordinates.low) & (at < self.coordinates.high)
         J = J * (inside / self.coordinates.scale)[..., None, :]
-        n, d = problem.model.n_states, parts.disturbance.stop - parts.disturbance.start
-        A, B = (np.broadcast_to(M, (*at.shape[:-1], *M.shape)).copy() for M in problem.prediction)
-        A[..., :n, parts.state] += J[..., :n]
-        A[..., :n, parts.disturbance] += J[..., n : n + d]
-        B[..., :n, :] += J[..., n + d : n + d + m]
+        whole = np.broadcast_to(row.linear, (*at.shape[:-1], *row.linear.shape)).copy()
+        whole[..., row.inputs] += row.spread @ J
+        if row.observer is not None:  # on its bounds the shown estimate does not move
+            free = row.clip(self.step(theta, u))
+            whole[..., self.problem.layout.disturbance, :] *= free[..., None]
+        A, B = np.split(whole, [row.size], axis=-1)
         return A, B
 
     def replay(self, episode: Episode, starts: Array, steps: int) -> Array:
@@ -151,7 +165,7 @@ class Dynamics:
 
         References and disturbances are those of the log at each step.
         """
-        parts, n = self.problem.layout, self.problem.model.n_states
+        parts, n = self.row, self.problem.model.n_states
         theta = np.broadcast_to(
             episode.thetas[starts], (len(self.members), len(starts), parts.size)
         )
@@ -160,7 +174,7 @@ class Dynamics:
             found[:, :, k] = theta[..., parts.state]
             if k == steps:
                 break
-            theta[..., parts.constant] = episode.thetas[starts + k][:, parts.constant]
+            theta[..., parts.given] = episode.thetas[starts + k][:, parts.given]
             u = np.broadcast_to(
                 episode.actions[starts + k], (*theta.shape[:2], len(self.problem.R))
             )
@@ -168,26 +182,34 @@ class Dynamics:
         return found
 
     def roll_out(
-        self, act: Callable[[Array], Array], starts: Array, steps: int
+        self,
+        act: Callable[[Array], Array],
+        starts: Array,
+        steps: int,
+        given: Array | None = None,
     ) -> tuple[Array, Array]:
-        """Return thetas (steps + 1, members, batch, n_theta) and inputs (steps, ...) of a policy.
+        """Return rows (steps + 1, members, batch, size) and inputs (steps, ...) of a policy.
 
         Parameters
         ----------
         act : callable
             From theta (rows, n_theta) to inputs (rows, m).
-        starts : ndarray, shape (members, batch, n_theta)
+        starts : ndarray, shape (members, batch, size)
             Where the runs begin.
         steps : int
             How long they are.
+        given : ndarray, shape (steps, batch, p), optional
+            References and measured disturbances at each step. The default is that they stay.
         """
         k, batch, size = starts.shape
         thetas, inputs = np.empty((steps + 1, *starts.shape)), np.empty((steps, k, batch, self.m))
         thetas[0] = starts
         for t in range(steps):
-            u = np.asarray(act(thetas[t].reshape(-1, size)), np.float64).reshape(k, batch, self.m)
-            inputs[t] = u
-            thetas[t + 1] = self.step(thetas[t], u)
+            if given is not None:
+                thetas[t][..., self.row.given] = given[t]
+            u = np.asarray(act(self.row.shown(thetas[t].reshape(-1, size))), np.float64)
+            inputs[t] = u.reshape(k, batch, self.m)
+            thetas[t + 1] = self.step(thetas[t], inputs[t])
         return thetas, inputs
 
     @property
@@ -201,15 +223,15 @@ class Dynamics:
         The inputs are the logged ones, corrected by what the law makes of the deviation of the
         state: where the law made the log, it acts on its own predictions.
         """
-        parts, law = self.problem.layout, law_of(self.problem)
+        parts, law = self.row, law_of(self.problem)
         u_min, u_max = self.problem.u_min, self.problem.u_max
-        logged = law(episode.thetas[:-1])
+        logged = law(parts.shown(episode.thetas[:-1]))
         theta = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
         costs = np.zeros(len(self.members))
         for k in range(len(episode)):
-            theta[..., parts.constant] = episode.thetas[k, parts.constant]
-            correction = law(theta[:, 0]) - logged[k]
+            theta[..., parts.given] = episode.thetas[k, parts.given]
+            correction = law(parts.shown(theta[:, 0])) - logged[k]
             u = np.clip(episode.actions[k] + correction, u_min, u_max)[:, None]
-            costs += self.problem.stage_cost(theta, u)[:, 0]
+            costs += self.problem.stage_cost(parts.shown(theta), u)[:, 0]
             theta = self.step(theta, u)
         return costs

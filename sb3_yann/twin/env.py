@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, as_whole
+from sb3_yann.control import DisturbanceObserver
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode
@@ -62,7 +63,12 @@ class TwinEnv(gym.Env[Single, Single]):
         self.observation_space = ProblemBox(low, high, problem=problem)
         u_min, u_max = (each.astype(np.float32) for each in (problem.u_min, problem.u_max))
         self.action_space = gym.spaces.Box(u_min, u_max)
-        self._theta: Array | None = None
+        self._theta: Array | None = None  # a row
+
+    @property
+    def observer(self) -> DisturbanceObserver | None:
+        """The observer that is a part of the twin, None where there is none."""
+        return self.dynamics.row.observer
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -77,7 +83,8 @@ class TwinEnv(gym.Env[Single, Single]):
             acting = seed % len(members)
         self._acting = Dynamics(problem, self.dynamics.coordinates, (members[acting],))
         self._episode = self.episodes[int(self.np_random.integers(len(self.episodes)))]
-        theta = self._episode.thetas[0].copy()
+        row = self.dynamics.row
+        theta = row.shown(self._episode.thetas[0]).copy()
         state = problem.layout.state
         theta[state] = self.starts.draw(1, self.np_random)[0, state]
         if options:
@@ -88,7 +95,7 @@ class TwinEnv(gym.Env[Single, Single]):
             if not np.all(np.isfinite(given)):
                 raise ValueError(f"options['state'] = {given.tolist()} must be finite numbers.")
             theta[: len(given)] = given
-        self._theta, self._steps = theta, 0
+        self._theta, self._steps = row.begin(theta), 0
         return theta.astype(np.float32), {"state": theta.copy(), "member": acting}
 
     def step(self, action: Single) -> tuple[Single, float, bool, bool, dict[str, Any]]:
@@ -99,7 +106,8 @@ class TwinEnv(gym.Env[Single, Single]):
         if u.shape != self.action_space.shape or not np.all(np.isfinite(u)):
             wanted = f"{self.action_space.shape} finite numbers"
             raise ValueError(f"action = {action!r} must be {wanted}.")
-        thetas, costs, violated, over = step_all([self], self._acting, u[None])
+        rows, costs, violated, over = step_all([self], self._acting, u[None])
+        thetas = self.dynamics.row.shown(rows)
         cost, violation = float(costs[0]), bool(violated[0])
         info = {"cost": cost, "violation": violation, "state": thetas[0]}
         return thetas[0].astype(np.float32), -cost, False, bool(over[0]), info
@@ -108,7 +116,7 @@ class TwinEnv(gym.Env[Single, Single]):
 def step_all(
     envs: Sequence[TwinEnv], dynamics: Dynamics, actions: Array
 ) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Step envs of one twin as one array; return thetas, costs, violations, and who is over.
+    """Step envs of one twin as one array; return rows, costs, violations, and who is over.
 
     Parameters
     ----------
@@ -119,15 +127,15 @@ def step_all(
     actions : ndarray, shape (envs, m)
         Clipped to their bounds.
     """
-    problem, constant = dynamics.problem, dynamics.problem.layout.constant
+    problem, row = dynamics.problem, dynamics.row
     u = np.clip(actions, problem.u_min, problem.u_max)
     before = np.array([each._theta for each in envs])
-    costs = np.asarray(problem.stage_cost(before, u))
+    costs = np.asarray(problem.stage_cost(row.shown(before), u))
     after = dynamics.step(before[:, None], u[:, None])[:, 0]
     for each, theta in zip(envs, after, strict=True):
         each._steps += 1
         if each._steps < len(each._episode.thetas):
-            theta[constant] = each._episode.thetas[each._steps, constant]
+            theta[row.given] = each._episode.thetas[each._steps, row.given]
         each._theta = theta.copy()
     over = np.array([each._steps >= len(each._episode) for each in envs])
     return after, costs, envs[0].limits.violated(after), over

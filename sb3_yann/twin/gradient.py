@@ -18,6 +18,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import Dynamics
+from sb3_yann.twin.row_layout import RowLayout
 
 
 @dataclass(frozen=True)
@@ -41,22 +42,34 @@ class Objective:
     high: Array
     penalty: float
 
-    def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
-        """Return the derivatives of the cost of each step by theta and by the input."""
+    def slopes(self, rows: Array, inputs: Array, row: RowLayout) -> tuple[Array, Array]:
+        """Return the derivatives of the cost of runs by their rows and by the inputs.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (steps + 1, ..., size)
+            Of the runs.
+        inputs : ndarray, shape (steps, ..., m)
+            What acted.
+        row : RowLayout
+            What a row holds.
+        """
         W, size = self.problem.stage_matrix, self.problem.n_theta
-        both = 2 * np.concatenate([thetas, inputs], axis=-1) @ W
-        by_theta, by_u = both[..., :size].copy(), both[..., size:].copy()
-        state = self.problem.layout.state
-        by_theta[..., state] += 2 * self.penalty * self._beyond(thetas[..., state])
-        return by_theta, by_u
+        thetas, by_rows = row.shown(rows), np.zeros(rows.shape)
+        both = 2 * np.concatenate([thetas[:-1], inputs], axis=-1) @ W
+        by_rows[:-1, ..., :size], by_u = both[..., :size], both[..., size:].copy()
+        by_rows[-1, ..., :size] = 2 * thetas[-1] @ self.value
+        by_rows[:-1, ..., row.state] += 2 * self.penalty * self._beyond(rows[:-1, ..., row.state])
+        return by_rows, by_u
 
     def _beyond(self, x: Array) -> Array:
         half = self.problem.theta_half[self.problem.layout.state]
         over = np.maximum(x - self.high, 0.0) - np.maximum(self.low - x, 0.0)
         return np.asarray(over / half**2)
 
-    def costs(self, thetas: Array, inputs: Array) -> Array:
+    def costs(self, rows: Array, inputs: Array) -> Array:
         """Return the costs of runs, without the penalty."""
+        thetas = rows[..., : self.problem.n_theta]
         end = thetas[-1]
         stage = self.problem.stage_cost(thetas[:-1], inputs).sum(axis=0)
         return np.asarray(stage + np.sum((end @ self.value) * end, axis=-1))
@@ -87,24 +100,23 @@ def accumulate_gradient(
         The twin's.
     objective : Objective
         What is minimized.
-    starts : ndarray, shape (members, batch, n_theta)
+    starts : ndarray, shape (members, batch, size)
         Where the runs begin.
     steps : int
         Length T of the runs.
     reference : three of ndarray, shape (members, batch), optional
         Costs that no run should exceed; how much each counts below them, and above.
     """
-    problem = objective.problem
+    problem, row = objective.problem, dynamics.row
     thetas, inputs = dynamics.roll_out(actor(layer, problem), starts, steps)
-    by_theta, by_u = objective.slopes(thetas[:-1], inputs)
-    by_theta = np.concatenate([by_theta, 2 * thetas[-1:] @ objective.value])
+    by_theta, by_u = objective.slopes(thetas, inputs, row)
     costs = objective.costs(thetas, inputs)
     weights = np.ones_like(costs)
     if reference is not None:
         weights = np.where(costs > reference[0], reference[2], reference[1])
-    flat = thetas[:-1].reshape(-1, problem.n_theta)
+    flat = row.shown(thetas[:-1]).reshape(-1, problem.n_theta)
     actions = layer(th.as_tensor(flat))
-    if layer.packed is not None and dynamics.packed is not None:
+    if layer.packed is not None and dynamics.packed is not None and row.observer is None:
         _compiled_costates(layer, dynamics, actions, flat, inputs, by_theta, by_u)
     else:
         _costates(layer, dynamics, thetas, inputs, by_theta, by_u)
@@ -159,7 +171,7 @@ def _costates(
     ----------
     layer, dynamics, thetas, inputs
         As in :func:`accumulate_gradient`, and what :meth:`Dynamics.roll_out` makes of them.
-    by_theta, by_u : ndarray, shapes (steps + 1, members, batch, n_theta) and (steps, ..., m)
+    by_theta, by_u : ndarray, shapes (steps + 1, members, batch, size) and (steps, ..., m)
         Overwritten from the end to the beginning.
     """
     problem, steps = dynamics.problem, len(inputs)
@@ -167,12 +179,14 @@ def _costates(
     A, B = (
         np.moveaxis(each.reshape(len(each), steps, -1, *each.shape[2:]), 0, 1) for each in (A, B)
     )
-    slopes = _slopes_of_actor(layer, thetas[:-1].reshape(-1, problem.n_theta))
+    shown = dynamics.row.shown(thetas[:-1])
+    slopes = _slopes_of_actor(layer, shown.reshape(-1, problem.n_theta))
     K = problem.u_half[:, None] * slopes.reshape(*inputs.shape, problem.n_theta)
     for t in reversed(range(steps)):
         row = by_theta[t + 1][..., None, :]
         by_u[t] += (row @ B[t])[..., 0, :]
-        by_theta[t] += (row @ A[t] + by_u[t][..., None, :] @ K[t])[..., 0, :]
+        by_theta[t] += (row @ A[t])[..., 0, :]
+        by_theta[t, ..., : problem.n_theta] += (by_u[t][..., None, :] @ K[t])[..., 0, :]
 
 
 def _by_member(thetas: Array, inputs: Array) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, law_of
 from sb3_yann.twin.residuals import Nothing
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.starts import Starts
 
 ROUNDING = 1e-9
@@ -26,11 +27,14 @@ class Limits:
     ----------
     problem : LinearMPC
     low, high : ndarray, shape (n,)
+    row : RowLayout
+        Where in the rows of the twin the states are.
     """
 
     problem: LinearMPC
     low: Array
     high: Array
+    row: RowLayout
 
     @classmethod
     def of(cls, problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> Limits:
@@ -48,18 +52,18 @@ class Limits:
         room = ROUNDING * problem.theta_half[:n]
         bounded = np.maximum(low, np.where(soft, -np.inf, problem.x_min))
         limited = np.minimum(high, np.where(soft, np.inf, problem.x_max))
-        return cls(problem, bounded - room, limited + room)
+        return cls(problem, bounded - room, limited + room, coordinates.row)
 
     def broken(self, thetas: Array) -> NDArray[np.bool_]:
-        """Return whether states break a hard bound of the problem itself."""
-        x, problem = thetas[..., self.problem.layout.state], self.problem
+        """Return whether states of rows (..., size) break a hard bound of the problem itself."""
+        x, problem = thetas[..., self.row.state], self.problem
         room, hard = ROUNDING * problem.theta_half[problem.layout.state], problem.soft.x <= 0
         beyond = (x < problem.x_min - room) | (x > problem.x_max + room)
         return np.asarray((beyond & hard).any(axis=-1))
 
     def violated(self, thetas: Array) -> NDArray[np.bool_]:
-        """Return whether states lie beyond, for thetas (..., n_theta); NaN does."""
-        x = thetas[..., self.problem.layout.state]
+        """Return whether states lie beyond, for rows (..., size); NaN does."""
+        x = thetas[..., self.row.state]
         inside = (x >= self.low) & (x <= self.high)
         return np.asarray(~inside.all(axis=-1))
 
@@ -69,6 +73,7 @@ def _planned(problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> tu
     n, steps = problem.model.n_states, len(starts.rows) // len(starts.first)
     model = Dynamics(problem, coordinates, (Nothing(n),))
     first = starts.draw(PLANNED, np.random.default_rng(0))
-    x = model.roll_out(law_of(problem), first[None], steps)[0][..., :n].reshape(-1, n)
+    rows = model.roll_out(law_of(problem), first[None], steps)[0]
+    x = rows[..., coordinates.row.state].reshape(-1, n)
     least, most = problem.theta_min[:n], problem.theta_max[:n]
     return np.clip(x.min(axis=0), least, most), np.clip(x.max(axis=0), least, most)

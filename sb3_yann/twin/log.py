@@ -26,7 +26,8 @@ class Episode:
     Attributes
     ----------
     thetas : ndarray, shape (T + 1, n_theta)
-        ``[x, r, d, u_prev]`` at each sample, as the law sees it.
+        ``[x, r, d, u_prev]`` at each sample, as the law sees it. In a twin with an observer these
+        are rows (T + 1, size): see :class:`RowLayout`.
     actions : ndarray, shape (T, m)
         The inputs, in the units of the problem.
     """
@@ -45,6 +46,8 @@ def as_episodes(
     references: Sequence[ArrayLike] | None = None,
     disturbances: Sequence[ArrayLike] | None = None,
     previous: Sequence[ArrayLike] | None = None,
+    *,
+    observed: bool = False,
 ) -> tuple[Episode, ...]:
     """Return episodes as the problem sees them.
 
@@ -58,6 +61,8 @@ def as_episodes(
         What theta holds besides, one for each episode, or one row for all of it.
     previous : sequence of array_like, shape (m,), optional
         The input before each episode; zero by default.
+    observed : bool, default False
+        Whether an observer estimates the disturbances: they are NaN where none are given.
 
     Raises
     ------
@@ -91,7 +96,7 @@ def as_episodes(
         beside = [name for name, each in given.items() if each is not None]
         if whole and beside:
             raise ValueError(f"{beside} is given, but states are all of theta: leave it out.")
-        found.append(Episode(x if whole else _theta(problem, i, x, u, own), u))
+        found.append(Episode(x if whole else _theta(problem, i, x, u, own, observed), u))
     return tuple(found)
 
 
@@ -172,14 +177,18 @@ def _actions(problem: LinearMPC, i: int, actions: ArrayLike) -> Array:
     return np.clip(u, problem.u_min, problem.u_max)
 
 
-def _theta(problem: LinearMPC, i: int, x: Array, u: Array, given: dict[str, Any]) -> Array:
+def _theta(
+    problem: LinearMPC, i: int, x: Array, u: Array, given: dict[str, Any], observed: bool
+) -> Array:
     layout = problem.layout
     theta = np.zeros((len(x), layout.size))
     theta[:, layout.state] = x
     for name, part in (("references", layout.reference), ("disturbances", layout.disturbance)):
         size = part.stop - part.start
         if given[name] is None:
-            if size:
+            if size and observed and name == "disturbances":
+                theta[:, part] = np.nan
+            elif size:
                 raise ValueError(
                     f"The problem's theta holds {size} {name}: pass {name}=, shape (T + 1, "
                     f"{size}) for each episode, or states of all of theta."

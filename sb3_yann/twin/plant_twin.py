@@ -9,32 +9,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import nnls
 
 from sb3_yann._validation import as_whole
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.env import TwinEnv
 from sb3_yann.twin.gaussian_process import GaussianProcess
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
+from sb3_yann.twin.observers import observer_of, warn_of_estimates
 from sb3_yann.twin.reidentification import reidentified
 from sb3_yann.twin.replay_buffer import episodes_of
 from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.sampling import cut_at_gaps
-from sb3_yann.twin.selection import FOLDS, Candidate, FreeRuns, candidates, choose, fitted
+from sb3_yann.twin.selection import FOLDS, Candidate, candidates, choose, fitted
 from sb3_yann.twin.starts import Starts
-from sb3_yann.twin.trust import (
-    Trust,
-    UntrustedTwinError,
-    beyond_the_box,
-    excitation,
-    foreign_previous,
-    held_out_costs,
-    judge,
-    standing_still,
-)
+from sb3_yann.twin.trust import Trust, UntrustedTwinError, evidence
 from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
 
 BLOCKS = 40
@@ -54,13 +46,16 @@ class PlantTwin:
     four episodes are cut into pieces for both. Outside the data the residual stays what it is at
     their edge.
 
+    Where an observer *estimates* d, it is a part of the twin: ``x+ = A x + B u + residual(x, u)``,
+    and the observer steps its estimate from that, as it does beside the plant.
+
     Make one with :meth:`fit` or :meth:`from_buffer`.
 
     Attributes
     ----------
     problem : LinearMPC
     episodes : tuple of Episode
-        The log.
+        The log, in rows of ``dynamics.row``: theta, and what an observer remembers.
     kind : str
         The residual that was chosen.
     dynamics : Dynamics
@@ -109,6 +104,7 @@ class PlantTwin:
         disturbances: Sequence[ArrayLike] | None = None,
         previous: Sequence[ArrayLike] | None = None,
         time: Sequence[ArrayLike] | None = None,
+        observer: DisturbanceObserver | None = None,
         residuals: Sequence[str | Callable[[], Any]] = KINDS,
         n_members: int = 5,
         seed: int = 0,
@@ -129,6 +125,10 @@ class PlantTwin:
         time : sequence of array_like, shape (T + 1,), optional
             When each row of an episode's states was measured, in the unit of ``model.dt``. An
             episode is cut at steps that take less than half or more than one and a half of dt.
+        observer : DisturbanceObserver, optional
+            The one whose estimates x and d of theta are, of all states: that of
+            :class:`ObserveDisturbance`. Without ``disturbances`` states (T + 1, n) are what it
+            measured, and it is run over them.
         residuals : sequence, default ("none", "linear", "quadratic", "cubic")
             What there is to choose from; "gaussian process" and "network" take longer. A function
             makes a regressor with ``fit(z, y)`` and ``predict(z)``, as scikit-learn has it.
@@ -146,13 +146,17 @@ class PlantTwin:
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
         as_whole("n_members", n_members)
         as_whole("seed", seed, 0)
-        log = as_episodes(problem, episodes, references, disturbances, previous)
+        row, given = RowLayout(problem, observer), (references, disturbances, previous)
+        log = as_episodes(problem, episodes, *given, observed=observer is not None)
         notes: tuple[str, ...] = ()
         if time is not None:
             log, notes = cut_at_gaps(log, time, problem.model.dt)
         log, copied = without_copies(log)
         notes += copied
-        coordinates, rng = Coordinates.of(problem, log), np.random.default_rng(seed)
+        if observer is None:
+            warn_of_estimates(problem, log)
+        log = tuple(Episode(*row.recovered(each.thetas, each.actions)) for each in log)
+        coordinates, rng = Coordinates.of(problem, log, observer), np.random.default_rng(seed)
         asked = candidates(problem, residuals, rng)
         # The model as it is comes first, to compare with, whether it may be chosen or not.
         others = [each for each in asked if each.name != "none"]
@@ -163,12 +167,14 @@ class PlantTwin:
         drawn = log if len(log) >= FOLDS else pieces(log, BLOCKS)
         members = _members(problem, coordinates, drawn, choice, n_members, seed)
         dynamics = Dynamics(problem, coordinates, members)
-        trust = _trust(problem, coordinates, parts, (choices, chosen, runs), dynamics)
+        trust = evidence(dynamics, parts, (choices, chosen, runs))
         return cls(problem, log, choice.name, dynamics, trust, notes)
 
     @classmethod
     def from_buffer(cls, model: Any, **options: Any) -> PlantTwin:
         """Return the twin of the plant whose transitions a model's replay buffer holds.
+
+        An observer among the wrappers of the model's env becomes a part of it.
 
         Parameters
         ----------
@@ -182,8 +188,8 @@ class PlantTwin:
         ValueError
             If the buffer holds no episode of some steps.
         """
-        episodes = episodes_of(model)
-        return cls.fit(model.policy.problem, episodes, **options)
+        episodes, found = episodes_of(model), {"observer": observer_of(model.get_env())}
+        return cls.fit(model.policy.problem, episodes, **(found | options))
 
     @property
     def trusted(self) -> bool:
@@ -246,7 +252,7 @@ class PlantTwin:
     @cached_property
     def starts(self) -> Starts:
         """Where episodes begin."""
-        return Starts.of(self.problem, self.episodes)
+        return Starts.of(self.problem, self.episodes, self.dynamics.row.observer)
 
     @cached_property
     def limits(self) -> Limits:
@@ -293,28 +299,3 @@ def _members(
         drawn = rng.integers(len(log), size=len(log))
         members += fitted(problem, coordinates, [log[i] for i in drawn], [choice.make()])
     return tuple(members)
-
-
-def _trust(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    log: tuple[Episode, ...],
-    found: tuple[list[Candidate], int, FreeRuns],
-    dynamics: Dynamics,
-) -> Trust:
-    choices, chosen, runs = found
-    standing = standing_still(problem, coordinates, log, runs.horizons)
-    costs = held_out_costs(problem, coordinates, log, choices[chosen])
-    inputs = excitation(problem, log)
-    beyond = beyond_the_box(problem, log)
-    names = problem.model.input_names
-    problems, advice = judge(runs, standing, costs, inputs, len(log), beyond, names)
-    problems += foreign_previous(problem, log)
-    n, first = problem.model.n_states, Dynamics(problem, coordinates, dynamics.members[:1])
-    left = np.concatenate(
-        [e.thetas[1:, :n] - first.step(e.thetas[None, :-1], e.actions[None])[0][:, :n] for e in log]
-    )
-    # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
-    mixing = np.eye(n) + problem.model.A**2
-    noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(left, axis=0)))[0])
-    return Trust(runs, chosen, standing, *costs, *inputs, noise, tuple(problems), tuple(advice))

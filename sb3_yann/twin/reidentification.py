@@ -30,10 +30,10 @@ def reidentified(
         return problem
     (residual,) = fitted(problem, coordinates, log, [choices[chosen].make()])
     middle, model = np.zeros((1, len(coordinates.scale))), problem.model
-    n, m, d = model.n_states, model.n_inputs, model.n_disturbances
+    n, m, d = model.n_states, model.n_inputs, len(middle[0]) - model.n_states - model.n_inputs
     slopes = residual.jacobian(middle)[0] / coordinates.scale
     A, E, B = np.split(slopes, [n, n + d], axis=1)
-    A, B, E = model.A + A, model.B + B, model.E + E
+    A, B, E = model.A + A, model.B + B, model.E + (E if d else 0.0)
     x: Array = np.zeros(n)
     u: Array = np.zeros(m)
     if problem.layout.has_constants:  # else the residual has no constant term

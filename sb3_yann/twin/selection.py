@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.twin.dynamics import Coordinates, Dynamics, features
+from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.gaussian_process import GaussianProcess
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.network import Network
@@ -109,7 +109,7 @@ def fitted(
     made : sequence
         Residuals that are not fitted yet.
     """
-    z, y = zip(*(regression(problem, coordinates, each) for each in episodes), strict=True)
+    z, y = zip(*(regression(coordinates, each) for each in episodes), strict=True)
     z_all, y_all = np.concatenate(z), np.concatenate(y)
     moments: dict[tuple[int, bool], Any] = {}  # which do not depend on the shrinkage
     for residual in made:
@@ -123,14 +123,11 @@ def fitted(
     return list(made)
 
 
-def regression(
-    problem: LinearMPC, coordinates: Coordinates, episode: Episode
-) -> tuple[Array, Array]:
+def regression(coordinates: Coordinates, episode: Episode) -> tuple[Array, Array]:
     """Return z (T, k), and what the linear model leaves of the next states (T, n)."""
-    A, B = problem.prediction
-    theta, u, n = episode.thetas, episode.actions, problem.model.n_states
-    left = theta[1:, :n] - (theta[:-1] @ A.T + u @ B.T)[:, :n]
-    return coordinates.scaled(features(problem, theta[:-1], u)), left
+    row, rows, u = coordinates.row, episode.thetas, episode.actions
+    linear = np.concatenate([rows[:-1], u], axis=1) @ row.linear[row.state].T
+    return coordinates.scaled(row.features(rows[:-1], u)), rows[1:, row.state] - linear
 
 
 @dataclass(frozen=True)
@@ -246,13 +243,13 @@ def _errors(
     horizons: Any,
 ) -> Array:
     """Return mean squares (candidates, h) of one episode's free runs."""
-    n, found = problem.model.n_states, np.full((len(made), len(horizons)), np.nan)
+    found = np.full((len(made), len(horizons)), np.nan)
     horizons = horizons[horizons <= len(episode)]  # a short piece says nothing of more
     if not len(horizons):
         return found
     steps = int(horizons[-1])
     starts = np.unique(np.linspace(0, len(episode) - steps, RUNS).astype(int))
-    actual = episode.thetas[starts[:, None] + horizons, :n]
+    actual = episode.thetas[starts[:, None] + horizons, coordinates.row.state]
     for same in _alike(made):
         dynamics = Dynamics(problem, coordinates, tuple(made[i] for i in same))
         with np.errstate(all="ignore"):

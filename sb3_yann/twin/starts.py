@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.row_layout import RowLayout
 
 AROUND, WIDEST, RARE = 3.0, 2.0, 0.05
 """How many boxes wide starts are drawn at most; how much wider than the log's starts their box is
@@ -26,8 +29,10 @@ class Starts:
     ----------
     problem : LinearMPC
     low, high : ndarray, shape (n,)
-    first, rows : ndarray, shapes (episodes, n_theta) and (rows, n_theta)
-        The first theta of each episode, and all of them.
+    first, rows : ndarray, shapes (episodes, size) and (rows, size)
+        The first row of each episode, and all of them.
+    observer : DisturbanceObserver, optional
+        The twin's, which begins with them.
     """
 
     problem: LinearMPC
@@ -35,9 +40,15 @@ class Starts:
     high: Array
     first: Array
     rows: Array
+    observer: DisturbanceObserver | None = None
 
     @classmethod
-    def of(cls, problem: LinearMPC, episodes: tuple[Episode, ...]) -> Starts:
+    def of(
+        cls,
+        problem: LinearMPC,
+        episodes: tuple[Episode, ...],
+        observer: DisturbanceObserver | None = None,
+    ) -> Starts:
         """Return those of a log."""
         first = np.array([each.thetas[0] for each in episodes])
         rows = np.concatenate([each.thetas[:-1] for each in episodes])
@@ -47,7 +58,12 @@ class Starts:
         half = half * _widened(k)
         low = np.maximum(middle - half, problem.theta_min[:n])
         high = np.minimum(middle + half, problem.theta_max[:n])
-        return cls(problem, low, high, first, rows)
+        return cls(problem, low, high, first, rows, observer)
+
+    @cached_property
+    def row(self) -> RowLayout:
+        """What a row holds."""
+        return RowLayout(self.problem, self.observer)
 
     @property
     def shown(self) -> tuple[Array, Array]:
@@ -55,20 +71,26 @@ class Starts:
 
         Beyond the latter, in one coordinate, lies one start in twenty: see :meth:`chance_beyond`.
         """
-        k, low, high = len(self.first), self.first.min(0), self.first.max(0)
+        first, rows, k = self.row.shown(self.first), self.row.shown(self.rows), len(self.first)
+        low, high = first.min(0), first.max(0)
         ranges = 2 * (2 / (k + 1) / RARE) ** (1 / max(k - 1, 1)) - 1
         further = (high - low) / 2 * max(ranges - 1, 0.0)
-        low, high = np.minimum(self.rows.min(0), low - further), high + further
-        return low, np.maximum(self.rows.max(0), high)
+        low, high = np.minimum(rows.min(0), low - further), high + further
+        return low, np.maximum(rows.max(0), high)
 
-    def draw(self, count: int, rng: np.random.Generator) -> Array:
-        """Return thetas (count, n_theta) where episodes begin: in the box, the rest as logged."""
-        drawn = self.first[rng.integers(len(self.first), size=count)].copy()
+    def draw(self, count: int, rng: np.random.Generator, episodes: Any = None) -> Array:
+        """Return rows (count, size) where episodes begin: in the box, the rest as logged.
+
+        Numbers of ``episodes`` (count,) say in which of them; by default they are drawn.
+        """
+        if episodes is None:
+            episodes = rng.integers(len(self.first), size=count)
+        drawn = self.first[episodes]
         drawn[:, : len(self.low)] = rng.uniform(self.low, self.high, (count, len(self.low)))
-        return drawn
+        return self.row.begin(drawn)
 
     def draw_between(self, count: int, rng: np.random.Generator) -> Array:
-        """Return thetas (count, n_theta) where episodes begin, at other set-points as well.
+        """Return rows (count, size) where episodes begin, at other set-points as well.
 
         Every other one has references and disturbances from the box that the log shows: what
         passes at the few of the log may fail between them.
@@ -76,19 +98,19 @@ class Starts:
         drawn, layout = self.draw(count, rng), self.problem.layout
         if not layout.has_constants:
             return drawn
-        held, some = slice(layout.n_states, layout.previous.start), drawn[::2].copy()
+        held, some = self.row.given, drawn[::2].copy()
         low, high = np.clip(self.shown, self.problem.theta_min, self.problem.theta_max)
         some[:, held] = rng.uniform(low[held], high[held], some[:, held].shape)
-        inside = self.problem.law().in_domain(some)
+        inside = self.problem.law().in_domain(self.row.shown(some))
         drawn[::2][inside] = some[inside]
         return drawn
 
     def draw_logged(self, count: int, rng: np.random.Generator) -> Array:
-        """Return thetas (count, n_theta) from amid the log."""
+        """Return rows (count, size) from amid the log."""
         return self.rows[rng.integers(len(self.rows), size=count)]
 
     def draw_around(self, count: int, rng: np.random.Generator) -> Array:
-        """Return thetas (count, n_theta) from boxes up to three times as wide: nothing is known.
+        """Return rows (count, size) from boxes up to three times as wide: nothing is known.
 
         How wide is drawn evenly, and wider where :meth:`chance_beyond` says so: the fewer starts
         there are in the log, the wider. Those that the law has no solution for are replaced by
@@ -101,15 +123,15 @@ class Starts:
         wide = np.maximum(ranges / _widened(k), rng.uniform(1, AROUND, (count, 1)))
         reach = np.minimum(wide, AROUND) * half
         drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
-        drawn = np.clip(drawn, self.problem.theta_min, self.problem.theta_max)
-        outside = ~self.problem.law().in_domain(drawn)
+        shown = np.clip(self.row.shown(drawn), self.problem.theta_min, self.problem.theta_max)
+        outside, drawn = ~self.problem.law().in_domain(shown), self.row.begin(shown)
         drawn[outside] = self.draw_logged(int(outside.sum()), rng)
         return drawn
 
     def chance_beyond(self, thetas: Array) -> Array:
         """Return how likely a start lies so far out or farther, in one coordinate: (...,).
 
-        For thetas (..., n_theta), in the one that lies farthest out. Of k draws from a uniform
+        For rows (..., size), in the one that lies farthest out. Of k draws from a uniform
         distribution the next one lies beyond ``rho`` times their range with probability
         ``2 / (k + 1) ((1 + rho) / 2) ** (1 - k)``: spacings are exchangeable.
         """
@@ -120,7 +142,7 @@ class Starts:
         return np.asarray(2 / (k + 1) * ((1 + np.maximum(rho, 1.0)) / 2) ** (1.0 - k))
 
     def draw_anywhere(self, count: int, rng: np.random.Generator) -> Array:
-        """Return thetas (count, n_theta), a third each of beginnings, of logged and of around."""
+        """Return rows (count, size), a third each of beginnings, of logged and of around."""
         third = count // 3
         parts = self.draw_logged(third, rng), self.draw_around(third, rng)
         return np.concatenate([self.draw_between(count - 2 * third, rng), *parts])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
@@ -95,7 +96,8 @@ def relative_error(predicted: Array, actual: Array) -> float:
 
 def costs_of(problem: LinearMPC, episode: Episode) -> float:
     """Return the stage cost of a logged episode."""
-    return float(np.sum(problem.stage_cost(episode.thetas[:-1], episode.actions)))
+    thetas = episode.thetas[:-1, : problem.n_theta]
+    return float(np.sum(problem.stage_cost(thetas, episode.actions)))
 
 
 def held_out_costs(
@@ -129,32 +131,18 @@ def held_out_costs(
     return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
 
 
-def standing_still(
-    problem: LinearMPC, coordinates: Coordinates, episodes: tuple[Episode, ...], horizons: Any
-) -> Array:
-    """Return the error (h,) of the prediction that the state stays where it is.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Of the plant.
-    coordinates : Coordinates
-        What residuals are scaled by.
-    episodes : sequence of Episode
-        The log.
-    horizons : ndarray of int, shape (h,)
-        Steps ahead.
-    """
-    n, found = problem.model.n_states, []
+def standing_still(coordinates: Coordinates, episodes: tuple[Episode, ...], horizons: Any) -> Array:
+    """Return the error (h,) of the prediction, so many steps ahead, that the state stays."""
+    states, found = [e.thetas[:, coordinates.row.state] for e in episodes], []
     for h in horizons:
-        moves = [(e.thetas[h:, :n] - e.thetas[:-h, :n]) / coordinates.units for e in episodes]
+        moves = [(x[h:] - x[:-h]) / coordinates.units for x in states]
         found.append(np.sqrt(np.mean(np.concatenate(moves) ** 2)))
     return np.array(found)
 
 
 def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array, Array]:
     """Return how much of each input is its own (m,), and how much it moves (m,)."""
-    theta = np.concatenate([each.thetas[:-1] for each in episodes])
+    theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
     u = np.concatenate([each.actions for each in episodes])
     columns = np.column_stack([np.ones(len(theta)), theta])
     left = u - columns @ np.linalg.lstsq(columns, u, rcond=None)[0]
@@ -245,3 +233,38 @@ def judge(
         )
         advice.append(f"Log {max(3, n_episodes)} episodes more, or lessen the sensors' noise.")
     return problems, advice
+
+
+def evidence(
+    dynamics: Dynamics,
+    log: tuple[Episode, ...],
+    found: tuple[list[Candidate], int, FreeRuns],
+) -> Trust:
+    """Return the evidence for a twin.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        The twin's.
+    log : tuple of Episode
+        Each is left out once.
+    found : tuple of list, int and FreeRuns
+        The candidates, which was chosen, and their free runs.
+    """
+    (choices, chosen, runs), problem = found, dynamics.problem
+    coordinates, row = dynamics.coordinates, dynamics.row
+    standing = standing_still(coordinates, log, runs.horizons)
+    costs = held_out_costs(problem, coordinates, log, choices[chosen])
+    inputs = excitation(problem, log)
+    beyond = beyond_the_box(problem, log)
+    names = problem.model.input_names
+    problems, advice = judge(runs, standing, costs, inputs, len(log), beyond, names)
+    problems += foreign_previous(problem, log)
+    first = Dynamics(problem, coordinates, dynamics.members[:1])
+    left = np.concatenate(
+        [e.thetas[1:] - first.step(e.thetas[None, :-1], e.actions[None])[0] for e in log]
+    )[:, row.state]
+    # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
+    mixing = np.eye(problem.model.n_states) + problem.model.A**2
+    noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(left, axis=0)))[0])
+    return Trust(runs, chosen, standing, *costs, *inputs, noise, tuple(problems), tuple(advice))

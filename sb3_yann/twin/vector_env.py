@@ -39,7 +39,8 @@ class _Copies:
         u, shape = np.asarray(actions, np.float64), (len(self.envs), first.dynamics.m)
         if u.shape != shape or not np.all(np.isfinite(u)):
             raise ValueError(f"actions = {actions!r} must be {shape} finite numbers.")
-        return step_all(self.envs, self._stack, u)
+        rows, costs, violated, over = step_all(self.envs, self._stack, u)
+        return first.dynamics.row.shown(rows), costs, violated, over
 
 
 class TwinVectorEnv(VectorEnv[Single, Single, NDArray[Any]]):

@@ -8,7 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits, Tracking, offset_free
+from sb3_yann.wrappers import ObserveDisturbance
 from sb3_yann_envs import ProblemBox
 
 DT = 0.1
@@ -90,3 +91,72 @@ def rated() -> PlantTwin:
         theta_max=[3, 3], rate=RateLimits(-0.3, 0.3),
     )  # fmt: skip
     return PlantTwin.fit(mpc, log(4))
+
+
+D_MAX = 0.045
+"""Largest disturbance of the offset-free cart: less than what its observer estimates at times."""
+
+
+@cache
+def offset_free_problem() -> tuple[LinearMPC, Any]:
+    """The cart's MPC with a set-point and a disturbance, and the observer that estimates it."""
+    plain = problem()
+    tracking = LinearMPC(
+        plain.model, Q=plain.Q, R=plain.R, horizon=2, u_min=-1, u_max=1, theta_min=[-3, -3],
+        theta_max=[3, 3], tracking=Tracking([0], -0.5, 0.5),
+    )  # fmt: skip
+    return offset_free(tracking, D_MAX)
+
+
+class Moved(gym.Wrapper[Any, Any, Any, Any]):
+    """A plant whose set-point changes amid an episode; it is appended to the measurement."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        low, high = (np.append(each, s) for each, s in zip(
+            (env.observation_space.low, env.observation_space.high), (-0.5, 0.5), strict=True))  # fmt: skip
+        self.observation_space = gym.spaces.Box(np.float32(low), np.float32(high))
+
+    def reset(self, *, seed=None, options=None):
+        x, info = self.env.reset(seed=seed, options=options)
+        self.wanted, self.t = np.random.default_rng(seed).uniform(-0.5, 0.5, 2), 0
+        return np.float32([*x, self.wanted[0]]), info
+
+    def step(self, action):
+        x, reward, over, late, info = self.env.step(action)
+        self.t += 1
+        return np.float32([*x, self.wanted[self.t // 30 % 2]]), reward, over, late, info
+
+
+def observed_env(plant: Any = None) -> ObserveDisturbance:
+    """Return the cart, or another plant, as its offset-free MPC sees it."""
+    mpc, observer = offset_free_problem()
+    bounds = mpc.disturbances.d_min, mpc.disturbances.d_max
+    return ObserveDisturbance(Moved(Cart() if plant is None else plant), observer, *bounds)
+
+
+def observed_log(episodes: int = 5) -> list[Any]:
+    """Return episodes of the offset-free MPC: thetas and actions, and what the plant did.
+
+    The third entry of each are the plant's states, the fourth the observer's estimates.
+    """
+    law, env, found = offset_free_problem()[0].explicit(), observed_env(), []
+    for seed in range(episodes):
+        theta, over = env.reset(seed=seed)[0], False
+        rows, actions = [theta], []
+        states, estimates = [env.unwrapped.x], [env.observer.estimate]
+        while not over:
+            actions.append(law(theta).astype(np.float32))
+            theta, _, _, over, _ = env.step(actions[-1])
+            rows.append(theta)
+            states.append(env.unwrapped.x)
+            estimates.append(env.observer.estimate)
+        found.append((*map(np.array, (rows, actions, states, estimates)),))
+    return found
+
+
+@cache
+def observed() -> PlantTwin:
+    """Return the twin of the cart and its observer."""
+    mpc, observer = offset_free_problem()
+    return PlantTwin.fit(mpc, [each[:2] for each in observed_log()], observer=observer)

@@ -13,10 +13,10 @@ from sb3_yann.twin.gradient import (
     accumulate_gradient,
     actor,
 )
-from twin_samples import rated, twin
+from twin_samples import observed, rated, twin
 
 
-@pytest.mark.parametrize("make", [twin, rated])
+@pytest.mark.parametrize("make", [twin, rated, observed])
 def test_it_is_the_directional_derivative_of_the_mean_cost(make) -> None:
     found = make()
     mpc, law = found.problem, found.problem.explicit()

@@ -1,0 +1,226 @@
+"""A twin of a plant whose disturbance is estimated: the observer is a part of it."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_yann import (
+    DisturbanceBounds,
+    DisturbanceObserver,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    PlantTwin,
+    YannPolicy,
+)
+from sb3_yann.audit.plants import TwinPlant
+from sb3_yann.twin.dynamics import Dynamics
+from sb3_yann.twin.observers import EstimatedDisturbanceWarning, observer_of
+from sb3_yann.twin.row_layout import RowLayout
+from twin_samples import (
+    D_MAX,
+    DT,
+    Cart,
+    observed,
+    observed_env,
+    observed_log,
+    offset_free_problem,
+    problem,
+)
+
+
+class Same(Cart):
+    """A plant that is a member of the twin."""
+
+    def __init__(self, dynamics: Dynamics) -> None:
+        super().__init__()
+        self.dynamics = dynamics
+
+    def step(self, action: Any) -> Any:
+        u, n = np.clip(np.asarray(action, float), -1, 1), self.dynamics.problem.n_theta
+        row = self.dynamics.row.begin(np.array([*self.x, *np.zeros(n - 2)]))
+        after = self.dynamics.step(row[None, None], u[None, None])[0, 0]
+        self.x, self.t = after[self.dynamics.row.state], self.t + 1
+        return self.x.astype(np.float32), 0.0, False, self.t >= self.length, {}
+
+
+def test_the_twin_s_env_is_the_wrapped_plant_step_by_step() -> None:
+    found, clipped = observed(), 0
+    dynamics = found.dynamics
+    member = Dynamics(found.problem, dynamics.coordinates, dynamics.members[2:3])
+    plant, env, over = observed_env(Same(member)), found.env(member=2), False
+    shown, _ = plant.reset(seed=3)
+    env.reset(seed=3)
+    env.reset(options={"state": shown.astype(float)})
+    rng, law = np.random.default_rng(0), found.problem.explicit()
+    while not over:
+        u = np.float32(np.clip(law(shown) + 0.2 * rng.standard_normal(1), -1, 1))
+        shown, _, _, over, _ = plant.step(u)
+        inside, *_ = env.step(u)
+        moving = [0, 1, 3, 4]  # the set-points are those of the log
+        np.testing.assert_allclose(inside[moving], shown[moving], rtol=0, atol=1e-6)
+        clipped += bool(np.any(np.abs(shown[3:]) >= np.float32(D_MAX)))
+    assert 5 < clipped < 55
+
+
+def test_vector_envs_step_as_the_env_does() -> None:
+    found = observed()
+    env, several, venv = found.env(), found.vector_env(3), found.vec_env(2)
+    first, rng = several.reset(seed=4)[0], np.random.default_rng(0)
+    venv.seed(4)
+    other = venv.reset()
+    one = env.reset(seed=4)[0]
+    for _ in range(60):
+        np.testing.assert_array_equal(first[0], one)
+        np.testing.assert_array_equal(other[0], one)
+        u = rng.uniform(-1, 1, (3, 1)).astype(np.float32)
+        before, (one, reward, *_) = one, env.step(u[0])
+        first, rewards, *_ = several.step(u)
+        other = venv.step(u[:2])[0]
+        cost = found.problem.stage_cost(before.astype(float), u[0].astype(float))
+        assert rewards[0] == reward == pytest.approx(-float(cost), rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize("begin", [0, 20])
+def test_the_log_tells_what_was_measured_and_estimated(begin) -> None:
+    mpc, observer = offset_free_problem()
+    row = RowLayout(mpc, observer)
+    for thetas, actions, states, estimates in observed_log():
+        rows, inputs = row.recovered(thetas[begin:].astype(float), actions[begin:].astype(float))
+        lost = begin + (begin > 0)  # what was measured amid an estimate is not known
+        assert len(rows) == len(thetas) - lost and len(inputs) == len(rows) - 1
+        np.testing.assert_array_equal(row.shown(rows), thetas[lost:])
+        if np.all(np.abs(thetas[begin, 3:]) < D_MAX):  # on a bound the estimate is not known yet
+            np.testing.assert_allclose(rows[:, row.state], states[lost:], atol=1e-6)
+            np.testing.assert_allclose(rows[:, row._raw], estimates[lost:, 2:], atol=1e-6)
+
+
+def test_an_observer_is_run_over_a_log_of_measurements() -> None:
+    mpc, observer = offset_free_problem()
+    log = observed_log()
+    measured = [(states, actions) for _, actions, states, _ in log]
+    wanted = [thetas[:, 2:3] for thetas, *_ in log]
+    twin = PlantTwin.fit(mpc, measured, references=wanted, observer=observer)
+    for ours, each in zip(twin.episodes, observed().episodes, strict=True):
+        np.testing.assert_allclose(ours.thetas, each.thetas, atol=1e-6)
+    assert twin.kind == observed().kind
+
+
+def test_it_learns_what_an_estimate_that_is_taken_for_measured_hides() -> None:
+    mpc, found = offset_free_problem()[0], observed()
+    assert found.trusted and found.trust.error_ratio < 0.01 and found.trust.cost_error < 1e-3
+    with pytest.warns(EstimatedDisturbanceWarning, match="Pass observer="):
+        blind = PlantTwin.fit(mpc, [each[:2] for each in observed_log()])
+    assert blind.trust.cost_error > 10 * found.trust.cost_error
+
+
+def test_a_measured_disturbance_is_not_taken_for_an_estimate() -> None:
+    model = LinearModel([[1.0, DT], [0.0, 0.95]], [[0.0], [DT]], DT, E=[[0.0], [1.0]])
+    plain, rng = problem(), np.random.default_rng(0)
+    mpc = LinearMPC(
+        model, Q=plain.Q, R=plain.R, horizon=2, u_min=-1, u_max=1, theta_min=[-3, -3],
+        theta_max=[3, 3], disturbances=DisturbanceBounds(-0.2, 0.2),
+    )  # fmt: skip
+    episodes, loads = [], []
+    for _ in range(3):
+        x, d, rows = np.zeros(2), np.zeros(1), []
+        for _ in range(60):
+            rows.append([x, rng.uniform(-1, 1, 1), d])
+            x = model.A @ x + model.B @ rows[-1][1] + 1.2 * model.E @ d + 0.01 * x**2
+            d = np.clip(0.9 * d + 0.03 * rng.standard_normal(1), -0.2, 0.2)
+        states, inputs, load = (np.array(each) for each in zip(*rows, strict=True))
+        episodes.append((states, inputs[:-1]))
+        loads.append(load)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EstimatedDisturbanceWarning)
+        PlantTwin.fit(mpc, episodes, disturbances=loads, residuals=["linear"], n_members=1)
+
+
+def test_the_slopes_of_a_step_are_those_of_differences_on_bounds_of_d_as_well() -> None:
+    found, rng = observed(), np.random.default_rng(0)
+    dynamics, row = found.dynamics, found.dynamics.row
+    at = np.array([found.starts.draw_logged(40, rng) for _ in dynamics.members])
+    u = rng.uniform(-0.9, 0.9, (*at.shape[:2], 1))
+    A, B = dynamics.jacobians(at, u)
+    step = 1e-6
+    for j in range(row.size):
+        moved = step * np.eye(row.size)[j]
+        slope = (dynamics.step(at + moved, u) - dynamics.step(at - moved, u)) / (2 * step)
+        np.testing.assert_allclose(A[..., j], slope, atol=1e-6)
+    slope = (dynamics.step(at, u + step) - dynamics.step(at, u - step)) / (2 * step)
+    np.testing.assert_allclose(B[..., 0], slope, atol=1e-6)
+    on_bound = np.abs(dynamics.step(at, u)[..., 3:5]) == D_MAX
+    assert on_bound.any() and not on_bound.all()
+
+
+def test_compiled_steps_are_those_of_numpy(monkeypatch) -> None:
+    found, rng = observed(), np.random.default_rng(0)
+    at = np.array([found.starts.draw_anywhere(30, rng) for _ in found.dynamics.members])
+    u = rng.uniform(-1, 1, (*at.shape[:2], 1))
+    compiled = found.dynamics.step(at, u)
+    monkeypatch.setattr(Dynamics, "packed", None)
+    np.testing.assert_allclose(compiled, found.dynamics.step(at, u), rtol=1e-12, atol=1e-12)
+
+
+def test_starts_begin_with_the_estimate_of_an_observer_that_begins() -> None:
+    found, rng = observed(), np.random.default_rng(0)
+    row = found.dynamics.row
+    for drawn in (found.starts.draw_between(50, rng), found.starts.draw(50, rng)):
+        assert drawn.shape == (50, row.size)
+        np.testing.assert_array_equal(drawn[:, row.state], drawn[:, :2])
+        np.testing.assert_array_equal(drawn[:, [3, 4]], 0.0)
+    assert all(each.shape == (5,) for each in found.starts.shown)
+
+
+def test_a_plan_in_it_takes_the_estimate_for_constant() -> None:
+    found, rng = observed(), np.random.default_rng(0)
+    plant, rows = TwinPlant(found, [0, 3]), np.arange(2)
+    theta, u = found.dynamics.row.shown(found.starts.draw_logged(2, rng)), np.full((2, 1), 0.3)
+    A, B = (each[0] for each in plant.jacobians(theta[None], u[None], rows))
+    after, step = plant.step(theta, u, rows), 1e-6
+    np.testing.assert_array_equal(after[:, 2:], theta[:, 2:])
+    for j in range(5):
+        moved = plant.step(theta + step * np.eye(5)[j], u, rows)
+        np.testing.assert_allclose(A[..., j], (moved - after) / step, atol=1e-4)
+    np.testing.assert_allclose(B[..., 0], (plant.step(theta, u + step, rows) - after) / step,
+                               atol=1e-4)  # fmt: skip
+
+
+def test_the_observer_is_found_among_the_wrappers() -> None:
+    mpc, observer = offset_free_problem()
+    assert observer_of(gym.make("CSTR-v0")) is None and observer_of(None) is None
+    assert observer_of(DummyVecEnv([Cart])) is None
+    env = gym.wrappers.TimeLimit(observed_env(), 30)
+    assert np.array_equal(observer_of(env).gain, observer.gain)
+    assert observer_of(observed().env()) is observed().dynamics.row.observer
+    model = DDPG(
+        YannPolicy, env, policy_kwargs={"problem": mpc}, device="cpu", gradient_steps=0,
+        learning_starts=0,
+    )  # fmt: skip
+    model.learn(90, callback=NoActionNoise())
+    twin = PlantTwin.from_buffer(model)
+    assert twin.dynamics.row.observer is not None
+    assert twin.episodes[0].thetas.shape == (31, twin.dynamics.row.size)
+
+
+def test_an_observer_of_another_model_or_of_some_states_is_refused() -> None:
+    mpc, observer = offset_free_problem()
+    log = [each[:2] for each in observed_log()]
+    with pytest.raises(TypeError, match="observer = 'mine' must be a DisturbanceObserver"):
+        PlantTwin.fit(mpc, log, observer="mine")
+    with pytest.raises(ValueError, match=r"observer has \(2, 1, 2\) .* the problem \(2, 1, 0\)"):
+        RowLayout(problem(), observer)
+    model = LinearModel(mpc.model.A, mpc.model.B, DT, E=[[0.0], [1.0]])
+    one = LinearMPC(
+        model, Q=mpc.Q, R=mpc.R, horizon=2, u_min=-1, u_max=1, theta_min=[-3, -3],
+        theta_max=[3, 3], disturbances=DisturbanceBounds(-0.1, 0.1),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="needs an observer that measures all 2 states"):
+        RowLayout(one, DisturbanceObserver(model, [0]))
