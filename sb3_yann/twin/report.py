@@ -68,14 +68,14 @@ def _costs(trust: Trust) -> Iterator[str]:
 
 
 def _inputs(problem: LinearMPC, trust: Trust) -> Iterator[str]:
-    yield "Inputs: how much they move, and how much of that does not follow from the state:"
+    yield "Inputs: how much they move, and how much of that does not follow the MPC:"
     for k in range(problem.model.n_inputs):
         known = "its gain is known from the log"
         if trust.excitation[k] < ALONE:
             known = "its gain rests on the given B"
         moves, share = 100 * trust.moves[k], 100 * trust.excitation[k]
         name = labels_of(problem.model)[1][k]
-        yield f"  {name}: {moves:.3g} % of half the range, {share:.3g} %: {known}"
+        yield f"  {name}: {moves:.3g} % of half the range, {share:.2f} %: {known}"
 
 
 def _noise(problem: LinearMPC, trust: Trust) -> Iterator[str]:

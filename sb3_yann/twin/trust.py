@@ -12,7 +12,8 @@ from scipy.optimize import nnls
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.control.model.labels import name_of
+from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.selection import Candidate, FreeRuns, fitted
 
@@ -26,6 +27,10 @@ OUTSIDE = 0.05
 """Share of logged rows beyond the box of theta from which on units are doubted."""
 PREVIOUS = 0.01
 """How far theta's previous input may be from the one before it, in half-widths."""
+ROUNDING = 1e-6
+"""Of a half-width: float32 rounds so much."""
+SPIKE = 1e3
+"""One reading that is so many times as far off as most stands alone."""
 ALONE = 0.02
 """An input's gain is known from the data where at least this share of its variance is its own."""
 
@@ -141,21 +146,45 @@ def standing_still(coordinates: Coordinates, episodes: tuple[Episode, ...], hori
 
 
 def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array, Array]:
-    """Return how much of each input is its own (m,), and how much it moves (m,)."""
+    """Return how much of each input is its own (m,), and how much it moves (m,).
+
+    What is linear in theta or the MPC's own input is not.
+    """
     theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
     u = np.concatenate([each.actions for each in episodes])
-    columns = np.column_stack([np.ones(len(theta)), theta])
+    columns = np.column_stack([np.ones(len(theta)), theta, law_of(problem)(theta)])
     left = u - columns @ np.linalg.lstsq(columns, u, rcond=None)[0]
     variance = np.var(u, axis=0)
     share = np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)
     return share, np.sqrt(variance) / problem.u_half
 
 
-def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> float:
-    """Return the share of logged rows whose state lies beyond the box of theta."""
-    x = np.concatenate([each.thetas[:, problem.layout.state] for each in episodes])
-    low, high = (each[problem.layout.state] for each in (problem.theta_min, problem.theta_max))
-    return float(np.mean(np.any((x < low) | (x > high), axis=1)))
+def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
+    """Return the share of logged rows (n_theta,) where an entry lies beyond the box of theta."""
+    theta = np.concatenate([each.thetas[:, : problem.n_theta] for each in episodes])
+    room = ROUNDING * problem.theta_half
+    low, high = problem.theta_min - room, problem.theta_max + room
+    return np.asarray(np.mean((theta < low) | (theta > high), axis=0))
+
+
+def count_apart(episodes: tuple[Episode, ...]) -> int:
+    """Return how many episodes there are, where one that begins as another ends goes on with it."""
+    ends = np.array([each.thetas[-1] for each in episodes])
+    return sum(not np.any(np.all(each.thetas[0] == ends, axis=1)) for each in episodes)
+
+
+def spikes(problem: LinearMPC, episodes: tuple[Episode, ...], left: list[Array]) -> list[str]:
+    """Return which reading stands alone, by what one step leaves of the states, (T, n) each."""
+    together = np.abs(np.concatenate(left))
+    size = np.median(together, axis=0) + ROUNDING * problem.theta_half[problem.layout.state]
+    largest = np.array([np.max(np.abs(each) / size, axis=0) for each in left])
+    episode, state = np.unravel_index(np.argmax(largest), largest.shape)
+    if not largest[episode, state] > SPIKE:
+        return []
+    row = int(np.argmax(np.abs(left[episode][:, state]))) + 1
+    read = episodes[int(episode)].thetas[row, state] + problem.model.x_ss[state]
+    name = name_of(problem.model, "state", int(state))
+    return [f"Look at where {name} is about {read:.6g}: no other step has moved it so far."]
 
 
 def foreign_previous(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[str]:
@@ -176,7 +205,7 @@ def judge(
     costs: tuple[Array, Array],
     inputs: tuple[Array, Array],
     n_episodes: int,
-    beyond: float,
+    beyond: tuple[float, str],
     names: Sequence[str] = (),
 ) -> tuple[list[str], list[str]]:
     """Return what speaks against a twin, and what would help.
@@ -193,8 +222,8 @@ def judge(
         How much of each input is its own, and how much it moves.
     n_episodes : int
         In the log.
-    beyond : float
-        Share of logged rows beyond the box of theta.
+    beyond : pair of float and str
+        The largest share of logged rows beyond the box of theta, and of which entry.
     names : sequence of str, optional
         Those of the inputs.
     """
@@ -211,7 +240,7 @@ def judge(
     for k in np.flatnonzero(~still & (share < ALONE)):
         which = names[k] if names else f"Input {k}"
         advice.append(
-            f"{which} follows the state ({100 * share[k]:.2g} % of its variance is its own), so "
+            f"{which} follows the MPC ({100 * share[k]:.2f} % of its variance is its own), so "
             "its gain rests on the given B. A small step test on it would tell."
         )
     if n_episodes > 1 and runs.errors[0][0] > FOREIGN * standing[0]:
@@ -220,9 +249,9 @@ def judge(
             f"({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
         )
         advice.append("Compare units, operating point and sampling time of the log and the model.")
-    if beyond > OUTSIDE:
+    if beyond[0] > OUTSIDE:
         problems.append(
-            f"{100 * beyond:.3g} % of the logged states lie beyond the problem's box of theta."
+            f"{100 * beyond[0]:.3g} % of the logged {beyond[1]} lie beyond the problem's box of theta."
         )
         advice.append("Compare units and operating point of the log and the model.")
     error = relative_error(*costs)
@@ -256,14 +285,17 @@ def evidence(
     standing = standing_still(coordinates, log, runs.horizons)
     costs = held_out_costs(problem, coordinates, log, choices[chosen])
     inputs = excitation(problem, log)
-    beyond = beyond_the_box(problem, log)
+    shares = beyond_the_box(problem, log)
+    beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
-    problems, advice = judge(runs, standing, costs, inputs, len(log), beyond, names)
+    problems, advice = judge(runs, standing, costs, inputs, count_apart(log), beyond, names)
     problems += foreign_previous(problem, log)
     first = Dynamics(problem, coordinates, dynamics.members[:1])
-    left = np.concatenate(
-        [e.thetas[1:] - first.step(e.thetas[None, :-1], e.actions[None])[0] for e in log]
-    )[:, row.state]
+    parts = [e.thetas[1:] - first.step(e.thetas[None, :-1], e.actions[None])[0] for e in log]
+    parts = [each[:, row.state] for each in parts]
+    left = np.concatenate(parts)
+    if problems:
+        advice += spikes(problem, log, parts)
     # A step from a noisy state to a noisy state errs by the noise twice, the first through A.
     mixing = np.eye(problem.model.n_states) + problem.model.A**2
     noise = np.sqrt(nnls(mixing, np.nan_to_num(np.var(left, axis=0)))[0])

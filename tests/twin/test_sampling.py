@@ -125,3 +125,28 @@ def test_what_is_missing_in_a_poor_log_is_advised() -> None:
     ):
         found = PlantTwin.fit(problems.cstr(), episodes, residuals=["none", "linear"])
         assert not found.trusted and advice in found.report()
+
+
+def test_the_input_of_an_mpc_in_a_closed_loop_is_not_its_own() -> None:
+    law = problems.cstr().explicit()
+    found = PlantTwin.fit(problems.cstr(), [(x, law(x[:-1])) for x, _ in reactor()])
+    assert found.trust.excitation < 1e-9  # though it is no linear function of the state
+    assert "0.00 %: its gain rests on the given B" in found.report()
+    rng = np.random.default_rng(0)
+    dithered = [(x, np.clip(u + rng.normal(0, 10, u.shape), -55, 55)) for x, u in reactor()]
+    assert PlantTwin.fit(problems.cstr(), dithered).trust.excitation > 0.02
+
+
+def test_an_episode_cut_in_two_is_one() -> None:
+    (x, u), *_ = log(1)
+    found = PlantTwin.fit(problem(), [(x[:31], u[:30]), (x[30:], u[30:])])
+    assert not found.trusted and "There is one episode" in found.report()
+    assert PlantTwin.fit(problem(), log(3)).trusted
+
+
+def test_a_spike_is_named_where_a_log_is_not_trusted() -> None:
+    episodes = log(4)
+    episodes[2][0][17, 1] += 50.0
+    found = PlantTwin.fit(problem(), episodes)
+    said = f"Look at where state 1 is about {episodes[2][0][17, 1]:.6g}:"
+    assert not found.trusted and said in found.report()
