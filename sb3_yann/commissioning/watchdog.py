@@ -187,7 +187,8 @@ class Watchdog:
         if stands.max() < FROZEN:
             return None
         noisy = bands.noisy & (stands >= FROZEN * (1 + bands.repeats))
-        moving = np.abs(episode.moved) > MOVED * stands * bands.error
+        unsure = np.hypot(bands.error, episode.tracks.doubts[0])  # what is not familiar counts
+        moving = np.abs(episode.moved) > MOVED * stands * unsure
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             model = self.dynamics.problem.model
             name, shown = model.state_names, episode.reading[i] + model.x_ss[i]
