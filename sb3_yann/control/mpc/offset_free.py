@@ -24,8 +24,8 @@ def offset_free(
 
     Where the plant is not its model, the MPC settles beside its set-points. A constant disturbance
     in each state accounts for that: tracked outputs then settle without offset (Pannocchia and
-    Rawlings, AIChE J. 49, 2003). All states must be measured. The noise that the observer assumes is
-    in half-widths of the box of states, so that no unit matters.
+    Rawlings, AIChE J. 49, 2003). All states must be measured. The observer takes disturbances and
+    errors of measurements for equally large, in half-widths of the box of states.
 
     Parameters
     ----------
