@@ -31,7 +31,7 @@ from examples.quadruple_tank import (
 )
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann._validation import Array
-from sb3_yann.twin.gradient import actor_inputs
+from sb3_yann.twin.gradient import actor
 
 STEPS, EPISODES = 60, 10
 NOISE = 0.02
@@ -157,7 +157,7 @@ def run(plant: Tank, seed: int) -> Outcome:
     twin = PlantTwin.fit(problem, [*zip(*logged, strict=True)], seed=seed)
     model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": problem}, device="cpu")
     found, layer = improve(model, twin, seed=seed), model.policy.actor.mu
-    ours = costs(plant, controller(problem, lambda rows: actor_inputs(layer, problem, rows)))
+    ours = costs(plant, controller(problem, actor(layer, problem)))
     again = costs(plant, controller(twin.reidentified()))
     wear = mpc.mean() - ideal.mean()
     shares = [(mpc.mean() - each.mean()) / wear if plant != NEW else 0.0 for each in (ours, again)]
