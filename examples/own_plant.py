@@ -53,9 +53,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # the networks are too small to share among cores
-    console = Console(highlight=False)
-
-    mpc = design()
+    console, mpc = Console(highlight=False), design()
     console.print(mpc.model.report(), mpc.report(), sep="\n")
     make = partial(make_env, mpc)
     # Five per cent of the pumps' range is more than the wear takes.
