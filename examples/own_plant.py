@@ -23,6 +23,21 @@ STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
 TEST_SEEDS = range(2000, 2050)  # starts, set-points and disturbances that training never sees
 
 
+def design() -> LinearMPC:
+    """Return the MPC of a model that was identified from a log."""
+    write_log("out/log.csv")  # you have yours
+    log = np.loadtxt("out/log.csv", delimiter=",", skiprows=1)
+    x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
+    plant = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=[3, 3], d_ss=[0])
+    plant = plant.named(["h1", "h2", "h3", "h4"], ["v1", "v2"], [*["cm"] * 4, "V", "V"])
+    # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
+    weights = {"Q": np.diag([1, 1, 0, 0]), "R": 0.5 * np.eye(2), "horizon": 2, "gamma": 0.9}
+    wanted = Tracking([0, 1], plant.x_ss[:2] - 4, plant.x_ss[:2] + 4)
+    wishes = {"tracking": wanted, "disturbances": DisturbanceBounds(-1, 1)}
+    limits = {"u_min": 0, "u_max": MAX_VOLTAGE, "theta_min": 0, "theta_max": FULL}
+    return LinearMPC(plant, **weights, **wishes, **limits, absolute=True)  # as the plant shows them
+
+
 def make_env(mpc: LinearMPC) -> gymnasium.Env:
     """Return the plant of today, in deviations, with all that the MPC's theta holds."""
     env = Deviations(QuadrupleTank(noise=0.03, wear=0.1), mpc.model)
@@ -38,20 +53,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # the networks are too small to share among cores
-    console = Console(highlight=False)
-
-    write_log("out/log.csv")  # you have yours
-    log = np.loadtxt("out/log.csv", delimiter=",", skiprows=1)
-    x, u, d = log[:, 1:5], log[:-1, 5:7], log[:-1, 7:]
-    plant = LinearModel.from_data(x, u, disturbances=d, dt=DT, u_ss=[3, 3], d_ss=[0])
-    plant = plant.named(["h1", "h2", "h3", "h4"], ["v1", "v2"], [*["cm"] * 4, "V", "V"])
-    # The discount is the learner's: set-points that nobody knows yet are no matter of the critic.
-    weights = {"Q": np.diag([1, 1, 0, 0]), "R": 0.5 * np.eye(2), "horizon": 2, "gamma": 0.9}
-    wanted = Tracking([0, 1], plant.x_ss[:2] - 4, plant.x_ss[:2] + 4)
-    wishes = {"tracking": wanted, "disturbances": DisturbanceBounds(-1, 1)}
-    limits = {"u_min": 0, "u_max": MAX_VOLTAGE, "theta_min": 0, "theta_max": FULL}
-    mpc = LinearMPC(plant, **weights, **wishes, **limits, absolute=True)  # as the plant shows them
-    console.print(plant.report(), mpc.report(), sep="\n")
+    console, mpc = Console(highlight=False), design()
+    console.print(mpc.model.report(), mpc.report(), sep="\n")
     make = partial(make_env, mpc)
     # Five per cent of the pumps' range is more than the wear takes.
     policy = {"problem": mpc, "max_correction": 0.05}

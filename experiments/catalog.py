@@ -22,15 +22,27 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from experiments import FINGERPRINT as FINGERPRINT
 from experiments import optimum, twin, yardsticks
-from experiments.measures import OURS
+from experiments.measures import MPC, OBSERVER, OPTIMUM, OURS, REIDENTIFIED
 from experiments.runner import Outcome, Run
 from experiments.yardsticks import Learner
-from sb3_yann import ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
-from sb3_yann.evaluation.episodes import Episodes, evaluate
+from sb3_yann import (
+    DisturbanceObserver,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    PlantTwin,
+    YannPolicy,
+    offset_free,
+)
+from sb3_yann.evaluation.episodes import Episodes, Source, evaluate
+from sb3_yann.wrappers import ObserveDisturbance, StageCost
 from sb3_yann_envs import cstr, problems
 
 TEST_SEEDS = range(2000, 2100)
 """Test starts; the first ten are those of the paper's tables."""
+LOG_SEEDS = range(70_000, 70_005)
+"""Episodes of the MPC from which its model is identified again."""
 GUARD_SEEDS = range(1_000_000, 1_000_200)
 """Starts on which a rival may choose its best policy: as many as the guard's, and new ones."""
 CHECKPOINTS = (0, 10, 20, 30, 40, 50, 75, 100, 150, 200)
@@ -48,6 +60,36 @@ class Plant:
     gradient_steps: int = 1
     critic_warmup: int = 2000
     guard: dict[str, Any] = field(default_factory=dict)
+    observer: DisturbanceObserver | None = None
+
+    @property
+    def env(self) -> Source:
+        """What makes an env that shows theta; the cost is the plant's."""
+        return self.env_id if self.observer is None else lambda: self.shown(gym.make(self.env_id))
+
+    def shown(self, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+        """Return an env of the plant that shows theta."""
+        if self.observer is None:
+            return env
+        bounds = self.problem().disturbances
+        return ObserveDisturbance(env, self.observer, bounds.d_min, bounds.d_max)
+
+    def taught(self, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+        """Return the same with the stage cost of the problem, for which the critic is exact."""
+        return env if self.observer is None else StageCost(self.shown(env), self.problem())
+
+
+def observed(plant: Plant) -> Plant:
+    """Return a plant whose MPC has an observer."""
+    problem, observer = offset_free(plant.problem())
+    return replace(plant, problem=lambda: problem, observer=observer)
+
+
+def reidentified(plant: Plant) -> LinearMPC:
+    """Return the MPC whose model is identified again, from episodes of the MPC."""
+    problem = plant.problem()
+    log = evaluate(problem.explicit(), plant.env, LOG_SEEDS)
+    return PlantTwin.fit(problem, [*zip(log.observations, log.actions, strict=True)]).reidentified()
 
 
 def true_reactor() -> LinearMPC:
@@ -152,7 +194,7 @@ def yann(  # noqa: PLR0913 (what the variants vary)
         model.learning_starts = 0
         callbacks = []
     if guard is not None:
-        simulator = None if plant_alone else plant.env_id
+        simulator = None if plant_alone else plant.env
         rule = {**plant.guard.get("rule", {}), **guard.get("rule", {})}
         callbacks.append(ImprovementGuard(simulator, **{**plant.guard, **guard, "rule": rule}))
     return Learner(model, model.policy, callbacks)
@@ -177,6 +219,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "one network": {"networks": "shared"},
     "no settings": {"defaults": True, "tau": 0.02},
     "no settings, one network": {"defaults": True, "tau": 0.02, "networks": "shared"},
+    "no settings, from the MPC with observer": {"defaults": True, "tau": 0.02},
     "input steps bounded": {"guard": {"rule": {"largest_step": 1.5}}},
 }
 """What is changed of YANN-RL, one thing at a time."""
@@ -207,7 +250,8 @@ VARIANTS = {
     ],
 }
 """What is changed on which plant, beside what has ten seeds."""
-FIXED = ("MPC", "LQR", "optimum")
+FIXED = (MPC, "LQR", OPTIMUM)
+UNTRAINED = (*FIXED, OBSERVER, REIDENTIFIED)
 
 
 def _runs() -> list[Run]:
@@ -220,6 +264,9 @@ def _runs() -> list[Run]:
     reactor, true_model, pendulum, printed = PLANTS
     ten, five, three, long = range(40, 50), range(40, 45), range(40, 43), range(50, 53)
     runs = [Run(plant, name, 0, 0) for plant in PLANTS for name in FIXED]
+    runs.extend(
+        Run(p, name, 0, 0) for p in (reactor, pendulum) for name in (OBSERVER, REIDENTIFIED)
+    )
 
     def add(plant: str, learners: Iterable[str], seeds: range, episodes: int = 50) -> None:
         runs.extend(Run(plant, name, seed, episodes) for name in learners for seed in seeds)
@@ -303,12 +350,13 @@ def execute(run: Run) -> Outcome:
     torch.set_num_threads(1)
     if run.plant == twin.PLANT:
         return twin.execute(run)
-    plant = PLANTS[run.plant]
-    test = partial(evaluate, env=plant.env_id, seeds=TEST_SEEDS)
-    if run.learner in FIXED:
+    given = PLANTS[run.plant]
+    plant = observed(given) if run.learner.endswith(OBSERVER) else given
+    test = partial(evaluate, env=plant.env, seeds=TEST_SEEDS)
+    if run.learner in UNTRAINED:
         return _fixed(run.learner, plant, test)
     recorder = Recorder(gym.make(plant.env_id))
-    learner = LEARNERS[run.learner](lambda: recorder, run.seed, plant=plant)
+    learner = LEARNERS[run.learner](lambda: plant.taught(recorder), run.seed, plant=plant)
     checkpoints = Checkpoints(test, learner.policy, recorder)
     # An episode that ends early makes room for another one: so many episodes, not so many steps.
     stop = _StopAfter(run.episodes, recorder)
@@ -318,7 +366,7 @@ def execute(run: Run) -> Outcome:
     checkpoints.tests[run.episodes] = final = test(learner.policy)
     e = run.episodes
     starts = recorder.starts[:e]
-    mpc = evaluate(plant.problem().explicit(), plant.env_id, range(e), starts)
+    mpc = evaluate(given.problem().explicit(), given.env_id, range(e), starts)
     tests = checkpoints.tests
     return Outcome(
         checkpoints=np.array([*tests]),
@@ -369,12 +417,12 @@ def _test_starts(env_id: str) -> Any:
 def _fixed(name: str, plant: Plant, test: Callable[..., Episodes]) -> Outcome:
     """Return the outcome of a controller that does not learn."""
     extra: dict[str, Any] = {}
-    if name == "optimum":
+    if name == OPTIMUM:
         costs = plant.optimum(_test_starts(plant.env_id), plant.steps)
         violations = np.zeros(len(costs), dtype=int)
     else:
-        problem = plant.problem()
-        episodes = test(problem.explicit() if name == "MPC" else yardsticks.lqr(problem))
+        problem = reidentified(plant) if name == REIDENTIFIED else plant.problem()
+        episodes = test(yardsticks.lqr(problem) if name == "LQR" else problem.explicit())
         costs, violations = episodes.costs, episodes.violations
         extra = _changes_of_input(episodes)
     none = np.zeros(0)

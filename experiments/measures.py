@@ -13,7 +13,8 @@ from experiments.runner import Outcome, Run
 from sb3_yann._validation import Array
 
 OURS, MPC, OPTIMUM = "YANN-RL", "MPC", "optimum"
-FIRST = (OPTIMUM, MPC, "LQR", OURS)
+OBSERVER, REIDENTIFIED = "MPC with observer", "re-identified MPC"
+FIRST = (OPTIMUM, MPC, OBSERVER, REIDENTIFIED, "LQR", OURS)
 HELD = 50.0
 """A pendulum that costs less than this was held upright."""
 NEAR = 1.1

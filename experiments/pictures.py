@@ -139,7 +139,8 @@ def _picture(
         _band(costs, *excess[name], k, label)
     for k, (name, outcome) in enumerate(fixed.items()):
         level = float(outcome.test_costs[-1].mean()) / base
-        style = {"color": "black", "linestyle": STYLES[1 + k % 3], "linewidth": 1}
+        color = "black" if k < 3 else "gray"  # there are three kinds of lines
+        style = {"color": color, "linestyle": STYLES[1 + k % 3], "linewidth": 1}
         for axes in (curves, closer):
             axes.axhline(level, label=name, zorder=1, **style)
     costs.axhline(0, color="black", linewidth=1, label="as the MPC", zorder=1)

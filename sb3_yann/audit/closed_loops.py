@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.plants import Plant
-from sb3_yann.audit.task import Task
+from sb3_yann.audit.task import Bounds, Task
 from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
 from sb3_yann.control import DisturbanceObserver, LinearMPC
-from sb3_yann.evaluation.episodes import LONGEST, Source
+from sb3_yann.evaluation.episodes import LONGEST, Source, endless
 from sb3_yann.twin.dynamics import law_of
 
 Controller = Callable[[int, Array, NDArray[np.bool_]], Array]
@@ -27,6 +27,8 @@ CHANGED = 0.05
 """A reference or disturbance that has moved by so many half-widths is planned for anew."""
 DITHER, HELD = 0.1, 5
 """Half-widths by which a log for a twin is excited, and for how many steps each time."""
+ROOM = 1e-3
+"""Half-widths beyond a bound that count as on it."""
 BURSTS = 25
 """Some searches begin with all inputs on a bound, for this part of the episode."""
 
@@ -38,8 +40,8 @@ class Loops:
     Attributes
     ----------
     costs, violations, lengths : ndarray, shape (k,)
-        Sums of stage costs; steps that the env reports, or that exceed the problem's
-        bounds by a thousandth of their half-width; steps.
+        Sums of stage costs; steps that the env reports, or that exceed bounds of the problem;
+        steps.
     thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
         After its end an episode stays where it is.
     """
@@ -109,54 +111,32 @@ def play(
     """
     with ExitStack() as stack:
         envs = [stack.enter_context(closing(make())) for _ in seeds]
-        begun = (env.reset(seed=s)[0] for env, s in zip(envs, seeds, strict=True))
-        now = np.array([_theta(problem, seen) for seen in begun])
+        begun = [env.reset(seed=s)[0] for env, s in zip(envs, seeds, strict=True)]
+        now: Array = np.array(begun, dtype=np.float64)
         thetas, running = [now], np.ones(len(envs), dtype=bool)
         inputs: list[Array] = []
-        violations, lengths = np.zeros((2, len(envs)), dtype=np.int64)
+        told: list[NDArray[np.bool_]] = []
+        lengths = np.zeros(len(envs), dtype=np.int64)
         while running.any():
             u = controller(len(inputs), now, running)
-            now = now.copy()
+            now, violated = now.copy(), np.zeros(len(envs), dtype=bool)
             for i in np.flatnonzero(running):
                 action = u[i].astype(envs[i].action_space.dtype)
-                seen, _, terminated, truncated, info = envs[i].step(action)
-                now[i] = _theta(problem, seen)
-                violations[i] += bool(info.get("violation", False)) or _outside(problem, now[i])
+                now[i], _, terminated, truncated, info = envs[i].step(action)
+                violated[i] = info.get("violation", False)
                 running[i] = not (terminated or truncated)
                 lengths[i] += 1
             thetas.append(now)
             inputs.append(u)
+            told.append(violated)
             if len(inputs) >= LONGEST:
-                raise RuntimeError(
-                    f"An episode of {envs[0]} has not ended after {LONGEST} steps. Wrap the env in "
-                    "gymnasium.wrappers.TimeLimit."
-                )
+                raise endless(envs[0])
     states, played = np.array(thetas), np.array(inputs)
     taken = np.arange(len(inputs))[:, None] < lengths
     costs = np.sum(problem.stage_cost(states[:-1], played), axis=0, where=taken)
+    beyond = np.any(Bounds.of(problem).beyond(states[1:], ROOM) != 0, axis=-1)
+    violations = np.sum(np.array(told) | beyond, axis=0, where=taken)
     return Loops(costs, violations, lengths, states, played)
-
-
-def _theta(problem: LinearMPC, observation: Any) -> Array:
-    theta = np.array(observation, dtype=np.float64)
-    if theta.shape != (problem.n_theta,):
-        raise ValueError(
-            f"The env shows an observation of shape {theta.shape}, but theta = "
-            f"[{', '.join(problem.layout.names)}] has {problem.n_theta} entries. Wrap the env so "
-            "that it shows all of theta: see sb3_yann.wrappers."
-        )
-    return theta
-
-
-def _outside(problem: LinearMPC, theta: Array) -> bool:
-    """Tell whether a state or an output breaks a bound of the problem."""
-    x, C = theta[problem.layout.state], problem.outputs.C
-    half = problem.theta_half[problem.layout.state]
-    y = np.concatenate([x, C @ x])
-    room = 1e-3 * np.concatenate([half, np.abs(C) @ half])
-    low = np.concatenate([problem.x_min, problem.outputs.y_min]) - room
-    high = np.concatenate([problem.x_max, problem.outputs.y_max]) + room
-    return bool(np.any((y < low) | (y > high)))
 
 
 def of_law(problem: LinearMPC) -> Controller:
@@ -214,21 +194,22 @@ class Observing:
 
     def __init__(self, problem: LinearMPC, other: LinearMPC, observer: DisturbanceObserver) -> None:
         self.problem, self.other, self.observer = problem, other, observer
-        self.estimates: Array = np.zeros((0, 0))
+        self.observers: list[DisturbanceObserver] = []
         self.u: Array = np.zeros((0, 0))
 
     def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
         """Return the inputs (k, m)."""
-        layout, observer = self.problem.layout, self.observer
-        x, n = theta[:, layout.state], layout.n_states
+        layout, bounds = self.problem.layout, self.other.disturbances
+        x = theta[:, layout.state]
         if t == 0:
-            self.estimates = np.pad(x, ((0, 0), (0, observer.model.n_disturbances)))
+            self.observers = [copy.copy(self.observer) for _ in x]
+            found = [each.reset(y) for each, y in zip(self.observers, x, strict=True)]
         else:
-            expected = self.estimates @ observer.A.T + self.u @ observer.B.T
-            self.estimates = expected + (x - expected @ observer.seen.T) @ observer.gain.T
-        bounds = self.other.disturbances
-        d = np.clip(self.estimates[:, n:], bounds.d_min, bounds.d_max)
-        parts = self.estimates[:, :n], theta[:, layout.reference], d, theta[:, layout.previous]
+            rows = zip(self.observers, x, self.u, strict=True)
+            found = [each.update(y, u) for each, y, u in rows]
+        x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
+        d = np.clip(d_hat, bounds.d_min, bounds.d_max)
+        parts = x_hat, theta[:, layout.reference], d, theta[:, layout.previous]
         self.u = np.asarray(self.other.online()(np.concatenate(parts, axis=1)))
         return self.u
 
@@ -248,7 +229,7 @@ class Planning:
 
     def __init__(self, plant: Plant, task: Task, steps: int) -> None:
         self.plant, self.task, self.steps = plant, task, steps
-        self._plans: list[tuple[int, Plans]] = []
+        self._plans: dict[int, tuple[int, Plans]] = {}  # when each was made
         self._constants: Array = np.zeros((0, 0))
 
     def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
@@ -256,15 +237,14 @@ class Planning:
         problem, constant = self.task.problem, self.task.problem.layout.constant
         if t == 0:
             self._constants = np.full_like(theta[:, constant], np.nan)
-            self._plans = [(0, None)] * len(theta)  # type: ignore[list-item]
         away = np.abs(theta[:, constant] - self._constants) / problem.theta_half[constant]
         stale = running & (np.any(~(away <= CHANGED), axis=1) | (t == 0))
         if stale.any() and t < self.steps:
             self._plan(t, theta, np.flatnonzero(stale))
         u = np.empty((len(theta), problem.model.n_inputs))
-        for i, (begun, plan) in enumerate(self._plans):
+        for i, (begun, plan) in self._plans.items():
             at = min(t, self.steps - 1) - begun
-            u[i] = np.nan_to_num(follow(plan, 0.0, at, theta[i : i + 1])[0])
+            u[i] = np.nan_to_num(follow(plan, at, theta[i : i + 1])[0])
         return np.clip(u, *self.task.limits(theta))
 
     def _plan(self, t: int, theta: Array, rows: NDArray[np.intp]) -> None:

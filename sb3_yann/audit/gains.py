@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_yann._validation import Array
+from sb3_yann.audit.offset import CURE
 
 ADVICE = {
     "do not bother": "the MPC is nearly optimal here.",
-    "add ObserveDisturbance first": "that brings most of it: mpc, observer = offset_free(mpc), and "
-    "env = ObserveDisturbance(env, observer, low, high).",
+    "add ObserveDisturbance first": f"that brings most of it: {CURE}",
     "re-identify": "a linear model of the plant as it is brings most of it: see "
     "LinearModel.from_data, PlantTwin.reidentified, improve(model, twin).",
     "learn": "most of it is beyond a linear model: improve(model, twin), or DDPG under an "

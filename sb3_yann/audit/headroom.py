@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Callable
 from contextlib import closing
@@ -217,7 +218,7 @@ class _Search:
         verdict = [*ADVICE][1 + int(np.argmax(parts))]
         if total < max(LITTLE, SURE * whole.standard_error * self.random):
             verdict = "do not bother"
-        return Headroom(base.costs, observer, model, best, *parts, verdict, self.source)
+        return dataclasses.replace(whole, verdict=verdict)
 
 
 def _name(mpc: LinearMPC, make: Callable[[], gym.Env[Any, Any]]) -> str:

@@ -8,6 +8,10 @@ from sb3_yann._validation import Array
 from sb3_yann.audit.sample import Sample
 from sb3_yann.control import LinearMPC
 
+CURE = (
+    "mpc, observer = offset_free(mpc), and env = ObserveDisturbance(env, observer, "
+    "mpc.disturbances.d_min, mpc.disturbances.d_max)."
+)
 SHORTEST, LAST = 15, 1 / 3
 """Steps that a reference must hold at least, and the part of them that counts, the last."""
 FEWEST = 2
@@ -41,8 +45,7 @@ def steady_offset(problem: LinearMPC, sample: Sample) -> str:
     return (
         f"Where a reference held, {len(found)} times, the tracked output {i} came to rest "
         f"{beside[i]:.3g} beside r[{i}]: the plant is not its model. Without an offset, and before "
-        "any learning: mpc, observer = offset_free(mpc), and env = ObserveDisturbance(env, "
-        "observer, mpc.disturbances.d_min, mpc.disturbances.d_max)."
+        f"any learning: {CURE}"
     )
 
 

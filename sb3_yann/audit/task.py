@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
@@ -13,6 +14,47 @@ from sb3_yann.control import LinearMPC
 INSIDE, WEIGHT = 1e-3, 1e4
 """How far inside of the bounds plans stay, in half-widths; what one half-width beyond that costs in
 a step, in mean costs of a step."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of states and outputs.
+
+    Attributes
+    ----------
+    C : ndarray, shape (k, n)
+        Combinations of the states.
+    low, high, half : ndarray, shape (k,)
+        Their bounds, one of which is finite at least, and half-widths.
+    states : slice
+        Where theta has the states.
+    """
+
+    C: Array
+    low: Array
+    high: Array
+    half: Array
+    states: slice
+
+    @classmethod
+    def of(cls, problem: LinearMPC, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
+        """Return those of a problem, and of its states (n,) besides."""
+        outputs, size = problem.outputs, problem.theta_half[problem.layout.state]
+        C = np.vstack([np.eye(len(size)), outputs.C])
+        lowest = np.concatenate([np.maximum(problem.x_min, low), outputs.y_min])
+        highest = np.concatenate([np.minimum(problem.x_max, high), outputs.y_max])
+        half = np.concatenate([size, np.abs(outputs.C) @ size])
+        used = np.isfinite(lowest) | np.isfinite(highest)
+        return cls(C[used], lowest[used], highest[used], half[used], problem.layout.state)
+
+    def beyond(self, thetas: Array, room: float) -> Array:
+        """Return by how much bounds that are moved out by some room are exceeded (..., k).
+
+        Room and result are in half-widths.
+        """
+        y = thetas[..., self.states] @ self.C.T
+        above = np.maximum((y - self.high) / self.half - room, 0)
+        return np.asarray(above - np.maximum((self.low - y) / self.half - room, 0))
 
 
 @dataclass(frozen=True)
@@ -38,29 +80,15 @@ class Task:
     weight: float
 
     @cached_property
-    def _bounded(self) -> tuple[Array, Array, Array, Array]:
-        """Rows (k, n) of bounded combinations of states, their bounds (k,) and half-widths."""
-        problem, outputs = self.problem, self.problem.outputs
-        size = problem.theta_half[problem.layout.state]
-        C = np.vstack([np.eye(len(size)), outputs.C])
-        low = np.concatenate([np.maximum(problem.x_min, self.low), outputs.y_min])
-        high = np.concatenate([np.minimum(problem.x_max, self.high), outputs.y_max])
-        half = np.concatenate([size, np.abs(outputs.C) @ size])
-        used = np.isfinite(low) | np.isfinite(high)
-        return C[used], low[used], high[used], half[used]
-
-    def beyond(self, thetas: Array, inside: float = 0.0) -> Array:
-        """Return by how much bounds, moved inside, are exceeded (..., bounds), in half-widths."""
-        C, low, high, half = self._bounded
-        y, room = thetas[..., self.problem.layout.state] @ C.T, inside * half
-        return np.asarray((np.maximum(y - high + room, 0) - np.maximum(low + room - y, 0)) / half)
+    def _bounds(self) -> Bounds:
+        return Bounds.of(self.problem, self.low, self.high)
 
     def costs(self, thetas: Array, inputs: Array) -> Array:
         """Return the costs (k,) of thetas (T + 1, k, n_theta) and inputs (T, k, m); inf for NaN."""
         with np.errstate(over="ignore", invalid="ignore"):
             stage = self.problem.stage_cost(thetas[:-1], inputs).sum(axis=0)
             end = np.sum((thetas[-1] @ self.end) * thetas[-1], axis=-1)
-            outside = np.sum(self.beyond(thetas[1:], INSIDE) ** 2, axis=(0, 2))
+            outside = np.sum(self._bounds.beyond(thetas[1:], -INSIDE) ** 2, axis=(0, 2))
             total = stage + end + self.weight * outside
         return np.where(np.isfinite(total), total, np.inf)
 
@@ -77,9 +105,8 @@ class Task:
 
     def penalty(self, thetas: Array) -> tuple[Array, Array]:
         """Return gradient (..., n) and curvature (..., n, n) of what is beyond bounds."""
-        C, _, _, half = self._bounded
-        over, weight = self.beyond(thetas, INSIDE), 2 * self.weight
-        scaled = C / half[:, None]
+        over, weight = self._bounds.beyond(thetas, -INSIDE), 2 * self.weight
+        scaled = self._bounds.C / self._bounds.half[:, None]
         active = (over != 0).astype(float)
         curvature = np.einsum("ki,...k,kj->...ij", scaled, active, scaled)
         return weight * over @ scaled, weight * curvature

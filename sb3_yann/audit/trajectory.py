@@ -87,23 +87,10 @@ class Plans:
         )
 
 
-def follow(plans: Plans, corrections: Array | float, t: int, theta: Array) -> Array:
-    """Return the inputs (k, m) of plans at a step.
-
-    Parameters
-    ----------
-    plans : Plans
-        With their feedback.
-    corrections : ndarray, shape (T, k, m), or float
-        What is added.
-    t : int
-        The step.
-    theta : ndarray, shape (k, n_theta)
-        Where the plant is.
-    """
+def follow(plans: Plans, t: int, theta: Array) -> Array:
+    """Return the inputs (k, m) of plans at a step, from theta (k, n_theta)."""
     away = theta - plans.thetas[t]
-    moved = corrections if isinstance(corrections, float) else corrections[t]
-    return np.asarray(plans.inputs[t] + moved + (plans.gains[t] @ away[..., None])[..., 0])
+    return np.asarray(plans.inputs[t] + (plans.gains[t] @ away[..., None])[..., 0])
 
 
 def planned(
@@ -165,10 +152,10 @@ def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) ->
         plans.gains[:, active] = gains
         waiting: Rows = np.arange(len(active))
         for size in SIZES:
-            now, some = active[waiting], Plans(old.thetas, old.inputs, gains, old.costs).of(waiting)
-            policy = partial(follow, some, size * corrections[:, waiting])
-            steps, begin = len(old.inputs), old.thetas[0, waiting]
-            thetas, inputs = roll_out(plant, task, policy, begin, steps, rows[now])
+            moved = Plans(old.thetas, old.inputs + size * corrections, gains, old.costs)
+            now, some = active[waiting], moved.of(waiting)
+            given = partial(follow, some), some.thetas[0], len(some.inputs), rows[now]
+            thetas, inputs = roll_out(plant, task, *given)
             costs = task.costs(thetas, inputs)
             better = costs < some.costs
             won = now[better]

@@ -184,7 +184,7 @@ def _as_one(
         ended[running] |= terminated[running]
         running &= ~(terminated | truncated)
         if len(actions) == LONGEST:
-            raise _endless(env)
+            raise endless(env)
     states, inputs = np.array(observations, float), np.array(actions, float)
     return Episodes(
         costs,
@@ -195,7 +195,8 @@ def _as_one(
     )
 
 
-def _endless(env: Any) -> RuntimeError:
+def endless(env: Any) -> RuntimeError:
+    """Return what is raised where an episode has no end."""
     return RuntimeError(
         f"An episode of {env} has not ended after {LONGEST} steps. Give it a limit: "
         "max_episode_steps when it is registered, or gymnasium.wrappers.TimeLimit."
@@ -227,6 +228,6 @@ def _side_by_side(
             if not (terminated or truncated):
                 going_on.append((env, episode))
             if len(episode.actions) == LONGEST:
-                raise _endless(env)
+                raise endless(env)
         running = going_on
     return episodes

@@ -17,6 +17,8 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Appends a vector between ``low`` and ``high`` to the observation.
 
     The first ``n_replaced`` entries of the env's observation give way to ``n_new`` unbounded ones.
+    What lies on a bound is shown inside it, where float32 would round it beyond: some laws are zero
+    outside their box.
 
     Parameters
     ----------
@@ -43,6 +45,12 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"low = {self.low.tolist()} and high = {self.high.tolist()} must be numbers, and "
                 "no entry of low may exceed that of high."
             )
+        self._rounded = self.low.astype(np.float32), self.high.astype(np.float32)
+        low32, high32 = self._rounded
+        self._inside = (
+            np.where(low32 < self.low, np.nextafter(low32, np.float32(np.inf)), low32),
+            np.where(high32 > self.high, np.nextafter(high32, np.float32(-np.inf)), high32),
+        )
         free = np.full(n_new, np.inf)
         self.observation_space = spaces.Box(
             np.concatenate([-free, inner.low[n_replaced:], self.low]).astype(np.float32),
@@ -53,13 +61,21 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(**kwargs)  # seeds the generator that draws
-        return self._observe(observation, None, info), info
+        return self._shown(observation, None, info), info
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Step; the observation is the completed one."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
-        return self._observe(observation, u, info), float(reward), terminated, truncated, info
+        return self._shown(observation, u, info), float(reward), terminated, truncated, info
+
+    def _shown(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
+        """Return what is observed, with what was appended on its bounds or inside them."""
+        shown = self._observe(observation, u, info)
+        appended = shown[len(shown) - len(self.low) :]
+        for rounded, inside in zip(self._rounded, self._inside, strict=True):
+            np.copyto(appended, inside, where=appended == rounded)
+        return shown
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         """Return what is observed after an input u (m,), None at the start of an episode."""

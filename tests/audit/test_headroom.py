@@ -123,7 +123,6 @@ def test_noise_is_no_headroom() -> None:
     """A plan that knew the noise to come would cost a fifth less than the MPC, which is optimal."""
     found = headroom(heater(), partial(Heater, noise=0.1), n_starts=10)
     assert found.verdict == "do not bother" and found.total < 0.01
-    assert np.any(found.mpc_costs > found.mpc_costs.mean())  # there is some luck to be had
 
 
 def test_the_best_of_a_random_plant_is_one_controller() -> None:

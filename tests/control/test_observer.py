@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from general_problems import LOADED, THERMAL
-from sb3_yann import DisturbanceObserver, LinearModel
+from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, offset_free
 
 
 def test_the_estimate_of_a_constant_disturbance_is_exact_in_the_end() -> None:
@@ -82,3 +82,17 @@ def test_bad_measurements_are_named() -> None:
         DisturbanceObserver(LOADED).update([1], [0])
     with pytest.raises(ValueError, match="u holds NaN"):
         DisturbanceObserver(LOADED).update([1, 2], [np.nan])
+
+
+def test_the_observer_of_an_offset_free_mpc_knows_no_units() -> None:
+    """A temperature in thousandths of a degree is estimated as fast as one in degrees."""
+    units = np.diag([1.0, 1000.0])
+    A, B = units @ THERMAL.A @ np.linalg.inv(units), units @ THERMAL.B
+    gains = []
+    for model, unit in ((THERMAL, np.eye(2)), (LinearModel(A, B, 1.0), units)):
+        Q, half = np.linalg.inv(unit @ unit), np.diag(unit) * 5
+        box = {"theta_min": -half, "theta_max": half, "u_min": -1, "u_max": 1}
+        _, observer = offset_free(LinearMPC(model, Q=Q, R=[[1]], horizon=2, **box))
+        gains.append(observer.gain)
+    both = np.kron(np.eye(2), units)  # of the states and of their disturbances
+    np.testing.assert_allclose(gains[1], both @ gains[0] @ np.linalg.inv(units), rtol=1e-6)

@@ -9,7 +9,14 @@ from gymnasium.utils.env_checker import check_env
 
 from general_problems import servo
 from sample_plants import LinearPlant, two_input_mpc
-from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, NonFiniteWarning, RateLimits
+from sb3_yann import (
+    DisturbanceObserver,
+    LinearModel,
+    LinearMPC,
+    NonFiniteWarning,
+    RateLimits,
+    Tracking,
+)
 from sb3_yann.wrappers import (
     MeasuredDisturbance,
     ObserveDisturbance,
@@ -251,3 +258,13 @@ def test_inputs_on_their_way_are_shown_newest_first() -> None:
 def test_delays_that_do_not_fit_are_named(delays: list[int]) -> None:
     with pytest.raises(ValueError, match=r"delays = .* must"):
         PastInputs(gym.make("CSTR-v0"), delays)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_what_lies_on_a_bound_stays_inside_when_it_is_rounded(sign) -> None:
+    """float32 has no 0.3 but one beyond it, where this law would be zero."""
+    law = servo(infeasible="zero_input", tracking=Tracking([0], -0.3, 0.3)).explicit()
+    env = SetPoint(Counter(), -0.3, 0.3, schedule=lambda step: 0.3 * sign)
+    for shown in (env.reset()[0], env.step(np.zeros(1))[0]):
+        assert 0.299999 < sign * float(shown[2]) <= 0.3
+        assert sign * law([0, 0, shown[2]])[0] > 0.01

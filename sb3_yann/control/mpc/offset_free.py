@@ -24,7 +24,8 @@ def offset_free(
 
     Where the plant is not its model, the MPC settles beside its set-points. A constant disturbance
     in each state accounts for that: tracked outputs then settle without offset (Pannocchia and
-    Rawlings, AIChE J. 49, 2003). All states must be measured.
+    Rawlings, AIChE J. 49, 2003). All states must be measured. The observer takes disturbances and
+    errors of measurements for equally large, in half-widths of the box of states.
 
     Parameters
     ----------
@@ -58,7 +59,8 @@ def offset_free(
             f"The MPC has {old.n_disturbances} disturbances already. Give their observer the "
             "model: DisturbanceObserver(mpc.model)."
         )
-    largest = SHARE * mpc.theta_half[mpc.layout.state] if d_max is None else d_max
+    unit = mpc.theta_half[mpc.layout.state]
+    largest = SHARE * unit if d_max is None else d_max
     bound = as_positive_vector("d_max", largest, n, "In units of the states.")
     names = {"state_names": old.state_names, "input_names": old.input_names, "units": old.units}
     model = LinearModel(old.A, old.B, old.dt, old.x_ss, old.u_ss, np.eye(n), **names)
@@ -72,4 +74,5 @@ def offset_free(
         theta_min=mpc.theta_min[states],
         theta_max=mpc.theta_max[states],
     )
-    return found, DisturbanceObserver(model)
+    noise = {"state_noise": unit, "disturbance_noise": unit, "measurement_noise": unit}
+    return found, DisturbanceObserver(model, **noise)
