@@ -251,7 +251,8 @@ def judge(
         advice.append("Compare units, operating point and sampling time of the log and the model.")
     if beyond[0] > OUTSIDE:
         problems.append(
-            f"{100 * beyond[0]:.3g} % of the logged {beyond[1]} lie beyond the problem's box of theta."
+            f"{100 * beyond[0]:.3g} % of the logged {beyond[1]} lie beyond the problem's box of "
+            "theta."
         )
         advice.append("Compare units and operating point of the log and the model.")
     error = relative_error(*costs)

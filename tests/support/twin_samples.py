@@ -113,8 +113,8 @@ class Moved(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
-        low, high = (np.append(each, s) for each, s in zip(
-            (env.observation_space.low, env.observation_space.high), (-0.5, 0.5), strict=True))  # fmt: skip
+        low = np.append(env.observation_space.low, -0.5)
+        high = np.append(env.observation_space.high, 0.5)
         self.observation_space = gym.spaces.Box(np.float32(low), np.float32(high))
 
     def reset(self, *, seed=None, options=None):
