@@ -50,7 +50,8 @@ class Commissioning:
     model : DDPG or TD3
         With a :class:`YannPolicy`. A policy that it has learnt before is tried as any other.
     plant_env : gymnasium.Env, str or callable
-        The plant. It is reset with a seed, which a real one ignores.
+        The plant. It is reset with a seed, which a real one ignores. The twins have the observer
+        among the wrappers of the model's env, or of this one.
     batch : int, default 4
         Episodes in the first batch, at least 2; each one is twice as long as the one before.
     max_correction : float, default 0.1
@@ -113,7 +114,7 @@ class Commissioning:
         self.iterations, self.seed = as_whole("iterations", iterations), as_whole("seed", seed, 0)
         self.twin: PlantTwin | None = None
         self.watchdog: Watchdog | None = None
-        self.observer = observer_of(model.get_env())
+        self.observer = observer_of(model.get_env()) or observer_of(plant_env)
         record = Record(None if log_path is None else Path(log_path))
         bound = 1.0 if self.policy.max_correction is None else self.policy.max_correction
         # A model that was saved meanwhile has the bound of then.
@@ -150,7 +151,6 @@ class Commissioning:
         as_whole("batches", batches)
         if len(self.batches) < batches:
             with one_env(self.plant_env) as env:
-                self._take_observer(env)
                 plant = Plant(env, self.model)
                 while len(self.batches) < batches:
                     while not self._batch_is_over():
@@ -310,15 +310,6 @@ class Commissioning:
             self.journal.record.load(outlook.model, self.model)
         self.incumbent.candidate = None
         self.incumbent.hold()
-        self._restore_twin(outlook)
-
-    def _restore_twin(self, outlook: Outlook) -> None:
         if outlook.twin is not None:
             self.twin = self._fit(outlook.twin, outlook.twin_seed)
             self.watchdog = Watchdog.of(self.twin)
-
-    def _take_observer(self, env: gym.Env[Any, Any]) -> None:
-        """Take the plant's observer where the model's env has none; a restored twin needs it."""
-        if self.observer is None and (found := observer_of(env)) is not None:
-            self.observer = found
-            self._restore_twin(self.journal.outlook)

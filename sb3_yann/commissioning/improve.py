@@ -21,6 +21,11 @@ from sb3_yann.commissioning.trial import Check
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
+EXACT = 0.5
+"""Errors of the twin relative to the given model's below which it is an exact one."""
+LEAST, LEAST_OF_EXACT = 2e-3, 2e-4
+"""What a policy must gain in a twin, and in an exact one, relative to the MPC's mean cost."""
+
 RACE = 3
 """Of two searches the better one goes on after such a part of the iterations."""
 
@@ -39,8 +44,9 @@ class Improvement:
     change : float
         The accepted policy's mean cost in the twin against the MPC's: -0.02 is 2 % less.
     accepted : bool
-        Whether a policy passed that gains at least 0.2 %, and two standard errors on episodes like
-        the log's; if none did, the model is as it was.
+        Whether a policy passed that gains at least 0.2 %, or 0.02 % where the twin errs less than
+        half as much as the given model, and two standard errors on episodes like the log's; if
+        none did, the model is as it was.
     before : Check, optional
         Of what the model had learnt before, if it had.
 
@@ -61,7 +67,7 @@ class Improvement:
         if self.accepted:
             return ""
         gain = f"a gain of {100 * abs(self.change):.2g} %" if self.change < 0 else "no gain"
-        last = self.checks[-1].reason or f"{gain} in the twin is not worth a change"
+        last = self.checks[-1].reason or f"{gain} in the twin is too small, or not sure"
         return f"Nothing better was found: {last}."
 
 
@@ -87,12 +93,14 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     checked against the MPC, from seeded starts on every member of the twin. It is accepted if no
     start costs more than with the MPC by 0.05 % of the mean, none violates more, and the mean is
     not above that of the accepted policy. A start outside the log may cost 0.5 % of its own more,
-    and up to ten times as much the rarer it is. Of what is refused, a half and a quarter are
-    tried. What passes is confirmed on new starts, where the twin's second opinion, a model without
-    a form, must see a gain as well and no start dearer by 1 %. In the end it must gain 0.2 %, and
-    twice the standard error on episodes like the log's. Starts that it loses, or nearly, are played
-    in the gradients to come. What the model has learnt before is checked first. Beyond what
-    the log shows the MPC acts alone: no member of the twin knows the plant there.
+    and up to ten times as much the rarer it is. Of what is refused, a half and a quarter are tried.
+    What passes is confirmed on new starts, where the twin's second opinion, a model without a form,
+    must see a gain as well and no start dearer by 1 %. In the end it must gain 0.2 %, or 0.02 %
+    where the twin errs less than half as much as the given model. On episodes that go on as those
+    of the log it must gain twice the standard error, over episodes and members. Starts that it
+    loses, or nearly, are played in the gradients to come. What the model has learnt before is
+    checked first. Beyond what the log shows the MPC acts alone: no member of the twin knows the
+    plant there.
 
     Two searches run, one from the present policy and one from the re-identified MPC. After a third
     of the iterations the better one goes on.
@@ -172,12 +180,13 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     before = None if layer.network.is_zero() else searches[0].checks[0]
     leg = min(iterations, max(check_every, -(-iterations // RACE)))
     total = iterations + (len(searches) - 1) * leg
-    for _ in track(_race(searches, leg), "improving", total, disable=not progress_bar):
+    least = LEAST_OF_EXACT if twin.trust.error_ratio < EXACT else LEAST
+    for _ in track(_race(searches, leg, least), "improving", total, disable=not progress_bar):
         pass
     search = min(searches, key=lambda each: each.change)
     change, own = search.change, policy.actor.mu.state_dict()
     moved = any(not th.equal(own[key].cpu(), each) for key, each in search.accepted.items())
-    if not moved or not search.is_worth_it:
+    if not moved or not search.gains(least):
         return Improvement(tuple(search.checks), 0.0 if moved else change, False, before)
     with all_or_nothing(policy):
         policy.actor.mu.load_state_dict(search.accepted)
@@ -188,7 +197,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     return Improvement(tuple(search.checks), change, True, before)
 
 
-def _race(searches: list[Search], leg: int) -> Iterator[int]:
+def _race(searches: list[Search], leg: int, least: float) -> Iterator[int]:
     """Yield after each gradient step: of all searches in the first leg, then of the best one.
 
     The others follow where that finds nothing worth a change.
@@ -198,5 +207,5 @@ def _race(searches: list[Search], leg: int) -> Iterator[int]:
             yield from each.steps(leg)
     for each in sorted(searches, key=lambda each: each.change):
         yield from each.steps(each.pace.iterations)
-        if each.is_worth_it:
+        if each.gains(least):
             break

@@ -110,10 +110,9 @@ class Search:
         """The check of the accepted weights; None where none are."""
         return next((each for each in reversed(self.checks) if each.accepted), None)
 
-    @property
-    def is_worth_it(self) -> bool:
-        """Whether the accepted weights surely gain enough."""
-        return self.best is not None and self.best.is_worth_it
+    def gains(self, least: float) -> bool:
+        """Return whether the accepted weights gain so much, and surely something."""
+        return self.best is not None and self.best.gains(least)
 
     def _check(self) -> bool:
         """Check the present actor, else what lies between it and the accepted one."""

@@ -27,9 +27,7 @@ FURTHER = 0.01
 NEARLY = 0.5
 """A start that loses so much of what it may lose is a hard one."""
 
-LEAST = 2e-3
-"""What a policy must gain in the twin, relative to the MPC's mean cost, to be worth a change."""
-SURELY = 2.0
+SURE = 2.0
 """Standard errors by which episodes that go on as those of the log must gain."""
 
 Inputs = Callable[[Array], Array]
@@ -67,10 +65,9 @@ class Check:
     logged: float = 0.0
     error: float = 0.0
 
-    @property
-    def is_worth_it(self) -> bool:
-        """Whether the gain is large enough for a change, and sure on episodes like the log's."""
-        return self.change <= -LEAST and self.logged + SURELY * self.error < 0
+    def gains(self, least: float) -> bool:
+        """Return whether it gains so much, and surely something on episodes like the log's."""
+        return self.change <= -least and self.logged + SURE * self.error < 0
 
 
 @dataclass

@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.row_layout import ROUNDED
 
 EXPLAINED = 1e-3
 """An estimate's moves follow the model's errors but for so much of their squares."""
@@ -45,10 +46,10 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
     if not parts.n_disturbances:
         return
     d_min, d_max = (each[parts.disturbance] for each in inside)
-    errors, moves = [], []
+    room, errors, moves = ROUNDED * (d_max - d_min), [], []
     for each in episodes:
         d = each.thetas[:, parts.disturbance]
-        free = np.all((d > d_min) & (d < d_max), axis=1)
+        free = np.all((d > d_min + room) & (d < d_max - room), axis=1)
         free = free[1:] & free[:-1]
         left = each.thetas[1:] - problem.predict(each.thetas[:-1], each.actions)
         errors.append(left[free, parts.state])

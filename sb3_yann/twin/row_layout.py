@@ -11,6 +11,8 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 
+ROUNDED = 1e-6
+"""So near to its bound, relative to their distance, an estimate may lie beyond it."""
 SINGULAR = 1e10
 """Condition number from which on a matrix is not inverted."""
 
@@ -175,7 +177,8 @@ class RowLayout:
         z = observer.A @ np.concatenate([row[parts.state], row[self._raw]]) + observer.B @ u
         seen = np.linalg.solve(observer.gain[:n], theta[parts.state] - z[:n])
         d, shown, (low, high) = z[n:] + observer.gain[n:] @ seen, theta[parts.disturbance], self._d
-        d = np.where((shown > low) & (shown < high), shown, d)
+        room = ROUNDED * (high - low)  # an observation rounds the bounds to float32
+        d = np.where((shown > low + room) & (shown < high - room), shown, d)
         x = np.linalg.solve(observer.C, observer.C @ z[:n] + seen)
         return np.concatenate([theta, x, d])
 

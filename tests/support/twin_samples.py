@@ -8,7 +8,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits, Tracking, offset_free
+from sb3_yann import (
+    DisturbanceObserver,
+    LinearModel,
+    LinearMPC,
+    PlantTwin,
+    RateLimits,
+    Tracking,
+    offset_free,
+)
 from sb3_yann.wrappers import ObserveDisturbance
 from sb3_yann_envs import ProblemBox
 
@@ -93,7 +101,7 @@ def rated() -> PlantTwin:
     return PlantTwin.fit(mpc, log(4))
 
 
-D_MAX = 0.045
+D_MAX = 0.02
 """Largest disturbance of the offset-free cart: less than what its observer estimates at times."""
 
 
@@ -105,7 +113,16 @@ def offset_free_problem() -> tuple[LinearMPC, Any]:
         plain.model, Q=plain.Q, R=plain.R, horizon=2, u_min=-1, u_max=1, theta_min=[-3, -3],
         theta_max=[3, 3], tracking=Tracking([0], -0.5, 0.5),
     )  # fmt: skip
-    return offset_free(tracking, D_MAX)
+    mpc, _ = offset_free(tracking, D_MAX)
+    return mpc, DisturbanceObserver(mpc.model, disturbance_noise=0.05)  # a slow one
+
+
+class Calm(Cart):
+    """The cart, from starts from which it does not run away at first."""
+
+    def reset(self, *, seed=None, options=None):
+        self.x = 0.4 * super().reset(seed=seed)[0]
+        return self.x.astype(np.float32), {}
 
 
 class Moved(gym.Wrapper[Any, Any, Any, Any]):
@@ -132,15 +149,15 @@ def observed_env(plant: Any = None) -> ObserveDisturbance:
     """Return the cart, or another plant, as its offset-free MPC sees it."""
     mpc, observer = offset_free_problem()
     bounds = mpc.disturbances.d_min, mpc.disturbances.d_max
-    return ObserveDisturbance(Moved(Cart() if plant is None else plant), observer, *bounds)
+    return ObserveDisturbance(Moved(Calm() if plant is None else plant), observer, *bounds)
 
 
-def observed_log(episodes: int = 5) -> list[Any]:
+def observed_log(episodes: int = 5, plant: Any = None) -> list[Any]:
     """Return episodes of the offset-free MPC: thetas and actions, and what the plant did.
 
     The third entry of each are the plant's states, the fourth the observer's estimates.
     """
-    law, env, found = offset_free_problem()[0].explicit(), observed_env(), []
+    law, env, found = offset_free_problem()[0].explicit(), observed_env(plant), []
     for seed in range(episodes):
         theta, over = env.reset(seed=seed)[0], False
         rows, actions = [theta], []

@@ -1,0 +1,72 @@
+"""Twins with an observer of the disturbance: the policy, the watchdog and the plant's batches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG
+
+from sb3_yann import Commissioning, YannPolicy, improve
+from sb3_yann.commissioning.comparison import predicted_costs
+from sb3_yann.commissioning.watchdog import Watchdog
+from sb3_yann.evaluation import evaluate
+from sb3_yann.twin.dynamics import law_of
+from sb3_yann.wrappers import StageCost
+from twin_samples import observed, observed_env, offset_free_problem
+
+
+def plant() -> StageCost:
+    """Return the cart as its offset-free MPC sees it, with that MPC's stage cost."""
+    return StageCost(observed_env(), offset_free_problem()[0])
+
+
+def model() -> DDPG:
+    mpc = offset_free_problem()[0]
+    return DDPG(YannPolicy, plant(), policy_kwargs={"problem": mpc}, seed=0, device="cpu")
+
+
+def test_the_twin_predicts_what_episodes_cost_that_it_has_not_seen() -> None:
+    found, law = observed(), law_of(offset_free_problem()[0])
+    played = evaluate(offset_free_problem()[0].explicit(), plant, range(700, 705))
+
+    class Episode:
+        def __init__(self, thetas: np.ndarray, actions: np.ndarray) -> None:
+            self.thetas, self.actions = thetas.astype(float), actions
+
+    episodes = [Episode(*each) for each in zip(played.observations, played.actions, strict=True)]
+    np.testing.assert_allclose(predicted_costs(found, episodes, law), played.costs, rtol=2e-3)
+
+
+def test_what_is_improved_in_the_twin_is_better_on_the_plant() -> None:
+    ours = model()
+    found = improve(ours, observed(), iterations=80)
+    seeds = range(800, 840)
+    mpc = evaluate(offset_free_problem()[0].explicit(), plant, seeds).costs
+    change = evaluate(ours, plant, seeds).costs - mpc
+    assert found.accepted and change.mean() < -0.001 * mpc.mean()  # there is little to gain
+    assert change.max() < 0.005 * mpc.mean()
+
+
+def test_the_watchdog_is_quiet_and_sees_what_the_observer_smooths() -> None:
+    found, law = observed(), law_of(offset_free_problem()[0])
+    dog, env = Watchdog.of(found), plant()
+    for fault, quiet in ((0.0, True), (0.3, False)):
+        theta, over = env.reset(seed=901)[0].astype(float), False
+        dog.start(theta, law)
+        for k in range(60):
+            if k == 20:
+                env.unwrapped.x = env.unwrapped.x + np.array([0.0, fault])
+            u = law(theta[None])[0].astype(np.float32)
+            before, (theta, _, _, over, _) = theta, env.step(u)
+            theta = theta.astype(float)
+            dog.watch(before, u.astype(float), theta)
+        assert over and dog.quiet == quiet
+
+
+def test_commissioning_takes_the_observer_of_the_env() -> None:
+    run = Commissioning(model(), plant(), batch=3, iterations=20)
+    batches = run.run(batches=1)
+    assert run.twin is not None and run.twin.dynamics.row.observer is not None
+    assert run.twin.trusted and batches[0].acted == "MPC"
+    assert [each.alarm for each in run.episodes] == [None] * 3
+    assert batches[0].cost == pytest.approx(batches[0].mpc, rel=0.01)

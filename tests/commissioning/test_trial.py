@@ -1,0 +1,72 @@
+"""Trials go on as the log's episodes do, and what passes gains surely."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sb3_yann.commissioning.grounds import Grounds
+from sb3_yann.commissioning.trial import Check, Trial
+from sb3_yann.twin.dynamics import law_of
+from twin_samples import observed, twin
+
+
+def trial() -> Trial:
+    """Return one of a plant whose set-points change amid an episode."""
+    return Grounds(observed(), n_runs=5, n_starts=12, seed=0).trial
+
+
+def test_every_other_start_goes_on_with_the_set_points_of_a_logged_episode() -> None:
+    found, part = trial(), observed().dynamics.row.given
+    assert (found.follow >= 0).tolist() == [False, True] * 6 + [False] * 12
+    assert set(found.follow[found.follow >= 0]) == set(range(5))  # all of them
+    for given, number, start in zip(
+        np.swapaxes(found.given, 0, 1), found.follow, found.starts[0], strict=True
+    ):
+        if number < 0:
+            np.testing.assert_array_equal(given, np.tile(start[part], (60, 1)))
+        else:
+            np.testing.assert_array_equal(given, observed().episodes[number].thetas[:-1, part])
+            assert np.ptp(given) > 0
+    rows, _ = found._run(law_of(observed().problem))
+    np.testing.assert_array_equal(rows[:-1, 2][..., part], found.given)
+
+
+def test_without_set_points_all_that_begin_as_the_log_does_count() -> None:
+    found = Grounds(twin(), n_runs=5, n_starts=12, seed=0).trial
+    assert (found.follow >= 0).tolist() == [True] * 12 + [False] * 12
+
+
+def test_what_loses_on_episodes_like_the_logs_is_refused() -> None:
+    found = trial()
+    (costs, unsafe), follow = found.mpc, np.tile(found.follow, len(found.starts))
+    room, held = 4e-4 * found.mean, found.known & (follow < 0)
+    loses = costs + np.where(held, -2 * room, room * found.known)
+    assert loses[found.known].mean() < costs[found.known].mean()
+    said = found.check(1, (loses, unsafe), found.mpc)
+    assert not said.accepted and said.reason.startswith("episodes like the log's cost 0.04 % more")
+    gains = found.check(1, (costs - room * found.known, unsafe), found.mpc)
+    assert gains.accepted and gains.logged == pytest.approx(-4e-4)
+    assert gains.error == pytest.approx(0, abs=1e-12)
+
+
+def test_the_standard_error_is_over_episodes_and_members() -> None:
+    found = trial()
+    costs, unsafe = found.mpc
+    rng, shape = np.random.default_rng(0), found.starts.shape[:2]
+    by_episode, by_member = rng.uniform(-1, 0, 5), 0.1 * rng.uniform(-1, 0, shape[0])
+    gain = found.mean * np.where(found.follow >= 0, by_episode[found.follow], 0) * np.ones(shape)
+    error = by_episode.std(ddof=1) / np.sqrt(5)
+    said = found.check(1, (costs + gain.ravel(), unsafe), found.mpc)
+    assert said.error == pytest.approx(error, rel=1e-6)
+    gain += found.mean * by_member[:, None]
+    said = found.check(1, (costs + gain.ravel(), unsafe), found.mpc)
+    assert said.error == pytest.approx(np.hypot(error, by_member.std(ddof=1)), rel=1e-6)
+
+
+def test_a_gain_must_be_large_enough_and_sure() -> None:
+    def gains(change: float, error: float) -> bool:
+        return Check(1, True, "", change, 0.0, True, change, error).gains(2e-3)
+
+    assert gains(-0.01, 0.004) and gains(-0.002, 0.0)
+    assert not gains(-0.01, 0.006) and not gains(-0.001, 0.0)
