@@ -55,15 +55,6 @@ def report(options: Namespace) -> None:
     print(f"Written: {written}")
 
 
-def export(options: Namespace) -> None:
-    """Write a model or a law for other machines."""
-    from sb3_yann import export as write
-
-    given = options.model
-    subject = model_of(given) if _is_model(given) else law_of(given)
-    print(write(subject, options.file, format=options.format))
-
-
 def commission(options: Namespace) -> None:
     """Run a commissioning, or go on with one, and print its batches."""
     from sb3_yann import Commissioning

@@ -82,12 +82,6 @@ def _add_design(commands: Any) -> None:
     )
     one.set_defaults(run=actions.plot)
 
-    one = commands.add_parser("export", help="write a model or a law for the controller's hardware")
-    one.add_argument("model", help=f"{_MODEL}, a law's .npz file, or {_PROBLEM}")
-    one.add_argument("file", help="where to write it; the suffix is the format")
-    one.add_argument("--format", help="default: what the suffix says")
-    one.set_defaults(run=actions.export)
-
 
 def _add_plant(commands: Any) -> None:
     """Add the commands that play episodes."""
