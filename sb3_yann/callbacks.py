@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Figure as LoggedFigure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._validation import as_whole
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import YannPolicy, require_yann_policy
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 class NoActionNoise(BaseCallback):
@@ -138,3 +145,55 @@ class ControlDiagnostics(BaseCallback):
                 th.as_tensor(actions, dtype=th.float32, device=self.model.device),
             )
         return np.asarray(q.cpu().numpy()[:, 0])
+
+
+class FigureLog(BaseCallback):
+    """Shows pictures in tensorboard, every so many steps and when `learn` ends.
+
+    Parameters
+    ----------
+    figures : mapping of str to callable
+        What to draw, by the name in tensorboard: functions without arguments that return Axes or a
+        Figure, such as ``guard.plot``. They are called anew each time.
+    every : int, default 10_000
+        Steps between two pictures.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    >>> pictures = FigureLog({"law/regions": model.policy.problem.explicit().plot})
+    >>> _ = model.learn(10, callback=[NoActionNoise(), pictures])
+    """
+
+    def __init__(
+        self, figures: Mapping[str, Callable[[], Axes | Figure]], every: int = 10_000
+    ) -> None:
+        super().__init__()
+        for name, draw in figures.items():
+            if not callable(draw):
+                raise TypeError(
+                    f"figures[{name!r}] = {draw!r} must be a function that draws, such as "
+                    "guard.plot, without parentheses."
+                )
+        self.figures, self.every = dict(figures), as_whole("every", every)
+
+    def _on_training_start(self) -> None:
+        self.last = self.num_timesteps
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps - self.last >= self.every:
+            self._write()
+        return True
+
+    def _on_training_end(self) -> None:
+        self._write()
+
+    def _write(self) -> None:
+        self.last = self.num_timesteps
+        for name, draw in self.figures.items():
+            drawn: Any = draw()
+            figure = getattr(drawn, "figure", None) or drawn  # of Axes, else itself
+            picture = LoggedFigure(figure, close=False)
+            self.logger.record(name, picture, exclude=("stdout", "log", "json", "csv"))
+        self.logger.dump(self.num_timesteps)

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_flag, as_options, as_whole
 from sb3_yann.evaluation.episodes import Source
+from sb3_yann.evaluation.plots.decisions import plot_decisions
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.options import AcceptanceRule, StepSize
@@ -28,6 +29,9 @@ from sb3_yann.guard.summary import summary_of
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class ImprovementGuard(BaseCallback):
@@ -159,6 +163,13 @@ class ImprovementGuard(BaseCallback):
         evidence = self.state.evidence
         known = evidence.accepted or evidence.mpc
         return summary_of(self.decisions, 0 if known is None else len(known.costs))
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the mean cost of each candidate by the verdict on it; return the axes.
+
+        Without ``axes`` they are a new figure's.
+        """
+        return plot_decisions(self.decisions, axes)
 
     @property
     def state(self) -> GuardState:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,9 @@ from sb3_yann.twin.selection import FOLDS, Candidate, candidates, choose, fitted
 from sb3_yann.twin.starts import Starts
 from sb3_yann.twin.trust import Trust, UntrustedTwinError, evidence
 from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
@@ -206,6 +209,12 @@ class PlantTwin:
         """Return what the twin explains, what it does not know, and whether to trust it."""
         text = report(self.problem, self.episodes, self.kind, self.trust)
         return "\n".join([*self.notes, text])
+
+    def plot(self, axes: tuple[Axes, Axes] | None = None) -> tuple[Axes, Axes]:
+        """Draw costs of held-out episodes, and errors of free runs; return both axes."""
+        from sb3_yann.twin.plots import draw_twin
+
+        return draw_twin(self.trust, axes)
 
     def reidentified(self) -> LinearMPC:
         """Return the MPC of the same costs, bounds and horizon with a model of the log.

@@ -13,10 +13,10 @@ from sb3_yann import LinearModel, LinearMPC, Tracking
 from sb3_yann.evaluation import (
     Episodes,
     comparison_table,
-    plots,
     save_plant_trajectories,
     save_trajectories,
 )
+from sb3_yann.evaluation.plots import trajectories
 from sb3_yann_envs.problems import clipped_pendulum
 
 
@@ -68,13 +68,13 @@ def pictured(tmp_path, monkeypatch, **options) -> dict:
     x[-1, 2] = 9  # the set-point of a step that is not taken
     episodes = Episodes(np.ones(1), np.zeros(1, int), (x,), (u,), np.zeros(1, bool))
     seen: dict = {}
-    draw = plots._draw
+    draw = trajectories._draw
 
     def drawn(panels, runs, *rest):
         draw(panels, runs, *rest)
         seen.update(panels=panels, runs=runs, references=rest[-1])
 
-    monkeypatch.setattr(plots, "_draw", drawn)
+    monkeypatch.setattr(trajectories, "_draw", drawn)
     save_plant_trajectories(tmp_path / "run.png", {"mpc": episodes}, mpc, "s", **options)
     return seen
 

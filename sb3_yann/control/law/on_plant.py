@@ -12,6 +12,7 @@ from sb3_yann._validation import Array, ReadOnlyArrays, as_array, to_float
 from sb3_yann.control.model.linear_model import LinearModel
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from typing_extensions import Self
 
 Law = TypeVar("Law", bound="OnPlant")
@@ -89,6 +90,16 @@ class OnPlant(ReadOnlyArrays):
                 "u_ss + law(shown - theta_ss)."
             )
         return np.asarray(self(to_float("shown", shown) - self.theta_ss) + self.model.u_ss)
+
+    def plot(self, axes: Axes | None = None, **options: Any) -> Axes:
+        """Draw the regions by :func:`~sb3_yann.control.law.plot.plot_regions`; return the axes.
+
+        Options are those of that function: ``entries``, ``at``, ``labels``, ``name``. A law that is
+        solved online has no regions, and is a ValueError.
+        """
+        from sb3_yann.control.law.plot import plot_regions
+
+        return plot_regions(self, axes, **options)
 
 
 def plant_arrays(law: OnPlant) -> dict[str, Any]:

@@ -133,7 +133,7 @@ def save_plant_trajectories(
     names = dict(enumerate(problem.labels(units=True))) | dict(labels or {})
     return save_trajectories(
         path,
-        {name: _shifted(name, episodes, *shift) for name, episodes in runs.items()},
+        {name: shifted(name, episodes, *shift) for name, episodes in runs.items()},
         {i: names[i] for i in shown},
         with_units(problem.model)[1],
         problem.model.dt,
@@ -143,8 +143,18 @@ def save_plant_trajectories(
     )
 
 
-def _shifted(name: str, episodes: Episodes, theta_ss: Array, u_ss: Array) -> Episodes:
-    """Return episodes with an operating point added."""
+def shifted(name: str, episodes: Episodes, theta_ss: Array, u_ss: Array) -> Episodes:
+    """Return episodes with an operating point added.
+
+    Parameters
+    ----------
+    name : str
+        Of the episodes, for an error.
+    episodes : Episodes
+        Their observations are theta.
+    theta_ss, u_ss : ndarray, shapes (n_theta,) and (m,)
+        What is added.
+    """
     for x, u in zip(episodes.observations, episodes.actions, strict=True):
         if x.shape[1:] != theta_ss.shape or u.shape[1:] != u_ss.shape:
             raise ValueError(

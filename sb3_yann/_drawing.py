@@ -1,0 +1,65 @@
+"""What all pictures share: colors, figures without a window, legends beside the data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ParamSpec
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
+"""Okabe and Ito's, told apart with any color vision (*Color Universal Design*, 2008)."""
+REST = "#D9D9D9"
+LIMIT = {"color": "black", "linestyle": (0, (5, 2)), "linewidth": 1.0}
+SET_POINT = {"color": "black", "linestyle": ":", "linewidth": 1.4}
+
+
+def new_figure(width: float = 6.4, height: float = 4.0) -> Figure:
+    """Return a figure that no window and no pyplot knows; sizes are in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # slow to import
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def axes_or_new(axes: Axes | None, width: float = 6.4, height: float = 4.0) -> Axes:
+    """Return the axes that are given, or those of a new figure."""
+    return new_figure(width, height).subplots() if axes is None else axes
+
+
+def legend_beside(axes: Axes, title: str | None = None) -> None:
+    """Put the legend to the right of the data; none where nothing has a label."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            title=title, loc="upper left", bbox_to_anchor=(1.02, 1), borderaxespad=0, frameon=False
+        )
+
+
+def legend_above(axes: Axes, columns: int = 3) -> None:
+    """Put the legend above the data; none where nothing has a label."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            loc="lower left",
+            bbox_to_anchor=(0, 1.01),
+            borderaxespad=0,
+            frameon=False,
+            ncols=columns,
+        )
+
+
+def as_figure(draw: Callable[P, Axes]) -> Callable[P, Figure]:
+    """Return a function that draws into a new figure and returns that."""
+
+    def figure(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        found: Figure = draw(*args, **kwargs).figure  # type: ignore[assignment]
+        return found
+
+    figure.__doc__ = f"Return a figure of :func:`{draw.__name__}`, with its arguments."
+    figure.__name__ = draw.__name__.removeprefix("plot_") + "_figure"
+    return figure

@@ -1,0 +1,204 @@
+"""The regions of an explicit law in a plane of two coordinates."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._drawing import COLORS, REST, axes_or_new, legend_beside
+from sb3_yann._validation import Array, as_array, half_widths
+from sb3_yann.control.model.labels import labels_of, with_units
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SMALL = 0.004
+"""A region that covers a smaller part of the picture gets no number."""
+MOST_NUMBERS = 60
+Name = Callable[[int, Array], str]
+
+
+def plot_regions(
+    law: Any,
+    axes: Axes | None = None,
+    *,
+    entries: Sequence[int] = (0, 1),
+    at: ArrayLike | None = None,
+    labels: Sequence[str] | None = None,
+    name: Name | None = None,
+) -> Axes:
+    """Draw the regions in the plane of two entries of theta, as the plant shows them.
+
+    Parameters
+    ----------
+    law : PiecewiseAffine
+        With a bounded box of theta, and at least two parameters.
+    axes : matplotlib Axes, optional
+        Where to draw; a new figure's by default.
+    entries : pair of int, default (0, 1)
+        The coordinates to the right and up.
+    at : array_like, shape (n_theta,), optional
+        The other entries, as the plant shows them; the operating point by default.
+    labels : sequence of str, optional
+        What entries of theta are called; by default the model's names.
+    name : callable, optional
+        From a region and a theta (n_theta,) inside it to what colors stand for. By default the
+        inputs: which of them are constant there.
+
+    Returns
+    -------
+    Axes
+        Each region is a polygon whose ``get_gid()`` is its number.
+
+    Raises
+    ------
+    ValueError
+        If ``entries`` are not two different ones of theta, the box is not bounded there, or the
+        law is solved online.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> axes = plot_regions(problems.clipped_pendulum().explicit())
+    >>> len(axes.patches), axes.get_xlabel()
+    (7, 'angle (rad)')
+    """
+    if not hasattr(law, "starts"):
+        raise ValueError(
+            f"{law!r} is solved online and has no regions. Take LinearMPC.explicit(), or draw its "
+            "input by sb3_yann.evaluation.plots.plot_surface."
+        )
+    across, up = _entries(entries, law.n_theta)
+    zero = np.zeros(law.n_theta) if law.theta_ss is None else law.theta_ss
+    point = zero if at is None else as_array("at", at, (law.n_theta,))
+    polygons = slices(law, (across, up), point - zero)
+    axes = axes_or_new(axes, 7.4, 4.4)
+    shift = zero[[across, up]]
+    named: dict[str, list[int]] = {}
+    for i, polygon in polygons.items():
+        theta = np.array(point - zero)
+        theta[[across, up]] = polygon.mean(axis=0)
+        named.setdefault((name or _constant_inputs(law))(i, theta), []).append(i)
+    sizes = {i: area(polygon) for i, polygon in polygons.items()}
+    _fill(axes, {i: p + shift for i, p in polygons.items()}, named, sizes)
+    called = [*labels] if labels else _labels(law)
+    low, high = law.theta_min[[across, up]] + shift, law.theta_max[[across, up]] + shift
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    if sum(sizes.values()) < 0.999 * np.prod(high - low):
+        axes.fill_between([], [], facecolor="white", edgecolor="0.6", label="no solution")
+    axes.set(xlabel=called[across], ylabel=called[up])
+    legend_beside(axes)
+    return axes
+
+
+def slices(law: Any, entries: tuple[int, int], at: Array) -> dict[int, Array]:
+    """Return the polygon (k, 2) of each region that a plane through ``at`` cuts.
+
+    The box is clipped by one half-plane after the other (Sutherland and Hodgman, *Communications of
+    the ACM* 17, 1974).
+    """
+    low, high = law.theta_min[[*entries]], law.theta_max[[*entries]]
+    if not np.all(np.isfinite([low, high])):
+        raise ValueError(
+            f"The law's box is not bounded in entries {list(entries)} of theta: there is no frame "
+            "to draw. Choose others, or solve the problem for a bounded theta_min and theta_max."
+        )
+    fixed = np.array(at, np.float64)
+    fixed[[*entries]] = 0.0
+    box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    rows, levels = law.A[:, [*entries]], law.b - law.A @ fixed
+    found = {}
+    for i, (first, last) in enumerate(pairwise([*law.starts, len(law.b)])):
+        polygon = _clipped(box, rows[first:last], levels[first:last])
+        if len(polygon) > 2 and area(polygon) > 1e-9 * float(np.prod(high - low)):
+            found[i] = polygon
+    return found
+
+
+def area(polygon: Array) -> float:
+    """Return the area of a polygon (k, 2): the shoelace formula."""
+    x, y = polygon.T
+    return float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2)
+
+
+def _clipped(polygon: Array, rows: Array, levels: Array) -> Array:
+    """Return the part (k, 2) of a convex polygon where ``rows z <= levels``."""
+    for row, level in zip(rows, levels, strict=True):
+        room = level - polygon @ row
+        if np.all(room >= 0):
+            continue
+        after, beyond = np.roll(polygon, -1, axis=0), np.roll(room, -1)
+        kept = []
+        for z, next_z, here, there in zip(polygon, after, room, beyond, strict=True):
+            if here >= 0:
+                kept.append(z)
+            if (here >= 0) != (there >= 0):
+                kept.append(z + (next_z - z) * here / (here - there))
+        polygon = np.array(kept).reshape(-1, 2)
+        if len(polygon) < 3:
+            break
+    return polygon
+
+
+def _entries(entries: Sequence[int], n: int) -> tuple[int, int]:
+    chosen = [*entries]
+    whole = all(isinstance(each, int | np.integer) and 0 <= each < n for each in chosen)
+    if len(chosen) != 2 or not whole or chosen[0] == chosen[1]:
+        raise ValueError(
+            f"entries = {chosen} must be two different entries of theta, from 0 to {n - 1}."
+        )
+    return int(chosen[0]), int(chosen[1])
+
+
+def _labels(law: Any) -> list[str]:
+    states = [] if law.model is None else with_units(law.model)[0]
+    return states + [f"theta[{i}]" for i in range(len(states), law.n_theta)]
+
+
+def _constant_inputs(law: Any) -> Name:
+    """Return what names a region by the inputs that do not move in it."""
+    m, model = law.n_inputs, law.model
+    names = [f"u[{k}]" for k in range(m)] if model is None else labels_of(model)[1]
+    units = model.units[model.n_states :] if model is not None and model.units else [""] * m
+    rest = np.zeros(m) if model is None else model.u_ss
+    size = np.abs(law.gains).max(axis=(0, 2)) + 1e-300
+    digits = 12 - np.ceil(np.log10(half_widths(law.u_min, law.u_max) + np.abs(rest))).astype(int)
+
+    def name(i: int, theta: Array) -> str:
+        still = np.flatnonzero(np.abs(law.gains[i]).max(axis=1) <= 1e-9 * size)
+        values = [round(float(law.offsets[i][k] + rest[k]), digits[k]) + 0.0 for k in still]
+        said = [f"{names[k]} = {v:.4g} {units[k]}" for k, v in zip(still, values, strict=True)]
+        return ", ".join(map(str.strip, said)) or f"the input{'s' * (m > 1)} move{'s' * (m == 1)}"
+
+    return name
+
+
+def _fill(
+    axes: Axes, polygons: dict[int, Array], named: dict[str, list[int]], sizes: dict[int, float]
+) -> None:
+    """Fill polygons, those of one name in one color; what covers least has no color of its own."""
+    from matplotlib.patches import Polygon
+
+    ranked = sorted(named, key=lambda each: -sum(sizes[i] for i in named[each]))
+    whole = sum(sizes.values())
+    for rank, each in enumerate(ranked):
+        own = rank < len(COLORS) or len(ranked) == len(COLORS) + 1
+        color = COLORS[rank] if rank < len(COLORS) else REST
+        label = textwrap.fill(each, 34) if own else f"{len(ranked) - len(COLORS)} others"
+        if rank > len(COLORS):
+            label = "_nolegend_"
+        for i in named[each]:
+            patch = Polygon(
+                polygons[i], facecolor=color, alpha=0.6, edgecolor="black", linewidth=0.5
+            )
+            patch.set(label=label, gid=str(i))
+            axes.add_patch(patch)
+            label = "_nolegend_"
+            if sizes[i] > SMALL * whole and len(polygons) <= MOST_NUMBERS:
+                x, y = polygons[i].mean(axis=0)
+                axes.text(x, y, str(i), ha="center", va="center", fontsize=8)

@@ -1,0 +1,198 @@
+"""Closed loops, surfaces, and what a policy does in each region: the numbers that are drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel, LinearMPC, SoftBounds, Tracking
+from sb3_yann.evaluation import Episodes, evaluate
+from sb3_yann.evaluation.plots import (
+    RegionUse,
+    fit_figure,
+    loops_figure,
+    plot_changes,
+    plot_fit,
+    plot_loop,
+    plot_regions,
+    plot_surface,
+    plot_visits,
+    regions_figure,
+    surfaces_figure,
+    use_figure,
+)
+from sb3_yann_envs import problems
+
+
+def tank(**options) -> LinearMPC:
+    model = LinearModel(
+        [[0.9]], [[0.5]], 2.0, [12], [40], state_names=["level"], input_names=["flow"],
+        units={"level": "m", "flow": "L/s"},
+    )  # fmt: skip
+    given = {"x_min": -3, "x_max": 3, "theta_min": -4, "theta_max": 4}
+    limits = {"u_min": -1, "u_max": 1, "horizon": 2}
+    return LinearMPC(model, Q=[[1]], R=[[1]], **{**given, **limits, **options})
+
+
+def episodes(count: int, size: int = 1, steps: int = 5) -> Episodes:
+    x = [np.full((steps + 1, size), k / count) for k in range(count)]
+    u = [np.full((steps, 1), -k / count) for k in range(count)]
+    none = np.zeros(count, int)
+    return Episodes(np.ones(count), none, tuple(x), tuple(u), none.astype(bool))
+
+
+def test_few_episodes_are_lines_in_plant_units() -> None:
+    axes = plot_loop(tank(), {"MPC": episodes(3)}, "level", time_unit="s")
+    own = [line for line in axes.lines if len(line.get_ydata()) == 6]
+    np.testing.assert_allclose([line.get_ydata()[0] for line in own], [12, 12 + 1 / 3, 12 + 2 / 3])
+    assert own[0].get_xdata().tolist() == [0, 2, 4, 6, 8, 10]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "level (m)")
+
+
+def test_of_many_episodes_the_median_and_the_bands_are_drawn() -> None:
+    axes = plot_loop(tank(), {"MPC": episodes(50)}, "flow")
+    values = 40 - np.arange(50) / 50
+    (median,) = (line for line in axes.lines if len(line.get_ydata()) == 5)
+    assert set(median.get_ydata()) == {np.median(values)}
+    spans = [np.ptp(each.get_paths()[0].vertices[:, 1]) for each in axes.collections]
+    low, high = np.percentile(values, [10, 90])
+    np.testing.assert_allclose(sorted(spans), [high - low, np.ptp(values)])
+
+
+def test_episodes_that_have_ended_count_no_more() -> None:
+    long, short = episodes(8), episodes(8, steps=2)
+    both = Episodes(
+        np.ones(16), np.zeros(16, int), (*long.observations, *short.observations),
+        (*long.actions, *short.actions), np.zeros(16, bool),
+    )  # fmt: skip
+    axes = plot_loop(tank(), {"MPC": both}, 0)
+    (median,) = (line for line in axes.lines if len(line.get_ydata()) == 6)
+    assert np.isfinite(median.get_ydata()).all()
+
+
+def test_limits_are_drawn_near_the_data_and_named_where_they_are_far() -> None:
+    axes = plot_loop(tank(x_max=1.2), {"MPC": episodes(4)}, "level")
+    drawn = [line.get_ydata()[0] for line in axes.lines if len(set(line.get_ydata())) == 1]
+    assert 13.2 in drawn and 9.0 not in drawn
+    assert [text.get_text() for text in axes.texts] == ["limit: 9"]
+    low, high = axes.get_ylim()
+    assert low < 12 and high > 13.2
+
+
+def test_a_soft_limit_is_called_one() -> None:
+    soft = tank(x_max=0.5, soft=SoftBounds(x=1.0, penalty=10.0))
+    labels = plot_loop(soft, {"MPC": episodes(4)}, "level").get_legend_handles_labels()[1]
+    assert "soft limit" in labels
+
+
+def test_a_set_point_is_a_line_of_its_own_without_the_last_one() -> None:
+    mpc = tank(tracking=Tracking([0], -2, 2))
+    played = episodes(2, size=2)
+    for x in played.observations:
+        x[:, 1], x[-1, 1] = 1.0, 9.0
+    axes = plot_loop(mpc, {"MPC": played}, "level")
+    (line,) = (each for each in axes.lines if each.get_label() == "set-point")
+    assert set(line.get_ydata()) == {13.0}
+
+
+def test_before_lies_above_after_with_the_same_range() -> None:
+    figure = loops_figure(tank(), {"before": episodes(9), "after": episodes(20)})
+    rows = [panel.get_gridspec() and panel.get_subplotspec().rowspan.start for panel in figure.axes]
+    assert rows == [0, 0, 1, 1]
+    assert [panel.get_title(loc="left") for panel in figure.axes] == ["before", "", "after", ""]
+    assert figure.axes[0].get_ylim() == figure.axes[2].get_ylim()
+
+
+def test_few_episodes_of_all_controllers_share_a_panel() -> None:
+    figure = loops_figure(tank(), {"before": episodes(2), "after": episodes(2)})
+    assert len(figure.axes) == 2
+
+
+def test_what_is_no_quantity_and_no_episodes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"'depth' is no entry: expected one of \['level', 'flow'"):
+        plot_loop(tank(), {"MPC": episodes(1)}, "depth")
+    with pytest.raises(ValueError, match="no episodes to draw"):
+        plot_loop(tank(), {}, "level")
+    with pytest.raises(ValueError, match=r"'MPC' has observations \(6, 3\)"):
+        plot_loop(tank(), {"MPC": episodes(1, size=3)}, "level")
+
+
+def test_the_surface_is_the_law_in_plant_units() -> None:
+    mpc = problems.cstr()
+    axes = plot_surface(mpc, mpc.explicit(), entries=("C_B", "T"))
+    (mesh,) = axes.collections
+    corners = mesh.get_coordinates()
+    middle = (corners[40, 60] + corners[41, 61]) / 2
+    shown = np.array(mpc.theta_ss)
+    shown[[1, 3]] = middle
+    values = np.asarray(mesh.get_array()).reshape(121, 121)
+    assert values[40, 60] == pytest.approx(mpc.explicit().plant_input(shown)[0])
+    assert values.min() == pytest.approx(0, abs=1e-9) and values.max() == pytest.approx(110)
+
+
+def test_a_difference_is_that_of_two_laws_and_its_colors_are_symmetric() -> None:
+    mpc = problems.clipped_pendulum()
+    law = mpc.explicit()
+    axes = plot_surface(mpc, lambda theta: law(theta) + 0.5, minus=law)
+    mesh = axes.collections[0]
+    np.testing.assert_allclose(mesh.get_array(), 0.5)
+    assert mesh.get_clim() == pytest.approx((-0.5, 0.5))
+
+
+def test_before_and_after_share_their_colors() -> None:
+    mpc = problems.clipped_pendulum()
+    figure = surfaces_figure(mpc, mpc.explicit(), lambda theta: np.full((len(theta), 1), 3.0))
+    scales = [panel.collections[0].get_clim() for panel in figure.axes[:3]]
+    assert scales == [(-2.0, 3.0), (-2.0, 3.0), (-5.0, 5.0)]
+
+
+@pytest.mark.parametrize("options", [{"entries": (0, 0)}, {"output": 1}, {"entries": (0, "x")}])
+def test_a_surface_needs_two_coordinates_and_an_input(options) -> None:
+    mpc = problems.clipped_pendulum()
+    with pytest.raises(ValueError, match=r"entr(y|ies)|output"):
+        plot_surface(mpc, mpc.explicit(), **options)
+
+
+def test_use_counts_steps_and_distances_by_region() -> None:
+    mpc = problems.cstr()
+    law, played = mpc.explicit(), evaluate(mpc.explicit(), "CSTR-v0", range(2))
+    moved = lambda theta: np.clip(law(theta) + 5.5, -55, 55)  # noqa: E731
+    use = RegionUse.of(mpc, moved, played)
+    theta = np.concatenate([x[:-1] for x in played.observations])
+    regions, counts = np.unique(law.locate(theta), return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    assert use.regions.tolist() == regions[order].tolist()
+    np.testing.assert_allclose(use.share, counts[order] / len(theta))
+    assert use.largest.max() == pytest.approx(0.1)  # of half the range
+    heights = [bar.get_height() for bar in plot_visits(use).patches]
+    np.testing.assert_allclose(heights, 100 * use.share)
+    axes = plot_changes(use)
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), 100 * use.largest)
+    np.testing.assert_allclose([bar.get_height() for bar in axes.patches], 100 * use.mean)
+    assert len(use_figure(mpc, moved, played).axes) == 2
+
+
+def test_a_color_stands_for_the_constraints_that_act() -> None:
+    mpc = problems.cstr()
+    axes = plot_regions(mpc, entries=("C_A", "T"), by="constraint")
+    labels = axes.get_legend_handles_labels()[1]
+    assert {"U at its lower bound", "U at its upper bound", "no constraint acts"} <= {*labels}
+    assert regions_figure(mpc).axes[0].get_xlabel() == "C_A (mol/L)"
+    with pytest.raises(ValueError, match="by"):
+        plot_regions(mpc, by="color")
+
+
+def test_the_fit_of_the_true_model_is_whole_and_of_a_wrong_one_is_not() -> None:
+    rng = np.random.default_rng(0)
+    x, u = np.zeros((41, 1)), rng.normal(size=(40, 1))
+    for k in range(40):
+        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+    true = LinearModel([[0.8]], [[0.5]], 1, [3], [7])
+    free = plot_fit(true, x + 3, u + 7).lines[1]
+    np.testing.assert_allclose(free.get_ydata(), x[:, 0] + 3, atol=1e-12)
+    assert free.get_label() == "free run, fit 100.0 %"
+    wrong = LinearModel([[0.5]], [[0.5]], 1, [3], [7])
+    assert "100.0" not in plot_fit(wrong, x + 3, u + 7).lines[1].get_label()
+    assert len(fit_figure(true, x + 3, u + 7).axes) == 1
+    with pytest.raises(ValueError, match="state = 1 must be below 1"):
+        plot_fit(true, x, u, state=1)
