@@ -41,7 +41,7 @@ def plot(options: Namespace) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(layout="constrained")
-    law_of(options.law).plot(axes=tuple(options.axes), ax=figure.subplots())
+    law_of(options.law).plot(figure.subplots(), entries=tuple(options.axes))
     figure.savefig(options.picture, dpi=150)
     print(f"Written: {options.picture}")
 

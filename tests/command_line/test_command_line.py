@@ -68,6 +68,15 @@ def episode_cost(act, seed: int) -> float:
     return cost
 
 
+def test_plot_draws_a_law_from_its_file_from_a_model_and_from_a_problem(model, folder) -> None:
+    problem().explicit().save(folder / "law.npz")
+    for given in ("law.npz", "cart.zip", "my_cart:cart"):
+        assert main(["plot", given, "law.png"]) == 0
+        assert (folder / "law.png").stat().st_size > 5000
+        (folder / "law.png").unlink()
+    assert main(["plot", "law.npz", "law.png", "--axes", "0", "7"]) == 1
+
+
 def test_td3_s_models_are_read_too(folder) -> None:
     TD3(YannPolicy, Cart(), device="cpu", target_policy_noise=0.0).save(folder / "td3")
     assert main(["evaluate", "td3", "--env", "my_cart:Cart", "--episodes", "1"]) == 0
