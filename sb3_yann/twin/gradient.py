@@ -150,7 +150,8 @@ def _compiled_costates(
     from sb3_yann.twin._kernels.costates import costates
 
     law, problem = layer.explicit_law, dynamics.problem
-    policy: Any = (*layer.packed, problem.u_half)  # type: ignore[misc]
+    half = np.array(problem.u_half)  # a loaded problem holds it read-only
+    policy: Any = (*layer.packed, half)  # type: ignore[misc]
     twin: Any = (*dynamics.packed, law.locate(np.where(np.isfinite(flat), flat, 0.0)))  # type: ignore[misc, union-attr]
     rows = (each.reshape(-1, each.shape[-1]) for each in (flat, inputs, by_theta, by_u))
     costates(*policy, *twin, *kept_for_gradient(actions), *rows)
