@@ -6,7 +6,9 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.log import Episode
@@ -23,6 +25,8 @@ class EstimatedDisturbanceWarning(UserWarning):
 def observer_of(env: Any) -> DisturbanceObserver | None:
     """Return the observer among the wrappers of an env or of a VecEnv, None where there is none.
 
+    An id, a class or a function that makes an env has none.
+
     Examples
     --------
     >>> import gymnasium as gym
@@ -30,9 +34,9 @@ def observer_of(env: Any) -> DisturbanceObserver | None:
     True
     """
     found = None
-    if hasattr(env, "get_attr"):
+    if isinstance(env, VecEnv):
         found = env.get_attr("observer", 0)[0] if env.has_attr("observer") else None
-    elif hasattr(env, "get_wrapper_attr") and env.has_wrapper_attr("observer"):
+    elif isinstance(env, gym.Env) and env.has_wrapper_attr("observer"):
         found = env.get_wrapper_attr("observer")
     return found if isinstance(found, DisturbanceObserver) else None
 

@@ -200,7 +200,8 @@ def test_a_plan_in_it_takes_the_estimate_for_constant() -> None:
 
 def test_the_observer_is_found_among_the_wrappers() -> None:
     mpc, observer = offset_free_problem()
-    assert observer_of(gym.make("CSTR-v0")) is None and observer_of(None) is None
+    for nobody in (gym.make("CSTR-v0"), None, "CSTR-v0", Cart, observed_env):
+        assert observer_of(nobody) is None
     assert observer_of(DummyVecEnv([Cart])) is None
     env = gym.wrappers.TimeLimit(observed_env(), 30)
     assert np.array_equal(observer_of(env).gain, observer.gain)
