@@ -27,6 +27,7 @@ FLOORS = [
     {"sb3_yann.audit", "sb3_yann.guard"},
     {"sb3_yann.commissioning"},
     {"sb3_yann.export"},
+    {"sb3_yann.reporting"},
     {"sb3_yann"},
     {"sb3_yann.command_line"},
     {"sb3_yann.__main__"},

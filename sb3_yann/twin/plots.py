@@ -42,6 +42,8 @@ def plot_costs(trust: Trust, axes: Axes | None = None) -> Axes:
 
 def plot_free_runs(trust: Trust, axes: Axes | None = None) -> Axes:
     """Draw the error of free runs over held-out episodes by how many steps they look ahead."""
+    from matplotlib.ticker import LogLocator
+
     axes, runs = axes_or_new(axes, 5.2, 4.2), trust.runs
     rows = (
         ("twin", runs.errors[trust.chosen], COLORS[0], "o-"),
@@ -55,6 +57,9 @@ def plot_free_runs(trust: Trust, axes: Axes | None = None) -> Axes:
         axes.set(xscale="log", yscale="log")
         axes.set_xticks(runs.horizons, [str(each) for each in runs.horizons], minor=False)
         axes.set_xticks([], minor=True)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")  # no powers of ten
+        axes.yaxis.set_minor_formatter("")
     axes.grid(alpha=0.3)
     legend_above(axes)
     return axes

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 FEW = 6
 """So many episodes are drawn one by one; of more, the median and bands."""
 COLUMNS = 3
+REFERENCES = ("limit", "soft limit", "bound of the input", "set-point")
 NEAR = 1.0
 """A limit is drawn where it is at most so many widths of the data beyond them."""
 
@@ -170,6 +171,7 @@ def _legend(figure: Figure, panels: Any) -> None:
     for panel in panels.ravel():
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
+    found = dict(sorted(found.items(), key=lambda each: each[0] in REFERENCES))
     columns = min(4, len(found)) if max(map(len, found)) < 24 else 2
     figure.legend(
         [*found.values()], [*found], loc="outside upper left", ncols=columns, frameon=False

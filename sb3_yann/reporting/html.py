@@ -1,0 +1,164 @@
+"""Small pieces of HTML. All text is escaped, pictures are part of the page, nothing is loaded."""
+
+from __future__ import annotations
+
+import base64
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
+from io import BytesIO
+from string import Template
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LARGEST_SVG = 120_000
+"""Bytes; a larger picture becomes a PNG."""
+DPI = 110
+STYLE = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { background: #fff; color: #1a1a1a; font: 16px/1.5 system-ui, -apple-system, "Segoe UI",
+  Roboto, "Helvetica Neue", Arial, sans-serif; margin: 0 auto; max-width: 62rem;
+  padding: 1.5rem 2rem 4rem; }
+h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .3rem; }
+h2 { border-top: 2px solid #0072b2; font-size: 1.25rem; margin: 2.6rem 0 .6rem;
+  padding-top: .5rem; }
+h3 { font-size: 1.02rem; margin: 1.5rem 0 .4rem; }
+h1, h2, h3, td, th, p, li { overflow-wrap: anywhere; }
+p { margin: .5rem 0; max-width: 46rem; }
+.said { color: #555; }
+nav ol { columns: 2; margin: .3rem 0; padding-left: 1.6rem; }
+a { color: #00527f; }
+.wide { margin: .7rem 0; overflow-x: auto; }
+table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
+th, td { border-bottom: 1px solid #ddd; padding: .25rem .7rem .25rem 0; text-align: left;
+  vertical-align: top; }
+th { border-bottom: 1.5px solid #888; font-weight: 600; }
+td.number, th.number { text-align: right; white-space: nowrap; }
+pre { background: #f6f6f6; font: .82rem/1.4 ui-monospace, Menlo, Consolas, monospace;
+  overflow-x: auto; padding: .7rem .9rem; }
+figure { margin: 1rem 0; }
+figcaption { color: #555; font-size: .88rem; max-width: 46rem; }
+img { display: block; height: auto; max-width: 100%; }
+.passed, .failed, .note { font-weight: 600; white-space: nowrap; }
+.passed { color: #00694b; } .failed { color: #a83c00; } .note { color: #555; }
+.sign td { height: 3.2rem; min-width: 11rem; vertical-align: bottom; }
+@media (max-width: 640px) {
+  body { font-size: 15px; padding: 1rem .9rem 3rem; }
+  nav ol { columns: 1; }
+  img { max-width: none; width: max(100%, 34rem); }
+}
+@media print {
+  @page { margin: 16mm 14mm; size: A4; }
+  body { font-size: 10pt; max-width: none; padding: 0; }
+  nav { display: none; }
+  a { color: inherit; text-decoration: none; }
+  .wide, pre { overflow: visible; }
+  pre { white-space: pre-wrap; }
+  table { font-size: 8.5pt; }
+  h2, h3 { break-after: avoid; }
+  figure, tr, .sign { break-inside: avoid; }
+}
+"""
+PAGE = Template(
+    """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<title>$title</title>
+<style>$style</style>
+</head>
+<body>
+$body
+</body>
+</html>
+"""
+)
+
+
+class Html(str):
+    """Text that is HTML already."""
+
+
+def clean(value: Any) -> Html:
+    """Return a value as HTML: escaped, unless it is that already."""
+    return value if isinstance(value, Html) else Html(escape(str(value)))
+
+
+def tag(name: str, *content: Any, **attributes: str) -> Html:
+    """Return an element; ``class_`` is the attribute of that name."""
+    own = "".join(f' {key.rstrip("_")}="{escape(each)}"' for key, each in attributes.items())
+    return Html(f"<{name}{own}>{''.join(map(clean, content))}</{name}>")
+
+
+def join(parts: Iterable[Any]) -> Html:
+    """Return pieces one below the other."""
+    return Html("\n".join(map(clean, parts)))
+
+
+def say(*sentences: str) -> Html:
+    """Return a paragraph."""
+    return tag("p", " ".join(sentences))
+
+
+def left_out(why: str) -> Html:
+    """Return the sentence that stands for a part that is not there."""
+    return tag("p", why, class_="said")
+
+
+def lines(text: str) -> Html:
+    """Return text with its lines and columns as they are."""
+    return tag("pre", text)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Html:
+    """Return a table that scrolls on a narrow screen; columns of numbers are set to the right."""
+    body = [[*row] for row in rows]
+    numbers = [bool(body) and all(_is_number(row[k]) for row in body) for k in range(len(head))]
+    kinds = [{"class_": "number"} if each else {} for each in numbers]
+    top = tag("tr", *(tag("th", each, **kind) for each, kind in zip(head, kinds, strict=True)))
+    below = [
+        tag("tr", *(tag("td", each, **kind) for each, kind in zip(row, kinds, strict=True)))
+        for row in body
+    ]
+    whole = tag("table", tag("thead", top), tag("tbody", *below))
+    return tag("div", whole, class_="wide")
+
+
+def _is_number(value: Any) -> bool:
+    return str(value).strip() == "" or str(value).lstrip("+-−")[:1].isdigit() or value == "none"
+
+
+def picture(draw: Callable[[], Figure], caption: str) -> Html:
+    """Return a picture with its caption; a name with a dollar sign is no formula.
+
+    Letters that the font lacks become boxes, without a warning.
+    """
+    import matplotlib
+
+    options: Any = {"text.parse_math": False, "svg.hashsalt": "sb3-yann"}
+    with matplotlib.rc_context(options), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+        figure, kind = draw(), "svg+xml"
+        content = _saved(figure, format="svg", metadata={"Date": None})
+        if len(content) > LARGEST_SVG:
+            content, kind = _saved(figure, format="png", dpi=DPI), "png"
+    source = f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
+    shown = Html(f'<img alt="{escape(caption)}" src="{source}">')
+    return tag("figure", tag("div", shown, class_="wide"), tag("figcaption", caption))
+
+
+def _saved(figure: Figure, **options: Any) -> bytes:
+    buffer = BytesIO()
+    figure.savefig(buffer, **options)
+    return buffer.getvalue()
+
+
+def page(title: str, body: Iterable[Any]) -> str:
+    """Return the whole page."""
+    return PAGE.substitute(title=clean(title), style=STYLE, body=join(body))

@@ -1,0 +1,195 @@
+"""The report: gathers its parts, and writes one page that needs nothing else."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from datetime import datetime, timezone
+from os import PathLike
+from pathlib import Path
+
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_yann._validation import as_whole
+from sb3_yann.audit import Headroom
+from sb3_yann.evaluation.episodes import Source
+from sb3_yann.guard import ImprovementGuard
+from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
+from sb3_yann.reporting.evidence_parts import guard_part, headroom_part, twin_part
+from sb3_yann.reporting.html import Html, clean, join, page, say, table, tag
+from sb3_yann.reporting.loop_parts import distance_part, loops_part, statistics_part
+from sb3_yann.reporting.problem_parts import constraints_part, law_part, plant_part
+from sb3_yann.reporting.record_parts import again_part, cost_part
+from sb3_yann.reporting.subject import Finding, Part, Subject
+from sb3_yann.twin import PlantTwin
+
+PARTS = (
+    plant_part, constraints_part, law_part, loops_part, statistics_part, distance_part, guard_part,
+    twin_part, headroom_part, cost_part, again_part,
+)  # fmt: skip
+
+
+def report(
+    model: OffPolicyAlgorithm,
+    path: str | PathLike[str] = "report.html",
+    *,
+    env: Source | None = None,
+    guard: ImprovementGuard | None = None,
+    twin: PlantTwin | None = None,
+    headroom: Headroom | None = None,
+    seeds: Iterable[int] = range(20),
+    title: str = "Report on a policy that starts as an MPC",
+) -> Path:
+    """Write a page about a model that an engineer can read, print and sign; return its path.
+
+    It is one HTML file without scripts, and loads nothing: pictures are part of it. It tells the
+    plant and the problem in plant units, the register of constraints, the law and how it was
+    checked, closed loops against the MPC, what they prove, where and how far the policy leaves the
+    MPC, every decision of the guard, the twin, what there is to gain, timing, versions and seeds.
+    What cannot be told from what is given is left out, and said to be.
+
+    Parameters
+    ----------
+    model : DDPG or TD3
+        With a :class:`YannPolicy`. The decisions of its guard travel with it.
+    path : path-like, default "report.html"
+        Folders are made as needed. The file is there as a whole or not at all.
+    env : gymnasium.Env, str or callable, optional
+        Where closed loops are played, as of :func:`~sb3_yann.evaluation.evaluate`; by default the
+        guard's simulator, if a guard is given.
+    guard : ImprovementGuard, optional
+        The one that watched `learn`; it adds its settings to the decisions.
+    twin : PlantTwin, optional
+        Of the model's problem.
+    headroom : Headroom, optional
+        As :func:`headroom` has found it.
+    seeds : iterable of int, default range(20)
+        Of the closed loops, best ones that nothing was trained or tried on.
+    title : str, optional
+        The heading.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of another kind, or belongs to another model or problem.
+    OSError
+        If the file cannot be written: before anything is played.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> from sb3_yann import report
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    >>> report(model, "cstr.html", env="CSTR-v0", seeds=range(2)).name
+    'cstr.html'
+    """
+    subject = _subject(model, env, guard, twin, headroom, seeds)
+    with _Whole(Path(path)) as target:
+        parts = [each(subject) for each in PARTS]
+        target.write(page(title, [_head(title), *_body(parts), _signatures()]))
+    return Path(path)
+
+
+def _subject(
+    model: OffPolicyAlgorithm,
+    env: Source | None,
+    guard: ImprovementGuard | None,
+    twin: PlantTwin | None,
+    headroom: Headroom | None,
+    seeds: Iterable[int],
+) -> Subject:
+    """Return what the report is about, checked."""
+    if not isinstance(model, OffPolicyAlgorithm):
+        raise TypeError(f"model = {model!r} must be a DDPG or TD3 model with a YannPolicy.")
+    policy = require_yann_policy(model.policy, "report")
+    given = {"guard": (guard, ImprovementGuard), "twin": (twin, PlantTwin)}
+    for name, (value, kind) in {**given, "headroom": (headroom, Headroom)}.items():
+        if value is not None and not isinstance(value, kind):
+            raise TypeError(f"{name} = {value!r} must be a {kind.__name__}, or None.")
+    if guard is not None and getattr(guard, "model", None) is not model:
+        raise ValueError(
+            "The guard has not watched this model: pass the one that was its callback in learn, or "
+            "none. The decisions travel with the model."
+        )
+    if twin is not None:
+        require_problem_of_twin(policy, twin.problem)
+    chosen = tuple(as_whole("seeds", each, 0) for each in seeds)
+    if not chosen:
+        raise ValueError("seeds is empty: pass one whole number for each episode, e.g. range(20).")
+    played = guard.env if env is None and guard is not None else env
+    return Subject(model, policy, played, guard, twin, headroom, chosen)
+
+
+class _Whole:
+    """A file that is written beside its place, and takes it as a whole; else nothing changes."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
+
+    def __enter__(self) -> _Whole:
+        try:
+            if self.path.is_dir():
+                raise IsADirectoryError("it is a folder")
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.unfinished.touch()
+        except OSError as error:
+            raise OSError(
+                f"path = {str(self.path)!r} cannot be written ({error}). Name a file in a folder "
+                "that you may write to."
+            ) from error
+        return self
+
+    def write(self, text: str) -> None:
+        """Write the text, and put the file in its place."""
+        self.unfinished.write_text(text, encoding="utf-8")
+        os.replace(self.unfinished, self.path)
+
+    def __exit__(self, *_: object) -> None:
+        self.unfinished.unlink(missing_ok=True)
+
+
+def _head(title: str) -> Html:
+    written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    return join([tag("h1", title), tag("p", f"Written {written}.", class_="said")])
+
+
+def _body(parts: Sequence[Part]) -> list[Html]:
+    """Return summary, contents and the parts themselves."""
+    numbered = [*enumerate(parts, start=1)]
+    links = (tag("li", _link(k, part.title)) for k, part in numbered)
+    rows = [
+        [tag("span", found.verdict, class_=found.verdict), found.text, _link(k, str(k))]
+        for k, part in numbered
+        for found in part.findings
+    ]
+    summary = [tag("h2", "Summary"), _verdict([each for p in parts for each in p.findings])]
+    summary += [table(["", "finding", "part"], rows), tag("nav", tag("ol", *links))]
+    sections = [
+        tag("section", tag("h2", f"{k}. {part.title}", id=f"part-{k}"), part.content)
+        for k, part in numbered
+    ]
+    return [*summary, *sections]
+
+
+def _link(number: int, text: str) -> Html:
+    return tag("a", text, href=f"#part-{number}")
+
+
+def _verdict(findings: Sequence[Finding]) -> Html:
+    counts = Counter(each.verdict for each in findings)
+    said = f"{counts['passed']} checks passed, {counts['failed']} failed."
+    if counts["failed"]:
+        said += " Read what failed before you sign."
+    return say(said, "A note is for information: there is nothing to pass.")
+
+
+def _signatures() -> Html:
+    rows = [[clean(role), "", "", ""] for role in ("prepared", "checked", "approved")]
+    return join(
+        [
+            tag("h2", "Signatures"),
+            tag("div", table(["", "name", "date", "signature"], rows), class_="sign"),
+        ]
+    )
