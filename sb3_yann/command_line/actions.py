@@ -46,6 +46,15 @@ def plot(options: Namespace) -> None:
     print(f"Written: {options.picture}")
 
 
+def report(options: Namespace) -> None:
+    """Write the report on a model."""
+    from sb3_yann import report as write
+
+    env = env_of(options.env) if options.env else None
+    written = write(model_of(options.model), options.page, env=env, seeds=range(options.episodes))
+    print(f"Written: {written}")
+
+
 def commission(options: Namespace) -> None:
     """Run a commissioning, or go on with one, and print its batches."""
     from sb3_yann import Commissioning

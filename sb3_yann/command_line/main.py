@@ -92,6 +92,13 @@ def _add_plant(commands: Any) -> None:
     one.add_argument("--seed", type=int, default=0, help="of the first episode; default: 0")
     one.set_defaults(run=actions.evaluate)
 
+    one = commands.add_parser("report", help="write a report that can be signed")
+    one.add_argument("model", help=_MODEL)
+    one.add_argument("page", help="where to write it: .html")
+    one.add_argument("--env", help=f"{_ENV}; without it nothing is played")
+    one.add_argument("--episodes", type=int, default=20, metavar="N", help="default: 20")
+    one.set_defaults(run=actions.report)
+
     one = commands.add_parser("commission", help="improve a model on its plant, batch by batch")
     one.add_argument("model", help=_MODEL)
     one.add_argument("--env", required=True, help=_ENV)

@@ -77,6 +77,15 @@ def test_plot_draws_a_law_from_its_file_from_a_model_and_from_a_problem(model, f
     assert main(["plot", "law.npz", "law.png", "--axes", "0", "7"]) == 1
 
 
+def test_report_writes_one_page(model, folder) -> None:
+    with_env = ["report", "cart", "with.html", "--env", "my_cart:Cart", "--episodes", "2"]
+    assert main(["report", "cart", "without.html"]) == main(with_env) == 0
+    without, played = (folder / f"{name}.html" for name in ("without", "with"))
+    assert without.read_text().startswith("<!") and len(played.read_text()) > 1.2 * len(
+        without.read_text()
+    )
+
+
 def test_td3_s_models_are_read_too(folder) -> None:
     TD3(YannPolicy, Cart(), device="cpu", target_policy_noise=0.0).save(folder / "td3")
     assert main(["evaluate", "td3", "--env", "my_cart:Cart", "--episodes", "1"]) == 0
