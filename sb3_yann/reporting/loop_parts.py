@@ -114,6 +114,9 @@ def statistics_part(subject: Subject) -> Part:
 def _mean_in_words(change: Array, typical: float) -> tuple[str, Finding]:
     """Return what the mean difference and its t interval say."""
     mean, count, scale = float(change.mean()), len(change), abs(typical) or 1.0
+    if np.all(np.abs(change) <= ROUNDING * scale):
+        said = "From these starts the policy costs what the MPC costs."
+        return said, Finding("note", said)
     word = "less" if mean < 0 else "more"
     said = f"On average the policy costs {100 * abs(mean) / scale:.2f} % {word} than the MPC"
     if count < 2:

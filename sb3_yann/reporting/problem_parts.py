@@ -33,6 +33,13 @@ def plant_part(subject: Subject) -> Part:
         [name, "input", number(value)] for name, value in zip(inputs, model.u_ss, strict=True)
     ]
     point += [[f"d[{i}]", "disturbance", number(value)] for i, value in enumerate(model.d_ss)]
+    labels, shift = problem.labels(units=True), problem.theta_ss
+    box = [
+        [name, number(low), number(high)]
+        for name, low, high in zip(
+            labels, problem.theta_min + shift, problem.theta_max + shift, strict=True
+        )
+    ]
     soft = problem.soft.penalty
     facts = [
         ["horizon", f"{problem.horizon} steps of {model.dt:g}"],
@@ -51,6 +58,8 @@ def plant_part(subject: Subject) -> Part:
                 table(["quantity", "kind", "value"], point),
                 tag("h3", "The control problem"),
                 table(["setting", "value"], facts),
+                tag("h3", "Parameters of the law, and the box for which it is solved"),
+                table(["parameter", "lower", "upper"], box),
                 tag("h3", "The linear model"),
                 lines(model.report()),
             ]

@@ -95,11 +95,12 @@ def again_part(subject: Subject) -> Part:
         ["the MPC problem", _problem_print(subject)],
     ]
     seeds = ", ".join(map(str, subject.seeds))
+    env = repr(subject.env) if isinstance(subject.env, str | None) else subject.env_name
     code = (
         f"from stable_baselines3 import {type(model).__name__}\n"
         "from sb3_yann import report\n\n"
         f'model = {type(model).__name__}.load("the model of these fingerprints")\n'
-        f"report(model, env={subject.env_name or None!r}, seeds=[{seeds}])"
+        f"report(model, env={env}, seeds=[{seeds}])"
     )
     parts = [
         tag("h3", "Versions"), table(["library", "version"], versions),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -128,7 +128,8 @@ class Subject:
     @property
     def env_name(self) -> str:
         """A name of the simulator."""
-        return "" if self.env is None else name_of(self.env)
+        function = self.env.func if isinstance(self.env, partial) else self.env  # without arguments
+        return "" if function is None else name_of(function)
 
     def seen(self, observations: Any) -> Any:
         """Return observations of the env, below any VecNormalize, as the policy sees them."""

@@ -233,7 +233,8 @@ def _draw_set_points(axes: Axes, problem: LinearMPC, episodes: Episodes, entry: 
     rows = _rows(problem, episodes, at)[:, :-1]  # not that of a step which nobody takes
     time = problem.model.dt * np.arange(rows.shape[1])
     known = np.unique(rows, axis=0)
-    style = SET_POINT if len(known) == 1 else {**SET_POINT, "alpha": 0.35, "linewidth": 0.7}
+    faint = {"alpha": 0.7 if len(known) <= FEW else 0.35, "linewidth": 0.8}
+    style = SET_POINT if len(known) == 1 else {**SET_POINT, **faint}
     for k, row in enumerate(known):
         label = "set-point" if k == 0 else "_nolegend_"
         axes.plot(time, row, drawstyle="steps-post", label=label, **style)  # type: ignore[arg-type]

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Values = tuple[Array, tuple[Array, Array], Array]
+ROUNDING = 1e-4
+"""A change of an input by less, in half-widths, is drawn pale."""
 POINTS = 121
 """Of the grid, in each direction."""
 
@@ -70,7 +72,7 @@ def plot_surface(
     axes, label = axes_or_new(axes, 5.4, 4.2), with_units(problem.model)[1][output]
     if minus is not None:
         own = own[0] - _values(problem, minus, entries, at, output)[0], *own[1:]
-        size, label = float(np.abs(own[0]).max()) or 1e-9, f"change of {label}"
+        size, label = _size(problem, own[0], output), f"change of {label}"
         mesh = _draw(axes, problem, entries, own, scale or (-size, size), "PuOr")
     else:
         mesh = _draw(axes, problem, entries, own, scale or _extent(own[0]))
@@ -111,7 +113,7 @@ def surfaces_figure(
     first, second = (_values(problem, each, entries, at, output) for each in (before, after))
     scale = _extent(np.stack([first[0], second[0]]))
     change = second[0] - first[0]
-    size, label = float(np.abs(change).max()) or 1e-9, with_units(problem.model)[1][output]
+    size, label = _size(problem, change, output), with_units(problem.model)[1][output]
     _draw(panels[0], problem, entries, first, scale)
     mesh = _draw(panels[1], problem, entries, second, scale)
     figure.colorbar(mesh, ax=[*panels[:2]], label=label)
@@ -122,6 +124,11 @@ def surfaces_figure(
         panel.set_title(title)
         panel.label_outer()
     return figure
+
+
+def _size(problem: LinearMPC, change: Array, output: int) -> float:
+    """Return the range of the colors of a change: rounding has none."""
+    return max(float(np.abs(change).max()), ROUNDING * float(problem.u_half[output]))
 
 
 def _extent(u: Array) -> tuple[float, float]:

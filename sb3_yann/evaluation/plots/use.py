@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+LEAST = 0.01
+"""Percent that the axis of distances reaches at least: rounding is not drawn large."""
 MOST = 30
 """Regions in a picture: those visited most."""
 
@@ -96,7 +98,7 @@ def plot_changes(use: RegionUse, axes: Axes | None = None) -> Axes:
     axes.bar(places, 100 * use.mean[:MOST], color=COLORS[0], label="mean")
     axes.plot(places, 100 * use.largest[:MOST], "v", color=COLORS[1], markersize=5, label="largest")
     axes.set(ylabel="distance from the MPC\n(% of half the range)")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, max(axes.get_ylim()[1], LEAST))
     axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0)
     return _with_regions(use, axes)
 

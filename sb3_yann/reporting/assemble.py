@@ -114,6 +114,8 @@ def _subject(
         )
     if twin is not None:
         require_problem_of_twin(policy, twin.problem)
+    if not isinstance(seeds, Iterable):
+        raise TypeError(f"seeds = {seeds!r} must hold a seed for each episode, e.g. range(20).")
     chosen = tuple(as_whole("seeds", each, 0) for each in seeds)
     if not chosen:
         raise ValueError("seeds is empty: pass one whole number for each episode, e.g. range(20).")

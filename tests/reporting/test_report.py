@@ -1,0 +1,382 @@
+"""The report: what it says is so, what it cannot say it leaves out, and it loads nothing."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import partial
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import Wrapper
+from stable_baselines3 import DDPG, PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import guard_samples
+import twin_samples
+import unit_samples
+from guard_samples import Slide, make_guard
+from sb3_yann import Headroom, LinearModel, LinearMPC, NoActionNoise, PlantTwin, report
+from sb3_yann.evaluation import evaluate
+from sb3_yann.reporting import (
+    assemble,
+    evidence_parts,
+    loop_parts,
+    problem_parts,
+    record_parts,
+)
+from sb3_yann_envs import problems
+from weights import last_layer, unpin
+
+VOID = {"meta", "img"}
+SEEDS = range(8)
+
+
+class Outline(HTMLParser):
+    """Reads a page as a browser does: its text, its elements, and whether they are balanced."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.text.append(data)
+
+
+def read(path: Path) -> tuple[Outline, str]:
+    """Return the elements of a page, and its text with single spaces."""
+    outline = Outline()
+    outline.feed(path.read_text(encoding="utf-8"))
+    outline.close()
+    assert outline.open == []
+    return outline, re.sub(r"\s+", " ", " ".join(outline.text))
+
+
+def guarded():
+    """Return a small model that has learnt under a guard, and the guard."""
+    model, guard = guard_samples.build(), make_guard(n_new_starts=3, n_final_starts=5)
+    model.learn(80, callback=[NoActionNoise(), guard])
+    return model, guard
+
+
+def moved(by: float = 0.1):
+    """Return a small model whose policy adds a constant to its MPC, at all points."""
+    model = guard_samples.build()
+    unpin(model)
+    with th.no_grad():
+        last_layer(model).zero_()
+        last_layer(model)[..., -1] = by
+    return model
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> tuple[Path, DDPG]:
+    """A report with all its parts."""
+    kwargs = {"critic_warmup": 20}
+    model = DDPG("YannPolicy", "ClippedPendulum-v0", policy_kwargs=kwargs, device="cpu", seed=0)
+    guard = guard_samples.ImprovementGuard("ClippedPendulum-v0", n_starts=4, n_new_starts=0)
+    model.learn(210, callback=[NoActionNoise(), guard])
+    mpc = model.policy.problem
+    log = evaluate(mpc.explicit(), "ClippedPendulum-v0", range(5))
+    twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], n_members=1)
+    costs = np.array([10.0, 20.0])
+    room = Headroom(costs, costs, costs, costs - 0.5, 0.0, 0.0, 1 / 30, "learn", "a simulator")
+    path = tmp_path_factory.mktemp("report") / "new folder" / "whole.html"
+    options = {"guard": guard, "twin": twin, "headroom": room}
+    return report(model, path, seeds=SEEDS, **options), model
+
+
+def test_it_is_one_small_file_that_loads_nothing(whole) -> None:
+    path, _ = whole
+    assert path.stat().st_size < 3_000_000
+    source = path.read_text(encoding="utf-8")
+    assert "http://" not in source and "https://" not in source
+    assert not re.search(r"url\(|@import|<script|<link|<iframe|javascript:", source)
+    outline, _ = read(path)
+    names = {tag for tag, _ in outline.found}
+    assert not names & {"script", "link", "iframe", "object", "embed"}
+    for tag, attributes in outline.found:
+        assert not any(name.startswith("on") for name in attributes)
+        if tag == "img":
+            assert str(attributes["src"]).startswith("data:image/") and attributes["alt"]
+        if tag == "a":
+            assert str(attributes["href"]).startswith("#part-")
+    assert [*path.parent.iterdir()] == [path]
+
+
+def test_every_part_is_there_with_its_pictures(whole) -> None:
+    outline, text = read(whole[0])
+    for title in (
+        "Plant and problem", "Constraints register", "The law and how it was checked",
+        "Closed loops against the MPC", "Statistics in words",
+        "Where and how far the policy leaves the MPC", "Decisions of the guard",
+        "The twin and its verdict", "What there is to gain", "Timing and memory",
+        "To do it again", "Signatures",
+    ):  # fmt: skip
+        assert title in text
+    targets = {attributes.get("id") for _, attributes in outline.found}
+    links = [attributes["href"] for tag, attributes in outline.found if tag == "a"]
+    assert links and all(str(link)[1:] in targets for link in links)
+    assert sum(tag == "img" for tag, _ in outline.found) == 7
+    assert "was given" not in text and "left out" not in text
+
+
+def test_names_units_and_limits_are_the_plant_s(whole) -> None:
+    _, text = read(whole[0])
+    assert "torque (N m) -2 2 hard" in text and "angle (rad) -2 2 hard" in text
+    assert "horizon 2 steps of 0.05" in text and "diag(1, 0.1)" in text
+
+
+def test_its_costs_are_those_of_evaluate(whole) -> None:
+    path, model = whole
+    _, text = read(path)
+    law = model.policy.problem.explicit()
+    for played in (law, model):
+        mean = evaluate(played, "ClippedPendulum-v0", SEEDS).costs.mean()
+        assert f"{mean:.6g}"[:6] in text  # the policy's law rounds to float32
+
+
+def test_every_decision_is_there_with_its_reason() -> None:
+    model, guard = guarded()
+    part = evidence_parts.guard_part(subject_of(model, guard=guard))
+    text = unescape(re.sub(r"<[^>]+>", " ", part.content))
+    assert guard.decisions
+    for each in guard.decisions:
+        assert each.reason in text and f"{each.candidate_cost:.6g}" in text
+    assert f"All {len(guard.decisions)} decisions" in text
+    assert [each.verdict for each in part.findings] == ["passed"]
+
+
+def subject_of(model, **given):
+    defaults = dict.fromkeys(("env", "guard", "twin", "headroom"))
+    return assemble._subject(model, **{**defaults, "seeds": SEEDS, **given})
+
+
+def test_a_policy_that_the_guard_has_not_accepted_is_named() -> None:
+    model, _ = guarded()
+    with th.no_grad():
+        last_layer(model).add_(0.01)
+    (finding,) = evidence_parts.guard_part(subject_of(model)).findings
+    assert finding.verdict == "failed" and "NOT the one" in finding.text
+
+
+def test_of_many_decisions_refusals_in_the_middle_are_left_out(monkeypatch) -> None:
+    model, guard = guarded()
+    template = guard.decisions[0]
+    decisions = [
+        replace(template, verdict="rejected", reason=f"no {k}", regions=()) for k in range(99)
+    ]
+    decisions[50] = replace(template, verdict="accepted", reason="", episode=4711)
+    model.guard_state.decisions = decisions
+    monkeypatch.setattr(evidence_parts, "MOST", 20)
+    text = evidence_parts.guard_part(subject_of(model)).content
+    assert "no 0<" in text and "no 98<" in text and "4711" in text and "no 49<" not in text
+    assert "11 of 99 decisions" in text
+
+
+def test_what_is_not_given_is_left_out_in_a_sentence(tmp_path) -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    outline, text = read(report(model, tmp_path / "bare.html"))
+    for sentence in (
+        "No env was given: closed loops are left out.", "No guard was at work on this model",
+        "No twin was given", "No headroom was given",
+        "Without an env, what closed loops do to the bounds is left out.",
+    ):  # fmt: skip
+        assert sentence in text
+    assert sum(tag == "img" for tag, _ in outline.found) == 2
+
+
+HOSTILE = '<script>alert("x")</script>'
+FORMULA = r"$\frac$ & 'T'"
+
+
+def test_hostile_names_stay_text(tmp_path) -> None:
+    model = LinearModel(
+        [[0.9, 0.1], [0, 0.8]], [[0], [1]], 1, state_names=[HOSTILE, FORMULA],
+        input_names=["<b>u"], units=["<i>", "°C%", "\N{SNOWMAN}\N{PILE OF POO}"],
+    )  # fmt: skip
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=2, x_min=-5, x_max=5, u_min=-1, u_max=1)
+    env = partial(twin_like, mpc)
+    policy = DDPG("YannPolicy", env(), policy_kwargs={"problem": mpc}, device="cpu")
+    path = report(policy, tmp_path / "hostile.html", env=env, seeds=range(2), title=HOSTILE)
+    outline, text = read(path)
+    assert {tag for tag, _ in outline.found}.isdisjoint({"script", "b", "i"})
+    assert HOSTILE in text and FORMULA in text
+
+
+def twin_like(mpc: LinearMPC):
+    """Return the model of a problem as its plant, for a few steps."""
+    from gymnasium.wrappers import TimeLimit
+
+    from sample_plants import LinearPlant
+
+    return TimeLimit(LinearPlant(mpc), 10)
+
+
+def test_how_far_the_policy_leaves_the_mpc_is_in_the_inputs_units(tmp_path) -> None:
+    model = moved(0.1)
+    text = read(report(model, tmp_path / "moved.html", env=Slide, seeds=SEEDS))[1]
+    theta = np.linspace(-5, 5, 4001)[:, None]
+    with th.no_grad():
+        u = model.policy.actor.mu(th.as_tensor(theta)).double().numpy()
+    largest = np.abs(u - guard_samples.LAW(theta)).max()
+    told = [
+        float(each)
+        for each in re.findall(r"u\[0\] random points of the box (?:\S+ ){2}(\S+)", text)
+    ]
+    assert told == [pytest.approx(largest, rel=1e-2)]
+
+
+def test_violations_of_the_policy_alone_fail(tmp_path) -> None:
+    model, env = moved(-0.5), partial(Slide, limits=(-0.2, 1.1), low=3.0, high=4.0)
+    assert guard_samples.LAW([3.5])[0] == -1.0
+    opposite = partial(Slide, limits=(-1.1, -0.6), low=3.0, high=4.0)
+    worse = read(report(moved(0.6), tmp_path / "a.html", env=opposite, seeds=SEEDS))[1]
+    assert "failed Episodes in which the policy violates more than the MPC" in worse
+    assert re.search(r"\d+ of 8 episodes violate a limit", worse)
+    alike = read(report(model, tmp_path / "b.html", env=env, seeds=SEEDS))[1]
+    assert "passed Episodes in which the policy violates more than the MPC" in alike
+
+
+def test_the_interval_is_that_of_paired_differences(tmp_path) -> None:
+    from scipy import stats
+
+    model = moved(0.1)
+    text = read(report(model, tmp_path / "r.html", env=Slide, seeds=SEEDS))[1]
+    before, after = evaluate(guard_samples.LAW, Slide, SEEDS), evaluate(model, Slide, SEEDS)
+    change = after.costs - before.costs
+    low, high = stats.ttest_1samp(change, 0).confidence_interval(0.95)
+    scale = 100 / before.costs.mean()
+    assert f"between {scale * low:+.2f} and {scale * high:+.2f} %" in text
+    assert "0 of 8 episodes violate a limit (0 with the MPC)" in text
+    assert f"fewer than {100 * (1 - 0.05 ** (1 / 8)):.1f} % of such starts do" in text
+
+
+def test_a_policy_that_is_the_mpc_costs_the_same(tmp_path) -> None:
+    model = guard_samples.build()
+    text = read(report(model, tmp_path / "r.html", env=Slide, seeds=[3]))[1]
+    assert "From these starts the policy costs what the MPC costs." in text
+    assert "nothing has been learnt there" in text
+
+
+@pytest.mark.parametrize("shows", ["absolute", "normalized"])
+def test_the_mpc_is_played_through_the_policy_s_own_maps(shows, tmp_path) -> None:
+    mpc, env = unit_samples.absolute_mpc(), partial(unit_samples.plant, shows, "normalized")
+    kwargs = {"problem": mpc, "observation": unit_samples.SAYS[shows]}
+    model = DDPG("YannPolicy", env(), policy_kwargs=kwargs, device="cpu")
+    text = read(report(model, tmp_path / "r.html", env=env, seeds=range(3)))[1]
+    law = mpc.explicit()
+    same = evaluate(law, partial(unit_samples.plant, "deviation", "deviation"), range(3))
+    assert "From these starts the policy costs what the MPC costs." in text
+    assert f"mean cost {same.costs.mean():.5g}" in text
+    assert "temperature 340 360 hard" in text and "u[0] 38 45 hard" in text
+
+
+def test_observations_are_normalized_as_in_training(tmp_path) -> None:
+    from sb3_yann import AffineObservation
+
+    mpc = guard_samples.MPC
+    venv = VecNormalize(DummyVecEnv([Slide]), norm_reward=False, training=False)
+    venv.obs_rms.mean[:], venv.obs_rms.var[:] = 0.5, 4.0
+    kwargs = {"problem": mpc, "observation": AffineObservation.from_vec_normalize(venv)}
+    model = DDPG("YannPolicy", venv, policy_kwargs=kwargs, device="cpu")
+    text = read(report(model, tmp_path / "r.html", env=Slide, seeds=range(3)))[1]
+    assert "From these starts the policy costs what the MPC costs." in text
+    mean = evaluate(guard_samples.LAW, Slide, range(3)).costs.mean()
+    assert f"mean cost {mean:.5g}" in text
+
+
+def test_a_law_that_is_solved_online_has_no_regions_to_show(tmp_path) -> None:
+    mpc = problems.clipped_pendulum()
+    kwargs = {"problem": mpc, "law": "online"}
+    model = DDPG("YannPolicy", "ClippedPendulum-v0", policy_kwargs=kwargs, device="cpu")
+    text = read(report(model, tmp_path / "r.html", env="ClippedPendulum-v0", seeds=[0]))[1]
+    assert "The MPC's law is solved at each point" in text
+    assert "A picture of regions needs an explicit law" in text
+
+
+def test_a_wrong_law_fails(tmp_path, monkeypatch) -> None:
+    model = guard_samples.build()
+    subject = subject_of(model)
+    law = subject.law
+    vars(subject)["law"] = replace(law, offsets=law.offsets + 1e-3)
+    part = problem_parts.law_part(subject)
+    assert [each.verdict for each in part.findings] == ["failed", "failed"]
+
+
+def test_starts_that_the_guard_knows_are_named() -> None:
+    model, guard = guarded()
+    known = subject_of(model, guard=guard, seeds=range(999_995, 1_000_003))
+    text = loop_parts.loops_part(known).content
+    assert "3 of these starts are known to the guard" in text
+    assert "known to the guard" not in loop_parts.loops_part(subject_of(model, guard=guard)).content
+
+
+def test_a_fingerprint_is_that_of_the_weights() -> None:
+    one, other = guard_samples.build(), moved()
+    prints = [
+        record_parts.fingerprint(each.policy.actor.state_dict()) for each in (one, one, other)
+    ]
+    assert prints[0] == prints[1] != prints[2] and len(prints[0]) == 64
+
+
+class Untouchable(Wrapper):
+    """An env that must not be played."""
+
+    def __init__(self) -> None:
+        raise AssertionError("it was played")
+
+
+def test_a_path_that_cannot_be_written_is_told_before_anything_is_played(tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "report.html", tmp_path):
+        with pytest.raises(OSError, match=r"cannot be written .* Name a file in a folder"):
+            report(guard_samples.build(), path, env=Untouchable)
+
+
+def test_a_report_that_fails_leaves_the_last_one_as_it_was(tmp_path) -> None:
+    path = tmp_path / "report.html"
+    path.write_text("before")
+    with pytest.raises(AssertionError, match="it was played"):
+        report(guard_samples.build(), path, env=Untouchable)
+    assert path.read_text() == "before" and [*tmp_path.iterdir()] == [path]
+
+
+def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
+    model, path = guard_samples.build(), tmp_path / "r.html"
+    with pytest.raises(TypeError, match="must be a DDPG or TD3 model with a YannPolicy"):
+        report(PPO("MlpPolicy", Slide(), device="cpu"), path)
+    with pytest.raises(TypeError, match="needs a YannPolicy"):
+        report(DDPG("MlpPolicy", Slide(), device="cpu"), path)
+    with pytest.raises(TypeError, match="twin = 3 must be a PlantTwin, or None"):
+        report(model, path, twin=3)
+    with pytest.raises(ValueError, match="has not watched this model"):
+        report(model, path, guard=make_guard())
+    log = evaluate(twin_samples.problem().explicit(), twin_samples.Cart, range(3))
+    twin = PlantTwin.fit(
+        twin_samples.problem(), [*zip(log.observations, log.actions, strict=True)], n_members=1
+    )
+    with pytest.raises(ValueError, match="The twin is one of"):
+        report(model, path, twin=twin)
+    with pytest.raises(ValueError, match="seeds is empty"):
+        report(model, path, seeds=[])
+    with pytest.raises(ValueError, match="seeds = 0.5 must be a whole number"):
+        report(model, path, seeds=[0.5])
+    with pytest.raises(TypeError, match=r"seeds = 20 must hold .* range\(20\)"):
+        report(model, path, seeds=20)
+    assert not path.exists()
