@@ -227,18 +227,38 @@ def _pictures(subject: Subject) -> list[Html]:
         )
         draw = partial(use_figure, problem, policy, subject.loops[POLICY])
         found.append(picture(draw, caption))
-    bounded = np.all(np.isfinite([problem.theta_min, problem.theta_max]))
-    if problem.n_theta > 1 and bounded:
-        plane = steepest(subject)
+    if problem.n_theta < 2:
+        return found
+    plane = steepest(subject)
+    frame = _frame(subject, plane)
+    if frame is not None:
         names = " and ".join(problem.labels()[k] for k in plane)
         caption = (
-            f"The first input over {names}: before is the MPC, after the policy. The other "
-            "parameters are at the operating point; a black line surrounds where the MPC has a "
-            "solution."
+            f"The first input over {names}: before is the MPC, after the policy. The frame holds "
+            f"{'the closed loops' if subject.loops else 'the box of parameters'}; the other "
+            "parameters are at the operating point. A black line, if there is one, surrounds where "
+            "the MPC has a solution."
         )
-        surfaces = partial(surfaces_figure, problem, subject.law, policy, entries=plane)
+        surfaces = partial(
+            surfaces_figure, problem, subject.law, policy, entries=plane, frame=frame
+        )
         found.append(picture(surfaces, caption))
     return found
+
+
+def _frame(subject: Subject, plane: tuple[int, int]) -> tuple[Array, Array] | None:
+    """Return what of a plane the closed loops come through, or the box; None where it is flat."""
+    problem, entries = subject.problem, [*plane]
+    low, high = problem.theta_min[entries], problem.theta_max[entries]
+    if subject.loops is not None:
+        seen = np.concatenate([x[:, entries] for x in subject.loops[POLICY].observations])
+        seen = seen[np.isfinite(seen).all(axis=1)]
+        room = 0.05 * np.ptp(seen, axis=0)
+        low, high = seen.min(axis=0) - room, seen.max(axis=0) + room
+    if not np.all(np.isfinite([low, high])) or np.any(low >= high):
+        return None
+    shift = problem.theta_ss[entries]
+    return low + shift, high + shift
 
 
 def _change(old: float, new: float) -> str:

@@ -33,10 +33,12 @@ def cost_part(subject: Subject) -> Part:
     space, policy = subject.policy.observation_space, subject.policy
     observation = np.zeros(space.shape or (1,), space.dtype)
     theta = np.zeros(subject.problem.n_theta)
+    looked, policy.looked = policy.looked, True  # no observation of the env
     rows = [
         ["model.predict, one observation", *_times(lambda: subject.model.predict(observation))],
         ["the MPC's law, one theta", *_times(lambda: subject.law(theta))],
     ]
+    policy.looked = looked
     law = subject.law
     arrays = law.packed if isinstance(law, PiecewiseAffine) else ()
     tensors = policy.actor.state_dict().values()

@@ -65,7 +65,8 @@ class _Mpc:
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, None]:
         """Return the actions of the MPC."""
         subject = self.subject
-        u = subject.law(subject.thetas(observation))
+        theta = subject.thetas(observation)
+        u = subject.law(np.nan_to_num(theta, nan=0.0, posinf=0.0, neginf=0.0))  # as the policy does
         return subject.policy.input_units.action(u).astype(subject.policy.action_space.dtype), None
 
 
@@ -93,6 +94,8 @@ class Subject:
     twin : PlantTwin or None
     headroom : Headroom or None
     seeds : tuple of int
+    points : int
+        Drawn at random from the box of theta.
     """
 
     model: OffPolicyAlgorithm

@@ -59,6 +59,14 @@ def test_of_many_episodes_the_median_and_the_bands_are_drawn() -> None:
     np.testing.assert_allclose(sorted(spans), [high - low, np.ptp(values)])
 
 
+def test_bands_of_several_controllers_are_lines_that_hide_nothing() -> None:
+    axes = plot_loop(tank(), {"before": episodes(50), "after": episodes(20)}, "level")
+    assert len(axes.collections) == 0
+    drawn = sorted(line.get_ydata()[0] for line in axes.lines if len(line.get_ydata()) == 6)
+    found = [np.percentile(12 + np.arange(k) / k, [10, 50, 90]) for k in (50, 20)]
+    np.testing.assert_allclose(drawn, sorted(np.concatenate(found)))
+
+
 def test_episodes_that_have_ended_count_no_more() -> None:
     long, short = episodes(8), episodes(8, steps=2)
     both = Episodes(
@@ -128,6 +136,15 @@ def test_the_surface_is_the_law_in_plant_units() -> None:
     values = np.asarray(mesh.get_array()).reshape(121, 121)
     assert values[40, 60] == pytest.approx(mpc.explicit().plant_input(shown)[0])
     assert values.min() == pytest.approx(0, abs=1e-9) and values.max() == pytest.approx(110)
+
+
+def test_a_surface_is_drawn_in_the_frame_that_is_given() -> None:
+    mpc = problems.cstr()
+    axes = plot_surface(mpc, mpc.explicit(), entries=("C_B", "T"), frame=([0.5, 470], [1, 480]))
+    assert axes.get_xlim() == pytest.approx((0.5, 1), abs=0.01)
+    assert axes.get_ylim() == pytest.approx((470, 480), abs=0.1)
+    with pytest.raises(ValueError, match=r"no frame to draw \['C_B', 'T'\] in"):
+        plot_surface(mpc, mpc.explicit(), entries=("C_B", "T"), frame=([1, 470], [1, 480]))
 
 
 def test_a_difference_is_that_of_two_laws_and_its_colors_are_symmetric() -> None:

@@ -29,6 +29,7 @@ from sb3_yann.reporting import (
     problem_parts,
     record_parts,
 )
+from sb3_yann.reporting import subject as subject_module
 from sb3_yann_envs import problems
 from weights import last_layer, unpin
 
@@ -165,6 +166,29 @@ def test_every_decision_is_there_with_its_reason() -> None:
 def subject_of(model, **given):
     defaults = dict.fromkeys(("env", "guard", "twin", "headroom"))
     return assemble._subject(model, **{**defaults, "seeds": SEEDS, **given})
+
+
+def test_a_guard_of_a_plant_alone_has_no_simulator_to_play(tmp_path) -> None:
+    model, guard = guard_samples.build(), guard_samples.guard_alone()
+    model.learn(3 * guard_samples.BLOCK, callback=[NoActionNoise(), guard])
+    assert guard.decisions
+    text = read(report(model, tmp_path / "r.html", guard=guard))[1]
+    assert "No env was given" in text and "env none: the plant alone" in text
+    assert all(each.reason in text for each in guard.decisions)
+
+
+def test_a_sensor_that_fails_is_the_operating_point_to_the_mpc_too() -> None:
+    subject = subject_of(guard_samples.build())
+    actions, _ = subject_module._Mpc(subject).predict(np.array([[np.nan]]), deterministic=True)
+    np.testing.assert_allclose(actions, [guard_samples.LAW([0.0])], atol=1e-6)
+
+
+def test_timing_leaves_what_the_policy_has_looked_at_as_it_was() -> None:
+    mpc, env = unit_samples.absolute_mpc(), unit_samples.plant("absolute", "normalized")
+    kwargs = {"problem": mpc, "observation": "deviation"}
+    model = DDPG("YannPolicy", env, policy_kwargs=kwargs, device="cpu")
+    record_parts.cost_part(subject_of(model))
+    assert not model.policy.looked
 
 
 def test_a_policy_that_the_guard_has_not_accepted_is_named() -> None:
@@ -375,7 +399,7 @@ def test_what_is_not_the_model_s_is_refused(tmp_path) -> None:
         report(model, path, twin=twin)
     with pytest.raises(ValueError, match="seeds is empty"):
         report(model, path, seeds=[])
-    with pytest.raises(ValueError, match="seeds = 0.5 must be a whole number"):
+    with pytest.raises(ValueError, match=r"seeds = 0\.5 must be a whole number"):
         report(model, path, seeds=[0.5])
     with pytest.raises(TypeError, match=r"seeds = 20 must hold .* range\(20\)"):
         report(model, path, seeds=20)

@@ -40,7 +40,8 @@ def plot_loop(
     """Draw one quantity over time, as the plant shows it, with its limits and its set-point.
 
     Up to six episodes are lines. Of more, a line is their median, a dark band holds 80 % of them,
-    and a light one all. Where some have ended, the others count.
+    and a light one all; of several controllers dashed lines are the edges of the dark one. Where
+    some episodes have ended, the others count.
 
     Parameters
     ----------
@@ -75,7 +76,8 @@ def plot_loop(
     whole = _in_plant_units(problem, runs, absolute)
     axes = axes_or_new(axes, 6.4, 3.0)
     for color, (name, episodes) in enumerate(whole.items()):
-        _draw(axes, problem, episodes, entry, COLORS[color % len(COLORS)], name)
+        own = _rows(problem, episodes, entry), problem.model.dt, entry >= problem.n_theta
+        _draw(axes, *own, COLORS[color % len(COLORS)], name, len(runs) == 1)
     _draw_set_points(axes, problem, next(iter(whole.values())), entry)
     _draw_limits(axes, problem, entry, _range(problem, whole, entry))
     axes.set(xlabel=f"time ({time_unit})" if time_unit else "time", ylabel=_label(problem, entry))
@@ -156,7 +158,8 @@ def _draw_block(
     whole = {name: each for group in groups for name, each in group.items()}
     for panel, group in zip(panels, groups, strict=True):
         for name, episodes in group.items():
-            _draw(panel, problem, episodes, entry, COLORS[next(colors) % len(COLORS)], name)
+            own = _rows(problem, episodes, entry), problem.model.dt, entry >= problem.n_theta
+            _draw(panel, *own, COLORS[next(colors) % len(COLORS)], name, len(group) == 1)
         _draw_set_points(panel, problem, next(iter(group.values())), entry)
         _draw_limits(panel, problem, entry, _range(problem, whole, entry))
         panel.set_ylabel(_label(problem, entry))
@@ -204,25 +207,26 @@ def _rows(problem: LinearMPC, episodes: Episodes, entry: int) -> Array:
 
 
 def _draw(
-    axes: Axes, problem: LinearMPC, episodes: Episodes, entry: int, color: str, name: str
+    axes: Axes, rows: Array, dt: float, held: bool, color: str, name: str, alone: bool
 ) -> None:
-    rows = _rows(problem, episodes, entry)
-    time = problem.model.dt * np.arange(rows.shape[1])
-    steps = "steps-post" if entry >= problem.n_theta else "default"
-    step = "post" if entry >= problem.n_theta else None
+    """Draw lines of a few episodes; of many the median, and bands, or their edges beside others."""
+    time = dt * np.arange(rows.shape[1])
+    line: dict[str, Any] = {"color": color, "drawstyle": "steps-post" if held else "default"}
     if len(rows) <= FEW:
         for k, row in enumerate(rows):
-            axes.plot(
-                time, row, color=color, linewidth=1.1, alpha=0.85, drawstyle=steps,
-                label=name if k == 0 else "_nolegend_",
-            )  # fmt: skip
+            label = name if k == 0 else "_nolegend_"
+            axes.plot(time, row, linewidth=1.1, alpha=0.85, label=label, **line)
         return
     low, dark, middle, light, high = np.nanpercentile(rows, [0, 10, 50, 90, 100], axis=0)
-    band: dict[str, Any] = {"color": color, "linewidth": 0, "step": step}
-    axes.fill_between(time, low, high, alpha=0.18, **band)
-    axes.fill_between(time, dark, light, alpha=0.35, **band)
-    label = f"{name}, median of {len(rows)} (dark: 80 %, light: all)"
-    axes.plot(time, middle, color=color, linewidth=1.6, drawstyle=steps, label=label)
+    if alone:
+        band: dict[str, Any] = {"color": color, "linewidth": 0, "step": "post" if held else None}
+        axes.fill_between(time, low, high, alpha=0.18, **band)
+        axes.fill_between(time, dark, light, alpha=0.35, **band)
+    else:
+        for edge in (dark, light):
+            axes.plot(time, edge, linewidth=0.9, linestyle="--", **line)
+    what = "dark: 80 %, light: all" if alone else "dashed: 80 %"
+    axes.plot(time, middle, linewidth=1.7, label=f"{name}, median of {len(rows)} ({what})", **line)
 
 
 def _draw_set_points(axes: Axes, problem: LinearMPC, episodes: Episodes, entry: int) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._drawing import axes_or_new, new_figure
 from sb3_yann._validation import Array, as_array
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.model.labels import with_units
 from sb3_yann.evaluation.plots._sources import Quantity, entry_of, inputs_of
 
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
+Frame = tuple[ArrayLike, ArrayLike]
 Values = tuple[Array, tuple[Array, Array], Array]
 ROUNDING = 1e-4
 """A change of an input by less, in half-widths, is drawn pale."""
-POINTS = 121
-"""Of the grid, in each direction."""
+POINTS, FEW = 121, 41
+"""Of the grid, in each direction; few where the law is solved at each point."""
 
 
 def plot_surface(
@@ -35,7 +36,7 @@ def plot_surface(
     at: ArrayLike | None = None,
     output: int = 0,
     minus: Any = None,
-    scale: tuple[float, float] | None = None,
+    frame: Frame | None = None,
 ) -> Axes:
     """Draw an input, as the plant takes it, over two entries of theta.
 
@@ -44,7 +45,7 @@ def plot_surface(
     Parameters
     ----------
     problem : LinearMPC
-        With the box of theta that is the frame, names and units.
+        With the box of theta, names and units.
     policy : callable, model or YannPolicy
         A law takes theta (batch, n_theta) in deviations.
     axes : matplotlib Axes, optional
@@ -57,8 +58,9 @@ def plot_surface(
         Which input.
     minus : callable, model or YannPolicy, optional
         What to subtract: then the difference is drawn, in colors that are symmetric about zero.
-    scale : pair of float, optional
-        The range of the colors; by default that of the values.
+    frame : pair of array_like, shape (2,), optional
+        The lower left and the upper right corner, as the plant shows them; by default the box of
+        theta.
 
     Examples
     --------
@@ -68,14 +70,15 @@ def plot_surface(
     >>> float(abs(axes.collections[0].get_array()).max())
     2.0
     """
-    own = _values(problem, policy, entries, at, output)
+    place = entries, at, output, frame
+    own = _values(problem, policy, *place)
     axes, label = axes_or_new(axes, 5.4, 4.2), with_units(problem.model)[1][output]
     if minus is not None:
-        own = own[0] - _values(problem, minus, entries, at, output)[0], *own[1:]
+        own = own[0] - _values(problem, minus, *place)[0], *own[1:]
         size, label = _size(problem, own[0], output), f"change of {label}"
-        mesh = _draw(axes, problem, entries, own, scale or (-size, size), "PuOr")
+        mesh = _draw(axes, problem, entries, own, (-size, size), "PuOr")
     else:
-        mesh = _draw(axes, problem, entries, own, scale or _extent(own[0]))
+        mesh = _draw(axes, problem, entries, own, _extent(own[0]))
     axes.figure.colorbar(mesh, ax=axes, label=label)
     return axes
 
@@ -88,16 +91,17 @@ def surfaces_figure(
     entries: Sequence[Quantity] = (0, 1),
     at: ArrayLike | None = None,
     output: int = 0,
+    frame: Frame | None = None,
 ) -> Figure:
     """Return a figure of the control surface before, after, and of their difference.
 
     Parameters
     ----------
     problem : LinearMPC
-        With the box of theta that is the frame, names and units.
+        With the box of theta, names and units.
     before, after : callable, model or YannPolicy
         As of :func:`plot_surface`; the first two panels share their colors.
-    entries, at, output
+    entries, at, output, frame
         As there.
 
     Examples
@@ -110,7 +114,7 @@ def surfaces_figure(
     """
     figure = new_figure(10.2, 3.2)
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
-    first, second = (_values(problem, each, entries, at, output) for each in (before, after))
+    first, second = (_values(problem, each, entries, at, output, frame) for each in (before, after))
     scale = _extent(np.stack([first[0], second[0]]))
     change = second[0] - first[0]
     size, label = _size(problem, change, output), with_units(problem.model)[1][output]
@@ -161,6 +165,7 @@ def _values(
     entries: Sequence[Quantity],
     at: ArrayLike | None,
     output: int,
+    frame: Frame | None,
 ) -> Values:
     """Return an input on the grid in plant units, the grid, and whether the MPC has a solution."""
     chosen = [entry_of(problem, each) for each in entries]
@@ -171,15 +176,22 @@ def _values(
             f"output = {output} must be an input, from 0 to {problem.model.n_inputs - 1}."
         )
     low, high = problem.theta_min[chosen], problem.theta_max[chosen]
-    if not np.all(np.isfinite([low, high])):
+    if frame is not None:
+        low, high = (as_array("frame", each, (2,)) - problem.theta_ss[chosen] for each in frame)
+    if not np.all(np.isfinite([low, high])) or np.any(low >= high):
         names = [problem.labels()[i] for i in chosen]
-        raise ValueError(f"theta has no bounded box in {names}: there is no frame to draw.")
+        raise ValueError(
+            f"There is no frame to draw {names} in: the box goes from {low.tolist()} to "
+            f"{high.tolist()}, about the operating point. Pass frame=(lower left, upper right)."
+        )
     shown = problem.theta_ss if at is None else as_array("at", at, (problem.n_theta,))
-    steps = [np.linspace(a, b, POINTS) for a, b in zip(low, high, strict=True)]
-    theta = np.tile(shown - problem.theta_ss, (POINTS**2, 1))
+    law = problem.law()
+    points = POINTS if isinstance(law, PiecewiseAffine) else FEW
+    steps = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
+    theta = np.tile(shown - problem.theta_ss, (points**2, 1))
     theta[:, chosen] = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
     u = inputs_of(problem, policy, theta)[:, output] + problem.model.u_ss[output]
-    inside = problem.law().in_domain(theta).astype(float)
+    inside = law.in_domain(theta).astype(float)
     x, y = (each + problem.theta_ss[i] for each, i in zip(steps, chosen, strict=True))
-    shape = POINTS, POINTS
+    shape = points, points
     return u.reshape(shape), (x, y), inside.reshape(shape)

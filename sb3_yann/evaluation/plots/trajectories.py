@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_yann._drawing import COLORS
 from sb3_yann._validation import Array, as_flag
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import with_units
@@ -173,7 +174,7 @@ def _draw(
     panels: Any, runs: Mapping[str, Episodes], states: Sequence[int], dt: float, references: Any
 ) -> None:
     for color, (label, episodes) in enumerate(runs.items()):
-        style = {"color": f"C{color}", "alpha": 0.7, "linewidth": 1.2}
+        style = {"color": COLORS[color % len(COLORS)], "alpha": 0.7, "linewidth": 1.2}
         for k, (x, u) in enumerate(zip(episodes.observations, episodes.actions, strict=True)):
             style["label"] = label if k == 0 else "_nolegend_"
             for panel, i in zip(panels, states, strict=False):
