@@ -42,10 +42,9 @@ def save_picture(changes: np.ndarray) -> Path:
     figure = Figure(figsize=(8, 3), layout="constrained")
     axes = figure.subplots()
     axes.bar(TESTS, np.sort(changes), label="improved policy")
-    axes.axhline(0, color="black", linewidth=1, label="MPC")
+    axes.axhline(0, color="black", linewidth=3, label="MPC")
     axes.axhline(changes.mean(), color="C1", linestyle="--", label="mean")
     axes.set(xticks=[], xlabel="test episodes, sorted", ylabel="change of the cost, %")
-    axes.set_ylim(top=max(0, changes.max()) + 0.05 * np.ptp(changes))
     axes.legend()
     figure.savefig(path := OUT / "from_a_log.png", dpi=120)
     return path

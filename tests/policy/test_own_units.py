@@ -124,7 +124,8 @@ def test_a_loaded_model_goes_on_showing_deviations(tmp_path: Any) -> None:
 @pytest.mark.parametrize(("shows", "takes"), [("absolute", "absolute"), ("normalized",) * 2])
 def test_commissioning_plays_the_plant_in_its_units(shows: str, takes: str) -> None:
     env = units.plant(shows, takes)
-    episode = (played := Plant(env, build(env, units.SAYS[shows]))).play(3, played.mpc, None)
+    played = Plant(env, build(env, units.SAYS[shows]))
+    episode = played.play(played.begin(3), played.mpc, None)
     law = MPC.explicit()(episode.thetas[:-1])
     np.testing.assert_allclose(episode.actions, law, atol=1e-5)
     moved = MPC.predict(episode.thetas[:-1], episode.actions)
