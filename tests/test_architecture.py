@@ -26,14 +26,14 @@ FLOORS = [
     {"sb3_yann.callbacks", "sb3_yann.wrappers"},
     {"sb3_yann.audit", "sb3_yann.guard"},
     {"sb3_yann.commissioning"},
-    {"sb3_yann.export"},
+    {"sb3_yann.deployment"},
     {"sb3_yann.reporting"},
     {"sb3_yann"},
     {"sb3_yann.command_line"},
     {"sb3_yann.__main__"},
 ]
 """Each floor may import from those before it: control -> networks -> twin -> the parts for
-Stable-Baselines3 -> export. Rooms to come (twin, commissioning, export) have their floor already.
+Stable-Baselines3 -> deployment.
 `sb3_yann` itself only names what
 there is; the command line uses it as any other script does."""
 

@@ -265,10 +265,10 @@ class PiecewiseAffine(OnPlant):
         flags = self.infeasible == "zero_input", self.disjoint
         laws = self.gains, self.offsets, rows, self.starts, bounds, tolerances, flags
         if self.walks:
-            return pack(*laws, walk=(self.neighbors, *self._start_of_walk()))
+            return pack(*laws, walk=(self.neighbors, *self.start_of_walk()))
         return pack(*laws, tuple(vars(self.tree).values()) if self.tree else ())
 
-    def _start_of_walk(self) -> tuple[int, Array]:
+    def start_of_walk(self) -> tuple[int, Array]:
         """Return the region at the middle of the box, and a point inside it."""
         middle, half = (self.theta_max + self.theta_min) / 2, (self.theta_max - self.theta_min) / 2
         first = int(np.argmax(np.minimum.reduceat(self.b - self.A @ middle, self.starts)))

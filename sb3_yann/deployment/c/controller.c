@@ -1,0 +1,431 @@
+/*
+@ABOUT@
+ */
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "@NAME@.h"
+
+typedef yann_real real;
+
+#define N_OBS YANN_N_OBS
+#define N_INPUTS YANN_N_INPUTS
+#define ZERO ((real)0)
+#define ONE ((real)1)
+
+@TABLES@
+
+/* ---- The region that theta lies in, or that it violates least ---- */
+
+/* The smallest slack of a region's half-spaces, or some slack below `low`. */
+static real slack_of_region(int region, const real theta[N_THETA], real low)
+{
+    real smallest = INFINITY;
+    for (int row = starts[region]; row < starts[region + 1]; row++) {
+        real slack = b[row];
+        for (int j = 0; j < N_THETA; j++) {
+            slack -= A[row][j] * theta[j];
+        }
+        if (slack < smallest) {
+            smallest = slack;
+            if (smallest < low) {
+                break;
+            }
+        }
+    }
+    return smallest;
+}
+
+/* What ties with a slack is at least this. */
+static real nearly(real slack) { return slack - TIE * (ONE + FABS(slack)); }
+
+/* The first region that ties with the best. `known` is the slack of some region. */
+static int scan(const real theta[N_THETA], real known, real *inside)
+{
+    int best = 0;
+    real largest = -INFINITY;
+    real low = nearly(known);
+    for (int i = 0; i < N_REGIONS; i++) {
+        const real slack = slack_of_region(i, theta, low);
+        if (slack < low) {
+            continue;
+        }
+        if (DISJOINT && slack >= SURELY_INSIDE) {
+            *inside = slack;
+            return i;
+        }
+        if (slack > largest) {
+            largest = slack;
+            best = i;
+            low = nearly(slack) > low ? nearly(slack) : low;
+        }
+    }
+    *inside = largest;
+    low = nearly(largest);
+    for (int i = 0; i < best; i++) {
+        if (slack_of_region(i, theta, low) >= low) {
+            return i;
+        }
+    }
+    return best;
+}
+
+#if SEARCH_BY_WALK
+/* Along a line from the first region to theta, from neighbor to neighbor. */
+static int walk(const real theta[N_THETA])
+{
+    int region = WALK_FROM;
+    real reached = ZERO;
+    for (int visited = 0; visited < N_REGIONS; visited++) {
+        real leaves = INFINITY;
+        int out = -1;
+        for (int row = starts[region]; row < starts[region + 1]; row++) {
+            real slack = b[row];
+            for (int j = 0; j < N_THETA; j++) {
+                slack -= A[row][j] * theta[j];
+            }
+            if (slack < ZERO && slack < walk_slack[row]) {
+                const real there = walk_slack[row] / (walk_slack[row] - slack);
+                if (there < leaves) {
+                    leaves = there;
+                    out = row;
+                }
+            }
+        }
+        if (out < 0 || leaves < reached - BACK || neighbors[out] < 0) {
+            break;
+        }
+        region = neighbors[out];
+        reached = leaves > reached ? leaves : reached;
+    }
+    return region;
+}
+#endif
+
+#if SEARCH_BY_TREE
+/* The best region of the leaf that theta falls into; `room` is the way to the nearest hyperplane. */
+static int best_of_leaf(const real theta[N_THETA], real *inside, real *room)
+{
+    int node = 0, best = -1;
+    real largest = -INFINITY, low = -INFINITY;
+    *room = INFINITY;
+    while (node >= 0) {
+        real side = -tree_levels[node];
+        for (int j = 0; j < N_THETA; j++) {
+            side += tree_normals[node][j] * theta[j];
+        }
+        *room = FABS(side) < *room ? FABS(side) : *room;
+        node = tree_children[node][side > ZERO ? 1 : 0];
+    }
+    const int first = tree_leaf_starts[-node - 1], last = tree_leaf_starts[-node];
+    for (int k = first; k < last; k++) {
+        const int i = tree_leaf_regions[k];
+        const real slack = slack_of_region(i, theta, low);
+        if (slack > largest) {
+            largest = slack;
+            best = i;
+            low = nearly(slack);
+        }
+    }
+    low = nearly(largest);
+    for (int k = first; k < last; k++) {
+        const int i = tree_leaf_regions[k];
+        if (i < best && slack_of_region(i, theta, low) >= low) {
+            best = i;
+        }
+    }
+    *inside = largest;
+    return best;
+}
+#endif
+
+static int locate(const real theta[N_THETA], real *inside)
+{
+    real known = -INFINITY;
+#if SEARCH_BY_WALK
+    const int found = walk(theta);
+    known = slack_of_region(found, theta, -INFINITY);
+    if (known >= SURELY_INSIDE) {
+        *inside = known;
+        return found;
+    }
+#elif SEARCH_BY_TREE
+    real room;
+    const int found = best_of_leaf(theta, &known, &room);
+    if (known >= SURELY_INSIDE || (known >= -TOLERANCE && room > CLEAR)) {
+        *inside = known;
+        return found;
+    }
+#endif
+    return scan(theta, known, inside);
+}
+
+/* ---- Networks: exactly zero before they have learnt ---- */
+
+#if N_NETWORKS > 0
+static real activate(real x) { return ACTIVATION; }
+
+static void hidden_layer(int rows, int columns, const real weights[], int pinned, const real x[],
+                         real y[])
+{
+    for (int a = 0; a < rows; a++) {
+        const real *row = weights + (ptrdiff_t)a * (columns + 1);
+        real sum = row[columns];
+        for (int j = 0; j < columns; j++) {
+            sum += row[j] * x[j];
+        }
+        y[a] = activate(sum) - (pinned ? activate(row[columns]) : ZERO);
+    }
+}
+
+/* What network k adds to the law, in [-1, 1] for the input range; 0 if it is no number. */
+static int correction(int k, const real theta[N_THETA], real added[N_INPUTS])
+{
+    real x[N_THETA], first[WIDTH_1];
+    const real *last = first;
+    int at_zero = pinned[k], sound = 1;
+    for (int j = 0; j < N_THETA; j++) {
+        x[j] = theta[j] * per_theta[j];
+        at_zero = at_zero && x[j] == ZERO;
+    }
+    hidden_layer(WIDTH_1, N_THETA, &layer0[k][0][0], pinned[k], x, first);
+#if N_LAYERS > 2
+    real second[WIDTH_2];
+    hidden_layer(WIDTH_2, WIDTH_1, &layer1[k][0][0], pinned[k], first, second);
+    last = second;
+#endif
+    for (int i = 0; i < N_INPUTS; i++) {
+        real sum = pinned[k] ? ZERO : last_layer[k][i][WIDTH_LAST];
+        for (int j = 0; j < WIDTH_LAST; j++) {
+            sum += last_layer[k][i][j] * last[j];
+        }
+        added[i] = at_zero ? ZERO : sum;
+        sound = sound && isfinite(added[i]);
+    }
+    for (int i = 0; i < N_INPUTS; i++) {
+        added[i] = !sound ? ZERO : added[i] > REACH ? REACH : added[i] < -REACH ? -REACH : added[i];
+    }
+    return sound;
+}
+
+/* The part, from 1 to 0, of a correction that counts at theta. */
+static real part_that_counts(const real theta[N_THETA])
+{
+    real beyond = ZERO;
+    for (int j = 0; j < N_THETA; j++) {
+        const real far = FABS(theta[j] - confine_middle[j]) * confine_per_half[j];
+        beyond = far > beyond ? far : beyond;
+    }
+    const real part = (FADES_TO - beyond) / (FADES_TO - FADES_FROM);
+    return part > ONE ? ONE : part > ZERO ? part : ZERO;
+}
+#endif
+
+/* ---- Law and policy ---- */
+
+static real between(real value, real low, real high)
+{
+    return value < low ? low : value > high ? high : value;
+}
+
+/* Write the action, and the bounds that it keeps, in the units of the plant or the env. */
+static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPUTS],
+                    real low[N_INPUTS], real high[N_INPUTS])
+{
+    real theta[N_THETA], law[N_INPUTS], inside;
+    unsigned status = 0;
+    for (int i = 0; i < N_OBS; i++) {
+        if (!isfinite(obs[i])) {
+            status |= YANN_NOT_FINITE;
+        }
+    }
+    for (int j = 0; j < N_THETA; j++) {
+        theta[j] = obs_offset[j];
+        for (int i = 0; i < N_OBS; i++) {
+            /* What is not finite counts as at the operating point. */
+            if (obs_matrix[j][i] != ZERO) {
+                theta[j] += obs_matrix[j][i] * obs[i];
+            }
+        }
+        if (!isfinite(theta[j])) {
+            theta[j] = ZERO;
+        }
+    }
+    const int region = locate(theta, &inside);
+    if (inside < -TOLERANCE) {
+        status |= YANN_OUTSIDE;
+    }
+    for (int i = 0; i < N_INPUTS; i++) {
+        law[i] = offsets[region][i];
+        for (int j = 0; j < N_THETA; j++) {
+            law[i] += gains[region][i][j] * theta[j];
+        }
+        if (ZERO_INPUT && inside < -TOLERANCE) {
+            law[i] = resting[i];
+        }
+        law[i] = law[i] == law[i] ? law[i] : ZERO;
+        low[i] = input_min[i];
+        high[i] = input_max[i];
+        law[i] = between(law[i], low[i], high[i]);
+#if RATE
+        const real previous = theta[N_THETA - N_INPUTS + i] * per_input[i] - middle[i];
+        const real lowest = low[i], highest = high[i];
+        low[i] = between(previous + change_min[i], lowest, highest);
+        high[i] = between(previous + change_max[i], lowest, highest);
+        law[i] = between(law[i], low[i], high[i]);
+#endif
+    }
+#if N_NETWORKS > 0
+    const real part = part_that_counts(theta);
+    if (with_networks && !(status & YANN_NOT_FINITE) && network_of[region] >= 0 && part > ZERO) {
+        real added[N_INPUTS];
+        if (!correction(network_of[region], theta, added)) {
+            status |= YANN_NETWORK;
+        }
+        for (int i = 0; i < N_INPUTS; i++) {
+            law[i] = between(law[i] + added[i] * part, low[i], high[i]);
+        }
+    }
+#else
+    (void)with_networks;
+#endif
+    for (int i = 0; i < N_INPUTS; i++) {
+        action[i] = law[i] * action_scale[i] + action_shift[i];
+        low[i] = low[i] * action_scale[i] + action_shift[i];
+        high[i] = high[i] * action_scale[i] + action_shift[i];
+    }
+    return status;
+}
+
+unsigned yann_policy(const real obs[N_OBS], real action[N_INPUTS])
+{
+    real low[N_INPUTS], high[N_INPUTS];
+    return act(obs, 1, action, low, high);
+}
+
+unsigned yann_law(const real obs[N_OBS], real action[N_INPUTS])
+{
+    real low[N_INPUTS], high[N_INPUTS];
+    return act(obs, 0, action, low, high);
+}
+
+/* ---- One step of the plant's controller ---- */
+
+void yann_init(yann_state *state)
+{
+    for (int i = 0; i < N_OBS; i++) {
+        state->good[i] = obs_rest[i];
+        state->last[i] = obs_rest[i];
+        state->same[i] = 0;
+    }
+    for (int i = 0; i < N_INPUTS; i++) {
+        state->bump[i] = ZERO;
+    }
+    state->faults = 0;
+    state->sound = RECOVER;
+    state->left = 0;
+    state->started = 0;
+    state->mode = YANN_POLICY;
+    state->steps = 0;
+    state->changes = 0;
+    for (int i = 0; i < 3; i++) {
+        state->steps_of_mode[i] = 0;
+    }
+    (void)yann_law(obs_rest, state->output);
+}
+
+/* Keep what is good of the readings; return what is wrong with the others. */
+static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
+{
+    unsigned status = 0;
+    int moved = !state->started;
+    for (int i = 0; i < N_OBS; i++) {
+        moved = moved || obs[i] != state->last[i];
+    }
+    for (int i = 0; i < N_OBS; i++) {
+        unsigned fault = 0;
+        if (!state->started || obs[i] != state->last[i]) {
+            state->same[i] = 0;
+        } else if (moved && state->same[i] < INT16_MAX) {
+            state->same[i]++;
+        }
+        state->last[i] = obs[i];
+        if (!isfinite(obs[i])) {
+            fault = YANN_NOT_FINITE;
+        } else {
+            if (obs[i] < obs_min[i] || obs[i] > obs_max[i]) {
+                fault |= YANN_OUT_OF_RANGE;
+            }
+            if (FROZEN_AFTER > 0 && watched[i] && state->same[i] >= FROZEN_AFTER) {
+                fault |= YANN_FROZEN;
+            }
+        }
+        if (fault == 0) {
+            state->good[i] = obs[i];
+        }
+        status |= fault;
+    }
+    state->started = 1;
+    return status;
+}
+
+/* Who acts now. */
+static yann_mode who_acts(yann_state *state, unsigned status, yann_mode request)
+{
+    if ((status & (YANN_NOT_FINITE | YANN_OUT_OF_RANGE | YANN_FROZEN)) == 0) {
+        state->faults = 0;
+    } else if (state->faults <= HOLD) {
+        state->faults++;
+    }
+    if (status != 0) {
+        state->sound = 0;
+    } else if (state->sound < RECOVER) {
+        state->sound++;
+    }
+    if (request == YANN_MANUAL || state->faults > HOLD) {
+        return YANN_MANUAL;
+    }
+    return request == YANN_MPC || state->sound < RECOVER ? YANN_MPC : YANN_POLICY;
+}
+
+unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_mode request,
+                   const real *manual, real action[N_INPUTS])
+{
+    real target[N_INPUTS], low[N_INPUTS], high[N_INPUTS];
+    unsigned status = read_sensors(state, obs);
+    if (elapsed > LATE_AFTER) {
+        status |= YANN_LATE;
+    }
+    const yann_mode mode = who_acts(state, status, request);
+    status |= act(state->good, mode == YANN_POLICY, target, low, high);
+    for (int i = 0; i < N_INPUTS; i++) {
+        if (mode == YANN_MANUAL) {
+            target[i] = manual != NULL && isfinite(manual[i]) ? manual[i] : state->output[i];
+        }
+        if (mode != state->mode) {
+            state->bump[i] = state->output[i] - target[i];
+        }
+    }
+    if (mode != state->mode) {
+        state->changes++;
+        state->left = TRANSFER;
+    }
+    if (mode == YANN_MANUAL) {
+        state->left = 0; /* the operator's output is taken as it is */
+    }
+    for (int i = 0; i < N_INPUTS; i++) {
+        if (state->left > 0) {
+            target[i] += state->bump[i] * ((real)state->left / (real)TRANSFER);
+        }
+        state->output[i] = between(target[i], low[i], high[i]);
+        action[i] = state->output[i];
+    }
+    if (state->left > 0) {
+        state->left--;
+    }
+    state->mode = mode;
+    state->steps++;
+    state->steps_of_mode[mode]++;
+    return status;
+}

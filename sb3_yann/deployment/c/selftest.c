@@ -1,0 +1,60 @@
+/*
+ * A test of @NAME@.c with known answers: it returns 0 and prints the largest error, in parts of an
+ * input's range, or returns 1. Compile it with @NAME@.c, and run it on the target.
+ */
+#include <math.h>
+#include <stddef.h>
+#include <stdio.h>
+
+#include "@NAME@.h"
+
+#define N_POINTS @POINTS@
+#define N_STEPS @STEPS@
+
+@VECTORS@
+
+static double worst(const yann_real found[], const yann_real wanted[])
+{
+    double largest = 0.0;
+    for (int i = 0; i < YANN_N_INPUTS; i++) {
+        const double error = fabs((double)found[i] - (double)wanted[i]) / (double)range_of[i];
+        if (!(error <= largest)) { /* NaN too */
+            largest = error;
+        }
+    }
+    return largest;
+}
+
+int main(void)
+{
+    static yann_state state;
+    yann_real action[YANN_N_INPUTS];
+    double by_policy = 0.0, by_law = 0.0, by_step = 0.0;
+    int wrong = 0;
+    for (int k = 0; k < N_POINTS; k++) {
+        (void)yann_policy(points[k], action);
+        by_policy = fmax(by_policy, worst(action, policy[k]));
+        wrong += !(worst(action, policy[k]) <= @ROOM@);
+        (void)yann_law(points[k], action);
+        by_law = fmax(by_law, worst(action, law[k]));
+        wrong += !(worst(action, law[k]) <= @ROOM@);
+    }
+    yann_init(&state);
+    for (int k = 0; k < N_STEPS; k++) {
+        yann_real obs[YANN_N_OBS];
+        for (int i = 0; i < YANN_N_OBS; i++) {
+            obs[i] = readings[k][i];
+        }
+        if (lost[k]) {
+            obs[0] = (yann_real)NAN;
+        }
+        const unsigned found =
+            yann_step(&state, obs, elapsed[k], (yann_mode)requests[k], NULL, action);
+        by_step = fmax(by_step, worst(action, actions[k]));
+        wrong += !(worst(action, actions[k]) <= @ROOM@);
+        wrong += found != (unsigned)status[k] || state.mode != (yann_mode)modes[k];
+    }
+    printf("@NAME@: largest error %.2g (policy), %.2g (law), %.2g (steps) of the range; %s\n",
+           by_policy, by_law, by_step, wrong ? "FAILED" : "passed");
+    return wrong ? 1 : 0;
+}

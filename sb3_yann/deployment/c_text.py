@@ -1,0 +1,45 @@
+"""Numbers, tables and comments as C has them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def literal(value: float, precision: str) -> str:
+    """Return a number as C has it, exact in its precision."""
+    if np.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    digits, end = (9, "f") if precision == "float" else (17, "")
+    text = f"{float(value):.{digits}g}"
+    return (text if any(mark in text for mark in ".e") else f"{text}.0") + end
+
+
+def table(kind: str, name: str, values: NDArray[np.generic], precision: str) -> str:
+    """Return the declaration of a constant array."""
+    sizes = "".join(f"[{each}]" for each in values.shape)
+    return f"static const {kind} {name}{sizes} = {_nested(values, precision, 0)};"
+
+
+def _nested(values: NDArray[np.generic], precision: str, depth: int) -> str:
+    indent = "    " * (depth + 1)
+    if values.ndim > 1:
+        rows = f",\n{indent}".join(_nested(each, precision, depth + 1) for each in values)
+        return f"{{\n{indent}{rows},\n{'    ' * depth}}}"
+    whole = values.dtype.kind in "ib"
+    texts = [str(int(each)) if whole else literal(float(each), precision) for each in values]
+    lines, line = [], ""
+    for text in texts:
+        if line and len(line) + len(text) > 90 - len(indent):
+            lines.append(line)
+            line = ""
+        line += f"{', ' if line else ''}{text}"
+    body = f",\n{indent}".join([*lines, line])
+    return f"{{{body}}}" if not lines else f"{{\n{indent}{body},\n{'    ' * depth}}}"
+
+
+def comment(lines: list[str]) -> str:
+    """Return lines of a comment in ASCII, which nothing in them can end."""
+    plain = "\n".join(lines).encode("ascii", "backslashreplace").decode()
+    safe = plain.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
+    return "\n".join(f" * {line}".rstrip().rstrip("\\") for line in safe.splitlines())

@@ -1,0 +1,320 @@
+"""A policy or a law in production: this file needs numpy alone, and can be copied by itself.
+
+It is evaluated in float64, and every step watches the readings. The C code of an export does the
+same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from enum import IntFlag
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Array = NDArray[np.float64]
+
+FORMAT = 1
+POLICY, MPC, MANUAL = "policy", "mpc", "manual"
+MODES = POLICY, MPC, MANUAL
+ENTRIES = 4_000_000  # of slacks at a time
+
+
+class Status(IntFlag):
+    """What a step found. The first four are faults, upon which the controller falls back."""
+
+    NOT_FINITE = 1  # a reading is NaN or infinite
+    OUT_OF_RANGE = 2  # a reading is beyond the limits that the export was given
+    FROZEN = 4  # a reading stays the same to the bit while others move
+    LATE = 8  # more time has passed since the last step than it may
+    OUTSIDE = 16  # the MPC has no solution there; the law acts by its `infeasible` option
+    NETWORK = 32  # a network put out what is no number; the law acted
+
+
+SENSOR = Status.NOT_FINITE | Status.OUT_OF_RANGE | Status.FROZEN
+
+
+def _elu(x: Array) -> Array:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+
+
+def _relu(x: Array) -> Array:
+    return np.maximum(x, 0)
+
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": np.tanh, "relu": _relu, "elu": _elu}
+
+
+class Controller:
+    """What runs in production: ``controller(obs)`` is the action, with a fallback at every step.
+
+    A faulty reading is replaced by the last good one, and the MPC's law acts alone. After ``hold``
+    steps with a fault the output is held: manual. Once the readings are good again the law acts,
+    and after ``recover`` good steps the policy. At every change the output goes on from where it
+    was, and the difference fades within ``transfer`` steps.
+
+    Take it from :meth:`load`; the limits of the checks are in the file, see `export`.
+
+    Attributes
+    ----------
+    request : {"policy", "mpc", "manual"}
+        What the operator wants: the policy at first. "mpc" leaves the networks out.
+    mode : {"policy", "mpc", "manual"}
+        What acted at the last step.
+    status : Status
+        What the last step found; 0 for nothing.
+    counters : dict of str to int
+        Steps, those of each mode, those with each status, and changes of the mode.
+    name : str
+    obs_names, action_names : tuple of str
+        What the entries are called.
+
+    Examples
+    --------
+    >>> import sb3_yann
+    >>> from stable_baselines3 import DDPG
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    >>> _ = sb3_yann.export(model, "reactor.npz")
+    >>> controller = Controller.load("reactor.npz")
+    >>> action = controller([0.1, 0.0, 0.0, -5.0])
+    >>> bool(np.allclose(action, model.predict(np.float32([0.1, 0, 0, -5]))[0], atol=1e-4))
+    True
+    >>> held = controller([np.nan, 0.0, 0.0, -5.0])
+    >>> controller.mode, controller.status.name, bool(np.allclose(held, action))
+    ('mpc', 'NOT_FINITE', True)
+    """
+
+    def __init__(self, data: Mapping[str, Any]) -> None:
+        self.data = {name: np.asarray(each) for name, each in data.items()}
+        version = int(self.data["format"])
+        if version != FORMAT:
+            raise ValueError(
+                f"The controller has format {version}, this reader takes {FORMAT}. Export the "
+                "model again, or take the reader of the version that wrote it."
+            )
+        self.name, self.activation = str(self.data["name"]), str(self.data["activation"])
+        self.obs_names = tuple(map(str, self.data["obs_names"]))
+        self.action_names = tuple(map(str, self.data["action_names"]))
+        self.reset()
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Controller:
+        """Return the controller of a file that `export` wrote.
+
+        OSError if it cannot be read, ValueError if it holds no controller.
+        """
+        with open(path, "rb") as file:
+            try:
+                with np.load(file, allow_pickle=False) as data:
+                    return cls({name: data[name] for name in data.files})
+            except Exception as error:  # damaged files raise nearly all there is
+                what = str(error) or type(error).__name__
+                raise ValueError(
+                    f"{path} holds no controller ({what}). Write it with export(model, path)."
+                ) from None
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the file that :meth:`load` reads."""
+        with open(path, "wb") as file:
+            np.savez(file, **self.data)
+
+    def reset(self) -> None:
+        """Forget all steps, as at the start: the policy acts, from the operating point."""
+        n_obs, m = len(self.data["obs_rest"]), len(self.data["action_scale"])
+        self.request = self.mode = POLICY
+        self.status = Status(0)
+        self.counters = dict.fromkeys(["steps", *MODES, *(s.name.lower() for s in Status)], 0)
+        self.counters["changes"] = 0
+        self._good: Array = self.data["obs_rest"].astype(np.float64)  # the last good readings
+        self._last = np.full(n_obs, np.nan)
+        self._same = np.zeros(n_obs, np.int64)
+        self._faults, self._sound = 0, int(self.data["recover"])
+        self._output: Array = self.evaluate(self.data["obs_rest"], networks=False)
+        self._bump, self._left = np.zeros(m), 0
+
+    def evaluate(self, obs: ArrayLike, networks: bool = True) -> Array:
+        """Return the policy's actions, without memory: (m,) for (n_obs,), or rows of a batch.
+
+        What is not finite counts as at the operating point, and the law acts then, as in
+        `model.predict`.
+
+        Parameters
+        ----------
+        obs : array_like, shape (n_obs,) or (batch, n_obs)
+        networks : bool, default True
+            False is the MPC's law.
+        """
+        rows, single = self._rows(obs)
+        found = self._act(rows, networks)[0] * self.data["action_scale"] + self.data["action_shift"]
+        return found[0] if single else found
+
+    def in_domain(self, obs: ArrayLike) -> NDArray[np.bool_]:
+        """Return where the MPC has a solution: a bool, or (batch,)."""
+        rows, single = self._rows(obs)
+        inside = self._act(rows, False)[3]
+        return inside[0] if single else inside
+
+    def __call__(
+        self, obs: ArrayLike, elapsed: float | None = None, manual: ArrayLike | None = None
+    ) -> Array:
+        """Make one step; return the action (m,).
+
+        Parameters
+        ----------
+        obs : array_like, shape (n_obs,)
+            In the units of the export.
+        elapsed : float, optional
+            Time since the last step, in units of dt. None is in time.
+        manual : array_like, shape (m,), optional
+            The operator's output while manual, which is otherwise held.
+
+        Raises
+        ------
+        ValueError
+            If a shape is wrong, or ``request`` is none of the three.
+        """
+        rows, single = self._rows(obs)
+        if not single or self.request not in MODES:
+            raise ValueError(
+                f"obs has shape {rows.shape}, request is {self.request!r}; a step takes "
+                f"({self._good.size},) and one of {MODES}. Use evaluate(obs) for a batch."
+            )
+        used, status = self._readings(rows[0])
+        late = float(self.data["late_after"])
+        if elapsed is not None and elapsed > late:
+            status |= Status.LATE
+        mode = self._mode(status)
+        action, low, high, inside, sound = self._act(used[None], mode == POLICY)
+        status |= Status(0) if inside[0] else Status.OUTSIDE
+        status |= Status(0) if sound[0] else Status.NETWORK
+        scale, shift = self.data["action_scale"], self.data["action_shift"]
+        target = action[0] * scale + shift
+        if mode == MANUAL:
+            target = self._output if manual is None else self._as_manual(manual)
+        if mode != self.mode:
+            self.counters["changes"] += 1
+            self._left = int(self.data["transfer"])
+            self._bump = self._output - target
+        if mode == MANUAL:
+            self._left = 0  # the operator's output is taken as it is
+        if self._left > 0:
+            target = target + self._bump * (self._left / int(self.data["transfer"]))
+            self._left -= 1
+        bounds = np.sort([low[0] * scale + shift, high[0] * scale + shift], axis=0)
+        self._output = np.clip(target, *bounds)
+        self.mode, self.status = mode, status
+        for name in ("steps", mode, *(s.name.lower() for s in Status if s in status)):
+            self.counters[name] += 1
+        return self._output.copy()
+
+    def _readings(self, obs: Array) -> tuple[Array, Status]:
+        """Return the readings to act on, and what is wrong with those that came."""
+        finite, status = np.isfinite(obs), Status(0)
+        beyond = finite & ((obs < self.data["obs_min"]) | (obs > self.data["obs_max"]))
+        moved = obs != self._last
+        self._same = np.where(moved, 0, self._same + bool(moved.any()))
+        self._last = obs
+        after = int(self.data["frozen_after"])
+        frozen = finite & self.data["watched"] & (self._same >= after) & (after > 0)
+        for which, flag in (
+            (~finite, Status.NOT_FINITE),
+            (beyond, Status.OUT_OF_RANGE),
+            (frozen, Status.FROZEN),
+        ):
+            status |= flag if which.any() else Status(0)
+        self._good = np.where(~finite | beyond | frozen, self._good, obs)
+        return self._good, status
+
+    def _mode(self, status: Status) -> str:
+        """Return who acts now."""
+        self._faults = self._faults + 1 if status & SENSOR else 0
+        recover = int(self.data["recover"])
+        self._sound = 0 if status else min(self._sound + 1, recover)
+        if self.request == MANUAL or self._faults > int(self.data["hold"]):
+            return MANUAL
+        return MPC if self.request == MPC or self._sound < recover else POLICY
+
+    def _as_manual(self, manual: ArrayLike) -> Array:
+        given = np.asarray(manual, np.float64)
+        if given.shape != self._output.shape:
+            raise ValueError(f"manual has shape {given.shape}, expected {self._output.shape}.")
+        return np.where(np.isfinite(given), given, self._output)
+
+    def _rows(self, obs: ArrayLike) -> tuple[Array, bool]:
+        given, n_obs = np.asarray(obs, np.float64), len(self.data["obs_rest"])
+        if given.ndim not in (1, 2) or given.shape[-1] != n_obs:
+            raise ValueError(
+                f"obs has shape {given.shape}, expected ({n_obs},) or (batch, {n_obs}): "
+                f"{', '.join(self.obs_names)}."
+            )
+        return np.atleast_2d(given), given.ndim == 1
+
+    def _act(self, obs: Array, networks: bool) -> tuple[Any, ...]:
+        """Return actions in [-1, 1], their bounds, where the MPC has a solution, and a network one.
+
+        All but the last two, (batch,), are (batch, m).
+        """
+        data, lost = self.data, ~np.isfinite(obs)
+        theta = np.where(lost, 0.0, obs) @ data["obs_matrix"].T + data["obs_offset"]
+        theta[(lost @ (data["obs_matrix"] != 0).T) | ~np.isfinite(theta)] = 0.0
+        region, inside = self._locate(theta)
+        law = (data["gains"][region] @ theta[..., None])[..., 0] + data["offsets"][region]
+        if data["zero_input"]:
+            law = np.where(inside[:, None], law, data["resting"])
+        low, high = np.broadcast_to(data["bounds"][:, None], (2, *law.shape))
+        law = np.clip(np.nan_to_num(law), low, high)
+        if len(data["change"]):
+            last = theta[:, -law.shape[1] :] * data["per_input"] - data["middle"]
+            low, high = np.clip(last + data["change"][:, None], low, high)
+        law, sound = np.clip(law, low, high), np.ones(len(law), bool)
+        action = law
+        if networks:
+            part = np.where(lost.any(1), 0.0, self._part(theta))[:, None]
+            added = self._networks(theta * data["per_theta"], data["network_of"][region])
+            sound = np.isfinite(added).all(1) | (part[:, 0] == 0)
+            added = np.where(sound[:, None], added, 0.0)
+            added = np.clip(added, -data["reach"], data["reach"])
+            action = np.clip(law + np.where(part > 0, added * part, 0.0), low, high)
+        return action, low, high, inside, sound
+
+    def _part(self, theta: Array) -> Array:
+        """Return the part (batch,), from 1 to 0, of a network's output that counts."""
+        middle, per_half, (full, none) = *self.data["confines"], self.data["fades"]
+        beyond = (np.abs(theta - middle) * per_half).max(1)
+        return np.clip((none - beyond) / (none - full), 0, 1)
+
+    def _locate(self, theta: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the first region that theta violates least, and whether it holds theta."""
+        data, rows = self.data, max(1, ENTRIES // len(self.data["b"]))
+        tolerance, tie = data["tolerances"]
+        region, inside = np.empty(len(theta), np.int64), np.empty(len(theta), bool)
+        for i in range(0, len(theta), rows):
+            slack = data["b"] - theta[i : i + rows] @ data["A"].T
+            slack = np.minimum.reduceat(slack, data["starts"], axis=1)
+            largest = slack.max(1)
+            nearly = largest - tie * (1 + np.abs(largest))
+            region[i : i + rows] = (slack >= nearly[:, None]).argmax(1)
+            inside[i : i + rows] = largest >= -tolerance
+        return region, inside
+
+    def _networks(self, x: Array, used: NDArray[np.int64]) -> Array:
+        """Return (batch, m): what network number ``used`` puts out, zero for -1."""
+        data, act = self.data, ACTIVATIONS[self.activation]
+        layers = [data[f"layer{i}"] for i in range(int(data["n_layers"]))]
+        found = np.zeros((len(x), len(data["action_scale"])))
+        for k in np.unique(used[used >= 0]):
+            rows, pinned = used == k, bool(data["pinned"][k])
+            y = x[rows]
+            at_zero = pinned & ~y.any(1, keepdims=True)
+            with np.errstate(over="ignore", invalid="ignore"):
+                for layer in layers[:-1]:
+                    W, b = layer[k, :, :-1], layer[k, :, -1]
+                    y = act(y @ W.T + b) - (act(b) if pinned else 0.0)
+                W, b = layers[-1][k, :, :-1], layers[-1][k, :, -1]
+                y = y @ W.T + (0.0 if pinned else b)
+            found[rows] = np.where(at_zero, 0.0, y)
+        return found

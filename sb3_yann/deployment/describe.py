@@ -1,0 +1,299 @@
+"""A law, or the policy of a model, as plain arrays: what every format of an export is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
+
+from sb3_yann._validation import Array, as_between, as_bounds, as_whole
+from sb3_yann.control import OnlineLaw, PiecewiseAffine
+from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.mpc.choice import Law
+from sb3_yann.deployment.controller import FORMAT
+from sb3_yann.networks import SharedYannLayer, YannLayer
+from sb3_yann.networks.law_layer import ALL, NONE, LawLayer
+from sb3_yann.policy._features import AffineFeatures, keeps_entries
+from sb3_yann.policy.policies import YannPolicy
+
+ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.ELU: "elu"}
+Arrays = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What a controller takes for a fault, and how it falls back.
+
+    Parameters
+    ----------
+    obs_min, obs_max : array_like, shape (n_obs,), or float, optional
+        Limits of the readings, in the units of the export. None is no limit.
+    frozen_after : int, default 0
+        A state that stays the same to the bit for so many steps in which another reading moves is
+        frozen. 0 checks nothing: only you know how coarse a sensor is.
+    late_after : float, default 1.5
+        A step is late when more time has passed since the last one, in units of dt. It is checked
+        where a step is told the time.
+    hold : int, default 5
+        Steps with a faulty reading that the last good one stands in for; then the output is held.
+    recover : int, default 10
+        Steps without a fault before the policy acts again. The MPC's law acts until then.
+    transfer : int, default 5
+        Steps within which a change of who acts fades.
+
+    Examples
+    --------
+    >>> Checks(obs_min=[-2, -60], obs_max=[2, 20], frozen_after=30).hold
+    5
+    """
+
+    obs_min: ArrayLike | None = None
+    obs_max: ArrayLike | None = None
+    frozen_after: int = 0
+    late_after: float = 1.5
+    hold: int = 5
+    recover: int = 10
+    transfer: int = 5
+
+    def arrays(self, size: int) -> Arrays:
+        """Return them for ``size`` readings; TypeError or ValueError where one is wrong."""
+        low, high = as_bounds("obs", self.obs_min, self.obs_max, size)
+        counts = {
+            name: np.int64(as_whole(name, getattr(self, name), 0))
+            for name in ("frozen_after", "hold", "recover", "transfer")
+        }
+        late = as_between("late_after", self.late_after, 0, np.inf, "(]")
+        return {"obs_min": low, "obs_max": high, "late_after": np.float64(late), **counts}
+
+
+def describe(
+    given: BaseAlgorithm | YannPolicy | Law, name: str, checks: Checks, absolute: bool = False
+) -> Arrays:
+    """Return the arrays of a controller.
+
+    Parameters
+    ----------
+    given : model, YannPolicy, PiecewiseAffine or OnlineLaw
+        Of a law the controller takes theta and puts out u; of a model what `predict` does.
+    name : str
+        What the controller is called.
+    checks : Checks
+    absolute : bool, default False
+        Whether it takes theta and puts out inputs as the plant has them, not as the env or the
+        law does.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no export of it: the message says why.
+    """
+    policy = given.policy if isinstance(given, BaseAlgorithm) else given
+    if isinstance(policy, YannPolicy):
+        return _of_policy(policy, name, checks, absolute)
+    if not isinstance(policy, PiecewiseAffine | OnlineLaw):
+        raise TypeError(
+            f"{type(given).__name__} cannot be exported: pass a model with a YannPolicy, or a law "
+            "from LinearMPC.explicit()."
+        )
+    law = _explicit(policy)
+    states, inputs = _names(law)
+    shown = [*states, *(f"theta[{i}]" for i in range(len(states), law.n_theta))]
+    arrays = {
+        **law_arrays(law),
+        **_no_networks(law),
+        "change": np.empty((0, law.n_inputs)),
+        **checks.arrays(law.n_theta),
+        "watched": np.arange(law.n_theta) < len(states),
+    }
+    _, middle, half = input_range(law)
+    units = np.eye(law.n_theta), np.zeros(law.n_theta), half, middle
+    if absolute:
+        units = _plant_units(law)
+    return arrays | _with_units(name, law, units, shown, inputs)
+
+
+def _of_policy(policy: YannPolicy, name: str, checks: Checks, absolute: bool) -> Arrays:
+    layer, problem = policy.actor.mu, policy.problem
+    law = _explicit(layer.given if isinstance(layer, SharedYannLayer) else layer.explicit_law)
+    extractor = policy.actor.features_extractor
+    matrix, offset = np.eye(law.n_theta), np.zeros(law.n_theta)
+    if isinstance(extractor, AffineFeatures):
+        matrix, offset = extractor.matrix.T.cpu().numpy(), extractor.offset.cpu().numpy()
+    kept = keeps_entries(extractor) or absolute
+    box: Any = policy.action_space
+    low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
+    units = matrix, offset, (high - low) / 2, (high + low) / 2
+    if absolute:
+        units = _plant_units(law)
+    names = list(problem.labels()) if kept else [f"obs[{i}]" for i in range(matrix.shape[1])]
+    states = np.zeros(law.n_theta, bool)
+    states[problem.layout.state] = True
+    arrays = {
+        **law_arrays(law),
+        **network_arrays(layer, law),
+        "change": layer.change.cpu().numpy() if layer.rated else np.empty((0, law.n_inputs)),
+        **checks.arrays(len(units[0][0])),
+        "watched": states if kept else np.ones(len(names), bool),
+    }
+    return arrays | _with_units(name, law, units, names, _names(law)[1])
+
+
+def _explicit(law: Law | None) -> PiecewiseAffine:
+    if law is None:
+        raise ValueError(
+            "The policy's weights hold another law than its problem's. Load the model with the "
+            "problem that it was trained with."
+        )
+    if not isinstance(law, PiecewiseAffine):
+        raise ValueError(
+            "The law is solved online, by a quadratic program at each step; an export holds an "
+            "explicit law, whose time is bounded. Solve problem.explicit() without a limit before "
+            "the model is made, shorten the horizon, or run the model itself."
+        )
+    return law
+
+
+def _names(law: PiecewiseAffine) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what states and inputs are called; no states where the law knows no plant."""
+    if law.model is None:
+        return (), tuple(f"u[{i}]" for i in range(law.n_inputs))
+    return labels_of(law.model)
+
+
+def law_arrays(law: PiecewiseAffine) -> Arrays:
+    """Return a law for inputs in [-1, 1], or as they are where they have no bounds."""
+    finite, middle, half = input_range(law)
+    arrays = {
+        "gains": law.gains / half[:, None],
+        "offsets": (law.offsets - middle) / half,
+        "bounds": np.array([(law.u_min - middle) / half, (law.u_max - middle) / half]),
+        "A": law.A,
+        "b": law.b,
+        "starts": law.starts,
+        "zero_input": np.bool_(law.infeasible == "zero_input"),
+        "disjoint": np.bool_(law.disjoint),
+        "tolerances": np.array([law.tolerance, law.tie_tolerance]),
+        "box": np.array(
+            [
+                np.where(np.isfinite(each), each, otherwise)
+                for each, otherwise in ((law.theta_min, -1.0), (law.theta_max, 1.0))
+            ]
+        ),
+        "per_input": 1 / half,
+        "middle": middle / half,
+    }
+    arrays["bounds"][:, finite] = [[-1.0], [1.0]]  # to the bit
+    arrays["resting"] = np.clip(-middle / half, *arrays["bounds"])
+    arrays |= {"neighbors": np.empty(0, np.int64), "walk_slack": np.empty(0), "walk_from": 0}
+    if law.walks:
+        region, point = law.start_of_walk()
+        arrays |= {"neighbors": law.neighbors, "walk_from": np.int64(region)}
+        arrays["walk_slack"] = law.b - law.A @ point
+    elif law.tree is not None:
+        arrays |= {f"tree_{key}": each for key, each in vars(law.tree).items()}
+    return arrays
+
+
+def input_range(law: PiecewiseAffine) -> tuple[Any, Array, Array]:
+    """Return which inputs (m,) are bounded, the middles of their ranges and half-widths."""
+    finite = np.isfinite(law.u_min) & np.isfinite(law.u_max)
+    low, high = np.where(finite, law.u_min, -1.0), np.where(finite, law.u_max, 1.0)
+    return finite, (high + low) / 2, (high - low) / 2
+
+
+def _no_networks(law: PiecewiseAffine) -> Arrays:
+    n = law.n_theta
+    return {
+        "per_theta": np.ones(n),
+        "network_of": np.full(law.n_regions, -1),
+        "n_layers": np.int64(0),
+        "pinned": np.empty(0, bool),
+        "activation": "tanh",
+        "reach": np.inf,
+        "confines": np.zeros((2, n)),
+        "fades": np.array([ALL, NONE]),
+    }
+
+
+def network_arrays(layer: LawLayer, law: PiecewiseAffine) -> Arrays:
+    """Return the networks of a layer that are not zero, and which of them each region has."""
+    network = layer.network
+    nodes = network.first.nodes.detach().double().cpu().numpy()
+    k = nodes.shape[1] // 2
+    first = (nodes[:, :k] + nodes[:, k : 2 * k]).sum(1) + nodes[:, 2 * k :].sum(1)
+    rest = [each.detach().double().cpu().numpy() for each in network.weights()[1:]]
+    layers, pinned = [first, *rest], network.pinned_array > 0
+    zero = np.array([_is_zero([each[i] for each in layers], pinned[i]) for i in range(len(pinned))])
+    kept = np.flatnonzero(~zero)
+    number = np.full(len(zero), -1)
+    number[kept] = np.arange(len(kept))
+    per_region = isinstance(layer, YannLayer)
+    return {
+        **_no_networks(law),
+        "per_theta": 1 / layer.theta_half.double().cpu().numpy(),
+        "network_of": number if per_region else np.full(law.n_regions, number[0]),
+        "n_layers": np.int64(len(layers) if len(kept) else 0),
+        **({f"layer{i}": each[kept] for i, each in enumerate(layers)} if len(kept) else {}),
+        "pinned": pinned[kept],
+        "activation": _activation(network.activation),
+        "reach": np.inf if layer.reach is None else layer.reach,
+        "confines": layer.confines.cpu().numpy(),
+    }
+
+
+def _activation(given: Any) -> str:
+    own = getattr(given, "args", (given,))[0]  # of a partial, which is alive at zero
+    called = ACTIVATIONS.get(type(own))
+    if called is None or (called == "elu" and own.alpha != 1):
+        known = ", ".join(each.__name__ for each in ACTIVATIONS)
+        raise ValueError(
+            f"activation_fn = {own} cannot be exported. Train with one of {known} (alpha = 1)."
+        )
+    return called
+
+
+def _is_zero(layers: list[Array], pinned: bool) -> bool:
+    """Return whether a network puts out zero whatever it is given."""
+    if not all(np.all(np.isfinite(each)) for each in layers):
+        return False
+    biases = [each[:, -1] for each in layers[1:-1]] + ([] if pinned else [layers[-1][:, -1]])
+    silent = not np.any(layers[0]) and not any(map(np.any, biases))
+    return silent or not np.any(layers[-1][:, :-1] if pinned else layers[-1])
+
+
+def _plant_units(law: PiecewiseAffine) -> tuple[Array, Array, Array, Array]:
+    if law.model is None or law.theta_ss is None:
+        raise ValueError(
+            "absolute = True needs a law that knows its operating point: one from LinearMPC, not "
+            "one built by hand or from an old file."
+        )
+    _, middle, half = input_range(law)
+    return np.eye(law.n_theta), -law.theta_ss, half, law.model.u_ss + middle
+
+
+def _with_units(
+    name: str,
+    law: PiecewiseAffine,
+    units: tuple[Array, Array, Array, Array],
+    obs_names: Any,
+    action_names: Any,
+) -> Arrays:
+    matrix, offset, scale, shift = units
+    rest = np.linalg.lstsq(matrix, -offset, rcond=None)[0]  # what is seen at theta = 0
+    dt = 0.0 if law.model is None else law.model.dt
+    return {
+        "format": np.int64(FORMAT),
+        "name": name,
+        "dt": np.float64(dt),
+        "obs_matrix": matrix,
+        "obs_offset": offset,
+        "obs_rest": rest,
+        "action_scale": scale,
+        "action_shift": shift,
+        "obs_names": np.array(list(obs_names)),
+        "action_names": np.array(list(action_names)),
+    }

@@ -1,0 +1,163 @@
+"""Write the files of a controller, in the format that the path names."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from hashlib import sha256
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+import sb3_yann
+from sb3_yann._validation import as_choice, as_flag, as_options
+from sb3_yann.control.law._files import write_arrays
+from sb3_yann.control.mpc.choice import Law
+from sb3_yann.deployment.c_code import c_files
+from sb3_yann.deployment.cost import Cost, cost_of
+from sb3_yann.deployment.describe import Arrays, Checks, describe
+from sb3_yann.policy.policies import YannPolicy
+
+PRECISIONS = ("double", "float")
+WORDS = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export wrote.
+
+    Attributes
+    ----------
+    paths : tuple of Path
+    sizes : tuple of int
+        Bytes of each file.
+    cost : Cost
+        Tables, and the operations of a step at worst.
+    digest : str
+        Of the arrays: two exports of the same controller have the same.
+    """
+
+    paths: tuple[Path, ...]
+    sizes: tuple[int, ...]
+    cost: Cost
+    digest: str
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        pairs = zip(self.paths, self.sizes, strict=True)
+        written = ", ".join(f"{path} ({size / 1000:.1f} kB)" for path, size in pairs)
+        return f"{written}; {self.cost}; digest {self.digest}"
+
+
+def export(
+    given: BaseAlgorithm | YannPolicy | Law,
+    path: str | PathLike[str],
+    *,
+    format: str | None = None,
+    name: str | None = None,
+    precision: str = "double",
+    absolute: bool = False,
+    checks: Checks | None = None,
+) -> Exported:
+    """Write a controller that runs without this package, as a file or as code.
+
+    It is what `model.predict` is, law, networks, bounds and all, in the precision asked for; and a
+    step that checks the readings and falls back, see :class:`Controller`.
+
+    Parameters
+    ----------
+    given : model, YannPolicy or PiecewiseAffine
+        A law takes theta and puts out the input in deviations.
+    path : str or PathLike
+        Its suffix tells the format.
+    format : {"npz", "c"}, optional
+        ``npz`` is for :class:`Controller`, which needs numpy alone. ``c`` is C99: a file, its
+        header beside it, and a test with known answers.
+    name : str, optional
+        Prefix of all names in code; the file's by default.
+    precision : {"double", "float"}, default "double"
+        Of the numbers in code.
+    absolute : bool, default False
+        Whether observations are theta, and actions inputs, as the plant has them. By default they
+        are the env's, or the law's.
+    checks : Checks, optional
+        Limits of the readings and how to fall back. By default only what is not finite is a fault,
+        and late steps where the time is told.
+
+    Returns
+    -------
+    Exported
+        What was written, and what a step costs; print it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no such export; nothing is written then.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> written = export(problems.cstr().explicit(), "reactor.c", precision="float")
+    >>> [path.name for path in written.paths]
+    ['reactor.c', 'reactor.h', 'reactor_selftest.c']
+    """
+    target = Path(path)
+    kind = as_choice("format", format or target.suffix.lstrip("."), tuple(FORMATS))
+    as_choice("precision", precision, PRECISIONS)
+    called = target.stem if name is None else name
+    if not WORDS.fullmatch(called):
+        raise ValueError(
+            f"name = {called!r} must be a word of letters, digits and underscores that begins with "
+            "a letter: it goes into the names of the code. Pass name=."
+        )
+    own = as_options("checks", checks or Checks(), Checks)
+    data = describe(given, called, own, as_flag("absolute", absolute))
+    paths = FORMATS[kind](data, target, precision)
+    sizes = tuple(each.stat().st_size for each in paths)
+    return Exported(tuple(paths), sizes, cost_of(data), digest_of(data))
+
+
+def digest_of(data: Arrays) -> str:
+    """Return twelve characters that tell one controller from another."""
+    found = sha256()
+    for name in sorted(data):
+        each = np.asarray(data[name])
+        found.update(f"{name} {each.shape} {each.dtype.kind}".encode())
+        found.update(each.tobytes())
+    return found.hexdigest()[:12]
+
+
+def _write_npz(data: Arrays, path: Path, precision: str) -> list[Path]:
+    write_arrays(path, data)
+    return [path]
+
+
+def _write_c(data: Arrays, path: Path, precision: str) -> list[Path]:
+    about = (
+        f"{data['name']}, a controller, written by sb3-yann {sb3_yann.__version__}; "
+        f"digest {digest_of(data)}."
+    )
+    texts = c_files(data, precision, about)
+    parts = {path.parent / file: text for file, text in texts.items()}
+    return write_texts(parts)
+
+
+def write_texts(texts: dict[Path, str]) -> list[Path]:
+    """Write all files, or none; return their paths."""
+    parts = {path: path.with_name(f"{path.name}.{os.getpid()}.part") for path in texts}
+    try:
+        for path, text in texts.items():
+            parts[path].write_text(text, encoding="ascii", newline="\n")
+        for path, part in parts.items():
+            os.replace(part, path)
+    finally:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
+    return list(texts)
+
+
+FORMATS: dict[str, Callable[[Arrays, Path, str], list[Path]]] = {"npz": _write_npz, "c": _write_c}

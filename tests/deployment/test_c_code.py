@@ -1,0 +1,134 @@
+"""The C code of an export is the controller, step by step, for compilers at their strictest."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+
+import numpy as np
+import pytest
+
+from deployed import CASES, COMPILERS, STRICT, Compiled, needs_compiler, observations, policy_of
+from sb3_yann import Checks, export
+from sb3_yann.deployment.controller import MODES, Status
+from sb3_yann.deployment.selftest import steady
+
+pytestmark = needs_compiler
+WITHOUT_MEMORY = Status.OUTSIDE | Status.NETWORK | Status.NOT_FINITE
+
+
+def error(found: np.ndarray, wanted: np.ndarray, controller) -> float:
+    return float(np.max(np.abs(found - wanted) / (2 * controller.data["action_scale"])))
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("name", CASES)
+def test_double_is_the_controller(name, compiler, tmp_path):
+    policy = policy_of(name)
+    compiled = Compiled(policy, tmp_path, compiler=compiler)
+    obs, controller = observations(policy, 10_000), compiled.controller
+    # On a facet of a law whose networks jump there, rounding chooses.
+    kept = steady(controller, obs, "double")
+    assert len(kept) > 0.6 * len(obs)
+    actions, found = compiled.at(kept)
+    assert error(actions, controller.evaluate(kept), controller) < 1e-12
+    by_law, _ = compiled.at(kept, law=True)
+    assert error(by_law, controller.evaluate(kept, networks=False), controller) < 1e-12
+    outside = (found & int(Status.OUTSIDE)) > 0
+    assert np.array_equal(outside, ~controller.in_domain(kept))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_float_is_the_controller_where_it_is_steady(name, tmp_path):
+    policy = policy_of(name)
+    compiled = Compiled(policy, tmp_path, "float")
+    obs = observations(policy, 10_000).astype(np.float32).astype(np.float64)
+    kept = steady(compiled.controller, obs, "float")
+    assert len(kept) > 0.5 * len(obs)
+    actions, _ = compiled.at(kept)
+    assert error(actions, compiled.controller.evaluate(kept), compiled.controller) < 1e-5
+
+
+@pytest.mark.parametrize("name", ["reactor", "references and rates", "mixed observations"])
+def test_steps_with_faults_are_the_controllers(name, tmp_path):
+    policy = policy_of(name)
+    obs = observations(policy, 400)
+    low, high = np.percentile(obs, [5, 95], axis=0)
+    checks = Checks(obs_min=low, obs_max=high, frozen_after=3, hold=2, recover=4, transfer=3)
+    compiled, generator = Compiled(policy, tmp_path, checks=checks), np.random.default_rng(3)
+    controller, calm = compiled.controller, np.clip(obs, low, high)
+    compiled.begin()
+    met, modes = Status(0), set()
+    for k in range(600):
+        seen = calm[k // 2 % len(calm)].copy()
+        if k % 40 > 30:
+            seen[0] = calm[0, 0]  # frozen
+        if generator.random() < 0.1:
+            seen[generator.integers(len(seen))] = generator.choice([np.nan, np.inf, -np.inf, 1e9])
+        elapsed = 2.0 if generator.random() < 0.05 else 1.0
+        request = int(generator.choice([0, 1, 2], p=[0.9, 0.05, 0.05]))
+        manual = None
+        if generator.random() < 0.5:
+            manual = generator.uniform(-1, 1, compiled.m) * controller.data["action_scale"]
+        controller.request = MODES[request]
+        wanted = controller(seen, elapsed, manual)
+        action, found = compiled.step(seen, elapsed, request, manual)
+        assert error(action, wanted, controller) < 1e-12, k
+        assert found == int(controller.status), k
+        met |= controller.status
+        modes.add(controller.mode)
+    assert modes == set(MODES)
+    assert met & ~WITHOUT_MEMORY == Status.OUT_OF_RANGE | Status.FROZEN | Status.LATE
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("name", ["reactor", "two tanks, by a walk"])
+def test_the_self_test_passes_and_can_fail(name, precision, compiler, tmp_path):
+    export(policy_of(name), tmp_path / "plant.c", precision=precision)
+    passed = self_test(tmp_path, compiler)
+    assert passed.returncode == 0 and "passed" in passed.stdout
+    code = tmp_path / "plant.c"
+    text = code.read_text()
+    broken = re.sub(r"(action\[i\] = law\[i\]) \*", r"\1 * (real)1.001 *", text)
+    assert broken != text
+    code.write_text(broken)
+    assert self_test(tmp_path, compiler).returncode == 1
+
+
+def self_test(folder, compiler):
+    sources = [str(folder / "plant.c"), str(folder / "plant_selftest.c")]
+    guards = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    program = str(folder / "test")
+    subprocess.run([compiler, *STRICT, *guards, *sources, "-lm", "-o", program], check=True)
+    return subprocess.run([program], capture_output=True, text=True)
+
+
+def test_a_header_is_for_cpp_too(tmp_path):
+    export(policy_of("reactor"), tmp_path / "plant.c")
+    main = tmp_path / "main.cpp"
+    main.write_text('#include "plant.h"\nint main() { plant_state s; plant_init(&s); }\n')
+    compiler = COMPILERS[0]
+    subprocess.run([compiler, *STRICT, "-c", "plant.c"], cwd=tmp_path, check=True)
+    built = [compiler, "-x", "c++", "-Wall", "-Werror", "main.cpp", "-x", "none", "plant.o", "-lm"]
+    assert subprocess.run(built, cwd=tmp_path).returncode == 0
+
+
+def test_names_cannot_end_a_comment(tmp_path):
+    from dataclasses import replace
+
+    from sample_plants import LinearPlant  # noqa: F401 (the support folder is on the path)
+    from sb3_yann import LinearMPC
+
+    policy = policy_of("reactor")
+    mpc = policy.problem
+    model = mpc.model
+    evil = [*list(model.state_names)[:-1], 'T */ int x; /* "Ä\\']
+    names = type(model)(
+        model.A, model.B, model.dt, model.x_ss, model.u_ss, state_names=evil, input_names=["U"]
+    )
+    law = replace(mpc.explicit())
+    assert isinstance(mpc, LinearMPC)
+    compiled = Compiled(law.on_plant(names, np.zeros(4)), tmp_path)
+    actions, _ = compiled.at(np.zeros((1, 4)))
+    assert actions.shape == (1, 1)

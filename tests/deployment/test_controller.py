@@ -1,0 +1,263 @@
+"""The numpy-only controller is what the model predicts, and falls back when a reading fails."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+
+import sb3_yann.deployment.controller
+from deployed import CASES, disturbed, observations, policy_of
+from sample_laws import solved
+from sb3_yann import Checks, Controller, export
+from sb3_yann.deployment.controller import Status
+from sb3_yann.deployment.selftest import steady
+from weights import last_layer
+
+
+def controller_of(given, folder: Path, **options) -> Controller:
+    export(given, folder / "plant.npz", **options)
+    return Controller.load(folder / "plant.npz")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_is_the_policy(name, tmp_path):
+    policy = policy_of(name)
+    controller = controller_of(policy, tmp_path)
+    obs = observations(policy, 10_000)
+    scale = 2 * controller.data["action_scale"]
+    # In float64 by torch, which is an evaluation of its own.
+    wide = copy.deepcopy(policy).double()
+    with th.no_grad():
+        wanted = wide.actor(th.as_tensor(obs)).numpy()
+    wanted = wanted * controller.data["action_scale"] + controller.data["action_shift"]
+    kept = np.isin(obs, steady(controller, obs, "double")).all(1)
+    assert kept.mean() > 0.6
+    found = controller.evaluate(obs)
+    assert np.max(np.abs(found - wanted)[kept] / scale) < 1e-12
+    # The model itself computes its networks in float32.
+    predicted = policy.predict(obs, deterministic=True)[0]
+    assert np.percentile(np.abs(found - predicted) / scale, 99) < 1e-5
+
+
+@pytest.mark.parametrize("name", ["reactor", "references and rates", "mixed observations"])
+@pytest.mark.filterwarnings("ignore::sb3_yann.NonFiniteWarning")
+def test_what_is_not_finite_counts_as_in_the_policy(name, tmp_path):
+    policy = policy_of(name)
+    controller = controller_of(policy, tmp_path)
+    obs = observations(policy, 400)
+    for i, row in enumerate(obs):
+        row[i % obs.shape[1]] = [np.nan, np.inf, -np.inf][i % 3]
+    predicted = policy.predict(obs, deterministic=True)[0]
+    scale = 2 * controller.data["action_scale"]
+    assert np.max(np.abs(controller.evaluate(obs) - predicted) / scale) < 1e-6
+
+
+def test_a_law_alone_and_in_the_plants_own_units(tmp_path):
+    law = solved("reactor").explicit()
+    theta = np.random.default_rng(0).uniform(-1, 1, (1000, 4)) * [2, 2, 2, 40]
+    assert np.allclose(controller_of(law, tmp_path).evaluate(theta), law(theta), atol=1e-10)
+    absolute = controller_of(law, tmp_path, absolute=True)
+    shown = theta + law.theta_ss
+    assert np.allclose(absolute.evaluate(shown), law.plant_input(shown), atol=1e-9)
+    assert absolute.obs_names == ("C_A", "C_B", "C_S", "T")
+    assert absolute.action_names == ("U",)
+    policy = policy_of("reactor")
+    by_policy = controller_of(policy, tmp_path, absolute=True).evaluate(shown)
+    wanted = controller_of(policy, tmp_path).evaluate(theta) + 55
+    assert np.allclose(by_policy, wanted, atol=1e-9)
+
+
+def test_it_needs_numpy_alone(tmp_path):
+    policy = policy_of("reactor")
+    controller = controller_of(policy, tmp_path)
+    source = Path(sb3_yann.deployment.controller.__file__)
+    (tmp_path / "controller.py").write_bytes(source.read_bytes())
+    lines = """
+import sys
+class Wall:
+    def find_spec(self, name, *rest):
+        if name.split(".")[0] in ("torch", "numba", "scipy", "gymnasium", "sb3_yann"):
+            raise ImportError(name)
+sys.meta_path.insert(0, Wall())
+from controller import Controller
+print(*Controller.load("plant.npz")([0.1, 0.2, -0.1, 3.0]))
+"""
+    found = subprocess.run(
+        [sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert np.allclose(float(found.stdout), controller([0.1, 0.2, -0.1, 3.0]), rtol=1e-14)
+
+
+def test_importing_it_loads_no_torch():
+    lines = "import sys; from sb3_yann import Controller; print('torch' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True)
+    assert found.stdout.strip() == "False", found.stderr
+
+
+# ---- Faults ----
+
+
+def readings(count: int = 200) -> np.ndarray:
+    """A plant that moves slowly, so that a jump of the action is the controller's."""
+    k = np.arange(count)[:, None]
+    return np.sin(0.05 * k + np.arange(4)) * [0.5, 0.5, 0.5, 5.0]
+
+
+def test_a_lost_sensor_is_bridged_then_the_output_held_and_all_comes_back(tmp_path):
+    checks = Checks(hold=5, recover=10, transfer=5)
+    controller = controller_of(policy_of("reactor"), tmp_path, checks=checks)
+    obs, modes, outputs = readings(), [], []
+    for k, row in enumerate(obs):
+        seen = row.copy()
+        if 50 <= k < 70:
+            seen[3] = np.nan
+        outputs.append(controller(seen))
+        modes.append(controller.mode)
+        assert bool(controller.status & Status.NOT_FINITE) == (50 <= k < 70)
+    assert modes[:50] == ["policy"] * 50
+    assert modes[50:55] == ["mpc"] * 5 and modes[55:70] == ["manual"] * 15
+    assert modes[70:79] == ["mpc"] * 9 and modes[79:] == ["policy"] * 121
+    moves = np.abs(np.diff(np.ravel(outputs)))
+    assert np.all(np.ravel(outputs)[55:70] == outputs[54][0])  # held
+    # No bump: a change of who acts moves the output hardly more than the plant's own movement.
+    own = np.abs(np.diff(controller.evaluate(obs)[:, 0])).max()
+    bumps = np.abs(controller.evaluate(obs) - controller.evaluate(obs, networks=False)).max()
+    assert bumps > 5 * own  # it would have jumped
+    held = np.abs(controller.evaluate(obs[70], networks=False) - outputs[69]).max()
+    assert moves.max() < max(bumps, held) / 5 + 2 * own
+    counted = controller.counters
+    assert counted["steps"] == 200 and counted["changes"] == 4
+    assert (counted["manual"], counted["mpc"]) == (15, 14)
+    assert counted["not_finite"] == 20
+
+
+def test_limits_frozen_sensors_and_late_steps(tmp_path):
+    checks = Checks(obs_min=-50, obs_max=[9, 9, 9, 20], frozen_after=4, recover=2)
+    controller = controller_of(policy_of("reactor"), tmp_path, checks=checks)
+    obs = readings()
+    controller([0, 0, 0, 20.5])
+    assert controller.status & Status.OUT_OF_RANGE and controller.mode == "mpc"
+    controller.reset()
+    found = []
+    for row in obs[:12]:
+        controller([0.25, *row[1:]])
+        found.append(bool(controller.status & Status.FROZEN))
+    assert found == [False] * 4 + [True] * 8
+    controller.reset()
+    for _ in range(50):  # at rest nothing moves, and nothing is frozen
+        controller(obs[0])
+    assert controller.status == 0 and controller.mode == "policy"
+    controller(obs[1], elapsed=1.6)
+    assert controller.status == Status.LATE and controller.mode == "mpc"
+
+
+def test_the_operator_takes_over_and_gives_back_without_a_bump(tmp_path):
+    controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(transfer=4))
+    obs = readings(30) * 0.1
+    before = controller(obs[0])
+    controller.request = "manual"
+    assert controller(obs[1]) == before
+    assert controller(obs[2], manual=[40.0]) == 40.0
+    assert controller(obs[3], manual=[1e6]) == 55.0  # the input's own bound
+    controller.request = "policy"
+    outputs = [float(controller(row)[0]) for row in obs[4:10]]
+    assert outputs[0] == pytest.approx(55.0, abs=1e-6)
+    assert np.all(np.abs(np.diff(outputs)) < 16)
+    assert outputs[-1] == pytest.approx(float(controller.evaluate(obs[9])[0]))
+
+
+def test_rates_hold_whatever_happens(tmp_path):
+    mpc = policy_of("references and rates").problem
+    controller = controller_of(policy_of("references and rates"), tmp_path)
+    generator, previous = np.random.default_rng(0), 0.0
+    for k in range(300):
+        obs = generator.uniform(-1, 1, mpc.n_theta)
+        obs[-1] = previous
+        if k % 17 == 0:
+            obs[0] = np.nan
+        controller.request = ["policy", "mpc", "manual"][k // 7 % 3]
+        action = float(controller(obs, manual=generator.uniform(-5, 5, 1))[0])
+        assert mpc.rate.du_min - 1e-9 <= action - previous <= mpc.rate.du_max + 1e-9
+        previous = action
+
+
+def test_networks_that_overflow_leave_the_law(tmp_path):
+    policy = disturbed(solved("reactor"))
+    with th.no_grad():
+        last_layer(policy).fill_(np.inf)
+    controller = controller_of(policy, tmp_path)
+    obs = readings(10)[1:]
+    assert np.array_equal(controller.evaluate(obs), controller.evaluate(obs, networks=False))
+    controller(obs[0])
+    assert controller.status == Status.NETWORK
+
+
+# ---- What is refused ----
+
+
+def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
+    controller = controller_of(policy_of("reactor"), tmp_path)
+    path = tmp_path / "plant.npz"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="holds no controller"):
+        Controller.load(path)
+    with pytest.raises(OSError):
+        Controller.load(tmp_path / "none.npz")
+    with pytest.raises(ValueError, match=r"obs has shape \(3,\), expected \(4,\).*C_A"):
+        controller([1, 2, 3])
+    with pytest.raises(ValueError, match="Use evaluate"):
+        controller(np.zeros((2, 4)))
+    controller.request = "off"
+    with pytest.raises(ValueError, match="'off'"):
+        controller(np.zeros(4))
+    with pytest.raises(ValueError, match="format 99"):
+        Controller({**controller.data, "format": 99})
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"path": "plant.xyz"}, ValueError, "format"),
+        ({"path": "2 tanks.c"}, ValueError, "name = '2 tanks'"),
+        ({"precision": "half"}, ValueError, "precision"),
+        ({"checks": {"hold": -1}}, (TypeError, ValueError), "checks|hold"),
+        ({"checks": Checks(obs_min=[1, 2])}, ValueError, "obs_min"),
+    ],
+)
+def test_bad_arguments_write_nothing(change, error, message, tmp_path):
+    options = {"path": "plant.npz", **change}
+    with pytest.raises(error, match=message):
+        export(policy_of("reactor"), tmp_path / options.pop("path"), **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_online_law_and_strange_networks_say_why_not(tmp_path):
+    online = disturbed(solved("reactor"), law="online")
+    with pytest.raises(ValueError, match="solved online"):
+        export(online, tmp_path / "plant.c")
+    with pytest.raises(ValueError, match="solved online"):
+        export(solved("reactor").online(), tmp_path / "plant.c")
+    strange = disturbed(solved("reactor"), activation_fn=th.nn.Softsign)
+    with pytest.raises(ValueError, match="Softsign"):
+        export(strange, tmp_path / "plant.c")
+    with pytest.raises(TypeError, match="MlpPolicy|dict|cannot be exported"):
+        export({}, tmp_path / "plant.c")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_cost_is_said(tmp_path):
+    written = export(policy_of("nothing learnt"), tmp_path / "plant.npz")
+    assert written.cost.activations == 0  # networks of zeros are left out
+    learnt = export(policy_of("reactor"), tmp_path / "plant.npz")
+    assert learnt.cost.activations == 64
+    assert learnt.cost.table_bytes(4) < 32_000
+    assert "kB float" in str(learnt) and learnt.digest in str(learnt)
+    again = export(policy_of("reactor"), tmp_path / "again.npz", name="plant")
+    assert again.digest == learnt.digest != written.digest
