@@ -31,8 +31,8 @@ _NAMES = {
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
     "ExplicitSolutionError Identified LinearMPC LinearModel OnlineLaw OnlineLawWarning "
     "OutputBounds PiecewiseAffine RateLimits SoftBounds Terminal Tracking identify offset_free",
+    "sb3_yann.deployment.checks": "Checks",
     "sb3_yann.deployment.controller": "Controller",
-    "sb3_yann.deployment.describe": "Checks",
     "sb3_yann.deployment.exporting": "Exported export",
     "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "

@@ -55,6 +55,18 @@ def report(options: Namespace) -> None:
     print(f"Written: {written}")
 
 
+def export(options: Namespace) -> None:
+    """Write a controller, and print what it costs."""
+    from sb3_yann import export as write
+
+    given = model_of(options.law) if _is_model(options.law) else law_of(options.law)
+    precision = "float" if options.float else "double"
+    written = write(
+        given, options.path, name=options.name, precision=precision, absolute=options.absolute
+    )
+    print(f"Written: {written}")
+
+
 def commission(options: Namespace) -> None:
     """Run a commissioning, or go on with one, and print its batches."""
     from sb3_yann import Commissioning

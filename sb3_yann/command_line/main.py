@@ -99,6 +99,14 @@ def _add_plant(commands: Any) -> None:
     one.add_argument("--episodes", type=int, default=20, metavar="N", help="default: 20")
     one.set_defaults(run=actions.report)
 
+    one = commands.add_parser("export", help="write a controller: C code, or a file for numpy")
+    one.add_argument("law", help=f"{_MODEL}, a law's .npz file, or {_PROBLEM}")
+    one.add_argument("path", help="where to write it; the suffix tells the format: .c or .npz")
+    one.add_argument("--name", help="prefix of all names in code; default: the file's")
+    one.add_argument("--float", action="store_true", help="code in single precision")
+    one.add_argument("--absolute", action="store_true", help="readings and inputs as the plant's")
+    one.set_defaults(run=actions.export)
+
     one = commands.add_parser("commission", help="improve a model on its plant, batch by batch")
     one.add_argument("model", help=_MODEL)
     one.add_argument("--env", required=True, help=_ENV)

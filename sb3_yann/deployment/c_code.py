@@ -37,6 +37,7 @@ def c_files(data: Arrays, precision: str, about: str) -> dict[str, str]:
     data : dict of str to ndarray
         As `describe` returns them.
     precision : {"double", "float"}
+        Of all numbers.
     about : str
         What stands at the top: where it comes from.
     """
@@ -74,7 +75,7 @@ def _sizes(data: Arrays) -> str:
 
 def _tables(data: Arrays, precision: str) -> str:
     """Return sizes, options and tables."""
-    p, m, n = data["gains"].shape
+    p, _, n = data["gains"].shape
     walks, trees = data["neighbors"].size > 0, "tree_levels" in data
     n_networks = len(data["pinned"])
     rounding = (*data["tolerances"], *ROUNDING["double"][2:])

@@ -35,6 +35,7 @@ class Status(IntFlag):
     NETWORK = 32  # a network put out what is no number; the law acted
 
 
+NAMES = {each: str(each.name).lower() for each in Status}
 SENSOR = Status.NOT_FINITE | Status.OUT_OF_RANGE | Status.FROZEN
 
 
@@ -117,27 +118,22 @@ class Controller:
                     f"{path} holds no controller ({what}). Write it with export(model, path)."
                 ) from None
 
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the file that :meth:`load` reads."""
-        with open(path, "wb") as file:
-            np.savez(file, **self.data)
-
     def reset(self) -> None:
         """Forget all steps, as at the start: the policy acts, from the operating point."""
         n_obs, m = len(self.data["obs_rest"]), len(self.data["action_scale"])
         self.request = self.mode = POLICY
         self.status = Status(0)
-        self.counters = dict.fromkeys(["steps", *MODES, *(s.name.lower() for s in Status)], 0)
+        self.counters = dict.fromkeys(["steps", *MODES, *NAMES.values()], 0)
         self.counters["changes"] = 0
         self._good: Array = self.data["obs_rest"].astype(np.float64)  # the last good readings
-        self._last = np.full(n_obs, np.nan)
-        self._same = np.zeros(n_obs, np.int64)
+        self._last: Array = np.full(n_obs, np.nan)
+        self._same: NDArray[np.int64] = np.zeros(n_obs, np.int64)
         self._faults, self._sound = 0, int(self.data["recover"])
         self._output: Array = self.evaluate(self.data["obs_rest"], networks=False)
         self._bump, self._left = np.zeros(m), 0
 
     def evaluate(self, obs: ArrayLike, networks: bool = True) -> Array:
-        """Return the policy's actions, without memory: (m,) for (n_obs,), or rows of a batch.
+        """Return the policy's actions, without memory: (m,), or (batch, m) for a batch.
 
         What is not finite counts as at the operating point, and the law acts then, as in
         `model.predict`.
@@ -145,17 +141,19 @@ class Controller:
         Parameters
         ----------
         obs : array_like, shape (n_obs,) or (batch, n_obs)
+            In the units of the export.
         networks : bool, default True
             False is the MPC's law.
         """
         rows, single = self._rows(obs)
-        found = self._act(rows, networks)[0] * self.data["action_scale"] + self.data["action_shift"]
-        return found[0] if single else found
+        action: Array = self._act(rows, networks)[0]
+        action = action * self.data["action_scale"] + self.data["action_shift"]
+        return action[0] if single else action
 
     def in_domain(self, obs: ArrayLike) -> NDArray[np.bool_]:
         """Return where the MPC has a solution: a bool, or (batch,)."""
         rows, single = self._rows(obs)
-        inside = self._act(rows, False)[3]
+        inside: NDArray[np.bool_] = self._act(rows, False)[3]
         return inside[0] if single else inside
 
     def __call__(
@@ -204,10 +202,9 @@ class Controller:
         if self._left > 0:
             target = target + self._bump * (self._left / int(self.data["transfer"]))
             self._left -= 1
-        bounds = np.sort([low[0] * scale + shift, high[0] * scale + shift], axis=0)
-        self._output = np.clip(target, *bounds)
+        self._output = np.clip(target, low[0] * scale + shift, high[0] * scale + shift)
         self.mode, self.status = mode, status
-        for name in ("steps", mode, *(s.name.lower() for s in Status if s in status)):
+        for name in ("steps", mode, *(name for each, name in NAMES.items() if each in status)):
             self.counters[name] += 1
         return self._output.copy()
 
@@ -285,7 +282,8 @@ class Controller:
         """Return the part (batch,), from 1 to 0, of a network's output that counts."""
         middle, per_half, (full, none) = *self.data["confines"], self.data["fades"]
         beyond = (np.abs(theta - middle) * per_half).max(1)
-        return np.clip((none - beyond) / (none - full), 0, 1)
+        part: Array = np.clip((none - beyond) / (none - full), 0, 1)
+        return part
 
     def _locate(self, theta: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the first region that theta violates least, and whether it holds theta."""

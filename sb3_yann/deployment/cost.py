@@ -68,7 +68,7 @@ def cost_of(data: Arrays) -> Cost:
     widths = [data[f"layer{i}"].shape[1] for i in range(int(data["n_layers"]))]
     tree = len(data["tree_levels"]) if "tree_levels" in data else 0
     search = 2 * q * n + (q * n if data["neighbors"].size else 0) + tree * n
-    inputs = [n, *widths[:-1]]
+    inputs = [n, *widths][: len(widths)]
     networks = sum(a * b for a, b in zip(inputs, widths, strict=True)) + 2 * n
     n_obs = data["obs_matrix"].shape[1]
     hidden = sum(widths[:-1])

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from sb3_yann._validation import Array, as_between, as_bounds, as_whole
+from sb3_yann._validation import Array
 from sb3_yann.control import OnlineLaw, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.choice import Law
+from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.controller import FORMAT
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from sb3_yann.networks.law_layer import ALL, NONE, LawLayer
@@ -22,52 +21,8 @@ from sb3_yann.policy.policies import YannPolicy
 
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.ELU: "elu"}
 Arrays = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Checks:
-    """What a controller takes for a fault, and how it falls back.
-
-    Parameters
-    ----------
-    obs_min, obs_max : array_like, shape (n_obs,), or float, optional
-        Limits of the readings, in the units of the export. None is no limit.
-    frozen_after : int, default 0
-        A state that stays the same to the bit for so many steps in which another reading moves is
-        frozen. 0 checks nothing: only you know how coarse a sensor is.
-    late_after : float, default 1.5
-        A step is late when more time has passed since the last one, in units of dt. It is checked
-        where a step is told the time.
-    hold : int, default 5
-        Steps with a faulty reading that the last good one stands in for; then the output is held.
-    recover : int, default 10
-        Steps without a fault before the policy acts again. The MPC's law acts until then.
-    transfer : int, default 5
-        Steps within which a change of who acts fades.
-
-    Examples
-    --------
-    >>> Checks(obs_min=[-2, -60], obs_max=[2, 20], frozen_after=30).hold
-    5
-    """
-
-    obs_min: ArrayLike | None = None
-    obs_max: ArrayLike | None = None
-    frozen_after: int = 0
-    late_after: float = 1.5
-    hold: int = 5
-    recover: int = 10
-    transfer: int = 5
-
-    def arrays(self, size: int) -> Arrays:
-        """Return them for ``size`` readings; TypeError or ValueError where one is wrong."""
-        low, high = as_bounds("obs", self.obs_min, self.obs_max, size)
-        counts = {
-            name: np.int64(as_whole(name, getattr(self, name), 0))
-            for name in ("frozen_after", "hold", "recover", "transfer")
-        }
-        late = as_between("late_after", self.late_after, 0, np.inf, "(]")
-        return {"obs_min": low, "obs_max": high, "late_after": np.float64(late), **counts}
+Units = tuple[Array, Array, Array, Array]
+"""theta = matrix @ obs + offset, and action = scale * (what lies in [-1, 1]) + shift."""
 
 
 def describe(
@@ -82,6 +37,7 @@ def describe(
     name : str
         What the controller is called.
     checks : Checks
+        Limits of the readings, and how to fall back.
     absolute : bool, default False
         Whether it takes theta and puts out inputs as the plant has them, not as the env or the
         law does.
@@ -110,7 +66,7 @@ def describe(
         "watched": np.arange(law.n_theta) < len(states),
     }
     _, middle, half = input_range(law)
-    units = np.eye(law.n_theta), np.zeros(law.n_theta), half, middle
+    units: Units = np.eye(law.n_theta), np.zeros(law.n_theta), half, middle
     if absolute:
         units = _plant_units(law)
     return arrays | _with_units(name, law, units, shown, inputs)
@@ -126,7 +82,7 @@ def _of_policy(policy: YannPolicy, name: str, checks: Checks, absolute: bool) ->
     kept = keeps_entries(extractor) or absolute
     box: Any = policy.action_space
     low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
-    units = matrix, offset, (high - low) / 2, (high + low) / 2
+    units: Units = matrix, offset, (high - low) / 2, (high + low) / 2
     if absolute:
         units = _plant_units(law)
     names = list(problem.labels()) if kept else [f"obs[{i}]" for i in range(matrix.shape[1])]
@@ -157,17 +113,17 @@ def _explicit(law: Law | None) -> PiecewiseAffine:
     return law
 
 
-def _names(law: PiecewiseAffine) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _names(law: PiecewiseAffine) -> tuple[list[str], list[str]]:
     """Return what states and inputs are called; no states where the law knows no plant."""
     if law.model is None:
-        return (), tuple(f"u[{i}]" for i in range(law.n_inputs))
+        return [], [f"u[{i}]" for i in range(law.n_inputs)]
     return labels_of(law.model)
 
 
 def law_arrays(law: PiecewiseAffine) -> Arrays:
     """Return a law for inputs in [-1, 1], or as they are where they have no bounds."""
     finite, middle, half = input_range(law)
-    arrays = {
+    arrays: Arrays = {
         "gains": law.gains / half[:, None],
         "offsets": (law.offsets - middle) / half,
         "bounds": np.array([(law.u_min - middle) / half, (law.u_max - middle) / half]),
@@ -265,7 +221,7 @@ def _is_zero(layers: list[Array], pinned: bool) -> bool:
     return silent or not np.any(layers[-1][:, :-1] if pinned else layers[-1])
 
 
-def _plant_units(law: PiecewiseAffine) -> tuple[Array, Array, Array, Array]:
+def _plant_units(law: PiecewiseAffine) -> Units:
     if law.model is None or law.theta_ss is None:
         raise ValueError(
             "absolute = True needs a law that knows its operating point: one from LinearMPC, not "
@@ -278,7 +234,7 @@ def _plant_units(law: PiecewiseAffine) -> tuple[Array, Array, Array, Array]:
 def _with_units(
     name: str,
     law: PiecewiseAffine,
-    units: tuple[Array, Array, Array, Array],
+    units: Units,
     obs_names: Any,
     action_names: Any,
 ) -> Arrays:

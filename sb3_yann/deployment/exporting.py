@@ -18,8 +18,9 @@ from sb3_yann._validation import as_choice, as_flag, as_options
 from sb3_yann.control.law._files import write_arrays
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.deployment.c_code import c_files
+from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.cost import Cost, cost_of
-from sb3_yann.deployment.describe import Arrays, Checks, describe
+from sb3_yann.deployment.describe import Arrays, describe
 from sb3_yann.policy.policies import YannPolicy
 
 PRECISIONS = ("double", "float")

@@ -37,7 +37,8 @@ def steady(controller: Controller, obs: Array, precision: str) -> Array:
             change = np.abs(controller.evaluate(moved) - here) / controller.data["action_scale"]
             kept &= (change < ROOM[precision]).all(1)
             kept &= controller.in_domain(moved) == controller.in_domain(obs)
-    return obs[kept]
+    steady: Array = obs[kept]
+    return steady
 
 
 def vectors(controller: Controller, precision: str) -> dict[str, str]:

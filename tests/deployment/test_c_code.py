@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from deployed import CASES, COMPILERS, STRICT, Compiled, needs_compiler, observations, policy_of
-from sb3_yann import Checks, export
+from sample_laws import solved
+from sb3_yann import Checks, LinearModel, export
 from sb3_yann.deployment.controller import MODES, Status
 from sb3_yann.deployment.selftest import steady
 
@@ -44,7 +45,7 @@ def test_float_is_the_controller_where_it_is_steady(name, tmp_path):
     compiled = Compiled(policy, tmp_path, "float")
     obs = observations(policy, 10_000).astype(np.float32).astype(np.float64)
     kept = steady(compiled.controller, obs, "float")
-    assert len(kept) > 0.5 * len(obs)
+    assert len(kept) > 0.4 * len(obs)
     actions, _ = compiled.at(kept)
     assert error(actions, compiled.controller.evaluate(kept), compiled.controller) < 1e-5
 
@@ -115,20 +116,9 @@ def test_a_header_is_for_cpp_too(tmp_path):
 
 
 def test_names_cannot_end_a_comment(tmp_path):
-    from dataclasses import replace
-
-    from sample_plants import LinearPlant  # noqa: F401 (the support folder is on the path)
-    from sb3_yann import LinearMPC
-
-    policy = policy_of("reactor")
-    mpc = policy.problem
-    model = mpc.model
-    evil = [*list(model.state_names)[:-1], 'T */ int x; /* "Ä\\']
-    names = type(model)(
-        model.A, model.B, model.dt, model.x_ss, model.u_ss, state_names=evil, input_names=["U"]
-    )
-    law = replace(mpc.explicit())
-    assert isinstance(mpc, LinearMPC)
-    compiled = Compiled(law.on_plant(names, np.zeros(4)), tmp_path)
-    actions, _ = compiled.at(np.zeros((1, 4)))
-    assert actions.shape == (1, 1)
+    law = solved("reactor").explicit()
+    plain = law.model
+    names = ["a", "b", "c", 'T */ int x; /* "Ä\\']
+    model = LinearModel(plain.A, plain.B, plain.dt, state_names=names)
+    compiled = Compiled(law.on_plant(model, np.zeros(4)), tmp_path)
+    assert compiled.at(np.zeros((1, 4)))[0] == 0

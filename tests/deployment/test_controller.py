@@ -29,7 +29,7 @@ def controller_of(given, folder: Path, **options) -> Controller:
 def test_it_is_the_policy(name, tmp_path):
     policy = policy_of(name)
     controller = controller_of(policy, tmp_path)
-    obs = observations(policy, 10_000)
+    obs = observations(policy, 10_000).astype(np.float32).astype(np.float64)  # as SB3 takes it
     scale = 2 * controller.data["action_scale"]
     # In float64 by torch, which is an evaluation of its own.
     wide = copy.deepcopy(policy).double()
@@ -106,7 +106,7 @@ def test_importing_it_loads_no_torch():
 def readings(count: int = 200) -> np.ndarray:
     """A plant that moves slowly, so that a jump of the action is the controller's."""
     k = np.arange(count)[:, None]
-    return np.sin(0.05 * k + np.arange(4)) * [0.5, 0.5, 0.5, 5.0]
+    return np.sin(0.003 * k + np.arange(4)) * [0.15, 0.15, 0.15, 1.5]
 
 
 def test_a_lost_sensor_is_bridged_then_the_output_held_and_all_comes_back(tmp_path):
@@ -123,14 +123,14 @@ def test_a_lost_sensor_is_bridged_then_the_output_held_and_all_comes_back(tmp_pa
     assert modes[:50] == ["policy"] * 50
     assert modes[50:55] == ["mpc"] * 5 and modes[55:70] == ["manual"] * 15
     assert modes[70:79] == ["mpc"] * 9 and modes[79:] == ["policy"] * 121
-    moves = np.abs(np.diff(np.ravel(outputs)))
-    assert np.all(np.ravel(outputs)[55:70] == outputs[54][0])  # held
-    # No bump: a change of who acts moves the output hardly more than the plant's own movement.
-    own = np.abs(np.diff(controller.evaluate(obs)[:, 0])).max()
-    bumps = np.abs(controller.evaluate(obs) - controller.evaluate(obs, networks=False)).max()
-    assert bumps > 5 * own  # it would have jumped
-    held = np.abs(controller.evaluate(obs[70], networks=False) - outputs[69]).max()
-    assert moves.max() < max(bumps, held) / 5 + 2 * own
+    found = np.ravel(outputs)
+    assert np.all(found[55:70] == found[54])  # held
+    # A change of who acts would be a jump; it fades within five steps instead.
+    by_policy, by_law = (controller.evaluate(obs, networks=each)[:, 0] for each in (True, False))
+    own, jump = np.abs(np.diff(by_policy)).max(), np.abs(by_policy - by_law).max()
+    assert jump > 50 * own
+    assert np.abs(np.diff(found)).max() < 1.3 * jump / 5
+    assert found[85:] == pytest.approx(by_policy[85:])
     counted = controller.counters
     assert counted["steps"] == 200 and counted["changes"] == 4
     assert (counted["manual"], counted["mpc"]) == (15, 14)
@@ -247,7 +247,7 @@ def test_an_online_law_and_strange_networks_say_why_not(tmp_path):
     strange = disturbed(solved("reactor"), activation_fn=th.nn.Softsign)
     with pytest.raises(ValueError, match="Softsign"):
         export(strange, tmp_path / "plant.c")
-    with pytest.raises(TypeError, match="MlpPolicy|dict|cannot be exported"):
+    with pytest.raises(TypeError, match="dict cannot be exported"):
         export({}, tmp_path / "plant.c")
     assert list(tmp_path.iterdir()) == []
 

@@ -105,7 +105,8 @@ def observations(policy: YannPolicy, count: int, seed: int = 0) -> np.ndarray:
     if policy.observation is None:
         return theta
     back = np.linalg.pinv(policy.observation.matrix)
-    return (theta - policy.observation.offset) @ back.T
+    seen = (theta - policy.observation.offset) @ back.T
+    return seen + rng.normal(size=seen.shape) * (policy.observation.matrix == 0).all(0)
 
 
 class Compiled:

@@ -1,0 +1,57 @@
+"""What a controller takes for a fault."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import as_between, as_bounds, as_whole
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What a controller takes for a fault, and how it falls back.
+
+    Parameters
+    ----------
+    obs_min, obs_max : array_like, shape (n_obs,), or float, optional
+        Limits of the readings, in the units of the export. None is no limit.
+    frozen_after : int, default 0
+        A state that stays the same to the bit for so many steps in which another reading moves is
+        frozen. 0 checks nothing: only you know how coarse a sensor is.
+    late_after : float, default 1.5
+        A step is late when more time has passed since the last one, in units of dt. It is checked
+        where a step is told the time.
+    hold : int, default 5
+        Steps with a faulty reading that the last good one stands in for; then the output is held.
+    recover : int, default 10
+        Steps without a fault before the policy acts again. The MPC's law acts until then.
+    transfer : int, default 5
+        Steps within which a change of who acts fades.
+
+    Examples
+    --------
+    >>> Checks(obs_min=[-2, -60], obs_max=[2, 20], frozen_after=30).hold
+    5
+    """
+
+    obs_min: ArrayLike | None = None
+    obs_max: ArrayLike | None = None
+    frozen_after: int = 0
+    late_after: float = 1.5
+    hold: int = 5
+    recover: int = 10
+    transfer: int = 5
+
+    def arrays(self, size: int) -> dict[str, Any]:
+        """Return them for ``size`` readings; TypeError or ValueError where one is wrong."""
+        low, high = as_bounds("obs", self.obs_min, self.obs_max, size)
+        counts = {
+            name: np.int64(as_whole(name, getattr(self, name), 0))
+            for name in ("frozen_after", "hold", "recover", "transfer")
+        }
+        late = as_between("late_after", self.late_after, 0, np.inf, "(]")
+        return {"obs_min": low, "obs_max": high, "late_after": np.float64(late), **counts}
