@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="seven regions only, in a minute")
     parser.add_argument(
         "--only", metavar="SECTION", nargs="+", default=[],
-        help="law, actor, train, solve, exact, memory, online, env, gpu; writes no report "
+        help="law, actor, train, solve, exact, memory, online, export, env, gpu; writes no report "
         "unless --report",
     )  # fmt: skip
     parser.add_argument("--report", type=Path, metavar="FILE", help="docs/performance.md")

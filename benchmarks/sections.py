@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 
 from benchmarks import (
+    deployment,
     evaluation,
     exactness,
     gpu,
@@ -40,6 +41,8 @@ TITLES = {
     online.TRAIN: "The online law: one training step of DDPG, batch of 256",
     online.BUILT: "The online law: DDPG is built",
     online.EXACT: "The online law: exactness",
+    deployment.SECTION: "Exported controllers of the reactor, one step",
+    deployment.SMALL: "An exported controller of the reactor on an emulated microcontroller",
     simulators.SECTION: "Environments",
     memory.SECTION: "Memory",
     gpu.SECTION: "Processor and CUDA device",
@@ -57,6 +60,7 @@ WHOLE: dict[str, Callable[[Bench], None]] = {
     "suite": suite.suite,
     "large": large.large,
     "online": online.online,
+    "export": deployment.deployment,
     "env": simulators.simulators,
 }
 GPU = "gpu"

@@ -19,7 +19,7 @@ import sb3_yann
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"sb3_yann": ROOT / "sb3_yann", "sb3_yann_envs": ROOT / "envs" / "sb3_yann_envs"}
-ROOMS = "audit callbacks control evaluation guard networks policy wrappers".split()
+ROOMS = "audit callbacks control deployment evaluation guard networks policy wrappers".split()
 
 # `import sb3_yann` alone loads next to nothing: names are loaded at their first use.
 LOAD_ALL = {
@@ -67,7 +67,8 @@ def test_the_sdist_holds_the_code_of_every_room_and_no_outcome_of_it(sdist_names
     code = {path for room in rooms for path in (ROOT / room).rglob("*.py")}
     assert {path.relative_to(ROOT).as_posix() for path in code} <= sdist_names
     outcomes = [name for name in sdist_names if name.startswith(("benchmarks/", "experiments/"))]
-    assert all(name.endswith(".py") for name in outcomes)
+    firmware = (".c", ".ld")  # around exported code, on an emulated microcontroller
+    assert all(Path(name).suffix in (".py", *firmware) for name in outcomes)
 
 
 def test_metadata(metadata: Message) -> None:
@@ -90,6 +91,7 @@ def test_the_wheel_holds_every_file_of_both_packages_and_nothing_else(
     found = {name for name in wheel_names if ".dist-info/" not in name}
     assert found == expected
     assert {"sb3_yann/py.typed", "sb3_yann_envs/py.typed"} <= found
+    assert "sb3_yann/deployment/c/controller.c" in found
     assert [name for name in found if name.startswith("sb3_yann/hyperparams/")]
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in wheel_names)
 

@@ -62,7 +62,9 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["commissioning", "guard", "headroom", "policy", "report", "twin"])
+@pytest.mark.parametrize(
+    "name", ["commissioning", "export", "guard", "headroom", "policy", "report", "twin"]
+)
 def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     run(f"docs/{name}.md")
@@ -95,7 +97,16 @@ def test_the_code_in_the_page_of_the_environments_runs() -> None:
 
 def test_every_page_with_code_is_run_by_a_test() -> None:
     found = {path.stem for path in PAGES if blocks(path.read_text(encoding="utf-8"))}
-    known = ("README", "commissioning", "environments", "guard", "gymnasium", "headroom", "mpc")
+    known = (
+        "README",
+        "commissioning",
+        "environments",
+        "export",
+        "guard",
+        "gymnasium",
+        "headroom",
+        "mpc",
+    )
     known += ("pcgym", "policy", "report", "twin")
     assert found == {*known}
 

@@ -29,7 +29,7 @@ ACTIVATION = {
 }
 
 
-def c_files(data: Arrays, precision: str, about: str) -> dict[str, str]:
+def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, str]:
     """Return the texts of the C files by their names.
 
     Parameters
@@ -40,16 +40,18 @@ def c_files(data: Arrays, precision: str, about: str) -> dict[str, str]:
         Of all numbers.
     about : str
         What stands at the top: where it comes from.
+    file : str
+        What the files are called, without a suffix.
     """
     name = str(data["name"])
     entries = {
         "ABOUT": comment([*about.splitlines(), *_units(data), "", str(cost_of(data)) + "."]),
         "SIZES": _sizes(data),
         "REAL": precision,
-        "NAME": name,
+        "FILE": file,
         "TABLES": _tables(data, precision),
     }
-    suffixes = {"controller.h": ".h", "controller.c": ".c", "selftest.c": "_selftest.c"}
+    suffixes = {"controller.c": ".c", "controller.h": ".h", "selftest.c": "_selftest.c"}
     found = {}
     for source, suffix in suffixes.items():
         text = (files("sb3_yann.deployment") / "c" / source).read_text(encoding="ascii")
@@ -57,7 +59,7 @@ def c_files(data: Arrays, precision: str, about: str) -> dict[str, str]:
         for key, entry in {**entries, **own}.items():
             text = text.replace(f"@{key}@", entry)
         text = text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
-        found[name + suffix] = text
+        found[file + suffix] = text
     return found
 
 

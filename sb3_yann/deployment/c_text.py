@@ -16,7 +16,17 @@ def literal(value: float, precision: str) -> str:
 
 
 def table(kind: str, name: str, values: NDArray[np.generic], precision: str) -> str:
-    """Return the declaration of a constant array."""
+    """Return the declaration of a constant array.
+
+    Parameters
+    ----------
+    kind, name : str
+        Its type and its name.
+    values : ndarray
+        Of any shape but an empty one.
+    precision : {"double", "float"}
+        Of its numbers.
+    """
     sizes = "".join(f"[{each}]" for each in values.shape)
     return f"static const {kind} {name}{sizes} = {_nested(values, precision, 0)};"
 

@@ -7,13 +7,13 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import sha256
+from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-import sb3_yann
 from sb3_yann._validation import as_choice, as_flag, as_options
 from sb3_yann.control.law._files import write_arrays
 from sb3_yann.control.mpc.choice import Law
@@ -40,6 +40,12 @@ class Exported:
         Tables, and the operations of a step at worst.
     digest : str
         Of the arrays: two exports of the same controller have the same.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> export(problems.cstr().explicit(), "reactor.npz").cost.multiplications
+    694
     """
 
     paths: tuple[Path, ...]
@@ -139,10 +145,10 @@ def _write_npz(data: Arrays, path: Path, precision: str) -> list[Path]:
 
 def _write_c(data: Arrays, path: Path, precision: str) -> list[Path]:
     about = (
-        f"{data['name']}, a controller, written by sb3-yann {sb3_yann.__version__}; "
+        f"{data['name']}, a controller, written by sb3-yann {version('sb3-yann')}; "
         f"digest {digest_of(data)}."
     )
-    texts = c_files(data, precision, about)
+    texts = c_files(data, precision, about, path.stem)
     parts = {path.parent / file: text for file, text in texts.items()}
     return write_texts(parts)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG, TD3
 
-from sb3_yann import LinearMPC, PiecewiseAffine, YannPolicy
+from sb3_yann import Controller, LinearMPC, PiecewiseAffine, YannPolicy
 from sb3_yann.command_line import main
 from twin_samples import Cart, problem
 
@@ -75,6 +75,17 @@ def test_plot_draws_a_law_from_its_file_from_a_model_and_from_a_problem(model, f
         assert (folder / "law.png").stat().st_size > 5000
         (folder / "law.png").unlink()
     assert main(["plot", "law.npz", "law.png", "--axes", "0", "7"]) == 1
+
+
+def test_export_writes_code_and_says_what_it_costs(model, folder, capsys) -> None:
+    assert main(["export", "cart.zip", "cart.c", "--float", "--name", "wagon"]) == 0
+    assert "multiplications" in capsys.readouterr().out
+    assert (folder / "cart.c").exists() and (folder / "cart_selftest.c").exists()
+    assert "typedef float wagon_real" in (folder / "cart.h").read_text()
+    assert main(["export", "my_cart:cart", "cart.npz"]) == 0
+    u = Controller.load("cart.npz").evaluate([0.3, 0.1])
+    assert np.allclose(u, problem().explicit()([0.3, 0.1]))
+    assert main(["export", "cart.zip", "cart.doc"]) == 1
 
 
 def test_report_writes_one_page(model, folder) -> None:

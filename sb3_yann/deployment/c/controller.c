@@ -5,7 +5,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "@NAME@.h"
+#include "@FILE@.h"
 
 typedef yann_real real;
 

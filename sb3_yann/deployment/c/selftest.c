@@ -1,12 +1,12 @@
 /*
- * A test of @NAME@.c with known answers: it returns 0 and prints the largest error, in parts of an
- * input's range, or returns 1. Compile it with @NAME@.c, and run it on the target.
+ * A test of @FILE@.c with known answers: it returns 0 and prints the largest error, in parts of an
+ * input's range, or returns 1. Compile it with @FILE@.c, and run it on the target.
  */
 #include <math.h>
 #include <stddef.h>
 #include <stdio.h>
 
-#include "@NAME@.h"
+#include "@FILE@.h"
 
 #define N_POINTS @POINTS@
 #define N_STEPS @STEPS@
@@ -54,7 +54,7 @@ int main(void)
         wrong += !(worst(action, actions[k]) <= @ROOM@);
         wrong += found != (unsigned)status[k] || state.mode != (yann_mode)modes[k];
     }
-    printf("@NAME@: largest error %.2g (policy), %.2g (law), %.2g (steps) of the range; %s\n",
+    printf("@FILE@: largest error %.2g (policy), %.2g (law), %.2g (steps) of the range; %s\n",
            by_policy, by_law, by_step, wrong ? "FAILED" : "passed");
     return wrong ? 1 : 0;
 }
