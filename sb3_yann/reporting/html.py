@@ -26,7 +26,8 @@ h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .3rem; }
 h2 { border-top: 2px solid #0072b2; font-size: 1.25rem; margin: 2.6rem 0 .6rem;
   padding-top: .5rem; }
 h3 { font-size: 1.02rem; margin: 1.5rem 0 .4rem; }
-h1, h2, h3, td, th, p, li { overflow-wrap: anywhere; }
+h1, h2, h3, p, li { overflow-wrap: anywhere; }
+td, th { overflow-wrap: break-word; }
 p { margin: .5rem 0; max-width: 46rem; }
 .said { color: #555; }
 nav ol { columns: 2; margin: .3rem 0; padding-left: 1.6rem; }
@@ -38,7 +39,7 @@ th, td { border-bottom: 1px solid #ddd; padding: .25rem .7rem .25rem 0; text-ali
 th { border-bottom: 1.5px solid #888; font-weight: 600; }
 td.number, th.number { text-align: right; white-space: nowrap; }
 pre { background: #f6f6f6; font: .82rem/1.4 ui-monospace, Menlo, Consolas, monospace;
-  overflow-x: auto; padding: .7rem .9rem; }
+  overflow-x: auto; padding: .7rem .9rem; white-space: pre-wrap; }
 figure { margin: 1rem 0; }
 figcaption { color: #555; font-size: .88rem; max-width: 46rem; }
 img { display: block; height: auto; max-width: 100%; }
@@ -56,7 +57,6 @@ img { display: block; height: auto; max-width: 100%; }
   nav { display: none; }
   a { color: inherit; text-decoration: none; }
   .wide, pre { overflow: visible; }
-  pre { white-space: pre-wrap; }
   table { font-size: 8.5pt; }
   h2, h3 { break-after: avoid; }
   figure, tr, .sign { break-inside: avoid; }
