@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
 PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
 	$(PY) -m pytest -n logical --maxprocesses 4 --dist loadfile
 # python -m, not the scripts in .venv/bin: their first line breaks on a path with spaces.
@@ -13,7 +14,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --quiet
 CODE := sb3_yann envs benchmarks experiments examples tests
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper bench test test-fast check format clean
+.PHONY: help demo paper bench test test-fast check docs format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -39,12 +40,16 @@ check: $(STAMP)  ## lint, check the formatting and the types
 	$(PY) -m ruff format --check $(CODE)
 	$(PY) -m mypy
 
+docs: $(DOCS_STAMP)  ## build the documentation as a site, docs/_build/html/index.html
+	@$(PY) -m sphinx --quiet --fail-on-warning --keep-going docs docs/_build/html
+	@echo "built docs/_build/html/index.html"
+
 format: $(STAMP)  ## format the code and apply the linter's safe fixes
 	$(PY) -m ruff check --fix --exit-zero --quiet $(CODE)
 	$(PY) -m ruff format $(CODE)
 
 clean:  ## remove .venv, caches and build outputs
-	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist docs/_build docs/_made .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find $(CODE) -type d -name __pycache__ -prune -exec rm -rf {} +
 
 $(STAMP): pyproject.toml constraints.txt
@@ -63,3 +68,10 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PIP) install -c constraints.txt --no-build-isolation -e '.[dev]'
 	@touch $@
 	@echo "installed into $(VENV)"
+
+$(DOCS_STAMP): $(STAMP)
+	@$(PY) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "error: the documentation needs Python 3.11 or newer:" \
+			"make clean docs PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@$(PIP) install -c constraints.txt --no-build-isolation -e '.[docs]'
+	@touch $@
