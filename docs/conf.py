@@ -60,7 +60,8 @@ myst_heading_anchors = 3
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_google_docstring = False
-suppress_warnings = ["ref.python"]  # words in the types of parameters that attributes are called, too
+# Words in the types of parameters, which attributes of several classes are called too.
+suppress_warnings = ["ref.python"]
 
 
 def write_pages(*_: Any) -> None:

@@ -30,7 +30,7 @@ def save(figure: Figure, name: str) -> None:
     """Save a figure in few colors, which keeps it small."""
     path = HERE / f"{name}.png"
     figure.savefig(path, dpi=90)
-    Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)
+    Image.open(path).convert("RGB").quantize(200).save(path, optimize=True)
     print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
 
 
