@@ -37,7 +37,7 @@ ENVS = {"ClippedPendulumEnv": "clipped_pendulum", "CSTREnv": "cstr"}
 OUTSIDE = ("README", "CONTRIBUTING", "CHANGELOG")
 
 project = "sb3-yann"
-author = "the sb3-yann authors"
+author = copyright = "the sb3-yann authors"
 version = release = importlib.import_module("sb3_yann").__version__
 root_doc = "index"
 extensions = [
@@ -60,8 +60,10 @@ myst_heading_anchors = 3
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_google_docstring = False
-# Words in the types of parameters, which attributes of several classes are called too.
-suppress_warnings = ["ref.python"]
+# The types of parameters are words, "array_like, shape (n,)": no names to look up.
+napoleon_use_param = False
+napoleon_use_rtype = False
+suppress_warnings = ["ref.python"]  # such words that attributes of two classes are called, too
 
 
 def write_pages(*_: Any) -> None:
@@ -74,6 +76,14 @@ def write_pages(*_: Any) -> None:
         for each in OUTSIDE:
             text = text.replace(f"]({each}.md", f"]({each.lower()}.md")
         (MADE / f"{name.lower()}.md").write_text(text, encoding="utf-8")
+    for name, home in ENVS.items():
+        env = getattr(importlib.import_module(f"sb3_yann_envs.{home}"), name)
+        (MADE / f"{name}.md").write_text(f"# {name}\n\n{inspect.getdoc(env)}\n", encoding="utf-8")
+    (MADE / "api.rst").write_text(api_page(), encoding="utf-8")
+
+
+def api_page() -> str:
+    """Return the page that lists the public names, each with a page of its own."""
     lines, seen = ["API", "===", ""], set[int]()
     for package, title in API.items():
         module = importlib.import_module(package)
@@ -83,13 +93,8 @@ def write_pages(*_: Any) -> None:
         lines += ["", title, "-" * len(title), "", f".. currentmodule:: {package}", ""]
         lines += [".. autosummary::", "   :toctree: api", "   :nosignatures:", ""]
         lines += [f"   {name}" for name in names]
-    lines += ["", ".. toctree::", "   :maxdepth: 1", ""]
-    for name, home in ENVS.items():
-        env = getattr(importlib.import_module(f"sb3_yann_envs.{home}"), name)
-        text = f"# {name}\n\n{inspect.getdoc(env)}\n"
-        (MADE / f"{name}.md").write_text(text, encoding="utf-8")
-        lines.append(f"   {name}")
-    (MADE / "api.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    lines += ["", ".. toctree::", "   :maxdepth: 1", "", *(f"   {name}" for name in ENVS), ""]
+    return "\n".join(lines)
 
 
 def read_page(_: Any, name: str, source: list[str]) -> None:
