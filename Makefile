@@ -10,10 +10,10 @@ PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
 # python -m, not the scripts in .venv/bin: their first line breaks on a path with spaces.
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
-CODE := sb3_yann envs benchmarks experiments examples tests
+CODE := sb3_yann envs benchmarks experiments examples tests docs/conf.py docs/pictures.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper bench test test-fast check format clean
+.PHONY: help demo paper bench test test-fast check docs format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -39,12 +39,19 @@ check: $(STAMP)  ## lint, check the formatting and the types
 	$(PY) -m ruff format --check $(CODE)
 	$(PY) -m mypy
 
+docs: $(STAMP)  ## build the documentation as a site, docs/_build/html/index.html
+	@$(PY) -c 'import sphinx' 2>/dev/null || { \
+		echo "error: the documentation needs Python 3.11 or newer:" \
+			"make clean docs PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@$(PY) -m sphinx --quiet --fail-on-warning --keep-going docs docs/_build/html
+	@echo "built docs/_build/html/index.html"
+
 format: $(STAMP)  ## format the code and apply the linter's safe fixes
 	$(PY) -m ruff check --fix --exit-zero --quiet $(CODE)
 	$(PY) -m ruff format $(CODE)
 
 clean:  ## remove .venv, caches and build outputs
-	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist docs/_build docs/_made .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find $(CODE) -type d -name __pycache__ -prune -exec rm -rf {} +
 
 $(STAMP): pyproject.toml constraints.txt

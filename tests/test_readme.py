@@ -63,7 +63,9 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["commissioning", "export", "guard", "headroom", "policy", "report", "twin"]
+    "name",
+    ["cloned_policy", "commissioning", "export", "guard", "headroom", "policy", "report"]
+    + ["tutorial", "twin"],
 )
 def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -91,23 +93,16 @@ def test_an_environment_of_gymnasium_takes_twelve_lines(at, needs) -> None:
     np.testing.assert_allclose(action.detach().numpy()[0], wanted, atol=0.02)
 
 
-def test_the_code_in_the_page_of_the_environments_runs() -> None:
-    run("docs/environments.md")
+@pytest.mark.parametrize("name", ["environments", "gallery", "own_plant"])
+def test_the_code_in_a_page_that_does_not_train_runs(name) -> None:
+    run(f"docs/{name}.md")
 
 
 def test_every_page_with_code_is_run_by_a_test() -> None:
     found = {path.stem for path in PAGES if blocks(path.read_text(encoding="utf-8"))}
-    known = (
-        "README",
-        "commissioning",
-        "environments",
-        "export",
-        "guard",
-        "gymnasium",
-        "headroom",
-        "mpc",
-    )
-    known += ("pcgym", "policy", "report", "twin")
+    known = ("README", "cloned_policy", "commissioning", "environments", "gallery", "guard")
+    known += ("gymnasium", "headroom", "mpc", "own_plant", "pcgym", "policy", "report", "tutorial")
+    known += ("export", "twin")
     assert found == {*known}
 
 

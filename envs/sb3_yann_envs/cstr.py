@@ -225,8 +225,8 @@ class CSTREnv(ProblemEnv):
 
     ## Rewards
 
-    *r = -(0.1 (dC_A<sup>2</sup> + dC_B<sup>2</sup> + dC_S<sup>2</sup> + dT<sup>2</sup>)
-    + 0.0001 u<sup>2</sup>)*, with the deviations before the step and the clipped action, computed
+    *r = -(0.1 (dC_A<sup>2</sup> + dC_B<sup>2</sup> + dC_S<sup>2</sup> + dT<sup>2</sup>) +
+    0.0001 u<sup>2</sup>)*, with the deviations before the step and the clipped action, computed
     from the state in float64. A step at whose end T > 480 K costs 1e5 more.
 
     The `info` of a step holds `cost` (minus the reward, with the penalty) and `violation` (whether

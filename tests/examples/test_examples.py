@@ -76,3 +76,19 @@ def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
     assert after < 0.99 * before and "violations: 0" in done.stdout
     assert (tmp_path / "out" / "from_a_log.zip").exists()
     assert (tmp_path / "out" / "from_a_log.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_cloned_policy_forgets_and_a_yann_policy_does_not(tmp_path) -> None:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "cloned_policy.py", "--episodes", "1"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "100"},
+    )
+    assert done.returncode == 0, done.stderr
+    rows = re.findall(r"│ (\d) +│ ([\d.,]+) \(\d+\) +│ ([\d.,]+) \(\d+\)", done.stdout)
+    costs = {int(n): [float(each.replace(",", "")) for each in rest] for n, *rest in rows}
+    assert costs[0][0] == pytest.approx(costs[0][1], rel=0.01)  # both are the MPC at first
+    assert costs[1][0] > 1.1 * costs[0][0] and costs[1][1] == costs[0][1]

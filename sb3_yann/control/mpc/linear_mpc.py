@@ -45,7 +45,7 @@ class LinearMPC(MPCProblem):
     r"""The linear MPC problem, in deviations from the model's operating point.
 
     .. math::
-        \min_{u_0 \dots u_{N-1}} \sum_{k=0}^{N-1} \gamma^k (e_k' Q e_k + v_k' R v_k
+        \min_{u_0 \ldots u_{N-1}} \sum_{k=0}^{N-1} \gamma^k (e_k' Q e_k + v_k' R v_k
             + \Delta u_k' R_{du} \Delta u_k) + \gamma^N z_N' P z_N,
             \quad x_{k+1} = A x_k + B u_k + E d
 
