@@ -214,7 +214,7 @@ class Controller:
         beyond = finite & ((obs < self.data["obs_min"]) | (obs > self.data["obs_max"]))
         moved = obs != self._last
         self._same = np.where(moved, 0, self._same + bool(moved.any()))
-        self._last = obs
+        self._last = obs.copy()  # a caller may fill the same array again
         after = int(self.data["frozen_after"])
         frozen = finite & self.data["watched"] & (self._same >= after) & (after > 0)
         for which, flag in (

@@ -157,6 +157,16 @@ def test_limits_frozen_sensors_and_late_steps(tmp_path):
     assert controller.status == Status.LATE and controller.mode == "mpc"
 
 
+def test_an_array_that_is_filled_again_is_not_frozen(tmp_path):
+    controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(frozen_after=3))
+    buffer = np.zeros(4)
+    for row in readings(20):
+        buffer[:] = row
+        buffer[1] = 0.1  # this one is
+        controller(buffer)
+    assert controller.status == Status.FROZEN
+
+
 def test_the_operator_takes_over_and_gives_back_without_a_bump(tmp_path):
     controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(transfer=4))
     obs = readings(30) * 0.1
