@@ -76,7 +76,7 @@ def test_metadata(metadata: Message) -> None:
     assert metadata["Version"] == sb3_yann.__version__
     assert metadata["License-Expression"] == "MIT"
     assert metadata["Requires-Python"] == ">=3.10"
-    assert metadata.get_all("Provides-Extra") == "bench dev docs paper pcgym zoo".split()
+    assert metadata.get_all("Provides-Extra") == "bench dev docs export paper pcgym zoo".split()
 
 
 def test_the_wheel_holds_every_file_of_both_packages_and_nothing_else(

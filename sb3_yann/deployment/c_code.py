@@ -11,14 +11,9 @@ from sb3_yann.deployment.c_text import comment, literal, table
 from sb3_yann.deployment.controller import Controller
 from sb3_yann.deployment.cost import cost_of, index_bytes
 from sb3_yann.deployment.describe import Arrays
+from sb3_yann.deployment.rounding import rounding_of
 from sb3_yann.deployment.selftest import vectors
 
-ROUNDING = {
-    # TOLERANCE and TIE as in the law; SURELY_INSIDE, CLEAR and BACK as in its compiled search.
-    "double": (None, None, 1e-9, 1e-6, 1e-9),
-    # In float a slack is known to some 1e-6 of a half-width of the box.
-    "float": (1e-5, 2e-6, 1e-5, 1e-4, 1e-5),
-}
 ACTIVATION = {
     ("tanh", "double"): "tanh(x)",
     ("tanh", "float"): "tanhf(x)",
@@ -80,10 +75,7 @@ def _tables(data: Arrays, precision: str) -> str:
     p, _, n = data["gains"].shape
     walks, trees = data["neighbors"].size > 0, "tree_levels" in data
     n_networks = len(data["pinned"])
-    rounding = (*data["tolerances"], *ROUNDING["double"][2:])
-    if precision == "float":
-        rounding = ROUNDING["float"]
-    names = "TOLERANCE", "TIE", "SURELY_INSIDE", "CLEAR", "BACK"
+    rounding = rounding_of(data, precision)._asdict()
     flags = {
         "N_THETA": n,
         "N_REGIONS": p,
@@ -99,7 +91,7 @@ def _tables(data: Arrays, precision: str) -> str:
         "RECOVER": int(data["recover"]),
         "TRANSFER": int(data["transfer"]),
         "LATE_AFTER": literal(data["late_after"], precision),
-        **{k: literal(v, precision) for k, v in zip(names, rounding, strict=True)},
+        **{name.upper(): literal(value, precision) for name, value in rounding.items()},
     }
     numbers = {
         "A": data["A"], "b": data["b"], "gains": data["gains"], "offsets": data["offsets"],

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import as_between, as_bounds, as_whole
+from sb3_yann._validation import as_bounds, as_positive, as_whole
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Checks:
     frozen_after : int, default 0
         A state that stays the same to the bit for so many steps in which another reading moves is
         frozen. 0 checks nothing: only you know how coarse a sensor is.
-    late_after : float, default 1.5
-        A step is late when more time has passed since the last one, in units of dt. It is checked
-        where a step is told the time.
+    late_after : float, optional
+        A step is late when more time has passed since the last one, in units of dt, 1.5 by default.
+        It is checked where a step is told the time. None checks nothing.
     hold : int, default 5
         Steps with a faulty reading that the last good one stands in for; then the output is held.
     recover : int, default 10
@@ -41,7 +41,7 @@ class Checks:
     obs_min: ArrayLike | None = None
     obs_max: ArrayLike | None = None
     frozen_after: int = 0
-    late_after: float = 1.5
+    late_after: float | None = 1.5
     hold: int = 5
     recover: int = 10
     transfer: int = 5
@@ -53,5 +53,7 @@ class Checks:
             name: np.int64(as_whole(name, getattr(self, name), 0))
             for name in ("frozen_after", "hold", "recover", "transfer")
         }
-        late = as_between("late_after", self.late_after, 0, np.inf, "(]")
+        late = np.inf
+        if self.late_after is not None:
+            late = as_positive("late_after", self.late_after, "None checks nothing.")
         return {"obs_min": low, "obs_max": high, "late_after": np.float64(late), **counts}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import version
@@ -21,9 +21,10 @@ from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.cost import Cost, cost_of
 from sb3_yann.deployment.describe import Arrays, describe
+from sb3_yann.deployment.onnx_graph import onnx_model
+from sb3_yann.deployment.rounding import PRECISIONS
 from sb3_yann.policy.policies import YannPolicy
 
-PRECISIONS = ("double", "float")
 WORDS = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -81,13 +82,14 @@ def export(
         A law takes theta and puts out the input in deviations.
     path : str or PathLike
         Its suffix tells the format.
-    format : {"npz", "c"}, optional
+    format : {"npz", "c", "onnx"}, optional
         ``npz`` is for :class:`Controller`, which needs numpy alone. ``c`` is C99: a file, its
-        header beside it, and a test with known answers.
+        header beside it, and a test with known answers. ``onnx`` is a graph without memory, from
+        ``obs`` (batch, n_obs) to ``action`` and ``outside``; it needs onnx to write.
     name : str, optional
         Prefix of all names in code; the file's by default.
     precision : {"double", "float"}, default "double"
-        Of the numbers in code.
+        Of the numbers in code and graphs.
     absolute : bool, default False
         Whether observations are theta, and actions inputs, as the plant has them. By default they
         are the env's, or the law's.
@@ -102,7 +104,7 @@ def export(
 
     Raises
     ------
-    TypeError, ValueError
+    ImportError, TypeError, ValueError
         If there is no such export; nothing is written then.
 
     Examples
@@ -153,12 +155,17 @@ def _write_c(data: Arrays, path: Path, precision: str) -> list[Path]:
     return write_texts(parts)
 
 
-def write_texts(texts: dict[Path, str]) -> list[Path]:
+def _write_onnx(data: Arrays, path: Path, precision: str) -> list[Path]:
+    return write_texts({path: onnx_model(data, precision, digest_of(data))})
+
+
+def write_texts(texts: Mapping[Path, str | bytes]) -> list[Path]:
     """Write all files, or none; return their paths."""
     parts = {path: path.with_name(f"{path.name}.{os.getpid()}.part") for path in texts}
     try:
         for path, text in texts.items():
-            parts[path].write_text(text, encoding="ascii", newline="\n")
+            content = text if isinstance(text, bytes) else text.encode("ascii")
+            parts[path].write_bytes(content)
         for path, part in parts.items():
             os.replace(part, path)
     finally:
@@ -167,4 +174,8 @@ def write_texts(texts: dict[Path, str]) -> list[Path]:
     return list(texts)
 
 
-FORMATS: dict[str, Callable[[Arrays, Path, str], list[Path]]] = {"npz": _write_npz, "c": _write_c}
+FORMATS: dict[str, Callable[[Arrays, Path, str], list[Path]]] = {
+    "npz": _write_npz,
+    "c": _write_c,
+    "onnx": _write_onnx,
+}

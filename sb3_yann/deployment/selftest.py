@@ -7,10 +7,9 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.deployment.c_text import table
 from sb3_yann.deployment.controller import MODES, Controller
+from sb3_yann.deployment.rounding import ROOM
 
 POINTS, STEPS = 48, 60
-ROOM = {"double": 1e-12, "float": 1e-5}
-"""How far exported code may be off, in parts of an input's range."""
 
 
 def points(controller: Controller, count: int, seed: int = 0) -> Array:

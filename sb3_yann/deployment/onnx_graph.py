@@ -1,0 +1,239 @@
+"""A controller without memory as an ONNX graph: ``action`` and ``outside`` of ``obs``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann.deployment.controller import ACTIVATIONS
+from sb3_yann.deployment.describe import Arrays
+from sb3_yann.deployment.rounding import rounding_of
+
+OPSET = 17
+
+
+def onnx_model(data: Arrays, precision: str, digest: str) -> bytes:
+    """Return the file of a graph that is `Controller.evaluate`.
+
+    ``obs`` (batch, n_obs) to ``action`` (batch, m) and ``outside`` (batch,): where the MPC has no
+    solution. All regions are asked at once: a batch of B takes B times the largest number of
+    half-spaces of a region times the regions.
+
+    Parameters
+    ----------
+    data : dict of str to ndarray
+        As `describe` returns them.
+    precision : {"double", "float"}
+        Of all numbers, in and out.
+    digest : str
+        Goes into the metadata, with the names of all entries.
+
+    Raises
+    ------
+    ImportError
+        If onnx is not installed.
+    """
+    try:
+        import onnx
+    except ImportError:
+        raise ImportError("An ONNX file needs onnx: pip install onnx.") from None
+    graph = _Graph(precision)
+    action, outside = _policy(graph, data, rounding_of(data, precision))
+    kind = onnx.TensorProto.DOUBLE if precision == "double" else onnx.TensorProto.FLOAT
+    value = onnx.helper.make_tensor_value_info
+    n_obs, m = data["obs_matrix"].shape[1], len(data["action_scale"])
+    graph.op("Identity", action, to="action")
+    graph.op("Identity", outside, to="outside")
+    whole = onnx.helper.make_graph(
+        graph.nodes,
+        str(data["name"]),
+        [value("obs", kind, ["batch", n_obs])],
+        [
+            value("action", kind, ["batch", m]),
+            value("outside", onnx.TensorProto.BOOL, ["batch"]),
+        ],
+        graph.constants,
+    )
+    opset = [onnx.helper.make_opsetid("", OPSET)]
+    model = onnx.helper.make_model(whole, producer_name="sb3-yann", opset_imports=opset)
+    model.ir_version = 8  # what runtimes of that opset read
+    names = {key: ", ".join(map(str, data[key])) for key in ("obs_names", "action_names")}
+    onnx.helper.set_model_props(model, {"digest": digest, **names})
+    onnx.checker.check_model(model)
+    found: bytes = model.SerializeToString()
+    return found
+
+
+class _Graph:
+    """Nodes and constants, each with a name of its own."""
+
+    def __init__(self, precision: str) -> None:
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+        self.real = np.float64 if precision == "double" else np.float32
+
+    def new(self) -> str:
+        """Return a name that is not taken."""
+        return f"v{len(self.nodes)}"
+
+    def op(self, kind: str, *inputs: str, to: str = "", **attributes: Any) -> str:
+        """Add a node; return the name of what it puts out."""
+        import onnx
+
+        name = to or self.new()
+        self.nodes.append(onnx.helper.make_node(kind, list(inputs), [name], **attributes))
+        return name
+
+    def constant(self, values: Any) -> str:
+        """Add a constant: whole numbers and bools as they are, others in the precision."""
+        import onnx
+
+        array: NDArray[Any] = np.asarray(values)
+        if array.dtype.kind == "f":
+            array = array.astype(self.real)
+        name = f"c{len(self.constants)}"
+        self.constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    def number(self, given: str) -> str:
+        """Return a bool as a number, 0 or 1."""
+        import onnx
+
+        wide = self.real is np.float64
+        kind = onnx.TensorProto.DOUBLE if wide else onnx.TensorProto.FLOAT
+        self.nodes.append(onnx.helper.make_node("Cast", [given], [name := self.new()], to=kind))
+        return name
+
+    def not_finite(self, given: str) -> str:
+        """Return where a number is NaN or infinite."""
+        # x - x is 0 for numbers alone; runtimes know IsInf for some types only.
+        return self.op("Not", self.op("Equal", self.op("Sub", given, given), self.constant(0.0)))
+
+    def any(self, given: str) -> str:
+        """Return where a row (batch, k) of bools holds one that is true, (batch, 1)."""
+        most = self.op("ReduceMax", self.number(given), axes=[1], keepdims=1)
+        return self.op("Greater", most, self.constant(0.0))
+
+    def between(self, value: str, low: str, high: str) -> str:
+        """Return a value clipped to bounds that broadcast."""
+        return self.op("Min", self.op("Max", value, low), high)
+
+    def times(self, matrices: str, vectors: str) -> str:
+        """Return matrices (batch, a, b) times vectors (batch, b): (batch, a)."""
+        last = self.constant(np.array([2]))
+        column = self.op("Unsqueeze", vectors, last)
+        return self.op("Squeeze", self.op("MatMul", matrices, column), last)
+
+
+def _policy(graph: _Graph, data: Arrays, rounding: Any) -> tuple[str, str]:
+    """Return the names of action and outside."""
+    op, constant = graph.op, graph.constant
+    zero = constant(0.0)
+    lost = graph.not_finite("obs")
+    seen = op("Where", lost, zero, "obs")
+    theta = op("MatMul", seen, constant(data["obs_matrix"].T))
+    theta = op("Add", theta, constant(data["obs_offset"][None]))
+    shown = constant((data["obs_matrix"] != 0).astype(float).T)
+    depends = op("Greater", op("MatMul", graph.number(lost), shown), zero)
+    theta = op("Where", op("Or", depends, graph.not_finite(theta)), zero, theta)
+    region, inside = _locate(graph, data, theta, rounding)
+    law = graph.times(op("Gather", constant(data["gains"]), region), theta)
+    law = op("Add", law, op("Gather", constant(data["offsets"]), region))
+    law = op("Where", graph.not_finite(law), zero, law)
+    if data["zero_input"]:
+        law = op("Where", inside, law, constant(data["resting"][None]))
+    low, high = (constant(each[None]) for each in data["bounds"])
+    law = graph.between(law, low, high)
+    if len(data["change"]):
+        m = len(data["action_scale"])
+        ends = (constant(np.array([each])) for each in (-m, 2**31 - 1, 1))
+        last = op("Slice", theta, *ends)
+        last = op("Mul", last, constant(data["per_input"][None]))
+        last = op("Sub", last, constant(data["middle"][None]))
+        ways = [op("Add", last, constant(each[None])) for each in data["change"]]
+        low, high = (graph.between(each, low, high) for each in ways)
+        law = graph.between(law, low, high)
+    if int(data["n_layers"]):
+        added = _correction(graph, data, theta, region)
+        added = op("Where", graph.any(lost), zero, added)
+        law = graph.between(op("Add", law, added), low, high)
+    action = op("Mul", law, constant(data["action_scale"][None]))
+    action = op("Add", action, constant(data["action_shift"][None]))
+    return action, op("Squeeze", op("Not", inside), constant(np.array([1])))
+
+
+def _locate(graph: _Graph, data: Arrays, theta: str, rounding: Any) -> tuple[str, str]:
+    """Return the region (batch,) that theta violates least, and whether it holds it (batch, 1)."""
+    op, constant = graph.op, graph.constant
+    starts, rows = data["starts"], len(data["b"])
+    counts = np.diff([*starts, rows])
+    A = np.zeros((len(starts), counts.max(), theta_size := data["A"].shape[1]))
+    b = np.full(A.shape[:2], np.inf)  # rows that never bind fill up the shorter regions
+    for i, (start, count) in enumerate(zip(starts, counts, strict=True)):
+        A[i, :count], b[i, :count] = data["A"][start : start + count], data["b"][start:][:count]
+    slack = op("MatMul", theta, constant(A.reshape(-1, theta_size).T))
+    slack = op("Sub", constant(b.reshape(1, -1)), slack)
+    slack = op("Reshape", slack, constant(np.array([-1, *b.shape])))
+    slack = op("ReduceMin", slack, axes=[2], keepdims=0)
+    largest = op("ReduceMax", slack, axes=[1], keepdims=1)
+    room = op("Add", op("Abs", largest), constant(1.0))
+    nearly = op("Sub", largest, op("Mul", room, constant(rounding.tie)))
+    ties = graph.number(op("Not", op("Less", slack, nearly)))
+    region = op("ArgMax", ties, axis=1, keepdims=0)
+    return region, op("Not", op("Less", largest, constant(-rounding.tolerance)))
+
+
+def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
+    """Return what the networks add, (batch, m)."""
+    op, constant = graph.op, graph.constant
+    number, act = data["network_of"], ACTIVATIONS[str(data["activation"])]
+    used = op("Gather", constant(np.maximum(number, 0)), region)
+    x = op("Mul", theta, constant(data["per_theta"][None]))
+    moved = graph.any(op("Not", op("Equal", x, constant(0.0))))
+    pinned = data["pinned"]
+    last = int(data["n_layers"]) - 1
+    for i in range(last + 1):
+        layer = data[f"layer{i}"]
+        W, bias = layer[:, :, :-1], layer[:, :, -1]
+        if i == last:
+            bias = np.where(pinned[:, None], 0.0, bias)
+        x = graph.times(op("Gather", constant(W), used), x)
+        x = op("Add", x, op("Gather", constant(bias), used))
+        if i < last:
+            at_zero = np.where(pinned[:, None], act(bias), 0.0)
+            x = op("Sub", _activate(graph, x, data), op("Gather", constant(at_zero), used))
+    sound = op("Not", graph.any(graph.not_finite(x)))
+    counts = op("Unsqueeze", op("Gather", constant(number >= 0), region), constant(np.array([1])))
+    still = op("And", op("Unsqueeze", op("Gather", constant(pinned), used),
+                         constant(np.array([1]))), op("Not", moved))  # fmt: skip
+    counts = op("And", op("And", counts, sound), op("Not", still))
+    x = op("Where", counts, x, constant(0.0))
+    if np.isfinite(data["reach"]):
+        x = graph.between(x, constant(-data["reach"]), constant(data["reach"]))
+    return op("Mul", x, _part(graph, data, theta))
+
+
+def _part(graph: _Graph, data: Arrays, theta: str) -> str:
+    """Return the part (batch, 1), from 1 to 0, of a correction that counts."""
+    op, constant = graph.op, graph.constant
+    middle, per_half = data["confines"]
+    full, none = data["fades"]
+    beyond = op("Abs", op("Sub", theta, constant(middle[None])))
+    beyond = op("Mul", beyond, constant(per_half[None]))
+    beyond = op("ReduceMax", beyond, axes=[1], keepdims=1)
+    part = op("Div", op("Sub", constant(none), beyond), constant(none - full))
+    return graph.between(part, constant(0.0), constant(1.0))
+
+
+def _activate(graph: _Graph, x: str, data: Arrays) -> str:
+    """Return the activation of x."""
+    kind, op = str(data["activation"]), graph.op
+    if kind == "tanh":
+        return op("Tanh", x)
+    zero = graph.constant(0.0)
+    if kind == "relu":
+        return op("Max", x, zero)
+    below = op("Sub", op("Exp", op("Min", x, zero)), graph.constant(1.0))
+    return op("Where", op("Greater", x, zero), x, below)
