@@ -10,9 +10,14 @@ def literal(value: float, precision: str) -> str:
     """Return a number as C has it, exact in its precision."""
     if np.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"
-    digits, end = (9, "f") if precision == "float" else (17, "")
-    text = f"{float(value):.{digits}g}"
-    return (text if any(mark in text for mark in ".e") else f"{text}.0") + end
+    return f"{shortest(value, precision)}{'f' if precision == 'float' else ''}"
+
+
+def shortest(value: float, precision: str) -> str:
+    """Return the shortest decimal number that is exact in the precision, with a point."""
+    text = str(np.float32(value)) if precision == "float" else repr(float(value))
+    head, exponent, tail = text.partition("e")
+    return f"{head if '.' in head else f'{head}.0'}{exponent}{tail}"
 
 
 def table(kind: str, name: str, values: NDArray[np.generic], precision: str) -> str:

@@ -23,6 +23,7 @@ from sb3_yann.deployment.cost import Cost, cost_of
 from sb3_yann.deployment.describe import Arrays, describe
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.rounding import PRECISIONS
+from sb3_yann.deployment.structured_text import plcopen_xml, st_text
 from sb3_yann.policy.policies import YannPolicy
 
 WORDS = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -82,10 +83,11 @@ def export(
         A law takes theta and puts out the input in deviations.
     path : str or PathLike
         Its suffix tells the format.
-    format : {"npz", "c", "onnx"}, optional
+    format : {"npz", "c", "onnx", "st", "xml"}, optional
         ``npz`` is for :class:`Controller`, which needs numpy alone. ``c`` is C99: a file, its
         header beside it, and a test with known answers. ``onnx`` is a graph without memory, from
-        ``obs`` (batch, n_obs) to ``action`` and ``outside``; it needs onnx to write.
+        ``obs`` (batch, n_obs) to ``action`` and ``outside``; it needs onnx to write. ``st`` is
+        IEC 61131-3 Structured Text, a function block; ``xml`` the same for PLCopen's importers.
     name : str, optional
         Prefix of all names in code; the file's by default.
     precision : {"double", "float"}, default "double"
@@ -146,17 +148,28 @@ def _write_npz(data: Arrays, path: Path, precision: str) -> list[Path]:
 
 
 def _write_c(data: Arrays, path: Path, precision: str) -> list[Path]:
-    about = (
-        f"{data['name']}, a controller, written by sb3-yann {version('sb3-yann')}; "
-        f"digest {digest_of(data)}."
-    )
-    texts = c_files(data, precision, about, path.stem)
+    texts = c_files(data, precision, _about(data), path.stem)
     parts = {path.parent / file: text for file, text in texts.items()}
     return write_texts(parts)
 
 
 def _write_onnx(data: Arrays, path: Path, precision: str) -> list[Path]:
     return write_texts({path: onnx_model(data, precision, digest_of(data))})
+
+
+def _write_st(data: Arrays, path: Path, precision: str) -> list[Path]:
+    return write_texts({path: st_text(data, precision, _about(data))})
+
+
+def _write_plcopen(data: Arrays, path: Path, precision: str) -> list[Path]:
+    return write_texts({path: plcopen_xml(data, precision, _about(data))})
+
+
+def _about(data: Arrays) -> str:
+    return (
+        f"{data['name']}, a controller, written by sb3-yann {version('sb3-yann')}; "
+        f"digest {digest_of(data)}."
+    )
 
 
 def write_texts(texts: Mapping[Path, str | bytes]) -> list[Path]:
@@ -178,4 +191,6 @@ FORMATS: dict[str, Callable[[Arrays, Path, str], list[Path]]] = {
     "npz": _write_npz,
     "c": _write_c,
     "onnx": _write_onnx,
+    "st": _write_st,
+    "xml": _write_plcopen,
 }

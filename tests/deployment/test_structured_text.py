@@ -1,0 +1,126 @@
+"""The Structured Text of an export is the controller, step by step, faults included."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from deployed import CASES, observations, policy_of
+from sb3_yann import Checks, Controller, export
+from sb3_yann.deployment.controller import MODES, Status
+from sb3_yann.deployment.selftest import steady
+from structured_text import FunctionBlock
+
+
+def both(name, folder, **options):
+    export(policy_of(name), folder / "plant.npz", **options)
+    export(policy_of(name), folder / "plant.st", **options)
+    return Controller.load(folder / "plant.npz"), FunctionBlock((folder / "plant.st").read_text())
+
+
+def error(found, wanted, controller) -> float:
+    return float(np.max(np.abs(found - wanted) / (2 * controller.data["action_scale"])))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_block_is_the_policy(name, tmp_path):
+    controller, block = both(name, tmp_path)
+    obs = steady(controller, observations(policy_of(name), 160), "double")
+    assert len(obs) > 60
+    for row in obs:
+        command, status, mode = block.step(obs=list(row), request=0)
+        assert mode == 0
+        assert error(command, controller.evaluate(row), controller) < 1e-12
+        assert status == (0 if controller.in_domain(row) else Status.OUTSIDE)
+
+
+@pytest.mark.parametrize("name", ["reactor", "references and rates", "two inputs, zero input"])
+def test_steps_with_faults_are_the_controllers(name, tmp_path):
+    obs = observations(policy_of(name), 200)
+    low, high = np.percentile(obs, [5, 95], axis=0)
+    checks = Checks(obs_min=low, obs_max=high, frozen_after=3, hold=2, recover=4, transfer=3)
+    controller, block = both(name, tmp_path, checks=checks)
+    generator, calm = np.random.default_rng(3), np.clip(obs, low, high)
+    met, modes, m = Status(0), set(), len(controller.data["action_scale"])
+    for k in range(400):
+        seen = calm[k // 2 % len(calm)].copy()
+        if k % 40 > 30:
+            seen[0] = calm[0, 0]  # frozen
+        if generator.random() < 0.1:
+            seen[generator.integers(len(seen))] = generator.choice([np.nan, np.inf, -np.inf, 1e9])
+        elapsed = 2.0 if generator.random() < 0.05 else 1.0
+        request = int(generator.choice([0, 1, 2], p=[0.9, 0.05, 0.05]))
+        manual = generator.uniform(-1, 1, m) if generator.random() < 0.5 else None
+        controller.request = MODES[request]
+        wanted = controller(seen, elapsed, manual)
+        given = {"manual": [0.0] * m if manual is None else list(manual)}
+        given |= {"has_manual": manual is not None, "elapsed": elapsed, "request": request}
+        command, status, mode = block.step(obs=list(seen), **given)
+        assert error(command, wanted, controller) < 1e-12, k
+        assert (status, MODES[mode]) == (int(controller.status), controller.mode), k
+        met |= controller.status
+        modes.add(mode)
+    assert modes == {0, 1, 2}
+    assert Status.OUT_OF_RANGE | Status.FROZEN | Status.LATE | Status.NOT_FINITE in met
+
+
+def test_plcopen_holds_the_same_block(tmp_path):
+    export(policy_of("reactor"), tmp_path / "plant.st")
+    export(policy_of("reactor"), tmp_path / "plant.xml")
+    space = "{http://www.plcopen.org/xml/tc6_0201}"
+    root = ElementTree.parse(tmp_path / "plant.xml").getroot()
+    assert root.tag == f"{space}project"
+    (pou,) = root.iter(f"{space}pou")
+    assert pou.attrib == {"name": "plant", "pouType": "functionBlock"}
+    body = "".join(pou.find(f"{space}body").itertext())
+    text = (tmp_path / "plant.st").read_text()
+    assert body.strip() in text
+    block = FunctionBlock(text)
+    tables = {}
+    for variable in pou.iter(f"{space}variable"):
+        values = variable.find(f"{space}initialValue/{space}arrayValue")
+        if values is not None:
+            tables[variable.get("name").lower()] = [
+                float(each.find(f"{space}simpleValue").get("value"))
+                for each in values
+                for _ in range(int(each.get("repetitionValue", 1)))
+            ]
+    assert {"a", "gains", "layer0", "starts"} <= set(tables)
+    assert all(np.array_equal(block.vars[name], each) for name, each in tables.items())
+    named = [each.get("name") for each in root.find(f".//{space}inputVars")]
+    assert named == ["obs", "elapsed", "request", "has_manual", "manual"]
+
+
+@pytest.mark.skipif(shutil.which("blark") is None, reason="no blark")
+def test_blark_parses_it(tmp_path):
+    for name in ("reactor", "two inputs, zero input", "references and rates"):
+        export(policy_of(name), tmp_path / "plant.st")
+        done = subprocess.run(
+            ["blark", "parse", "plant.st"], cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_single_precision_is_real(tmp_path):
+    export(policy_of("reactor"), tmp_path / "plant.st", precision="float")
+    text = (tmp_path / "plant.st").read_text()
+    assert "LREAL" not in text and "DINT_TO_REAL" in text
+    block = FunctionBlock(text)  # in Python's doubles, with tables of floats
+    export(policy_of("reactor"), tmp_path / "plant.npz")
+    controller = Controller.load(tmp_path / "plant.npz")
+    for row in steady(controller, observations(policy_of("reactor"), 50), "float"):
+        command, _, _ = block.step(obs=list(row), request=0)
+        assert error(command, controller.evaluate(row), controller) < 1e-5
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_name_is_taken_twice_whatever_its_case(name, tmp_path):
+    export(policy_of(name), tmp_path / "plant.st")
+    text = re.sub(r"\(\*.*?\*\)", "", (tmp_path / "plant.st").read_text(), flags=re.S)
+    names = [each.lower() for each in re.findall(r"^\s*(\w+) : ", text, flags=re.M)]
+    assert len(names) > 30 and len(names) == len(set(names))
