@@ -99,9 +99,9 @@ def _add_plant(commands: Any) -> None:
     one.add_argument("--episodes", type=int, default=20, metavar="N", help="default: 20")
     one.set_defaults(run=actions.report)
 
-    one = commands.add_parser("export", help="write a controller: C code, or a file for numpy")
+    one = commands.add_parser("export", help="write a controller: C code, a function block, ...")
     one.add_argument("law", help=f"{_MODEL}, a law's .npz file, or {_PROBLEM}")
-    one.add_argument("path", help="where to write it; the suffix tells the format: .c or .npz")
+    one.add_argument("path", help="where to write it: .c, .npz, .onnx, .st, .xml (PLCopen) or .fmu")
     one.add_argument("--name", help="prefix of all names in code; default: the file's")
     one.add_argument("--float", action="store_true", help="code in single precision")
     one.add_argument("--absolute", action="store_true", help="readings and inputs as the plant's")

@@ -21,6 +21,7 @@ from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.cost import Cost, cost_of
 from sb3_yann.deployment.describe import Arrays, describe
+from sb3_yann.deployment.fmu import fmu_bytes
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.rounding import PRECISIONS
 from sb3_yann.deployment.structured_text import plcopen_xml, st_text
@@ -83,11 +84,12 @@ def export(
         A law takes theta and puts out the input in deviations.
     path : str or PathLike
         Its suffix tells the format.
-    format : {"npz", "c", "onnx", "st", "xml"}, optional
+    format : {"npz", "c", "onnx", "st", "xml", "fmu"}, optional
         ``npz`` is for :class:`Controller`, which needs numpy alone. ``c`` is C99: a file, its
         header beside it, and a test with known answers. ``onnx`` is a graph without memory, from
         ``obs`` (batch, n_obs) to ``action`` and ``outside``; it needs onnx to write. ``st`` is
         IEC 61131-3 Structured Text, a function block; ``xml`` the same for PLCopen's importers.
+        ``fmu`` is an FMU with sources, FMI 2.0 for co-simulation.
     name : str, optional
         Prefix of all names in code; the file's by default.
     precision : {"double", "float"}, default "double"
@@ -165,6 +167,10 @@ def _write_plcopen(data: Arrays, path: Path, precision: str) -> list[Path]:
     return write_texts({path: plcopen_xml(data, precision, _about(data))})
 
 
+def _write_fmu(data: Arrays, path: Path, precision: str) -> list[Path]:
+    return write_texts({path: fmu_bytes(data, precision, _about(data), digest_of(data))})
+
+
 def _about(data: Arrays) -> str:
     return (
         f"{data['name']}, a controller, written by sb3-yann {version('sb3-yann')}; "
@@ -193,4 +199,5 @@ FORMATS: dict[str, Callable[[Arrays, Path, str], list[Path]]] = {
     "onnx": _write_onnx,
     "st": _write_st,
     "xml": _write_plcopen,
+    "fmu": _write_fmu,
 }
