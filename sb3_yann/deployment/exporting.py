@@ -24,7 +24,7 @@ from sb3_yann.deployment.describe import Arrays, describe
 from sb3_yann.deployment.fmu import fmu_bytes
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.rounding import PRECISIONS
-from sb3_yann.deployment.structured_text import plcopen_xml, st_text
+from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
 from sb3_yann.policy.policies import YannPolicy
 
 WORDS = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -108,7 +108,7 @@ def export(
 
     Raises
     ------
-    ImportError, TypeError, ValueError
+    ImportError, OSError, TypeError, ValueError
         If there is no such export; nothing is written then.
 
     Examples
@@ -127,6 +127,10 @@ def export(
             f"name = {called!r} must be a word of letters, digits and underscores that begins with "
             "a letter: it goes into the names of the code. Pass name=."
         )
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"There is no folder {target.parent}: make it first.")
+    if kind in ("st", "xml") and called.upper() in RESERVED:
+        raise ValueError(f"name = {called!r} is a word of Structured Text. Pass another name=.")
     own = as_options("checks", checks or Checks(), Checks)
     data = describe(given, called, own, as_flag("absolute", absolute))
     paths = FORMATS[kind](data, target, precision)

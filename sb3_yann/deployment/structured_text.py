@@ -34,6 +34,15 @@ END_FOR;""",
 }
 """Of both entries of ``pair``; what is no number stays it."""
 TYPES = {"double": "LREAL", "float": "REAL"}
+RESERVED = set(
+    """
+    ABS ACTION AND ARRAY AT BOOL BY BYTE CASE CONSTANT COS DATE DINT DO DT DWORD ELSE ELSIF EN
+    ENO EXIT EXP FALSE FOR FUNCTION IF INT LEFT LEN LIMIT LINT LN LOG LREAL MAX MID MIN MOD MUX
+    NOT OF OR PROGRAM REAL REPEAT RETURN RIGHT SEL SIN SINT STEP STRING STRUCT TAN TASK THEN
+    TIME TO TOD TRUE TYPE UDINT UINT ULINT UNTIL USINT VAR WHILE WITH WORD WSTRING XOR
+    """.split()
+)
+"""Words of the language that a function block cannot be called."""
 LARGEST = {"double": 1e300, "float": 1e37}
 """Beyond it a reading counts as infinite: standard functions cannot ask whether a number is."""
 

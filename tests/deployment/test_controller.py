@@ -236,6 +236,8 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
     [
         ({"path": "plant.xyz"}, ValueError, "format"),
         ({"path": "2 tanks.c"}, ValueError, "name = '2 tanks'"),
+        ({"path": "real.st"}, ValueError, "name = 'real' is a word of Structured Text"),
+        ({"path": "no/plant.c"}, FileNotFoundError, "There is no folder"),
         ({"precision": "half"}, ValueError, "precision"),
         ({"checks": {"hold": -1}}, (TypeError, ValueError), "checks|hold"),
         ({"checks": Checks(obs_min=[1, 2])}, ValueError, "obs_min"),
