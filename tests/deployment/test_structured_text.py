@@ -124,3 +124,14 @@ def test_no_name_is_taken_twice_whatever_its_case(name, tmp_path):
     text = re.sub(r"\(\*.*?\*\)", "", (tmp_path / "plant.st").read_text(), flags=re.S)
     names = [each.lower() for each in re.findall(r"^\s*(\w+) : ", text, flags=re.M)]
     assert len(names) > 30 and len(names) == len(set(names))
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("name", ["reactor", "two inputs, zero input", "references and rates"])
+def test_it_is_what_matiec_compiles_rightly(name, precision, tmp_path):
+    checks = Checks(late_after=None)
+    export(policy_of(name), tmp_path / "plant.st", precision=precision, checks=checks)
+    text = re.sub(r"\(\*.*?\*\)", "", (tmp_path / "plant.st").read_text(), flags=re.S)
+    assert "END_WHILE" in text and not re.search(r"\bFOR\b", text)
+    literals = [abs(float(each)) for each in re.findall(r"\d+\.\d+(?:e[-+]?\d+)?", text)]
+    assert len(literals) > 200 and all(x == 0 or 1e-37 <= x <= 1e38 for x in literals)
