@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from sb3_yann.deployment.c_text import comment, literal, table
 from sb3_yann.deployment.controller import Controller
-from sb3_yann.deployment.cost import cost_of, index_bytes
+from sb3_yann.deployment.cost import cost_of
 from sb3_yann.deployment.describe import Arrays
 from sb3_yann.deployment.rounding import rounding_of
 from sb3_yann.deployment.selftest import vectors
+from sb3_yann.deployment.tables import index_bytes, search_tables, tables_of
 
 ACTIVATION = {
     ("tanh", "double"): "tanh(x)",
@@ -76,7 +77,7 @@ def _tables(data: Arrays, precision: str) -> str:
     walks, trees = data["neighbors"].size > 0, "tree_levels" in data
     n_networks = len(data["pinned"])
     rounding = rounding_of(data, precision)._asdict()
-    flags = {
+    flags: dict[str, object] = {
         "N_THETA": n,
         "N_REGIONS": p,
         "FABS(x)": "fabsf(x)" if precision == "float" else "fabs(x)",
@@ -93,49 +94,26 @@ def _tables(data: Arrays, precision: str) -> str:
         "LATE_AFTER": literal(data["late_after"], precision),
         **{name.upper(): literal(value, precision) for name, value in rounding.items()},
     }
-    numbers = {
-        "A": data["A"], "b": data["b"], "gains": data["gains"], "offsets": data["offsets"],
-        "input_min": data["bounds"][0], "input_max": data["bounds"][1],
-        "obs_matrix": data["obs_matrix"], "obs_offset": data["obs_offset"],
-        "obs_rest": data["obs_rest"], "obs_min": data["obs_min"], "obs_max": data["obs_max"],
-        "action_scale": data["action_scale"], "action_shift": data["action_shift"],
-        "resting": data["resting"],
-    }  # fmt: skip
-    whole = {
-        "starts": np.array([*data["starts"], len(data["b"])]),
-        "watched": data["watched"],
-    }
+    numbers, whole = tables_of(data)
+    of_search, indices_of_search = search_tables(data)
+    numbers, whole = {**numbers, **of_search}, {**whole, **indices_of_search}
     if walks:
         flags["WALK_FROM"] = int(data["walk_from"])
-        whole["neighbors"], numbers["walk_slack"] = data["neighbors"], data["walk_slack"]
-    if trees:
-        numbers |= {f"tree_{key}": data[f"tree_{key}"] for key in ("normals", "levels")}
-        keys = "children", "leaf_starts", "leaf_regions"
-        whole |= {f"tree_{key}": data[f"tree_{key}"] for key in keys}
-    if flags["RATE"]:
-        numbers["change_min"], numbers["change_max"] = data["change"]
-        numbers |= {"per_input": data["per_input"], "middle": data["middle"]}
     if n_networks:
-        _add_networks(data, precision, flags, numbers, whole)
-    index = f"int{8 * index_bytes(sum(map(np.size, whole.values())))}_t"
+        flags |= _network_flags(data, precision)
+    index = f"int{8 * index_bytes(whole)}_t"
     defined = [f"#define {name} {value}" for name, value in flags.items()]
     tables = [table("real", name, each, precision) for name, each in numbers.items()]
     indices = [table(index, name, each, precision) for name, each in whole.items()]
     return "\n".join([*defined, "", *tables, *indices])
 
 
-def _add_networks(
-    data: Arrays,
-    precision: str,
-    flags: dict[str, object],
-    numbers: dict[str, NDArray[np.float64]],
-    whole: dict[str, NDArray[np.int64]],
-) -> None:
-    """Add the sizes and tables of the networks."""
+def _network_flags(data: Arrays, precision: str) -> dict[str, object]:
+    """Return the sizes of the networks."""
     last = int(data["n_layers"]) - 1
     widths = [data[f"layer{i}"].shape[1] for i in range(last)]
     full, none = data["fades"]
-    flags |= {
+    return {
         "N_LAYERS": last + 1,
         **{f"WIDTH_{i + 1}": width for i, width in enumerate(widths)},
         "WIDTH_LAST": widths[-1],
@@ -144,11 +122,3 @@ def _add_networks(
         "FADES_FROM": literal(full, precision),
         "FADES_TO": literal(none, precision),
     }
-    numbers |= {f"layer{i}": data[f"layer{i}"] for i in range(last)}
-    numbers |= {
-        "last_layer": data[f"layer{last}"],
-        "per_theta": data["per_theta"],
-        "confine_middle": data["confines"][0],
-        "confine_per_half": data["confines"][1],
-    }
-    whole |= {"network_of": data["network_of"], "pinned": data["pinned"].astype(np.int64)}

@@ -4,17 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from sb3_yann.deployment.describe import Arrays
-
-TABLES = (
-    "gains", "offsets", "bounds", "A", "b", "obs_matrix", "obs_offset", "obs_rest", "action_scale",
-    "action_shift", "change", "per_theta", "confines", "layer0", "layer1", "layer2", "walk_slack",
-    "tree_normals", "tree_levels", "resting", "obs_min", "obs_max",
-)  # fmt: skip
-INDICES = "starts", "network_of", "neighbors", "tree_children", "tree_leaf_starts"
-WHOLE = (*INDICES, "tree_leaf_regions")
+from sb3_yann.deployment.tables import index_bytes, search_tables, tables_of
 
 
 @dataclass(frozen=True)
@@ -27,6 +18,8 @@ class Cost:
         Entries of its tables of numbers.
     indices : int
         Entries of its tables of whole numbers.
+    index_bytes : int
+        Bytes of each of these.
     multiplications : int
         Multiplications, each with an addition, of one step at worst: a search that must ask every
         region twice.
@@ -38,13 +31,14 @@ class Cost:
 
     numbers: int
     indices: int
+    index_bytes: int
     multiplications: int
     activations: int
     locals: int
 
     def table_bytes(self, size: int) -> int:
         """Return the bytes of the tables, for numbers of ``size`` bytes."""
-        return self.numbers * size + self.indices * index_bytes(self.indices)
+        return self.numbers * size + self.indices * self.index_bytes
 
     def __str__(self) -> str:
         """Say it in words."""
@@ -56,14 +50,10 @@ class Cost:
         )
 
 
-def index_bytes(count: int) -> int:
-    """Return the bytes of an index into tables with so many entries."""
-    return 2 if count < 2**15 else 4
-
-
 def cost_of(data: Arrays) -> Cost:
     """Return what a controller of these arrays costs."""
-    size = {name: int(np.size(data[name])) for name in (*TABLES, *WHOLE) if name in data}
+    tables = zip(tables_of(data), search_tables(data), strict=True)
+    numbers, whole = ({**own, **of_search} for own, of_search in tables)
     (_, m, n), q = data["gains"].shape, len(data["b"])
     widths = [data[f"layer{i}"].shape[1] for i in range(int(data["n_layers"]))]
     tree = len(data["tree_levels"]) if "tree_levels" in data else 0
@@ -73,8 +63,9 @@ def cost_of(data: Arrays) -> Cost:
     n_obs = data["obs_matrix"].shape[1]
     hidden = sum(widths[:-1])
     return Cost(
-        numbers=sum(size.get(name, 0) for name in TABLES),
-        indices=sum(size.get(name, 0) for name in WHOLE),
+        numbers=sum(each.size for each in numbers.values()),
+        indices=sum(each.size for each in whole.values()),
+        index_bytes=index_bytes(whole),
         multiplications=n * n_obs + search + m * (n + 2) + (networks if widths else 0),
         activations=2 * hidden,
         locals=2 * n + 7 * m + hidden + 8,

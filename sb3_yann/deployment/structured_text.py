@@ -12,6 +12,7 @@ import numpy as np
 from sb3_yann.deployment.c_text import shortest as real
 from sb3_yann.deployment.describe import Arrays
 from sb3_yann.deployment.rounding import rounding_of
+from sb3_yann.deployment.tables import tables_of
 
 ACTIVATE = {
     "tanh": """k := 0;
@@ -116,7 +117,7 @@ def _parts(data: Arrays, precision: str) -> tuple[str, list[str], list[str], str
         interface, body, variables = (
             text.replace(f"@{key}@", value) for text in (interface, body, variables)
         )
-    constants = [*_numbers(data, precision), *_tables(data, precision, flags)]
+    constants = [*_numbers(data, precision), *_tables(data, precision)]
     declared = [line.strip() for line in variables.splitlines() if line.strip()]
     return interface, constants, declared, body
 
@@ -186,28 +187,9 @@ def _numbers(data: Arrays, precision: str) -> Iterator[str]:
         yield f"{name.upper()} : DINT := {int(data[name])};"
 
 
-def _tables(data: Arrays, precision: str, flags: set[str]) -> Iterator[str]:
+def _tables(data: Arrays, precision: str) -> Iterator[str]:
     """Yield declarations of arrays, flat: their rows follow each other."""
-    numbers = {
-        "A": data["A"], "b": data["b"], "gains": data["gains"], "offsets": data["offsets"],
-        "input_min": data["bounds"][0], "input_max": data["bounds"][1],
-        "obs_matrix": data["obs_matrix"], "obs_offset": data["obs_offset"],
-        "obs_rest": data["obs_rest"], "obs_min": data["obs_min"], "obs_max": data["obs_max"],
-        "action_scale": data["action_scale"], "action_shift": data["action_shift"],
-    }  # fmt: skip
-    whole = {"starts": np.array([*data["starts"], len(data["b"])])}
-    if "zero input" in flags:
-        numbers["resting"] = data["resting"]
-    if "rate" in flags:
-        numbers["change_min"], numbers["change_max"] = data["change"]
-        numbers |= {"per_input": data["per_input"], "middle": data["middle"]}
-    if "networks" in flags:
-        last = int(data["n_layers"]) - 1
-        numbers |= {f"layer{i}": data[f"layer{i}"] for i in range(last)}
-        numbers |= {"last_layer": data[f"layer{last}"], "per_theta": data["per_theta"]}
-        numbers["confine_middle"], numbers["confine_per_half"] = data["confines"]
-        whole |= {"network_of": data["network_of"], "pinned": data["pinned"].astype(np.int64)}
-    whole["watched"] = data["watched"].astype(np.int64)
+    numbers, whole = tables_of(data)
     for name, values in numbers.items():
         kept = np.where(np.abs(values) < SMALLEST, 0.0, np.clip(values, -LARGEST, LARGEST))
         texts = [real(float(each), precision) for each in kept.flat]

@@ -8,11 +8,21 @@ import subprocess
 import numpy as np
 import pytest
 
-from deployed import CASES, COMPILERS, STRICT, Compiled, needs_compiler, observations, policy_of
+from deployed import (
+    CASES,
+    COMPILERS,
+    STRICT,
+    Compiled,
+    needs_compiler,
+    observations,
+    policy_of,
+    with_faults,
+)
 from sample_laws import solved
-from sb3_yann import Checks, LinearModel, export
+from sb3_yann import LinearModel, export
 from sb3_yann.deployment.controller import MODES, Status
 from sb3_yann.deployment.selftest import steady
+from sb3_yann.deployment.tables import index_bytes
 
 pytestmark = needs_compiler
 WITHOUT_MEMORY = Status.OUTSIDE | Status.NETWORK | Status.NOT_FINITE
@@ -52,25 +62,11 @@ def test_float_is_the_controller_where_it_is_steady(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["reactor", "references and rates", "mixed observations"])
 def test_steps_with_faults_are_the_controllers(name, tmp_path):
-    policy = policy_of(name)
-    obs = observations(policy, 400)
-    low, high = np.percentile(obs, [5, 95], axis=0)
-    checks = Checks(obs_min=low, obs_max=high, frozen_after=3, hold=2, recover=4, transfer=3)
-    compiled, generator = Compiled(policy, tmp_path, checks=checks), np.random.default_rng(3)
-    controller, calm = compiled.controller, np.clip(obs, low, high)
+    checks, steps = with_faults(policy_of(name), 600)
+    compiled = Compiled(policy_of(name), tmp_path, checks=checks)
+    controller, met, modes = compiled.controller, Status(0), set()
     compiled.begin()
-    met, modes = Status(0), set()
-    for k in range(600):
-        seen = calm[k // 2 % len(calm)].copy()
-        if k % 40 > 30:
-            seen[0] = calm[0, 0]  # frozen
-        if generator.random() < 0.1:
-            seen[generator.integers(len(seen))] = generator.choice([np.nan, np.inf, -np.inf, 1e9])
-        elapsed = 2.0 if generator.random() < 0.05 else 1.0
-        request = int(generator.choice([0, 1, 2], p=[0.9, 0.05, 0.05]))
-        manual = None
-        if generator.random() < 0.5:
-            manual = generator.uniform(-1, 1, compiled.m) * controller.data["action_scale"]
+    for k, (seen, elapsed, request, manual) in enumerate(steps):
         controller.request = MODES[request]
         wanted = controller(seen, elapsed, manual)
         action, found = compiled.step(seen, elapsed, request, manual)
@@ -122,3 +118,9 @@ def test_names_cannot_end_a_comment(tmp_path):
     model = LinearModel(plain.A, plain.B, plain.dt, state_names=names)
     compiled = Compiled(law.on_plant(model, np.zeros(4)), tmp_path)
     assert compiled.at(np.zeros((1, 4)))[0] == 0
+
+
+def test_indices_are_as_wide_as_what_they_point_at():
+    few = {"starts": np.array([0, 2**15 - 1])}
+    assert index_bytes(few) == 2
+    assert index_bytes({**few, "neighbors": np.array([-1, 2**15])}) == 4

@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from deployed import CASES, observations, policy_of
-from sb3_yann import Checks, Controller, export
+from deployed import CASES, observations, policy_of, with_faults
+from sb3_yann import Controller, export
 from sb3_yann.deployment.controller import MODES, Status
 from sb3_yann.deployment.selftest import steady
 from structured_text import FunctionBlock
@@ -41,21 +41,10 @@ def test_a_block_is_the_policy(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["reactor", "references and rates", "two inputs, zero input"])
 def test_steps_with_faults_are_the_controllers(name, tmp_path):
-    obs = observations(policy_of(name), 200)
-    low, high = np.percentile(obs, [5, 95], axis=0)
-    checks = Checks(obs_min=low, obs_max=high, frozen_after=3, hold=2, recover=4, transfer=3)
+    checks, steps = with_faults(policy_of(name), 400)
     controller, block = both(name, tmp_path, checks=checks)
-    generator, calm = np.random.default_rng(3), np.clip(obs, low, high)
     met, modes, m = Status(0), set(), len(controller.data["action_scale"])
-    for k in range(400):
-        seen = calm[k // 2 % len(calm)].copy()
-        if k % 40 > 30:
-            seen[0] = calm[0, 0]  # frozen
-        if generator.random() < 0.1:
-            seen[generator.integers(len(seen))] = generator.choice([np.nan, np.inf, -np.inf, 1e9])
-        elapsed = 2.0 if generator.random() < 0.05 else 1.0
-        request = int(generator.choice([0, 1, 2], p=[0.9, 0.05, 0.05]))
-        manual = generator.uniform(-1, 1, m) if generator.random() < 0.5 else None
+    for k, (seen, elapsed, request, manual) in enumerate(steps):
         controller.request = MODES[request]
         wanted = controller(seen, elapsed, manual)
         given = {"manual": [0.0] * m if manual is None else list(manual)}

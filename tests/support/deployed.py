@@ -19,7 +19,7 @@ from gymnasium import spaces
 import general_problems
 import sample_laws
 from policy_samples import make_policy
-from sb3_yann import AffineObservation, LinearMPC, YannPolicy, export
+from sb3_yann import AffineObservation, Checks, LinearMPC, YannPolicy, export
 from sb3_yann.deployment.controller import Controller
 from weights import network_of
 
@@ -94,8 +94,12 @@ def policy_of(name: str) -> YannPolicy:
 
 
 def observations(policy: YannPolicy, count: int, seed: int = 0) -> np.ndarray:
-    """Return some in the box, some beyond it, some on facets, the operating point."""
+    """Return some in the box, some beyond it, some on facets, the operating point.
+
+    There are fewer for a law of many regions, which numpy must all ask.
+    """
     law, rng = policy.problem.explicit(), np.random.default_rng(seed)
+    count = count if law.n_regions < 100 else min(count, 2_000)
     middle, half = (law.theta_max + law.theta_min) / 2, (law.theta_max - law.theta_min) / 2
     reach = np.where(np.arange(count) % 3, 1.0, 2.5)[:, None]
     theta = middle + reach * half * rng.uniform(-1, 1, (count, law.n_theta))
@@ -107,6 +111,28 @@ def observations(policy: YannPolicy, count: int, seed: int = 0) -> np.ndarray:
     back = np.linalg.pinv(policy.observation.matrix)
     seen = (theta - policy.observation.offset) @ back.T
     return seen + rng.normal(size=seen.shape) * (policy.observation.matrix == 0).all(0)
+
+
+def with_faults(policy: YannPolicy, steps: int) -> tuple[Checks, list[tuple[Any, ...]]]:
+    """Return limits of the readings, and steps: (obs, elapsed, request, manual or None).
+
+    Readings are lost, beyond their limits or frozen, steps late; the operator takes over.
+    """
+    obs, generator = observations(policy, steps), np.random.default_rng(3)
+    low, high = np.percentile(obs, [5, 95], axis=0)
+    calm, m = np.clip(obs, low, high), policy.problem.model.n_inputs
+    found = []
+    for k in range(steps):
+        seen = calm[k // 2 % len(calm)].copy()
+        if k % 40 > 30:
+            seen[0] = calm[0, 0]  # frozen
+        if generator.random() < 0.1:
+            seen[generator.integers(len(seen))] = generator.choice([np.nan, np.inf, -np.inf, 1e9])
+        elapsed = 2.0 if generator.random() < 0.05 else 1.0
+        request = int(generator.choice([0, 1, 2], p=[0.9, 0.05, 0.05]))
+        manual = generator.uniform(-1, 1, m) if generator.random() < 0.5 else None
+        found.append((seen, elapsed, request, manual))
+    return Checks(low, high, frozen_after=3, hold=2, recover=4, transfer=3), found
 
 
 class Compiled:

@@ -261,9 +261,11 @@ static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPU
         for (int j = 0; j < N_THETA; j++) {
             law[i] += gains[region][i][j] * theta[j];
         }
-        if (ZERO_INPUT && inside < -TOLERANCE) {
+#if ZERO_INPUT
+        if (inside < -TOLERANCE) {
             law[i] = resting[i];
         }
+#endif
         law[i] = law[i] == law[i] ? law[i] : ZERO;
         low[i] = input_min[i];
         high[i] = input_max[i];
