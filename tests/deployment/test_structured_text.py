@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from deployed import CASES, observations, policy_of, with_faults
-from sb3_yann import Controller, export
+from sb3_yann import Checks, Controller, export
 from sb3_yann.deployment.controller import MODES, Status
 from sb3_yann.deployment.selftest import steady
 from structured_text import FunctionBlock
