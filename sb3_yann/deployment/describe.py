@@ -183,6 +183,11 @@ def network_arrays(layer: LawLayer, law: PiecewiseAffine) -> Arrays:
     first = (nodes[:, :k] + nodes[:, k : 2 * k]).sum(1) + nodes[:, 2 * k :].sum(1)
     rest = [each.detach().double().cpu().numpy() for each in network.weights()[1:]]
     layers, pinned = [first, *rest], network.pinned_array > 0
+    if not all(np.all(np.isfinite(each)) for each in layers):
+        raise ValueError(
+            "The actor's weights hold NaN or infinite entries: there is nothing to export. Load an "
+            "earlier save of the model, or export the law, model.policy.problem.explicit()."
+        )
     zero = np.array([_is_zero([each[i] for each in layers], pinned[i]) for i in range(len(pinned))])
     kept = np.flatnonzero(~zero)
     number = np.full(len(zero), -1)
@@ -214,8 +219,6 @@ def _activation(given: Any) -> str:
 
 def _is_zero(layers: list[Array], pinned: bool) -> bool:
     """Return whether a network puts out zero whatever it is given."""
-    if not all(np.all(np.isfinite(each)) for each in layers):
-        return False
     biases = [each[:, -1] for each in layers[1:-1]] + ([] if pinned else [layers[-1][:, -1]])
     silent = not np.any(layers[0]) and not any(map(np.any, biases))
     return silent or not np.any(layers[-1][:, :-1] if pinned else layers[-1])

@@ -117,9 +117,8 @@ def _description(data: Arrays, guid: str, texts: dict[str, str]) -> str:
 
 def _variable(name: str, reference: int, causality: str, said: str, kind: str) -> str:
     initial = ' initial="calculated"' if causality == "output" else ""
-    variability = "continuous" if kind.startswith("Real") else "discrete"
     return (
         f'<ScalarVariable name="{name}" valueReference="{reference}" causality="{causality}" '
-        f'variability="{variability}"{initial} description={quoteattr(said)}><{kind}/>'
+        f'variability="discrete"{initial} description={quoteattr(said)}><{kind}/>'
         "</ScalarVariable>\n"
     )

@@ -190,6 +190,11 @@ def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
     op, constant = graph.op, graph.constant
     number, act = data["network_of"], ACTIVATIONS[str(data["activation"])]
     used = op("Gather", constant(np.maximum(number, 0)), region)
+    shared = bool(np.all(number == 0))
+
+    def of_row(table: NDArray[Any]) -> str:
+        return constant(table) if shared else op("Gather", constant(table), used)
+
     x = op("Mul", theta, constant(data["per_theta"][None]))
     moved = graph.any(op("Not", op("Equal", x, constant(0.0))))
     pinned = data["pinned"]
@@ -199,11 +204,12 @@ def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
         W, bias = layer[:, :, :-1], layer[:, :, -1]
         if i == last:
             bias = np.where(pinned[:, None], 0.0, bias)
-        x = graph.times(op("Gather", constant(W), used), x)
-        x = op("Add", x, op("Gather", constant(bias), used))
+        # A shared network is one matrix for all rows, not a copy of it for each.
+        x = op("MatMul", x, constant(W[0].T)) if shared else graph.times(of_row(W), x)
+        x = op("Add", x, of_row(bias))
         if i < last:
             at_zero = np.where(pinned[:, None], act(bias), 0.0)
-            x = op("Sub", _activate(graph, x, data), op("Gather", constant(at_zero), used))
+            x = op("Sub", _activate(graph, x, data), of_row(at_zero))
     sound = op("Not", graph.any(graph.not_finite(x)))
     counts = op("Unsqueeze", op("Gather", constant(number >= 0), region), constant(np.array([1])))
     still = op("And", op("Unsqueeze", op("Gather", constant(pinned), used),

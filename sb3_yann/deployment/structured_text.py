@@ -15,7 +15,8 @@ from sb3_yann.deployment.rounding import rounding_of
 from sb3_yann.deployment.tables import tables_of
 
 ACTIVATE = {
-    "tanh": """FOR k := 0 TO 1 DO
+    "tanh": """k := 0;
+WHILE k <= 1 DO
     small := MIN(ABS(pair[k]), 25.0);
     small := 1.0 - 2.0 / (EXP(2.0 * small) + 1.0);
     IF pair[k] < 0.0 THEN
@@ -24,13 +25,16 @@ ACTIVATE = {
     IF pair[k] = pair[k] THEN
         pair[k] := small;
     END_IF;
-END_FOR;""",
+    k := k + 1;
+END_WHILE;""",
     "relu": "pair[0] := MAX(pair[0], 0.0);\npair[1] := MAX(pair[1], 0.0);",
-    "elu": """FOR k := 0 TO 1 DO
+    "elu": """k := 0;
+WHILE k <= 1 DO
     IF pair[k] < 0.0 THEN
         pair[k] := EXP(pair[k]) - 1.0;
     END_IF;
-END_FOR;""",
+    k := k + 1;
+END_WHILE;""",
 }
 """Of both entries of ``pair``; what is no number stays it."""
 TYPES = {"double": "LREAL", "float": "REAL"}
@@ -43,8 +47,13 @@ RESERVED = set(
     """.split()
 )
 """Words of the language that a function block cannot be called."""
-LARGEST = {"double": 1e300, "float": 1e37}
-"""Beyond it a reading counts as infinite: standard functions cannot ask whether a number is."""
+LARGEST, SMALLEST = 1e37, 1e-37
+"""Beyond the first a reading counts as infinite, for no standard function asks whether it is.
+
+Below the second a table holds zero. Both are for LREAL too: MatIEC, the compiler of OpenPLC and
+Beremiz, reads its literals as REAL first. It also leaves out a FOR loop of one turn, so all loops
+are WHILE.
+"""
 
 
 def st_text(data: Arrays, precision: str, about: str) -> str:
@@ -175,11 +184,11 @@ def _numbers(data: Arrays, precision: str) -> Iterator[str]:
     reals = {
         "TOLERANCE": rounding.tolerance,
         "TIE": rounding.tie,
-        "BEYOND_ALL": LARGEST[precision],
-        "REACH": min(float(data["reach"]), LARGEST[precision]),
+        "BEYOND_ALL": LARGEST,
+        "REACH": min(float(data["reach"]), LARGEST),
         "FADES_FROM": full,
         "FADES_TO": none,
-        "LATE_AFTER": min(float(data["late_after"]), LARGEST[precision]),
+        "LATE_AFTER": min(float(data["late_after"]), LARGEST),
     }
     for name, value in reals.items():
         yield f"{name} : {kind} := {real(value, precision)};"
@@ -189,10 +198,10 @@ def _numbers(data: Arrays, precision: str) -> Iterator[str]:
 
 def _tables(data: Arrays, precision: str) -> Iterator[str]:
     """Yield declarations of arrays, flat: their rows follow each other."""
-    largest = LARGEST[precision]
     numbers, whole = tables_of(data)
     for name, values in numbers.items():
-        texts = [real(float(np.clip(each, -largest, largest)), precision) for each in values.flat]
+        kept = np.where(np.abs(values) < SMALLEST, 0.0, np.clip(values, -LARGEST, LARGEST))
+        texts = [real(float(each), precision) for each in kept.flat]
         yield _array(name, TYPES[precision], texts)
     for name, indices in whole.items():
         yield _array(name, "DINT", [str(int(each)) for each in indices.flat])

@@ -199,13 +199,22 @@ def test_rates_hold_whatever_happens(tmp_path):
 
 def test_networks_that_overflow_leave_the_law(tmp_path):
     policy = disturbed(solved("reactor"))
-    with th.no_grad():
-        last_layer(policy).fill_(np.inf)
     controller = controller_of(policy, tmp_path)
+    last = f"layer{int(controller.data['n_layers']) - 1}"
+    controller = Controller({**controller.data, last: np.full_like(controller.data[last], np.inf)})
     obs = readings(10)[1:]
     assert np.array_equal(controller.evaluate(obs), controller.evaluate(obs, networks=False))
     controller(obs[0])
     assert controller.status == Status.NETWORK
+
+
+def test_weights_that_are_no_numbers_are_refused(tmp_path):
+    policy = disturbed(solved("reactor"))
+    with th.no_grad():
+        last_layer(policy)[0, 0, 0] = np.nan
+    with pytest.raises(ValueError, match="weights hold NaN"):
+        export(policy, tmp_path / "plant.c")
+    assert list(tmp_path.iterdir()) == []
 
 
 # ---- What is refused ----
