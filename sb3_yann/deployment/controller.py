@@ -213,7 +213,8 @@ class Controller:
         finite, status = np.isfinite(obs), Status(0)
         beyond = finite & ((obs < self.data["obs_min"]) | (obs > self.data["obs_max"]))
         moved = obs != self._last
-        self._same = np.where(moved, 0, self._same + bool(moved.any()))
+        others = (moved & finite & np.isfinite(self._last)).any()  # NaN has not moved
+        self._same = np.where(moved, 0, self._same + bool(others))
         self._last = obs.copy()  # a caller may fill the same array again
         after = int(self.data["frozen_after"])
         frozen = finite & self.data["watched"] & (self._same >= after) & (after > 0)

@@ -124,3 +124,13 @@ def test_indices_are_as_wide_as_what_they_point_at():
     few = {"starts": np.array([0, 2**15 - 1])}
     assert index_bytes(few) == 2
     assert index_bytes({**few, "neighbors": np.array([-1, 2**15])}) == 4
+
+
+def test_a_sensor_may_be_watched_for_a_long_time(tmp_path):
+    compiled = Compiled(policy_of("reactor"), tmp_path, checks=Checks(frozen_after=40_000))
+    compiled.begin()
+    moving, found = np.zeros(4), []
+    for k in range(40_002):
+        moving[1] = 0.01 * (k % 2)
+        found.append(compiled.step(moving, 1.0, 1, None)[1])
+    assert found[39_999] == 0 and found[40_000] == Status.FROZEN

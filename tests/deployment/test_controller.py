@@ -157,6 +157,16 @@ def test_limits_frozen_sensors_and_late_steps(tmp_path):
     assert controller.status == Status.LATE and controller.mode == "mpc"
 
 
+def test_a_lost_sensor_does_not_make_the_others_frozen(tmp_path):
+    checks = Checks(frozen_after=3, hold=50)
+    controller = controller_of(policy_of("reactor"), tmp_path, checks=checks)
+    for k in range(20):  # at rest; one is lost for a while
+        lost = [np.nan, np.inf][k % 2] if 2 <= k < 12 else 0.1
+        controller([lost, 0.1, 0.1, 1.0])
+        assert not controller.status & Status.FROZEN, k
+    assert controller.status == 0
+
+
 def test_an_array_that_is_filled_again_is_not_frozen(tmp_path):
     controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(frozen_after=3))
     buffer = np.zeros(4)

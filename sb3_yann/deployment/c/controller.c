@@ -343,13 +343,14 @@ static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
     unsigned status = 0;
     int moved = !state->started;
     for (int i = 0; i < N_OBS; i++) {
-        moved = moved || obs[i] != state->last[i];
+        /* What is not finite has not moved. */
+        moved = moved || (isfinite(obs[i]) && isfinite(state->last[i]) && obs[i] != state->last[i]);
     }
     for (int i = 0; i < N_OBS; i++) {
         unsigned fault = 0;
         if (!state->started || obs[i] != state->last[i]) {
             state->same[i] = 0;
-        } else if (moved && state->same[i] < INT16_MAX) {
+        } else if (moved && state->same[i] < FROZEN_AFTER) {
             state->same[i]++;
         }
         state->last[i] = obs[i];
