@@ -168,7 +168,7 @@ class Controller:
         elapsed : float, optional
             Time since the last step, in units of dt. None is in time.
         manual : array_like, shape (m,), optional
-            The operator's output while manual, which is otherwise held.
+            The operator's output where he asks for it; otherwise it is held while manual.
 
         Raises
         ------
@@ -192,7 +192,8 @@ class Controller:
         scale, shift = self.data["action_scale"], self.data["action_shift"]
         target = action[0] * scale + shift
         if mode == MANUAL:
-            target = self._output if manual is None else self._as_manual(manual)
+            asked = manual is not None and self.request == MANUAL
+            target = self._as_manual(manual) if asked else self._output
         if mode != self.mode:
             self.counters["changes"] += 1
             self._left = int(self.data["transfer"])
@@ -202,6 +203,9 @@ class Controller:
         if self._left > 0:
             target = target + self._bump * (self._left / int(self.data["transfer"]))
             self._left -= 1
+        if self._previous_is_lost(rows[0], used):
+            last = (self._output - shift) / scale
+            low, high = np.clip(last + self.data["change"], *self.data["bounds"])[:, None]
         self._output = np.clip(target, low[0] * scale + shift, high[0] * scale + shift)
         self.mode, self.status = mode, status
         for name in ("steps", mode, *(name for each, name in NAMES.items() if each in status)):
@@ -226,6 +230,13 @@ class Controller:
             status |= flag if which.any() else Status(0)
         self._good = np.where(~finite | beyond | frozen, self._good, obs)
         return self._good, status
+
+    def _previous_is_lost(self, obs: Array, used: Array) -> bool:
+        """Return whether rates have to count from the own output: its reading is faulty."""
+        if not len(self.data["change"]):
+            return False
+        says = (self.data["obs_matrix"][-len(self._output) :] != 0).any(0)
+        return bool((says & (used != obs)).any())
 
     def _mode(self, status: Status) -> str:
         """Return who acts now."""

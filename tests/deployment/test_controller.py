@@ -192,6 +192,13 @@ def test_the_operator_takes_over_and_gives_back_without_a_bump(tmp_path):
     assert outputs[-1] == pytest.approx(float(controller.evaluate(obs[9])[0]))
 
 
+def test_an_output_is_held_whatever_the_operators_slider_says(tmp_path):
+    controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(hold=1))
+    outputs = [controller([0.1, 0, 0, each], manual=[50.0]) for each in [1.0, *[np.nan] * 5]]
+    assert controller.mode == "manual" and controller.request == "policy"
+    assert np.all(np.array(outputs) == outputs[0])
+
+
 def test_rates_hold_whatever_happens(tmp_path):
     mpc = policy_of("references and rates").problem
     controller = controller_of(policy_of("references and rates"), tmp_path)
@@ -201,6 +208,8 @@ def test_rates_hold_whatever_happens(tmp_path):
         obs[-1] = previous
         if k % 17 == 0:
             obs[0] = np.nan
+        if k % 23 > 19:
+            obs[-1] = np.nan  # rates count from the own output then
         controller.request = ["policy", "mpc", "manual"][k // 7 % 3]
         action = float(controller(obs, manual=generator.uniform(-5, 5, 1))[0])
         assert mpc.rate.du_min - 1e-9 <= action - previous <= mpc.rate.du_max + 1e-9

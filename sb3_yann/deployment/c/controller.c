@@ -373,6 +373,21 @@ static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
     return status;
 }
 
+#if RATE
+/* Whether a reading of the previous input is faulty. */
+static int previous_is_lost(const yann_state *state, const real obs[N_OBS])
+{
+    for (int i = 0; i < N_INPUTS; i++) {
+        for (int j = 0; j < N_OBS; j++) {
+            if (obs_matrix[N_THETA - N_INPUTS + i][j] != ZERO && !(state->good[j] == obs[j])) {
+                return 1;
+            }
+        }
+    }
+    return 0;
+}
+#endif
+
 /* Who acts now. */
 static yann_mode who_acts(yann_state *state, unsigned status, yann_mode request)
 {
@@ -402,9 +417,20 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
     }
     const yann_mode mode = who_acts(state, status, request);
     status |= act(state->good, mode == YANN_POLICY, target, low, high);
+#if RATE
+    /* Rates count from the own output then. */
+    for (int i = 0; i < N_INPUTS && previous_is_lost(state, obs); i++) {
+        const real last = (state->output[i] - action_shift[i]) / action_scale[i];
+        low[i] = between(last + change_min[i], input_min[i], input_max[i]);
+        high[i] = between(last + change_max[i], input_min[i], input_max[i]);
+        low[i] = low[i] * action_scale[i] + action_shift[i];
+        high[i] = high[i] * action_scale[i] + action_shift[i];
+    }
+#endif
     for (int i = 0; i < N_INPUTS; i++) {
         if (mode == YANN_MANUAL) {
-            target[i] = manual != NULL && isfinite(manual[i]) ? manual[i] : state->output[i];
+            const int given = request == YANN_MANUAL && manual != NULL && isfinite(manual[i]);
+            target[i] = given ? manual[i] : state->output[i];
         }
         if (mode != state->mode) {
             state->bump[i] = state->output[i] - target[i];

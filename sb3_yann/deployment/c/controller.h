@@ -50,7 +50,7 @@ void yann_init(yann_state *state);
  * One step: write the action, return what was found (0 for nothing).
  *   elapsed  time since the last step in units of dt; 0 or less where it is not known
  *   request  what the operator wants
- *   manual   the operator's output while manual, or NULL to hold it
+ *   manual   the operator's output, which acts where he requests it; or NULL to hold it
  */
 unsigned yann_step(yann_state *state, const yann_real obs[YANN_N_OBS], yann_real elapsed,
                    yann_mode request, const yann_real *manual, yann_real action[YANN_N_INPUTS]);
