@@ -93,9 +93,16 @@ def _of_policy(policy: YannPolicy, name: str, checks: Checks, absolute: bool) ->
         **network_arrays(layer, law),
         "change": layer.change.cpu().numpy() if layer.rated else np.empty((0, law.n_inputs)),
         **checks.arrays(len(units[0][0])),
-        "watched": states if kept else np.ones(len(names), bool),
+        "watched": states if kept else _show_states(units[0], states),
     }
     return arrays | _with_units(name, law, units, names, _names(law)[1])
+
+
+def _show_states(matrix: Array, states: Array) -> Array:
+    """Return which entries of an observation say what states are, and nothing else of theta."""
+    counts = matrix != 0
+    shown: Array = counts[states].any(0) & ~counts[np.logical_not(states)].any(0)
+    return shown
 
 
 def _explicit(law: Law | None) -> PiecewiseAffine:

@@ -19,7 +19,7 @@ from deployed import (
     with_faults,
 )
 from sample_laws import solved
-from sb3_yann import LinearModel, export
+from sb3_yann import Checks, LinearModel, LinearMPC, export
 from sb3_yann.deployment.controller import MODES, Status
 from sb3_yann.deployment.selftest import steady
 from sb3_yann.deployment.tables import index_bytes
@@ -114,7 +114,7 @@ def test_a_header_is_for_cpp_too(tmp_path):
 def test_names_cannot_end_a_comment(tmp_path):
     law = solved("reactor").explicit()
     plain = law.model
-    names = ["a", "b", "c", 'T */ int x; /* "Ä\\']
+    names = ["a", "b???/", "c", 'T */ int x; /* "Ä\\']
     model = LinearModel(plain.A, plain.B, plain.dt, state_names=names)
     compiled = Compiled(law.on_plant(model, np.zeros(4)), tmp_path)
     assert compiled.at(np.zeros((1, 4)))[0] == 0
@@ -134,3 +134,38 @@ def test_a_sensor_may_be_watched_for_a_long_time(tmp_path):
         moving[1] = 0.01 * (k % 2)
         found.append(compiled.step(moving, 1.0, 1, None)[1])
     assert found[39_999] == 0 and found[40_000] == Status.FROZEN
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_a_reading_that_is_huge_is_outside(precision, tmp_path):
+    largest = float(np.finfo(np.float64 if precision == "double" else np.float32).max)
+    mpc = LinearMPC(
+        LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1),
+        Q=1e16 * np.eye(2), R=[[1e15]], horizon=3, x_min=[-5e-8, -2e-8], x_max=[5e-8, 2e-8],
+        u_min=-1e-8, u_max=1e-8,
+    )  # fmt: skip
+    compiled = Compiled(mpc.explicit(), tmp_path, precision=precision)
+    signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [1, 0], [0, -1]])
+    for size in (largest, largest / 1e3, 1e30):
+        actions, found = compiled.at(size * signs)
+        assert np.all(found == Status.OUTSIDE)
+        assert not compiled.controller.in_domain(size * signs).any()
+        wanted = compiled.controller.evaluate(size * signs)
+        assert error(actions, wanted, compiled.controller) < 1e-5
+
+
+def test_inputs_without_bounds(tmp_path):
+    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
+    bounds = {"x_min": [-5, -2], "x_max": [5, 2]}
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, **bounds)
+    export(mpc.explicit(), tmp_path / "plant.c")
+    assert self_test(tmp_path, COMPILERS[0]).returncode == 0
+
+
+def test_float_beside_a_huge_operating_point_is_refused(tmp_path):
+    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, x_ss=[1e8, 0], u_ss=[0])
+    bounds = {"x_min": [-5, -2], "x_max": [5, 2], "u_min": -1, "u_max": 1}
+    law = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, **bounds).explicit()
+    with pytest.raises(ValueError, match="Pass precision='double'"):
+        export(law, tmp_path / "plant.c", absolute=True, precision="float")
+    assert list(tmp_path.iterdir()) == []

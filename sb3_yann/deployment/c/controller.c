@@ -241,16 +241,16 @@ static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPU
         }
     }
     for (int j = 0; j < N_THETA; j++) {
+        int known = 1;
         theta[j] = obs_offset[j];
         for (int i = 0; i < N_OBS; i++) {
-            /* What is not finite counts as at the operating point. */
             if (obs_matrix[j][i] != ZERO) {
                 theta[j] += obs_matrix[j][i] * obs[i];
+                known = known && isfinite(obs[i]);
             }
         }
-        if (!isfinite(theta[j])) {
-            theta[j] = ZERO;
-        }
+        /* What is not finite counts as at the operating point, what is far as not so far. */
+        theta[j] = known && theta[j] == theta[j] ? between(theta[j], -far[j], far[j]) : ZERO;
     }
     const int region = locate(theta, &inside);
     if (inside < -TOLERANCE) {
