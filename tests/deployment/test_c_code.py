@@ -169,3 +169,36 @@ def test_float_beside_a_huge_operating_point_is_refused(tmp_path):
     with pytest.raises(ValueError, match="Pass precision='double'"):
         export(law, tmp_path / "plant.c", absolute=True, precision="float")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_header_tells_deviations_from_what_the_plant_shows(tmp_path):
+    law = solved("reactor").explicit()
+    for absolute, shown in ((False, ["T, 0 at rest", "U, -55 to 55"]), (True, ["T, 475 at rest"])):
+        export(law, tmp_path / "plant.c", absolute=absolute)
+        export(law, tmp_path / "plant.st", absolute=absolute)
+        for suffix in ("h", "st"):
+            text = (tmp_path / f"plant.{suffix}").read_text()
+            assert all(each in text for each in shown)
+
+
+def test_steps_are_counted_by_what_they_found(tmp_path):
+    export(policy_of("reactor"), tmp_path / "plant.c")
+    (tmp_path / "main.c").write_text(
+        """#include <math.h>
+#include "plant.h"
+int main(void)
+{
+    plant_state s;
+    double obs[4] = {0.0, 0.0, 0.0, 0.0}, action[1];
+    plant_init(&s);
+    for (int k = 0; k < 5; k++) {
+        obs[1] = k < 2 ? (double)NAN : 0.0;
+        plant_step(&s, obs, k == 3 ? 9.0 : 1.0, PLANT_POLICY, 0, action);
+    }
+    return s.found[0] == 2 && s.found[1] == 0 && s.found[3] == 1 && s.steps == 5 ? 0 : 1;
+}
+"""
+    )
+    built = [COMPILERS[0], *STRICT, "main.c", "plant.c", "-lm", "-o", "main"]
+    subprocess.run(built, cwd=tmp_path, check=True)
+    assert subprocess.run([str(tmp_path / "main")]).returncode == 0

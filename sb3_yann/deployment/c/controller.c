@@ -334,6 +334,9 @@ void yann_init(yann_state *state)
     for (int i = 0; i < 3; i++) {
         state->steps_of_mode[i] = 0;
     }
+    for (int i = 0; i < 6; i++) {
+        state->found[i] = 0;
+    }
     (void)yann_law(obs_rest, state->output);
 }
 
@@ -456,5 +459,8 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
     state->mode = mode;
     state->steps++;
     state->steps_of_mode[mode]++;
+    for (int i = 0; i < 6; i++) {
+        state->found[i] += (status >> i) & 1u;
+    }
     return status;
 }

@@ -40,7 +40,8 @@ typedef struct {
     yann_mode mode;      /* who acted at the last step */
     unsigned long steps; /* how many there were */
     unsigned long steps_of_mode[3];
-    unsigned long changes; /* of who acts */
+    unsigned long changes;  /* of who acts */
+    unsigned long found[6]; /* how many steps found each of the above, from NOT_FINITE on */
 } yann_state;
 
 /* Begin at the operating point. */
