@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from importlib.resources import files
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sb3_yann.deployment.c_text import comment, literal, table
 from sb3_yann.deployment.controller import Controller
 from sb3_yann.deployment.cost import cost_of
