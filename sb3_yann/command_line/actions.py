@@ -135,4 +135,5 @@ def law_of(given: str) -> Any:
 
 def _is_model(given: str) -> bool:
     """Tell whether a file is a model's: a zip archive that is no .npz."""
-    return Path(given).suffix != ".npz" and zipfile.is_zipfile(given)
+    found = given if Path(given).exists() else f"{given}.zip"  # model.save("m") writes m.zip
+    return Path(found).suffix != ".npz" and zipfile.is_zipfile(found)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from importlib.resources import files
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sb3_yann.deployment.c_text import comment, literal, table
 from sb3_yann.deployment.controller import Controller
 from sb3_yann.deployment.cost import cost_of
-from sb3_yann.deployment.describe import Arrays
+from sb3_yann.deployment.describe import Arrays, in_words
 from sb3_yann.deployment.rounding import rounding_of
 from sb3_yann.deployment.selftest import vectors
 from sb3_yann.deployment.tables import index_bytes, search_tables, tables_of
@@ -40,8 +37,9 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
         What the files are called, without a suffix.
     """
     name = str(data["name"])
+    shown = [f"  {line}" for line in in_words(data, "action")]
     entries = {
-        "ABOUT": comment([*about.splitlines(), *_units(data), "", str(cost_of(data)) + "."]),
+        "ABOUT": comment([*about.splitlines(), "", *shown, "", f"{cost_of(data)}."]),
         "SIZES": _sizes(data),
         "REAL": precision,
         "FILE": file,
@@ -57,13 +55,6 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
         text = text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
         found[file + suffix] = text
     return found
-
-
-def _units(data: Arrays) -> list[str]:
-    def listed(kind: str, names: NDArray[np.str_]) -> list[str]:
-        return [f"  {kind}[{i}]  {name}" for i, name in enumerate(names)]
-
-    return ["", *listed("obs", data["obs_names"]), *listed("action", data["action_names"])]
 
 
 def _sizes(data: Arrays) -> str:

@@ -56,5 +56,5 @@ def _nested(values: NDArray[np.generic], precision: str, depth: int) -> str:
 def comment(lines: list[str]) -> str:
     """Return lines of a comment in ASCII, which nothing in them can end."""
     plain = "\n".join(lines).encode("ascii", "backslashreplace").decode()
-    safe = plain.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
+    safe = plain.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("??", "? ?")
     return "\n".join(f" * {line}".rstrip().rstrip("\\") for line in safe.splitlines())

@@ -22,6 +22,7 @@ FORMAT = 1
 POLICY, MPC, MANUAL = "policy", "mpc", "manual"
 MODES = POLICY, MPC, MANUAL
 ENTRIES = 4_000_000  # of slacks at a time
+FAR = 1e12  # times the box of theta: what is farther off counts as there
 
 
 class Status(IntFlag):
@@ -48,6 +49,35 @@ def _relu(x: Array) -> Array:
 
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": np.tanh, "relu": _relu, "elu": _elu}
+
+
+def _check(data: Mapping[str, Any]) -> None:
+    """Raise ValueError where an array has another shape than its neighbors, or holds NaN."""
+    (p, m, n), (q,), n_obs = data["gains"].shape, data["b"].shape, data["obs_matrix"].shape[-1]
+    shapes: list[tuple[tuple[int, ...], str]] = [
+        ((p, m), "offsets"), ((q, n), "A"), ((p,), "starts network_of"), ((2, n), "confines box"),
+        ((2,), "tolerances fades"), ((n, n_obs), "obs_matrix"), ((2, m), "bounds"),
+        ((n,), "obs_offset per_theta"), ((n_obs,), "obs_rest obs_min obs_max watched"),
+        ((m,), "action_scale action_shift resting per_input middle"),
+        ((), "hold recover transfer frozen_after late_after reach zero_input n_layers"),
+    ]  # fmt: skip
+    wanted = [(name, shape) for shape, names in shapes for name in names.split()]
+    if len(data["change"]):
+        wanted.append(("change", (2, m)))
+    size, k = n, len(data["pinned"])
+    for i in range(int(data["n_layers"])):
+        width = m if i == int(data["n_layers"]) - 1 else data[f"layer{i}"].shape[1]
+        wanted.append((f"layer{i}", (k, width, size + 1)))
+        size = width
+    for name, shape in wanted:
+        if data[name].shape != shape:
+            raise ValueError(f"{name} has shape {data[name].shape}, expected {shape}")
+        if not name.startswith("layer") and np.isnan(data[name]).any():
+            raise ValueError(f"{name} holds NaN")
+    if np.isnan(data["gains"]).any() or np.isnan(data["b"]).any():
+        raise ValueError("the law holds NaN")
+    if str(data["activation"]) not in ACTIVATIONS:
+        raise ValueError(f"the activation is {data['activation']}")
 
 
 class Controller:
@@ -97,6 +127,7 @@ class Controller:
                 f"The controller has format {version}, this reader takes {FORMAT}. Export the "
                 "model again, or take the reader of the version that wrote it."
             )
+        _check(self.data)
         self.name, self.activation = str(self.data["name"]), str(self.data["activation"])
         self.obs_names = tuple(map(str, self.data["obs_names"]))
         self.action_names = tuple(map(str, self.data["action_names"]))
@@ -168,7 +199,7 @@ class Controller:
         elapsed : float, optional
             Time since the last step, in units of dt. None is in time.
         manual : array_like, shape (m,), optional
-            The operator's output while manual, which is otherwise held.
+            The operator's output where he asks for it; otherwise it is held while manual.
 
         Raises
         ------
@@ -192,7 +223,8 @@ class Controller:
         scale, shift = self.data["action_scale"], self.data["action_shift"]
         target = action[0] * scale + shift
         if mode == MANUAL:
-            target = self._output if manual is None else self._as_manual(manual)
+            held = manual is None or self.request != MANUAL
+            target = self._output if held else self._as_manual(manual)
         if mode != self.mode:
             self.counters["changes"] += 1
             self._left = int(self.data["transfer"])
@@ -202,6 +234,9 @@ class Controller:
         if self._left > 0:
             target = target + self._bump * (self._left / int(self.data["transfer"]))
             self._left -= 1
+        if self._previous_is_lost(rows[0], used):
+            last = (self._output - shift) / scale
+            low, high = np.clip(last + self.data["change"], *self.data["bounds"])[:, None]
         self._output = np.clip(target, low[0] * scale + shift, high[0] * scale + shift)
         self.mode, self.status = mode, status
         for name in ("steps", mode, *(name for each, name in NAMES.items() if each in status)):
@@ -213,7 +248,8 @@ class Controller:
         finite, status = np.isfinite(obs), Status(0)
         beyond = finite & ((obs < self.data["obs_min"]) | (obs > self.data["obs_max"]))
         moved = obs != self._last
-        self._same = np.where(moved, 0, self._same + bool(moved.any()))
+        others = (moved & finite & np.isfinite(self._last)).any()  # NaN has not moved
+        self._same = np.where(moved, 0, self._same + bool(others))
         self._last = obs.copy()  # a caller may fill the same array again
         after = int(self.data["frozen_after"])
         frozen = finite & self.data["watched"] & (self._same >= after) & (after > 0)
@@ -226,6 +262,13 @@ class Controller:
         self._good = np.where(~finite | beyond | frozen, self._good, obs)
         return self._good, status
 
+    def _previous_is_lost(self, obs: Array, used: Array) -> bool:
+        """Return whether rates have to count from the own output: its reading is faulty."""
+        if not len(self.data["change"]):
+            return False
+        says = (self.data["obs_matrix"][-len(self._output) :] != 0).any(0)
+        return bool((says & (used != obs)).any())
+
     def _mode(self, status: Status) -> str:
         """Return who acts now."""
         self._faults = self._faults + 1 if status & SENSOR else 0
@@ -235,7 +278,7 @@ class Controller:
             return MANUAL
         return MPC if self.request == MPC or self._sound < recover else POLICY
 
-    def _as_manual(self, manual: ArrayLike) -> Array:
+    def _as_manual(self, manual: ArrayLike | None) -> Array:
         given = np.asarray(manual, np.float64)
         if given.shape != self._output.shape:
             raise ValueError(f"manual has shape {given.shape}, expected {self._output.shape}.")
@@ -256,8 +299,11 @@ class Controller:
         All but the last two, (batch,), are (batch, m).
         """
         data, lost = self.data, ~np.isfinite(obs)
-        theta = np.where(lost, 0.0, obs) @ data["obs_matrix"].T + data["obs_offset"]
-        theta[(lost @ (data["obs_matrix"] != 0).T) | ~np.isfinite(theta)] = 0.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            theta = np.where(lost, 0.0, obs) @ data["obs_matrix"].T + data["obs_offset"]
+        theta[(lost @ (data["obs_matrix"] != 0).T) | np.isnan(theta)] = 0.0
+        far = FAR * np.abs(data["box"]).max(0)  # beyond it slacks would overflow
+        theta = np.clip(theta, -far, far)
         region, inside = self._locate(theta)
         law = (data["gains"][region] @ theta[..., None])[..., 0] + data["offsets"][region]
         if data["zero_input"]:

@@ -93,9 +93,34 @@ def _of_policy(policy: YannPolicy, name: str, checks: Checks, absolute: bool) ->
         **network_arrays(layer, law),
         "change": layer.change.cpu().numpy() if layer.rated else np.empty((0, law.n_inputs)),
         **checks.arrays(len(units[0][0])),
-        "watched": states if kept else np.ones(len(names), bool),
+        "watched": states if kept else _show_states(units[0], states),
     }
     return arrays | _with_units(name, law, units, names, _names(law)[1])
+
+
+def in_words(data: Arrays, put_out: str) -> list[str]:
+    """Return a line for each entry of an observation and of what is put out: name and values.
+
+    The values tell deviations from what the plant itself shows.
+    """
+    shift, scale = data["action_shift"], data["action_scale"]
+    ends = data["bounds"] * scale + shift
+    shown = zip(data["obs_names"], data["obs_rest"], strict=True)
+    inputs = zip(data["action_names"], *ends, strict=True)
+    return [
+        *(f"obs[{i}]  {name}, {rest:.6g} at rest" for i, (name, rest) in enumerate(shown)),
+        *(
+            f"{put_out}[{i}]  {name}, {low:.6g} to {high:.6g}"
+            for i, (name, low, high) in enumerate(inputs)
+        ),
+    ]
+
+
+def _show_states(matrix: Array, states: Array) -> Array:
+    """Return which entries of an observation say what states are, and nothing else of theta."""
+    counts = matrix != 0
+    shown: Array = counts[states].any(0) & ~counts[np.logical_not(states)].any(0)
+    return shown
 
 
 def _explicit(law: Law | None) -> PiecewiseAffine:

@@ -27,6 +27,7 @@ from sb3_yann.deployment.rounding import PRECISIONS
 from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
 from sb3_yann.policy.policies import YannPolicy
 
+C_HEADERS = ("math", "stddef", "stdint", "stdio")  # which the code includes
 WORDS = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -154,6 +155,10 @@ def _write_npz(data: Arrays, path: Path, precision: str) -> list[Path]:
 
 
 def _write_c(data: Arrays, path: Path, precision: str) -> list[Path]:
+    if path.stem.lower() in C_HEADERS:
+        raise ValueError(
+            f"{path.stem}.h would stand in for C's own header: call the file something else."
+        )
     texts = c_files(data, precision, _about(data), path.stem)
     parts = {path.parent / file: text for file, text in texts.items()}
     return write_texts(parts)

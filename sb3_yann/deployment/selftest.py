@@ -29,23 +29,41 @@ def steady(controller: Controller, obs: Array, precision: str) -> Array:
     size = 1e-6 if precision == "float" else 1e-13
     scale = np.abs(obs).max(0)
     here, kept = controller.evaluate(obs), np.ones(len(obs), bool)
+    half = _range_of(controller, here) / 2
     for sign in (-1, 1):
         for j in range(obs.shape[1]):
             moved = obs.copy()
             moved[:, j] += sign * 2 * size * scale[j]
-            change = np.abs(controller.evaluate(moved) - here) / controller.data["action_scale"]
+            change = np.abs(controller.evaluate(moved) - here) / half
             kept &= (change < ROOM[precision]).all(1)
             kept &= controller.in_domain(moved) == controller.in_domain(obs)
     steady: Array = obs[kept]
     return steady
 
 
+def _range_of(controller: Controller, actions: Array) -> Array:
+    """Return the ranges of the inputs (m,), of those without bounds what the actions span."""
+    scale, bounds = controller.data["action_scale"], controller.data["bounds"]
+    largest = np.abs(actions - controller.data["action_shift"]).max(0)
+    half: Array = np.where(np.isfinite(bounds).all(0), scale, np.maximum(scale, largest))
+    return 2 * half
+
+
 def vectors(controller: Controller, precision: str) -> dict[str, str]:
-    """Return the entries of the C self-test."""
+    """Return the entries of the C self-test.
+
+    ValueError if a rounding changes all answers.
+    """
     drawn = points(controller, 4 * POINTS)
     if precision == "float":
         drawn = drawn.astype(np.float32).astype(np.float64)
     obs = steady(controller, drawn, precision)[:POINTS]
+    if not len(obs):
+        raise ValueError(
+            f"In {precision} a rounding of a reading moves the output by more than "
+            f"{ROOM[precision]:g} of its range, at all points tried: readings are large beside "
+            "what they move by. Pass precision='double', or export without absolute=True."
+        )
     walked = Controller(controller.data)
     rows: list[Array] = []
     found = []
@@ -59,7 +77,7 @@ def vectors(controller: Controller, precision: str) -> dict[str, str]:
         rows.append(seen)
     answers = np.array(found)
     m = len(controller.data["action_scale"])
-    range_of = 2 * controller.data["action_scale"]
+    range_of = _range_of(controller, controller.evaluate(drawn))
     late = np.where(np.arange(STEPS) == 20, 3.0, 1.0)
     requests = np.array([1 if 50 <= k < 53 else 2 if k >= 56 else 0 for k in range(STEPS)])
     numbers = {

@@ -10,7 +10,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from sb3_yann.deployment.c_text import shortest as real
-from sb3_yann.deployment.describe import Arrays
+from sb3_yann.deployment.describe import Arrays, in_words
 from sb3_yann.deployment.rounding import rounding_of
 from sb3_yann.deployment.tables import tables_of
 
@@ -251,7 +251,7 @@ def _lines(declared: list[str]) -> str:
 
 def _about(data: Arrays, about: str) -> list[str]:
     """Return the lines of the comment, in ASCII, which nothing in them can end."""
-    names = [f"obs[{i}]  {name}" for i, name in enumerate(data["obs_names"])]
-    names += [f"command[{i}]  {name}" for i, name in enumerate(data["action_names"])]
-    plain = "\n".join([about, *names]).encode("ascii", "backslashreplace").decode()
+    plain = (
+        "\n".join([about, *in_words(data, "command")]).encode("ascii", "backslashreplace").decode()
+    )
     return plain.replace("*)", "* )").replace("(*", "( *").splitlines()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_yann.deployment.controller import FAR
 from sb3_yann.deployment.describe import Arrays
 
 Tables = dict[str, NDArray[Any]]
@@ -20,6 +21,7 @@ def tables_of(data: Arrays) -> tuple[Tables, Tables]:
     )
     numbers: Tables = {name: data[name] for name in same.split()}
     numbers["input_min"], numbers["input_max"] = data["bounds"]
+    numbers["far"] = FAR * np.abs(data["box"]).max(0)
     starts = np.array([*data["starts"], len(data["b"])])
     whole: Tables = {"starts": starts, "watched": data["watched"].astype(np.int64)}
     if data["zero_input"]:

@@ -86,6 +86,10 @@ def test_export_writes_code_and_says_what_it_costs(model, folder, capsys) -> Non
     u = Controller.load("cart.npz").evaluate([0.3, 0.1])
     assert np.allclose(u, problem().explicit()([0.3, 0.1]))
     assert main(["export", "cart.zip", "cart.doc"]) == 1
+    assert main(["export", "cart", "same.c", "--float", "--name", "wagon"]) == 0
+    assert (folder / "same_selftest.c").read_text().replace("same", "cart") == (
+        folder / "cart_selftest.c"
+    ).read_text()
 
 
 def test_report_writes_one_page(model, folder) -> None:

@@ -19,7 +19,7 @@ from deployed import (
     with_faults,
 )
 from sample_laws import solved
-from sb3_yann import LinearModel, export
+from sb3_yann import Checks, LinearModel, LinearMPC, export
 from sb3_yann.deployment.controller import MODES, Status
 from sb3_yann.deployment.selftest import steady
 from sb3_yann.deployment.tables import index_bytes
@@ -114,7 +114,7 @@ def test_a_header_is_for_cpp_too(tmp_path):
 def test_names_cannot_end_a_comment(tmp_path):
     law = solved("reactor").explicit()
     plain = law.model
-    names = ["a", "b", "c", 'T */ int x; /* "Ä\\']
+    names = ["a", "b???/", "c", 'T */ int x; /* "Ä\\']
     model = LinearModel(plain.A, plain.B, plain.dt, state_names=names)
     compiled = Compiled(law.on_plant(model, np.zeros(4)), tmp_path)
     assert compiled.at(np.zeros((1, 4)))[0] == 0
@@ -124,3 +124,81 @@ def test_indices_are_as_wide_as_what_they_point_at():
     few = {"starts": np.array([0, 2**15 - 1])}
     assert index_bytes(few) == 2
     assert index_bytes({**few, "neighbors": np.array([-1, 2**15])}) == 4
+
+
+def test_a_sensor_may_be_watched_for_a_long_time(tmp_path):
+    compiled = Compiled(policy_of("reactor"), tmp_path, checks=Checks(frozen_after=40_000))
+    compiled.begin()
+    moving, found = np.zeros(4), []
+    for k in range(40_002):
+        moving[1] = 0.01 * (k % 2)
+        found.append(compiled.step(moving, 1.0, 1, None)[1])
+    assert found[39_999] == 0 and found[40_000] == Status.FROZEN
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_a_reading_that_is_huge_is_outside(precision, tmp_path):
+    largest = float(np.finfo(np.float64 if precision == "double" else np.float32).max)
+    mpc = LinearMPC(
+        LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1),
+        Q=1e16 * np.eye(2), R=[[1e15]], horizon=3, x_min=[-5e-8, -2e-8], x_max=[5e-8, 2e-8],
+        u_min=-1e-8, u_max=1e-8,
+    )  # fmt: skip
+    compiled = Compiled(mpc.explicit(), tmp_path, precision=precision)
+    signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [1, 0], [0, -1]])
+    for size in (largest, largest / 1e3, 1e30):
+        actions, found = compiled.at(size * signs)
+        assert np.all(found == Status.OUTSIDE)
+        assert not compiled.controller.in_domain(size * signs).any()
+        wanted = compiled.controller.evaluate(size * signs)
+        assert error(actions, wanted, compiled.controller) < 1e-5
+
+
+def test_inputs_without_bounds(tmp_path):
+    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
+    bounds = {"x_min": [-5, -2], "x_max": [5, 2]}
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, **bounds)
+    export(mpc.explicit(), tmp_path / "plant.c")
+    assert self_test(tmp_path, COMPILERS[0]).returncode == 0
+
+
+def test_float_beside_a_huge_operating_point_is_refused(tmp_path):
+    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, x_ss=[1e8, 0], u_ss=[0])
+    bounds = {"x_min": [-5, -2], "x_max": [5, 2], "u_min": -1, "u_max": 1}
+    law = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, **bounds).explicit()
+    with pytest.raises(ValueError, match="Pass precision='double'"):
+        export(law, tmp_path / "plant.c", absolute=True, precision="float")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_header_tells_deviations_from_what_the_plant_shows(tmp_path):
+    law = solved("reactor").explicit()
+    for absolute, shown in ((False, ["T, 0 at rest", "U, -55 to 55"]), (True, ["T, 475 at rest"])):
+        export(law, tmp_path / "plant.c", absolute=absolute)
+        export(law, tmp_path / "plant.st", absolute=absolute)
+        for suffix in ("h", "st"):
+            text = (tmp_path / f"plant.{suffix}").read_text()
+            assert all(each in text for each in shown)
+
+
+def test_steps_are_counted_by_what_they_found(tmp_path):
+    export(policy_of("reactor"), tmp_path / "plant.c")
+    (tmp_path / "main.c").write_text(
+        """#include <math.h>
+#include "plant.h"
+int main(void)
+{
+    plant_state s;
+    double obs[4] = {0.0, 0.0, 0.0, 0.0}, action[1];
+    plant_init(&s);
+    for (int k = 0; k < 5; k++) {
+        obs[1] = k < 2 ? (double)NAN : 0.0;
+        plant_step(&s, obs, k == 3 ? 9.0 : 1.0, PLANT_POLICY, 0, action);
+    }
+    return s.found[0] == 2 && s.found[1] == 0 && s.found[3] == 1 && s.steps == 5 ? 0 : 1;
+}
+"""
+    )
+    built = [COMPILERS[0], *STRICT, "main.c", "plant.c", "-lm", "-o", "main"]
+    subprocess.run(built, cwd=tmp_path, check=True)
+    assert subprocess.run([str(tmp_path / "main")]).returncode == 0

@@ -12,9 +12,9 @@ import pytest
 import torch as th
 
 import sb3_yann.deployment.controller
-from deployed import CASES, disturbed, observations, policy_of
+from deployed import CASES, box, disturbed, observations, policy_of
 from sample_laws import solved
-from sb3_yann import Checks, Controller, export
+from sb3_yann import AffineObservation, Checks, Controller, export
 from sb3_yann.deployment.controller import Status
 from sb3_yann.deployment.selftest import steady
 from weights import last_layer
@@ -157,6 +157,16 @@ def test_limits_frozen_sensors_and_late_steps(tmp_path):
     assert controller.status == Status.LATE and controller.mode == "mpc"
 
 
+def test_a_lost_sensor_does_not_make_the_others_frozen(tmp_path):
+    checks = Checks(frozen_after=3, hold=50)
+    controller = controller_of(policy_of("reactor"), tmp_path, checks=checks)
+    for k in range(20):  # at rest; one is lost for a while
+        lost = [np.nan, np.inf][k % 2] if 2 <= k < 12 else 0.1
+        controller([lost, 0.1, 0.1, 1.0])
+        assert not controller.status & Status.FROZEN, k
+    assert controller.status == 0
+
+
 def test_an_array_that_is_filled_again_is_not_frozen(tmp_path):
     controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(frozen_after=3))
     buffer = np.zeros(4)
@@ -182,6 +192,28 @@ def test_the_operator_takes_over_and_gives_back_without_a_bump(tmp_path):
     assert outputs[-1] == pytest.approx(float(controller.evaluate(obs[9])[0]))
 
 
+def test_a_set_point_in_a_map_is_not_frozen(tmp_path):
+    mpc = policy_of("references and rates").problem
+    n, order = mpc.n_theta, np.roll(np.arange(mpc.n_theta), 1)
+    shown = AffineObservation.pick(order, n)
+    policy = disturbed(mpc, observation=shown, observation_space=box(n, np.float64))
+    controller = controller_of(policy, tmp_path, checks=Checks(frozen_after=3))
+    watched = np.zeros(n, bool)
+    watched[order[mpc.layout.state]] = True
+    assert controller.data["watched"].tolist() == watched.tolist()
+    generator = np.random.default_rng(0)
+    for _ in range(10):
+        controller(np.where(watched, generator.uniform(-0.1, 0.1, n), 0.0))
+        assert not controller.status & Status.FROZEN
+
+
+def test_an_output_is_held_whatever_the_operators_slider_says(tmp_path):
+    controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(hold=1))
+    outputs = [controller([0.1, 0, 0, each], manual=[50.0]) for each in [1.0, *[np.nan] * 5]]
+    assert controller.mode == "manual" and controller.request == "policy"
+    assert np.all(np.array(outputs) == outputs[0])
+
+
 def test_rates_hold_whatever_happens(tmp_path):
     mpc = policy_of("references and rates").problem
     controller = controller_of(policy_of("references and rates"), tmp_path)
@@ -191,6 +223,8 @@ def test_rates_hold_whatever_happens(tmp_path):
         obs[-1] = previous
         if k % 17 == 0:
             obs[0] = np.nan
+        if k % 23 > 19:
+            obs[-1] = np.nan  # rates count from the own output then
         controller.request = ["policy", "mpc", "manual"][k // 7 % 3]
         action = float(controller(obs, manual=generator.uniform(-5, 5, 1))[0])
         assert mpc.rate.du_min - 1e-9 <= action - previous <= mpc.rate.du_max + 1e-9
@@ -240,6 +274,22 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
         Controller({**controller.data, "format": 99})
 
 
+def test_arrays_that_do_not_fit_together_are_named(tmp_path):
+    data = controller_of(policy_of("references and rates"), tmp_path).data
+    wrong = {
+        "action_scale": np.ones(2), "obs_min": np.float64(0), "hold": np.ones(1),
+        "change": np.ones((2, 5)), "layer1": data["layer1"][:, :-1], "b": np.nan * data["b"],
+        "gains": np.nan * data["gains"], "activation": "swish", "recover": np.nan,
+    }  # fmt: skip
+    for name, value in wrong.items():
+        np.savez(tmp_path / "wrong.npz", **{**data, name: value})
+        with pytest.raises(ValueError, match="holds no controller"):
+            Controller.load(tmp_path / "wrong.npz")
+    np.savez(tmp_path / "wrong.npz", **{k: v for k, v in data.items() if k != "hold"})
+    with pytest.raises(ValueError, match="hold"):
+        Controller.load(tmp_path / "wrong.npz")
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
@@ -247,6 +297,7 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
         ({"path": "2 tanks.c"}, ValueError, "name = '2 tanks'"),
         ({"path": "real.st"}, ValueError, "name = 'real' is a word of Structured Text"),
         ({"path": "no/plant.c"}, FileNotFoundError, "There is no folder"),
+        ({"path": "math.c", "name": "plant"}, ValueError, "math.h"),
         ({"precision": "half"}, ValueError, "precision"),
         ({"checks": {"hold": -1}}, (TypeError, ValueError), "checks|hold"),
         ({"checks": Checks(obs_min=[1, 2])}, ValueError, "obs_min"),

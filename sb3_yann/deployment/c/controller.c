@@ -241,16 +241,16 @@ static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPU
         }
     }
     for (int j = 0; j < N_THETA; j++) {
+        int known = 1;
         theta[j] = obs_offset[j];
         for (int i = 0; i < N_OBS; i++) {
-            /* What is not finite counts as at the operating point. */
             if (obs_matrix[j][i] != ZERO) {
                 theta[j] += obs_matrix[j][i] * obs[i];
+                known = known && isfinite(obs[i]);
             }
         }
-        if (!isfinite(theta[j])) {
-            theta[j] = ZERO;
-        }
+        /* What is not finite counts as at the operating point, what is far as not so far. */
+        theta[j] = known && theta[j] == theta[j] ? between(theta[j], -far[j], far[j]) : ZERO;
     }
     const int region = locate(theta, &inside);
     if (inside < -TOLERANCE) {
@@ -334,6 +334,9 @@ void yann_init(yann_state *state)
     for (int i = 0; i < 3; i++) {
         state->steps_of_mode[i] = 0;
     }
+    for (int i = 0; i < 6; i++) {
+        state->found[i] = 0;
+    }
     (void)yann_law(obs_rest, state->output);
 }
 
@@ -343,13 +346,14 @@ static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
     unsigned status = 0;
     int moved = !state->started;
     for (int i = 0; i < N_OBS; i++) {
-        moved = moved || obs[i] != state->last[i];
+        /* What is not finite has not moved. */
+        moved = moved || (isfinite(obs[i]) && isfinite(state->last[i]) && obs[i] != state->last[i]);
     }
     for (int i = 0; i < N_OBS; i++) {
         unsigned fault = 0;
         if (!state->started || obs[i] != state->last[i]) {
             state->same[i] = 0;
-        } else if (moved && state->same[i] < INT16_MAX) {
+        } else if (moved && state->same[i] < FROZEN_AFTER) {
             state->same[i]++;
         }
         state->last[i] = obs[i];
@@ -371,6 +375,21 @@ static unsigned read_sensors(yann_state *state, const real obs[N_OBS])
     state->started = 1;
     return status;
 }
+
+#if RATE
+/* Whether a reading of the previous input is faulty. */
+static int previous_is_lost(const yann_state *state, const real obs[N_OBS])
+{
+    for (int i = 0; i < N_INPUTS; i++) {
+        for (int j = 0; j < N_OBS; j++) {
+            if (obs_matrix[N_THETA - N_INPUTS + i][j] != ZERO && !(state->good[j] == obs[j])) {
+                return 1;
+            }
+        }
+    }
+    return 0;
+}
+#endif
 
 /* Who acts now. */
 static yann_mode who_acts(yann_state *state, unsigned status, yann_mode request)
@@ -401,9 +420,20 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
     }
     const yann_mode mode = who_acts(state, status, request);
     status |= act(state->good, mode == YANN_POLICY, target, low, high);
+#if RATE
+    /* Rates count from the own output then. */
+    for (int i = 0; i < N_INPUTS && previous_is_lost(state, obs); i++) {
+        const real last = (state->output[i] - action_shift[i]) / action_scale[i];
+        low[i] = between(last + change_min[i], input_min[i], input_max[i]);
+        high[i] = between(last + change_max[i], input_min[i], input_max[i]);
+        low[i] = low[i] * action_scale[i] + action_shift[i];
+        high[i] = high[i] * action_scale[i] + action_shift[i];
+    }
+#endif
     for (int i = 0; i < N_INPUTS; i++) {
         if (mode == YANN_MANUAL) {
-            target[i] = manual != NULL && isfinite(manual[i]) ? manual[i] : state->output[i];
+            const int given = request == YANN_MANUAL && manual != NULL && isfinite(manual[i]);
+            target[i] = given ? manual[i] : state->output[i];
         }
         if (mode != state->mode) {
             state->bump[i] = state->output[i] - target[i];
@@ -429,5 +459,8 @@ unsigned yann_step(yann_state *state, const real obs[N_OBS], real elapsed, yann_
     state->mode = mode;
     state->steps++;
     state->steps_of_mode[mode]++;
+    for (int i = 0; i < 6; i++) {
+        state->found[i] += (status >> i) & 1u;
+    }
     return status;
 }

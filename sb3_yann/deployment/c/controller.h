@@ -40,7 +40,8 @@ typedef struct {
     yann_mode mode;      /* who acted at the last step */
     unsigned long steps; /* how many there were */
     unsigned long steps_of_mode[3];
-    unsigned long changes; /* of who acts */
+    unsigned long changes;  /* of who acts */
+    unsigned long found[6]; /* how many steps found each of the above, from NOT_FINITE on */
 } yann_state;
 
 /* Begin at the operating point. */
@@ -50,7 +51,7 @@ void yann_init(yann_state *state);
  * One step: write the action, return what was found (0 for nothing).
  *   elapsed  time since the last step in units of dt; 0 or less where it is not known
  *   request  what the operator wants
- *   manual   the operator's output while manual, or NULL to hold it
+ *   manual   the operator's output, which acts where he requests it; or NULL to hold it
  */
 unsigned yann_step(yann_state *state, const yann_real obs[YANN_N_OBS], yann_real elapsed,
                    yann_mode request, const yann_real *manual, yann_real action[YANN_N_INPUTS]);
