@@ -21,7 +21,7 @@ from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.cost import Cost, cost_of
 from sb3_yann.deployment.describe import Arrays, describe
-from sb3_yann.deployment.fmu import fmu_bytes
+from sb3_yann.deployment.fmu import fmu_file
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.rounding import PRECISIONS
 from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
@@ -90,7 +90,7 @@ def export(
         header beside it, and a test with known answers. ``onnx`` is a graph without memory, from
         ``obs`` (batch, n_obs) to ``action`` and ``outside``; it needs onnx to write. ``st`` is
         IEC 61131-3 Structured Text, a function block; ``xml`` the same for PLCopen's importers.
-        ``fmu`` is an FMU with sources, FMI 2.0 for co-simulation.
+        ``fmu`` is an FMU for co-simulation, FMI 2.0: sources, and a library where a C compiler is.
     name : str, optional
         Prefix of all names in code; the file's by default.
     precision : {"double", "float"}, default "double"
@@ -177,7 +177,7 @@ def _write_plcopen(data: Arrays, path: Path, precision: str) -> list[Path]:
 
 
 def _write_fmu(data: Arrays, path: Path, precision: str) -> list[Path]:
-    return write_texts({path: fmu_bytes(data, precision, _about(data), digest_of(data))})
+    return write_texts({path: fmu_file(data, precision, _about(data))})
 
 
 def _about(data: Arrays) -> str:

@@ -1,4 +1,4 @@
-"""A controller as an FMU, FMI 2.0 for co-simulation: its C code, and a library where one can be."""
+"""A controller as an FMU for co-simulation (FMI 2.0): the C code, its interface, a library."""
 
 from __future__ import annotations
 
@@ -6,119 +6,180 @@ import io
 import platform
 import shutil
 import subprocess
+import tempfile
+import uuid
+import warnings
 import zipfile
 from importlib.resources import files
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from xml.sax.saxutils import quoteattr
+from xml.etree import ElementTree as ET
+
+import numpy as np
 
 from sb3_yann.deployment.c_code import c_files
+from sb3_yann.deployment.c_text import comment, literal
 from sb3_yann.deployment.describe import Arrays
 
+LIBRARIES = {
+    ("Linux", "x86_64"): ("linux64", ".so"),
+    ("Darwin", "x86_64"): ("darwin64", ".dylib"),
+    ("Darwin", "arm64"): ("darwin64", ".dylib"),
+}
 COMPILERS = "cc", "gcc", "clang"
+FLAGS = "-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"
+WRITTEN = 1980, 1, 1, 0, 0, 0  # of every part, so that the same export is the same file
 
 
-def fmu_bytes(data: Arrays, precision: str, about: str, digest: str) -> bytes:
-    """Return the file of an FMU: description, sources, and a library for 64-bit Linux.
+def fmu_file(data: Arrays, precision: str, about: str) -> bytes:
+    """Return the bytes of an FMU.
 
-    The library is there only if it is written on such a machine with a C compiler; others compile
-    the sources, as importers of FMUs with sources do.
+    It holds the C code, and a library for this machine where a C compiler is at hand. A step is a
+    step of the controller: the communication step is its dt.
 
     Parameters
     ----------
     data : dict of str to ndarray
         As `describe` returns them.
     precision : {"double", "float"}
-        Of the computation; an FMU's own numbers are doubles.
+        Of the calculation; the variables are in double.
     about : str
-        What stands at the top of the sources.
-    digest : str
-        Of the arrays: it is the FMU's own identifier.
+        Where it comes from.
     """
     name = str(data["name"])
-    texts = c_files(data, precision, about, name)
-    texts.pop(f"{name}_selftest.c")
-    guid = f"{{sb3-yann-{digest}}}"
-    wrapper = (files("sb3_yann.deployment") / "c" / "fmi2.c").read_text(encoding="ascii")
-    entries = {"FILE": name, "GUID": guid, "DT": repr(_step(data))}
-    for key, entry in entries.items():
-        wrapper = wrapper.replace(f"@{key}@", entry)
-    wrapper = wrapper.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
-    texts["fmi2.c"] = wrapper
-    found = io.BytesIO()
-    with zipfile.ZipFile(found, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(zipfile.ZipInfo("modelDescription.xml"), _description(data, guid, texts))
-        for file, text in texts.items():
-            archive.writestr(zipfile.ZipInfo(f"sources/{file}"), text)
-        if library := _compiled(texts):
-            archive.writestr(zipfile.ZipInfo(f"binaries/linux64/{name}.so"), library)
-    return found.getvalue()
+    identity = "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, f"{precision} {about}")) + "}"
+    sources = {
+        file: text
+        for file, text in c_files(data, precision, about, name).items()
+        if not file.endswith("_selftest.c")
+    }
+    sources |= _interface(data, about, identity)
+    units = [file for file in sources if file.endswith(".c")]
+    parts: dict[str, bytes] = {
+        "modelDescription.xml": _description(data, about, identity, units),
+        **{f"sources/{file}": text.encode("ascii") for file, text in sources.items()},
+    }
+    folder, suffix = LIBRARIES.get((platform.system(), platform.machine()), ("", ""))
+    library = _library(sources) if folder else b""
+    if library:
+        parts[f"binaries/{folder}/{name}{suffix}"] = library
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path, content in parts.items():
+            entry = zipfile.ZipInfo(path, WRITTEN)
+            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            archive.writestr(entry, content)
+    return file.getvalue()
 
 
-def _step(data: Arrays) -> float:
-    """Return the sampling time, 1 where none is known."""
-    return float(data["dt"]) or 1.0
+def _interface(data: Arrays, about: str, identity: str) -> dict[str, str]:
+    """Return the texts of the functions of FMI 2.0, and of their types."""
+    name = str(data["name"])
+    entries = {
+        "ABOUT": comment(about.splitlines()),
+        "FILE": name,
+        "GUID": identity,
+        "DT": literal(float(data["dt"]), "double"),
+        "REST": "{" + ", ".join(literal(each, "double") for each in data["obs_rest"]) + "}",
+    }
+    found = {}
+    for suffix in (".c", ".h"):
+        text = (files("sb3_yann.deployment") / "c" / f"fmi2{suffix}").read_text(encoding="ascii")
+        for key, entry in entries.items():
+            text = text.replace(f"@{key}@", entry)
+        text = text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
+        found[f"{name}_fmi2{suffix}"] = text
+    return found
 
 
-def _compiled(texts: dict[str, str]) -> bytes | None:
-    """Return the library, or None where none can be made."""
-    compiler = next(filter(shutil.which, COMPILERS), None)
-    if compiler is None or (platform.system(), platform.machine()) != ("Linux", "x86_64"):
-        return None
-    with TemporaryDirectory() as folder:
-        for file, text in texts.items():
+def _library(sources: dict[str, str]) -> bytes:
+    """Return a shared library of the sources; nothing where there is no compiler."""
+    compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
+    if compiler is None:
+        return b""
+    with tempfile.TemporaryDirectory() as folder:
+        for file, text in sources.items():
             (Path(folder) / file).write_text(text, encoding="ascii")
-        sources = sorted(file for file in texts if file.endswith(".c"))
-        command = [compiler, "-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"]
-        built = [*command, *sources, "-lm", "-o", "fmu.so"]
-        if subprocess.run(built, cwd=folder, capture_output=True).returncode:
-            return None
-        return (Path(folder) / "fmu.so").read_bytes()
+        units = [file for file in sources if file.endswith(".c")]
+        command = [compiler, *FLAGS, *units, "-lm", "-o", "library"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+        if done.returncode:
+            warnings.warn(
+                f"{compiler} failed, so the FMU holds sources and no library: "
+                f"{done.stderr.strip()[:300]}",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            return b""
+        return (Path(folder) / "library").read_bytes()
 
 
-def _description(data: Arrays, guid: str, texts: dict[str, str]) -> str:
-    name, n_obs, m = str(data["name"]), len(data["obs_rest"]), len(data["action_scale"])
-    variables = [
-        _variable(f"obs[{i}]", i, "input", said, f'Real start="{float(data["obs_rest"][i])!r}"')
-        for i, said in enumerate(data["obs_names"])
-    ]
-    for what, said, first in (
-        ("manual", "the operator's output", n_obs),
-        ("command", "", n_obs + m),
-    ):
-        for i, called in enumerate(data["action_names"]):
-            kind = "input" if what == "manual" else "output"
-            start = 'Real start="0.0"' if kind == "input" else "Real"
-            text = f"{called}: {said}" if said else called
-            variables.append(_variable(f"{what}[{i}]", first + i, kind, text, start))
-    requested = "0 the policy, 1 the MPC, 2 manual"
-    variables += [
-        _variable("request", 0, "input", requested, 'Integer start="0" min="0" max="2"'),
-        _variable("status", 1, "output", "what the step found, 0 for nothing", "Integer"),
-        _variable("mode", 2, "output", f"who acted: {requested}", "Integer"),
-        _variable("has_manual", 0, "input", "whether manual counts", 'Boolean start="false"'),
-    ]
-    outputs = [i for i, each in enumerate(variables, 1) if 'causality="output"' in each]
-    unknowns = "".join(f'<Unknown index="{i}"/>' for i in outputs)
-    sources = "".join(f'<File name="{file}"/>' for file in sorted(texts) if file.endswith(".c"))
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n'
-        f'<fmiModelDescription fmiVersion="2.0" modelName="{name}" guid="{guid}" '
-        'generationTool="sb3-yann" variableNamingConvention="structured">\n'
-        f'<CoSimulation modelIdentifier="{name}" canHandleVariableCommunicationStepSize="true">'
-        f"<SourceFiles>{sources}</SourceFiles></CoSimulation>\n"
-        f'<DefaultExperiment stepSize="{_step(data)!r}"/>\n'
-        f"<ModelVariables>\n{''.join(variables)}</ModelVariables>\n"
-        f"<ModelStructure><Outputs>{unknowns}</Outputs>"
-        f"<InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure>\n"
-        "</fmiModelDescription>\n"
+def _description(data: Arrays, about: str, identity: str, units: list[str]) -> bytes:
+    """Return modelDescription.xml."""
+    name, dt = str(data["name"]), float(data["dt"])
+    root = ET.Element(
+        "fmiModelDescription",
+        fmiVersion="2.0",
+        modelName=name,
+        guid=identity,
+        description=about,
+        generationTool="sb3-yann",
+        variableNamingConvention="structured",
     )
+    kind = ET.SubElement(root, "CoSimulation", modelIdentifier=name)
+    listed = ET.SubElement(kind, "SourceFiles")
+    for unit in units:
+        ET.SubElement(listed, "File", name=unit)
+    logs = ET.SubElement(root, "LogCategories")
+    ET.SubElement(logs, "Category", name="logStatusError")
+    if dt:
+        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(dt))
+    variables = ET.SubElement(root, "ModelVariables")
+    _add_variables(variables, data)
+    structure = ET.SubElement(root, "ModelStructure")
+    found = [i + 1 for i, each in enumerate(variables) if each.get("causality") == "output"]
+    for part in ("Outputs", "InitialUnknowns"):
+        unknowns = ET.SubElement(structure, part)
+        for index in found:
+            ET.SubElement(unknowns, "Unknown", index=str(index))
+    ET.indent(root)
+    return bytes(ET.tostring(root, "utf-8", xml_declaration=True)) + b"\n"
 
 
-def _variable(name: str, reference: int, causality: str, said: str, kind: str) -> str:
-    initial = ' initial="calculated"' if causality == "output" else ""
-    return (
-        f'<ScalarVariable name="{name}" valueReference="{reference}" causality="{causality}" '
-        f'variability="discrete"{initial} description={quoteattr(said)}><{kind}/>'
-        "</ScalarVariable>\n"
-    )
+def _add_variables(within: ET.Element, data: Arrays) -> None:
+    """Add all variables, in the order of their value references."""
+    n_obs, inputs = len(data["obs_rest"]), [*map(str, data["action_names"])]
+    rest = [*map(float, data["obs_rest"])]
+    shown = "time since the last step in units of dt; 0 where it is not known"
+    who = "0 the policy, 1 the MPC, 2 manual"
+    reals = [(f"obs[{i}]", str(data["obs_names"][i]), rest[i]) for i in range(n_obs)]
+    reals += [("elapsed", shown, 0.0)]
+    reals += [(f"manual[{i}]", f"{each}, of the operator", 0.0) for i, each in enumerate(inputs)]
+    taken: list[tuple[str, str, list[tuple[str, str, float | None]]]] = [
+        ("Real", "input", [*reals]),
+        ("Real", "output", [(f"command[{i}]", each, None) for i, each in enumerate(inputs)]),
+        ("Integer", "input", [("request", who, 0.0)]),
+        ("Integer", "output", [("status", "0, or the sum of what was found", None)]),
+        ("Integer", "output", [("mode", f"who acted: {who}", None)]),
+        ("Boolean", "input", [("has_manual", "false holds the output while manual", 0.0)]),
+    ]
+    counts = dict.fromkeys(("Real", "Integer", "Boolean"), 0)
+    for kind, causality, entries in taken:
+        for name, description, start in entries:
+            variable = ET.SubElement(
+                within,
+                "ScalarVariable",
+                name=name,
+                valueReference=str(counts[kind]),
+                description=description,
+                causality=causality,
+                variability="discrete",
+            )
+            counts[kind] += 1
+            first = {} if start is None else {"start": _start(kind, start)}
+            ET.SubElement(variable, kind, first)
+
+
+def _start(kind: str, value: float) -> str:
+    if kind == "Boolean":
+        return "true" if value else "false"
+    return str(int(value)) if kind == "Integer" else repr(float(np.float64(value)))

@@ -1,308 +1,289 @@
 /*
- * FMI 2.0 for co-simulation around @FILE@.c: inputs obs, request, has_manual and manual; outputs
- * command, status and mode. A communication step is one step of the controller; its size is dt.
+@ABOUT@
+ *
+ * The FMI 2.0 interface for co-simulation around yann_step(). The importer sets the inputs of a
+ * sampling instant, may read the outputs that follow from them at once, and calls fmi2DoStep()
+ * with the controller's dt, which makes the step once and for all. After it the outputs stay as
+ * they are until an input is set.
  */
-#include <stdlib.h>
+#include <math.h>
+#include <stddef.h>
 #include <string.h>
 
 #include "@FILE@.h"
+#include "@FILE@_fmi2.h"
 
-#ifdef _WIN32
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
-#endif
-
-typedef void *fmi2Component;
-typedef void *fmi2ComponentEnvironment;
-typedef void *fmi2FMUstate;
-typedef unsigned int fmi2ValueReference;
-typedef double fmi2Real;
-typedef int fmi2Integer;
-typedef int fmi2Boolean;
-typedef char fmi2Char;
-typedef const fmi2Char *fmi2String;
-typedef char fmi2Byte;
-typedef enum { fmi2OK, fmi2Warning, fmi2Discard, fmi2Error, fmi2Fatal, fmi2Pending } fmi2Status;
-typedef enum { fmi2ModelExchange, fmi2CoSimulation } fmi2Type;
-typedef enum {
-    fmi2DoStepStatus,
-    fmi2PendingStatus,
-    fmi2LastSuccessfulTime,
-    fmi2Terminated
-} fmi2StatusKind;
-typedef struct fmi2CallbackFunctions fmi2CallbackFunctions;
-
+/* Value references: obs, elapsed, manual and command among the real ones, in this order. */
 #define N_OBS YANN_N_OBS
 #define N_INPUTS YANN_N_INPUTS
-#define DT @DT@
+#define AT_ELAPSED N_OBS
+#define AT_MANUAL (N_OBS + 1)
+#define AT_COMMAND (AT_MANUAL + N_INPUTS)
+#define N_REALS (AT_COMMAND + N_INPUTS)
+enum { AT_REQUEST, AT_STATUS, AT_MODE, N_INTEGERS };
+enum { AT_HAS_MANUAL, N_BOOLEANS };
 
-/* References of the variables: obs, then manual, then command; request, status, mode; has_manual. */
+static const fmi2Real step_size = @DT@; /* 0 where it is not known */
+static const fmi2Real first_obs[N_OBS] = @REST@;
+
 typedef struct {
-    yann_state state;
-    yann_real obs[N_OBS], manual[N_INPUTS], command[N_INPUTS];
-    int request, status, mode, has_manual;
-} controller;
+    fmi2Real real[N_REALS];
+    fmi2Integer integer[N_INTEGERS];
+    fmi2Boolean boolean[N_BOOLEANS];
+    yann_state before, after; /* of the step at this instant */
+    int known;                /* whether `after` and the outputs follow from the inputs */
+    int made;                 /* whether fmi2DoStep() has made that step */
+    fmi2String name;
+    fmi2CallbackFunctions callbacks;
+} instance;
 
-static yann_real *number_of(controller *own, fmi2ValueReference reference)
+static void complain(instance *own, fmi2String text)
 {
-    if (reference < N_OBS) {
-        return &own->obs[reference];
+    if (own->callbacks.logger != NULL) {
+        own->callbacks.logger(own->callbacks.componentEnvironment, own->name, fmi2Error,
+                              "logStatusError", "%s", text);
     }
-    reference -= N_OBS;
-    if (reference < N_INPUTS) {
-        return &own->manual[reference];
-    }
-    reference -= N_INPUTS;
-    return reference < N_INPUTS ? &own->command[reference] : NULL;
 }
 
-static int *whole_of(controller *own, fmi2ValueReference reference)
+static void begin(instance *own)
 {
-    int *const all[] = {&own->request, &own->status, &own->mode};
-    return reference < 3 ? all[reference] : NULL;
+    memset(own->real, 0, sizeof own->real);
+    memset(own->integer, 0, sizeof own->integer);
+    memset(own->boolean, 0, sizeof own->boolean);
+    memcpy(own->real, first_obs, sizeof first_obs);
+    yann_init(&own->before);
+    own->known = own->made = 0;
 }
 
-static void begin(controller *own)
+/* The step that the inputs of this instant ask for; it does not count before fmi2DoStep(). */
+static void look(instance *own)
 {
-    memset(own, 0, sizeof *own);
-    yann_init(&own->state);
+    yann_real obs[N_OBS], manual[N_INPUTS], action[N_INPUTS];
+    if (own->known) {
+        return;
+    }
     for (int i = 0; i < N_OBS; i++) {
-        own->obs[i] = own->state.good[i]; /* the operating point */
+        obs[i] = (yann_real)own->real[i];
     }
     for (int i = 0; i < N_INPUTS; i++) {
-        own->command[i] = own->state.output[i];
+        manual[i] = (yann_real)own->real[AT_MANUAL + i];
     }
+    own->after = own->before;
+    own->integer[AT_STATUS] = (fmi2Integer)yann_step(
+        &own->after, obs, (yann_real)own->real[AT_ELAPSED], (yann_mode)own->integer[AT_REQUEST],
+        own->boolean[AT_HAS_MANUAL] ? manual : NULL, action);
+    own->integer[AT_MODE] = (fmi2Integer)own->after.mode;
+    for (int i = 0; i < N_INPUTS; i++) {
+        own->real[AT_COMMAND + i] = action[i];
+    }
+    own->known = 1;
 }
 
-EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
-EXPORT const char *fmi2GetVersion(void) { return "2.0"; }
+EXPORT const char *FMI(fmi2GetTypesPlatform)(void) { return "default"; }
 
-EXPORT fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid,
-                                     fmi2String resources, const fmi2CallbackFunctions *functions,
-                                     fmi2Boolean visible, fmi2Boolean logging)
-{
-    (void)name, (void)resources, (void)functions, (void)visible, (void)logging;
-    if (type != fmi2CoSimulation || guid == NULL || strcmp(guid, "@GUID@") != 0) {
-        return NULL;
-    }
-    controller *own = malloc(sizeof *own);
-    if (own != NULL) {
-        begin(own);
-    }
-    return own;
-}
+EXPORT const char *FMI(fmi2GetVersion)(void) { return "2.0"; }
 
-EXPORT void fmi2FreeInstance(fmi2Component c) { free(c); }
-
-EXPORT fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n,
-                                      const fmi2String categories[])
+EXPORT fmi2Status FMI(fmi2SetDebugLogging)(fmi2Component c, fmi2Boolean on, size_t n,
+                                           const fmi2String categories[])
 {
     (void)c, (void)on, (void)n, (void)categories;
     return fmi2OK;
 }
 
-EXPORT fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance,
-                                      fmi2Real tolerance, fmi2Real start, fmi2Boolean has_stop,
-                                      fmi2Real stop)
+EXPORT fmi2Component FMI(fmi2Instantiate)(fmi2String name, fmi2Type type, fmi2String guid,
+                                          fmi2String resources,
+                                          const fmi2CallbackFunctions *callbacks,
+                                          fmi2Boolean visible, fmi2Boolean logging)
 {
-    (void)c, (void)has_tolerance, (void)tolerance, (void)start, (void)has_stop, (void)stop;
+    (void)resources, (void)visible, (void)logging;
+    if (callbacks == NULL || callbacks->allocateMemory == NULL || callbacks->freeMemory == NULL) {
+        return NULL;
+    }
+    instance *own = callbacks->allocateMemory(1, sizeof *own);
+    if (own == NULL) {
+        return NULL;
+    }
+    own->callbacks = *callbacks;
+    own->name = "@FILE@";
+    if (type != fmi2CoSimulation || guid == NULL || strcmp(guid, "@GUID@") != 0) {
+        complain(own, "This FMU is for co-simulation, and modelDescription.xml must be its own.");
+        callbacks->freeMemory(own);
+        return NULL;
+    }
+    (void)name; /* it may not outlive this call */
+    begin(own);
+    return own;
+}
+
+EXPORT void FMI(fmi2FreeInstance)(fmi2Component c)
+{
+    if (c != NULL) {
+        ((instance *)c)->callbacks.freeMemory(c);
+    }
+}
+
+EXPORT fmi2Status FMI(fmi2SetupExperiment)(fmi2Component c, fmi2Boolean with_tolerance,
+                                           fmi2Real tolerance, fmi2Real start,
+                                           fmi2Boolean with_stop, fmi2Real stop)
+{
+    (void)c, (void)with_tolerance, (void)tolerance, (void)start, (void)with_stop, (void)stop;
     return fmi2OK;
 }
 
-EXPORT fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return c ? fmi2OK : fmi2Error; }
-EXPORT fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return c ? fmi2OK : fmi2Error; }
-EXPORT fmi2Status fmi2Terminate(fmi2Component c) { return c ? fmi2OK : fmi2Error; }
+EXPORT fmi2Status FMI(fmi2EnterInitializationMode)(fmi2Component c) { return (void)c, fmi2OK; }
 
-EXPORT fmi2Status fmi2Reset(fmi2Component c)
+EXPORT fmi2Status FMI(fmi2ExitInitializationMode)(fmi2Component c) { return (void)c, fmi2OK; }
+
+EXPORT fmi2Status FMI(fmi2Terminate)(fmi2Component c) { return (void)c, fmi2OK; }
+
+EXPORT fmi2Status FMI(fmi2Reset)(fmi2Component c)
 {
     begin(c);
     return fmi2OK;
 }
 
-EXPORT fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n,
-                              fmi2Real value[])
-{
-    for (size_t i = 0; i < n; i++) {
-        const yann_real *found = number_of(c, r[i]);
-        if (found == NULL) {
-            return fmi2Error;
-        }
-        value[i] = (fmi2Real)*found;
+/* Getting and setting, alike for three types: of so many entries the first are inputs. */
+#define ACCESS(Type, type, entries, inputs)                                                        \
+    EXPORT fmi2Status FMI(fmi2Get##Type)(fmi2Component c, const fmi2ValueReference at[], size_t n, \
+                                         fmi2##Type value[])                                       \
+    {                                                                                              \
+        instance *own = c;                                                                         \
+        look(own);                                                                                 \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            if (at[i] >= (entries)) {                                                              \
+                complain(own, "No such variable.");                                                \
+                return fmi2Error;                                                                  \
+            }                                                                                      \
+            value[i] = own->type[at[i]];                                                           \
+        }                                                                                          \
+        return fmi2OK;                                                                             \
+    }                                                                                              \
+    EXPORT fmi2Status FMI(fmi2Set##Type)(fmi2Component c, const fmi2ValueReference at[], size_t n, \
+                                         const fmi2##Type value[])                                 \
+    {                                                                                              \
+        instance *own = c;                                                                         \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            if (at[i] >= (inputs)) {                                                               \
+                complain(own, "No such input.");                                                   \
+                return fmi2Error;                                                                  \
+            }                                                                                      \
+            own->type[at[i]] = value[i];                                                           \
+            own->known = own->made = 0;                                                            \
+        }                                                                                          \
+        return fmi2OK;                                                                             \
     }
-    return fmi2OK;
-}
+ACCESS(Real, real, (fmi2ValueReference)N_REALS, (fmi2ValueReference)AT_COMMAND)
+ACCESS(Integer, integer, (fmi2ValueReference)N_INTEGERS, (fmi2ValueReference)AT_STATUS)
+ACCESS(Boolean, boolean, (fmi2ValueReference)N_BOOLEANS, (fmi2ValueReference)N_BOOLEANS)
 
-EXPORT fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference r[], size_t n,
-                              const fmi2Real value[])
+EXPORT fmi2Status FMI(fmi2DoStep)(fmi2Component c, fmi2Real now, fmi2Real step, fmi2Boolean kept)
 {
-    for (size_t i = 0; i < n; i++) {
-        yann_real *found = number_of(c, r[i]);
-        if (found == NULL) {
-            return fmi2Error;
-        }
-        *found = (yann_real)value[i];
+    instance *own = c;
+    (void)now, (void)kept;
+    if (step_size > 0.0 && fabs(step - step_size) > 1e-6 * step_size) {
+        complain(own, "The communication step must be the controller's dt, @DT@.");
+        return fmi2Error;
     }
-    return fmi2OK;
-}
-
-EXPORT fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference r[], size_t n,
-                                 fmi2Integer value[])
-{
-    for (size_t i = 0; i < n; i++) {
-        const int *found = whole_of(c, r[i]);
-        if (found == NULL) {
-            return fmi2Error;
-        }
-        value[i] = *found;
+    if (own->made) {
+        own->known = 0; /* the inputs are those of the step before */
     }
+    look(own);
+    own->before = own->after;
+    own->made = 1;
     return fmi2OK;
 }
 
-EXPORT fmi2Status fmi2SetInteger(fmi2Component c, const fmi2ValueReference r[], size_t n,
-                                 const fmi2Integer value[])
+/* ---- What modelDescription.xml says that there is not ---- */
+
+static fmi2Status not_there(fmi2Component c)
 {
-    for (size_t i = 0; i < n; i++) {
-        int *found = whole_of(c, r[i]);
-        if (found == NULL || value[i] < 0 || value[i] > 2) {
-            return fmi2Error;
-        }
-        *found = value[i];
+    complain(c, "modelDescription.xml does not offer this function.");
+    return fmi2Error;
+}
+
+EXPORT fmi2Status FMI(fmi2GetString)(fmi2Component c, const fmi2ValueReference at[], size_t n,
+                                     fmi2String value[])
+{
+    (void)at, (void)value;
+    return n == 0 ? fmi2OK : not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2SetString)(fmi2Component c, const fmi2ValueReference at[], size_t n,
+                                     const fmi2String value[])
+{
+    (void)at, (void)value;
+    return n == 0 ? fmi2OK : not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2GetFMUstate)(fmi2Component c, fmi2FMUstate *state)
+{
+    return (void)state, not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2SetFMUstate)(fmi2Component c, fmi2FMUstate state)
+{
+    return (void)state, not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2FreeFMUstate)(fmi2Component c, fmi2FMUstate *state)
+{
+    return (void)state, not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2SerializedFMUstateSize)(fmi2Component c, fmi2FMUstate state, size_t *size)
+{
+    return (void)state, (void)size, not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2SerializeFMUstate)(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[],
+                                             size_t size)
+{
+    return (void)state, (void)bytes, (void)size, not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2DeSerializeFMUstate)(fmi2Component c, const fmi2Byte bytes[], size_t size,
+                                               fmi2FMUstate *state)
+{
+    return (void)state, (void)bytes, (void)size, not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2GetDirectionalDerivative)(fmi2Component c,
+                                                    const fmi2ValueReference unknown[], size_t n,
+                                                    const fmi2ValueReference known[], size_t m,
+                                                    const fmi2Real dv[], fmi2Real du[])
+{
+    (void)unknown, (void)n, (void)known, (void)m, (void)dv, (void)du;
+    return not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2SetRealInputDerivatives)(fmi2Component c, const fmi2ValueReference at[],
+                                                   size_t n, const fmi2Integer order[],
+                                                   const fmi2Real value[])
+{
+    return (void)at, (void)n, (void)order, (void)value, not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2GetRealOutputDerivatives)(fmi2Component c, const fmi2ValueReference at[],
+                                                    size_t n, const fmi2Integer order[],
+                                                    fmi2Real value[])
+{
+    return (void)at, (void)n, (void)order, (void)value, not_there(c);
+}
+
+EXPORT fmi2Status FMI(fmi2CancelStep)(fmi2Component c) { return not_there(c); }
+
+/* A step is done when fmi2DoStep() returns: there is never a pending one to ask about. */
+#define STATUS(Name, type)                                                                         \
+    EXPORT fmi2Status FMI(fmi2Get##Name##Status)(fmi2Component c, const fmi2StatusKind kind,       \
+                                                 type *value)                                      \
+    {                                                                                              \
+        return (void)c, (void)kind, (void)value, fmi2Discard;                                      \
     }
-    return fmi2OK;
-}
-
-EXPORT fmi2Status fmi2GetBoolean(fmi2Component c, const fmi2ValueReference r[], size_t n,
-                                 fmi2Boolean value[])
+EXPORT fmi2Status FMI(fmi2GetStatus)(fmi2Component c, const fmi2StatusKind kind, fmi2Status *value)
 {
-    for (size_t i = 0; i < n; i++) {
-        if (r[i] != 0) {
-            return fmi2Error;
-        }
-        value[i] = ((controller *)c)->has_manual;
-    }
-    return fmi2OK;
+    return (void)c, (void)kind, (void)value, fmi2Discard;
 }
-
-EXPORT fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference r[], size_t n,
-                                 const fmi2Boolean value[])
-{
-    for (size_t i = 0; i < n; i++) {
-        if (r[i] != 0) {
-            return fmi2Error;
-        }
-        ((controller *)c)->has_manual = value[i] != 0;
-    }
-    return fmi2OK;
-}
-
-EXPORT fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, fmi2Boolean no_undo)
-{
-    controller *own = c;
-    (void)time, (void)no_undo;
-    own->status = (int)yann_step(&own->state, own->obs, (yann_real)(size / DT),
-                                 (yann_mode)own->request, own->has_manual ? own->manual : NULL,
-                                 own->command);
-    own->mode = (int)own->state.mode;
-    return fmi2OK;
-}
-
-/* What this FMU does not offer, as its description says. */
-EXPORT fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference r[], size_t n,
-                                fmi2String value[])
-{
-    (void)c, (void)r, (void)value;
-    return n ? fmi2Error : fmi2OK;
-}
-EXPORT fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference r[], size_t n,
-                                const fmi2String value[])
-{
-    (void)c, (void)r, (void)value;
-    return n ? fmi2Error : fmi2OK;
-}
-EXPORT fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state)
-{
-    (void)c, (void)state;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state)
-{
-    (void)c, (void)state;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state)
-{
-    (void)c, (void)state;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size)
-{
-    (void)c, (void)state, (void)size;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[],
-                                        size_t size)
-{
-    (void)c, (void)state, (void)bytes, (void)size;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size,
-                                          fmi2FMUstate *state)
-{
-    (void)c, (void)bytes, (void)size, (void)state;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference of[],
-                                               size_t n, const fmi2ValueReference by[], size_t m,
-                                               const fmi2Real along[], fmi2Real value[])
-{
-    (void)c, (void)of, (void)n, (void)by, (void)m, (void)along, (void)value;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference r[],
-                                              size_t n, const fmi2Integer order[],
-                                              const fmi2Real value[])
-{
-    (void)c, (void)r, (void)n, (void)order, (void)value;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference r[],
-                                               size_t n, const fmi2Integer order[],
-                                               fmi2Real value[])
-{
-    (void)c, (void)r, (void)n, (void)order, (void)value;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2CancelStep(fmi2Component c)
-{
-    (void)c;
-    return fmi2Error;
-}
-EXPORT fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Status *value)
-{
-    (void)c, (void)kind, (void)value;
-    return fmi2Discard;
-}
-EXPORT fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value)
-{
-    (void)c, (void)kind, (void)value;
-    return fmi2Discard;
-}
-EXPORT fmi2Status fmi2GetIntegerStatus(fmi2Component c, const fmi2StatusKind kind,
-                                       fmi2Integer *value)
-{
-    (void)c, (void)kind, (void)value;
-    return fmi2Discard;
-}
-EXPORT fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind,
-                                       fmi2Boolean *value)
-{
-    (void)c, (void)kind, (void)value;
-    return fmi2Discard;
-}
-EXPORT fmi2Status fmi2GetStringStatus(fmi2Component c, const fmi2StatusKind kind,
-                                      fmi2String *value)
-{
-    (void)c, (void)kind, (void)value;
-    return fmi2Discard;
-}
+STATUS(Real, fmi2Real)
+STATUS(Integer, fmi2Integer)
+STATUS(Boolean, fmi2Boolean)
+STATUS(String, fmi2String)
