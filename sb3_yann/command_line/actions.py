@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from argparse import Namespace
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -59,10 +61,19 @@ def export(options: Namespace) -> None:
     """Write a controller, and print what it costs."""
     from sb3_yann import export as write
 
-    given = model_of(options.law) if _is_model(options.law) else law_of(options.law)
-    precision = "float" if options.float else "double"
+    if _is_model(options.law):
+        given = model_of(options.law)
+    elif Path(options.law).suffix == ".npz":
+        given = law_of(options.law)
+    else:
+        given = problem_of(options.law)
     written = write(
-        given, options.path, name=options.name, precision=precision, absolute=options.absolute
+        given,
+        options.path,
+        name=options.name,
+        precision="float" if options.float else "double",
+        absolute=options.absolute,
+        checks=checks_of(options.checks),
     )
     print(f"Written: {written}")
 
@@ -113,9 +124,29 @@ def model_of(path: str) -> Any:
 
     if not Path(path).exists() and not Path(f"{path}.zip").exists():
         raise FileNotFoundError(f"There is no model {path}: model.save(path) writes one.")
+    if not _is_model(path):
+        raise ValueError(f"{path} is no model: pass a .zip file that model.save(path) has written.")
     model = TD3.load(path, device="cpu")
     require_yann_policy(model.policy, "sb3-yann")
     return model
+
+
+def checks_of(path: str | None) -> Any:
+    """Return the Checks that a JSON file sets; None without one."""
+    if path is None:
+        return None
+    from sb3_yann import Checks
+
+    try:
+        given = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON: {error}") from None
+    known = [each.name for each in fields(Checks)]
+    if not isinstance(given, dict) or not set(given) <= set(known):
+        raise ValueError(
+            f"{path} must be an object with some of {', '.join(known)}; it holds {given!r}."
+        )
+    return Checks(**given)
 
 
 def law_of(given: str) -> Any:

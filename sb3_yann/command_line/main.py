@@ -105,6 +105,9 @@ def _add_plant(commands: Any) -> None:
     one.add_argument("--name", help="prefix of all names in code; default: the file's")
     one.add_argument("--float", action="store_true", help="code in single precision")
     one.add_argument("--absolute", action="store_true", help="readings and inputs as the plant's")
+    one.add_argument(
+        "--checks", metavar="FILE.json", help="limits of readings, and how to fall back"
+    )
     one.set_defaults(run=actions.export)
 
     one = commands.add_parser("commission", help="improve a model on its plant, batch by batch")

@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from sb3_yann._validation import Array
-from sb3_yann.control import OnlineLaw, PiecewiseAffine
+from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.deployment.checks import Checks
@@ -21,19 +21,19 @@ from sb3_yann.policy.policies import YannPolicy
 
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.ELU: "elu"}
 Arrays = dict[str, Any]
+Exportable = BaseAlgorithm | YannPolicy | LinearMPC | PiecewiseAffine | OnlineLaw
 Units = tuple[Array, Array, Array, Array]
 """theta = matrix @ obs + offset, and action = scale * (what lies in [-1, 1]) + shift."""
 
 
-def describe(
-    given: BaseAlgorithm | YannPolicy | Law, name: str, checks: Checks, absolute: bool = False
-) -> Arrays:
+def describe(given: Exportable, name: str, checks: Checks, absolute: bool = False) -> Arrays:
     """Return the arrays of a controller.
 
     Parameters
     ----------
-    given : model, YannPolicy, PiecewiseAffine or OnlineLaw
-        Of a law the controller takes theta and puts out u; of a model what `predict` does.
+    given : model, YannPolicy, LinearMPC or PiecewiseAffine
+        Of an MPC or a law the controller takes theta and puts out u, of a model it does what
+        `predict` does.
     name : str
         What the controller is called.
     checks : Checks
@@ -50,18 +50,18 @@ def describe(
     policy = given.policy if isinstance(given, BaseAlgorithm) else given
     if isinstance(policy, YannPolicy):
         return _of_policy(policy, name, checks, absolute)
-    if not isinstance(policy, PiecewiseAffine | OnlineLaw):
+    if not isinstance(policy, LinearMPC | PiecewiseAffine | OnlineLaw):
         raise TypeError(
-            f"{type(given).__name__} cannot be exported: pass a model with a YannPolicy, or a law "
-            "from LinearMPC.explicit()."
+            f"{type(given).__name__} cannot be exported: pass a model with a YannPolicy, a "
+            "LinearMPC, or a law from LinearMPC.explicit()."
         )
-    law = _explicit(policy)
+    law = _explicit(policy.law() if isinstance(policy, LinearMPC) else policy)
     states, inputs = _names(law)
     shown = [*states, *(f"theta[{i}]" for i in range(len(states), law.n_theta))]
     arrays = {
         **law_arrays(law),
         **_no_networks(law),
-        "change": np.empty((0, law.n_inputs)),
+        "change": _change(policy if isinstance(policy, LinearMPC) else None, law),
         **checks.arrays(law.n_theta),
         "watched": np.arange(law.n_theta) < len(states),
     }
@@ -121,6 +121,15 @@ def _show_states(matrix: Array, states: Array) -> Array:
     counts = matrix != 0
     shown: Array = counts[states].any(0) & ~counts[np.logical_not(states)].any(0)
     return shown
+
+
+def _change(problem: LinearMPC | None, law: PiecewiseAffine) -> Array:
+    """Return by how much an input may change, (2, m) in parts of its range, or nothing."""
+    if problem is None or problem.rate is None or not problem.has_rate_bounds:
+        return np.empty((0, law.n_inputs))
+    half = input_range(law)[2]
+    change: Array = np.array([problem.rate.du_min, problem.rate.du_max]) / half
+    return change
 
 
 def _explicit(law: Law | None) -> PiecewiseAffine:

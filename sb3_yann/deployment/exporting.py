@@ -12,20 +12,17 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._validation import as_choice, as_flag, as_options
 from sb3_yann.control.law._files import write_arrays
-from sb3_yann.control.mpc.choice import Law
 from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.cost import Cost, cost_of
-from sb3_yann.deployment.describe import Arrays, describe
+from sb3_yann.deployment.describe import Arrays, Exportable, describe
 from sb3_yann.deployment.fmu import fmu_file
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.rounding import PRECISIONS
 from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
-from sb3_yann.policy.policies import YannPolicy
 
 C_HEADERS = ("math", "stddef", "stdint", "stdio")  # which the code includes
 WORDS = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -65,7 +62,7 @@ class Exported:
 
 
 def export(
-    given: BaseAlgorithm | YannPolicy | Law,
+    given: Exportable,
     path: str | PathLike[str],
     *,
     format: str | None = None,
@@ -81,8 +78,9 @@ def export(
 
     Parameters
     ----------
-    given : model, YannPolicy or PiecewiseAffine
-        A law takes theta and puts out the input in deviations.
+    given : model, YannPolicy, LinearMPC or PiecewiseAffine
+        An MPC and a law take theta and put out the input in deviations. A law alone does not know
+        the `RateLimits` of its problem: pass the problem, and they are kept.
     path : str or PathLike
         Its suffix tells the format.
     format : {"npz", "c", "onnx", "st", "xml", "fmu"}, optional
@@ -126,12 +124,12 @@ def export(
     if not WORDS.fullmatch(called):
         raise ValueError(
             f"name = {called!r} must be a word of letters, digits and underscores that begins with "
-            "a letter: it goes into the names of the code. Pass name=."
+            "a letter: it goes into the names of the code. Pass another name."
         )
     if not target.parent.is_dir():
         raise FileNotFoundError(f"There is no folder {target.parent}: make it first.")
     if kind in ("st", "xml") and called.upper() in RESERVED:
-        raise ValueError(f"name = {called!r} is a word of Structured Text. Pass another name=.")
+        raise ValueError(f"name = {called!r} is a word of Structured Text. Pass another name.")
     own = as_options("checks", checks or Checks(), Checks)
     data = describe(given, called, own, as_flag("absolute", absolute))
     paths = FORMATS[kind](data, target, precision)

@@ -14,8 +14,13 @@ from sb3_yann.command_line import main
 from twin_samples import Cart, problem
 
 PLANT = """
+import dataclasses
+from sb3_yann import RateLimits
 from twin_samples import Cart, problem
 cart = problem
+
+def rated():
+    return dataclasses.replace(problem(), rate=RateLimits(-0.5, 0.5))
 """
 
 
@@ -92,6 +97,19 @@ def test_export_writes_code_and_says_what_it_costs(model, folder, capsys) -> Non
     ).read_text()
 
 
+def test_export_takes_checks_and_keeps_the_rates_of_a_problem(folder, capsys) -> None:
+    (folder / "limits.json").write_text('{"obs_min": [-2, -3], "frozen_after": 9}')
+    assert main(["export", "my_cart:cart", "cart.npz", "--checks", "limits.json"]) == 0
+    data = Controller.load("cart.npz").data
+    assert data["obs_min"].tolist() == [-2, -3] and data["frozen_after"] == 9
+    assert main(["export", "my_cart:rated", "rated.npz"]) == 0
+    assert Controller.load("rated.npz").data["change"].shape == (2, 1)
+    for text, said in (("{", "no JSON"), ('{"obs_mn": 1}', "some of obs_min"), ("[]", "an object")):
+        (folder / "limits.json").write_text(text)
+        assert main(["export", "my_cart:cart", "not.npz", "--checks", "limits.json"]) == 1
+        assert said in capsys.readouterr().err and not (folder / "not.npz").exists()
+
+
 def test_report_writes_one_page(model, folder) -> None:
     with_env = ["report", "cart", "with.html", "--env", "my_cart:Cart", "--episodes", "2"]
     assert main(["report", "cart", "without.html"]) == main(with_env) == 0
@@ -122,6 +140,7 @@ def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys) -
         (["solve", "my_cart:Cart"], "expected a LinearMPC"),
         (["evaluate", "none.zip", "--env", "my_cart:Cart"], "There is no model none.zip"),
         (["evaluate", "mlp", "--env", "Pendulum-v1"], "needs a YannPolicy"),
+        (["report", "law.npz", "page.html"], "law.npz is no model"),
         (["commission", "none", "--env", "my_cart:Cart", "--record", "r"], "There is no model"),
     ],
 )
@@ -130,6 +149,7 @@ def test_what_cannot_be_done_is_an_exit_code_of_one_and_a_sentence(
 ) -> None:
     if "mlp" in arguments:
         DDPG("MlpPolicy", "Pendulum-v1", device="cpu").save(folder / "mlp")
+    problem().explicit().save(folder / "law.npz")
     assert main(arguments) == 1
     printed = capsys.readouterr().err
     assert printed.startswith(f"sb3-yann {arguments[0]}: ") and said in printed
