@@ -14,7 +14,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments import twin
+from experiments import pcgym, twin
 from experiments.results import in_short, write_report
 from experiments.runner import Outcome, Run, RunsFailed, load_all, run_all
 from experiments.summary import quote
@@ -42,14 +42,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 130
     everything = load_all(runs, folder, catalog.FINGERPRINT)
     from_logs = {run: each for run, each in everything.items() if run.plant == twin.PLANT}
-    outcomes = {run: each for run, each in everything.items() if run not in from_logs}
+    strangers = {run: each for run, each in everything.items() if run.plant in pcgym.PLANTS}
+    apart = from_logs.keys() | strangers.keys()
+    outcomes = {run: each for run, each in everything.items() if run not in apart}
     if outcomes:
         command = f'make paper ARGS="{shlex.join(given)}"' if given else "make paper"
         for path in write_report(outcomes, report_folder, command=command):
             console.print(f"Written: {path}")
         if not options.quick and quote(in_short(outcomes), Path("README.md")):
             console.print("Written: the results in README.md")
-    for path in twin.write_report(from_logs, report_folder):
+    for path in (
+        *twin.write_report(from_logs, report_folder),
+        *pcgym.write_report(strangers, report_folder),
+    ):
         console.print(f"Written: {path}")
     console.print(f"{len(everything)} of {len(runs)} runs are in {folder}.")
     if failed:

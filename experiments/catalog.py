@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
@@ -21,7 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 
 from experiments import FINGERPRINT as FINGERPRINT
-from experiments import optimum, twin, yardsticks
+from experiments import optimum, pcgym, twin, yardsticks
 from experiments.measures import MPC, OBSERVER, OPTIMUM, OURS, REIDENTIFIED
 from experiments.runner import Outcome, Run
 from experiments.yardsticks import Learner
@@ -289,7 +290,7 @@ def _runs() -> list[Run]:
     return runs
 
 
-RUNS = [*_runs(), *twin.runs()]
+RUNS = [*_runs(), *twin.runs(), *(pcgym.runs() if find_spec("pcgym") else ())]
 QUICK = [
     *(Run(plant, name, 0, 0) for plant in ("CSTR", "pendulum, Q = I") for name in FIXED),
     Run("CSTR", OURS, 20, 8),
@@ -350,6 +351,8 @@ def execute(run: Run) -> Outcome:
     torch.set_num_threads(1)
     if run.plant == twin.PLANT:
         return twin.execute(run)
+    if run.plant in pcgym.PLANTS:
+        return pcgym.execute(run)
     given = PLANTS[run.plant]
     plant = observed(given) if run.learner.endswith(OBSERVER) else given
     test = partial(evaluate, env=plant.env, seeds=TEST_SEEDS)

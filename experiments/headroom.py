@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.wrappers import TimeLimit
 
 from examples.quadruple_tank import QuadrupleTank
-from experiments import tank
+from experiments import pcgym, tank
 from experiments.catalog import PLANTS, TEST_SEEDS
 from experiments.markdown import number, table
 from experiments.summary import quote
@@ -28,14 +27,11 @@ from sb3_yann import Headroom, LinearMPC, PlantTwin, headroom
 from sb3_yann.evaluation import evaluate
 from sb3_yann.evaluation.episodes import Source
 from sb3_yann.wrappers import Deviations, SetPoint
-from sb3_yann_envs.pcgym import PCGymEnv
 
 STARTS = 20
 HOLD = 20
 """Steps after which the tank has another set-point."""
 HEADER = ("plant", "MPC", "total", "offset", "model error", "nonlinearity", "verdict", "seconds")
-PCGYM = {"cstr": 5, "four_tank": 3, "multistage_extraction": 1}
-"""Horizons of the MPCs of PC-Gym's plants."""
 REACTOR = "CSTR"
 # The examples import each other by name.
 EXAMPLES = str(Path(__file__).parents[1] / "examples")
@@ -90,16 +86,10 @@ def quadrotor() -> Case:
     return Case(mpc, partial(quadrotor.make_env, mpc), starts=5, seed=0)
 
 
-def of_pcgym(name: str) -> Case:
-    """Return a plant of PC-Gym with its linear MPC."""
-    plant = PCGymEnv(name)
-    error = 1e3 * np.isin(np.arange(len(plant.x0)), plant.outputs)
-    R = np.diag(0.1 / (plant.u_max - plant.u_min) ** 2)
-    mpc = LinearMPC(
-        plant.linear_model(), Q=np.diag(error), R=R, horizon=PCGYM[name], gamma=0.95,
-        tracking=plant.tracking, absolute=True, **plant.bounds,
-    )  # fmt: skip
-    return Case(mpc, lambda: Deviations(PCGymEnv(name), mpc))
+def of_pcgym(name: str, offset_free: bool = False) -> Case:
+    """Return a plant of PC-Gym with its linear MPC, with an observer or without."""
+    case = pcgym.Case(name, offset_free)
+    return Case(case.mpc, case.env)
 
 
 CASES: dict[str, Callable[[], Case]] = {
@@ -114,7 +104,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "`examples/quadrotor.py`": quadrotor,
 }
 PCGYM_CASES: dict[str, Callable[[], Case]] = {
-    f"PC-Gym, `{name}`": partial(of_pcgym, name) for name in PCGYM
+    f"PC-Gym, `{name}`{', offset-free' * free}": partial(of_pcgym, name, free)
+    for free in (False, True)
+    for name in pcgym.HORIZONS
 }
 
 

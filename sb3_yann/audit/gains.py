@@ -9,8 +9,12 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.audit.offset import CURE
 
+LITTLE = 0.005
+"""A gain below this, relative to the MPC's cost, is not worth an observer or a new model."""
+WORTH = 0.02
+"""A gain below this is not worth learning, which finds a part of it."""
 ADVICE = {
-    "do not bother": "the MPC is nearly optimal here.",
+    "do not bother": "there is little to gain over the MPC.",
     "add ObserveDisturbance first": f"that brings most of it: {CURE}",
     "re-identify": "a linear model of the plant as it is brings most of it: see "
     "LinearModel.from_data, PlantTwin.reidentified, improve(model, twin).",
@@ -94,3 +98,24 @@ class Headroom:
 def gain(before: Array, after: Array) -> float:
     """Return by how much mean costs fall, relative to those before."""
     return float((before.mean() - after.mean()) / (abs(before.mean()) or 1.0))
+
+
+def verdict_of(offset: float, model_error: float, nonlinearity: float, doubt: float = 0.0) -> str:
+    """Return what to do: a key of `ADVICE`.
+
+    Parameters
+    ----------
+    offset, model_error, nonlinearity : float
+        Parts of the gain, relative to the MPC's cost.
+    doubt : float, default 0
+        What the whole must exceed besides, where it is known from so many random starts only.
+
+    Examples
+    --------
+    >>> verdict_of(0.0, 0.0, 0.015), verdict_of(0.0, 0.01, 0.005), verdict_of(0.0, 0.005, 0.02)
+    ('do not bother', 're-identify', 'learn')
+    """
+    parts = offset, model_error, nonlinearity
+    verdict = [*ADVICE][1 + int(np.argmax(parts))]
+    worth = WORTH if verdict == "learn" else LITTLE
+    return verdict if sum(parts) >= max(worth, doubt) else "do not bother"

@@ -23,7 +23,7 @@ from sb3_yann.audit.closed_loops import (
     of_model,
     play,
 )
-from sb3_yann.audit.gains import ADVICE, Headroom, gain
+from sb3_yann.audit.gains import Headroom, gain, verdict_of
 from sb3_yann.audit.plants import Plant, TwinPlant, simulated
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
@@ -34,8 +34,6 @@ from sb3_yann.twin.observers import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.reidentification import reidentified
 
-LITTLE = 0.005
-"""A gain below this, relative to the MPC's cost, is not worth the trouble."""
 SURE = 2.0
 """Standard errors that a gain on a random plant must exceed."""
 
@@ -215,9 +213,7 @@ class _Search:
         offset, known = min(offset, total), min(known, total)
         parts = offset, max(0.0, known - offset), total - max(offset, known)
         whole = Headroom(base.costs, observer, model, best, *parts, "", self.source)
-        verdict = [*ADVICE][1 + int(np.argmax(parts))]
-        if total < max(LITTLE, SURE * whole.standard_error * self.random):
-            verdict = "do not bother"
+        verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
         return dataclasses.replace(whole, verdict=verdict)
 
 

@@ -21,6 +21,7 @@ from sb3_yann import (
     headroom,
     offset_free,
 )
+from sb3_yann.audit.gains import verdict_of
 from sb3_yann.evaluation import evaluate
 from sb3_yann.wrappers import ObserveDisturbance
 from sb3_yann_envs import problems
@@ -111,6 +112,22 @@ def test_what_a_linear_model_cannot_do_is_left_to_learning() -> None:
     found = headroom(problems.clipped_pendulum(), "ClippedPendulum-v0", n_starts=3, seed=2001)
     assert found.verdict == "learn"
     assert found.nonlinearity == pytest.approx(found.total) and found.total > 0.005
+
+
+@pytest.mark.parametrize(
+    ("parts", "doubt", "verdict"),
+    [
+        ((0.0, 0.0, 0.019), 0.0, "do not bother"),  # learning would find a part of it
+        ((0.0, 0.0, 0.021), 0.0, "learn"),
+        ((0.004, 0.003, 0.014), 0.0, "learn"),
+        ((0.006, 0.0, 0.001), 0.0, "add ObserveDisturbance first"),
+        ((0.004, 0.0, 0.0), 0.0, "do not bother"),
+        ((0.0, 0.3, 0.1), 0.5, "do not bother"),  # by chance
+        ((0.0, 0.3, 0.1), 0.3, "re-identify"),
+    ],
+)
+def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None:
+    assert verdict_of(*parts, doubt=doubt) == verdict
 
 
 def test_changes_of_a_set_point_are_not_known_before() -> None:

@@ -1,0 +1,342 @@
+"""Plants of PC-Gym: `python -m experiments.pcgym`, some hours of one core; needs the extra `pcgym`.
+
+The linear MPCs, an NMPC, YANN-RL from the offset-free MPC, with a simulator and from a log alone,
+and four learners of Stable-Baselines3. Writes the table into docs/pcgym.md; `make paper` does the
+runs too, where PC-Gym is installed. Nothing was tuned on these seeds, nor on these episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import RescaleAction, RescaleObservation
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+
+from experiments import FINGERPRINT
+from experiments.markdown import number, table
+from experiments.measures import MPC, OURS, REIDENTIFIED
+from experiments.runner import Outcome, Run, run_all
+from experiments.summary import quote
+from sb3_yann import (
+    DisturbanceBounds,
+    DisturbanceObserver,
+    ImprovementGuard,
+    LinearMPC,
+    NoActionNoise,
+    PlantTwin,
+    YannPolicy,
+    improve,
+)
+from sb3_yann.evaluation import Episodes, evaluate
+from sb3_yann.wrappers import Deviations, ObserveDisturbance, StageCost
+from sb3_yann_envs.pcgym import PCGymEnv
+
+HORIZONS = {"cstr": 5, "four_tank": 3, "multistage_extraction": 1}
+"""Of the MPCs, chosen on episodes 100 to 109."""
+PLANTS = {f"PC-Gym, {name}": name for name in HORIZONS}
+OFFSET_FREE, NMPC, FROM_A_LOG = "offset-free MPC", "NMPC", f"{OURS}, from a log"
+FIXED = MPC, OFFSET_FREE, REIDENTIFIED, NMPC
+RIVALS: dict[str, type[Any]] = {"DDPG": DDPG, "TD3": TD3, "SAC": SAC, "PPO": PPO}
+TESTS = range(3000, 3030)
+LOG = 10  # episodes
+EPISODES = 50
+STEPS = 50_000
+SEEDS = {OURS: range(40, 43), FROM_A_LOG: range(40, 43), **dict.fromkeys(RIVALS, range(40, 41))}
+HEADER = ("plant", "controller", "training steps", "PC-Gym's cost", "against offset-free, %",
+          "worst episode, %", "stage cost", "against offset-free, %", "ms a step",
+          "seeds")  # fmt: skip
+BEGIN, END = "<!-- plants: begin -->\n", "<!-- plants: end -->"
+
+
+class Case:
+    """A plant with its linear MPC, with an observer or without."""
+
+    def __init__(self, name: str, offset_free: bool = False) -> None:
+        self.name = name
+        self.plant = plant = PCGymEnv(name)
+        model = plant.linear_model(offset_free=offset_free)
+        error = 1e3 * np.isin(np.arange(len(plant.x0)), plant.outputs)
+        self.observer: DisturbanceObserver | None = None
+        more: dict[str, Any] = {}
+        if offset_free:
+            moves, more = np.diag(model.E), {"disturbances": DisturbanceBounds(-1, 1)}
+            noise = {"state_noise": moves, "measurement_noise": 0.01 * moves}
+            self.observer = DisturbanceObserver(model, **noise, disturbance_noise=10)
+        self.mpc = LinearMPC(
+            model, Q=np.diag(error), R=np.diag(0.1 / (plant.u_max - plant.u_min) ** 2),
+            horizon=HORIZONS[name], gamma=0.95, tracking=plant.tracking, absolute=True,
+            **more, **plant.bounds,
+        )  # fmt: skip
+
+    def env(self) -> gym.Env[Any, Any]:
+        """Return the plant in deviations, with PC-Gym's reward."""
+        env: gym.Env[Any, Any] = Deviations(PCGymEnv(self.name), self.mpc)
+        if self.observer is None:
+            return env
+        bounds = self.mpc.disturbances
+        return ObserveDisturbance(env, self.observer, bounds.d_min, bounds.d_max)
+
+    def taught(self) -> gym.Env[Any, Any]:
+        """Return the same with the MPC's stage cost."""
+        return StageCost(self.env(), self.mpc)
+
+
+class NonlinearMPC:
+    """Knows the equations, not the next set-point: single shooting by IPOPT, from theta to u.
+
+    Moves of the inputs, in parts of their range, weigh 1e-4.
+    """
+
+    HORIZON = 15
+    SUBSTEPS = {"cstr": 4, "four_tank": 4, "multistage_extraction": 100}
+
+    def __init__(self, case: Case) -> None:
+        import casadi
+
+        plant, self.mpc = case.plant, case.mpc
+        n, m, p = len(plant.x0), len(plant.u_min), len(plant.outputs)
+        steps = self.SUBSTEPS[case.name]
+        x, u, rate, h = casadi.SX.sym("x", n), casadi.SX.sym("u", m), plant._rate, plant.dt / steps
+        z = x
+        for _ in range(steps):
+            k1 = rate(z, u)
+            k2 = rate(z + h / 2 * k1, u)
+            k3 = rate(z + h / 2 * k2, u)
+            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + h * k3, u))
+        sample = casadi.Function("sample", [x, u], [z])
+        V, start, wanted = (casadi.SX.sym(*each) for each in (
+            ("V", m, self.HORIZON), ("start", n), ("wanted", p)))  # fmt: skip
+        z, cost = start, 0
+        for k in range(self.HORIZON):
+            z = sample(z, plant.u_min + (plant.u_max - plant.u_min) * V[:, k])
+            cost += 1e3 * casadi.sumsqr(z[plant.outputs] - wanted)
+            cost += 1e-4 * casadi.sumsqr(V[:, k] - V[:, max(k - 1, 0)])
+        program = {"x": casadi.vec(V), "p": casadi.vertcat(start, wanted), "f": cost}
+        quiet = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 60}
+        self.solve = casadi.nlpsol("plan", "ipopt", program, quiet)
+        self.plant, self.size, self.plans = plant, n + p, {}
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray:
+        """Return inputs (batch, m), as deviations; each row goes on with its own plan."""
+        m, low = len(self.plant.u_min), self.plant.u_min
+        width, given = self.plant.u_max - low, np.atleast_2d(theta) + self.mpc.theta_ss
+        found = np.empty((len(given), m))
+        for i, row in enumerate(given):
+            before = self.plans.get(i, np.full(m * self.HORIZON, 0.5))
+            plan = np.array(self.solve(x0=before, p=row[: self.size], lbx=0, ubx=1)["x"]).ravel()
+            self.plans[i] = np.concatenate([plan[m:], plan[-m:]])
+            found[i] = low + width * plan[:m] - self.mpc.model.u_ss
+        return found.reshape(*np.shape(theta)[:-1], m)
+
+
+def scaled(name: str) -> gym.Env[Any, Any]:
+    """Return a plant with observations and actions in [-1, 1]."""
+    return RescaleObservation(RescaleAction(PCGymEnv(name), -1.0, 1.0), -1.0, 1.0)
+
+
+class Rival:
+    """What a model of `scaled` does to theta."""
+
+    def __init__(self, model: Any, case: Case) -> None:
+        self.model, self.mpc, self.plant = model, case.mpc, case.plant
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray:
+        """Return inputs (batch, m), as deviations."""
+        box, plant = self.plant.observation_space, self.plant
+        shown = 2 * (theta + self.mpc.theta_ss - box.low) / (box.high - box.low) - 1
+        action = self.model.predict(shown.astype(np.float32), deterministic=True)[0]
+        u = plant.u_min + (np.clip(action, -1, 1) + 1) / 2 * (plant.u_max - plant.u_min)
+        return np.asarray(u - self.mpc.model.u_ss)
+
+
+class Timed:
+    """A controller, and how long it takes, in s."""
+
+    def __init__(self, act: Callable[[Any], Any]) -> None:
+        self.act: Callable[[Any], Any] = act
+        self.times: list[float] = []
+
+    def __call__(self, theta: Any) -> Any:
+        """Act."""
+        began = time.perf_counter()
+        found = self.act(theta)
+        self.times.append(time.perf_counter() - began)
+        return found
+
+
+def runs() -> list[Run]:
+    """Return all runs; those of one seed come before those of the next."""
+    found = [Run(plant, name, 0, 0) for plant in PLANTS for name in FIXED]
+    longest = max(map(len, SEEDS.values()))
+    for i in range(longest):
+        for name, seeds in SEEDS.items():
+            episodes = LOG if name == FROM_A_LOG else EPISODES
+            found += [Run(plant, name, seeds[i], episodes) for plant in PLANTS if i < len(seeds)]
+    return found
+
+
+def execute(run: Run) -> Outcome:
+    """Return the outcome of a run: PC-Gym's costs as those of its tests."""
+    began, name = time.perf_counter(), PLANTS[run.plant]
+    case = Case(name, offset_free=run.learner in (OFFSET_FREE, OURS, FROM_A_LOG))
+    tested: dict[int, tuple[Episodes, float]] = {}
+
+    def test(steps: int, act: Callable[[Any], Any]) -> None:
+        with_rows, one = evaluate(act, case.env, TESTS), Timed(act)
+        evaluate(one, case.env(), TESTS[:1])  # a row at a time, as a plant asks
+        tested[steps] = with_rows, 1e3 * float(np.median(one.times))
+
+    steps = len(case.plant.schedule) - 1
+    if run.learner in FIXED:
+        problem = reidentified(case) if run.learner == REIDENTIFIED else case.mpc
+        test(0, NonlinearMPC(case) if run.learner == NMPC else problem.explicit())
+    elif run.learner == OURS:
+        model = policy_of(case, run.seed)
+        guard = ImprovementGuard(case.taught)
+        model.learn(steps * EPISODES, callback=[NoActionNoise(), guard])
+        test(steps * EPISODES, partial(acted, model))
+    elif run.learner == FROM_A_LOG:
+        model = policy_of(case, run.seed)
+        twin = twin_of(case, run.seed)
+        if twin.trusted:
+            improve(model, twin, seed=run.seed)
+        test(steps * LOG, partial(acted, model))
+    else:
+        model = RIVALS[run.learner](
+            "MlpPolicy", scaled(name), gamma=0.95, seed=run.seed, device="cpu"
+        )
+        during = TestAt(steps * EPISODES, lambda: test(steps * EPISODES, Rival(model, case)))
+        model.learn(STEPS, callback=during)
+        test(STEPS, Rival(model, case))
+    return outcome(case, tested, time.perf_counter() - began)
+
+
+def outcome(case: Case, tested: Mapping[int, tuple[Episodes, float]], seconds: float) -> Outcome:
+    """Return tests after so many steps as an outcome: their costs by both metrics."""
+    plain, size = Case(case.name).mpc, case.plant.observation_space.shape[0]
+    stage = [
+        [
+            float(plain.stage_cost(seen[:-1, :size], taken).sum())
+            for seen, taken in zip(each.observations, each.actions, strict=True)
+        ]
+        for each, _ in tested.values()
+    ]
+    none = np.zeros(0)
+    return Outcome(
+        np.array([*tested]),
+        np.array([each.costs for each, _ in tested.values()]),
+        np.array([each.violations for each, _ in tested.values()]),
+        none, none, none,
+        {"stage_costs": np.array(stage), "ms": np.array([ms for _, ms in tested.values()])},
+        seconds,
+    )  # fmt: skip
+
+
+class TestAt(BaseCallback):
+    """Tests once, after so many steps."""
+
+    def __init__(self, steps: int, test: Callable[[], None]) -> None:
+        super().__init__()
+        self.steps, self.test = steps, test
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.steps:
+            self.test()
+        return True
+
+
+def policy_of(case: Case, seed: int) -> DDPG:
+    """Return a model that starts as the MPC; nothing is set for the plant."""
+    return DDPG(
+        YannPolicy, case.taught(), gamma=0.95, tau=0.02, seed=seed, device="cpu",
+        policy_kwargs={"problem": case.mpc},
+    )  # fmt: skip
+
+
+def acted(model: DDPG, theta: np.ndarray) -> np.ndarray:
+    """Return what a model does, without noise."""
+    return np.asarray(model.predict(theta, deterministic=True)[0])
+
+
+def log_of(case: Case, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return episodes of the MPC."""
+    played = evaluate(case.mpc.explicit(), case.env, range(1000 * seed, 1000 * seed + LOG))
+    return [*zip(played.observations, played.actions, strict=True)]
+
+
+def twin_of(case: Case, seed: int) -> PlantTwin:
+    """Return a twin of a log, with the observer."""
+    return PlantTwin.fit(case.mpc, log_of(case, seed), observer=case.observer, seed=seed)
+
+
+def reidentified(case: Case) -> LinearMPC:
+    """Return the MPC whose model is identified again, from a log of the MPC."""
+    return PlantTwin.fit(case.mpc, log_of(case, 40)).reidentified()
+
+
+def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
+    """Return the rows of the table: medians and ranges over the seeds."""
+    found = []
+    for plant in PLANTS:
+        base = outcomes.get(Run(plant, OFFSET_FREE, 0, 0))
+        if base is None:
+            continue
+        for name in (*FIXED, OURS, FROM_A_LOG, *RIVALS):
+            of = [
+                each for run, each in outcomes.items() if (run.plant, run.learner) == (plant, name)
+            ]
+            for k, steps in enumerate(of[0].checkpoints if of else ()):
+                found.append(_row(plant, name, int(steps), [(each, k) for each in of], base))
+    return found
+
+
+def _row(
+    plant: str, name: str, steps: int, tests: Sequence[tuple[Outcome, int]], base: Outcome
+) -> tuple[str, ...]:
+    """Return the row of a controller after so many steps."""
+    cells = []
+    for costs, ours in (
+        ([each.test_costs[k] for each, k in tests], base.test_costs[0]),
+        ([each.extra["stage_costs"][k] for each, k in tests], base.extra["stage_costs"][0]),
+    ):
+        means = np.array([each.mean() for each in costs])
+        change = 100 * (means / ours.mean() - 1)
+        spread = f" ({change.min():+.2f} to {change.max():+.2f})" if len(change) > 1 else ""
+        worst = max(100 * ((each - ours) / ours.mean()).max() for each in costs)
+        median = f"{np.median(change):+.2f}{spread}"
+        cells.append((number(float(np.median(means)), 3), median, f"{worst:+.2f}"))
+    ms = np.median([each.extra["ms"][k] for each, k in tests])
+    first, second = cells
+    shown = f"{steps:,}" if steps else ""
+    return plant, name, shown, *first, *second[:2], number(ms, 2), f"{len(tests)}"
+
+
+def write_report(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
+    """Quote the table in ``pcgym.md`` if it is there; return the paths that were written."""
+    found, page = rows(outcomes), folder / "pcgym.md"
+    return [page] if found and quote(table(HEADER, found, texts=2), page, BEGIN, END) else []
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Do the runs that are missing, print the table and quote it."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.pcgym", description=__doc__)
+    parser.add_argument("--jobs", type=int, default=-1, help="processes (all cores)")
+    parser.add_argument("--results", type=Path, default=Path("out/paper"), help="of the runs")
+    parser.add_argument("--report", type=Path, default=Path("docs"), help="folder of the page")
+    options = parser.parse_args(arguments)
+    found = run_all(runs(), execute, options.results, fingerprint=FINGERPRINT, jobs=options.jobs)
+    print(table(HEADER, rows(found), texts=2))
+    for path in write_report(found, options.report):
+        print(f"Written: {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""The table of PC-Gym's plants: its cells by hand, and what the controllers do, if it is there."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from experiments import pcgym
+from experiments.runner import Outcome, Run
+
+PLANT = next(iter(pcgym.PLANTS))
+needs_pcgym = pytest.mark.skipif(
+    importlib.util.find_spec("pcgym") is None, reason="PC-Gym is not installed"
+)
+
+
+def outcome(*costs: list[float], steps: tuple[int, ...] = (0,)) -> Outcome:
+    none, tests = np.zeros(0), np.array(costs)
+    extra = {"stage_costs": 2 * tests, "ms": np.full(len(tests), 0.5)}
+    return Outcome(np.array(steps), tests, np.zeros_like(tests), none, none, none, extra)
+
+
+OUTCOMES = {
+    Run(PLANT, pcgym.OFFSET_FREE, 0, 0): outcome([10.0, 30.0]),
+    Run(PLANT, pcgym.OURS, 40, 50): outcome([9.0, 30.2], steps=(5950,)),
+    Run(PLANT, pcgym.OURS, 41, 50): outcome([10.0, 30.0], steps=(5950,)),
+    Run(PLANT, "PPO", 40, 50): outcome([40.0, 40.0], [20.0, 30.0], steps=(5950, 50_000)),
+}
+
+
+def test_rows_are_medians_against_the_offset_free_mpc(tmp_path):
+    offset_free, ours, early, late = pcgym.rows(OUTCOMES)
+    assert offset_free == (
+        PLANT, "offset-free MPC", "", "20.000", "+0.00", "+0.00", "40.000", "+0.00", "0.50", "1",
+    )  # fmt: skip
+    assert ours[2:6] == ("5,950", "19.800", "-1.00 (-2.00 to +0.00)", "+1.00")
+    assert ours[-1] == "2"
+    assert early[2:6] == ("5,950", "40.000", "+100.00", "+150.00")
+    assert late[2:6] == ("50,000", "25.000", "+25.00", "+50.00")
+    assert len(offset_free) == len(pcgym.HEADER)
+    page = tmp_path / "pcgym.md"
+    page.write_text(f"before\n{pcgym.BEGIN}old\n{pcgym.END}after\n", encoding="utf-8")
+    assert pcgym.write_report(OUTCOMES, tmp_path) == [page]
+    assert "-1.00 (-2.00 to +0.00)" in page.read_text(encoding="utf-8")
+    assert pcgym.write_report({}, tmp_path) == pcgym.rows({}) == []
+
+
+def test_every_seed_of_every_controller_is_run_once():
+    runs = pcgym.runs()
+    assert len(set(runs)) == len(runs)
+    assert {run.learner for run in runs} == {*pcgym.FIXED, *pcgym.SEEDS}
+    assert {run.plant for run in runs} == {*pcgym.PLANTS}
+
+
+@needs_pcgym
+@pytest.mark.parametrize("name", pcgym.HORIZONS)
+def test_controllers_are_played_on_the_plant_they_know(name):
+    case, other = pcgym.Case(name), pcgym.Case(name, offset_free=True)
+    env, size = other.env(), case.plant.observation_space.shape[0]
+    theta, _ = env.reset(seed=5)
+    assert theta.shape == (other.mpc.n_theta,)
+    law = case.mpc.explicit()
+    nmpc = pcgym.NonlinearMPC(case)
+    for act in (law, nmpc):
+        u = act(theta[None, :size])
+        assert np.all(u >= case.mpc.u_min - 1e-9) and np.all(u <= case.mpc.u_max + 1e-9)
+
+
+@needs_pcgym
+def test_a_rival_sees_its_own_scale():
+    case = pcgym.Case("cstr")
+    env = pcgym.scaled("cstr")
+    shown, _ = env.reset(seed=3)
+    theta, _ = case.env().reset(seed=3)
+
+    class Model:
+        def predict(self, seen, deterministic):
+            assert deterministic and np.allclose(seen, shown, atol=1e-6)
+            return np.array([0.5], np.float32), None
+
+    u = pcgym.Rival(Model(), case)(theta)
+    assert np.allclose(u + case.mpc.model.u_ss, 295 + 0.75 * 7)
