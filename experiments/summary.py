@@ -9,12 +9,13 @@ from experiments.markdown import number, table
 from experiments.measures import MPC, OPTIMUM, OURS, Row, Standing, plants_of, standing
 from experiments.runner import Outcome, Run
 
-RIVAL = "DDPG"
+RIVAL, BARE = "DDPG", f"{OURS}, no settings"
 HEADER = (
     "plant",
     OPTIMUM,
     MPC,
     f"**{OURS}**",
+    "no settings",
     "worst start",
     "excess cost",
     RIVAL,
@@ -46,14 +47,15 @@ def quote(text: str, readme: Path, first: str = BEGIN, last: str = END) -> bool:
 
 def _cells(at: Standing) -> list[str]:
     """Return the row of a plant; a learner that was not run leaves its cells empty."""
-    optimum, mpc, ours, rival = (
-        at.row(name) if name in at.learners else None for name in (OPTIMUM, MPC, OURS, RIVAL)
+    optimum, mpc, ours, bare, rival = (
+        at.row(name) if name in at.learners else None for name in (OPTIMUM, MPC, OURS, BARE, RIVAL)
     )
     return [
         at.plant,
         _mean(optimum),
         _mean(mpc),
         f"**{_mean(ours)}**",
+        _mean(bare),
         number(ours.worst, sign="+") if ours else "",
         _excess(ours),
         _mean(rival),
@@ -82,6 +84,7 @@ def _legend(episodes: int, starts: int) -> str:
     return (
         f"Mean cost of a test episode after {episodes} training episodes, over {starts} starts "
         "that training and guard never see: the median over the seeds (and the range). "
+        f"*No settings*: {OURS} with `tau=0.02` on every plant, all else as it comes. "
         f"*Worst start*: the largest cost above the MPC's over all seeds and starts of {OURS}. "
         "*Excess cost*: what all training episodes together cost above the MPC from the same "
         f"starts, median. *Violations* (training episodes beyond a limit) and *seeds* are those of "
