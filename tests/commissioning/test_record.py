@@ -60,7 +60,7 @@ def test_every_flipped_bit_is_refused_or_cuts_off_the_last_line(path: Path) -> N
     [
         lambda lines: [lines[0], *lines[2:]],
         lambda lines: [lines[0], lines[2], lines[1], *lines[3:]],
-        lambda lines: [*lines[:3], lines[3].replace("1.5", "1.4"), *lines[4:]],
+        lambda lines: [*lines[:2], lines[2].replace("1.5", "1.4"), *lines[3:]],
         lambda lines: [json.dumps({"event": "begin", **SETTINGS}), *lines[1:]],
         lambda lines: [*lines, 100_000 * "["],
         lambda lines: [*lines, "\ufeff"],
