@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Options = TypeVar("Options")
+LARGEST_BOUND = 1e100
+"""Squares and sums of larger ones overflow."""
 
 
 class NonFiniteWarning(RuntimeWarning):
@@ -57,7 +59,7 @@ def as_bounds(
 ) -> tuple[Array, Array]:
     """Return bounds of shape ``(size,)``, the lower below the upper.
 
-    A scalar is for all entries; None and infinity are no bound.
+    A scalar is for all entries; None and infinity are no bound. A finite one has at most 1e100.
     """
     low = _bound(f"{name}_min", lower, size, -np.inf)
     high = _bound(f"{name}_max", upper, size, np.inf)
@@ -246,6 +248,12 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
         raise ValueError(f"{name} has shape {array.shape}, expected ({size},) or a single number.")
     if np.any(np.isnan(array)):
         raise ValueError(f"{name} holds NaN: {array.tolist()}. Use inf for 'no bound'.")
+    huge = np.flatnonzero(np.isfinite(array) & (np.abs(array) > LARGEST_BOUND))
+    if len(huge):
+        raise ValueError(
+            f"{name}[{huge[0]}] = {array[huge[0]]:g} must be at most {LARGEST_BOUND:g} in size, or "
+            "infinite. Use inf for 'no bound'."
+        )
     return _frozen(array)
 
 
