@@ -198,7 +198,16 @@ def as_options(name: str, value: Any, kind: type[Options]) -> Options:
 
 
 def to_float(name: str, value: Any) -> Array:
-    """Return ``value`` as a new float64 array of any shape; raise TypeError if it is none."""
+    """Return ``value`` as a new float64 array of any shape; raise TypeError if it is none.
+
+    Masked entries are a ValueError: an array of numbers would show what lies under the mask.
+    """
+    parts = value if isinstance(value, (list, tuple)) else [value]
+    if any(isinstance(each, np.ma.MaskedArray) and np.ma.is_masked(each) for each in parts):
+        raise ValueError(
+            f"{name} has masked entries, expected are numbers. Leave their rows out: split a log "
+            "there into two episodes."
+        )
     try:
         if np.iscomplexobj(value):
             raise TypeError("it is complex")
