@@ -143,7 +143,10 @@ def as_between(
     kinds = (int, float, np.integer, np.floating)
     if isinstance(value, bool) or not isinstance(value, kinds):
         raise TypeError(f"{name} = {_short(value)} must be a number. {hint}".rstrip())
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = np.inf if value > 0 else -np.inf
     left = number >= low if ends[0] == "[" else number > low
     right = number <= high if ends[1] == "]" else number < high
     if left and right and np.isfinite(number):
@@ -154,7 +157,7 @@ def as_between(
     else:
         above = f" {'above' if ends[0] == '(' else 'of at least'} {low:g}" if low > -np.inf else ""
         wanted = f"be a finite number{above}"
-    raise ValueError(f"{name} = {value!r} must {wanted}. {hint}".rstrip())
+    raise ValueError(f"{name} = {_short(value)} must {wanted}. {hint}".rstrip())
 
 
 def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
@@ -163,6 +166,8 @@ def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
         raise ValueError(
             f"{name} = {_short(value)} must be a whole number of at least {least}. {hint}".rstrip()
         )
+    if value >= 2**63:
+        raise ValueError(f"{name} = {_short(value)} must be below 2**63. {hint}".rstrip())
     return int(value)
 
 
@@ -212,7 +217,7 @@ def to_float(name: str, value: Any) -> Array:
         if np.iscomplexobj(value):
             raise TypeError("it is complex")
         return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         fault = f"{name} = {_short(value)} is not an array of real numbers ({error})."
         raise TypeError(fault) from None
 

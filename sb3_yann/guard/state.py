@@ -174,9 +174,7 @@ def begin_record(path: Path, decisions: list[Decision]) -> bool:
         numbers = (path.with_name(f"{path.stem}.{i}{path.suffix}") for i in count(1))
         beside = next(each for each in numbers if not each.exists())
         os.rename(path, beside)
-        warnings.warn(
-            f"{path} held the record of another run: it is {beside} now.", stacklevel=2
-        )
+        warnings.warn(f"{path} held the record of another run: it is {beside} now.", stacklevel=2)
     return write_record(path, decisions, anew=True)
 
 

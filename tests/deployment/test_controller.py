@@ -279,15 +279,16 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
 
 def test_arrays_that_do_not_fit_together_are_named(tmp_path):
     data = controller_of(policy_of("references and rates"), tmp_path).data
-    wrong = {
-        "action_scale": np.ones(2), "obs_min": np.float64(0), "hold": np.ones(1),
-        "change": np.ones((2, 5)), "layer1": data["layer1"][:, :-1], "b": np.nan * data["b"],
-        "gains": np.nan * data["gains"], "activation": "swish", "recover": np.nan,
-        "starts": data["starts"] - 1, "network_of": data["network_of"] + 1000, "hold": -1,
-        "n_layers": -1, "obs_names": np.array(["x"]), "bounds": -data["bounds"],
-        "action_scale": np.zeros(1), "A": np.full_like(data["A"], np.inf), "transfer": 0.5,
-    }  # fmt: skip
-    for name, value in wrong.items():
+    wrong = [
+        ("action_scale", np.ones(2)), ("action_scale", np.zeros(1)), ("obs_min", np.float64(0)),
+        ("hold", np.ones(1)), ("hold", -1), ("transfer", 0.5), ("recover", np.nan),
+        ("n_layers", -1), ("change", np.ones((2, 5))), ("layer1", data["layer1"][:, :-1]),
+        ("b", np.nan * data["b"]), ("gains", np.nan * data["gains"]), ("activation", "swish"),
+        ("A", np.full_like(data["A"], np.inf)), ("obs_names", np.array(["x"])),
+        ("starts", data["starts"] - 1), ("network_of", data["network_of"] + 1000),
+        ("bounds", -data["bounds"]),
+    ]  # fmt: skip
+    for name, value in wrong:
         write_arrays(tmp_path / "wrong.npz", {**data, name: value})
         with pytest.raises(ValueError, match="holds no controller"):
             Controller.load(tmp_path / "wrong.npz")
