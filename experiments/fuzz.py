@@ -233,7 +233,7 @@ def _changed(array: Any, rng: np.random.Generator) -> Any:
 
 
 def _record(folder: Path) -> Target:
-    """Damaged records of a commissioning."""
+    """Return a target of damaged records of a commissioning."""
     path, settings = folder / "plant.jsonl", {"batch": 2}
     journal = Journal(Record(path), settings, Outlook(0.1))
     for _ in range(3):
@@ -263,7 +263,7 @@ checks: {hold: 5, recover: 10, transfer: 5, frozen_after: 30, late_after: 1.5}
 
 
 def _settings(folder: Path) -> Target:
-    """Settings in YAML, as RL Zoo reads them."""
+    """Return a target of settings in YAML, as RL Zoo reads them."""
 
     def attempt(rng: np.random.Generator) -> str:
         try:
@@ -303,14 +303,15 @@ def _odd_settings(rng: np.random.Generator) -> Any:
 
 WORDS = (
     *"solve plot export evaluate report commission --save --name --axes --time-limit".split(),
-    *"--region-limit --float --absolute --episodes --version --help law.npz broken.npz m.zip".split(),
-    *"no:such sb3_yann:nothing Pendulum-v9 0 1 -1 1e9 nan out.c out.npz out.st out.png x.fmu".split(),
+    *"--region-limit --float --absolute --episodes --version --help law.npz broken.npz".split(),
+    *"m.zip no:such sb3_yann:nothing Pendulum-v9 0 1 -1 1e9 nan".split(),
+    *"out.c out.npz out.st out.png x.fmu".split(),
     *("", "--", "\0", "ä b", "../../..", "/", "out.c/out.c"),
 )
 
 
 def _command_line(folder: Path) -> Target:
-    """Words in any order: the exit code is 0, 1 or 2, and an error is a line that says why."""
+    """Return a target of words in any order: the code is 0, 1 or 2, and an error says why."""
     _, path = _law_file("law", folder)
     content = path.read_bytes()
 

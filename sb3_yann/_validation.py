@@ -208,7 +208,7 @@ def to_float(name: str, value: Any) -> Array:
     Masked entries are a ValueError: an array of numbers would show what lies under the mask.
     """
     parts = value if isinstance(value, (list, tuple)) else [value]
-    if any(isinstance(each, np.ma.MaskedArray) and np.ma.is_masked(each) for each in parts):
+    if any(isinstance(each, np.ma.MaskedArray) and np.any(each.mask) for each in parts):
         raise ValueError(
             f"{name} has masked entries, expected are numbers. Leave their rows out: split a log "
             "there into two episodes."

@@ -1,7 +1,7 @@
 """A policy or a law in production: it needs numpy and `_archive.py`, a file that needs numpy alone.
 
-Copy both into one folder, and they run without this package. It is evaluated in float64, and every step watches the readings. The C code of an export does the
-same.
+Copy both into one folder, and they run without this package. A policy is evaluated in float64, and
+every step watches the readings. The C code of an export does the same.
 """
 
 from __future__ import annotations

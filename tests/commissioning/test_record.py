@@ -34,7 +34,7 @@ def path(tmp_path: Path) -> Path:
 
 def test_it_reads_what_it_wrote(path: Path) -> None:
     again = journal(path)
-    assert [each.reward for each in again.episodes][0] == 1.5
+    assert again.episodes[0].reward == 1.5
     assert again.episodes[1].alarm.message == "x[0] = 3 > 2 °C"
     assert len(again.record.events) == 5 and "digest" not in again.record.events[0]
     again.begin(False)

@@ -164,9 +164,9 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Non
     # A small part alone may be an input with next to no effect, whose bounds are as they should be.
     for i in np.flatnonzero((0 < most) & (most < LITTLE) & (width > 1 / LITTLE)):
         raise ValueError(
-            f"u_max[{i}] = {u_max[i]:g}, with u_min[{i}] = {u_min[i]:g}, is too large: expected are "
-            f"bounds of which the MPC asks for more than {LITTLE:g}, and it asks for {most[i]:.0e} of "
-            "these. Pass what the actuator can do, or inf for no bound."
+            f"u_max[{i}] = {u_max[i]:g}, with u_min[{i}] = {u_min[i]:g}, is too large: expected "
+            f"are bounds of which the MPC asks for more than {LITTLE:g}, and it asks for "
+            f"{most[i]:.0e} of these. Pass what the actuator can do, or inf for no bound."
         )
     if np.any(asked > ABSURD):
         i = int(np.argmax(asked.max(axis=0)))
