@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Options = TypeVar("Options")
+LARGEST_BOUND = 1e100
+"""Squares and sums of larger ones overflow."""
 
 
 class NonFiniteWarning(RuntimeWarning):
@@ -57,7 +59,7 @@ def as_bounds(
 ) -> tuple[Array, Array]:
     """Return bounds of shape ``(size,)``, the lower below the upper.
 
-    A scalar is for all entries; None and infinity are no bound.
+    A scalar is for all entries; None and infinity are no bound. A finite one has at most 1e100.
     """
     low = _bound(f"{name}_min", lower, size, -np.inf)
     high = _bound(f"{name}_max", upper, size, np.inf)
@@ -141,7 +143,10 @@ def as_between(
     kinds = (int, float, np.integer, np.floating)
     if isinstance(value, bool) or not isinstance(value, kinds):
         raise TypeError(f"{name} = {_short(value)} must be a number. {hint}".rstrip())
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = np.inf if value > 0 else -np.inf
     left = number >= low if ends[0] == "[" else number > low
     right = number <= high if ends[1] == "]" else number < high
     if left and right and np.isfinite(number):
@@ -152,7 +157,7 @@ def as_between(
     else:
         above = f" {'above' if ends[0] == '(' else 'of at least'} {low:g}" if low > -np.inf else ""
         wanted = f"be a finite number{above}"
-    raise ValueError(f"{name} = {value!r} must {wanted}. {hint}".rstrip())
+    raise ValueError(f"{name} = {_short(value)} must {wanted}. {hint}".rstrip())
 
 
 def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
@@ -161,6 +166,8 @@ def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
         raise ValueError(
             f"{name} = {_short(value)} must be a whole number of at least {least}. {hint}".rstrip()
         )
+    if value >= 2**63:
+        raise ValueError(f"{name} = {_short(value)} must be below 2**63. {hint}".rstrip())
     return int(value)
 
 
@@ -196,12 +203,21 @@ def as_options(name: str, value: Any, kind: type[Options]) -> Options:
 
 
 def to_float(name: str, value: Any) -> Array:
-    """Return ``value`` as a new float64 array of any shape; raise TypeError if it is none."""
+    """Return ``value`` as a new float64 array of any shape; raise TypeError if it is none.
+
+    Masked entries are a ValueError: an array of numbers would show what lies under the mask.
+    """
+    parts = value if isinstance(value, (list, tuple)) else [value]
+    if any(isinstance(each, np.ma.MaskedArray) and np.any(each.mask) for each in parts):
+        raise ValueError(
+            f"{name} has masked entries, expected are numbers. Leave their rows out: split a log "
+            "there into two episodes."
+        )
     try:
         if np.iscomplexobj(value):
             raise TypeError("it is complex")
         return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         fault = f"{name} = {_short(value)} is not an array of real numbers ({error})."
         raise TypeError(fault) from None
 
@@ -246,6 +262,12 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
         raise ValueError(f"{name} has shape {array.shape}, expected ({size},) or a single number.")
     if np.any(np.isnan(array)):
         raise ValueError(f"{name} holds NaN: {array.tolist()}. Use inf for 'no bound'.")
+    huge = np.flatnonzero(np.isfinite(array) & (np.abs(array) > LARGEST_BOUND))
+    if len(huge):
+        raise ValueError(
+            f"{name}[{huge[0]}] = {array[huge[0]]:g} must be at most {LARGEST_BOUND:g} in size, or "
+            "infinite. Use inf for 'no bound'."
+        )
     return _frozen(array)
 
 

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = {"sb3_yann": ROOT, "sb3_yann_envs": ROOT / "envs"}
 
 FLOORS = [
-    {"sb3_yann._validation", "sb3_yann._numba", "sb3_yann._drawing"},
+    {"sb3_yann._archive", "sb3_yann._validation", "sb3_yann._numba", "sb3_yann._drawing"},
     {"sb3_yann.control"},
     {"sb3_yann_envs"},
     {"sb3_yann.networks"},
@@ -38,6 +38,7 @@ Stable-Baselines3 -> deployment.
 there is; the command line uses it as any other script does."""
 
 FORBIDDEN = {
+    "sb3_yann._archive": {"torch", "stable_baselines3", "gymnasium", "numba", "scipy", "sb3_yann"},
     "sb3_yann._validation": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann._numba": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann._drawing": {"torch", "stable_baselines3", "gymnasium"},

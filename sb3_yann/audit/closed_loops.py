@@ -18,7 +18,7 @@ from sb3_yann.audit.plants import Plant
 from sb3_yann.audit.task import Bounds, Task
 from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
 from sb3_yann.control import DisturbanceObserver, LinearMPC
-from sb3_yann.evaluation.episodes import LONGEST, Source, endless
+from sb3_yann.evaluation.episodes import Source, watch_length
 from sb3_yann.twin.dynamics import law_of
 
 Controller = Callable[[int, Array, NDArray[np.bool_]], Array]
@@ -129,8 +129,7 @@ def play(
             thetas.append(now)
             inputs.append(u)
             told.append(violated)
-            if len(inputs) >= LONGEST:
-                raise endless(envs[0])
+            watch_length(envs[0], len(inputs))
     states, played = np.array(thetas), np.array(inputs)
     taken = np.arange(len(inputs))[:, None] < lengths
     costs = np.sum(problem.stage_cost(states[:-1], played), axis=0, where=taken)

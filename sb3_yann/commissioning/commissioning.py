@@ -206,9 +206,11 @@ class Commissioning:
                 costs, outlook, verdict, reason = self._learn(plant, number)
             if verdict == "accepted":
                 saved = journal.record.save(self.model, number)
-                outlook = replace(outlook, policy=f"batch {number}", model=saved)
+                digest = journal.record.digest_of(saved)
+                policy = f"batch {number}"
+                outlook = replace(outlook, policy=policy, model=saved, model_digest=digest)
             elif verdict != "stays":
-                outlook = replace(outlook, policy="MPC", model=None)
+                outlook = replace(outlook, policy="MPC", model=None, model_digest=None)
             shown = costs.actual, costs.predicted, costs.mpc
             sizes = number, len(journal.batch), alarms
             journal.close(Batch(*sizes, who, within, *shown, verdict, reason), outlook)
@@ -307,7 +309,7 @@ class Commissioning:
             self.incumbent.give_back()
         else:
             self.incumbent.limit(outlook.max_correction)
-            self.journal.record.load(outlook.model, self.model)
+            self.journal.record.load(outlook.model, outlook.model_digest, self.model)
         self.incumbent.candidate = None
         self.incumbent.hold()
         if outlook.twin is not None:

@@ -75,8 +75,8 @@ class Outlook:
         The episodes that the twin in force was fitted to.
     twin_seed : int
         And its seed.
-    model : str or None
-        The file of the accepted policy.
+    model, model_digest : str or None
+        The file of the accepted policy, and its digest.
     """
 
     max_correction: float
@@ -86,6 +86,7 @@ class Outlook:
     twin: list[int] | None = None
     twin_seed: int = 0
     model: str | None = None
+    model_digest: str | None = None
 
 
 class Journal:
@@ -117,17 +118,14 @@ class Journal:
                 f"{record.path} was begun with {', '.join(wrong)}. Use these to go on, or name "
                 "another file."
             )
-        for event in record.events[1:]:
-            if event["event"] == "start":
-                self._begin(event["acts"])
-            elif event["event"] == "interrupted":
-                self._open = ""
-            elif event["event"] == "episode":
-                self._add(as_episode(event), event["acts"] != "MPC")
-            else:
-                named = {each.name: event[each.name] for each in fields(Batch)}
-                costs = {k: math.nan for k, each in named.items() if each is None}
-                self._close(Batch(**{**named, **costs}), Outlook(**event["from_here"]))
+        for number, event in enumerate(record.events[1:], start=2):
+            try:
+                self._take(event)
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(
+                    f"{record.path}, line {number}: no event of a commissioning "
+                    f"({type(error).__name__}: {error}). Name another file."
+                ) from error
 
     @property
     def accepted(self) -> bool:
@@ -198,6 +196,19 @@ class Journal:
         }
         self.record.append({"event": "batch", **said, "from_here": asdict(outlook)})
         self._close(batch, outlook)
+
+    def _take(self, event: Event) -> None:
+        """Do again what an event of the record tells."""
+        if event["event"] == "start":
+            self._begin(event["acts"])
+        elif event["event"] == "interrupted":
+            self._open = ""
+        elif event["event"] == "episode":
+            self._add(as_episode(event), event["acts"] != "MPC")
+        else:
+            named = {each.name: event[each.name] for each in fields(Batch)}
+            costs = {k: math.nan for k, each in named.items() if each is None}
+            self._close(Batch(**{**named, **costs}), Outlook(**event["from_here"]))
 
     def _begin(self, acts: str) -> None:
         self._cut_off, self._open = self.cut_off, acts

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -138,13 +138,14 @@ class Plant:
         if watchdog is not None:
             watchdog.start(known, act)
         thetas, actions, reward, violations, apart = [known], list[Array](), 0.0, 0, 0.0
-        alarm, step, over = None, -1, False
+        alarm, step, over, space = None, -1, False, cast(Any, self.env.action_space)
         while not over:
             u = act(known[None])[0].astype(np.float32)
             wanted = u if act == self.policy else self.policy(known[None])[0]
             law = self.mpc(known[None])[0]
             apart = max(apart, float(np.max(np.abs(wanted - law) / self.range)))
             action = u if self.as_is else self.yann.input_units.action(u).astype(np.float32)
+            action = np.clip(action, space.low, space.high)  # to the last bit
             observation, gained, terminated, over, info = self.env.step(action)
             unsafe = bool(info.get("violation", False)) or terminated
             reward, violations = reward + float(gained), violations + unsafe

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,34 @@ from sb3_yann.commissioning.watchdog import Alarm
 Event = dict[str, Any]
 NAME = "commissioning.jsonl"
 BEGIN = b'{"event": "begin"'
+ENDING = ', "digest": "{:0>16}"}}'
 
 
 class Record:
     """Events in their order, in memory and, if there is a path, in a file.
 
-    A last line that a kill cut off is left out, and overwritten by the next event.
+    A last line that a kill cut off is left out, and overwritten by the next event. Each line ends
+    with a digest of all up to it: a record that was changed is refused, and so is one of before
+    there were digests.
 
     Parameters
     ----------
     path : Path, optional
         A file, or a folder (without a suffix), in which it is ``commissioning.jsonl``.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    ValueError
+        If it is no record, or has changed since it was written.
     """
 
     def __init__(self, path: Path | None) -> None:
         is_folder = path is not None and (path.is_dir() or not path.suffix)
         self.path = path / NAME if path is not None and is_folder else path
         self.events: list[Event] = []
+        self._digest = ""
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -42,10 +54,9 @@ class Record:
             whole, _, rest = read.rpartition(b"\n")
             if rest and not whole and not rest.startswith(BEGIN[: len(rest)]):
                 raise ValueError(f"{self.path} is no record of a commissioning. Name another file.")
-            lines = whole.decode("utf-8").splitlines()
-            for number, line in enumerate(lines, start=1):
+            for number, line in enumerate(whole.split(b"\n") if whole else [], start=1):
                 try:
-                    self.events.append(_event(line))
+                    self.events.append(self._event(line.decode("utf-8")))
                 except ValueError as error:
                     raise ValueError(
                         f"{self.path}, line {number}: no event of a commissioning ({error}). Name "
@@ -60,7 +71,8 @@ class Record:
         if self.path is None:
             self.events.append(event)
             return
-        line = (json.dumps(event, allow_nan=False) + "\n").encode("utf-8")
+        text, digest = _with_digest(json.dumps(event, allow_nan=False), self._digest)
+        line = f"{text}\n".encode()
         if (self.path.stat().st_size if self.path.exists() else 0) != self._seen:
             raise RuntimeError(
                 f"{self.path} was changed by somebody else. One record belongs to one run."
@@ -72,6 +84,7 @@ class Record:
             file.flush()
             os.fsync(file.fileno())
         self._size = self._seen = self._size + len(line)
+        self._digest = digest
         self.events.append(event)
 
     def save(self, model: OffPolicyAlgorithm, batch: int) -> str | None:
@@ -84,17 +97,39 @@ class Record:
         os.replace(unfinished, self.path.with_name(name))
         return name
 
-    def load(self, name: str, model: OffPolicyAlgorithm) -> None:
-        """Give a model the parameters of one that was saved."""
+    def digest_of(self, name: str | None) -> str | None:
+        """Return the digest of a model that was saved."""
+        if self.path is None or name is None:
+            return None
+        return sha256(self.path.with_name(name).read_bytes()).hexdigest()
+
+    def load(self, name: str, digest: str | None, model: OffPolicyAlgorithm) -> None:
+        """Give a model the parameters of one that was saved; ValueError if it has changed."""
         assert self.path is not None  # names come from :meth:`save`
+        if self.digest_of(name) != digest:
+            raise ValueError(
+                f"{self.path.with_name(name)} has changed since it was accepted. Put back the file "
+                f"that was written, or begin anew with another record than {self.path}."
+            )
         model.set_parameters(str(self.path.with_name(name)), device=model.device)
 
+    def _event(self, line: str) -> Event:
+        """Return the event of the next line, whose digest must follow from the lines before."""
+        text = f"{line[: -len(ENDING.format(0))]}}}"
+        signed, digest = _with_digest(text, self._digest)
+        if signed != line:
+            raise ValueError("it has changed since it was written, or has no digest")
+        event = json.loads(text)
+        if not isinstance(event, dict) or "event" not in event:
+            raise ValueError("it has no key 'event'")
+        self._digest = digest
+        return event
 
-def _event(line: str) -> Event:
-    event = json.loads(line)
-    if not isinstance(event, dict) or "event" not in event:
-        raise ValueError("it has no key 'event'")
-    return event
+
+def _with_digest(text: str, before: str) -> tuple[str, str]:
+    """Return the text of an event with its digest as the last key, and the digest."""
+    digest = sha256(f"{before}{text}".encode()).hexdigest()[:16]
+    return text[:-1] + ENDING.format(digest), digest
 
 
 def as_event(episode: PlantEpisode) -> Event:

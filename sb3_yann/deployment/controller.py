@@ -1,7 +1,7 @@
-"""A policy or a law in production: this file needs numpy alone, and can be copied by itself.
+"""A policy or a law in production: it needs numpy and `_archive.py`, a file that needs numpy alone.
 
-It is evaluated in float64, and every step watches the readings. The C code of an export does the
-same.
+Copy both into one folder, and they run without this package. A policy is evaluated in float64, and
+every step watches the readings. The C code of an export does the same.
 """
 
 from __future__ import annotations
@@ -12,6 +12,11 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+try:
+    from sb3_yann._archive import read_arrays
+except ImportError:  # both files were copied
+    from _archive import read_arrays  # type: ignore[import-not-found, no-redef]
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -51,19 +56,23 @@ def _relu(x: Array) -> Array:
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": np.tanh, "relu": _relu, "elu": _elu}
 
 
+MAY_BE_INFINITE = "bounds change obs_min obs_max late_after reach confines".split()
+WHOLE = "hold recover transfer frozen_after n_layers"
+
+
 def _check(data: Mapping[str, Any]) -> None:
-    """Raise ValueError where an array has another shape than its neighbors, or holds NaN."""
+    """Raise ValueError where arrays do not fit together, or are none that a step can use."""
     (p, m, n), (q,), n_obs = data["gains"].shape, data["b"].shape, data["obs_matrix"].shape[-1]
     shapes: list[tuple[tuple[int, ...], str]] = [
-        ((p, m), "offsets"), ((q, n), "A"), ((p,), "starts network_of"), ((2, n), "confines box"),
-        ((2,), "tolerances fades"), ((n, n_obs), "obs_matrix"), ((2, m), "bounds"),
-        ((n,), "obs_offset per_theta"), ((n_obs,), "obs_rest obs_min obs_max watched"),
-        ((m,), "action_scale action_shift resting per_input middle"),
-        ((), "hold recover transfer frozen_after late_after reach zero_input n_layers"),
+        ((p, m, n), "gains"), ((q,), "b"), ((p, m), "offsets"), ((q, n), "A"),
+        ((p,), "starts network_of"), ((2, n), "confines box"), ((2,), "tolerances fades"),
+        ((n, n_obs), "obs_matrix"), ((2, m), "bounds"), ((n,), "obs_offset per_theta"),
+        ((n_obs,), "obs_rest obs_min obs_max watched obs_names"),
+        ((m,), "action_scale action_shift resting per_input middle action_names"),
+        ((), f"{WHOLE} late_after reach zero_input"),
     ]  # fmt: skip
     wanted = [(name, shape) for shape, names in shapes for name in names.split()]
-    if len(data["change"]):
-        wanted.append(("change", (2, m)))
+    wanted.append(("change", (2, m) if len(data["change"]) else (0, m)))
     size, k = n, len(data["pinned"])
     for i in range(int(data["n_layers"])):
         width = m if i == int(data["n_layers"]) - 1 else data[f"layer{i}"].shape[1]
@@ -72,12 +81,30 @@ def _check(data: Mapping[str, Any]) -> None:
     for name, shape in wanted:
         if data[name].shape != shape:
             raise ValueError(f"{name} has shape {data[name].shape}, expected {shape}")
-        if not name.startswith("layer") and np.isnan(data[name]).any():
+        if name.startswith("layer") or name.endswith("names"):
+            continue
+        if np.isnan(data[name]).any():
             raise ValueError(f"{name} holds NaN")
-    if np.isnan(data["gains"]).any() or np.isnan(data["b"]).any():
-        raise ValueError("the law holds NaN")
+        if name not in MAY_BE_INFINITE and np.isinf(data[name]).any():
+            raise ValueError(f"{name} holds infinite entries")
+    _check_indices(data, p, q, k)
+    low, high = data["bounds"]
+    if (low > high).any() or (data["action_scale"] <= 0).any():
+        raise ValueError("its bounds are crossed, or its scale is not above 0")
     if str(data["activation"]) not in ACTIVATIONS:
         raise ValueError(f"the activation is {data['activation']}")
+
+
+def _check_indices(data: Mapping[str, Any], p: int, q: int, k: int) -> None:
+    """Raise ValueError where a count or an index is none; regions p, rows q, networks k."""
+    starts, used = data["starts"], data["network_of"]
+    whole = all(data[name].dtype.kind == "i" for name in ("starts", "network_of", *WHOLE.split()))
+    if not whole or any(int(data[name]) < 0 for name in WHOLE.split()):
+        raise ValueError("a count or an index is no whole number")
+    if p == 0 or starts[0] != 0 or (np.diff([*starts, q]) < 1).any():
+        raise ValueError(f"starts are not the first rows of {p} regions in {q} half-spaces")
+    if (used < -1).any() or (used >= k).any() or (k > 0) != (int(data["n_layers"]) > 0):
+        raise ValueError(f"network_of does not fit {k} networks")
 
 
 class Controller:
@@ -137,17 +164,18 @@ class Controller:
     def load(cls, path: str | PathLike[str]) -> Controller:
         """Return the controller of a file that `export` wrote.
 
-        OSError if it cannot be read, ValueError if it holds no controller.
+        Nothing of the file is executed. OSError if it cannot be read; ValueError if it holds no
+        controller, was changed since it was written, or is of before files had digests.
         """
-        with open(path, "rb") as file:
-            try:
-                with np.load(file, allow_pickle=False) as data:
-                    return cls({name: data[name] for name in data.files})
-            except Exception as error:  # damaged files raise nearly all there is
-                what = str(error) or type(error).__name__
-                raise ValueError(
-                    f"{path} holds no controller ({what}). Write it with export(model, path)."
-                ) from None
+        try:
+            return cls(read_arrays(path))
+        except OSError:
+            raise
+        except Exception as error:  # arrays of a stranger raise nearly all there is
+            what = str(error) or type(error).__name__
+            raise ValueError(
+                f"{path} holds no controller ({what}). Write it with export(model, path)."
+            ) from None
 
     def reset(self) -> None:
         """Forget all steps, as at the start: the policy acts, from the operating point."""

@@ -262,7 +262,7 @@ def _plant_units(law: PiecewiseAffine) -> Units:
     if law.model is None or law.theta_ss is None:
         raise ValueError(
             "absolute = True needs a law that knows its operating point: one from LinearMPC, not "
-            "one built by hand or from an old file."
+            "one built by hand."
         )
     _, middle, half = input_range(law)
     return np.eye(law.n_theta), -law.theta_ss, half, law.model.u_ss + middle

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
@@ -16,7 +17,8 @@ from sb3_yann._validation import Array
 from sb3_yann.control import PiecewiseAffine
 
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
-LONGEST = 1_000_000
+LONG, LONGEST = 100_000, 1_000_000
+"""Steps of an episode after which a warning tells of it, and after which it is an error."""
 """Steps after which an episode is taken for one that never ends."""
 
 
@@ -183,8 +185,7 @@ def _as_one(
         lengths[running] += 1
         ended[running] |= terminated[running]
         running &= ~(terminated | truncated)
-        if len(actions) == LONGEST:
-            raise endless(env)
+        watch_length(env, len(actions))
     states, inputs = np.array(observations, float), np.array(actions, float)
     return Episodes(
         costs,
@@ -195,12 +196,17 @@ def _as_one(
     )
 
 
-def endless(env: Any) -> RuntimeError:
-    """Return what is raised where an episode has no end."""
-    return RuntimeError(
-        f"An episode of {env} has not ended after {LONGEST} steps. Give it a limit: "
-        "max_episode_steps when it is registered, or gymnasium.wrappers.TimeLimit."
+def watch_length(env: Any, steps: int) -> None:
+    """Warn of an episode that is long, and raise RuntimeError where it seems to have no end."""
+    if steps not in (LONG, LONGEST):
+        return
+    told = (
+        f"An episode of {env} has not ended after {steps} steps, all of which are kept in memory. "
+        "Give it a limit: max_episode_steps when it is registered, or gymnasium.wrappers.TimeLimit."
     )
+    if steps == LONGEST:
+        raise RuntimeError(told)
+    warnings.warn(told, stacklevel=3)
 
 
 def _side_by_side(
@@ -227,7 +233,7 @@ def _side_by_side(
             episode.terminated = bool(terminated)
             if not (terminated or truncated):
                 going_on.append((env, episode))
-            if len(episode.actions) == LONGEST:
-                raise endless(env)
+            if episode is running[0][1]:  # the others are as long
+                watch_length(env, len(episode.actions))
         running = going_on
     return episodes

@@ -21,10 +21,10 @@ from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.options import AcceptanceRule, StepSize
 from sb3_yann.guard.plant_acceptance import PlantAcceptance
-from sb3_yann.guard.preconditions import check_not_nested, check_twin
+from sb3_yann.guard.preconditions import check_alone, check_not_nested, check_twin
 from sb3_yann.guard.session import GuardSession, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
-from sb3_yann.guard.state import Decision, GuardState, write_csv
+from sb3_yann.guard.state import Decision, GuardState, begin_record
 from sb3_yann.guard.summary import summary_of
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import require_yann_policy
@@ -76,6 +76,8 @@ class ImprovementGuard(BaseCallback):
         How decisions scale the actor's learning rate.
     log_path : path-like, optional
         A CSV file of all decisions, up to date after each one; ``guard.decisions`` has them too.
+        What it held of another run is kept beside it, in a file with a number. Training goes on
+        where it cannot be written, with a warning.
     verbose : int, default 0
         1 prints each decision.
 
@@ -191,6 +193,7 @@ class ImprovementGuard(BaseCallback):
 
     def _on_training_start(self) -> None:
         check_not_nested(self)
+        check_alone(self)
         self._has_begun = False
         self.acceptance.start(self.session)
         known = getattr(self.model, "guard_state", None)
@@ -207,7 +210,7 @@ class ImprovementGuard(BaseCallback):
         self.session.policy.actor_step = self.acceptance.actor_step(self.session)
         self._has_begun = True
         if self.log_path is not None:
-            write_csv(self.log_path, self.decisions)
+            self.session.log_lacks_rows = not begin_record(self.log_path, self.decisions)
 
     def _start_afresh(self, known: GuardState | None) -> None:
         """Gather first evidence; where that fails, leave everything as it was."""

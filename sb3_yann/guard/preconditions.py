@@ -64,6 +64,22 @@ def check_not_nested(guard: BaseCallback) -> None:
         )
 
 
+def check_alone(guard: BaseCallback) -> None:
+    """Raise ValueError if another guard is among what was passed to learn."""
+    waiting, found = [guard.locals.get("callback")], []
+    while waiting:
+        each = waiting.pop()
+        waiting += [*getattr(each, "callbacks", [])]
+        waiting += [getattr(each, name, None) for name in ("callback", "callback_on_new_best")]
+        waiting = [other for other in waiting if isinstance(other, BaseCallback)]
+        found += [each] if isinstance(each, type(guard)) else []
+    if len(found) > 1:
+        raise ValueError(
+            f"{len(found)} guards were passed to learn, expected is one: each would restore what "
+            "it accepted itself. Give one guard all starts, by n_starts or a simulator of both."
+        )
+
+
 def _event_above(
     guard: BaseCallback, callback: BaseCallback | None, above: EventCallback | None = None
 ) -> EventCallback | None:

@@ -32,6 +32,7 @@ class GuardSession:
     simulator : gymnasium.Env, str, callable or None, where candidates play; None on a plant alone
     step_size, log_path, verbose : StepSize, Path or None and int, as in :class:`ImprovementGuard`
     interrupted : bool, whether Ctrl-C has restored the accepted policy: nothing else may be then
+    log_lacks_rows : bool, whether decisions could not be written to the log
     before_trial : tuple or None, what was accepted, its evidence and ``passed`` before a trial
     """
 
@@ -42,6 +43,7 @@ class GuardSession:
     log_path: Path | None
     verbose: int
     interrupted: bool = False
+    log_lacks_rows: bool = False
     before_trial: tuple[ActorCheckpoint, Any, list[Any]] | None = None
 
     def __post_init__(self) -> None:
@@ -145,7 +147,10 @@ class GuardSession:
             share,
         )
         state.decisions.append(decision)
-        log_last(state.decisions, self.model, self.log_path, self.verbose)
+        written = log_last(
+            state.decisions, self.model, self.log_path, self.verbose, self.log_lacks_rows
+        )
+        self.log_lacks_rows = not written
 
 
 def restore_accepted(model: BaseAlgorithm) -> None:

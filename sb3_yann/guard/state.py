@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
+import warnings
 from dataclasses import asdict, dataclass, field, fields
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
@@ -101,8 +104,12 @@ class GuardState:
 
 
 def log_last(
-    decisions: list[Decision], model: BaseAlgorithm, path: Path | None, verbose: int
-) -> None:
+    decisions: list[Decision],
+    model: BaseAlgorithm,
+    path: Path | None,
+    verbose: int,
+    anew: bool = False,
+) -> bool:
     """Write the last decision to the CSV file, to the model's logger and to the screen.
 
     Parameters
@@ -111,6 +118,13 @@ def log_last(
         All decisions so far, and the model whose logger is used.
     path, verbose : Path or None and int
         The CSV file, if any, and whether to print.
+    anew : bool, default False
+        Whether the file lacks earlier decisions: then all are written.
+
+    Returns
+    -------
+    bool
+        Whether the file holds all decisions. Training goes on where it does not: a warning says so.
     """
     last = decisions[-1]
     for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
@@ -118,29 +132,70 @@ def log_last(
     rejected = sum(each.verdict == "rejected" for each in decisions)
     model.logger.record("guard/rejected", rejected)
     model.logger.record("guard/accepted", len(decisions) - rejected)
-    if path is not None and path.exists():  # writing all of them would take ever longer
-        _write_rows(path, "a", [last])
-    elif path is not None:
-        write_csv(path, decisions)
     model.logger.dump(model.num_timesteps)  # as EvalCallback does, or the next would replace it
     if verbose:
         reason = f" ({last.reason})" if last.reason else ""
         costs = f"mean cost {last.accepted_cost:.6g}, MPC {last.mpc_cost:.6g}"
         print(f"Episode {last.episode}: {last.verdict}{reason}; {costs}")
+    return path is None or write_record(path, decisions, anew)
+
+
+def write_record(path: Path, decisions: list[Decision], anew: bool) -> bool:
+    """Add the last decision to a record, or write all anew; warn and return False if it fails."""
+    try:
+        if anew or not path.exists():
+            write_csv(path, decisions)
+        else:  # writing all of them would take ever longer
+            with path.open("a", newline="", encoding="utf-8") as file:
+                file.write(_rows(decisions[-1:], header=False))
+    except OSError as error:
+        warnings.warn(
+            f"The guard's record {path} could not be written ({error}). Training goes on, and "
+            "guard.decisions has all decisions; the record is completed once there is room.",
+            stacklevel=2,
+        )
+        return False
+    return True
+
+
+def begin_record(path: Path, decisions: list[Decision]) -> bool:
+    """Write the decisions so far; what a file holds of another run is kept beside, with a warning.
+
+    Returns whether they could be written, as :func:`write_record` does.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            known = _rows(decisions, header=True).startswith(file.read())
+    except FileNotFoundError:
+        known = True
+    except OSError:
+        known = False
+    if not known:
+        numbers = (path.with_name(f"{path.stem}.{i}{path.suffix}") for i in count(1))
+        beside = next(each for each in numbers if not each.exists())
+        os.rename(path, beside)
+        warnings.warn(f"{path} held the record of another run: it is {beside} now.", stacklevel=2)
+    return write_record(path, decisions, anew=True)
 
 
 def write_csv(path: Path, decisions: list[Decision]) -> None:
     """Write the decisions, all or none of them."""
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".unfinished")
-    _write_rows(unfinished, "w", decisions)
-    os.replace(unfinished, path)
+    try:
+        with unfinished.open("w", newline="", encoding="utf-8") as file:
+            file.write(_rows(decisions, header=True))
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
-def _write_rows(path: Path, mode: Literal["w", "a"], decisions: list[Decision]) -> None:
-    with path.open(mode, newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [each.name for each in fields(Decision)])
-        if mode == "w":
-            writer.writeheader()
-        for each in decisions:
-            writer.writerow({**asdict(each), "regions": " ".join(map(str, each.regions))})
+def _rows(decisions: list[Decision], header: bool) -> str:
+    """Return decisions as lines of a CSV file."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, [each.name for each in fields(Decision)])
+    if header:
+        writer.writeheader()
+    for each in decisions:
+        writer.writerow({**asdict(each), "regions": " ".join(map(str, each.regions))})
+    return text.getvalue()

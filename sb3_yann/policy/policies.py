@@ -255,6 +255,13 @@ class YannPolicy(TD3Policy):
             _checks.warn_of_misread_states(self.problem, self.theta(rows).double().cpu().numpy())
         return predicted
 
+    def unscale_action(self, scaled_action: Array) -> Array:
+        """Return actions in [-1, 1] as the env takes them: in its action space, to the last bit."""
+        space = cast(Any, self.action_space)
+        # SB3's formula rounds: where bounds are asymmetric it may end one bit beyond them.
+        action = super().unscale_action(scaled_action)
+        return np.clip(action, space.low, space.high)
+
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Return the map from an observation to theta."""
         if self.observation is None:

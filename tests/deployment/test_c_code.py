@@ -19,7 +19,7 @@ from deployed import (
     with_faults,
 )
 from sample_laws import solved
-from sb3_yann import Checks, LinearModel, LinearMPC, export
+from sb3_yann import Checks, Controller, LinearModel, LinearMPC, export
 from sb3_yann.deployment.controller import MODES, Status
 from sb3_yann.deployment.selftest import steady
 from sb3_yann.deployment.tables import index_bytes
@@ -202,3 +202,86 @@ int main(void)
     built = [COMPILERS[0], *STRICT, "main.c", "plant.c", "-lm", "-o", "main"]
     subprocess.run(built, cwd=tmp_path, check=True)
     assert subprocess.run([str(tmp_path / "main")]).returncode == 0
+
+
+HOSTILE = """#include <float.h>
+#include <math.h>
+#include <stdio.h>
+#include "plant.h"
+static unsigned long seed = 88172645463325252UL;
+static unsigned long draw(void)
+{
+    seed ^= seed << 13;
+    seed ^= seed >> 7;
+    return seed ^= seed << 17;
+}
+static REAL reading(void)
+{
+    const REAL odd[] = {(REAL)NAN, (REAL)INFINITY, (REAL)-INFINITY, (REAL)MOST, -(REAL)MOST,
+        (REAL)LEAST, (REAL)0.0, (REAL)-0.0, (REAL)1e30, (REAL)-1e-30};
+    if (draw() % 3 == 0)
+        return odd[draw() % 10];
+    return (REAL)((double)(draw() % 20001) / 1000.0 - 10.0);
+}
+int main(void)
+{
+    plant_state s;
+    REAL obs[N_OBS], action[N_ACTIONS], manual[N_ACTIONS];
+    plant_init(&s);
+    for (int k = 0; k < 20000; k++) {
+        for (int i = 0; i < N_OBS; i++)
+            obs[i] = reading();
+        for (int i = 0; i < N_ACTIONS; i++)
+            manual[i] = reading();
+        int request = (int)(draw() % 3);
+        plant_step(&s, obs, reading(), request, draw() % 2 ? manual : 0, action);
+        for (int i = 0; i < N_ACTIONS; i++)
+            if (!(action[i] >= (REAL)LOW(i) && action[i] <= (REAL)HIGH(i))) {
+                printf("step %d: action %d is %g\\n", k, i, (double)action[i]);
+                return 1;
+            }
+        (void)plant_policy(obs, action);
+        (void)plant_law(obs, action);
+    }
+    return 0;
+}
+"""
+
+
+def sanitizers(folder) -> list[str]:
+    """Return the flags of gcc's sanitizers; skip where it has none."""
+    (folder / "one.c").write_text("int main(void) { return 0; }\n")
+    flags = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    built = [COMPILERS[0], *flags, "one.c", "-o", "one"]
+    found = subprocess.run(built, cwd=folder, capture_output=True)
+    if found.returncode or subprocess.run([str(folder / "one")], capture_output=True).returncode:
+        pytest.skip("the compiler has no sanitizers")
+    return flags
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("name", ["reactor", "references and rates", "two tanks, by a walk"])
+def test_hostile_readings_break_no_rule_of_c_and_no_bound(name, precision, tmp_path):
+    flags, policy = sanitizers(tmp_path), policy_of(name)
+    export(policy, tmp_path / "plant.npz", checks=Checks(frozen_after=3, hold=2, recover=2))
+    written = Controller.load(tmp_path / "plant.npz").data
+    options = {"checks": Checks(frozen_after=3, hold=2, recover=2), "precision": precision}
+    export(policy, tmp_path / "plant.c", **options)
+    ends = written["bounds"] * written["action_scale"] + written["action_shift"]
+    room = 1e-6 * (1 + np.abs(ends).max())
+    low, high = ("{" + ", ".join(f"{v:.17g}" for v in side) + "}" for side in
+                 (ends[0] - room, ends[1] + room))  # fmt: skip
+    largest = {"double": ("DBL_MAX", "5e-324"), "float": ("FLT_MAX", "1e-45")}[precision]
+    numbers = {
+        "REAL": precision, "MOST": largest[0], "LEAST": largest[1],
+        "N_OBS": len(written["obs_rest"]), "N_ACTIONS": len(written["action_scale"]),
+        "LOW(i)": f"((const double[]){low})[i]", "HIGH(i)": f"((const double[]){high})[i]",
+    }  # fmt: skip
+    head = "".join(f"#define {key} {value}\n" for key, value in numbers.items())
+    (tmp_path / "main.c").write_text(head + HOSTILE)
+    strict = [each for each in STRICT if each != "-Werror"]
+    built = [COMPILERS[0], *strict, *flags, "main.c", "plant.c", "-lm", "-o", "main"]
+    subprocess.run(built, cwd=tmp_path, check=True, capture_output=True)
+    ran = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stdout + ran.stderr

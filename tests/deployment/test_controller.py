@@ -12,10 +12,12 @@ import pytest
 import torch as th
 
 import general_problems
+import sb3_yann._archive
 import sb3_yann.deployment.controller
 from deployed import CASES, box, disturbed, observations, policy_of
 from sample_laws import solved
 from sb3_yann import AffineObservation, Checks, Controller, export
+from sb3_yann._archive import write_arrays
 from sb3_yann.deployment.controller import Status
 from sb3_yann.deployment.selftest import steady
 from weights import last_layer
@@ -96,7 +98,8 @@ def test_it_needs_numpy_alone(tmp_path):
     policy = policy_of("reactor")
     controller = controller_of(policy, tmp_path)
     source = Path(sb3_yann.deployment.controller.__file__)
-    (tmp_path / "controller.py").write_bytes(source.read_bytes())
+    for each in (source, Path(sb3_yann._archive.__file__)):
+        (tmp_path / each.name).write_bytes(each.read_bytes())
     lines = """
 import sys
 class Wall:
@@ -295,16 +298,20 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
 
 def test_arrays_that_do_not_fit_together_are_named(tmp_path):
     data = controller_of(policy_of("references and rates"), tmp_path).data
-    wrong = {
-        "action_scale": np.ones(2), "obs_min": np.float64(0), "hold": np.ones(1),
-        "change": np.ones((2, 5)), "layer1": data["layer1"][:, :-1], "b": np.nan * data["b"],
-        "gains": np.nan * data["gains"], "activation": "swish", "recover": np.nan,
-    }  # fmt: skip
-    for name, value in wrong.items():
-        np.savez(tmp_path / "wrong.npz", **{**data, name: value})
+    wrong = [
+        ("action_scale", np.ones(2)), ("action_scale", np.zeros(1)), ("obs_min", np.float64(0)),
+        ("hold", np.ones(1)), ("hold", -1), ("transfer", 0.5), ("recover", np.nan),
+        ("n_layers", -1), ("change", np.ones((2, 5))), ("layer1", data["layer1"][:, :-1]),
+        ("b", np.nan * data["b"]), ("gains", np.nan * data["gains"]), ("activation", "swish"),
+        ("A", np.full_like(data["A"], np.inf)), ("obs_names", np.array(["x"])),
+        ("starts", data["starts"] - 1), ("network_of", data["network_of"] + 1000),
+        ("bounds", -data["bounds"]),
+    ]  # fmt: skip
+    for name, value in wrong:
+        write_arrays(tmp_path / "wrong.npz", {**data, name: value})
         with pytest.raises(ValueError, match="holds no controller"):
             Controller.load(tmp_path / "wrong.npz")
-    np.savez(tmp_path / "wrong.npz", **{k: v for k, v in data.items() if k != "hold"})
+    write_arrays(tmp_path / "wrong.npz", {k: v for k, v in data.items() if k != "hold"})
     with pytest.raises(ValueError, match="hold"):
         Controller.load(tmp_path / "wrong.npz")
 

@@ -128,6 +128,13 @@ def test_a_simulator_that_seeds_the_global_generator_does_not_seed_it_for_others
     assert states[0] == states[1]
 
 
+@pytest.mark.parametrize("together", [lambda a, b: [a, b], lambda a, b: [CallbackList([a]), b]])
+def test_two_guards_at_once_are_refused(together) -> None:
+    guards = together(make_guard(), make_guard())
+    with pytest.raises(ValueError, match="2 guards were passed to learn, expected is one"):
+        train(build(), STEPS, *guards)
+
+
 @pytest.mark.parametrize(("kind", "deep"), [("every", False), ("every", True), ("eval", False)])
 def test_a_guard_within_an_event_callback_is_refused(deep, kind) -> None:
     guard = make_guard()

@@ -97,6 +97,16 @@ def test_an_episode_that_never_ends_is_reported(monkeypatch) -> None:
         train(build(), 4, make_guard(Endless))
 
 
+def test_an_episode_that_is_long_is_told_before_memory_is_full(monkeypatch) -> None:
+    monkeypatch.setattr("sb3_yann.evaluation.episodes.LONG", 20)
+    monkeypatch.setattr("sb3_yann.evaluation.episodes.LONGEST", 50)
+    with (
+        pytest.warns(UserWarning, match=r"not ended after 20 steps, all of which .*TimeLimit"),
+        pytest.raises(RuntimeError, match="has not ended after 50 steps"),
+    ):
+        train(build(), 4, make_guard(Endless))
+
+
 def stop(_) -> None:
     raise KeyboardInterrupt
 

@@ -91,10 +91,10 @@ def test_a_record_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch) -> None
     three_decisions(guard)
     before = path.read_bytes()
 
-    def fail(*_) -> None:
+    def fail(*_, **__) -> None:
         raise OSError("the disk is full")
 
-    monkeypatch.setattr(record.csv.DictWriter, "writerow", fail)
+    monkeypatch.setattr(record, "_rows", fail)
     with pytest.raises(OSError, match="full"):
         record.write_csv(path, guard.decisions)
     monkeypatch.undo()
@@ -102,6 +102,46 @@ def test_a_record_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch) -> None
     with pytest.raises(OSError, match="full"):
         record.write_csv(path, guard.decisions[:1])
     assert path.read_bytes() == before
+
+
+def test_a_full_disk_ends_no_training_and_the_record_is_completed_later(
+    tmp_path, monkeypatch
+) -> None:
+    path, own, calls = tmp_path / "guard.csv", record._rows, []
+
+    def at_times(decisions, header):
+        calls.append(len(decisions))
+        if len(calls) == 3:  # the head, the first decision, the second one
+            raise OSError(28, "No space left on device")
+        return own(decisions, header)
+
+    guard = make_guard(log_path=path)
+    monkeypatch.setattr(record, "_rows", at_times)
+    with pytest.warns(UserWarning, match=r"guard\.csv could not be written .*No space"):
+        three_decisions(guard)
+    assert [row["verdict"] for row in rows(path)] == verdicts(guard)
+    assert len(guard.decisions) == 3
+
+
+def test_a_record_of_another_run_is_kept_beside(tmp_path) -> None:
+    path = tmp_path / "guard.csv"
+    three_decisions(make_guard(log_path=path))
+    before = path.read_bytes()
+    (tmp_path / "guard.1.csv").write_text("mine")
+    with pytest.warns(UserWarning, match=r"guard\.csv held .* it is .*guard\.2\.csv now"):
+        other = make_guard(log_path=path)
+        train(build(gradient_steps=0), STEPS, other)
+    assert (tmp_path / "guard.2.csv").read_bytes() == before
+    assert (tmp_path / "guard.1.csv").read_text() == "mine"
+    assert len(rows(path)) == len(other.decisions)
+
+
+def test_a_second_learn_goes_on_with_its_own_record(tmp_path) -> None:
+    path = tmp_path / "guard.csv"
+    model = three_decisions(make_guard(log_path=path))
+    three_decisions(make_guard(log_path=path), model=model)
+    assert [each.name for each in tmp_path.iterdir()] == ["guard.csv"]
+    assert len(rows(path)) == len(model.guard_state.decisions) > 3
 
 
 def test_tensorboard_shows_every_decision_the_last_one_too(tmp_path) -> None:

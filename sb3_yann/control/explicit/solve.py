@@ -25,6 +25,9 @@ KERNELS = (
     "sb3_yann.control.law.search_tree",
 )
 """What a search needs that is compiled."""
+ABSURD, LITTLE = 1e8, 1e-9
+"""Asked for more input ranges in their box, laws are wrong, or feasible sets too thin to be seen;
+asked for less of a range, constraints of states are too faint beside it."""
 
 
 def solve_explicit(
@@ -56,6 +59,7 @@ def solve_explicit(
     """
     as_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
+    require_sane_sizes(program, u_min, u_max)
     units = ProgramUnits(program, u_min, u_max)
     _require_feasible(units.scaled)
     # Before the clock starts: on a new machine this compiles, for longer than many a time limit.
@@ -129,6 +133,49 @@ def _require_box(program: ParametricQP) -> None:
             f"The law needs a bounded box of theta, not {program.theta_min.tolist()} to "
             f"{program.theta_max.tolist()}. Pass finite theta_min and theta_max (or x_min and "
             "x_max), and where theta holds them, r_min and r_max, d_min and d_max, u_min and u_max."
+        )
+
+
+def asked_of_inputs(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
+    """Return which part of each input's range an entry of theta asks for in its box, (m, n).
+
+    That is the largest of all steps where no constraint acts. It is 0 without a box of theta.
+    """
+    m, count = len(u_min), len(program.c) - program.n_slacks
+    unit = 1 / np.sqrt(np.diag(program.H))
+    gains = np.linalg.solve(unit[:, None] * program.H * unit, unit[:, None] * program.F)
+    gains = np.abs(unit[:, None] * gains)[:count].reshape(-1, m, program.F.shape[1]).max(axis=0)
+    width = program.theta_max / 2 - program.theta_min / 2
+    box = np.where(np.isfinite(width), width, 0.0)
+    return np.asarray(gains * box / half_widths(u_min, u_max)[:, None])
+
+
+def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> None:
+    """Raise where the box of theta, or an input's range, is so large that rounding hides the rest.
+
+    Parameters
+    ----------
+    program, u_min, u_max
+        As in :func:`solve_explicit`.
+    """
+    bounded = np.isfinite(u_min) & np.isfinite(u_max)
+    asked = asked_of_inputs(program, u_min, u_max) * bounded[:, None]
+    most, width = asked.max(axis=1, initial=0.0), half_widths(u_min, u_max)
+    # A small part alone may be an input with next to no effect, whose bounds are as they should be.
+    for i in np.flatnonzero((0 < most) & (most < LITTLE) & (width > 1 / LITTLE)):
+        raise ValueError(
+            f"u_max[{i}] = {u_max[i]:g}, with u_min[{i}] = {u_min[i]:g}, is too large: expected "
+            f"are bounds of which the MPC asks for more than {LITTLE:g}, and it asks for "
+            f"{most[i]:.0e} of these. Pass what the actuator can do, or inf for no bound."
+        )
+    if np.any(asked > ABSURD):
+        i = int(np.argmax(asked.max(axis=0)))
+        raise ValueError(
+            f"theta_min[{i}] = {program.theta_min[i]:g} and theta_max[{i}] = "
+            f"{program.theta_max[i]:g} lie too far apart: in this box the MPC asks for inputs "
+            f"{asked.max():.0e} times their range, expected are at most {ABSURD:.0e}. Pass as "
+            "theta_min and theta_max, or x_min and x_max, what the plant can reach; or inf for no "
+            "bound, and use online()."
         )
 
 

@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from os import PathLike, fspath
-from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
+from sb3_yann._archive import read_arrays
 
 Law = TypeVar("Law")
-
-
-def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
-    """Write an ``.npz`` file as a whole: a reader never sees half of it."""
-    part = f"{fspath(path)}.{os.getpid()}.part"  # another process may be writing the same
-    try:
-        with open(part, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(part, path)
-    finally:
-        Path(part).unlink(missing_ok=True)
 
 
 def read_law(kind: str, path: str | PathLike[str], build: Callable[[dict[str, Any]], Law]) -> Law:
@@ -44,19 +30,12 @@ def read_law(kind: str, path: str | PathLike[str], build: Callable[[dict[str, An
     ValueError
         If it holds nothing that can be built from, whatever is wrong with it.
     """
-    with open(path, "rb") as file:
-        try:
-            return build(_arrays_of(file))
-        except Exception as error:  # damaged files raise nearly all there is
-            what = str(error) or type(error).__name__
-            raise ValueError(
-                f"{fspath(path)} does not hold {kind} ({what}). Write it with law.save(path)."
-            ) from None
-
-
-def _arrays_of(file: BinaryIO) -> dict[str, Any]:
-    if not zipfile.is_zipfile(file):
-        raise ValueError("it is no .npz file, or a part of one")
-    file.seek(0)
-    with np.load(file, allow_pickle=False) as data:
-        return {name: data[name] for name in data.files}
+    try:
+        return build(read_arrays(path))
+    except OSError:
+        raise
+    except Exception as error:  # arrays of a stranger raise nearly all there is
+        what = str(error) or type(error).__name__
+        raise ValueError(
+            f"{fspath(path)} does not hold {kind} ({what}). Write it with law.save(path)."
+        ) from None

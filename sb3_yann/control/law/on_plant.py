@@ -85,8 +85,8 @@ class OnPlant(ReadOnlyArrays):
         """
         if self.model is None or self.theta_ss is None:
             raise ValueError(
-                "The law knows no operating point: it was built by hand, or its file is an old "
-                "one. Take it from LinearMPC.explicit() or online(), or add the point yourself: "
+                "The law knows no operating point: it was built by hand. Take it from "
+                "LinearMPC.explicit() or online(), or add the point yourself: "
                 "u_ss + law(shown - theta_ss)."
             )
         return np.asarray(self(to_float("shown", shown) - self.theta_ss) + self.model.u_ss)
@@ -110,7 +110,7 @@ def plant_arrays(law: OnPlant) -> dict[str, Any]:
 
 
 def with_plant(law: Law, data: dict[str, Any]) -> Law:
-    """Return a law with the plant of its file; as it is where the file, an old one, has none.
+    """Return a law with the plant of its file; as it is where the file has none.
 
     Parameters
     ----------

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
+from sb3_yann._archive import write_arrays
 from sb3_yann._validation import Array, as_array
-from sb3_yann.control.law._files import read_law, write_arrays
+from sb3_yann.control.law._files import read_law
 from sb3_yann.control.law.on_plant import OnPlant, plant_arrays, with_plant
 from sb3_yann.control.polyhedra import largest_ball
 
@@ -191,12 +192,15 @@ class PiecewiseAffine(OnPlant):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> PiecewiseAffine:
-        """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
+        """Read a law that :meth:`save` wrote, to the bit; nothing of the file is executed.
+
+        OSError if the file cannot be read; ValueError if it holds no law, was changed since it was
+        written, or is of before files had digests.
+        """
         return read_law("a PiecewiseAffine", path, cls._from_arrays)
 
     @classmethod
     def _from_arrays(cls, data: dict[str, Any]) -> PiecewiseAffine:
-        data.setdefault("neighbors", _none())  # files of before
         values = {field.name: data[field.name] for field in fields(cls)}
         for name, kind in (("infeasible", str), ("disjoint", bool)):
             values[name] = kind(values[name])

@@ -55,6 +55,9 @@ class SearchTree:
         whole = (children, self.leaf_starts, self.leaf_regions)
         sound = (
             all(each.dtype.kind == "i" for each in whole)
+            and all(each.dtype.kind == "f" for each in (self.normals, self.levels))
+            and np.all(np.isfinite(self.levels))
+            and np.all(np.isfinite(self.normals))
             and self.leaf_starts.ndim == self.leaf_regions.ndim == 1
             and leaves > 0
             and self.levels.shape == (nodes,)

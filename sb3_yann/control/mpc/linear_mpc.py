@@ -14,7 +14,7 @@ from sb3_yann._validation import Array, as_array, as_bounds, as_symmetric
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.budget import SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.explicit.solve import solve_explicit
+from sb3_yann.control.explicit.solve import require_sane_sizes, solve_explicit
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
@@ -270,7 +270,10 @@ class LinearMPC(MPCProblem):
         return self._laws[solver]
 
     def online(self) -> OnlineLaw:
-        """Return the law theta -> u_0 that solves the program at each point: there at once."""
+        """Return the law theta -> u_0 that solves the program at each point: there at once.
+
+        ValueError if the box of theta or an input's range is so large that rounding hides the rest.
+        """
         return self._online
 
     def law(self, kind: str = "auto") -> Law:
@@ -283,7 +286,9 @@ class LinearMPC(MPCProblem):
 
     @cached_property
     def _online(self) -> OnlineLaw:
-        law = OnlineLaw.of(self.condensed(), self.u_min, self.u_max, self.infeasible)
+        program = self.condensed()
+        require_sane_sizes(program, self.u_min, self.u_max)
+        law = OnlineLaw.of(program, self.u_min, self.u_max, self.infeasible)
         return law.on_plant(self.model, self.theta_ss)
 
     @cached_property

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
+from sb3_yann._archive import write_arrays
 from sb3_yann._validation import Array, as_array, half_widths
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
 from sb3_yann.control.explicit.steep import SteepQP
-from sb3_yann.control.law._files import read_law, write_arrays
+from sb3_yann.control.law._files import read_law
 from sb3_yann.control.law.on_plant import OnPlant, plant_arrays, with_plant
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, as_points
 from sb3_yann.control.online.dual_program import (
@@ -171,7 +172,11 @@ class OnlineLaw(OnPlant):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> OnlineLaw:
-        """Read a law that :meth:`save` wrote; raise ValueError if the file holds none."""
+        """Read a law that :meth:`save` wrote, to the bit; nothing of the file is executed.
+
+        OSError if the file cannot be read; ValueError if it holds no law, was changed since it was
+        written, or is of before files had digests.
+        """
         return read_law("an OnlineLaw", path, cls._from_arrays)
 
     @classmethod

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.online_problems import points, six_masses, three_masses, wide_plant, worst_condition
 from general_problems import PROBLEMS, solved
 from reference_answers import online_answers, relative_error
+from sb3_yann._archive import write_arrays
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, ParametricQP, SoftBounds
 from sb3_yann.control.online import _kernels
 from sb3_yann.control.online.dual_program import DualProgram
@@ -197,7 +198,7 @@ def test_a_damaged_file_is_a_value_error_or_still_the_law(tmp_path) -> None:
 def test_a_program_that_is_not_convex_is_refused(H, tmp_path) -> None:
     law = LinearMPC(LinearModel([[0.5]], [[1]], 1.0), Q=[[1]], R=[[1]], horizon=1, u_max=1).online()
     arrays = {each.name: getattr(law, each.name) for each in fields(law)}
-    np.savez(tmp_path / "law.npz", **{**arrays, "H": np.array(H)})
+    write_arrays(tmp_path / "law.npz", {**arrays, "H": np.array(H)})
     with pytest.raises(ValueError, match=r"law\.npz does not hold .*H must be .*positive definite"):
         OnlineLaw.load(tmp_path / "law.npz")
 

@@ -1,0 +1,138 @@
+"""Files of plain arrays that are checked as they are read: this file needs numpy alone.
+
+An archive is an ``.npz`` file as `numpy.savez` writes it, with one entry more: a digest of all
+others. Nothing in it is executed. `numpy.load` reads it too, unchecked.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import stat
+import zipfile
+from collections.abc import Mapping
+from hashlib import sha256
+from io import BytesIO
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+DIGEST = "digest"
+MOST = 2**32
+"""Bytes of a file. What is larger is refused: a reader holds all of it in memory."""
+# What numpy writes before numbers, truth values and text; anything else is not read.
+HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00..\{'descr': '([<>|][biufU]\d{1,9})', 'fortran_order': (False|True), "
+    rb"'shape': \(((?:\d{1,18}, )*\d{1,18},?|)\), \} *\n",
+    re.DOTALL,
+)
+
+
+def digest_of(arrays: Mapping[str, Any]) -> str:
+    """Return 64 characters that tell these arrays from others: names, shapes, types and numbers.
+
+    It shows accidents. Who can write a file can write its digest too.
+    """
+    found = sha256()
+    for name in sorted(arrays):
+        each = np.asarray(arrays[name])
+        found.update(f"{name} {each.shape} {each.dtype.str}\n".encode())
+        found.update(each.tobytes())
+    return found.hexdigest()
+
+
+def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
+    """Write arrays and their digest as a whole: a reader never sees half of a file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; what was there before stays.
+    ValueError
+        If it would be larger than what is read.
+    """
+    size = sum(np.asarray(each).nbytes for each in arrays.values())
+    if size > 0.99 * MOST:
+        raise ValueError(f"{fspath(path)} would hold {size} bytes, more than {MOST} are not read.")
+    part = f"{fspath(path)}.{os.getpid()}.part"  # another process may be writing the same
+    try:
+        with open(part, "wb") as file:
+            np.savez(file, **{**arrays, DIGEST: digest_of(arrays)})
+        os.replace(part, path)
+    finally:
+        Path(part).unlink(missing_ok=True)
+
+
+def read_arrays(path: str | PathLike[str]) -> dict[str, Any]:
+    """Return the arrays of a file by name, after a check that they are those that were written.
+
+    It takes a few times the memory that the file takes on the disk, whatever is in it.
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or it cannot be read.
+    ValueError
+        If anything else is wrong with it.
+    """
+    found = os.stat(path)
+    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+        raise ValueError("it is no file but a device or a pipe")
+    if found.st_size > MOST:
+        raise ValueError(f"it has {found.st_size} bytes, more than {MOST} are not read")
+    with open(path, "rb") as file:
+        content = file.read(found.st_size)
+    if not zipfile.is_zipfile(BytesIO(content)):
+        raise ValueError("it is no .npz file, or a part of one")
+    try:
+        arrays = _entries(content)
+    except ValueError:
+        raise
+    except Exception as error:  # damaged archives raise nearly all there is
+        raise ValueError(str(error) or type(error).__name__) from None
+    if DIGEST not in arrays:
+        raise ValueError("it has no digest: it was not written by this version")
+    if str(arrays.pop(DIGEST)) != digest_of(arrays):
+        raise ValueError("it has changed since it was written: its digest is another one")
+    return arrays
+
+
+def _entries(content: bytes) -> dict[str, Any]:
+    """Return all arrays of an archive, none of them larger than the archive."""
+    with zipfile.ZipFile(BytesIO(content)) as archive:
+        members = archive.infolist()
+        stored = all(
+            each.compress_type == zipfile.ZIP_STORED and each.file_size == each.compress_size
+            for each in members
+        )
+        if not stored or sum(each.file_size for each in members) > len(content):
+            raise ValueError("its entries are compressed or overlap")
+        names = [each.filename.removesuffix(".npy") for each in members]
+        if len({*names}) < len(names):
+            raise ValueError("two of its entries have the same name")
+        return {
+            name: _array(name, archive.read(each))
+            for name, each in zip(names, members, strict=True)
+        }
+
+
+def _array(name: str, content: bytes) -> Any:
+    """Return the array of an entry; its header must fit what follows."""
+    header = HEADER.match(content)
+    if header is None:
+        raise ValueError(f"{name} is no array of numbers, truth values or text")
+    kind = np.dtype(header[1].decode())
+    shape = tuple(int(each) for each in header[3].replace(b",", b" ").split())
+    # An empty array may not be a large one in disguise: its other sides count as they are.
+    if math.prod(max(each, 1) for each in shape) * max(kind.itemsize, 1) > max(len(content), 1):
+        raise ValueError(f"{name} is not as large as its header says")
+    count = math.prod(shape)
+    if len(content) - header.end() != count * kind.itemsize or kind.itemsize == 0:
+        raise ValueError(f"{name} is not as large as its header says")
+    array = np.frombuffer(content, kind, count, header.end()).copy()
+    if header[2] == b"True":
+        return array.reshape(shape[::-1]).T
+    return array.reshape(shape)

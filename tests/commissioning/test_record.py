@@ -1,0 +1,101 @@
+"""A record that was changed is refused; one that a kill cut off goes on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_yann.commissioning.journal import Journal, Outlook
+from sb3_yann.commissioning.plant import PlantEpisode
+from sb3_yann.commissioning.record import Record
+from sb3_yann.commissioning.watchdog import Alarm
+
+SETTINGS = {"batch": 5, "problem": "abc"}
+ERRORS = (ValueError, OSError)
+
+
+def journal(path: Path) -> Journal:
+    return Journal(Record(path), SETTINGS, Outlook(0.1))
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    found = journal(tmp_path / "plant.jsonl")
+    for reward in (1.5, float("nan")):
+        alarm = None if reward == 1.5 else Alarm("violation", "x[0] = 3 > 2 °C")
+        found.begin(False)
+        played = np.eye(3)[:, :2], np.array([[0.1], [0.2]])
+        found.add(PlantEpisode(*played, reward, 0, alarm, 0.1, 0.0), False)
+    return found.record.path
+
+
+def test_it_reads_what_it_wrote(path: Path) -> None:
+    again = journal(path)
+    assert again.episodes[0].reward == 1.5
+    assert again.episodes[1].alarm.message == "x[0] = 3 > 2 °C"
+    assert len(again.record.events) == 5 and "digest" not in again.record.events[0]
+    again.begin(False)
+    assert len(journal(path).record.events) == 6
+
+
+def test_every_flipped_bit_is_refused_or_cuts_off_the_last_line(path: Path) -> None:
+    content, events = path.read_bytes(), Record(path).events
+    for at in range(len(content)):
+        broken = bytearray(content)
+        broken[at] ^= 1 << at % 8
+        path.write_bytes(broken)
+        try:
+            found = Record(path).events
+        except ValueError as error:
+            assert str(path) in str(error)
+        else:
+            assert at == len(content) - 1 and found == events[:-1]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda lines: [lines[0], *lines[2:]],
+        lambda lines: [lines[0], lines[2], lines[1], *lines[3:]],
+        lambda lines: [*lines[:2], lines[2].replace("1.5", "1.4"), *lines[3:]],
+        lambda lines: [json.dumps({"event": "begin", **SETTINGS}), *lines[1:]],
+        lambda lines: [*lines, 100_000 * "["],
+        lambda lines: [*lines, "\ufeff"],
+    ],
+    ids=["left out", "swapped", "another number", "without a digest", "brackets", "a mark"],
+)
+def test_a_record_that_was_edited_is_refused(change, path: Path) -> None:
+    lines = change(path.read_text("utf-8").splitlines())
+    path.write_text("\n".join(lines) + "\n", "utf-8")
+    with pytest.raises(ValueError, match=r"plant\.jsonl, line \d: no event"):
+        journal(path)
+
+
+@pytest.mark.parametrize(
+    "event",
+    [{"event": "episode"}, {"event": "start"}, {"event": "batch", "number": 1},
+     {"event": "episode", "acts": "MPC", "alarm": 3, "reward": "x"}],
+)  # fmt: skip
+def test_an_event_without_its_parts_is_refused(event, path: Path) -> None:
+    Record(path).append(event)
+    with pytest.raises(ValueError, match=r"plant\.jsonl, line 6: no event"):
+        journal(path)
+
+
+def test_a_cut_at_any_place_leaves_whole_lines(path: Path) -> None:
+    content, events = path.read_bytes(), Record(path).events
+    for end in range(len(content)):
+        path.write_bytes(content[:end])
+        assert Record(path).events == events[: content[:end].count(b"\n")]
+
+
+def test_a_model_that_changed_since_is_refused(path: Path) -> None:
+    record, saved = Record(path), path.with_name("plant-batch-1.zip")
+    saved.write_bytes(b"weights")
+    digest = record.digest_of(saved.name)
+    saved.write_bytes(b"Weights")
+    with pytest.raises(ValueError, match=r"plant-batch-1\.zip has changed since it was accepted"):
+        record.load(saved.name, digest, None)
