@@ -293,9 +293,9 @@ def _runs() -> list[Run]:
 RUNS = [*_runs(), *twin.runs(), *(pcgym.runs() if find_spec("pcgym") else ())]
 QUICK = [
     *(Run(plant, name, 0, 0) for plant in ("CSTR", "pendulum, Q = I") for name in FIXED),
-    Run("CSTR", OURS, 20, 8),
-    Run("CSTR", "DDPG", 20, 8),
-    Run("pendulum, Q = I", OURS, 20, 8),
+    Run("CSTR", OURS, 20, 4),
+    Run("CSTR", "DDPG", 20, 4),
+    Run("pendulum, Q = I", OURS, 20, 4),
 ]
 
 

@@ -20,6 +20,12 @@ def same_initial_weights() -> Iterator[None]:
         yield
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files with slow tests first: begun last, one would hold up the end alone."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 PROBLEMS = {
     "pendulum": problems.clipped_pendulum,
     "cstr": problems.cstr,

@@ -14,7 +14,7 @@ def test_the_quick_form_runs_to_its_report_and_does_nothing_twice(tmp_path) -> N
     assert "9 of 9 runs" in run_module(tmp_path, "experiments", "--quick")
     folder = tmp_path / "out" / "paper-quick"
     report = (folder / "results.md").read_text(encoding="utf-8")
-    assert "## After 8 training episodes" in report
+    assert "## After 4 training episodes" in report
     for picture in re.findall(r"!\[.*?\]\((.*?)\)", report):
         assert (folder / picture).stat().st_size > 10_000
     runs = {path: path.stat().st_mtime_ns for path in (folder / "runs").iterdir()}
