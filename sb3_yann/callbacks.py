@@ -15,6 +15,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_whole
 from sb3_yann.policy._finite import watch_buffer
+from sb3_yann.policy.observations import require_frozen, require_same_statistics
 from sb3_yann.policy.policies import YannPolicy, require_yann_policy
 
 if TYPE_CHECKING:
@@ -48,6 +49,12 @@ class NoActionNoise(BaseCallback):
         self.model.action_noise, self.model.learning_starts = None, 0
         if isinstance(self.model.policy, YannPolicy):
             watch_buffer(self.model)  # another one may have been loaded since
+            require_same_statistics(self.model)
+
+    def _on_rollout_start(self) -> None:
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is not None and isinstance(self.model.policy, YannPolicy):
+            require_frozen(normalize)
 
     def _on_step(self) -> bool:
         return True

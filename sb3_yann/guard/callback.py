@@ -27,6 +27,7 @@ from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, begin_record
 from sb3_yann.guard.summary import summary_of
 from sb3_yann.policy._finite import watch_buffer
+from sb3_yann.policy.observations import require_same_statistics
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 
@@ -194,6 +195,7 @@ class ImprovementGuard(BaseCallback):
     def _on_training_start(self) -> None:
         check_not_nested(self)
         check_alone(self)
+        require_same_statistics(self.model)
         self._has_begun = False
         self.acceptance.start(self.session)
         known = getattr(self.model, "guard_state", None)

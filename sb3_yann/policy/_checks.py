@@ -24,6 +24,7 @@ from sb3_yann.policy.observations import (
     AffineObservation,
     require_frozen,
     require_outermost,
+    statistics_of,
 )
 from sb3_yann.twin.replay_buffer import LOST_STATISTICS
 
@@ -93,7 +94,8 @@ def require_undone_normalization(
             "normalizes absolute values: AffineObservation.deviation(mpc.theta_ss) @ that."
         )
     require_outermost(normalize, algorithm.observation_space.shape)
-    vars(algorithm)["sees_normalized"] = True  # it is saved with the model
+    vars(algorithm)["sees_normalized"] = True  # both are saved with the model
+    vars(algorithm).setdefault("undone_statistics", statistics_of(normalize))
     largest = _largest_observation(problem, observation)
     if largest > normalize.clip_obs:
         raise ValueError(

@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
@@ -140,9 +141,8 @@ class AffineObservation(ReadOnlyArrays):
         require_outermost(normalize, venv.observation_space.shape)
         if not normalize.norm_obs:
             return cls.identity(int(np.prod(cast(tuple[int, ...], venv.observation_space.shape))))
-        statistics = cast(RunningMeanStd, normalize.obs_rms)  # a dict only for a space of dicts
-        std = np.sqrt(statistics.var + normalize.epsilon)
-        return cls.normalized(np.ravel(statistics.mean), np.ravel(std))
+        mean, var = statistics_of(normalize)
+        return cls.normalized(np.ravel(mean), np.ravel(np.sqrt(var + normalize.epsilon)))
 
     @property
     def n_theta(self) -> int:
@@ -248,6 +248,29 @@ def require_frozen(normalize: VecNormalize) -> None:
         raise ValueError(
             "VecNormalize still moves its statistics: one observation means another state at each "
             "step. Collect them first. Set venv.training = False then."
+        )
+
+
+def statistics_of(normalize: VecNormalize) -> tuple[Array, Array]:
+    """Return mean and variance of what a VecNormalize normalizes, as they are now."""
+    statistics = cast(RunningMeanStd, normalize.obs_rms)  # a dict only for a space of dicts
+    return statistics.mean.copy(), statistics.var.copy()
+
+
+def require_same_statistics(model: BaseAlgorithm) -> None:
+    """Raise if the VecNormalize of a model has changed since its policy was made."""
+    normalize = model.get_vec_normalize_env()
+    if normalize is None:
+        return
+    require_frozen(normalize)
+    known = getattr(model, "undone_statistics", None)
+    if known is None or not normalize.norm_obs:
+        return
+    if not all(map(np.array_equal, known, statistics_of(normalize))):
+        raise ValueError(
+            "The statistics of VecNormalize are others than when the model was made, and the "
+            "policy undoes those: it would take one state for another. Put them back "
+            "(VecNormalize.load), or make the model anew."
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from stable_baselines3 import DDPG
@@ -48,6 +50,27 @@ def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> Non
     model.save(tmp_path / "model")
     loaded = DDPG.load(tmp_path / "model", env=env)
     np.testing.assert_array_equal(loaded.predict(obs)[0], model.predict(obs)[0])
+
+
+def test_statistics_that_change_after_the_model_was_made_are_refused(tmp_path) -> None:
+    env = normalize()
+    model = build(env, ABSOLUTE @ AffineObservation.from_vec_normalize(env))
+    model.learn(2, callback=NoActionNoise())
+    kept = copy.deepcopy(env.obs_rms)
+    env.training = True
+    with pytest.raises(ValueError, match="still moves its statistics"):
+        model.learn(2, callback=NoActionNoise())  # the reset has moved them already
+    env.training = False
+    for guard in (NoActionNoise(), ImprovementGuard(lambda: Seen(lambda x: x + STEADY, 3))):
+        with pytest.raises(ValueError, match="others than when the model was made"):
+            model.learn(2, callback=guard)
+    env.obs_rms = kept
+    model.learn(2, callback=NoActionNoise())
+    model.save(tmp_path / "model")
+    DDPG.load(tmp_path / "model", env=env).learn(2, callback=NoActionNoise())
+    env.obs_rms.mean = env.obs_rms.mean + 0.1
+    with pytest.raises(ValueError, match="others than when the model was made"):
+        DDPG.load(tmp_path / "model", env=env).learn(2, callback=NoActionNoise())
 
 
 def test_a_loaded_model_whose_statistics_are_lost_is_named(tmp_path) -> None:
