@@ -143,21 +143,38 @@ def asked_of_inputs(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
     """
     m, count = len(u_min), len(program.c) - program.n_slacks
     unit = 1 / np.sqrt(np.diag(program.H))
-    gains = np.linalg.solve(unit[:, None] * program.H * unit, unit[:, None] * program.F)
+    H, F = unit[:, None] * program.H * unit, unit[:, None] * program.F
+    gains = np.linalg.lstsq(H, F, rcond=None)[0]
     gains = np.abs(unit[:, None] * gains)[:count].reshape(-1, m, program.F.shape[1]).max(axis=0)
     width = program.theta_max / 2 - program.theta_min / 2
     box = np.where(np.isfinite(width), width, 0.0)
     return np.asarray(gains * box / half_widths(u_min, u_max)[:, None])
 
 
+def _require_one_minimum(program: ParametricQP) -> None:
+    """Raise where the program has no unique solution but for rounding."""
+    unit = 1 / np.sqrt(np.maximum(np.diag(program.H), 1e-300))
+    for H in (program.H, unit[:, None] * program.H * unit):  # both are factored
+        try:
+            np.linalg.cholesky(H)
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                "The weights Q, R and the terminal cost differ so much that the quadratic program "
+                f"has no unique solution to rounding: its Hessian has eigenvalues from "
+                f"{np.linalg.eigvalsh(H)[0]:.1e} to {np.linalg.eigvalsh(H)[-1]:.1e}, and all must "
+                "be positive. Pass a larger R, a shorter horizon, or states in other units."
+            ) from None
+
+
 def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> None:
-    """Raise where the box of theta, or an input's range, is so large that rounding hides the rest.
+    """Raise where weights, the box of theta or an input's range make rounding hide the rest.
 
     Parameters
     ----------
     program, u_min, u_max
         As in :func:`solve_explicit`.
     """
+    _require_one_minimum(program)
     bounded = np.isfinite(u_min) & np.isfinite(u_max)
     asked = asked_of_inputs(program, u_min, u_max) * bounded[:, None]
     most, width = asked.max(axis=1, initial=0.0), half_widths(u_min, u_max)

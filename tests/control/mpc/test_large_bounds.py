@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sb3_yann.control import LinearModel, LinearMPC
+from sb3_yann.control import LinearModel, LinearMPC, Terminal
 
 MODEL = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
 
@@ -66,6 +66,16 @@ def test_a_box_that_is_only_large_has_the_right_law(large: float) -> None:
 def test_what_would_overflow_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=rf"{name}\[0\] = 1e\+200 must be .* Use inf"):
         problem(**{name: 1e200})
+
+
+@pytest.mark.parametrize("kind", ["explicit", "online"])
+def test_weights_that_make_the_program_singular_to_rounding_are_named(kind: str) -> None:
+    model = LinearModel([[0.5, 0], [0, 0.5]], [[1e3, 1e3], [1e3, 1e3]], 1.0)
+    weights = {"Q": np.eye(2), "R": 1e-14 * np.eye(2), "terminal": Terminal(np.eye(2))}
+    box = {"u_min": -1, "u_max": 1, "x_min": -5, "x_max": 5}
+    mpc = LinearMPC(model, **weights, horizon=1, **box)
+    with pytest.raises(ValueError, match=r"no unique solution to rounding.*larger R"):
+        getattr(mpc, kind)()
 
 
 def test_an_infinite_box_has_an_online_law() -> None:
