@@ -136,8 +136,8 @@ def killed(target: Target, sign: int, rng: np.random.Generator) -> str:
         target.write(folder, 0)
         child = _fork(lambda: _for_ever(target, folder))
         time.sleep(rng.uniform(0, WRITE))
-        _end(child, sign)
-        return _left(target, folder)
+        hangs = _end(child, sign) == "hangs"
+        return "it hangs, " * hangs + _left(target, folder)
 
 
 def full(target: Target, rng: np.random.Generator) -> str:
@@ -235,6 +235,7 @@ def _fork(work: Callable[[], None]) -> int:
     if child:
         return child
     code = 1
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever forks may ignore it
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         work()

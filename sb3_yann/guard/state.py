@@ -161,11 +161,13 @@ def write_record(path: Path, decisions: list[Decision], anew: bool) -> bool:
 def begin_record(path: Path, decisions: list[Decision]) -> bool:
     """Write the decisions so far; what a file holds of another run is kept beside, with a warning.
 
-    Returns whether they could be written, as :func:`write_record` does.
+    A run that goes on from a checkpoint drops what it had decided after it. Returns whether they
+    could be written, as :func:`write_record` does.
     """
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            known = _rows(decisions, header=True).startswith(file.read())
+            ours, theirs = _rows(decisions, header=True), file.read()
+        known = ours.startswith(theirs) or (decisions != [] and theirs.startswith(ours))
     except FileNotFoundError:
         known = True
     except OSError:
