@@ -11,6 +11,7 @@ import argparse
 import os
 import resource
 import signal
+import threading
 import time
 import warnings
 from collections import Counter
@@ -23,6 +24,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from stable_baselines3 import DDPG
+from tqdm import tqdm
 
 from experiments.faulty_plants import ENV, WAYS, WHERE, met
 from experiments.markdown import table
@@ -231,12 +233,16 @@ def commissioning(rng: np.random.Generator, model: DDPG) -> str:
 
 def _fork(work: Callable[[], None]) -> int:
     """Return the process that does some work; it exits with 0, or with 1 after an error."""
+    # A signal waits until the child can meet it: before, it would be lost or end the parent's work.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     child = os.fork()
     if child:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         return child
     code = 1
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever forks may ignore it
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever forks may ignore it
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         work()
         code = 0
@@ -295,6 +301,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--report", type=Path, default=Path("docs"), help="folder of the page")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    tqdm.set_lock(
+        threading.RLock()
+    )  # its own is shared with children, and one that is killed keeps it
+    for version in range(2):
+        law(version)  # children find them solved
     killed_ones = table(
         ("what", "fault", "trials", "left"), rows(options.trials, options.trainings), texts=4
     )

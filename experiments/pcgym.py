@@ -112,7 +112,7 @@ class NonlinearMPC:
             k3 = rate(z + h / 2 * k2, u)
             z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + h * k3, u))
         sample = casadi.Function("sample", [x, u], [z])
-        V, start, wanted = (casadi.SX.sym(*each) for each in (
+        V, start, wanted = (casadi.MX.sym(*each) for each in (
             ("V", m, self.HORIZON), ("start", n), ("wanted", p)))  # fmt: skip
         z, cost = start, 0
         for k in range(self.HORIZON):
@@ -120,8 +120,10 @@ class NonlinearMPC:
             cost += 1e3 * casadi.sumsqr(z[plant.outputs] - wanted)
             cost += 1e-4 * casadi.sumsqr(V[:, k] - V[:, max(k - 1, 0)])
         program = {"x": casadi.vec(V), "p": casadi.vertcat(start, wanted), "f": cost}
-        quiet = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 60}
-        self.solve = casadi.nlpsol("plan", "ipopt", program, quiet)
+        options = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+        # A Hessian through so many small steps takes seconds.
+        options |= {"ipopt.max_iter": 60, "ipopt.hessian_approximation": "limited-memory"}
+        self.solve = casadi.nlpsol("plan", "ipopt", program, options)
         self.plant, self.size, self.plans = plant, n + p, {}
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
