@@ -27,6 +27,7 @@ WAYS = (
     "never ends",
 )
 WHERE = "training", "the guard's trials"
+SHOWN = 160
 PATIENCE = 20
 """Seconds after which what never ends meets Ctrl-C."""
 
@@ -83,7 +84,8 @@ def met(way: str, where: str) -> tuple[str, str]:
             said.append("training goes on")
         except (Exception, KeyboardInterrupt) as error:
             said.append(f"{type(error).__name__}: {error}".splitlines()[0])
-    said += sorted({f"{each.category.__name__}: {each.message}" for each in found})[:2]
+    told = sorted({f"{each.category.__name__}: {each.message}".splitlines()[0] for each in found})
+    said += [each if len(each) < SHOWN else f"{each[:SHOWN]} ..." for each in told[:2]]
     kept, accepted = [*model.actor.state_dict().values()], getattr(model, "guard_state", None)
     same = all(torch.equal(*pair) for pair in zip(first, kept, strict=True))
     if not same and accepted is not None:
@@ -102,6 +104,7 @@ class Alarm:
         self.timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
 
     def __enter__(self) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
         self.timer.start()
 
     def __exit__(self, *_: Any) -> None:
