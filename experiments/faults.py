@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import resource
 import signal
 import threading
@@ -40,6 +41,13 @@ WRITE, TRAIN = 0.08, 1.5
 ROOM = 3_000
 """Bytes that a full disk has left at most."""
 RUN = Run("plant", "learner", 0, 0)
+
+
+CODE = (".c", ".h", "_selftest.c")
+
+
+class NoticedError(Exception):
+    """What is there is not whole, and cannot be used by mistake."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +94,13 @@ def write_code(folder: Path, version: int) -> None:
 
 
 def read_code(folder: Path) -> int:
-    """Return which of them is there: all three files say it."""
-    texts = [folder / name for name in ("law.c", "law.h", "law_selftest.c")]
-    found = {int("v1_" in each.read_text(encoding="ascii")) for each in texts}
-    if len(found) > 1:
-        raise ValueError("files of two versions")
-    return found.pop()
+    """Return which of them is there: all three files say it, or they do not compile."""
+    texts = [(folder / f"law{name}").read_text(encoding="ascii") for name in CODE]
+    marks = {re.findall(r"EXPORT(?: !=)? (0x\w{8})u", text)[0] for text in texts}
+    if len(marks) > 1:
+        raise NoticedError("two exports, which do not compile")
+    (version,) = {int("v1_" in text) for text in texts}
+    return version
 
 
 def write_run(folder: Path, version: int) -> None:
@@ -182,6 +191,8 @@ def _for_ever(target: Target, folder: Path) -> None:
 def _left(target: Target, folder: Path) -> str:
     try:
         target.read(folder)
+    except NoticedError as error:
+        return str(error)
     except Exception as error:
         return f"damaged ({type(error).__name__}: {error})"
     return "whole"

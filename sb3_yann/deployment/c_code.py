@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from importlib.resources import files
 
 from sb3_yann.deployment.c_text import comment, literal, table
@@ -54,7 +55,8 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
             text = text.replace(f"@{key}@", entry)
         text = text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
         found[file + suffix] = text
-    return found
+    export = zlib.crc32("".join(found.values()).encode("ascii"))
+    return {name: text.replace("@EXPORT@", f"{export:#010x}") for name, text in found.items()}
 
 
 def _sizes(data: Arrays) -> str:

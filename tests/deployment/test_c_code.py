@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 
 import numpy as np
@@ -117,7 +118,20 @@ def test_names_cannot_end_a_comment(tmp_path):
     names = ["a", "b???/", "c", 'T */ int x; /* "Ä\\']
     model = LinearModel(plain.A, plain.B, plain.dt, state_names=names)
     compiled = Compiled(law.on_plant(model, np.zeros(4)), tmp_path)
-    assert compiled.at(np.zeros((1, 4)))[0] == 0
+    assert abs(compiled.at(np.zeros((1, 4)))[0]) < 1e-9  # of 8.4 K/min
+
+
+@pytest.mark.parametrize("old", ["plant.c", "plant.h", "plant_selftest.c"])
+def test_files_of_two_exports_do_not_compile(old, tmp_path):
+    for name in ("reactor", "confined"):
+        (tmp_path / name).mkdir()
+        export(policy_of(name), tmp_path / name / "plant.c", name="plant")
+    shutil.copy(tmp_path / "confined" / old, tmp_path / "reactor" / old)
+    sources = [str(tmp_path / "reactor" / each) for each in ("plant.c", "plant_selftest.c")]
+    built = [COMPILERS[0], *sources, "-lm", "-o", str(tmp_path / "test")]
+    said = subprocess.run(built, capture_output=True, text=True)
+    assert said.returncode != 0
+    assert "is of another export than this file: export again" in said.stderr
 
 
 def test_indices_are_as_wide_as_what_they_point_at():

@@ -7,6 +7,10 @@
 
 #include "@FILE@.h"
 
+#if YANN_EXPORT != @EXPORT@u
+#error "@FILE@.h is of another export than this file: export again"
+#endif
+
 typedef yann_real real;
 
 #define N_OBS YANN_N_OBS

@@ -13,6 +13,9 @@
 extern "C" {
 #endif
 
+/* Which export this is: files of two exports do not compile. */
+#define YANN_EXPORT @EXPORT@u
+
 @SIZES@
 
 typedef @REAL@ yann_real;

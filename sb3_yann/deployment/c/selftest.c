@@ -8,6 +8,10 @@
 
 #include "@FILE@.h"
 
+#if YANN_EXPORT != @EXPORT@u
+#error "@FILE@.h is of another export than this file: export again"
+#endif
+
 #define N_POINTS @POINTS@
 #define N_STEPS @STEPS@
 
