@@ -13,7 +13,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --quiet
 CODE := sb3_yann envs benchmarks experiments examples tests docs/conf.py docs/pictures.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper bench test test-fast check docs format clean
+.PHONY: help demo paper bench test test-fast coverage check docs format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -33,6 +33,12 @@ test: $(STAMP)  ## run the tests, side by side (make test ARGS="-n 0 -k name" fo
 
 test-fast: $(STAMP)  ## run the tests that are not marked slow, in less than two minutes
 	@$(PYTEST) -m "not slow" $(ARGS)
+
+coverage: $(STAMP)  ## run the tests, and print the lines and branches they leave out
+	@rm -rf out/coverage && mkdir -p out/coverage
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
+		$(PY) -m coverage run -m pytest -n logical --maxprocesses 4 --dist loadfile $(ARGS)
+	@$(PY) -m coverage combine --quiet && $(PY) -m coverage report
 
 check: $(STAMP)  ## lint, check the formatting and the types
 	$(PY) -m ruff check $(CODE)
