@@ -137,7 +137,10 @@ class SetPoint(Appending):
     ) -> None:
         super().__init__(env, low, high)
         if not np.all(np.isfinite([self.low, self.high])):
-            raise ValueError("low and high must be finite: references are drawn between them.")
+            raise ValueError(
+                f"low = {self.low.tolist()} and high = {self.high.tolist()} must be finite: "
+                "references are drawn between them."
+            )
         if hold is not None:
             as_whole("hold", hold, hint="It counts steps; None is one reference in each episode.")
         self.hold, self.schedule, self.steps = hold, schedule, 0

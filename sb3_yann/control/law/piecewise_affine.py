@@ -309,6 +309,10 @@ def as_points(theta: ArrayLike, n: int) -> tuple[Array, Array]:
     if points.ndim not in (1, 2) or points.shape[-1] != n:
         wanted = f"({n},) or (batch, {n})"
         raise ValueError(f"theta has shape {points.shape}, expected {wanted}.")
-    if not np.all(np.isfinite(points)):
-        raise ValueError("theta holds NaN or infinite entries; the law is defined for numbers.")
-    return points, np.ascontiguousarray(np.atleast_2d(points))
+    rows = np.ascontiguousarray(np.atleast_2d(points))
+    if not np.all(np.isfinite(rows)):
+        bad = rows[~np.all(np.isfinite(rows), axis=1)][0]
+        raise ValueError(
+            f"theta holds NaN or infinite entries, {bad.tolist()}; the law is defined for numbers."
+        )
+    return points, rows

@@ -35,7 +35,9 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
     """Return x_s and u_s, see :meth:`LinearMPC.steady_state`."""
     constant = _constants(problem, r, d)
     if constant.ndim != 1:
-        raise ValueError("steady_state takes one r (p,) and one d (d,), not batches.")
+        raise ValueError(
+            f"r and d make {len(constant)} points, and steady_state takes one: r (p,) and d (d,)."
+        )
     room = margins(problem, r, d)
     x, u = problem.steady_states.x @ constant, problem.steady_states.u @ constant
     if np.any(room < 0):
