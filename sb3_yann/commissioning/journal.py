@@ -111,8 +111,7 @@ class Journal:
         begin: Event = {"event": "begin", **settings}
         if not record.events:
             record.append(begin)
-        first = record.events[0]
-        if first != begin:
+        elif (first := record.events[0]) != begin:
             wrong = [f"{k} = {first.get(k)!r}" for k in begin if begin[k] != first.get(k)]
             raise ValueError(
                 f"{record.path} was begun with {', '.join(wrong)}. Use these to go on, or name "
@@ -126,6 +125,7 @@ class Journal:
                     f"{record.path}, line {number}: no event of a commissioning "
                     f"({type(error).__name__}: {error}). Name another file."
                 ) from error
+        record.events.clear()  # the episodes hold their numbers in a fifth of the memory
 
     @property
     def accepted(self) -> bool:

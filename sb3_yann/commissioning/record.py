@@ -22,7 +22,9 @@ ENDING = ', "digest": "{:0>16}"}}'
 
 
 class Record:
-    """Events in their order, in memory and, if there is a path, in a file.
+    """Events in their order, in a file if there is a path.
+
+    ``events`` are those that the file held.
 
     A last line that a kill cut off is left out, and overwritten by the next event. Each line ends
     with a digest of all up to it: a record that was changed is refused, and so is one of before
@@ -62,6 +64,11 @@ class Record:
                         f"{self.path}, line {number}: no event of a commissioning ({error}). Name "
                         "another file, or the one that was begun."
                     ) from error
+            if self._is_whole(rest[:-1]):  # a kill never leaves more than the line
+                raise ValueError(
+                    f"{self.path} has changed since it was written: its last line does not end. "
+                    "Name another file, or the one that was begun."
+                )
             self._size, self._seen = len(whole) + (len(whole) > 0), len(read)
         else:
             self._size = self._seen = 0
@@ -69,7 +76,6 @@ class Record:
     def append(self, event: Event) -> None:
         """Add an event; when this returns it is on the disk."""
         if self.path is None:
-            self.events.append(event)
             return
         text, digest = _with_digest(json.dumps(event, allow_nan=False), self._digest)
         line = f"{text}\n".encode()
@@ -85,7 +91,6 @@ class Record:
             os.fsync(file.fileno())
         self._size = self._seen = self._size + len(line)
         self._digest = digest
-        self.events.append(event)
 
     def save(self, model: OffPolicyAlgorithm, batch: int) -> str | None:
         """Save a model beside the record, all of it or nothing; return its name."""
@@ -112,6 +117,16 @@ class Record:
                 f"that was written, or begin anew with another record than {self.path}."
             )
         model.set_parameters(str(self.path.with_name(name)), device=model.device)
+
+    def _is_whole(self, line: bytes) -> bool:
+        before = self._digest
+        try:
+            self._event(line.decode("utf-8"))
+        except ValueError:
+            return False
+        finally:
+            self._digest = before
+        return True
 
     def _event(self, line: str) -> Event:
         """Return the event of the next line, whose digest must follow from the lines before."""
