@@ -19,7 +19,6 @@ from sb3_yann.control import PiecewiseAffine
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
 LONG, LONGEST = 100_000, 1_000_000
 """Steps of an episode after which a warning tells of it, and after which it is an error."""
-"""Steps after which an episode is taken for one that never ends."""
 
 
 class Predictor(Protocol):

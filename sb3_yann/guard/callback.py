@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_flag, as_options, as_whole
-from sb3_yann.evaluation.episodes import Source
+from sb3_yann.evaluation.episodes import LONG, Source
 from sb3_yann.evaluation.plots.decisions import plot_decisions
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.interrupt import Handler, install
@@ -102,6 +102,7 @@ class ImprovementGuard(BaseCallback):
     twin: PlantTwin | None = None
     _handler: Handler | None = None
     _has_begun = False
+    _steps: Any = 0  # of each env's present episode
 
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
         self,
@@ -235,10 +236,21 @@ class ImprovementGuard(BaseCallback):
     def _on_step(self) -> bool:
         dones, rewards, infos = (self.locals[each] for each in ("dones", "rewards", "infos"))
         self.state.episodes += int(np.sum(dones))
+        self._warn_of_an_endless_episode(dones)
         if isinstance(self.acceptance, PlantAcceptance):
             self.acceptance.record(self.session, self.locals["buffer_actions"])
         self.acceptance.step(self.session, dones, rewards, infos)
         return True
+
+    def _warn_of_an_endless_episode(self, dones: Any) -> None:
+        self._steps = np.where(dones, 0, self._steps + 1)
+        if np.any(self._steps == LONG):
+            warnings.warn(
+                f"An episode of the training env has not ended after {LONG} steps, and the guard "
+                "decides at the ends of episodes; on a plant alone it keeps all steps of one in "
+                "memory. Give it a limit, by gymnasium.wrappers.TimeLimit.",
+                stacklevel=2,
+            )
 
     def _on_training_end(self) -> None:
         # The Zoo ends training after Ctrl-C as well, also before there is anything accepted.

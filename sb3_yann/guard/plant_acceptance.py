@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from sb3_yann.evaluation.episodes import LONG
 from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint, diverged
 from sb3_yann.guard.covariate import Recorder, predict_by_twin, predicted_cost
 from sb3_yann.guard.options import AcceptanceRule
@@ -121,13 +119,6 @@ class PlantAcceptance:
             if starting[i]:
                 self.recorders[i] = Recorder()
             self.recorders[i].add(theta[i], actions[i])
-            if len(self.recorders[i].actions) == LONG:
-                warnings.warn(
-                    f"An episode of the training env has not ended after {LONG} steps, all of "
-                    "which are kept in memory: the guard decides at the ends of episodes. Give it "
-                    "a limit, by gymnasium.wrappers.TimeLimit.",
-                    stacklevel=2,
-                )
 
     def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
         """Count the step; decide where a block is over.

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.env_util import make_vec_env
 
 from guard_samples import At, Slide, accepted_bits, actor_bits, better, build, make_guard, train
-from sb3_yann import restore_accepted
+from sb3_yann import NoActionNoise, restore_accepted
 from sb3_yann.evaluation.episodes import LONGEST, evaluate
 from weights import is_mpc
 
@@ -105,6 +106,16 @@ def test_an_episode_that_is_long_is_told_before_memory_is_full(monkeypatch) -> N
         pytest.raises(RuntimeError, match="has not ended after 50 steps"),
     ):
         train(build(), 4, make_guard(Endless))
+
+
+@pytest.mark.parametrize("simulator", [Slide, None])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_training_env_that_never_ends_is_told(simulator, n_envs, monkeypatch) -> None:
+    monkeypatch.setattr("sb3_yann.guard.callback.LONG", 20)
+    endless = build(env=make_vec_env(Endless, n_envs))
+    with pytest.warns(UserWarning, match=r"training env has not ended after 20 .*TimeLimit") as told:
+        train(endless, 30 * n_envs, NoActionNoise(), make_guard(simulator))
+    assert len(told) == 1
 
 
 def stop(_) -> None:

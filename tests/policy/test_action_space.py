@@ -11,6 +11,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from policy_samples import make_policy
 from sb3_yann import LinearModel, LinearMPC, YannPolicy
+from sb3_yann.commissioning.plant import Plant
 
 MODEL = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
 # With these SB3's own formula ends a bit above the upper bound, or below the lower one.
@@ -74,3 +75,11 @@ def test_no_step_of_training_leaves_the_action_space() -> None:
     model = DDPG(YannPolicy, env, policy_kwargs=kwargs, action_noise=noise, learning_starts=20)
     model.learn(100)
     assert env.saturated > 10
+
+
+@pytest.mark.parametrize("by", ["mpc", "policy"])
+def test_no_step_of_a_commissioning_leaves_the_action_space(by) -> None:
+    env = Strict()
+    plant = Plant(env, DDPG(YannPolicy, env, policy_kwargs={"problem": problem(*BOUNDS[0])}))
+    plant.play(plant.begin(seed=0), getattr(plant, by), watchdog=None)
+    assert env.saturated > 3
