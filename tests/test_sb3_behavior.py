@@ -232,7 +232,7 @@ def test_the_buffer_of_an_instance_may_have_its_own_add() -> None:
     assert buffer.size() == buffer.pos == STEPS + 1 and not buffer.full
     assert [each.item() for each in buffer.next_observations[: STEPS + 1]] == [1, 2, 3, 4, 1]
     assert buffer.dones[3].item() == 1 and buffer.timeouts[3].item() == 1
-    assert buffer.actions.shape[1:] == buffer.rewards.shape[1:] + (1,) == (1, 1)
+    assert buffer.actions.shape[1:] == (*buffer.rewards.shape[1:], 1) == (1, 1)
 
 
 @pytest.mark.parametrize("goes_on", [True, False])
