@@ -43,7 +43,6 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
         "ABOUT": comment([*about.splitlines(), "", *shown, "", f"{cost_of(data)}."]),
         "SIZES": _sizes(data),
         "REAL": precision,
-        "FILE": file,
         "TABLES": _tables(data, precision),
     }
     suffixes = {"controller.c": ".c", "controller.h": ".h", "selftest.c": "_selftest.c"}
@@ -55,8 +54,11 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
             text = text.replace(f"@{key}@", entry)
         text = text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
         found[file + suffix] = text
-    export = zlib.crc32("".join(found.values()).encode("ascii"))
-    return {name: text.replace("@EXPORT@", f"{export:#010x}") for name, text in found.items()}
+    export = f"{zlib.crc32(''.join(found.values()).encode('ascii')):#010x}"
+    return {
+        name: text.replace("@FILE@", file).replace("@EXPORT@", export)
+        for name, text in found.items()
+    }
 
 
 def _sizes(data: Arrays) -> str:

@@ -113,7 +113,9 @@ def test_an_episode_that_is_long_is_told_before_memory_is_full(monkeypatch) -> N
 def test_a_training_env_that_never_ends_is_told(simulator, n_envs, monkeypatch) -> None:
     monkeypatch.setattr("sb3_yann.guard.callback.LONG", 20)
     endless = build(env=make_vec_env(Endless, n_envs))
-    with pytest.warns(UserWarning, match=r"training env has not ended after 20 .*TimeLimit") as told:
+    with pytest.warns(
+        UserWarning, match=r"training env has not ended after 20 .*TimeLimit"
+    ) as told:
         train(endless, 30 * n_envs, NoActionNoise(), make_guard(simulator))
     assert len(told) == 1
 

@@ -9,7 +9,6 @@ from importlib import import_module
 from importlib.resources import files
 
 import gymnasium as gym
-import yaml
 from stable_baselines3 import DDPG
 
 import sb3_yann
@@ -34,7 +33,7 @@ def main() -> None:
     model.learn(500, callback=[sb3_yann.NoActionNoise(), guard])
     for algorithm in ("ddpg", "td3"):
         text = (files("sb3_yann.hyperparams") / f"{algorithm}.yml").read_text(encoding="utf-8")
-        assert {"CSTR-v0", "ClippedPendulum-v0"} <= yaml.safe_load(text).keys()
+        assert "\nCSTR-v0:" in text and "\nClippedPendulum-v0:" in text
     print("all is there")
 
 

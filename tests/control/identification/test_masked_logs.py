@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytest.importorskip("torch")
 from sb3_yann import LinearModel, LinearMPC, PlantTwin
 
 MODEL = LinearModel([[0.9, 0.1], [0, 0.8]], [[0], [1]], 1.0)
