@@ -56,14 +56,14 @@ class TwinState:
     episodes : int, training episodes so far
     is_due : bool, whether an improvement waits
     given : str, digest of the log of a twin that was given, empty where there was none
-    run : int, when the present `learn` began: two callbacks in it do not share a state
+    run : float, when the present `learn` began: two callbacks in it do not share a state
     """
 
     attempts: list[Attempt] = field(default_factory=list)
     episodes: int = 0
     is_due: bool = False
     given: str = ""
-    run: int = 0
+    run: float = 0
 
 
 class ImproveInTwin(BaseCallback):
@@ -152,7 +152,7 @@ class ImproveInTwin(BaseCallback):
         self.is_new = self.given not in ("", self.state.given)
         self.state.is_due |= self.is_new
 
-    def _go_on(self, run: int) -> None:
+    def _go_on(self, run: float) -> None:
         """Take the model's state, or begin one."""
         model: Any = self.model
         known = getattr(model, "twin_state", None)

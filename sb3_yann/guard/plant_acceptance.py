@@ -216,9 +216,9 @@ class PlantAcceptance:
     def _leave_out(self, evidence: BlockEvidence, cost: float) -> None:
         """Leave an episode out of the first block; raise ValueError if too many are."""
         evidence.left_out += 1
-        if evidence.left_out >= self.rule.trial_episodes:
+        if (lost := evidence.left_out) >= self.rule.trial_episodes:
             raise ValueError(
-                f"{evidence.left_out} episodes of the guard's first block cost no finite number, the "
+                f"{lost} episodes of the guard's first block cost no finite number, the "
                 f"last {cost:g}. Policies are compared by costs. Rewards must be finite numbers."
             )
 

@@ -77,12 +77,12 @@ def test_between_two_calls_of_learn_a_model_may_be_saved_and_loaded(tmp_path) ->
     found = []
     for is_loaded in (False, True):
         model = build(env=envs(1))
-        train(model, 8 * STEPS, guard_in_simulator())
+        train(model, 4 * STEPS, guard_in_simulator())
         model.save(tmp_path / "model")
         model.save_replay_buffer(tmp_path / "buffer")
         if is_loaded:
             model = loaded(tmp_path, envs(1))
-        go_on(model, 8 * STEPS, guard_in_simulator())
+        go_on(model, 4 * STEPS, guard_in_simulator())
         found.append(model_bits(model))
     assert found[0] == found[1]
 
