@@ -14,7 +14,7 @@ from stable_baselines3 import DDPG
 
 from resumed import Checkpoint, all_bits, envs, go_on, loaded, model_bits
 from sb3_yann import Commissioning, ImproveInTwin, Improvement, NoActionNoise, YannPolicy, improve
-from sb3_yann.commissioning import Check, commissioning
+from sb3_yann.commissioning import Check, callback, commissioning
 from twin_samples import Cart, twin
 
 STEPS = 20
@@ -59,7 +59,7 @@ def test_a_twin_that_was_saved_predicts_and_improves_as_before() -> None:
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize("n_envs", [1, 4])
+@pytest.mark.parametrize("n_envs", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_a_training_with_a_twin_that_stops_goes_on_as_if_it_had_not(n_envs, tmp_path) -> None:
     def in_twin() -> ImproveInTwin:
         return ImproveInTwin(every=4, iterations=2)
@@ -67,14 +67,17 @@ def test_a_training_with_a_twin_that_stops_goes_on_as_if_it_had_not(n_envs, tmp_
     whole, halfway = model(n_envs), 4 * STEPS
     callbacks = [NoActionNoise(), in_twin(), Checkpoint(halfway, tmp_path)]
     whole.learn(2 * halfway, callback=callbacks)
-    resumed, callback = loaded(tmp_path, envs(n_envs, Short)), in_twin()
-    go_on(resumed, halfway, callback)
-    assert [each.episode for each in callback.attempts] == [4, 8]
-    assert any(each.trusted for each in callback.attempts)
+    resumed, again = loaded(tmp_path, envs(n_envs, Short)), in_twin()
+    go_on(resumed, halfway, again)
+    assert [each.episode for each in again.attempts] == [4, 8]
+    assert any(each.trusted for each in again.attempts)
     assert model_bits(resumed) == model_bits(whole)
 
 
-def test_a_given_twin_acts_before_the_first_step_of_the_first_learn_only(tmp_path) -> None:
+def test_a_given_twin_acts_before_the_first_step_of_the_first_learn_only(
+    tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(callback, "improve", lambda *_, **__: Improvement((), 0.0, True))
     learner, options = model(gradient_steps=0), {"every": 9, "iterations": 1}
     learner.learn(1, callback=[NoActionNoise(), ImproveInTwin(twin(), **options)])
     learner.save(tmp_path / "model")
@@ -115,6 +118,7 @@ def events(path: Any) -> list[dict[str, Any]]:
     return found
 
 
+@pytest.mark.slow
 def test_a_commissioning_that_stops_after_a_batch_goes_on_as_if_it_had_not(
     tmp_path, monkeypatch
 ) -> None:
