@@ -1,7 +1,7 @@
 """A million steps under guard and in commissioning: `python -m experiments.endurance`, an hour.
 
-Memory, open files, threads and speed are taken twenty times on the way. What grows is a leak. Writes
-its table into docs/faults.md.
+Memory, open files, threads and speed are taken twenty times on the way; what grows is a leak. Its
+tables go into docs/faults.md.
 """
 
 from __future__ import annotations

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,7 +26,7 @@ class Attempt:
     Attributes
     ----------
     timestep, episode : int
-        Steps of the model, and episodes of the callback, until then.
+        Steps and episodes of training until then.
     trusted, accepted : bool
         Whether the twin was trusted, and whether a policy was accepted in it.
     cost_error : float
@@ -44,6 +46,26 @@ class Attempt:
     reason: str
 
 
+@dataclass
+class TwinState:
+    """All that a stopped run needs to go on; it travels in the model's zip.
+
+    Attributes
+    ----------
+    attempts : list of Attempt, all so far
+    episodes : int, training episodes so far
+    is_due : bool, whether an improvement waits
+    given : str, digest of the log of a twin that was given, empty where there was none
+    run : float, when the present `learn` began: two callbacks in it do not share a state
+    """
+
+    attempts: list[Attempt] = field(default_factory=list)
+    episodes: int = 0
+    is_due: bool = False
+    given: str = ""
+    run: float = 0
+
+
 class ImproveInTwin(BaseCallback):
     """Improves the policy in a twin of the plant after every so many training episodes.
 
@@ -52,7 +74,8 @@ class ImproveInTwin(BaseCallback):
     :class:`ImprovementGuard` in the same list an improvement is a candidate like any other; while
     a guard on a plant alone lets the actor rest, it waits. The algorithm's own gradient steps go
     on in between, ``gradient_steps=0`` leaves them out. No random numbers of the training are
-    drawn.
+    drawn. The count of episodes and the attempts travel with the model, as ``model.twin_state``:
+    a run that is loaded goes on there.
 
     Tensorboard shows ``twin/trusted``, ``twin/cost_error``, ``twin/accepted`` and ``twin/change``.
 
@@ -104,10 +127,14 @@ class ImproveInTwin(BaseCallback):
             raise TypeError(f"twin = {twin!r} must be a PlantTwin, or None to fit one.")
         if twin is not None:
             twin.require_trust()
-        self.twin, self.refits, self.is_due = twin, twin is None, twin is not None
+        self.twin, self.refits = twin, twin is None
         self.every, self.iterations = as_whole("every", every), as_whole("iterations", iterations)
-        self.seed, self.episodes = as_whole("seed", seed, 0), 0
-        self.attempts: list[Attempt] = []
+        self.seed, self.state = as_whole("seed", seed, 0), TwinState()
+
+    @property
+    def attempts(self) -> list[Attempt]:
+        """All attempts so far, those before a resumed run included."""
+        return self.state.attempts
 
     def _init_callback(self) -> None:
         self.policy = require_yann_policy(self.model.policy, "ImproveInTwin")
@@ -120,23 +147,38 @@ class ImproveInTwin(BaseCallback):
                 "last states of episodes. Build the model without it, or pass a PlantTwin."
             )
         watch_buffer(self.model)
+        self._go_on(self.model.start_time)
+        self.given = "" if self.twin is None or self.refits else _digest_of(self.twin)
+        self.is_new = self.given not in ("", self.state.given)
+        self.state.is_due |= self.is_new
+
+    def _go_on(self, run: float) -> None:
+        """Take the model's state, or begin one."""
+        model: Any = self.model
+        known = getattr(model, "twin_state", None)
+        if known is None:
+            model.twin_state = self.state = TwinState()
+        elif known is not self.state:
+            self.state = TwinState() if known.run == run else known
+        self.state.run = run
 
     def _on_rollout_start(self) -> None:
-        if self.is_due and not self.attempts:  # a twin that was given, before the first step
+        if self.is_new:  # a twin that was given, before the first step
             self._improve()
 
     def _on_step(self) -> bool:
-        ended = int(np.sum(self.locals["dones"]))
-        self.is_due |= (self.episodes + ended) // self.every > self.episodes // self.every
-        self.episodes += ended
-        if ended and self.is_due:
+        state, ended = self.state, int(np.sum(self.locals["dones"]))
+        state.is_due |= (state.episodes + ended) // self.every > state.episodes // self.every
+        state.episodes += ended
+        if ended and state.is_due:
             self._improve()
         return True
 
     def _improve(self) -> None:
         if self.policy.actor_step == 0:  # a guard tests the actor as it is
             return
-        self.is_due, seed = False, self.seed + len(self.attempts)
+        self.state.is_due, self.is_new, self.state.given = False, False, self.given
+        seed = self.seed + len(self.attempts)
         with preserve_rng():
             found = self._attempt(seed)
         self.attempts.append(found)
@@ -146,10 +188,10 @@ class ImproveInTwin(BaseCallback):
         self.logger.dump(self.num_timesteps)  # or the next would replace it
         if self.verbose:
             said = found.reason or f"{100 * found.change:+.2f} % in the twin"
-            print(f"Episode {self.episodes}: {said}")
+            print(f"Episode {self.state.episodes}: {said}")
 
     def _attempt(self, seed: int) -> Attempt:
-        now = self.model.num_timesteps, self.episodes
+        now = self.model.num_timesteps, self.state.episodes
         if self.refits:
             self.twin = None
             try:
@@ -162,3 +204,9 @@ class ImproveInTwin(BaseCallback):
             return Attempt(*now, False, False, error, np.nan, problems)
         found = improve(self.model, self.twin, self.iterations, seed=seed)
         return Attempt(*now, True, found.accepted, error, found.change, found.reason)
+
+
+def _digest_of(twin: PlantTwin) -> str:
+    """Return the digest of the log that a twin was fitted to."""
+    rows = (each.thetas.tobytes() + each.actions.tobytes() for each in twin.episodes)
+    return hashlib.sha256(b"".join(rows)).hexdigest()

@@ -198,7 +198,8 @@ class Commissioning:
             if self._changed:
                 costs = compare(journal, plant, self.twin, None)
                 self.twin = self.watchdog = None
-                outlook = Outlook(self._first_bound, "MPC", len(journal.episodes), number)
+                first = len(journal.episodes)
+                outlook = Outlook(self._first_bound, first=first, anew=number, tried=before.tried)
                 self.incumbent.give_back()
                 verdict: Verdict = "begins anew"
                 reason = "Two episodes in a row had an alarm."
@@ -211,6 +212,7 @@ class Commissioning:
                 outlook = replace(outlook, policy=policy, model=saved, model_digest=digest)
             elif verdict != "stays":
                 outlook = replace(outlook, policy="MPC", model=None, model_digest=None)
+            self.incumbent.limit(outlook.max_correction)
             shown = costs.actual, costs.predicted, costs.mpc
             sizes = number, len(journal.batch), alarms
             journal.close(Batch(*sizes, who, within, *shown, verdict, reason), outlook)
@@ -248,7 +250,7 @@ class Commissioning:
         self, twin: PlantTwin, outlook: Outlook, seed: int
     ) -> tuple[Outlook, Verdict, str]:
         """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
-        bound = self.journal.outlook.max_correction
+        bound, outlook = self.journal.outlook.max_correction, replace(outlook, tried=True)
         self.incumbent.take_candidate()
         held = ActorCheckpoint.of(self.policy)
         self.incumbent.limit(outlook.max_correction)
@@ -305,12 +307,13 @@ class Commissioning:
         """Restore the accepted policy, the twin and its watchdog as a record left them."""
         if not self.journal.batches:
             return
+        self.incumbent.limit(outlook.max_correction)
         if outlook.model is None:
             self.incumbent.give_back()
         else:
-            self.incumbent.limit(outlook.max_correction)
             self.journal.record.load(outlook.model, outlook.model_digest, self.model)
-        self.incumbent.candidate = None
+        if outlook.tried:
+            self.incumbent.candidate = None
         self.incumbent.hold()
         if outlook.twin is not None:
             self.twin = self._fit(outlook.twin, outlook.twin_seed)

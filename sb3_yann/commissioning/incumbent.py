@@ -31,7 +31,10 @@ class Incumbent:
             raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
         self.model, self.policy = model, require_yann_policy(model.policy, "Commissioning")
         with preserve_rng():  # building an actor draws weights
-            self._mpc = self.policy.make_actor().state_dict()
+            mpc = self.policy.make_actor().state_dict()
+        self._first = {name: each.clone() for name, each in self.policy.state_dict().items()}
+        for actor in ("actor", "actor_target"):
+            self._first |= {f"{actor}.{name}": each for name, each in mpc.items()}
         self.candidate: ActorCheckpoint | None = None
         if self.has_learnt:
             self.candidate = ActorCheckpoint.of(self.policy)
@@ -48,9 +51,10 @@ class Incumbent:
         self.policy.limit_correction(max_correction)
 
     def give_back(self) -> None:
-        """Make it the MPC."""
-        self.policy.actor.load_state_dict(self._mpc)
-        self.policy.actor_target.load_state_dict(self._mpc)
+        """Make it the MPC, with the critic that the model began with."""
+        self.policy.load_state_dict(self._first)
+        for network in (self.policy.actor, self.policy.critic):
+            network.optimizer.state.clear()  # what other weights were moved by
 
     def take_candidate(self) -> None:
         """Make it what the model had learnt before, if that still waits, to be tried."""

@@ -77,6 +77,8 @@ class Outlook:
         And its seed.
     model, model_digest : str or None
         The file of the accepted policy, and its digest.
+    tried : bool
+        Whether what the model had learnt before has been tried.
     """
 
     max_correction: float
@@ -87,6 +89,7 @@ class Outlook:
     twin_seed: int = 0
     model: str | None = None
     model_digest: str | None = None
+    tried: bool = False
 
 
 class Journal:

@@ -209,6 +209,7 @@ class ImprovementGuard(BaseCallback):
                 stacklevel=2,
             )
             self._start_afresh(known)
+        self.state.mpc = self.session.mpc
         self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
         self.session.policy.actor_step = self.acceptance.actor_step(self.session)
         self._has_begun = True

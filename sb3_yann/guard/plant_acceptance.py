@@ -20,6 +20,7 @@ from sb3_yann.guard.statistics import (
     excess_of_an_outlier,
     is_promising,
 )
+from sb3_yann.policy._sb3_hooks import is_under_way
 
 Phase = Literal["first", "learning", "trial", "again"]
 
@@ -40,6 +41,7 @@ class BlockEvidence:
     log : tuple of pairs of ndarray, thetas and inputs of the block's episodes, as ``predicted``
     candidate : ActorCheckpoint or None, the policy on trial after its first block
     on_trial : PlantEpisodes or None, its episodes
+    left_out : int, episodes of the first block whose cost is not known
     """
 
     phase: Phase = "first"
@@ -52,6 +54,7 @@ class BlockEvidence:
     log: tuple[Logged, ...] = ()
     candidate: ActorCheckpoint | None = None
     on_trial: PlantEpisodes | None = None
+    left_out: int = 0
 
     @property
     def played(self) -> PlantEpisodes:
@@ -69,16 +72,14 @@ class PlantAcceptance:
     def start(self, session: GuardSession) -> None:
         """Begin with the episodes that start now; one that is under way does not count."""
         check_acts_alone(session.model)
-        n_envs = session.model.n_envs
+        model, n_envs = session.model, session.model.n_envs
         # SB3 goes on amid an episode where its steps are not counted from 0 again.
-        going_on = int(session.model.num_timesteps > 0)
-        self.costs, self.lengths = np.zeros(n_envs), np.full(n_envs, going_on)
+        going_on = model.num_timesteps > 0 and is_under_way(model)
+        self.costs, self.lengths = np.zeros(n_envs), np.zeros(n_envs, dtype=int) + going_on
         self.violated = np.zeros(n_envs, dtype=bool)
         self.accepted_led = np.zeros(n_envs, dtype=bool)  # whether for all of the episode so far
         self.recorders = [Recorder() for _ in range(n_envs)]
         self.blocks, self.block = np.full(n_envs, -1), 0
-        self.last_restore = "", -1  # why, and after how many episodes
-        self.left_out = 0  # episodes of the first block whose cost is not known
 
     def still_holds(self, session: GuardSession) -> bool:
         """Return whether the evidence is there; a plant cannot be played again."""
@@ -191,7 +192,7 @@ class PlantAcceptance:
         evidence = _evidence(session)
         if self.blocks[i] == self.block:
             if evidence.phase == "first" and not np.isfinite(self.costs[i]):
-                self._leave_out(self.costs[i])
+                self._leave_out(evidence, self.costs[i])
             else:
                 evidence.costs.append(float(self.costs[i]))
                 if evidence.phase != "learning":
@@ -203,12 +204,12 @@ class PlantAcceptance:
         self.costs[i], self.lengths[i], self.violated[i] = 0.0, 0, False
         self.blocks[i] = -1
 
-    def _leave_out(self, cost: float) -> None:
+    def _leave_out(self, evidence: BlockEvidence, cost: float) -> None:
         """Leave an episode out of the first block; raise ValueError if too many are."""
-        self.left_out += 1
-        if self.left_out >= self.rule.trial_episodes:
+        evidence.left_out += 1
+        if (lost := evidence.left_out) >= self.rule.trial_episodes:
             raise ValueError(
-                f"{self.left_out} episodes of the guard's first block cost no finite number, the "
+                f"{lost} episodes of the guard's first block cost no finite number, the "
                 f"last {cost:g}. Policies are compared by costs. Rewards must be finite numbers."
             )
 
@@ -225,9 +226,9 @@ class PlantAcceptance:
         """Restore the accepted policy at once, whatever the block."""
         state = session.state
         state.accepted.restore(session.policy)
-        if self.last_restore != (reason, state.episodes):  # one decision for it in each episode
+        known = [(each.reason, each.episode) for each in state.decisions[-1:]]
+        if known != [(reason, state.episodes)]:  # one decision for it in each episode
             self._report(session, "rejected", reason, np.nan)
-        self.last_restore = reason, state.episodes
         self._begin(session, "first" if _evidence(session).accepted is None else "learning")
 
     def _end_block(self, session: GuardSession) -> None:

@@ -47,7 +47,10 @@ class GuardSession:
     before_trial: tuple[ActorCheckpoint, Any, list[Any]] | None = None
 
     def __post_init__(self) -> None:
-        if self.policy.actor.mu.network.is_zero():
+        known = getattr(self.model, "guard_state", None)
+        if known is not None and known.mpc is not None:  # a run that goes on has the same weights
+            self.mpc = known.mpc
+        elif self.policy.actor.mu.network.is_zero():
             self.mpc = ActorCheckpoint.of(self.policy)
 
     @cached_property

@@ -73,7 +73,6 @@ class SimulatorAcceptance:
         """Check that the simulator is another env than the training env, and a like one."""
         check_simulator(session, self.name)
         self.final: ActorCheckpoint | None = None
-        self.last_trial = -self.eval_every  # a trial always follows the first episode
 
     def still_holds(self, session: GuardSession) -> bool:
         """Return whether some episodes are still what the evidence says: only a name is known."""
@@ -142,9 +141,10 @@ class SimulatorAcceptance:
         session, dones, rewards, infos
             As in `PlantAcceptance.step`; the last two are not used.
         """
-        episodes = session.state.episodes
-        if np.any(dones) and episodes - self.last_trial >= self.eval_every:
-            self.last_trial = episodes
+        state = session.state
+        last, now = state.last_trial, state.episodes
+        if np.any(dones) and (last is None or now - last >= self.eval_every):
+            state.last_trial = now
             self.try_candidate(session)
 
     def end(self, session: GuardSession) -> None:

@@ -83,6 +83,8 @@ class GuardState:
     decisions : list of Decision, all so far
     budget : ErrorBudget, what is left to the tests on a plant alone
     input_step : ndarray, shape (m,), or None, how far inputs may move from one sample to the next
+    mpc : ActorCheckpoint or None, the MPC, with the weights that it goes on to learn from
+    last_trial : int or None, training episodes until the last trial in a simulator
     """
 
     settings: dict[str, Any]
@@ -97,6 +99,8 @@ class GuardState:
     decisions: list[Decision] = field(default_factory=list)
     budget: ErrorBudget = ErrorBudget()  # noqa: RUF009 (frozen)
     input_step: Array | None = None
+    mpc: ActorCheckpoint | None = None
+    last_trial: int | None = None
 
     def accept(self, checkpoint: ActorCheckpoint, evidence: Any) -> None:
         """Make a checkpoint the accepted one."""

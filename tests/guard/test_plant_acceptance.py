@@ -244,11 +244,11 @@ def test_a_run_that_was_stopped_in_a_trial_goes_on_in_it(tmp_path) -> None:
     train(model, stop + 1, At([BLOCK + 1], better), guard, save)
     loaded = DDPG.load(tmp_path / f"model_{stop}_steps", env=plant(), device="cpu")
     again = guard_alone()
-    train(loaded, 2 * STEPS, again, phases := Phases(again), reset_num_timesteps=False)
-    assert again.decisions == []  # the first episode after the load is not taken for a whole one
-    assert phases.phases == ["trial"] * 2 * STEPS
+    train(loaded, STEPS, again, phases := Phases(again), reset_num_timesteps=False)
+    assert again.decisions == []  # the episode that was cut off is not taken for a whole one
+    assert phases.phases == ["trial"] * STEPS
     loaded = DDPG.load(tmp_path / f"model_{stop}_steps", env=plant(), device="cpu")
-    train(loaded, 3 * STEPS, again := guard_alone(), reset_num_timesteps=False)
+    train(loaded, 2 * STEPS, again := guard_alone(), reset_num_timesteps=False)
     assert verdicts(again) == ["accepted"]
     np.testing.assert_allclose(again.state.evidence.mpc.costs, 4.25)
     np.testing.assert_allclose(again.state.evidence.accepted.costs, 4.0)

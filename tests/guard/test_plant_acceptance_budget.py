@@ -137,9 +137,9 @@ def test_a_run_that_was_stopped_while_the_accepted_policy_plays_again_goes_on(tm
     train(model, stop + 1, At([BLOCK + 1], better), guard_alone(), save)
     plant = Scattered()
     loaded = DDPG.load(tmp_path / f"model_{stop}_steps", env=plant, device="cpu")
-    plant.episodes = 9  # it goes on where it was; its next episode does not count
+    plant.episodes = 10  # it goes on where it was
     guard = guard_alone()
-    train(loaded, 2 * STEPS + BLOCK, guard, look := Phases(guard), reset_num_timesteps=False)
+    train(loaded, STEPS + BLOCK, guard, look := Phases(guard), reset_num_timesteps=False)
     assert look.phases == ["again", "trial", "learning"]
     assert verdicts(guard) == ["accepted"]
     assert correction(loaded) == 0.5

@@ -1,0 +1,162 @@
+"""What learns in a twin goes on after a stop as if there had been none, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG
+
+from resumed import Checkpoint, all_bits, envs, go_on, loaded, model_bits
+from sb3_yann import Commissioning, ImproveInTwin, Improvement, NoActionNoise, YannPolicy, improve
+from sb3_yann.commissioning import Check, callback, commissioning
+from twin_samples import Cart, twin
+
+STEPS = 20
+"""Of an episode in training; on the plant they are twice as long."""
+
+
+class Short(Cart):
+    """Short episodes of the cart, from where the MPC always comes back."""
+
+    def __init__(self, steps: int = STEPS) -> None:
+        super().__init__(steps)
+
+    def reset(self, **options):
+        super().reset(**options)
+        self.x = self.x * [0.6, 1.0]
+        return self.x.astype(np.float32), {}
+
+
+def model(n_envs: int = 1, **options: Any) -> DDPG:
+    options = {"seed": 0, "device": "cpu", "buffer_size": 1000, "batch_size": 16} | options
+    return DDPG(YannPolicy, envs(n_envs, Short), **options)
+
+
+# --- twins ----------------------------------------------------------------------------------------
+
+
+def test_a_twin_that_was_saved_predicts_and_improves_as_before() -> None:
+    again = pickle.loads(pickle.dumps(twin()))
+    theta, u = np.array([[0.3, -0.2], [1.0, 0.4]]), np.array([[0.5], [-0.1]])
+    members = len(again.dynamics.members)
+    now, before = (
+        each.dynamics.step(np.array([theta] * members), np.array([u] * members))
+        for each in (again, twin())
+    )
+    assert now.tobytes() == before.tobytes()
+    found = []
+    for each in (again, twin()):
+        learner = model()
+        said = improve(learner, each, iterations=6, batch=10, n_starts=5, reidentify=False)
+        found.append([all_bits(said), model_bits(learner)])
+        assert said.accepted
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("n_envs", [pytest.param(1, marks=pytest.mark.slow), 4])
+def test_a_training_with_a_twin_that_stops_goes_on_as_if_it_had_not(n_envs, tmp_path) -> None:
+    def in_twin() -> ImproveInTwin:
+        return ImproveInTwin(every=4, iterations=2)
+
+    whole, halfway = model(n_envs), 4 * STEPS
+    callbacks = [NoActionNoise(), in_twin(), Checkpoint(halfway, tmp_path)]
+    whole.learn(2 * halfway, callback=callbacks)
+    resumed, again = loaded(tmp_path, envs(n_envs, Short)), in_twin()
+    go_on(resumed, halfway, again)
+    assert [each.episode for each in again.attempts] == [4, 8]
+    assert any(each.trusted for each in again.attempts)
+    assert model_bits(resumed) == model_bits(whole)
+
+
+def test_a_given_twin_acts_before_the_first_step_of_the_first_learn_only(
+    tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(callback, "improve", lambda *_, **__: Improvement((), 0.0, True))
+    learner, options = model(gradient_steps=0), {"every": 9, "iterations": 1}
+    learner.learn(1, callback=[NoActionNoise(), ImproveInTwin(twin(), **options)])
+    learner.save(tmp_path / "model")
+    again = DDPG.load(tmp_path / "model", env=envs(1, Short), device="cpu")
+    same = ImproveInTwin(pickle.loads(pickle.dumps(twin())), **options)
+    again.learn(1, callback=[NoActionNoise(), same], reset_num_timesteps=False)
+    assert [each.timestep for each in same.attempts] == [0]
+    other = ImproveInTwin(twin(6), **options)
+    again.learn(1, callback=[NoActionNoise(), other], reset_num_timesteps=False)
+    assert [each.timestep for each in other.attempts] == [0, 2]
+
+
+def test_two_callbacks_of_one_learn_count_for_themselves() -> None:
+    learner = model(gradient_steps=0)
+    pair = [ImproveInTwin(every=9) for _ in range(2)]
+    learner.learn(2 * STEPS, callback=[NoActionNoise(), *pair])
+    assert [each.state.episodes for each in pair] == [2, 2]
+    assert learner.twin_state is pair[0].state
+
+
+# --- on the plant ---------------------------------------------------------------------------------
+
+
+def commission(path: Any, learner: DDPG | None = None) -> Commissioning:
+    learner = model() if learner is None else learner
+    options = {"batch": 4, "iterations": 20, "max_correction": 0.2, "reidentify": False}
+    return Commissioning(
+        learner, partial(Short, 2 * STEPS), log_path=path / "plant.jsonl", **options
+    )
+
+
+def events(path: Any) -> list[dict[str, Any]]:
+    """Return a record but for digests: a saved model holds the time."""
+    found = [json.loads(line) for line in (path / "plant.jsonl").read_text().splitlines()]
+    for each in found:
+        del each["digest"]
+        each.get("from_here", {}).pop("model_digest", None)
+    return found
+
+
+@pytest.mark.slow
+def test_a_commissioning_that_stops_after_a_batch_goes_on_as_if_it_had_not(
+    tmp_path, monkeypatch
+) -> None:
+    unsafe = Check(0, False, "start 3 violates a limit", 0.0, 0.0, False)
+    found = Improvement((unsafe,), 0.0, False, unsafe)
+
+    def refuse_second(*args: Any, **options: Any) -> Improvement:
+        return found if options["seed"] == 2 else improve(*args, **options)
+
+    monkeypatch.setattr(commissioning, "improve", refuse_second)
+    outcomes = []
+    for name in ("whole", "cut"):
+        run = commission(tmp_path / name)
+        for batches in (1, 2, 3):
+            run = commission(tmp_path / name) if name == "cut" else run
+            run.run(batches)
+        assert [each.verdict for each in run.batches] == ["accepted", "the MPC acts", "accepted"]
+        trained = model_bits(run.model), run.policy.max_correction, all_bits(run.batches)
+        outcomes.append([*trained, events(tmp_path / name)])
+    assert outcomes[0] == outcomes[1]
+    again = commission(tmp_path / "cut")
+    assert model_bits(again.model) == outcomes[0][0]
+
+
+def test_what_the_model_had_learnt_before_still_waits_after_a_stop(tmp_path, monkeypatch) -> None:
+    def learnt() -> DDPG:
+        found = model()
+        with th.no_grad():
+            for each in found.policy.actor.parameters():
+                each.add_(0.01)
+        return found
+
+    monkeypatch.setattr(commissioning, "why_taken_back", lambda *_: "a test")
+    first = commission(tmp_path, learnt())
+    first.run(1)
+    again = commission(tmp_path, learnt())
+    assert all_bits(again.incumbent.candidate) == all_bits(first.incumbent.candidate)
+    assert again.incumbent.candidate is not None
+    monkeypatch.undo()
+    again.run(2)
+    assert commission(tmp_path, learnt()).incumbent.candidate is None  # it has been tried

@@ -1,0 +1,124 @@
+"""A guarded training that is saved and loaded goes on as if it had never stopped, bit for bit."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import pytest
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from guard_samples import (
+    BLOCK,
+    STEPS,
+    At,
+    better,
+    build,
+    guard_alone,
+    plant,
+    still,
+    train,
+)
+from resumed import (
+    Checkpoint,
+    all_bits,
+    envs,
+    go_on,
+    guard_in_simulator,
+    loaded,
+    model_bits,
+)
+from sb3_yann.policy import policies
+
+RARE = {"eval_every": 3}
+"""A candidate after every third episode."""
+
+
+def whole_and_resumed(
+    folder, guard: Any, n: int, algorithm: Any = DDPG, episodes: int = 16
+) -> list[Any]:
+    """Return what is left of a training that went through, and of one that stopped halfway."""
+    whole = build(algorithm, env=envs(n))
+    steps, at = episodes * STEPS, episodes // 2 * STEPS
+    train(whole, steps, guard(log_path=folder / "whole.csv"), Checkpoint(at, folder))
+    model = loaded(folder, envs(n), algorithm)
+    go_on(model, steps - at, guard(log_path=folder / "cut.csv"))
+    assert len(model.guard_state.decisions) >= 3
+    records = [(folder / name).read_bytes() for name in ("whole.csv", "cut.csv")]
+    return [*zip(map(model_bits, (whole, model)), records, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "algorithm", "options"),
+    [(1, DDPG, {}), (4, DDPG, {}), (4, TD3, {}), (1, DDPG, RARE)],
+    ids=["one env", "four envs", "TD3", "rare trials"],
+)
+def test_with_a_simulator_nothing_is_lost(n_envs, algorithm, options, tmp_path) -> None:
+    guard = partial(guard_in_simulator, **options)
+    whole, resumed = whole_and_resumed(tmp_path, guard, n_envs, algorithm)
+    assert whole == resumed
+
+
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_on_a_plant_alone_nothing_is_lost(n_envs, tmp_path) -> None:
+    whole, resumed = whole_and_resumed(tmp_path, guard_alone, n_envs, episodes=32)
+    assert whole == resumed
+
+
+def test_moments_of_single_rows_are_kept(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(policies, "FEW", 2)  # regions, from which on there is a RowAdam
+    whole, resumed = whole_and_resumed(tmp_path, guard_in_simulator, 1)
+    assert whole == resumed
+    assert "steps" in whole[0]["optimizers"][0]["state"]["0"]
+
+
+def test_between_two_calls_of_learn_a_model_may_be_saved_and_loaded(tmp_path) -> None:
+    found = []
+    for is_loaded in (False, True):
+        model = build(env=envs(1))
+        train(model, 4 * STEPS, guard_in_simulator())
+        model.save(tmp_path / "model")
+        model.save_replay_buffer(tmp_path / "buffer")
+        if is_loaded:
+            model = loaded(tmp_path, envs(1))
+        go_on(model, 4 * STEPS, guard_in_simulator())
+        found.append(model_bits(model))
+    assert found[0] == found[1]
+
+
+def test_the_mpc_that_is_restored_has_the_same_weights_after_loading(tmp_path) -> None:
+    model, guard = build(gradient_steps=0), guard_in_simulator()
+    train(model, STEPS, At([1], better), guard)
+    assert not model.policy.actor.mu.network.is_zero()
+    model.save(tmp_path / "model")
+    again, other = DDPG.load(tmp_path / "model", env=envs(1), device="cpu"), guard_in_simulator()
+    train(again, 1, other, reset_num_timesteps=False)
+    assert all_bits(other.session.mpc) == all_bits(guard.session.mpc)
+
+
+def phases(model: Any, *callbacks: Any) -> list[str]:
+    """Return the phase after each of the next episodes under a new guard."""
+    found: list[str] = []
+    steps = range(STEPS, 4 * STEPS, STEPS)
+    look = At(steps, lambda _: found.append(model.guard_state.evidence.phase))
+    train(model, 3 * STEPS, *callbacks, guard_alone(), look, reset_num_timesteps=False)
+    return found
+
+
+def test_on_a_plant_alone_the_first_episode_after_loading_counts(tmp_path) -> None:
+    model = still()
+    train(model, BLOCK + STEPS, At([BLOCK + 1], better), guard_alone())
+    model.save(tmp_path / "model")
+    again = DDPG.load(tmp_path / "model", env=plant(), device="cpu")
+    assert phases(again) == ["learning", "learning", "trial"]
+
+
+@pytest.mark.parametrize("kind", ["amid an episode", "no Monitor"])
+def test_an_episode_that_may_be_under_way_does_not_count(kind) -> None:
+    env = DummyVecEnv([plant]) if kind == "no Monitor" else plant()
+    model = still(env=env)
+    train(model, BLOCK + STEPS, At([BLOCK + 1], better), guard_alone())
+    if kind == "amid an episode":
+        train(model, 1, reset_num_timesteps=False)
+    assert phases(model) == ["learning", "learning", "learning"]
