@@ -29,6 +29,7 @@ Matrices = tuple[Array, Array, Array]
 # States, inputs and horizon: few enough decisions to stay at some hundred regions.
 SIZES = [(1, 1, 5), (2, 1, 2), (2, 1, 4), (1, 2, 2), (2, 2, 2), (3, 1, 3), (3, 2, 2), (4, 1, 3)]
 MOST_REGIONS = 300
+PARTS = ("tracking", "disturbance", "rate")
 
 
 def examples(count: int) -> settings:
@@ -65,54 +66,71 @@ def _between(rng: np.random.Generator, low: float, high: float, count: int) -> t
     return -rng.uniform(low, high, count), rng.uniform(low, high, count)
 
 
+def _bounds(rng: np.random.Generator, kind: str, x_unit: Array) -> dict[str, Any]:
+    """Box of the states, and bounds of predicted states or outputs, hard or soft."""
+    low, high = (x_unit * each for each in _between(rng, 1, 4, len(x_unit)))
+    C = rng.normal(size=(1, len(x_unit))) / x_unit
+    box = {"theta_min": low, "theta_max": high}
+    inner = rng.uniform(0.3, 1.1, len(x_unit))
+    states, outputs = {"x_min": low * inner, "x_max": high * inner}, OutputBounds(C, -1.5, 1.0)
+    if kind == "soft states":
+        return {**states, "soft": SoftBounds(0.5 * x_unit, penalty=300.0)}
+    if kind == "soft outputs":
+        return {**box, "outputs": outputs, "soft": SoftBounds(y=1.0, penalty=300.0)}
+    return {**box, **{"box": {}, "states": states, "outputs": {"outputs": outputs}}[kind]}
+
+
+def _parts(
+    rng: np.random.Generator, names: set[str], plant: Matrices, units: tuple[Array, Array]
+) -> dict[str, Any]:
+    """Reference, disturbance and rates, those that are named."""
+    (A, B, _), (x_unit, u_unit), found = plant, units, {}
+    if "tracking" in names:
+        found["tracking"] = Tracking(_tracked(rng, A, B) / x_unit, *_between(rng, 0.1, 1, 1))
+    if "disturbance" in names:
+        found["disturbances"] = DisturbanceBounds(*_between(rng, 0.05, 0.3, 1))
+    if "rate" in names:
+        weight = rng.choice([0.0, 1.0]) * np.diag(u_unit**-2)
+        limits = (u_unit * each for each in _between(rng, 0.2, 1, len(u_unit)))
+        found["rate"] = RateLimits(*limits, weight)
+    return found
+
+
 @st.composite
-def problems(draw: st.DrawFn, n_regions: int = MOST_REGIONS, regulators: bool = False) -> LinearMPC:
-    """A solved problem: plant, units, bounds, and of the other parts some."""
+def problems(
+    draw: st.DrawFn,
+    n_regions: tuple[int, int] = (1, MOST_REGIONS),
+    parts: tuple[str, ...] = PARTS,
+    always: tuple[str, ...] = (),
+) -> LinearMPC:
+    """A solved problem: plant, units, bounds, and of the other parts some, or ``always``."""
     n, m, horizon = draw(st.sampled_from(SIZES))
     units = draw(st.sampled_from([0, 3]))  # powers of ten that states and inputs may span
-    parts = draw(st.sets(st.sampled_from(["tracking", "disturbance", "rate"]), max_size=2))
-    bounds = draw(st.sampled_from(["box", "states", "outputs", "soft states", "soft outputs"]))
-    terminal = draw(st.sampled_from(["free", "free", "bounded"]))
+    names = draw(st.sets(st.sampled_from(parts), max_size=2)) if parts else set()
+    names |= set(always)
+    kind = draw(st.sampled_from(["box", "states", "outputs", "soft states", "soft outputs"]))
+    ends = draw(st.booleans())
     radius, gamma = draw(st.sampled_from([(0.6, 1.0), (0.95, 0.95), (1.2, 1.0), (0.95, 1.0)]))
     infeasible = draw(st.sampled_from(["nearest_region", "zero_input"]))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    parts = set() if regulators else parts
     A, B, E = _plant(rng, n, m, radius)
     x_unit, u_unit = (10 ** (units * rng.uniform(-1, 1, size)) for size in (n, m))
     values: dict[str, Any] = {"horizon": horizon, "gamma": gamma, "infeasible": infeasible}
     values["Q"] = np.diag(rng.choice([0.1, 1.0, 10.0], n) / x_unit**2)
     values["R"] = np.diag(10 ** rng.uniform(-2, 1, m) / u_unit**2)
     values["u_min"], values["u_max"] = (u_unit * each for each in _between(rng, 0.3, 2, m))
-    low, high = (x_unit * each for each in _between(rng, 1, 4, n))
-    C = rng.normal(size=(1, n)) / x_unit
-    if bounds != "soft states":
-        values |= {"theta_min": low, "theta_max": high}
-    if bounds in ("states", "soft states"):
-        inner = rng.uniform(0.3, 1.1, n)
-        values |= {"x_min": low * inner, "x_max": high * inner}
-    if bounds in ("outputs", "soft outputs"):
-        values["outputs"] = OutputBounds(C, -1.5, 1.0)
-    if bounds == "soft states":
-        values["soft"] = SoftBounds(0.5 * x_unit, penalty=300.0)
-    if bounds == "soft outputs":
-        values["soft"] = SoftBounds(y=1.0, penalty=300.0)
-    if "tracking" in parts:
-        values["tracking"] = Tracking(_tracked(rng, A, B) / x_unit, *_between(rng, 0.1, 1, 1))
-    if "disturbance" in parts:
-        values["disturbances"] = DisturbanceBounds(*_between(rng, 0.05, 0.3, 1))
-    if "rate" in parts:
-        weight = draw(st.sampled_from([0.0, 1.0])) * np.diag(u_unit**-2)
-        values["rate"] = RateLimits(*(u_unit * each for each in _between(rng, 0.2, 1, m)), weight)
-    if terminal == "bounded" and not parts:
+    values |= _bounds(rng, kind, x_unit) | _parts(rng, names, (A, B, E), (x_unit, u_unit))
+    if ends and not names:
         F = rng.normal(size=(2, n)) / x_unit
         values["terminal"] = Terminal(set=(F, rng.uniform(0.5, 3, 2)))
     A, B = x_unit[:, None] * A / x_unit, x_unit[:, None] * B / u_unit
-    E = x_unit[:, None] * E if "disturbance" in parts else np.zeros((n, 0))
+    E = x_unit[:, None] * E if "disturbance" in names else np.zeros((n, 0))
     mpc = LinearMPC(LinearModel(A, B, 1.0, E=E), **values)
     try:
-        mpc.explicit(region_limit=n_regions)
+        mpc.explicit(region_limit=n_regions[1])
     except (ExplicitLimitError, ExplicitSolutionError):  # too many regions, or too thin ones
         assume(False)
+    assume(mpc.explicit().n_regions >= n_regions[0])
     return mpc
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import pickle
 import tempfile
 from pathlib import Path
@@ -12,62 +11,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from partitions import (
+    as_range,
+    balls,
+    edges,
+    kinds,
+    mixture,
+    reordered,
+    slacks,
+    steepest,
+    unit_half,
+)
 from random_problems import examples, in_box, problems, room
-from sample_problems import half_spaces
 from sb3_yann import LinearMPC
-from sb3_yann.control import OnlineLaw, PiecewiseAffine
-from sb3_yann.control.polyhedra import largest_ball
 
-Array = np.ndarray
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def unit_half(law: PiecewiseAffine) -> Array:
-    return np.asarray((law.theta_max - law.theta_min) / 2)
-
-
-def balls(law: PiecewiseAffine) -> list[tuple[Array, float]]:
-    """Center and radius, in half-widths of the box, of a large ball in each region."""
-    half, found = unit_half(law), []
-    for region in range(law.n_regions):
-        A, b = half_spaces(law, region)
-        center, radius = largest_ball(A * half, b.copy())
-        found.append((half * center, radius))
-    return found
-
-
-def slacks(law: PiecewiseAffine, points: Array) -> Array:
-    """How far each point lies inside each region, (count, p)."""
-    return np.asarray(np.minimum.reduceat(law.b - points @ law.A.T, law.starts, axis=1))
-
-
-def edges(law: PiecewiseAffine, seed: int, each: int = 4) -> tuple[Array, Array]:
-    """Points (count, n) on facets, and the directions in which the region ends there."""
-    half, rng = unit_half(law), np.random.default_rng(seed)
-    points, ways = [], []
-    for region, (center, _) in enumerate(balls(law)):
-        A, b = half_spaces(law, region)
-        for way in half * rng.normal(size=(each, law.n_theta)):
-            speed = A @ way
-            reach = np.min((b - A @ center)[speed > 0] / speed[speed > 0])
-            points.append(center + reach * way)
-            ways.append(way / np.max(np.abs(way / half)))
-    return np.array(points), np.array(ways)
-
-
-def as_range(law: PiecewiseAffine | OnlineLaw, change: Array) -> Array:
-    """Changes of the input (..., m) as shares of its range."""
-    return np.asarray(np.abs(change) / (law.u_max - law.u_min))
-
-
-def kinds(mpc: LinearMPC) -> list[PiecewiseAffine | OnlineLaw]:
-    return [mpc.explicit(), mpc.online()]
-
-
-def mixture(mpc: LinearMPC, seed: int) -> Array:
-    """Points in the box, beyond it, and on facets."""
-    inside, beyond = (in_box(mpc, 100, stretch, seed) for stretch in (1.0, 3.0))
-    return np.vstack([inside, beyond, edges(mpc.explicit(), seed, each=2)[0], 0 * inside[:1]])
 
 
 @examples(30)
@@ -107,12 +65,10 @@ def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: fl
     at, ways = edges(law, seed)
     one, other = at - step * ways, at + step * ways
     # The feasible set is convex: from one to the other the input follows the gains on the way.
-    width = law.u_max - law.u_min
-    steepest = (np.abs(law.gains) * unit_half(law)).sum(axis=2).max(axis=0) / width
     for each in kinds(mpc):
         kept = each.in_domain(one) & each.in_domain(other)
         change = as_range(law, each(one) - each(other))[kept]
-        assert np.all(change <= 2 * step * steepest + 1e-9)
+        assert np.all(change <= 2 * step * steepest(law) + 1e-9)
 
 
 @examples(40)
@@ -122,25 +78,6 @@ def test_online_law_is_the_explicit_law(mpc: LinearMPC, seed: int) -> None:
     inside = law.in_domain(points)
     np.testing.assert_array_equal(online.in_domain(points), inside)
     assert np.all(as_range(law, law(points) - online(points))[inside] <= 1e-9)
-
-
-def reordered(law: PiecewiseAffine, order: Array) -> PiecewiseAffine:
-    """The law with its regions in another order."""
-    parts = [half_spaces(law, region) for region in order]
-    place = np.append(np.argsort(order), -1)
-    rows = np.split(np.arange(law.n_halfspaces), law.starts[1:])
-    neighbors = law.neighbors
-    if neighbors.size:
-        neighbors = place[neighbors[np.concatenate([rows[region] for region in order])]]
-    return dataclasses.replace(
-        law,
-        gains=law.gains[order],
-        offsets=law.offsets[order],
-        A=np.vstack([A for A, _ in parts]),
-        b=np.concatenate([b for _, b in parts]),
-        starts=np.cumsum([0, *[len(b) for _, b in parts[:-1]]]),
-        neighbors=neighbors,
-    )
 
 
 @examples(40)
