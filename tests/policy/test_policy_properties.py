@@ -61,7 +61,7 @@ def predicted(policy: YannPolicy, observations: np.ndarray) -> np.ndarray:
 # --- the bounds --------------------------------------------------------------------------------
 
 
-@examples(40)
+@examples(25)
 @given(
     problems(),
     SEEDS,
@@ -86,7 +86,7 @@ def test_no_weights_lead_farther_from_the_mpc_than_the_bound(
         assert np.all(np.abs(found - law(mixed))[inside] <= reach)
 
 
-@examples(40)
+@examples(25)
 @given(
     problems(always=("rate",), parts=("tracking", "disturbance")),
     SEEDS,
@@ -111,7 +111,7 @@ def test_no_weights_move_an_input_faster_than_its_rate(
 # --- what is no number --------------------------------------------------------------------------
 
 
-@examples(60)
+@examples(30)
 @given(problems(), st.data(), KINDS, ARCHITECTURES, st.sampled_from([None, np.nan]))
 def test_every_observation_of_float32_has_an_action_of_the_space(
     mpc: LinearMPC, data: Any, kind: dict, net_arch: dict, poison: float | None
@@ -136,7 +136,7 @@ def test_every_observation_of_float32_has_an_action_of_the_space(
 # --- the critic, and targets --------------------------------------------------------------------
 
 
-@examples(40)
+@examples(25)
 @given(
     problems(), SEEDS, st.sampled_from(["afterstate", "state_action"]),
     st.sampled_from([0.9, 0.99]), ARCHITECTURES,
