@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +18,6 @@ from partitions import as_range, mixture
 from random_problems import examples, problems
 from sb3_yann import Checks, Controller, LinearMPC, YannPolicy, export
 from sb3_yann.deployment.selftest import steady
-from weights import network_of
 
 SEEDS = st.integers(0, 2**32 - 1)
 OPTIONS = st.sampled_from([
@@ -41,6 +41,7 @@ def by_torch(policy: YannPolicy, seen: np.ndarray, controller: Controller) -> np
     return np.asarray(actions * controller.data["action_scale"] + controller.data["action_shift"])
 
 
+@pytest.mark.slow
 @examples(12)
 @given(problems(), SEEDS, OPTIONS)
 def test_controller_is_the_policy_and_the_law(mpc: LinearMPC, seed: int, options: dict) -> None:

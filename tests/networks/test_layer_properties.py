@@ -103,6 +103,7 @@ def test_order_of_the_regions_changes_nothing_at_first(
     assert th.all((one - two).abs()[inside] <= 2e-7)
 
 
+@pytest.mark.slow
 @examples(20)
 @given(problems(), SEEDS, KINDS, HIDDEN, st.sampled_from([None, 0.1]))
 def test_size_and_order_of_a_batch_change_nothing(

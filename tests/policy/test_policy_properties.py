@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch as th
 from gymnasium import spaces
 from hypothesis import given
@@ -86,6 +87,7 @@ def test_no_weights_lead_farther_from_the_mpc_than_the_bound(
         assert np.all(np.abs(found - law(mixed))[inside] <= reach)
 
 
+@pytest.mark.slow
 @examples(25)
 @given(
     problems(always=("rate",), parts=("tracking", "disturbance")),
@@ -178,6 +180,7 @@ def outputs(networks: Any, theta: th.Tensor, action: th.Tensor) -> list[th.Tenso
         return [actor(theta), *critic(theta, action)]
 
 
+@pytest.mark.slow
 @examples(12)
 @given(problems(), SEEDS, ALGORITHMS, KINDS, st.sampled_from([0.0, 1.0]))
 def test_targets_begin_as_the_networks_and_follow_them_as_tau_says(
@@ -239,6 +242,7 @@ class Strict(gym.Env):
         return seen, reward, False, self.steps == 10, {}
 
 
+@pytest.mark.slow
 @examples(10)
 @given(
     problems(), ALGORITHMS, KINDS, st.sampled_from([1, 2]),

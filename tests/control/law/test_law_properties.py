@@ -28,6 +28,7 @@ from sb3_yann import LinearMPC
 SEEDS = st.integers(0, 2**32 - 1)
 
 
+@pytest.mark.slow
 @examples(25)
 @given(problems(), SEEDS)
 def test_regions_cover_what_is_feasible_and_nothing_else(mpc: LinearMPC, seed: int) -> None:
@@ -58,6 +59,7 @@ def test_no_two_regions_overlap(mpc: LinearMPC, seed: int) -> None:
         assert np.sum(holders > 1e-9, axis=1).max() <= 1
 
 
+@pytest.mark.slow
 @examples(40)
 @given(problems(), SEEDS, st.sampled_from([1e-9, 1e-6, 1e-3]))
 def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: float) -> None:
@@ -80,6 +82,7 @@ def test_online_law_is_the_explicit_law(mpc: LinearMPC, seed: int) -> None:
     assert np.all(as_range(law, law(points) - online(points))[inside] <= 1e-9)
 
 
+@pytest.mark.slow
 @examples(40)
 @given(problems(), SEEDS)
 def test_order_of_the_regions_changes_nothing(mpc: LinearMPC, seed: int) -> None:
