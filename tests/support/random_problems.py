@@ -33,9 +33,9 @@ PARTS = ("tracking", "disturbance", "rate")
 
 
 def examples(count: int) -> settings:
-    """Run so many examples; by the profile "thorough" thirty times as many, and new ones."""
+    """Run so many examples; by the profile "thorough" twenty times as many, and new ones."""
     thorough = settings.default is settings.get_profile("thorough")
-    return settings(settings.default, max_examples=count * (30 if thorough else 1))
+    return settings(settings.default, max_examples=count * (20 if thorough else 1))
 
 
 def _plant(rng: np.random.Generator, n: int, m: int, radius: float) -> Matrices:
