@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 try:
     import torch as th
@@ -14,6 +16,13 @@ except ImportError:  # models, MPC and law are tested without, see noxfile.py
 from sample_plants import asymmetric_pendulum_mpc, two_input_mpc
 from sb3_yann import LinearMPC
 from sb3_yann_envs import problems
+
+# `HYPOTHESIS_PROFILE=thorough` draws many more examples, and others each time.
+settings.register_profile(
+    "few", derandomize=True, deadline=None, suppress_health_check=list(HealthCheck)
+)
+settings.register_profile("thorough", settings.get_profile("few"), derandomize=False)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "few"))
 
 
 @pytest.fixture(autouse=True)

@@ -86,8 +86,10 @@ def policy_value(
     stage = Q + K.T @ R @ K
     if cross is not None:
         stage = stage - cross @ K - K.T @ cross.T
-    P = linalg.solve_discrete_lyapunov(closed.T, stage)
-    return np.asarray((P + P.T) / 2)
+    # In units in which the states are of like size: else the equation is singular to rounding.
+    closed, (unit, _) = linalg.matrix_balance(closed, permute=False, separate=True)
+    P = linalg.solve_discrete_lyapunov(closed.T, stage * np.outer(unit, unit))
+    return np.asarray((P + P.T) / 2 / np.outer(unit, unit))
 
 
 def spectral_radius(matrix: Array) -> float:

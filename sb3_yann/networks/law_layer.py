@@ -30,6 +30,7 @@ class LawLayer(nn.Module):
     half_range: th.Tensor
     change: th.Tensor
     confines: th.Tensor
+    rated: bool
     network: ZeroOutputNetwork
     reach: float | None
     constants: tuple[Array, Array, float]
@@ -91,8 +92,10 @@ class LawLayer(nn.Module):
 
     def limit(self, max_correction: float | None) -> None:
         """Bound the network's output to a fraction of the input range, or not at all."""
-        # The input range is 2 here. A little is left for the float32 rounding of what follows.
-        self.reach = None if max_correction is None else max(0.0, 2 * max_correction - 1e-6)
+        # The input range is 2 here. A little is left for the float32 rounding of what follows, and
+        # for what the rate's own room may take from the law.
+        left = 2e-6 if self.rated else 1e-6
+        self.reach = None if max_correction is None else max(0.0, 2 * max_correction - left)
         self.constants = (*self.constants[:2], np.inf if self.reach is None else self.reach)
 
     def confine(self, low: Array | None, high: Array | None) -> None:

@@ -180,3 +180,12 @@ def test_riccati_solution_does_not_depend_on_the_units_of_the_states() -> None:
     P = lqr.riccati(model, np.diag(units**-2.0), np.eye(1))
     expected = lqr.riccati(DOUBLE_INTEGRATOR, np.eye(2), np.eye(1))
     np.testing.assert_allclose(P * np.outer(units, units), expected, rtol=1e-9)
+
+
+def test_policy_value_does_not_depend_on_the_units_of_the_states() -> None:
+    K, units = np.array([[0.5, 0.2], [-0.1, 0.4]]), np.array([1e-6, 1e5])
+    value = lqr.policy_value(TWO_BY_TWO, Q, R, K, 0.99)
+    A, B = units[:, None] * TWO_BY_TWO.A / units, units[:, None] * TWO_BY_TWO.B
+    scale = np.outer(units, units)
+    other = lqr.policy_value(LinearModel(A, B, 1.0), Q / scale, R, K / units, 0.99)
+    np.testing.assert_allclose(other * scale, value, rtol=1e-12)

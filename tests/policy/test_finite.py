@@ -225,6 +225,18 @@ def test_where_the_networks_are_not_finite_the_law_acts_and_says_so(net_arch) ->
     np.testing.assert_allclose(after, before, atol=1e-6)
 
 
+@pytest.mark.parametrize("net_arch", [[3], [3, 3]], ids=["torch", "compiled"])
+def test_where_an_observation_overflows_in_the_networks_the_law_acts_and_says_so(net_arch) -> None:
+    mpc = two_input_mpc(x_min=-0.1, x_max=0.1)  # in half-widths it is beyond float32
+    model = shaken(build(LinearPlant(mpc), policy={"problem": mpc, "net_arch": net_arch}))
+    seen = np.float32([[3e38, -3e38, 3e38], [0.05, 0.01, 0]])
+    alone, _ = model.predict(seen[1:])
+    with pytest.warns(NonFiniteWarning, match="networks put out what is not finite"):
+        actions, _ = model.predict(seen)
+    np.testing.assert_allclose(actions[0], mpc.explicit()(seen[0]), atol=1e-6)
+    np.testing.assert_allclose(actions[1:], alone, atol=1e-6)
+
+
 def test_the_limits_of_the_rate_hold_where_the_state_is_not_known() -> None:
     mpc = servo(rate=RateLimits(-0.1, 0.1))
     model = shaken(build(LinearPlant(mpc), policy={"problem": mpc}))

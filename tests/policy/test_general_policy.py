@@ -65,6 +65,15 @@ def test_rates_are_kept_whatever_the_weights(
     assert np.max(moved / mpc.rate.du_max) > 0.999  # and they are what holds it
 
 
+def test_no_action_is_further_from_the_mpc_than_the_bound_where_the_rate_acts() -> None:
+    mpc = solved("servo with rates")
+    options = {"problem": mpc, "max_correction": 0.05}
+    model = scrambled(DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs=options), 50.0)
+    theta, _ = feasible_states(mpc, 1000)
+    far = np.abs(model.predict(theta.astype(np.float32))[0] - mpc.explicit()(theta))
+    assert np.max(far / (mpc.u_max - mpc.u_min)) <= 0.05  # no tolerance
+
+
 def test_an_output_at_the_limit_of_its_rate_learns_to_leave_it() -> None:
     mpc = solved("servo with rates")
     model = DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs={"problem": mpc})

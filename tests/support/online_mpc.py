@@ -153,30 +153,41 @@ class OnlineMPC:
         right = np.concatenate([np.zeros(n + m), right])
         return np.linalg.lstsq(kkt, right, rcond=1e-13)[0][: n + m]
 
+    def start(self, theta: Array) -> Array:
+        """Return the right-hand side of the steps of the model, scaled."""
+        model, N = self.mpc.model, self.mpc.horizon
+        x, _, d, _ = np.split(theta, np.cumsum(self.sizes))
+        start = np.tile(model.E @ d, N)
+        start[: len(x)] += model.A @ x
+        return np.asarray(start / self.row_unit)
+
+    def limits(self, theta: Array) -> tuple[Array, Array]:
+        """Return lower and upper limits of the variables, and of the rows, all scaled."""
+        shift, start = self.rows_theta @ theta, self.start(theta)
+        lower = [self.lower, start, (self.rows_lower - shift) / self.rows_length]
+        upper = [self.upper, start, (self.rows_upper - shift) / self.rows_length]
+        return np.concatenate(lower), np.concatenate(upper)
+
     def __call__(self, theta: Array) -> Array | None:
         """Return u_0, or None where no input keeps all constraints."""
-        model, N = self.mpc.model, self.mpc.horizon
-        n, m = model.B.shape
-        x, _, d, previous = np.split(theta, np.cumsum(self.sizes))
-        start = np.tile(model.E @ d, N)
-        start[:n] += model.A @ x
-        start /= self.row_unit
+        n, m = self.mpc.model.B.shape
+        *_, previous = np.split(theta, np.cumsum(self.sizes))
+        start = self.start(theta)
         gradient = self.slack_gradient - self.steps.T @ start
         if len(theta) > n:
             steady = self.steady_state(theta)
-            target = np.concatenate([np.tile(steady[:m], N), np.tile(steady[m:], N)])
+            steps = self.mpc.horizon
+            target = np.concatenate([np.tile(steady[:m], steps), np.tile(steady[m:], steps)])
             gradient = gradient - self.cost[:, : self.n_moves] @ target
         if len(previous):
             gradient = gradient + self.rate_gradient[:, :m] @ -previous
-        shift = self.rows_theta @ theta
-        upper = [self.upper, start, (self.rows_upper - shift) / self.rows_length]
-        lower = [self.lower, start, (self.rows_lower - shift) / self.rows_length]
+        lower, upper = self.limits(theta)
         z, _, status, _ = daqp.solve(
             self.hessian,
             gradient,
             self.rows,
-            np.minimum(np.concatenate(upper), NO_BOUND),
-            np.maximum(np.concatenate(lower), -NO_BOUND),
+            np.minimum(upper, NO_BOUND),
+            np.maximum(lower, -NO_BOUND),
             self.sense.copy(),
             primal_tol=1e-12,
             dual_tol=1e-12,

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
 from scipy import optimize
 
 from fresh_process import run_python
 from online_mpc import OnlineMPC
-from reference_answers import online_answers, random_problems, relative_error
+from reference_answers import online_answers, relative_error
 from sample_problems import (
     DOUBLE_INTEGRATOR,
     EYE_ROWS,
@@ -61,21 +60,6 @@ def test_law_and_domain_are_those_of_an_online_qp(name: str) -> None:
     assert feasible.any()
     np.testing.assert_array_equal(mpc.explicit().in_domain(points), feasible)
     assert relative_error(mpc, mpc.explicit()(points[feasible]), inputs) <= 1e-9
-
-
-@settings(
-    derandomize=True,
-    max_examples=25,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-@given(random_problems())
-def test_law_and_domain_of_random_problems_are_those_of_an_online_qp(mpc: LinearMPC) -> None:
-    law, points = mpc.explicit(), box_points(mpc, 200)
-    inputs, feasible = online_answers(mpc, points)
-    assume(feasible.any())
-    np.testing.assert_array_equal(law.in_domain(points), feasible)
-    assert relative_error(mpc, law(points[feasible]), inputs) <= 1e-9
 
 
 def test_online_qp_itself_agrees_with_a_general_purpose_solver() -> None:

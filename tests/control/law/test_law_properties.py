@@ -1,0 +1,154 @@
+"""What holds for the law of any problem: random plants, bounds, units and parts of theta."""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from partitions import (
+    as_range,
+    balls,
+    edges,
+    kinds,
+    mixture,
+    reordered,
+    slacks,
+    steepest,
+    unit_half,
+)
+from random_problems import examples, in_box, problems, room
+from sb3_yann import LinearMPC
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+@pytest.mark.slow
+@examples(25)
+@given(problems(), SEEDS)
+def test_regions_cover_what_is_feasible_and_nothing_else(mpc: LinearMPC, seed: int) -> None:
+    law, online = mpc.explicit(), mpc.online()
+    points = in_box(mpc, 15, seed=seed)
+    at_edge, ways = edges(law, seed, each=1)
+    across = (at_edge + 1e-3 * ways)[:5]
+    for theta in np.vstack([points, across[np.all(across <= law.theta_max, axis=1)]]):
+        if np.any(theta < law.theta_min):
+            continue
+        free = room(mpc, theta)
+        if abs(free) > 1e-6:  # what is nearer HiGHS does not tell
+            assert law.in_domain(theta) == (free > 0)
+            assert online.in_domain(theta) == (free > 0)
+
+
+@examples(40)
+@given(problems(), SEEDS)
+def test_no_two_regions_overlap(mpc: LinearMPC, seed: int) -> None:
+    law, rng = mpc.explicit(), np.random.default_rng(seed)
+    assert np.sum(slacks(law, in_box(mpc, 1000, seed=seed)) > 1e-9, axis=1).max() <= 1
+    for region, (center, radius) in enumerate(balls(law)):
+        assert radius > 0
+        ball = rng.normal(size=(20, law.n_theta))
+        ball *= rng.uniform(0, 0.99, (20, 1)) * radius / np.linalg.norm(ball, axis=1)[:, None]
+        holders = slacks(law, center + unit_half(law) * ball)
+        assert np.all(holders[:, region] > 0)
+        assert np.sum(holders > 1e-9, axis=1).max() <= 1
+
+
+@pytest.mark.slow
+@examples(40)
+@given(problems(), SEEDS, st.sampled_from([1e-9, 1e-6, 1e-3]))
+def test_law_has_no_jump_in_the_feasible_set(mpc: LinearMPC, seed: int, step: float) -> None:
+    law = mpc.explicit()
+    at, ways = edges(law, seed)
+    one, other = at - step * ways, at + step * ways
+    # The feasible set is convex: from one to the other the input follows the gains on the way.
+    for each in kinds(mpc):
+        kept = each.in_domain(one) & each.in_domain(other)
+        change = as_range(law, each(one) - each(other))[kept]
+        assert np.all(change <= 2 * step * steepest(law) + 1e-9)
+
+
+@examples(40)
+@given(problems(), SEEDS)
+def test_online_law_is_the_explicit_law(mpc: LinearMPC, seed: int) -> None:
+    law, online, points = mpc.explicit(), mpc.online(), in_box(mpc, 300, seed=seed)
+    inside = law.in_domain(points)
+    np.testing.assert_array_equal(online.in_domain(points), inside)
+    assert np.all(as_range(law, law(points) - online(points))[inside] <= 1e-9)
+
+
+@pytest.mark.slow
+@examples(40)
+@given(problems(), SEEDS)
+def test_order_of_the_regions_changes_nothing(mpc: LinearMPC, seed: int) -> None:
+    law, points = mpc.explicit(), mixture(mpc, seed)
+    order = np.random.default_rng(seed).permutation(law.n_regions)
+    other = reordered(law, order)
+    deepest = np.sort(slacks(law, points), axis=1)
+    tie = 1e-9 * (1 + np.abs(deepest[:, -1]))
+    clear = (law.n_regions == 1) | (deepest[:, -1] - deepest[:, -2:].min(axis=1) > tie)
+    np.testing.assert_array_equal(other(points)[clear], law(points)[clear])
+    np.testing.assert_array_equal(order[other.locate(points)][clear], law.locate(points)[clear])
+    inside = law.in_domain(points)  # on a facet the input is that of a neighbor, to rounding
+    np.testing.assert_array_equal(other.in_domain(points), inside)
+    assert np.all(as_range(law, law(points) - other(points))[inside] <= 1e-8)
+
+
+@examples(40)
+@given(problems(), SEEDS)
+def test_size_and_order_of_a_batch_change_no_bit(mpc: LinearMPC, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for law, points in (
+        (mpc.explicit(), mixture(mpc, seed)),
+        (mpc.online(), mixture(mpc, seed)[::5]),
+    ):
+        whole, order = law(points), rng.permutation(len(points))
+        anew = pickle.loads(pickle.dumps(law))  # an online law remembers its answers
+        np.testing.assert_array_equal(anew(points[order]), whole[order])
+        alone = pickle.loads(pickle.dumps(law))
+        np.testing.assert_array_equal([alone(each) for each in points[order]], whole[order])
+        np.testing.assert_array_equal(law.in_domain(points[order]), law.in_domain(points)[order])
+
+
+@examples(40)
+@given(problems(), st.data(), st.sampled_from([np.float32, np.float64]))
+def test_every_number_has_an_input_within_its_bounds(mpc: LinearMPC, data, dtype) -> None:
+    width = 8 * np.dtype(dtype).itemsize
+    numbers = st.floats(width=width, allow_nan=False, allow_infinity=False)
+    rows = st.lists(numbers, min_size=mpc.n_theta, max_size=mpc.n_theta)
+    points = np.array(data.draw(st.lists(rows, min_size=1, max_size=6)), dtype)
+    for law in kinds(mpc):
+        u = law(points)
+        assert np.all((law.u_min <= u) & (u <= law.u_max))
+        np.testing.assert_array_equal(law(points[0]), u[0])
+
+
+@examples(20)
+@given(problems(), st.data(), st.sampled_from([np.nan, np.inf, -np.inf]))
+def test_what_is_no_number_is_refused(mpc: LinearMPC, data, value: float) -> None:
+    theta = in_box(mpc, 3)
+    theta[data.draw(st.integers(0, 2)), data.draw(st.integers(0, mpc.n_theta - 1))] = value
+    lost = theta[np.argmin(np.isfinite(theta).all(axis=1))]
+    for law in kinds(mpc):
+        for points in (theta, lost, np.float32(lost)):
+            with pytest.raises(ValueError, match="NaN or infinite"):
+                law(points)
+
+
+@examples(15)
+@given(problems(), SEEDS)
+def test_law_is_saved_to_the_last_bit(mpc: LinearMPC, seed: int) -> None:
+    points = mixture(mpc, seed)[::5]
+    with tempfile.TemporaryDirectory() as folder:
+        for law in kinds(mpc):
+            law.save(Path(folder) / "law.npz")
+            loaded = type(law).load(Path(folder) / "law.npz")
+            assert (loaded, hash(loaded)) == (law, hash(law))
+            assert loaded.model == law.model
+            np.testing.assert_array_equal(loaded.theta_ss, law.theta_ss)
+            np.testing.assert_array_equal(loaded(points), law(points))
