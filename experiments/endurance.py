@@ -86,12 +86,12 @@ class _Counted(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def guarded(steps: int, folder: Path) -> Samples:
-    """Train under guard; an update for each sixteenth step, a trial after each episode."""
+    """Train under guard; an update for each sixteenth step, a trial after each tenth episode."""
     samples = Samples(steps)
     model = DDPG(
         "YannPolicy", ENV, device="cpu", seed=0, train_freq=16, tau=0.02, buffer_size=20_000
     )
-    guard = ImprovementGuard(ENV, n_starts=20, log_path=folder / "guard.csv")
+    guard = ImprovementGuard(ENV, n_starts=20, eval_every=10, log_path=folder / "guard.csv")
     model.learn(steps, callback=[NoActionNoise(), guard, _Look(samples)])
     return samples
 
