@@ -295,6 +295,6 @@ def _require_positive_definite(H: Array) -> None:
         symmetric = False
     if not symmetric:
         raise ValueError(
-            f"H = {H.tolist()} must be symmetric and positive definite: else the program has no "
+            f"H must be symmetric and positive definite, not {H.tolist()}: else the program has no "
             "unique solution."
         )
