@@ -219,6 +219,11 @@ CHANGES: dict[str, dict[str, Any]] = {
     "nearest outside": {"infeasible": "nearest_region"},
     "one network": {"networks": "shared"},
     "no settings": {"defaults": True, "tau": 0.02},
+    "one set": {
+        "defaults": True,
+        "gradient_steps": 4,
+        "guard": {"n_starts": 400, "patience": 10, "keep_if_worse": True},
+    },
     "no settings, one network": {"defaults": True, "tau": 0.02, "networks": "shared"},
     "no settings, from the MPC with observer": {"defaults": True, "tau": 0.02},
     "input steps bounded": {"guard": {"rule": {"largest_step": 1.5}}},
@@ -275,7 +280,7 @@ def _runs() -> list[Run]:
     add(reactor, [OURS, "residual RL"], ten)
     add(reactor, [f"{OURS}, two gradient steps", f"{OURS}, target rate 0.02"], ten)
     for plant in (reactor, pendulum, printed):
-        add(plant, [f"{OURS}, no settings"], ten)
+        add(plant, [f"{OURS}, no settings", f"{OURS}, one set"], ten)
     add(reactor, ["DDPG"], five)
     add(reactor, [OURS], long, episodes=200)
     add(reactor, ["DDPG"], range(50, 55), episodes=200)
