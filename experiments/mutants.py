@@ -1,0 +1,235 @@
+"""Mutation testing on a random sample: `python -m experiments.mutants --count 50`.
+
+One operator, number, comparison or statement of `control/`, `networks/`, `guard/` or `twin/` is
+changed (Cosmic Ray's operators: `pip install cosmic-ray`), and the tests are asked whether they
+notice. Those of the same folder go first, those that name the changed function first of all; a
+mutant that they pass for `--patience` seconds counts as a survivor. Run it in a checkout of its
+own: it changes files there. It forks, so it needs Linux or macOS.
+
+Left out: annotations, and the compiled loops, whose answers are compared with the layers' to the
+last bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import difflib
+import json
+import os
+import random
+import re
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from cosmic_ray.ast import get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator, operator_names
+
+ROOMS = ("control", "networks", "guard", "twin")
+PACKAGE = Path("sb3_yann")
+TESTS = Path("tests")
+BEHIND = {
+    "control": ("control", "policy", "networks", "audit", "reporting"),
+    "networks": ("networks", "policy", "twin", "commissioning"),
+    "guard": ("guard", "policy", "commissioning"),
+    "twin": ("twin", "commissioning", "guard"),
+}
+"""Folders of tests that use a room, the nearest first."""
+ARITHMETIC = "Add|Sub|Mul|Div"
+ORDER = "Eq|NotEq|Lt|LtE|Gt|GtE"
+OPERATORS = re.compile(
+    rf"core/(ReplaceBinaryOperator_({ARITHMETIC})_({ARITHMETIC})|ReplaceComparisonOperator_({ORDER})_"
+    rf"({ORDER})|\w+_(BitAnd_BitOr|BitOr_BitAnd|Is_IsNot|IsNot_Is)|ReplaceUnaryOperator_Delete_\w+|"
+    "AddNot|ReplaceTrueWithFalse|ReplaceFalseWithTrue|ReplaceAndWithOr|ReplaceOrWithAnd|"
+    "NumberReplacer|ZeroIterationForLoop|ReplaceContinueWithBreak|ReplaceBreakWithContinue)"
+)
+COMPILED = re.compile("kernels|search_tree")
+
+
+@dataclass
+class Mutant:
+    """A change of one place, and what became of it."""
+
+    room: str
+    module: str
+    line: int
+    change: str
+    outcome: str = ""
+    seconds: float = 0.0
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Try mutants of each room, append each to a file of JSON lines, and print the shares."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.mutants", description=__doc__)
+    parser.add_argument("--count", type=int, default=50, help="mutants of each room")
+    parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=ROOMS)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--patience", type=float, default=120, help="seconds of tests a mutant")
+    parser.add_argument("--results", type=Path, default=Path("out/mutants.jsonl"))
+    options = parser.parse_args(arguments)
+    options.results.parent.mkdir(parents=True, exist_ok=True)
+    _load_what_tests_need()
+    counts: dict[str, Counter[str]] = {room: Counter() for room in options.rooms}
+    drawn = {room: mutants(room, random.Random(options.seed)) for room in options.rooms}
+    for _ in range(options.count):
+        for room, some in drawn.items():
+            mutant, code = next(some)
+            attempt(mutant, code, options.patience)
+            counts[room][mutant.outcome] += 1
+            with options.results.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(mutant)) + "\n")
+            print(mutant.room, mutant.module, mutant.line, mutant.outcome, flush=True)
+    for room, found in counts.items():
+        print(room, dict(found), f"{found['killed'] / max(found.total(), 1):.0%} killed")
+
+
+def mutants(room: str, rng: random.Random) -> Iterator[tuple[Mutant, str]]:
+    """Yield changes of random places of a room, each with the module's code after it."""
+    modules = sorted(
+        each for each in (PACKAGE / room).rglob("*.py") if not COMPILED.search(str(each))
+    )
+    places = []
+    for module in modules:
+        tree = get_ast(module.read_text(encoding="utf-8"))
+        for name in operator_names():
+            if OPERATORS.fullmatch(name):
+                operator = get_operator(name)
+                found = list(_positions(tree, operator))
+                places += [(module, at, name, k) for k, at in enumerate(found)]
+    by_place: dict[tuple[Path, tuple[int, int]], list[tuple[str, int]]] = {}
+    for module, at, name, k in places:
+        by_place.setdefault((module, at), []).append((name, k))
+    order = sorted(by_place, key=str)
+    rng.shuffle(order)
+    print(f"{room}: {len(places)} mutants at {len(order)} places", flush=True)
+    for module, at in order:
+        name, k = rng.choice(by_place[module, at])
+        code = module.read_text(encoding="utf-8")
+        changed = mutate_code(code, get_operator(name)(), k)
+        if changed and _bare(changed) != _bare(code):
+            difference = list(difflib.unified_diff(code.splitlines(), changed.splitlines(), n=0))
+            yield Mutant(room, str(module), at[0], "\n".join(difference[3:])), changed
+
+
+def _positions(tree: object, operator: type) -> Iterator[tuple[int, int]]:
+    nodes = [tree]
+    made = operator()
+    while nodes:
+        node = nodes.pop(0)
+        for start, _ in made.mutation_positions(node):
+            yield start
+        nodes[:0] = getattr(node, "children", [])
+
+
+def _bare(code: str) -> str:
+    """Return the syntax tree without annotations, which change nothing at run time."""
+
+    class Strip(ast.NodeTransformer):
+        def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
+            self.generic_visit(node)
+            node.annotation = ast.Constant(None)
+            return node
+
+        def visit_arg(self, node: ast.arg) -> ast.AST:
+            node.annotation = None
+            return node
+
+        def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+            self.generic_visit(node)
+            node.returns = None
+            return node
+
+        def visit_If(self, node: ast.If) -> ast.AST:
+            self.generic_visit(node)
+            if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+                return ast.Pass()
+            return node
+
+    try:
+        return ast.dump(Strip().visit(ast.parse(code)))
+    except SyntaxError:
+        return code
+
+
+def attempt(mutant: Mutant, code: str, patience: float) -> None:
+    """Let the tests meet a mutant, in a process of their own."""
+    module = Path(mutant.module)
+    original = module.read_text(encoding="utf-8")
+    files = nearest(mutant, original)
+    began = time.monotonic()
+    try:
+        module.write_text(code, encoding="utf-8")
+        mutant.outcome = _tested(files, patience)
+    finally:
+        module.write_text(original, encoding="utf-8")
+    mutant.seconds = round(time.monotonic() - began, 1)
+
+
+def nearest(mutant: Mutant, code: str) -> list[str]:
+    """Return the files of tests that may notice a change, the likeliest first."""
+    inside = [
+        node.name
+        for node in ast.walk(ast.parse(code))
+        if isinstance(node, ast.FunctionDef | ast.ClassDef)
+        and node.lineno <= mutant.line <= (node.end_lineno or 0)
+    ]
+    names = [each for each in inside if not each.startswith("__")] + [Path(mutant.module).stem]
+    said = re.compile("|".join(rf"\b{re.escape(name.lstrip('_'))}\b" for name in names))
+    folders = BEHIND[mutant.room]
+    module_folder = Path(mutant.module).parent.name
+
+    def rank(file: Path) -> tuple[int, int, int]:
+        text = file.read_text(encoding="utf-8")
+        room = next(i for i, name in enumerate(folders) if name in file.parts)
+        where = 0 if room == 0 and module_folder in file.parts else 1
+        return (0 if said.search(text) else 1, room + where, len(text))
+
+    files = [file for folder in folders for file in sorted((TESTS / folder).rglob("test_*.py"))]
+    return [str(file) for file in sorted(files, key=rank)]
+
+
+def _tested(files: Sequence[str], patience: float) -> str:
+    child = os.fork()
+    if not child:
+        os.setsid()
+        quiet = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(quiet, 1)
+        os.dup2(quiet, 2)
+        import pytest
+
+        os._exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", *files]))
+    until = time.monotonic() + patience
+    while time.monotonic() < until:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return "survived" if os.waitstatus_to_exitcode(status) == 0 else "killed"
+        time.sleep(0.05)
+    os.killpg(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return "survived so far"
+
+
+def _load_what_tests_need() -> None:
+    """Import the slow libraries once, for all children; nothing of sb3_yann."""
+    sys.path.insert(0, "tests")
+    sys.dont_write_bytecode = True  # two mutants of one size within a second look alike
+    import gymnasium  # noqa: F401
+    import hypothesis  # noqa: F401
+    import numba  # noqa: F401
+    import ppopt.mplp_program  # noqa: F401
+    import pytest  # noqa: F401
+    import scipy.optimize  # noqa: F401
+    import stable_baselines3  # noqa: F401
+    import torch
+
+    torch.set_num_threads(1)
+
+
+if __name__ == "__main__":
+    main()
