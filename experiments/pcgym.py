@@ -49,7 +49,13 @@ TESTS = range(3000, 3030)
 LOG = 10  # episodes
 EPISODES = 50
 STEPS = 50_000
-SEEDS = {FROM_A_LOG: range(40, 50), **dict.fromkeys(RIVALS, range(40, 43)), OURS: range(40, 50)}
+LONG = f", {STEPS:,} steps"
+SEEDS = {
+    FROM_A_LOG: range(40, 50),
+    **dict.fromkeys(("DDPG", "TD3", "SAC"), range(40, 43)),
+    **dict.fromkeys((f"DDPG{LONG}", f"PPO{LONG}"), range(40, 41)),
+    OURS: range(40, 50),
+}
 HEADER = ("plant", "controller", "training steps", "PC-Gym's cost", "against offset-free, %",
           "worst episode, %", "stage cost", "against offset-free, %", "ms a step",
           "seeds")  # fmt: skip
@@ -223,12 +229,14 @@ def execute(run: Run) -> Outcome:
             improve(model, twin, seed=run.seed)
         test(steps * LOG, partial(acted, model))
     else:
-        model = RIVALS[run.learner](
-            "MlpPolicy", scaled(name), gamma=0.95, seed=run.seed, device="cpu"
-        )
-        during = TestAt(steps * EPISODES, lambda: test(steps * EPISODES, Rival(model, case)))
-        model.learn(STEPS, callback=during)
-        test(STEPS, Rival(model, case))
+        rival = RIVALS[run.learner.removesuffix(LONG)]
+        model = rival("MlpPolicy", scaled(name), gamma=0.95, seed=run.seed, device="cpu")
+        first = steps * EPISODES
+        last = STEPS if run.learner.endswith(LONG) else first
+        during = TestAt(first, lambda: test(first, Rival(model, case)))
+        model.learn(last, callback=during)
+        if last > first:
+            test(last, Rival(model, case))
     return outcome(case, tested, time.perf_counter() - began)
 
 
@@ -303,11 +311,12 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
         if base is None:
             continue
         for name in (*FIXED, OURS, FROM_A_LOG, *RIVALS):
-            of = [
-                each for run, each in outcomes.items() if (run.plant, run.learner) == (plant, name)
-            ]
-            for k, steps in enumerate(of[0].checkpoints if of else ()):
-                found.append(_row(plant, name, int(steps), [(each, k) for each in of], base))
+            at: dict[int, list[tuple[Outcome, int]]] = {}
+            for run, each in outcomes.items():
+                if run.plant == plant and run.learner.removesuffix(LONG) == name:
+                    for k, steps in enumerate(each.checkpoints):
+                        at.setdefault(int(steps), []).append((each, k))
+            found += [_row(plant, name, steps, at[steps], base) for steps in sorted(at)]
     return found
 
 
