@@ -222,6 +222,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "one set": {
         "defaults": True,
         "gradient_steps": 4,
+        "critic_warmup": 4000,
         "guard": {"n_starts": 400, "patience": 10, "keep_if_worse": True},
     },
     "no settings, one network": {"defaults": True, "tau": 0.02, "networks": "shared"},
