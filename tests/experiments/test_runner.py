@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from distributed import LocalCluster
 
 from experiments import cluster
 from experiments.runner import Outcome, Run, RunsFailed, path_of, run_all
 
+LocalCluster = pytest.importorskip("distributed").LocalCluster
 RUNS = [Run("CSTR", "YANN-RL", seed, 10 * seed) for seed in range(3)]
 
 

@@ -52,10 +52,15 @@ class InputUnits(ReadOnlyArrays):
         kinds = {"deviation": (one, 0 * one), "absolute": (one, u_ss)}
         if np.all(np.isfinite(bounds)):
             kinds["normalized"] = (1 / problem.u_half, -(u_max + u_min) / 2 / problem.u_half)
+        finite = np.where(np.isfinite(bounds), np.abs(bounds), 0).max(0)
+        size = np.where(np.isfinite(problem.u_half), problem.u_half, finite)
         digits = np.finfo(low.dtype).eps if np.issubdtype(low.dtype, np.floating) else 0.0
         for kind, (scale, shift) in kinds.items():
-            room = 2e-6 * scale * problem.u_half + digits * np.abs(given)
-            if np.all(np.isclose(given, scale * bounds + shift, rtol=0, atol=room)):
+            wanted, room = scale * bounds + shift, 2e-6 * scale * size + digits * np.abs(given)
+            # Not np.isclose: that of numpy 1 takes no room for each entry where some are infinite.
+            either = np.isfinite(given) & np.isfinite(wanted)
+            apart = np.abs(np.where(either, given, 0) - np.where(either, wanted, 0))
+            if np.all(np.where(either, apart <= room, given == wanted)):
                 return cls(kind, scale, shift)
         return None
 

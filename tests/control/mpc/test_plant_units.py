@@ -21,6 +21,17 @@ BOUNDS = {
 }
 
 
+def test_a_bound_on_one_side_is_compared_on_that_side() -> None:
+    mpc = replace(MPC, u_min=[0, -3], u_max=[np.inf, np.inf])
+    above = [np.inf, np.inf]
+    found = InputUnits.of(mpc, np.array([0.0, -3]), np.array(above))
+    assert found is not None and found.kind == "deviation"
+    found = InputUnits.of(mpc, np.array([300.0, -5]), np.array(above))
+    assert found is not None and found.kind == "absolute"
+    assert InputUnits.of(mpc, np.array([-5.0, -3]), np.array(above)) is None
+    assert InputUnits.of(mpc, np.array([0.0, -3]), np.array([1e6, np.inf])) is None
+
+
 @pytest.mark.parametrize("kind", BOUNDS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_bounds_tell_what_an_env_takes(kind: str, dtype: type) -> None:
