@@ -36,7 +36,7 @@ from sb3_yann.commissioning.record import Record
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann_envs import problems
 
-WRITE, TRAIN = 0.08, 1.5
+WRITE, TRAIN = 0.08, 4.0
 """Seconds within which a writer, and a training, is killed."""
 ROOM = 3_000
 """Bytes that a full disk has left at most."""
@@ -234,7 +234,9 @@ def commissioning(rng: np.random.Generator, model: DDPG) -> str:
         def run() -> None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                Commissioning(model, ENV, batch=2, log_path=folder / "record", shadow=True).run(1)
+                Commissioning(
+                    model, ENV, batch=2, iterations=3, log_path=folder / "record", shadow=True
+                ).run(1)
 
         child = _fork(run)
         time.sleep(rng.uniform(0, TRAIN))
