@@ -12,6 +12,8 @@ from experiments.runner import Outcome, Run, load
 from experiments.yardsticks import Learner
 from sb3_yann.evaluation import evaluate
 
+pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
+
 REACTOR, PENDULUM = observer.PLANTS
 
 

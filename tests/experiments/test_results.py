@@ -22,6 +22,8 @@ from experiments.results import write_report
 from experiments.runner import Outcome, Run
 from experiments.summary import BEGIN, END, quote, summary
 
+pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
+
 MPC_COSTS = np.array([100.0, 300.0])  # mean 200
 OPTIMUM = np.array([90.0, 290.0])  # mean 190
 

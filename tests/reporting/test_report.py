@@ -229,6 +229,7 @@ HOSTILE = '<script>alert("x")</script>'
 FORMULA = r"$\frac$ & 'T'"
 
 
+@pytest.mark.filterwarnings("ignore:Glyph")  # fonts of matplotlib before 3.11
 def test_hostile_names_stay_text(tmp_path) -> None:
     model = LinearModel(
         [[0.9, 0.1], [0, 0.8]], [[0], [1]], 1, state_names=[HOSTILE, FORMULA],
