@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import cluster
 from experiments.runner import Outcome, Run, RunsFailed, path_of, run_all
 
-LocalCluster = pytest.importorskip("distributed").LocalCluster
+LocalCluster = pytest.importorskip("distributed").LocalCluster  # of the extra `paper`
+cluster = pytest.importorskip("experiments.cluster")
 RUNS = [Run("CSTR", "YANN-RL", seed, 10 * seed) for seed in range(3)]
 
 
