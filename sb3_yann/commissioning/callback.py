@@ -130,6 +130,7 @@ class ImproveInTwin(BaseCallback):
         self.twin, self.refits = twin, twin is None
         self.every, self.iterations = as_whole("every", every), as_whole("iterations", iterations)
         self.seed, self.state = as_whole("seed", seed, 0), TwinState()
+        self._learner: OffPolicyAlgorithm | None = None  # whose the state is
 
     @property
     def attempts(self) -> list[Attempt]:
@@ -158,9 +159,9 @@ class ImproveInTwin(BaseCallback):
         known = getattr(model, "twin_state", None)
         if known is None:
             model.twin_state = self.state = TwinState()
-        elif known is not self.state:
+        elif self._learner is not model:  # else it is its own, also beside another callback
             self.state = TwinState() if known.run == run else known
-        self.state.run = run
+        self.state.run, self._learner = run, model
 
     def _on_rollout_start(self) -> None:
         if self.is_new:  # a twin that was given, before the first step

@@ -211,7 +211,9 @@ class Journal:
         else:
             named = {each.name: event[each.name] for each in fields(Batch)}
             costs = {k: math.nan for k, each in named.items() if each is None}
-            self._close(Batch(**{**named, **costs}), Outlook(**event["from_here"]))
+            # Records of before there was `tried`: nothing waited where they went on.
+            outlook = Outlook(**{"tried": True, **event["from_here"]})
+            self._close(Batch(**{**named, **costs}), outlook)
 
     def _begin(self, acts: str) -> None:
         self._cut_off, self._open = self.cut_off, acts

@@ -83,12 +83,16 @@ class Record:
             raise RuntimeError(
                 f"{self.path} was changed by somebody else. One record belongs to one run."
             )
-        with self.path.open("r+b" if self.path.exists() else "w+b") as file:
-            file.truncate(self._size)
-            file.seek(self._size)
-            file.write(line)
-            file.flush()
-            os.fsync(file.fileno())
+        try:
+            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+                file.truncate(self._size)
+                file.seek(self._size)
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except BaseException:  # a full disk, or Ctrl-C: the next event overwrites what is there
+            self._seen = self.path.stat().st_size if self.path.exists() else 0
+            raise
         self._size = self._seen = self._size + len(line)
         self._digest = digest
 
@@ -98,8 +102,13 @@ class Record:
             return None
         name = f"{self.path.stem}-batch-{batch}.zip"
         unfinished = self.path.with_name(f"{self.path.stem}-unfinished.zip")
-        model.save(unfinished)
-        os.replace(unfinished, self.path.with_name(name))
+        try:
+            model.save(unfinished)
+            with unfinished.open("r+b") as file:  # the line that names it is on the disk after it
+                os.fsync(file.fileno())
+            os.replace(unfinished, self.path.with_name(name))
+        finally:
+            unfinished.unlink(missing_ok=True)
         return name
 
     def digest_of(self, name: str | None) -> str | None:

@@ -102,7 +102,7 @@ class ImprovementGuard(BaseCallback):
     twin: PlantTwin | None = None
     _handler: Handler | None = None
     _has_begun = False
-    _steps: Any = 0  # of each env's present episode
+    _steps: Any = 0  # of each env's present episode, in this learn
 
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
         self,
@@ -197,7 +197,7 @@ class ImprovementGuard(BaseCallback):
         check_not_nested(self)
         check_alone(self)
         require_same_statistics(self.model)
-        self._has_begun = False
+        self._has_begun, self._steps = False, 0
         self.acceptance.start(self.session)
         known = getattr(self.model, "guard_state", None)
         if known is None or known.settings != self.acceptance.settings:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sb3_yann.commissioning.journal import Journal, Outlook
+from sb3_yann.commissioning.journal import Batch, Journal, Outlook
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Alarm
@@ -103,3 +106,52 @@ def test_a_model_that_changed_since_is_refused(path: Path) -> None:
     saved.write_bytes(b"Weights")
     with pytest.raises(ValueError, match=r"plant-batch-1\.zip has changed since it was accepted"):
         record.load(saved.name, digest, None)
+
+
+@pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "full"), KeyboardInterrupt()])
+@pytest.mark.parametrize("written", [True, False], ids=["written", "not written"])
+def test_after_a_full_disk_or_ctrl_c_the_same_run_goes_on(
+    fault: BaseException, written: bool, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise fault
+
+    again = journal(path)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", fail) if written else patched.setattr(Path, "open", fail)
+        with pytest.raises(type(fault)):
+            again.begin(True)
+    again.begin(False)
+    assert [each["event"] for each in Record(path).events[5:]] == ["start"]
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(RuntimeError, match="was changed by somebody else"):
+        again.begin(False)
+
+
+class Unsaved:
+    """A model whose save is cut off, or is done."""
+
+    def __init__(self, fault: BaseException | None) -> None:
+        self.fault = fault
+
+    def save(self, path: Path) -> None:
+        path.write_bytes(b"weights")
+        if self.fault is not None:
+            raise self.fault
+
+
+def test_a_model_is_on_the_disk_before_the_line_that_names_it(path: Path, monkeypatch) -> None:
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda number: synced.append(os.fstat(number).st_ino))
+    saved = path.with_name(Record(path).save(Unsaved(None), 1))
+    assert synced == [saved.stat().st_ino]
+    with pytest.raises(OSError, match="full"):
+        Record(path).save(Unsaved(OSError("full")), 2)
+    assert {each.name for each in path.parent.iterdir()} == {path.name, saved.name}
+
+
+def test_where_a_record_of_before_goes_on_nothing_waits_to_be_tried(path: Path) -> None:
+    batch, outlook = Batch(1, 2, 0, "MPC", 0.0, 1.0, 1.0, 1.0, "stays", ""), asdict(Outlook(0.1))
+    del outlook["tried"]
+    Record(path).append({"event": "batch", **asdict(batch), "from_here": outlook})
+    assert journal(path).outlook.tried

@@ -96,6 +96,11 @@ def test_two_callbacks_of_one_learn_count_for_themselves() -> None:
     learner.learn(2 * STEPS, callback=[NoActionNoise(), *pair])
     assert [each.state.episodes for each in pair] == [2, 2]
     assert learner.twin_state is pair[0].state
+    learner.learn(2 * STEPS, callback=[NoActionNoise(), *pair], reset_num_timesteps=False)
+    assert [each.state.episodes for each in pair] == [4, 4]
+    other = model(gradient_steps=0)
+    other.learn(STEPS, callback=[NoActionNoise(), *pair])
+    assert [each.state.episodes for each in pair] == [1, 1]
 
 
 # --- on the plant ---------------------------------------------------------------------------------

@@ -135,6 +135,15 @@ def test_files_of_two_exports_do_not_compile(old, tmp_path):
     assert "is of another export than this file: export again" in said.stderr
 
 
+def test_the_header_leaves_the_macro_of_a_shared_library_alone(tmp_path):
+    export(policy_of("reactor"), tmp_path / "plant.c")
+    (tmp_path / "main.c").write_text(  # as by CMake's generate_export_header
+        '#define PLANT_EXPORT extern\n#include "plant.h"\nPLANT_EXPORT int number;\n'
+    )
+    built = [COMPILERS[0], "-Werror", "-c", "main.c"]
+    subprocess.run(built, cwd=tmp_path, check=True)
+
+
 def test_indices_are_as_wide_as_what_they_point_at():
     few = {"starts": np.array([0, 2**15 - 1])}
     assert index_bytes(few) == 2

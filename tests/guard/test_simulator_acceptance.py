@@ -120,6 +120,13 @@ def test_a_training_env_that_never_ends_is_told(simulator, n_envs, monkeypatch) 
     assert len(told) == 1
 
 
+def test_a_guard_counts_the_steps_of_the_present_learn_whatever_its_envs(monkeypatch) -> None:
+    monkeypatch.setattr("sb3_yann.guard.callback.LONG", 5)
+    guard = make_guard(n_new_starts=0, n_final_starts=0)
+    for n_envs in (2, 3, 3):  # stopped amid episodes of 4 steps; a warning is an error
+        train(build(env=make_vec_env(Slide, n_envs)), 3 * n_envs, NoActionNoise(), guard)
+
+
 def stop(_) -> None:
     raise KeyboardInterrupt
 

@@ -288,13 +288,15 @@ class OnlineLaw(OnPlant):
 def _require_positive_definite(H: Array) -> None:
     scale = np.sqrt(np.abs(np.diag(H)))  # in units in which all variables count alike
     unit = H / np.maximum(np.outer(scale, scale), 1e-300)
-    symmetric = np.max(np.abs(unit - unit.T), initial=0.0) < 1e-9
+    apart = np.abs(unit - unit.T)
+    i, j = np.unravel_index(np.argmax(apart), apart.shape)
+    fault = "" if apart[i, j] < 1e-9 else f"H[{i}, {j}] = {H[i, j]:g}, H[{j}, {i}] = {H[j, i]:g}"
     try:
         np.linalg.cholesky(unit)
     except np.linalg.LinAlgError:
-        symmetric = False
-    if not symmetric:
+        fault = fault or f"its smallest eigenvalue is {np.linalg.eigvalsh(H)[0]:.3g}"
+    if fault:
         raise ValueError(
-            f"H must be symmetric and positive definite, not {H.tolist()}: else the program has no "
-            "unique solution."
+            f"H must be symmetric and positive definite ({fault}): else the program has no unique "
+            "solution."
         )

@@ -14,7 +14,7 @@ extern "C" {
 #endif
 
 /* Which export this is: files of two exports do not compile. */
-#define YANN_EXPORT @EXPORT@u
+#define YANN_EXPORT_ID @EXPORT@u
 
 @SIZES@
 

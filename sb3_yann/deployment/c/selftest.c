@@ -8,7 +8,7 @@
 
 #include "@FILE@.h"
 
-#if YANN_EXPORT != @EXPORT@u
+#if YANN_EXPORT_ID != @EXPORT@u
 #error "@FILE@.h is of another export than this file: export again"
 #endif
 

@@ -194,13 +194,22 @@ def test_a_damaged_file_is_a_value_error_or_still_the_law(tmp_path) -> None:
             assert "law.npz does not hold an OnlineLaw" in str(error)
 
 
-@pytest.mark.parametrize("H", [[[-1.0]], [[0.0]]])
-def test_a_program_that_is_not_convex_is_refused(H, tmp_path) -> None:
+@pytest.mark.parametrize(("H", "fault"), [(-1.0, "eigenvalue is -1"), (0.0, "eigenvalue is 0")])
+def test_a_program_that_is_not_convex_is_refused(H, fault, tmp_path) -> None:
     law = LinearMPC(LinearModel([[0.5]], [[1]], 1.0), Q=[[1]], R=[[1]], horizon=1, u_max=1).online()
     arrays = {each.name: getattr(law, each.name) for each in fields(law)}
-    write_arrays(tmp_path / "law.npz", {**arrays, "H": np.array(H)})
-    with pytest.raises(ValueError, match=r"law\.npz does not hold .*H must be .*positive definite"):
+    write_arrays(tmp_path / "law.npz", {**arrays, "H": np.array([[H]])})
+    message = rf"law\.npz does not hold .*H must be .*positive definite \(its smallest {fault}\)"
+    with pytest.raises(ValueError, match=message):
         OnlineLaw.load(tmp_path / "law.npz")
+
+
+def test_where_a_program_is_not_symmetric_is_named(tmp_path) -> None:
+    law = LinearMPC(LinearModel([[0.5]], [[1]], 1.0), Q=[[1]], R=[[1]], horizon=2, u_max=1).online()
+    H = law.H.copy()
+    H[0, 1] += 0.25
+    with pytest.raises(ValueError, match=rf"\(H\[0, 1\] = {H[0, 1]:g}, H\[1, 0\] = {H[1, 0]:g}\)"):
+        replace(law, H=H)
 
 
 @pytest.mark.parametrize(
