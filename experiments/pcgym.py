@@ -311,12 +311,12 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
         if base is None:
             continue
         for name in (*FIXED, OURS, FROM_A_LOG, *RIVALS):
-            at: dict[int, list[tuple[Outcome, int]]] = {}
+            at: dict[int, dict[int, tuple[Outcome, int]]] = {}
             for run, each in outcomes.items():
                 if run.plant == plant and run.learner.removesuffix(LONG) == name:
                     for k, steps in enumerate(each.checkpoints):
-                        at.setdefault(int(steps), []).append((each, k))
-            found += [_row(plant, name, steps, at[steps], base) for steps in sorted(at)]
+                        at.setdefault(int(steps), {})[run.seed] = each, k
+            found += [_row(plant, name, k, [*at[k].values()], base) for k in sorted(at)]
     return found
 
 
