@@ -216,7 +216,7 @@ def training(sign: int, rng: np.random.Generator, model: DDPG) -> str:
                 model.guard_state.accepted.restore(model.policy)
                 kept = [*model.actor.state_dict().values()]
                 same = all(torch.equal(*pair) for pair in zip(saved, kept, strict=True))
-                (folder / ("same" if same else "other")).touch()
+                (folder / ("the accepted policy" if same else "another policy")).touch()
             else:
                 (folder / "not begun").touch()
 
@@ -241,7 +241,8 @@ def commissioning(rng: np.random.Generator, model: DDPG) -> str:
         child = _fork(run)
         time.sleep(rng.uniform(0, TRAIN))
         _end(child, signal.SIGKILL)
-        return f"goes on: {_end(_fork(run), patience=120)}"
+        end = _end(_fork(run), patience=120)
+        return "goes on to its end" if end == "done" else f"going on: {end}"
 
 
 def _fork(work: Callable[[], None]) -> int:

@@ -1,4 +1,4 @@
-"""Mutation testing on a random sample: `python -m experiments.mutants --count 50`.
+"""Mutation testing on a random sample: `python experiments/mutants.py --count 50`.
 
 One operator, number, comparison or statement of `control/`, `networks/`, `guard/` or `twin/` is
 changed (Cosmic Ray's operators: `pip install cosmic-ray`), and the tests are asked whether they
@@ -70,7 +70,7 @@ class Mutant:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Try mutants of each room, append each to a file of JSON lines, and print the shares."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.mutants", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python experiments/mutants.py", description=__doc__)
     parser.add_argument("--count", type=int, default=50, help="mutants of each room")
     parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=ROOMS)
     parser.add_argument("--seed", type=int, default=0)
@@ -220,16 +220,18 @@ def _tested(files: Sequence[str], patience: int) -> str:
 
 
 def _load_what_tests_need() -> None:
-    """Import the slow libraries once, for all children; nothing of sb3_yann, nor of pytest."""
+    """Import slow libraries once, for all children: none that loads sb3_yann, nor pytest."""
+    sys.path[:1] = [os.getcwd(), "tests"]
     sys.dont_write_bytecode = True  # two mutants of one size within a second look alike
-    import gymnasium  # noqa: F401
     import numba  # noqa: F401
     import ppopt.mplp_program  # noqa: F401
     import scipy.optimize  # noqa: F401
-    import stable_baselines3  # noqa: F401
     import torch
 
     torch.set_num_threads(1)
+    loaded = [name for name in sys.modules if name.startswith("sb3_yann")]
+    if loaded:
+        raise SystemExit(f"{loaded[0]} is loaded already: the tests would not meet the mutants.")
 
 
 if __name__ == "__main__":
