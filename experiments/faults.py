@@ -96,7 +96,7 @@ def write_code(folder: Path, version: int) -> None:
 def read_code(folder: Path) -> int:
     """Return which of them is there: all three files say it, or they do not compile."""
     texts = [(folder / f"law{name}").read_text(encoding="ascii") for name in CODE]
-    marks = {re.findall(r"EXPORT(?: !=)? (0x\w{8})u", text)[0] for text in texts}
+    marks = {re.findall(r"EXPORT_ID(?: !=)? (0x\w{8})u", text)[0] for text in texts}
     if len(marks) > 1:
         raise NoticedError("two exports, which do not compile")
     (version,) = {int("v1_" in text) for text in texts}
