@@ -185,16 +185,16 @@ def nearest(mutant: Mutant, code: str) -> list[str]:
         if isinstance(node, ast.FunctionDef | ast.ClassDef)
         and node.lineno <= mutant.line <= (node.end_lineno or 0)
     ]
-    names = [each for each in inside if not each.startswith("__")] + [Path(mutant.module).stem]
+    names = [each for each in inside if not each.startswith("__")] or [Path(mutant.module).stem]
     said = re.compile("|".join(rf"\b{re.escape(name.lstrip('_'))}\b" for name in names))
     folders = BEHIND[mutant.room]
     module_folder = Path(mutant.module).parent.name
 
-    def rank(file: Path) -> tuple[int, int, int]:
+    def rank(file: Path) -> tuple[bool, bool, int, int]:
         text = file.read_text(encoding="utf-8")
         room = next(i for i, name in enumerate(folders) if name in file.parts)
-        where = 0 if room == 0 and module_folder in file.parts else 1
-        return (0 if said.search(text) else 1, room + where, len(text))
+        near = Path(mutant.module).stem.strip("_") in file.stem
+        return not near, not said.search(text), room + (module_folder not in file.parts), len(text)
 
     files = [file for folder in folders for file in sorted((TESTS / folder).rglob("test_*.py"))]
     return [str(file) for file in sorted(files, key=rank)]

@@ -54,6 +54,12 @@ def test_a_worse_mean_or_one_start_beyond_the_margin_is_refused(costs, why) -> N
     assert bool(objection(costs)) == bool(why)
 
 
+def test_an_equal_cost_is_no_excess_whatever_the_margin() -> None:
+    mpc, costs = np.full(4, 10.0), np.array([10.0, 9.0, 11.0, NAN])
+    assert Tolerance(2.0).excess(mpc, costs).tolist() == [0.0, -0.5, 0.5, INF]
+    assert Tolerance(0.0).excess(mpc, costs).tolist() == [0.0, -INF, INF, INF]
+
+
 def test_the_mean_is_compared_with_the_accepted_policy_and_each_start_with_the_mpc() -> None:
     assert "mean" in objection([10, 20, 30], accepted=(9, 20, 30))
     assert objection([10.9, 18, 29], accepted=(1, 28, 29)) == ""
