@@ -1,14 +1,14 @@
 """Mutation testing on a random sample: `python experiments/mutants.py --count 50`.
 
-One operator, number, comparison or statement of `control/`, `networks/`, `guard/` or `twin/` is
-changed (Cosmic Ray's operators: `pip install cosmic-ray`), and the tests are asked whether they
-notice: those that are not slow, of the same folder first, and of these the ones that name the
-changed function. A mutant that they pass for `--patience` seconds of one core counts as a survivor,
-a test that takes two minutes as failed. Run it in a checkout of its
-own: it changes files there. It forks, so it needs Linux or macOS.
+One operator, number, comparison or flag of `control/`, `networks/`, `guard/` or `twin/` is changed
+(Cosmic Ray's operators: `pip install cosmic-ray`), and those tests are asked that run the line,
+of all that are not slow; which these are is measured first, by coverage, in some minutes. A mutant
+that they pass is a survivor, also where they are not through after `--patience` seconds of one
+core; a test that takes two minutes counts as failed. Run it in a checkout of its own: it changes
+files there. It forks, so it needs Linux or macOS.
 
-Left out: annotations, and the compiled loops, whose answers are compared with the layers' to the
-last bit.
+Left out: annotations, lines that no test runs but by importing them, and the compiled loops, whose
+answers are compared with the layers' to the last bit.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import random
 import re
 import resource
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -33,17 +34,13 @@ from pathlib import Path
 from cosmic_ray.ast import get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
+from coverage import CoverageData
 
 ROOMS = ("control", "networks", "guard", "twin")
 PACKAGE = Path("sb3_yann")
 TESTS = Path("tests")
-BEHIND = {
-    "control": ("control", "policy", "networks", "audit", "reporting"),
-    "networks": ("networks", "policy", "twin", "commissioning"),
-    "guard": ("guard", "policy", "commissioning"),
-    "twin": ("twin", "commissioning", "guard"),
-}
-"""Folders of tests that use a room, the nearest first."""
+FOLDERS = ("control", "networks", "guard", "twin", "policy", "audit")
+"""Of the tests that are asked."""
 ARITHMETIC = "Add|Sub|Mul|Div"
 ORDER = "Eq|NotEq|Lt|LtE|Gt|GtE"
 OPERATORS = re.compile(
@@ -80,13 +77,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.results.parent.mkdir(parents=True, exist_ok=True)
     _load_what_tests_need()
     counts: dict[str, Counter[str]] = {room: Counter() for room in options.rooms}
-    if _tested(["tests/control/law", "tests/networks/test_yann.py"], 300) != "survived":
+    if _tested(["tests/networks/test_yann.py"], 300) != "survived":
         raise SystemExit("The tests fail before anything is changed: run them by themselves.")
+    runs = who_runs_what(options.results.with_suffix(".coverage"))
     drawn = {room: mutants(room, random.Random(options.seed)) for room in options.rooms}
     for _ in range(options.count):
         for room, some in drawn.items():
-            mutant, code = next(some)
-            attempt(mutant, code, options.patience)
+            mutant, code, tests = next(
+                (*each, tests) for each in some if (tests := of_line(runs, each[0]))
+            )
+            attempt(mutant, code, tests, options.patience)
             counts[room][mutant.outcome] += 1
             with options.results.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(asdict(mutant)) + "\n")
@@ -163,44 +163,49 @@ def _bare(code: str) -> str:
         return code
 
 
-def attempt(mutant: Mutant, code: str, patience: int) -> None:
+def attempt(mutant: Mutant, code: str, tests: Sequence[str], patience: int) -> None:
     """Let the tests meet a mutant, in a process of their own."""
     module = Path(mutant.module)
     original = module.read_text(encoding="utf-8")
-    files = nearest(mutant, original)
     began = time.monotonic()
     try:
         module.write_text(code, encoding="utf-8")
-        mutant.outcome = _tested(files, patience)
+        mutant.outcome = _tested(tests, patience)
     finally:
         module.write_text(original, encoding="utf-8")
     mutant.seconds = round(time.monotonic() - began, 1)
 
 
-def nearest(mutant: Mutant, code: str) -> list[str]:
-    """Return the files of tests that may notice a change, the likeliest first."""
-    inside = [
-        node.name
-        for node in ast.walk(ast.parse(code))
-        if isinstance(node, ast.FunctionDef | ast.ClassDef)
-        and node.lineno <= mutant.line <= (node.end_lineno or 0)
-    ]
-    names = [each for each in inside if not each.startswith("__")] or [Path(mutant.module).stem]
-    said = re.compile("|".join(rf"\b{re.escape(name.lstrip('_'))}\b" for name in names))
-    folders = BEHIND[mutant.room]
-    module_folder = Path(mutant.module).parent.name
-
-    def rank(file: Path) -> tuple[bool, bool, int, int]:
-        text = file.read_text(encoding="utf-8")
-        room = next(i for i, name in enumerate(folders) if name in file.parts)
-        near = Path(mutant.module).stem.strip("_") in file.stem
-        return not near, not said.search(text), room + (module_folder not in file.parts), len(text)
-
-    files = [file for folder in folders for file in sorted((TESTS / folder).rglob("test_*.py"))]
-    return [str(file) for file in sorted(files, key=rank)]
+def who_runs_what(data: Path) -> CoverageData:
+    """Return which tests run which lines; measured if the file is not there."""
+    if not data.exists():
+        settings = data.with_suffix(".ini")
+        settings.write_text("[run]\ndynamic_context = test_function\n", encoding="utf-8")
+        folders = [str(TESTS / name) for name in FOLDERS]
+        how = ["-m", "coverage", "run", f"--rcfile={settings}", f"--data-file={data}"]
+        tests = ["-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", *folders]
+        subprocess.run([sys.executable, *how, f"--source={PACKAGE}", *tests], check=True)
+    found = CoverageData(str(data))
+    found.read()
+    return found
 
 
-def _tested(files: Sequence[str], patience: int) -> str:
+def of_line(runs: CoverageData, mutant: Mutant, length: int = 12) -> list[str]:
+    """Return the tests that run a line, or the beginning of its statement; nearest files first."""
+    contexts = runs.contexts_by_lineno(str(Path(mutant.module).resolve()))
+    lines = range(mutant.line, max(0, mutant.line - length), -1)
+    tests = next((found for line in lines if (found := {*contexts.get(line, ())} - {""})), set())
+    files = {file.stem: file for file in TESTS.rglob("test_*.py")}
+    stem = Path(mutant.module).stem.strip("_")
+
+    def near(test: str) -> tuple[bool, str]:
+        return stem not in test.split(".")[0], test
+
+    found = [each.split(".") for each in sorted(tests, key=near)]
+    return [f"{files[name]}::{'::'.join(rest)}" for name, *rest in found if name in files]
+
+
+def _tested(tests: Sequence[str], patience: int) -> str:
     child = os.fork()
     if not child:
         os.setsid()
@@ -211,7 +216,7 @@ def _tested(files: Sequence[str], patience: int) -> str:
         import pytest
 
         options = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-o", HANGS, "-o", ENDS]
-        os._exit(pytest.main([*options, *files]))
+        os._exit(pytest.main([*options, *tests]))
     _, status = os.waitpid(child, 0)
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child, signal.SIGKILL)  # what it has left running
