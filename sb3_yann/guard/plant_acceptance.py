@@ -292,7 +292,8 @@ class PlantAcceptance:
         evidence = _evidence(session)
         known = evidence.accepted, evidence.mpc
         means = [np.nan if each is None else float(each.costs.mean()) for each in known]
-        session.decide(verdict, reason, verdict == "rejected", (cost, means[0], means[1]))
+        costs, share = (cost, means[0], means[1]), float(verdict == "accepted")
+        session.decide(verdict, reason, verdict == "rejected", costs, share=share)
 
 
 def _evidence(session: GuardSession) -> BlockEvidence:

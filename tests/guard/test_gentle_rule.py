@@ -77,7 +77,7 @@ def test_a_fall_back_to_the_mpc_is_called_that() -> None:
     rule = {**GENTLE, "by_region": False, "retreat": False}
     guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=60, rule=rule)
     train(model, STEPS, At([STEPS], push_left), guard)
-    assert guard.decisions[-1].reason.endswith("the guard falls back to the MPC")
+    assert guard.decisions[-1].reason.endswith("; the guard falls back to the MPC")
     assert is_mpc(model)
     said = guard.summary()
     assert "gains nothing" in said and "raise n_starts" in said
@@ -102,3 +102,19 @@ def test_a_run_that_ends_within_the_warm_up_says_so() -> None:
     train(model, STEPS, guard)
     assert not guard.decisions and is_mpc(model)
     assert "lower critic_warmup" in guard.summary() and "= 500" in guard.summary()
+
+
+def test_starts_are_lost_beyond_what_they_may_cost_and_the_hardest_come_first() -> None:
+    mpc, tolerance = np.full(6, 20.0), Tolerance(2.0, 0.5, 20.0)
+    nothing = np.zeros((6, 4), np.int64), np.zeros((6, 1), bool)
+    starts = Starts((*range(6),), Outcome(mpc, *nothing), tolerance, 6)
+    outcome = Outcome(np.array([21.9, 22.1, 23.9, 15.0, 20.0, 50.0]), *nothing)
+    assert starts.lost(outcome).tolist() == [False, True, True, False, False, True]
+    assert starts.hardest(outcome).tolist() == [5, 2, 1]
+    unsafe = nothing[0].copy()
+    unsafe[4, 0] = 1
+    assert starts.hardest(outcome._replace(unsafe=unsafe)).tolist() == [4, 5, 2, 1]
+    near = Outcome(np.array([21.0, 19.0, 21.5, 20.0, 18.0, 20.5]), *nothing)
+    assert not starts.lost(near).any()
+    assert starts.hardest(near).tolist() == [2, 0, 5]  # those that cost more than with the MPC
+    assert starts.hardest(None).tolist() == [0]

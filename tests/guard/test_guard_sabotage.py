@@ -223,6 +223,14 @@ def test_with_patience_the_actor_goes_on_until_the_last_of_so_many_rejections(
     assert not any(shrunk[i] for i in range(3) if not any(restored[: i + 1]))
 
 
+def test_patience_begins_anew_when_it_was_spent() -> None:
+    model, guard = build(gradient_steps=0), make_guard(patience=3, keep_if_worse=True)
+    left = iter([1.8, 1.9, 2.0, 1.7, 1.6, 1.5])
+    move = At(range(STEPS, 7 * STEPS, STEPS), lambda p: correct(p, RIGHT, next(left)))
+    train(model, 6 * STEPS + 1, move, guard)
+    assert [each.restored for each in guard.decisions[:6]] == [False, False, True] * 2
+
+
 @pytest.mark.parametrize("sabotage", [worse, randomize, partial(overwrite, value=np.nan)])
 def test_with_the_default_patience_what_is_worse_than_the_mpc_returns_at_once(sabotage) -> None:
     model, guard = build(gradient_steps=0), ImprovementGuard(Slide, n_starts=10, rule=STRICT)

@@ -63,6 +63,7 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
     decision = guard.decisions[0]
     assert decision.verdict == "accepted in part"
     assert "7 of 20 new starts lose against the MPC, seed 1000" in decision.reason
+    assert decision.reason.endswith("; what it has learnt in other regions is kept")
     assert decision.regions == (REGION[RIGHT],)
     weights = last_layer(model)[:, :, -1]
     assert not weights[REGION[LEFT]].any() and weights[REGION[RIGHT]].any()

@@ -65,7 +65,7 @@ def test_a_better_candidate_passes_after_a_first_a_learning_and_a_trial_block() 
     assert re.fullmatch(r"-\S+ from the same starts by the linear model, p = \S+", decision.reason)
     assert decision.candidate_cost == decision.accepted_cost == pytest.approx(4)
     assert decision.mpc_cost == pytest.approx(4.25)
-    assert np.isnan(decision.worst_start)
+    assert np.isnan(decision.worst_start) and decision.share == 1
     assert actor_bits(model.policy) == accepted_bits(guard)
     assert float(last_layer(model)[REGION[RIGHT], 0, -1].detach()) == 0.5
 
@@ -79,7 +79,7 @@ def test_a_candidate_that_is_no_better_is_taken_back(value) -> None:
     move = At([BLOCK + 1], partial(correct, region=RIGHT, value=value))
     train(model, 3 * BLOCK, move, guard, look)
     assert verdicts(guard) == ["rejected"]
-    assert guard.decisions[0].step == 0.5
+    assert (guard.decisions[0].step, guard.decisions[0].share) == (0.5, 0)
     assert guard.decisions[0].accepted_cost == pytest.approx(4.25)
     assert seen == [True]
 

@@ -102,6 +102,18 @@ def test_its_gradient_by_theta_is_its_slope(kind) -> None:
     assert th.allclose(theta.grad[inside], th.stack(slopes, 1)[inside], atol=1e-4)
 
 
+@LAWS
+def test_loops_do_not_stand_in_where_a_gradient_by_theta_is_asked_for(kind) -> None:
+    layer, theta = scrambled(layer_of(servo(), kind), 0.3), drawn(servo(), 40).float()
+    assert layer.network.compiles
+    found = []
+    for compiles in (True, False):
+        layer.network.has_loops, asked = compiles, theta.clone().requires_grad_()
+        layer(asked).sum().backward()
+        found.append(asked.grad)
+    assert found[0].abs().sum() > 0 and th.equal(*found)
+
+
 def test_it_learns_and_copies() -> None:
     layer, theta = layer_of(reactor(), "online"), drawn(reactor())
     other = copy.deepcopy(layer)

@@ -78,6 +78,15 @@ def test_more_names_than_colors_share_a_gray() -> None:
     assert "4 others" in many.get_legend_handles_labels()[1]
 
 
+def test_regions_are_numbered_but_for_slivers_and_where_they_are_too_many() -> None:
+    some = _stripes(np.array([-2, 0, 0.005, 2])).plot()
+    assert {text.get_text() for text in some.texts} == {"0", "2"}
+    first, last = (text.get_position() for text in some.texts)
+    assert first == pytest.approx((-1, 0)) and last == pytest.approx((1.0025, 0))
+    assert len(_stripes(np.linspace(-2, 2, 61)).plot().texts) == 60
+    assert not _stripes(np.linspace(-2, 2, 62)).plot().texts
+
+
 def _stripes(edges: np.ndarray):
     """Return a law with a region between every two edges of the first coordinate."""
     from sb3_yann import PiecewiseAffine

@@ -230,6 +230,16 @@ def test_trace_off_its_steady_state_is_refused_by_its_scale_and_warned_of_withou
     np.testing.assert_allclose(model.A, np.exp(0.1 * (-1 - 2e4 * TRACE)), rtol=1e-9)
 
 
+def test_a_steady_state_that_hardly_moves_is_not_warned_of(recwarn) -> None:
+    """A small part of itself, although more than rounding; a zero has no part of itself."""
+
+    def tank(x, u):
+        return np.array([u[0] - 0.01 * x[0], 1e-4 - 0.01 * x[1]])
+
+    LinearModel.from_dynamics(tank, [100.001, 0.0], [1.0], 0.1, scale=None)
+    assert not recwarn
+
+
 def test_bend_that_is_short_beside_one_is_linearized_with_its_scale() -> None:
     def f(x, u):
         return 1e-6 * (u - np.tanh(x / 1e-6))
