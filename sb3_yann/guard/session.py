@@ -120,7 +120,8 @@ class GuardSession:
         costs: tuple[float, float, float],
         worst_start: float = math.nan,
         regions: tuple[int, ...] = (),
-        share: float = 0.0,
+        *,
+        share: float,
     ) -> None:
         """Set the step size, and log a Decision.
 

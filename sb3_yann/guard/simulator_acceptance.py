@@ -229,7 +229,7 @@ class SimulatorAcceptance:
         cost = np.nan if outcome is None else float(outcome.costs.mean())
         costs = cost, float(paired.costs.mean()), float(paired.mpc_costs.mean())
         worst_start = float(np.max(paired.costs - paired.mpc_costs))
-        session.decide(verdict, reason, restored, costs, worst_start, tuple(regions), share)
+        session.decide(verdict, reason, restored, costs, worst_start, tuple(regions), share=share)
 
 
 def name_of(env: Any) -> str:
