@@ -98,7 +98,7 @@ def episodes(costs, predicted=None) -> PlantEpisodes:
     return PlantEpisodes(costs, np.ones_like(costs) if predicted is None else np.array(predicted))
 
 
-@pytest.mark.parametrize("sizes", [(10, 10), (4, 9), (3, 3)])
+@pytest.mark.parametrize("sizes", [(10, 10), (4, 9), (3, 3), (2, 5), (2, 2)])
 @pytest.mark.parametrize("predicted", ["equal", "missing"])
 def test_without_a_covariate_it_is_welch_s_test(sizes, predicted) -> None:
     rng = np.random.default_rng(0)
@@ -107,6 +107,12 @@ def test_without_a_covariate_it_is_welch_s_test(sizes, predicted) -> None:
     chance = probability_of_chance(episodes(new, covariates[0]), episodes(old, covariates[1]))
     expected = stats.ttest_ind(new, old, equal_var=False, alternative="less").pvalue
     assert chance == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("sizes", [(1, 5), (5, 1)])
+def test_a_single_episode_is_not_compared(sizes) -> None:
+    with pytest.raises(ValueError, match="6 episodes are too few to compare two policies"):
+        analyze_covariance(*(episodes(np.arange(size)) for size in sizes))
 
 
 def test_with_a_covariate_it_is_least_squares_with_a_variance_for_each_policy() -> None:

@@ -198,6 +198,13 @@ def test_plant_that_cannot_be_linearized_is_refused_with_the_reason(
         LinearModel.from_env(Plant(step), **(arguments or {"state": [0], "action": [0]}))
 
 
+def test_the_input_with_the_least_room_of_its_own_range_is_named() -> None:
+    plant = Plant(lambda x, u: 0.5 * x + u[:1] + u[1:])
+    plant.action_space = gym.spaces.Box(np.array([-0.1, -100]), np.array([0.1, 100]), dtype=float)
+    with pytest.raises(ValueError, match="entry 1 lies on its bound"):
+        LinearModel.from_env(plant, state=[0], action=[0.09, 100.0])
+
+
 def test_a_reset_that_ignores_the_state_is_noticed() -> None:
     class Deaf(Plant):
         def reset(self, *, seed=None, options=None):
