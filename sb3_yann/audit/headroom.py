@@ -24,6 +24,7 @@ from sb3_yann.audit.closed_loops import (
     play,
 )
 from sb3_yann.audit.gains import Headroom, gain, verdict_of
+from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import Plant, TwinPlant, simulated
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
@@ -66,8 +67,9 @@ def headroom(
     mpc : LinearMPC
         Its stage cost is what counts.
     env_or_twin : gymnasium.Env, str, callable or PlantTwin
-        A simulator that shows theta of the MPC and takes its inputs, and plays the same episode
-        again from the same seed and inputs; it is copied. Or a twin of the MPC's plant, each of
+        A simulator that shows theta of the MPC and takes its inputs, both as deviations, or both
+        absolute where the MPC has ``absolute=True``. It plays the same episode again from the same
+        seed and inputs, and is copied. Or a twin of the MPC's plant, each of
         whose members has its share of the starts.
     n_starts : int, default 30
         Starts, from ``seed`` on.
@@ -131,11 +133,13 @@ class _Search:
         else:
             self.make = maker(given)
             self.source = _name(mpc, self.make)
+            self.make = showing_theta(self.make, mpc)
 
     def play_mpc(self) -> None:
         """Play the MPC, and see that the env repeats an episode."""
         self.base = base = play(self.mpc, self.make, self.seeds, of_law(self.mpc))
         self.others: dict[str, Loops] = {}
+        require_deviations(self.mpc, base.steps()[0])
         again = play(self.mpc, self.make, self.seeds[:1], of_law(self.mpc)).costs[0]
         if not np.isclose(again, base.costs[0], rtol=1e-6, atol=0):
             raise ValueError(
