@@ -12,8 +12,8 @@ from gymnasium import spaces
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.mpc.plant_units import InputUnits, misread_state
 from sb3_yann.control.model.labels import labels_of
+from sb3_yann.control.mpc.plant_units import InputUnits, misread_state
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
 
@@ -57,9 +57,9 @@ def showing_theta(
     Parameters
     ----------
     make : callable
-        Makes an env of these spaces' shapes, which takes deviations, or is as absolute as the
-        problem.
+        Makes an env that shows as many values as theta has.
     problem : LinearMPC
+        Where it is absolute, an env that takes absolute inputs shows absolute values.
 
     Raises
     ------
