@@ -88,11 +88,18 @@ class Headroom:
             *(f"  {name}: {-100 * part:+.2f} %" for name, part in parts),
             f"An MPC with a re-identified model: "
             f"{-100 * gain(self.mpc_costs, self.reidentified_costs):+.2f} %.",
-            f"Verdict: {self.verdict}; {ADVICE[self.verdict]}",
+            f"Verdict: {self.verdict}; {self._advice()}",
         ]
         return "\n".join(lines)
 
     __str__ = report
+
+    def _advice(self) -> str:
+        """Return what the verdict means, and whether more starts might change it."""
+        parts = self.offset, self.model_error, self.nonlinearity
+        if self.verdict != verdict_of(*parts):
+            return "what was found may be chance on so few starts. Take more: n_starts=."
+        return ADVICE[self.verdict]
 
 
 def gain(before: Array, after: Array) -> float:

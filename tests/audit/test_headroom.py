@@ -130,6 +130,12 @@ def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None
     assert verdict_of(*parts, doubt=doubt) == verdict
 
 
+def test_what_may_be_chance_is_not_called_little() -> None:
+    costs = np.array([1.0, 3.0])
+    found = Headroom(costs, costs, costs, costs / 2, 0.5, 0.0, 0.0, "do not bother", "a plant")
+    assert "may be chance on so few starts. Take more: n_starts" in str(found)
+
+
 def test_changes_of_a_set_point_are_not_known_before() -> None:
     """With preview the optimum would move before the change; the plan costs what the MPC costs."""
     found = headroom(heater(), Heater(steps=40), n_starts=6, seed=20)

@@ -95,12 +95,24 @@ def softened_box(bounds: Bounds, softness: Array) -> Bounds:
     return bounds[0] - beyond, bounds[1] + beyond
 
 
-def warn_of_no_rest(low: Array, high: Array) -> None:
-    """Warn of inputs that cannot rest at the operating point."""
+def warn_of_no_rest(low: Array, high: Array, u_ss: Array, absolute: bool) -> None:
+    """Warn of inputs (m,) that cannot rest at the operating point.
+
+    Parameters
+    ----------
+    low, high, u_ss : ndarray, shape (m,)
+        Bounds in deviations, and the operating point.
+    absolute : bool
+        Whether u_ss was taken off the bounds.
+    """
+    cure = "Give absolute bounds with absolute=True, or take u_ss of the model off them."
+    if absolute:
+        cure = "Linearize where the inputs keep their bounds, or correct u_ss of the model."
+    rest = u_ss if absolute else np.zeros_like(u_ss)
     for i in np.flatnonzero((low > 0) | (high < 0)):
         warnings.warn(
-            f"u_min = {low[i]:g} and u_max = {high[i]:g} leave out u[{i}] = 0, the operating point:"
-            " the law cannot rest there. Take u_ss of the model off bounds that are absolute.",
+            f"u_min = {low[i] + rest[i]:g} and u_max = {high[i] + rest[i]:g} leave out u[{i}] = "
+            f"{rest[i]:g}, the operating point: the law cannot rest there. {cure}",
             stacklevel=3,
         )
 
