@@ -24,8 +24,15 @@ def operating_point(
 ) -> Array:
     """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant.
 
-    The last states are inputs on their way, as many as ``delays`` (m,) says: at rest these are the
-    inputs, however far from the data.
+    Parameters
+    ----------
+    found, sizes : Regression, and (n, m, d)
+        The fit.
+    given : sequence of ndarray, shapes (n,), (m,) and (d,)
+        What is known of the point, None where nothing is.
+    delays : sequence of int, length m
+        So many of the last states are each input on its way: at rest these are the inputs, however
+        far from the data.
     """
     n, m, _ = sizes
     means = zip(given, np.split(found.center, [n, n + m]), strict=True)
