@@ -28,6 +28,7 @@ from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import Plant, TwinPlant, simulated
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
+from sb3_yann.control.mpc.offset_free import SHARE
 from sb3_yann.evaluation.episodes import Source
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import as_episodes
@@ -120,6 +121,7 @@ class _Search:
     def __init__(self, mpc: LinearMPC, given: Source | PlantTwin, seeds: range) -> None:
         self.mpc, self.seeds = mpc, seeds
         self.twin, self.random = None, False
+        self.d_max: Array | None = None
         self.make: Callable[[], gym.Env[Any, Any]]
         if isinstance(given, PlantTwin):
             given.require_trust()
@@ -156,9 +158,12 @@ class _Search:
         beyond = np.abs(following - mpc.predict(thetas, inputs)).max(axis=0)[mpc.layout.state]
         unit = mpc.theta_half[mpc.layout.state]
         try:
-            pair = offset_free(mpc, np.maximum(2 * beyond, 1e-6 * unit))
+            largest = np.maximum(2 * beyond, 1e-6 * unit)
+            pair = offset_free(mpc, largest)
         except ValueError:  # a disturbance that no input can hold
             return
+        if np.any(largest > SHARE * unit):  # the default would cut off what was found here
+            self.d_max = np.maximum(largest, SHARE * unit)
         self.others["observer"] = play(mpc, self.make, self.seeds, Observing(mpc, *pair))
 
     def reidentify(self) -> None:
@@ -216,7 +221,7 @@ class _Search:
         total, offset, known = (gain(base.costs, each) for each in (best, observer, model))
         offset, known = min(offset, total), min(known, total)
         parts = offset, max(0.0, known - offset), total - max(offset, known)
-        whole = Headroom(base.costs, observer, model, best, *parts, "", self.source)
+        whole = Headroom(base.costs, observer, model, best, *parts, "", self.source, self.d_max)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
         return dataclasses.replace(whole, verdict=verdict)
 

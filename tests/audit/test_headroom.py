@@ -97,6 +97,23 @@ def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:
     assert abs(without[-1, 0] - without[-1, 1]) > 0.02
 
 
+def test_a_disturbance_beyond_the_default_is_told() -> None:
+    plant = partial(Heater, load=0.6)
+    found = headroom(heater(), plant, n_starts=3)
+    assert found.d_max is not None and found.d_max[0] > 0.6
+    assert f"offset_free(mpc, d_max=[{found.d_max[0]:.3g}])" in found.report()
+    costs = []
+    for pair in (offset_free(heater()), offset_free(heater(), d_max=found.d_max)):
+        bounds = pair[0].disturbances
+        env = ObserveDisturbance(plant(), pair[1], bounds.d_min, bounds.d_max)
+        runs = evaluate(pair[0].online(), env, range(3))
+        rows = zip(runs.observations, runs.actions, strict=True)
+        costs.append([heater().stage_cost(x[:-1, :2], u).sum() for x, u in rows])
+    np.testing.assert_allclose(costs[1], found.observer_costs, rtol=0.05)  # of estimates
+    assert np.mean(costs[0]) > 1.1 * np.mean(costs[1])
+    assert headroom(heater(), partial(Heater, load=0.1), n_starts=3).d_max is None
+
+
 def test_the_reactor_s_figure_is_that_of_its_optimum() -> None:
     found = reactor()
     starts = evaluate(problems.cstr().explicit(), "CSTR-v0", range(2000, 2004)).observations

@@ -50,7 +50,15 @@ class InputUnits(ReadOnlyArrays):
     def between(
         cls, u_min: Array, u_max: Array, u_ss: Array, low: NDArray[Any], high: NDArray[Any]
     ) -> InputUnits | None:
-        """Return the same for bounds u_min and u_max (m,) of deviations from u_ss (m,)."""
+        """Return the same as :meth:`of`.
+
+        Parameters
+        ----------
+        u_min, u_max, u_ss : ndarray, shape (m,)
+            Bounds in deviations, and what these count from.
+        low, high : ndarray, shape (m,)
+            The env's.
+        """
         u_half = half_widths(u_min, u_max)
         bounds, one = np.array([u_min, u_max]), np.ones_like(u_ss)
         given = np.array([low, high], np.float64)
