@@ -141,6 +141,12 @@ class _Search:
         """Play the MPC, and see that the env repeats an episode."""
         self.base = base = play(self.mpc, self.make, self.seeds, of_law(self.mpc))
         self.others: dict[str, Loops] = {}
+        if not np.all(np.isfinite(base.costs)):
+            i = int(np.flatnonzero(~np.isfinite(base.costs))[0])
+            raise ValueError(
+                f"The MPC's episode from the seed {self.seeds[i]} costs {base.costs[i]}: what the "
+                "env shows must be finite numbers."
+            )
         require_deviations(self.mpc, base.steps()[0])
         again = play(self.mpc, self.make, self.seeds[:1], of_law(self.mpc)).costs[0]
         if not np.isclose(again, base.costs[0], rtol=1e-6, atol=0):

@@ -235,6 +235,14 @@ def test_what_it_cannot_use_is_named() -> None:
     with pytest.raises(ValueError, match="does not repeat it"):
         headroom(heater(), Random())
 
+    class Failing(Heater):
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return observation * np.nan, *rest
+
+    with pytest.raises(ValueError, match="from the seed 0 costs nan: what the env shows"):
+        headroom(heater(), Failing())
+
 
 def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:
     mpc, observer = offset_free(heater())

@@ -176,3 +176,14 @@ def test_what_cannot_have_been_played_before_an_episode_is_asked_for(wrap: Any) 
     assert wrap(Valve(2.0, 8.0), initial=[5.0]).initial.tolist() == [5.0]
     wrap(Valve(0.0, 8.0))
     PastInputs(Valve(2.0, 8.0), [0])
+
+
+def test_an_observation_that_is_a_column_is_named() -> None:
+    class Column(Reactor):
+        def reset(self, **kwargs: Any) -> Any:
+            observation, info = super().reset(**kwargs)
+            return np.reshape(observation, (-1, 1)), info
+
+    env = StageCost(Column(), MPC, observation="absolute")
+    with pytest.raises(ValueError, match=r"observation of shape \(2, 1\), .* has \(2,\)"):
+        env.reset(seed=0)
