@@ -41,6 +41,8 @@ class Headroom:
         What to do: one of "do not bother", "add ObserveDisturbance first", "re-identify", "learn".
     source : str
         Where it was found.
+    d_max : ndarray, shape (n,), optional
+        Of :func:`offset_free`, where its default is less than the disturbances of this plant.
 
     Examples
     --------
@@ -59,6 +61,7 @@ class Headroom:
     nonlinearity: float
     verdict: str
     source: str
+    d_max: Array | None = None
 
     @property
     def total(self) -> float:
@@ -88,11 +91,22 @@ class Headroom:
             *(f"  {name}: {-100 * part:+.2f} %" for name, part in parts),
             f"An MPC with a re-identified model: "
             f"{-100 * gain(self.mpc_costs, self.reidentified_costs):+.2f} %.",
-            f"Verdict: {self.verdict}; {ADVICE[self.verdict]}",
+            f"Verdict: {self.verdict}; {self._advice()}",
         ]
         return "\n".join(lines)
 
     __str__ = report
+
+    def _advice(self) -> str:
+        """Return what the verdict means, and whether more starts might change it."""
+        parts = self.offset, self.model_error, self.nonlinearity
+        if self.verdict != verdict_of(*parts):
+            return "what was found may be chance on so few starts. Take more: n_starts=."
+        advice = ADVICE[self.verdict]
+        if self.d_max is None:
+            return advice
+        largest = ", ".join(f"{each:.3g}" for each in self.d_max)
+        return advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
 
 
 def gain(before: Array, after: Array) -> float:

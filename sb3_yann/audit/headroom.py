@@ -24,9 +24,11 @@ from sb3_yann.audit.closed_loops import (
     play,
 )
 from sb3_yann.audit.gains import Headroom, gain, verdict_of
+from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import Plant, TwinPlant, simulated
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
+from sb3_yann.control.mpc.offset_free import SHARE
 from sb3_yann.evaluation.episodes import Source
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import as_episodes
@@ -66,8 +68,9 @@ def headroom(
     mpc : LinearMPC
         Its stage cost is what counts.
     env_or_twin : gymnasium.Env, str, callable or PlantTwin
-        A simulator that shows theta of the MPC and takes its inputs, and plays the same episode
-        again from the same seed and inputs; it is copied. Or a twin of the MPC's plant, each of
+        A simulator that shows theta of the MPC and takes its inputs, both as deviations, or both
+        absolute where the MPC has ``absolute=True``. It plays the same episode again from the same
+        seed and inputs, and is copied. Or a twin of the MPC's plant, each of
         whose members has its share of the starts.
     n_starts : int, default 30
         Starts, from ``seed`` on.
@@ -118,6 +121,7 @@ class _Search:
     def __init__(self, mpc: LinearMPC, given: Source | PlantTwin, seeds: range) -> None:
         self.mpc, self.seeds = mpc, seeds
         self.twin, self.random = None, False
+        self.d_max: Array | None = None
         self.make: Callable[[], gym.Env[Any, Any]]
         if isinstance(given, PlantTwin):
             given.require_trust()
@@ -131,11 +135,19 @@ class _Search:
         else:
             self.make = maker(given)
             self.source = _name(mpc, self.make)
+            self.make = showing_theta(self.make, mpc)
 
     def play_mpc(self) -> None:
         """Play the MPC, and see that the env repeats an episode."""
         self.base = base = play(self.mpc, self.make, self.seeds, of_law(self.mpc))
         self.others: dict[str, Loops] = {}
+        if not np.all(np.isfinite(base.costs)):
+            i = int(np.flatnonzero(~np.isfinite(base.costs))[0])
+            raise ValueError(
+                f"The MPC's episode from the seed {self.seeds[i]} costs {base.costs[i]}: what the "
+                "env shows must be finite numbers."
+            )
+        require_deviations(self.mpc, base.steps()[0])
         again = play(self.mpc, self.make, self.seeds[:1], of_law(self.mpc)).costs[0]
         if not np.isclose(again, base.costs[0], rtol=1e-6, atol=0):
             raise ValueError(
@@ -152,9 +164,12 @@ class _Search:
         beyond = np.abs(following - mpc.predict(thetas, inputs)).max(axis=0)[mpc.layout.state]
         unit = mpc.theta_half[mpc.layout.state]
         try:
-            pair = offset_free(mpc, np.maximum(2 * beyond, 1e-6 * unit))
+            largest = np.maximum(2 * beyond, 1e-6 * unit)
+            pair = offset_free(mpc, largest)
         except ValueError:  # a disturbance that no input can hold
             return
+        if np.any(largest > SHARE * unit):  # the default would cut off what was found here
+            self.d_max = np.maximum(largest, SHARE * unit)
         self.others["observer"] = play(mpc, self.make, self.seeds, Observing(mpc, *pair))
 
     def reidentify(self) -> None:
@@ -212,7 +227,7 @@ class _Search:
         total, offset, known = (gain(base.costs, each) for each in (best, observer, model))
         offset, known = min(offset, total), min(known, total)
         parts = offset, max(0.0, known - offset), total - max(offset, known)
-        whole = Headroom(base.costs, observer, model, best, *parts, "", self.source)
+        whole = Headroom(base.costs, observer, model, best, *parts, "", self.source, self.d_max)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
         return dataclasses.replace(whole, verdict=verdict)
 

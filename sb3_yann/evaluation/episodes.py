@@ -14,7 +14,8 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.control import PiecewiseAffine
+from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
+from sb3_yann.control.mpc.plant_units import InputUnits
 
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
 LONG, LONGEST = 100_000, 1_000_000
@@ -96,13 +97,17 @@ def evaluate(
     resets = [*zip(seeds, options, strict=True)]
     act = _as_batch_function(policy)
     if isinstance(env, gym.Env):
+        _require_same_inputs(policy, env.action_space)
         episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
     elif isinstance(env, str) and (vector_env := _vector_env(env, len(seeds))) is not None:
         with closing(vector_env):
+            _require_same_inputs(policy, vector_env.single_action_space)
             return _as_one(act, vector_env, seeds, starts)
     else:
         with ExitStack() as stack:
             envs = [stack.enter_context(one_env(env)) for _ in seeds]
+            for each in envs[:1]:
+                _require_same_inputs(policy, each.action_space)
             if len({id(each.unwrapped) for each in envs}) < len(envs):
                 raise ValueError(
                     "The function that makes envs returned the same one twice. Make a new one each "
@@ -141,6 +146,11 @@ class _Episode:
 
 
 def _as_batch_function(policy: Predictor | Callable[[Any], Any]) -> Callable[[Any], Any]:
+    if isinstance(policy, LinearMPC):
+        raise TypeError(
+            "policy is a LinearMPC, which is a problem: pass its law, mpc.explicit() or mpc.law(); "
+            "for an env in absolute values mpc.explicit().plant_input."
+        )
     if hasattr(policy, "predict"):
         return lambda observations: policy.predict(observations, deterministic=True)[0]
     if isinstance(policy, PiecewiseAffine):
@@ -148,6 +158,23 @@ def _as_batch_function(policy: Predictor | Callable[[Any], Any]) -> Callable[[An
     if callable(policy):
         return lambda observations: [policy(observation) for observation in observations]
     raise TypeError(f"policy = {policy!r} must have a predict method or be callable.")
+
+
+def _require_same_inputs(policy: Any, space: Any) -> None:
+    """Raise if a law puts out deviations, and an env takes absolute inputs."""
+    model = getattr(policy, "model", None)
+    if not isinstance(policy, PiecewiseAffine | OnlineLaw) or not isinstance(model, LinearModel):
+        return
+    if not isinstance(space, gym.spaces.Box):
+        return
+    units = InputUnits.between(policy.u_min, policy.u_max, model.u_ss, space.low, space.high)
+    if units is not None and units.kind == "absolute":
+        raise ValueError(
+            f"The env takes absolute inputs, from {space.low.tolist()} to {space.high.tolist()}, "
+            f"and the law puts out deviations, from {policy.u_min.tolist()} to "
+            f"{policy.u_max.tolist()}. Pass law.plant_input where the env shows absolute values "
+            "too, else wrap the plant in sb3_yann.wrappers.Deviations(env, mpc.model)."
+        )
 
 
 def _vector_env(env_id: str, n: int) -> VectorEnv[Any, Any, Any] | None:

@@ -215,6 +215,7 @@ def warn_of_misread_states(problem: LinearMPC, theta: Array) -> None:
         What the policy made of its first observations.
     """
     for sign in (1, -1):
+        warn_of_misread_references(problem, theta, sign)
         i = misread_state(problem, theta, sign)
         if i is None:
             continue
@@ -233,6 +234,38 @@ def warn_of_misread_states(problem: LinearMPC, theta: Array) -> None:
                 "policy_kwargs={'observation': 'deviation'}."
             )
         warnings.warn(said, stacklevel=4)
+
+
+def warn_of_misread_references(problem: LinearMPC, theta: Array, sign: int) -> None:
+    """Warn where set-points lie outside their box, and inside it with the operating point.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        The policy's.
+    theta : ndarray, shape (batch, n_theta)
+        What the policy made of its first observations.
+    sign : {1, -1}
+        Whether they are shown in absolute values, or the operating point was taken off deviations.
+    """
+    low, high = problem.tracking.r_min, problem.tracking.r_max
+    point = problem.tracking.C @ problem.model.x_ss
+    r, room = theta[:, problem.layout.reference], 1e-6 * (high - low)
+    shown, meant = (
+        np.all((low - room <= each) & (each <= high + room), axis=0)
+        for each in (r, r - sign * point)
+    )
+    for i in np.flatnonzero(meant & ~shown)[:1]:
+        seen = r[0, i] + (0 if sign == 1 else point[i])
+        what, takes = ("absolute values", "deviations")[::sign], (low, high)
+        if sign == -1:
+            takes = low + point, high + point
+        warnings.warn(
+            f"Set-point {i} = {seen:.6g} is shown, and the policy takes {what[1]} from "
+            f"{takes[0][i]:.6g} to {takes[1][i]:.6g}: these are {what[0]}. Give SetPoint its low "
+            f"and high in {what[1]}.",
+            stacklevel=5,
+        )
 
 
 def require_theta(

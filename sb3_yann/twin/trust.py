@@ -23,6 +23,8 @@ STILL = 1e-4
 """An input that moves by less, in half-widths, does not move."""
 FOREIGN = 10.0
 """A model that errs by so many times what moves describes another plant."""
+POOR = 2.0
+"""From so many times on, a report asks whether it is the same plant."""
 OUTSIDE = 0.05
 """Share of logged rows beyond the box of theta from which on units are doubted."""
 PREVIOUS = 0.01
@@ -249,6 +251,12 @@ def judge(
             f"({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations)."
         )
         advice.append("Compare units, operating point and sampling time of the log and the model.")
+    elif n_episodes > 1 and runs.errors[0][0] > POOR * standing[0]:
+        advice.append(
+            f"The problem's model predicts {runs.horizons[0]} steps worse than 'nothing moves' "
+            f"({runs.errors[0][0]:.3g} against {standing[0]:.3g} standard deviations). Look at the "
+            "order of the columns, units, operating point and sampling time of the log."
+        )
     if beyond[0] > OUTSIDE:
         problems.append(
             f"{100 * beyond[0]:.3g} % of the logged {beyond[1]} lie beyond the problem's box of "

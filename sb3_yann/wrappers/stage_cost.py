@@ -76,6 +76,12 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(**kwargs)
+        shape, told = np.shape(observation), self.observation_space.shape
+        if shape != told:
+            raise ValueError(
+                f"The env's reset returned an observation of shape {shape}, and its "
+                f"observation_space has {told}: return a vector, such as np.ravel(observation)."
+            )
         self.theta = self.seen(observation)
         return observation, info
 

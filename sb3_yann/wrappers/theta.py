@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, NonFiniteWarning, as_whole
@@ -26,8 +27,9 @@ class PreviousInput(Appending):
     ----------
     env : gymnasium.Env, with one-dimensional Box spaces
     initial : array_like, shape (m,), optional
-        What counts as the previous input at the start of an episode: zeros by default, the
-        operating point.
+        What counts as the previous input at the start of an episode, as the env takes it: zeros by
+        default, the operating point of an env that takes deviations. One whose bounds leave zero
+        out needs it.
 
     Examples
     --------
@@ -40,6 +42,8 @@ class PreviousInput(Appending):
     def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
         bounds = require_vector(env, "action_space")
         super().__init__(env, bounds.low, bounds.high)
+        if initial is None:
+            _require_zero(bounds, np.ones(bounds.shape, dtype=bool))
         start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
         if start.shape != bounds.shape:
             raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
@@ -66,7 +70,8 @@ class PastInputs(Appending):
     delays : sequence of int, length m
         For each input, how many of its past values are appended, newest first.
     initial : array_like, shape (m,), optional
-        What was on its way at the start of an episode: zeros by default, the operating point.
+        What was on its way at the start of an episode, as the env takes it: zeros by default, the
+        operating point of an env that takes deviations. One whose bounds leave zero out needs it.
 
     Examples
     --------
@@ -88,6 +93,8 @@ class PastInputs(Appending):
             )
         low, high = np.repeat(bounds.low, self.delays), np.repeat(bounds.high, self.delays)
         super().__init__(env, low, high)
+        if initial is None:
+            _require_zero(bounds, np.array(self.delays) > 0)
         start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
         if start.shape != bounds.shape:
             raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
@@ -102,6 +109,16 @@ class PastInputs(Appending):
             self.past = [u, *self.past][:longest]
         shown = [self.past[k][j] for j, delay in enumerate(self.delays) for k in range(delay)]
         return joined(observation, np.array(shown, np.float64))
+
+
+def _require_zero(bounds: spaces.Box, needed: NDArray[np.bool_]) -> None:
+    """Raise where inputs that are ``needed`` (m,) cannot have been zero before an episode."""
+    if np.any(needed & ((bounds.low > 0) | (bounds.high < 0))):
+        raise ValueError(
+            f"The env takes inputs from {bounds.low.tolist()} to {bounds.high.tolist()}: zero, "
+            "the default, cannot be the one before an episode. Pass initial, such as u_ss of the "
+            "model."
+        )
 
 
 class SetPoint(Appending):
@@ -220,6 +237,20 @@ class MeasuredDisturbance(Appending):
         return joined(observation, self.held)
 
 
+def _require_deviations(env: Env, u_ss: Array) -> None:
+    """Raise where an env takes absolute inputs: an operating point (m,) is inside, zero is not."""
+    space = require_vector(env, "action_space")
+    low, high = space.low, space.high
+    if low.shape == u_ss.shape and np.any(
+        ((low >= 0) | (high <= 0)) & (low < u_ss) & (u_ss < high) & (u_ss != 0)
+    ):
+        raise ValueError(
+            f"The env takes inputs from {low.tolist()} to {high.tolist()}, which are absolute: the "
+            f"operating point is u_ss = {u_ss.tolist()}, and the observer counts from it. Wrap the "
+            "plant in Deviations(env, mpc.model) before."
+        )
+
+
 class ObserveDisturbance(Appending):
     """Puts the estimated state in place of the measurement, and appends the disturbance d (d,).
 
@@ -249,6 +280,7 @@ class ObserveDisturbance(Appending):
     ) -> None:
         if not isinstance(observer, DisturbanceObserver):
             raise TypeError(f"observer = {observer!r} must be a DisturbanceObserver.")
+        _require_deviations(env, observer.model.u_ss)
         super().__init__(env, low, high, observer.n_measured, observer.model.n_states)
         if len(self.low) != observer.model.n_disturbances:
             raise ValueError(

@@ -50,7 +50,8 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
         if seen.shape[0] < n or taken.shape != (m,):
             raise ValueError(
                 f"The env shows {seen.shape} and takes {taken.shape}, but the model has {n} states "
-                f"and {m} inputs. Wrap the plant before other wrappers, or pass its own model."
+                f"and {m} inputs. Wrap the plant before other wrappers, or pass its own model; of "
+                "one with dead time wrap the plant in PastInputs first."
             )
         self.x_ss: Array = np.zeros(seen.shape[0])
         self.x_ss[:n] = model.x_ss

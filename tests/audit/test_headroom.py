@@ -97,6 +97,23 @@ def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:
     assert abs(without[-1, 0] - without[-1, 1]) > 0.02
 
 
+def test_a_disturbance_beyond_the_default_is_told() -> None:
+    plant = partial(Heater, load=0.6)
+    found = headroom(heater(), plant, n_starts=3)
+    assert found.d_max is not None and found.d_max[0] > 0.6
+    assert f"offset_free(mpc, d_max=[{found.d_max[0]:.3g}])" in found.report()
+    costs = []
+    for pair in (offset_free(heater()), offset_free(heater(), d_max=found.d_max)):
+        bounds = pair[0].disturbances
+        env = ObserveDisturbance(plant(), pair[1], bounds.d_min, bounds.d_max)
+        runs = evaluate(pair[0].online(), env, range(3))
+        rows = zip(runs.observations, runs.actions, strict=True)
+        costs.append([heater().stage_cost(x[:-1, :2], u).sum() for x, u in rows])
+    np.testing.assert_allclose(costs[1], found.observer_costs, rtol=0.05)  # of estimates
+    assert np.mean(costs[0]) > 1.1 * np.mean(costs[1])
+    assert headroom(heater(), partial(Heater, load=0.1), n_starts=3).d_max is None
+
+
 def test_the_reactor_s_figure_is_that_of_its_optimum() -> None:
     found = reactor()
     starts = evaluate(problems.cstr().explicit(), "CSTR-v0", range(2000, 2004)).observations
@@ -128,6 +145,12 @@ def test_what_a_linear_model_cannot_do_is_left_to_learning() -> None:
 )
 def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None:
     assert verdict_of(*parts, doubt=doubt) == verdict
+
+
+def test_what_may_be_chance_is_not_called_little() -> None:
+    costs = np.array([1.0, 3.0])
+    found = Headroom(costs, costs, costs, costs / 2, 0.5, 0.0, 0.0, "do not bother", "a plant")
+    assert "may be chance on so few starts. Take more: n_starts" in str(found)
 
 
 def test_changes_of_a_set_point_are_not_known_before() -> None:
@@ -211,6 +234,14 @@ def test_what_it_cannot_use_is_named() -> None:
 
     with pytest.raises(ValueError, match="does not repeat it"):
         headroom(heater(), Random())
+
+    class Failing(Heater):
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return observation * np.nan, *rest
+
+    with pytest.raises(ValueError, match="from the seed 0 costs nan: what the env shows"):
+        headroom(heater(), Failing())
 
 
 def test_an_mpc_with_disturbances_has_an_observer_or_measures_them() -> None:

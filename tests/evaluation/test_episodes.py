@@ -8,8 +8,10 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG
 
+import unit_samples as units
 from sb3_yann import YannPolicy
 from sb3_yann.evaluation import Episodes, evaluate
+from sb3_yann.wrappers import Deviations
 from sb3_yann_envs import problems
 
 SEEDS = range(3)
@@ -217,3 +219,19 @@ def test_an_env_that_is_given_stays_open() -> None:
 def test_something_that_is_no_policy_is_named() -> None:
     with pytest.raises(TypeError, match="predict"):
         evaluate(3, "CSTR-v0", SEEDS)  # type: ignore[arg-type]
+
+
+def test_a_law_in_deviations_is_not_played_on_an_absolute_env() -> None:
+    mpc, env = units.absolute_mpc(), units.plant("absolute", "absolute")
+    for law in (mpc.explicit(), mpc.online()):
+        with pytest.raises(ValueError, match=r"absolute inputs, from \[38.*plant_input"):
+            evaluate(law, env, SEEDS)
+        evaluate(law, units.plant("deviation", "deviation"), SEEDS)
+    costs = evaluate(mpc.explicit().plant_input, env, SEEDS).costs
+    wrapped = evaluate(mpc.explicit(), Deviations(env, mpc.model), SEEDS).costs
+    np.testing.assert_allclose(costs, wrapped, rtol=1e-9)
+
+
+def test_a_problem_is_not_its_law() -> None:
+    with pytest.raises(TypeError, match=r"pass its law, mpc\.explicit"):
+        evaluate(problems.cstr(), "CSTR-v0", SEEDS)  # type: ignore[arg-type]

@@ -23,12 +23,13 @@ from sb3_yann import (
     LinearMPC,
     NoActionNoise,
     NonFiniteWarning,
+    Tracking,
     YannPolicy,
 )
 from sb3_yann.commissioning.plant import Plant
 from sb3_yann.evaluation import evaluate
 from sb3_yann.twin.replay_buffer import episodes_of
-from sb3_yann.wrappers import Deviations, StageCost
+from sb3_yann.wrappers import Deviations, SetPoint, StageCost
 
 MPC = units.absolute_mpc()
 ALL = [(shows, takes) for shows in units.SHOWS for takes in units.TAKES]
@@ -223,3 +224,27 @@ def test_a_reading_that_is_lost_is_called_by_its_name(shows: str) -> None:
     with pytest.warns(NonFiniteWarning, match=r"not finite in entries \[0\] \(temperature\)"):
         action = model.predict(seen)[0]
     assert env.unwrapped.input(action) == pytest.approx(MPC.explicit()(x), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("absolute", "low", "high", "message"),
+    [
+        (True, -5.0, 5.0, r"takes absolute values from 345 to 355: these are deviations"),
+        (False, 345.0, 355.0, r"takes deviations from -5 to 5: these are absolute values"),
+    ],
+)
+def test_set_points_in_other_units_than_the_policy_s_are_named(
+    absolute: bool, low: float, high: float, message: str
+) -> None:
+    given = {"Q": np.eye(2), "R": [[0.1]], "horizon": 2, "gamma": 0.99, "absolute": True}
+    mpc = LinearMPC(units.MODEL, tracking=Tracking([0], 345, 355), **given, **units.LIMITS)
+    plant = units.plant("absolute", "absolute")
+    plant = plant if absolute else Deviations(plant, mpc.model)
+    bounds = (345, 355) if absolute else (-5, 5)
+    right = SetPoint(plant, *bounds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        build(right, mpc=mpc).predict(right.reset(seed=0)[0])
+    wrong = SetPoint(plant, low, high)
+    with pytest.warns(UserWarning, match=message):
+        build(wrong, mpc=mpc).predict(wrong.reset(seed=0)[0])

@@ -156,6 +156,23 @@ def test_a_model_that_is_far_worse_than_none_is_that_of_another_plant() -> None:
     assert not found.trusted and "far worse than 'nothing moves'" in found.report()
 
 
+def test_a_log_with_its_columns_swapped_is_asked_about() -> None:
+    """The twin learns such a plant well, and is trusted: only the model tells."""
+    place = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 2))
+    log, mpc = [], problem()
+    for x in place:
+        states, inputs = [x], []
+        for t in range(60):
+            inputs.append(mpc.explicit()(states[-1]) + 0.2 * np.sin(1.3 * t))
+            states.append(mpc.model.step(states[-1], inputs[-1]))
+        log.append((np.array(states), np.clip(inputs, -1, 1)))
+    question = "worse than 'nothing moves'"
+    swapped = PlantTwin.fit(mpc, [(x[:, ::-1], u) for x, u in log], n_members=1)
+    assert f"{question} (" in swapped.report()
+    assert "order of the columns" in swapped.report() or not swapped.trusted
+    assert question not in PlantTwin.fit(mpc, log, n_members=1).report()
+
+
 def test_the_model_as_it_is_is_looked_at_even_where_it_may_not_be_chosen() -> None:
     found = PlantTwin.fit(problem(), log(3), residuals=["quadratic"])
     assert found.kind.startswith("quadratic") and found.trust.runs.names[0] == "none"

@@ -8,8 +8,20 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_yann import AffineObservation, LinearModel, LinearMPC, Tracking
-from sb3_yann.wrappers import Deviations, StageCost
+from sb3_yann import (
+    AffineObservation,
+    DisturbanceObserver,
+    LinearModel,
+    LinearMPC,
+    Tracking,
+)
+from sb3_yann.wrappers import (
+    Deviations,
+    ObserveDisturbance,
+    PastInputs,
+    PreviousInput,
+    StageCost,
+)
 
 X_SS, U_SS = np.array([350.0, 2.0]), np.array([10.0])
 MODEL = LinearModel([[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0, X_SS, U_SS)
@@ -130,3 +142,48 @@ def test_the_stage_cost_of_an_absolute_plant_follows_its_problem() -> None:
     assert env.step(np.array([0.0], np.float32))[1] == pytest.approx(
         -float(MPC.stage_cost(x - X_SS, [1.5]))
     )
+
+
+def test_dead_time_comes_before_deviations() -> None:
+    model = LinearModel(np.eye(3) / 2, np.ones((3, 1)), 1.0, [*X_SS, 10.0], [10.0])
+    with pytest.raises(ValueError, match="of one with dead time wrap the plant in PastInputs"):
+        Deviations(Reactor(), model)
+
+
+class Valve(gym.Env):
+    """A level of 5 m, and a flow of 2 to 8 m3/h."""
+
+    observation_space = gym.spaces.Box(0, 10, (1,), np.float64)
+
+    def __init__(self, low: float, high: float) -> None:
+        self.action_space = gym.spaces.Box(low, high, (1,), np.float64)
+
+
+@pytest.mark.parametrize(("low", "high"), [(2.0, 8.0), (0.0, 8.0), (-8.0, -2.0)])
+def test_an_observer_refuses_absolute_inputs(low: float, high: float) -> None:
+    u_ss = [-5.0 if high < 0 else 5.0]
+    model = LinearModel([[0.9]], [[0.5]], 1.0, [5.0], u_ss, [[1.0]])
+    observer = DisturbanceObserver(model)
+    with pytest.raises(ValueError, match=r"inputs from .* which are absolute.*Deviations"):
+        ObserveDisturbance(Valve(low, high), observer, -1, 1)
+    ObserveDisturbance(Deviations(Valve(low, high), model), observer, -1, 1)
+
+
+@pytest.mark.parametrize("wrap", [PreviousInput, lambda env, **u: PastInputs(env, [2], **u)])
+def test_what_cannot_have_been_played_before_an_episode_is_asked_for(wrap: Any) -> None:
+    with pytest.raises(ValueError, match=r"takes inputs from \[2.0\] to \[8.0\].*Pass initial"):
+        wrap(Valve(2.0, 8.0))
+    assert wrap(Valve(2.0, 8.0), initial=[5.0]).initial.tolist() == [5.0]
+    wrap(Valve(0.0, 8.0))
+    PastInputs(Valve(2.0, 8.0), [0])
+
+
+def test_an_observation_that_is_a_column_is_named() -> None:
+    class Column(Reactor):
+        def reset(self, **kwargs: Any) -> Any:
+            observation, info = super().reset(**kwargs)
+            return np.reshape(observation, (-1, 1)), info
+
+    env = StageCost(Column(), MPC, observation="absolute")
+    with pytest.raises(ValueError, match=r"observation of shape \(2, 1\), .* has \(2,\)"):
+        env.reset(seed=0)

@@ -81,12 +81,12 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
-    system = _system(found, sizes, given, dt)
+    system = _system(found, sizes, given, dt, delays)
     system = _with_exact_memory(system, delays, sizes[0])
     late = [] if any(delays) else input_notes(found, fitted, sizes)
     if late:
         warnings.warn(" ".join(late), stacklevel=3)
-    told = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight)
+    told = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
     notes = [*system.notes, *_memory_notes(delays, sizes), *told, *shrunk, *late]
     if lost:
         notes.append(f"{lost} steps that took another time than dt were left out.")
@@ -94,11 +94,15 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
 
 
 def _system(
-    found: Regression, sizes: tuple[int, int, int], given: Sequence[Array | None], dt: float
+    found: Regression,
+    sizes: tuple[int, int, int],
+    given: Sequence[Array | None],
+    dt: float,
+    delays: Sequence[int],
 ) -> LinearSystem:
     """Return the system about its operating point, with notes on drift and extrapolation."""
     n, m, _ = sizes
-    point = operating_point(found, sizes, given)
+    point = operating_point(found, sizes, given, delays)
     A, B, E = np.split(found.coefficients, [n, n + m], axis=1)
     x, u, d = np.split(point, [n, n + m])
     notes = []

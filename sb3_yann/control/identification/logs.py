@@ -51,6 +51,11 @@ def as_episodes(
                     f"{name} of episode {i} has {len(part)} rows, states has {len(state)}. "
                     "Expected T >= 1 and T + 1: the states before each action and after the last."
                 )
+    if sum(map(len, u)) < 2:
+        raise ValueError(
+            f"states has shape {x[0].shape} and actions {u[0].shape}: one step tells nothing. Rows "
+            "are samples and columns states or inputs; transpose a log that has them otherwise."
+        )
     episodes = [Episode(parts[0], np.hstack(parts[1:])) for parts in zip(x, u, d, strict=True)]
     return episodes, (x[0].shape[1], u[0].shape[1], d[0].shape[1])
 

@@ -17,9 +17,23 @@ SURE = 5.0
 
 
 def operating_point(
-    found: Regression, sizes: tuple[int, int, int], given: Sequence[Array | None]
+    found: Regression,
+    sizes: tuple[int, int, int],
+    given: Sequence[Array | None],
+    delays: Sequence[int] = (),
 ) -> Array:
-    """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant."""
+    """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant.
+
+    Parameters
+    ----------
+    found, sizes : Regression, and (n, m, d)
+        The fit.
+    given : sequence of ndarray, shapes (n,), (m,) and (d,)
+        What is known of the point, None where nothing is.
+    delays : sequence of int, length m
+        So many of the last states are each input on its way: at rest these are the inputs, however
+        far from the data.
+    """
     n, m, _ = sizes
     means = zip(given, np.split(found.center, [n, n + m]), strict=True)
     start = np.concatenate([mean if value is None else value for value, mean in means])
@@ -41,6 +55,11 @@ def operating_point(
         way = _way(free @ moves[:, inputs], free @ drift, errors)
         start[inputs] += scale[inputs] * way
         drift = drift + moves[:, inputs] @ way
+    if any(delays):
+        states = slice(0, n - sum(delays))
+        start[states.stop : n] = np.repeat(start[inputs], delays)
+        drift = ((found.predict(start[None])[0] - start[:n]) / scale[:n])[states]
+        moves, doubt = moves[states], doubt[states]
     start[states] += scale[states] * _way(moves[:, states], drift, doubt[:, states])
     return start
 

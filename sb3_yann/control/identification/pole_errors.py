@@ -15,10 +15,11 @@ NORMAL = 1.96  # standard deviations on either side that hold 95 %
 def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
     """Return the poles (n,), largest first, and their standard errors, inf of repeated poles.
 
-    To first order a pole moves by ``y' dA x / y'x`` with its left and right eigenvectors.
+    To first order a pole moves by ``y' dA x / y'x`` with its left and right eigenvectors. States
+    after the first n are inputs on their way: they move none of these poles.
     """
-    values, left, right = linalg.eig(found.coefficients[:, :n], left=True, right=True)
-    rows = np.real(np.sum(left.conj() * (found.covariance @ left), axis=0))
+    values, left, right = linalg.eig(found.coefficients[:n, :n], left=True, right=True)
+    rows = np.real(np.sum(left.conj() * (found.covariance[:n, :n] @ left), axis=0))
     columns = np.real(np.sum(right.conj() * (found.correlation[:n, :n] @ right), axis=0))
     overlap = np.abs(np.sum(left.conj() * right, axis=0))
     size = np.sqrt(np.maximum(rows * columns, 0.0))

@@ -22,6 +22,7 @@ def quality_notes(
     tested: list[Episode],
     fits: tuple[Array, Array],
     ridge: float,
+    memory: int = 0,
 ) -> list[str]:
     """Return notes on residuals, fit, excitation, bias and poles.
 
@@ -29,12 +30,15 @@ def quality_notes(
     ----------
     found, fitted, tested : Regression and lists of Episode
         The fit, what it was fitted to, and what was held out.
-    fits, ridge : pair of ndarray (n,), and float
-        The fits one and more steps ahead in percent, and the penalty.
+    fits, ridge, memory : pair of ndarray (n,), float and int
+        The fits one and more steps ahead in percent, the penalty, and how many of the last states
+        are inputs on their way, of which nothing is in doubt.
     """
+    n = found.reached.size - memory
+    fits = fits[0][:n], fits[1][:n]
     notes = [
         f"Fitted to {found.steps} steps; one step differs from the prediction by "
-        f"{listed(np.sqrt(np.diag(found.covariance)))} (standard deviation of each state)."
+        f"{listed(np.sqrt(np.diag(found.covariance))[:n])} (standard deviation of each state)."
     ]
     if tested:
         notes.append(_words_for(fits, sum(map(len, tested))))
@@ -45,13 +49,14 @@ def quality_notes(
         )
     if ridge > 0:
         notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
-    return [*notes, *_residual_notes(found, fitted), pole_note(found, found.reached.size)]
+    return [*notes, *_residual_notes(found, fitted, n), pole_note(found, n)]
 
 
-def _residual_notes(found: Regression, fitted: list[Episode]) -> list[str]:
+def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[str]:
     """Return notes on what the residuals hold beside white noise: curvature, or colour."""
     share, rest = bent(found, fitted)
-    colored = np.abs(found.autocorrelation) > 3 / np.sqrt(found.steps)
+    share, own = share[:n], found.autocorrelation[:n]
+    colored = np.abs(own) > 3 / np.sqrt(found.steps)
     notes = []
     if np.any(share > 0):
         notes.append(
@@ -60,12 +65,12 @@ def _residual_notes(found: Regression, fitted: list[Episode]) -> list[str]:
             "the operating point, or learn what is missing (PlantTwin)."
         )
         # What curvature explains is no noise.
-        colored &= np.abs(neighbors(rest, fitted)) > 3 / np.sqrt(found.steps)
+        colored &= np.abs(neighbors(rest, fitted)[:n]) > 3 / np.sqrt(found.steps)
         # Where it explains much, what it leaves is curvature of higher order.
         colored &= share < MUCH
     if np.any(colored):
         notes.append(
-            f"The residuals of neighboring steps are correlated ({listed(found.autocorrelation)}): "
+            f"The residuals of neighboring steps are correlated ({listed(own)}): "
             "there is sensor noise, which biases A towards zero, or an unmodeled state. The "
             "standard errors do not tell that."
         )

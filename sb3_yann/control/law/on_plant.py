@@ -89,7 +89,13 @@ class OnPlant(ReadOnlyArrays):
                 "LinearMPC.explicit() or online(), or add the point yourself: "
                 "u_ss + law(shown - theta_ss)."
             )
-        return np.asarray(self(to_float("shown", shown) - self.theta_ss) + self.model.u_ss)
+        values = to_float("shown", shown)
+        if values.shape[-1:] != self.theta_ss.shape:
+            size = len(self.theta_ss)
+            raise ValueError(
+                f"shown has shape {values.shape}, expected ({size},) or (batch, {size})."
+            )
+        return np.asarray(self(values - self.theta_ss) + self.model.u_ss)
 
     def plot(self, axes: Axes | None = None, **options: Any) -> Axes:
         """Draw the regions by :func:`~sb3_yann.control.law.plot.plot_regions`; return the axes.

@@ -109,3 +109,50 @@ def short_repr(model: Any) -> str:
     sizes = f"states={states}, inputs={inputs}, disturbances={model.n_disturbances}"
     point = f"x_ss={model.x_ss.tolist()}, u_ss={model.u_ss.tolist()}"
     return f"{type(model).__name__}({sizes}, dt={model.dt:g}, {point})"
+
+
+def past_inputs(model: LinearSystem) -> list[tuple[int, str]]:
+    """Return the number of the input, and the lag as in ``(k-1)``, of each last state named so.
+
+    Examples
+    --------
+    >>> from sb3_yann.control import LinearModel
+    >>> past_inputs(LinearModel([[1, 1], [0, 0]], [[0], [1]], 1, state_names=["T", "u[0](k-1)"]))
+    [(0, '(k-1)')]
+    """
+    inputs, found = labels_of(model)[1], list[tuple[int, str]]()
+    for label in reversed(model.state_names):
+        name, lag, rest = label.partition("(k-")
+        if name not in inputs or not rest.removesuffix(")").isdigit():
+            break
+        found.insert(0, (inputs.index(name), lag + rest))
+    return found
+
+
+def completed(
+    model: LinearSystem,
+    past: Sequence[tuple[int, str]],
+    state_names: Sequence[str],
+    input_names: Sequence[str],
+    units: Units,
+) -> tuple[Sequence[str], Units]:
+    """Return names of states and units with those of inputs on their way, where they are left out.
+
+    Parameters
+    ----------
+    model : LinearModel
+        With dead time.
+    past : sequence of (int, str)
+        Its last states: numbers of inputs, and lags.
+    state_names, input_names, units : sequence of str, units a mapping too
+        As they are given: of all states, or of all but these.
+    """
+    own, m = model.n_states - len(past), model.n_inputs
+    named = len(input_names) == m
+    if not isinstance(state_names, str) and len(state_names) == own and own:
+        inputs = list(input_names) if named else labels_of(model)[1]
+        state_names = [*state_names, *(inputs[j] + lag for j, lag in past)]
+    if not isinstance(units, str | Mapping) and len(units) == own + m:
+        of_inputs = list(units[own:])
+        units = [*units[:own], *(of_inputs[j] for j, _ in past), *of_inputs]
+    return state_names, units

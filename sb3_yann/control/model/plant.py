@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import LinearSystem
-from sb3_yann.control.model.labels import Units, short_repr
+from sb3_yann.control.model.labels import Units, completed, past_inputs, short_repr
 from sb3_yann.control.model.report import describe
 from sb3_yann.control.model.statespace import to_control
 
@@ -32,7 +32,13 @@ class Plant(LinearSystem):
         input_names: Sequence[str] = (),
         units: Units = (),
     ) -> Self:
-        """Return the model with names and units; notes and drift stay."""
+        """Return the model with names and units; notes and drift stay.
+
+        Inputs on their way, the last states of a model with dead time, are named after the inputs
+        where names and units are given of the others only.
+        """
+        if past := past_inputs(self):
+            state_names, units = completed(self, past, state_names, input_names, units)
         given = {"state_names": state_names, "input_names": input_names, "units": units}
         return type(self)(**{**vars(self), **given})
 

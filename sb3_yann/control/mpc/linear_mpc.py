@@ -157,7 +157,9 @@ class LinearMPC(MPCProblem):
         theta = arguments.theta_box(layout, given.theta, fallback, rest)
         states = theta[0][:n], theta[1][:n]
         if not layout.has_constants:  # otherwise there are other places to rest
-            arguments.warn_of_no_rest(*u)
+            arguments.warn_of_no_rest(*u, model.u_ss, absolute)
+            if absolute:
+                arguments.warn_of_no_room(model, *states)
         arguments.warn_of_unused_softness(soft.x, x, states)
         arguments.warn_of_drift(model, *states)
         checked = (

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, ReadOnlyArrays
+from sb3_yann._validation import Array, ReadOnlyArrays, half_widths
 from sb3_yann.control.mpc.problem import MPCProblem
 
 NEAR = 0.5
@@ -44,16 +44,31 @@ class InputUnits(ReadOnlyArrays):
         low, high : ndarray, shape (m,)
             The env's.
         """
-        u_min, u_max, u_ss = problem.u_min, problem.u_max, problem.model.u_ss
+        return cls.between(problem.u_min, problem.u_max, problem.model.u_ss, low, high)
+
+    @classmethod
+    def between(
+        cls, u_min: Array, u_max: Array, u_ss: Array, low: NDArray[Any], high: NDArray[Any]
+    ) -> InputUnits | None:
+        """Return the same as :meth:`of`.
+
+        Parameters
+        ----------
+        u_min, u_max, u_ss : ndarray, shape (m,)
+            Bounds in deviations, and what these count from.
+        low, high : ndarray, shape (m,)
+            The env's.
+        """
+        u_half = half_widths(u_min, u_max)
         bounds, one = np.array([u_min, u_max]), np.ones_like(u_ss)
         given = np.array([low, high], np.float64)
         if given.shape != bounds.shape:
             return None
         kinds = {"deviation": (one, 0 * one), "absolute": (one, u_ss)}
         if np.all(np.isfinite(bounds)):
-            kinds["normalized"] = (1 / problem.u_half, -(u_max + u_min) / 2 / problem.u_half)
+            kinds["normalized"] = (1 / u_half, -(u_max + u_min) / 2 / u_half)
         finite = np.where(np.isfinite(bounds), np.abs(bounds), 0).max(0)
-        size = np.where(np.isfinite(problem.u_half), problem.u_half, finite)
+        size = np.where(np.isfinite(u_half), u_half, finite)
         digits = np.finfo(low.dtype).eps if np.issubdtype(low.dtype, np.floating) else 0.0
         for kind, (scale, shift) in kinds.items():
             wanted, room = scale * bounds + shift, 2e-6 * scale * size + digits * np.abs(given)

@@ -64,6 +64,36 @@ def test_a_given_steady_state_is_completed_by_the_inputs_that_rest_there() -> No
         identify(x, u, dt=1, delay=1, x_ss=[0, 0])
 
 
+def test_inputs_on_their_way_rest_where_a_given_input_does_however_far_from_the_data() -> None:
+    x, u = late((2, 3), 0.0)
+    for far in (1.5, 40.0):
+        model = LinearModel.from_data(x, u, dt=1, delay=[2, 3], u_ss=[far, -far])
+        np.testing.assert_array_equal(model.x_ss[2:], np.repeat([far, -far], [2, 3]))
+    near = LinearModel.from_data(x, u, dt=1, delay=[2, 3], u_ss=[0.5, 0.2])
+    rest = near.x_ss[:2]
+    np.testing.assert_allclose(A @ rest + B @ near.u_ss, rest, atol=1e-6)
+
+
+def test_what_is_certain_of_the_memory_is_left_out_of_the_notes() -> None:
+    report = LinearModel.from_data(*late((2, 3), 0.02), dt=1, delay=[2, 3]).report()
+    told = next(each for each in report.splitlines() if "95 % confidence" in each)
+    assert told.count("within") == 2 and "unstable" not in told and "hardly" not in told
+    assert "held out, 100 % is perfect: 9" in report and "100, 100" not in report
+
+
+def test_names_of_the_inputs_on_their_way_follow_from_those_of_the_inputs() -> None:
+    model = LinearModel.from_data(*late((2, 0), 0.02), dt=1, delay=[2, 0])
+    named = model.named(["T", "h"], ["w", "v"], ["K", "m", "kg/s", "V"])
+    assert named.state_names == ("T", "h", "w(k-1)", "w(k-2)")
+    assert named.units == ("K", "m", "kg/s", "kg/s", "kg/s", "V")
+    assert named.named(["a", "b"], ["c", "d"]).state_names == ("a", "b", "c(k-1)", "c(k-2)")
+    whole = named.named(["a", "b", "c", "d"], ["e", "f"], {"a": "K"})
+    assert whole.state_names == ("a", "b", "c", "d") and whole.units[0] == "K"
+    assert model.named(["T", "h"]).state_names == ("T", "h", "u[0](k-1)", "u[0](k-2)")
+    with pytest.raises(ValueError, match="must be 4 different names"):
+        model.named(["a", "b", "c"])
+
+
 def test_a_law_with_dead_time_is_better_than_one_that_ignores_it() -> None:
     x, u = late((2, 0), 0.01)
     weights = {"Q": np.eye(2), "R": np.eye(2), "horizon": 2, "u_min": -1, "u_max": 1}

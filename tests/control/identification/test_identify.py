@@ -320,6 +320,7 @@ BAD_DATA: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"states": [X, X[:, :1]], "actions": [U, U]}, ValueError, r"shape \(401, 1\), expected"),
     ({"states": X[:1], "actions": U[:0]}, ValueError, "actions of episode 0 has 0 rows"),
     ({"states": X[:5], "actions": U[:4]}, ValueError, "3 steps to fit 4 parameters"),
+    ({"states": X.T, "actions": U[:, :1].T}, ValueError, r"\(2, 401\) .* one step .* transpose"),
     ({"disturbances": U[:-1]}, ValueError, "disturbances of episode 0 has 399 rows"),
     ({"held_out": 1.0}, ValueError, r"held_out = 1\.0 must lie in \[0, 1\)"),
     ({"ridge": -1}, ValueError, "ridge = -1 must be a finite number of at least 0"),

@@ -94,3 +94,40 @@ def test_a_problem_shows_its_bounds_as_they_were_given() -> None:
 def test_absolute_is_a_flag() -> None:
     with pytest.raises(TypeError, match="absolute = 1 must be True or False"):
         LinearMPC(MODEL, Q=np.eye(2), R=[[1]], horizon=2, absolute=1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("absolute", "low", "high", "message"),
+    [
+        (True, 4, 10, r"u_min = 4 and u_max = 10 leave out u\[0\] = 3, .*Linearize where"),
+        (False, 4, 10, r"u_min = 4 and u_max = 10 leave out u\[0\] = 0, .*absolute=True"),
+    ],
+)
+def test_an_input_that_cannot_rest_is_told_in_the_units_that_were_given(
+    absolute: bool, low: float, high: float, message: str
+) -> None:
+    tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
+    box = {"theta_min": -20, "theta_max": 20, "u_min": low, "u_max": high}
+    with pytest.warns(UserWarning, match=message):
+        LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, absolute=absolute, **box)
+
+
+def test_a_box_that_leaves_out_the_operating_point_is_told() -> None:
+    tanks = LinearModel(
+        np.eye(2) / 2, [[1], [1]], 1, x_ss=[12, 1], u_ss=[3], state_names=["h", "c"]
+    )
+    given = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 0, "u_max": 9, "absolute": True}
+    with pytest.warns(UserWarning) as told:
+        LinearMPC(tanks, x_min=[0, 5], x_max=[3, 20], **given)  # swapped
+    assert [str(each.message)[:60] for each in told] == [
+        "h = 12, the operating point, lies outside its bounds, 0 to 3",
+        "c = 1, the operating point, lies outside its bounds, 5 to 20",
+    ]
+
+
+def test_an_absolute_column_is_not_taken_for_a_batch() -> None:
+    tanks = LinearModel(np.eye(2) / 2, [[1], [1]], 1, x_ss=[12, 1], u_ss=[3])
+    given = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 0, "u_max": 9, "absolute": True}
+    law = LinearMPC(tanks, x_min=[0, 0], x_max=[20, 3], **given).online()
+    with pytest.raises(ValueError, match=r"shown has shape \(2, 1\), expected \(2,\) or"):
+        law.plant_input([[12.0], [1.0]])
