@@ -70,6 +70,20 @@ class Improvement:
         last = self.checks[-1].reason or f"{gain} in the twin is too small, or not sure"
         return f"Nothing better was found: {last}."
 
+    def report(self) -> str:
+        """Return in words what was accepted, or why nothing was, and how many checks it took."""
+        taken = f"{len(self.checks)} checks, {sum(each.accepted for each in self.checks)} accepted."
+        if not self.accepted:
+            return f"{self.reason} The model is as it was. {taken}"
+        last = next((each for each in reversed(self.checks) if each.accepted), None)
+        said = f"Accepted: {100 * self.change:+.2f} % of the mean cost in the twin"
+        if last is not None:
+            said += f", {100 * last.logged:+.2f} % (± {100 * last.error:.2f}) on episodes like the"
+            said += f" log's, {100 * last.worst:+.2f} % from the worst start"
+        return f"{said}. {taken}"
+
+    __str__ = report
+
 
 def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     model: OffPolicyAlgorithm,

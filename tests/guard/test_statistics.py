@@ -370,3 +370,6 @@ def test_the_worst_of_many_starts_stand_for_all_of_them() -> None:
     found, errors = np.transpose([tail_average(each, 0.05, 1000) for each in draws])
     assert found.mean() == pytest.approx(stats.norm.pdf(stats.norm.isf(0.05)) / 0.05, abs=0.02)
     assert errors.mean() == pytest.approx(found.std(), rel=0.15)
+    assert tail_average(10 * draws[0], 0.05, 1000)[1] == pytest.approx(10 * errors[0])
+    two, n = np.array([3.0, 1.0] + 18 * [0.0]), 20  # beyond the level, 1, is 2 with p = 1/20
+    assert tail_average(two, 0.1, n)[1] == pytest.approx(2 * np.sqrt(0.05 * 0.95 * n) / 2)
