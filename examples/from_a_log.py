@@ -63,7 +63,7 @@ def main() -> None:
     model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": problem}, device="cpu")
     found = improve(model, twin, progress_bar=True)
     model.save(OUT / "from_a_log")
-    print(f"\nIn the twin the policy costs {100 * found.change:+.2f} % against the MPC.")
+    print(f"\n{found}")
     ours = evaluate(model, "CSTR-v0", TESTS)
     mpc = evaluate(problem.explicit(), "CSTR-v0", TESTS)
     changes = 100 * (ours.costs - mpc.costs) / mpc.costs.mean()

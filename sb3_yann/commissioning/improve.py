@@ -72,7 +72,8 @@ class Improvement:
 
     def report(self) -> str:
         """Return in words what was accepted, or why nothing was, and how many checks it took."""
-        taken = f"{len(self.checks)} checks, {sum(each.accepted for each in self.checks)} accepted."
+        passed = sum(each.accepted for each in self.checks)
+        taken = f"{passed} of {len(self.checks)} checks passed."
         if not self.accepted:
             return f"{self.reason} The model is as it was. {taken}"
         last = next((each for each in reversed(self.checks) if each.accepted), None)

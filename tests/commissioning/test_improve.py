@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import NoActionNoise, PlantTwin, UntrustedTwinError, YannPolicy, improve
+from sb3_yann.commissioning import Improvement
 from sb3_yann.commissioning.grounds import Grounds
 from sb3_yann.commissioning.search import Pace, Search
 from sb3_yann.commissioning.trial import Check
@@ -51,6 +52,24 @@ def test_on_the_reactor_five_episodes_are_enough_and_the_model_goes_on(tmp_path)
     theta = np.float32([0.01, 0.1, -0.1, 1.0])
     np.testing.assert_array_equal(again.predict(theta)[0], model.predict(theta)[0])
     again.learn(20, callback=NoActionNoise())
+
+
+def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
+    passed = Check(20, True, "", -0.021, 0.0004, True, -0.015, 0.003)
+    refused = Check(40, False, "2 starts with violations", -0.03, 0.0, False)
+    found = Improvement((passed, refused), -0.021, accepted=True)
+    assert (
+        str(found)
+        == found.report()
+        == (
+            "Accepted: -2.10 % of the mean cost in the twin, -1.50 % (± 0.30) on episodes like the "
+            "log's, +0.04 % from the worst start. 1 of 2 checks passed."
+        )
+    )
+    assert Improvement((refused,), 0.0, accepted=False).report() == (
+        "Nothing better was found: 2 starts with violations. The model is as it was. "
+        "0 of 1 checks passed."
+    )
 
 
 def problem_law(env_id: str):

@@ -9,7 +9,7 @@ from sb3_yann.control.polyhedra import facets, farthest_point, farthest_points, 
 
 TRIANGLE = np.array([[-1.0, 0.0], [0.0, -1.0], [0.6, 0.8]])
 ROOM = np.array([0.0, 0.0, 2.4])
-"""x, y >= 0 and 3 x + 4 y <= 12: the corners are (0, 0), (4, 0) and (0, 3), the inner circle has 1."""
+"""x, y >= 0 and 3 x + 4 y <= 12: corners at (0, 0), (4, 0) and (0, 3); the inner circle has 1."""
 LENGTHS = np.array([[1.0, 1.0, 1.0], [5.0, 1e-3, 40.0]])
 
 
