@@ -48,6 +48,7 @@ def as_episodes(
     previous: Sequence[ArrayLike] | None = None,
     *,
     observed: bool = False,
+    absolute: bool = False,
 ) -> tuple[Episode, ...]:
     """Return episodes as the problem sees them.
 
@@ -63,6 +64,8 @@ def as_episodes(
         The input before each episode; zero by default.
     observed : bool, default False
         Whether an observer estimates the disturbances: they are NaN where none are given.
+    absolute : bool, default False
+        Whether all of it is in absolute values, off which the operating point is taken.
 
     Raises
     ------
@@ -70,12 +73,14 @@ def as_episodes(
         For no episodes, wrong shapes, entries that are not finite, inputs beyond their bounds.
     """
     layout, pairs = problem.layout, _pairs(episodes)
+    point = problem.theta_ss if absolute else np.zeros(layout.size)
+    u_ss = problem.model.u_ss if absolute else np.zeros(problem.model.n_inputs)
     given = {"references": references, "disturbances": disturbances, "previous": previous}
     for name, values in given.items():
         _one_for_each(name, values, len(pairs))
     found = []
     for i, (states, actions) in enumerate(pairs):
-        u = _actions(problem, i, actions)
+        u = _actions(problem, i, actions, u_ss)
         x = _finite(f"episode {i}: states", states)
         if x.ndim == 1:
             x = x[:, None]
@@ -96,7 +101,8 @@ def as_episodes(
         beside = [name for name, each in given.items() if each is not None]
         if whole and beside:
             raise ValueError(f"{beside} is given, but states are all of theta: leave it out.")
-        found.append(Episode(x if whole else _theta(problem, i, x, u, own, observed), u))
+        x = x - point[: x.shape[1]]
+        found.append(Episode(x if whole else _theta(problem, i, x, u, own, observed, point), u))
     return tuple(found)
 
 
@@ -159,26 +165,34 @@ def _finite(name: str, values: ArrayLike) -> Array:
     return array
 
 
-def _actions(problem: LinearMPC, i: int, actions: ArrayLike) -> Array:
+def _actions(problem: LinearMPC, i: int, actions: ArrayLike, u_ss: Array) -> Array:
     u = _finite(f"episode {i}: actions", actions)
     u = u[:, None] if u.ndim == 1 else u
     m = problem.model.n_inputs
     if u.ndim != 2 or u.shape[1] != m:
         raise ValueError(f"episode {i}: actions have shape {u.shape}, expected (T, {m}).")
+    u = u - u_ss
     room = 1e-3 * problem.u_half
     beyond = (u < problem.u_min - room) | (u > problem.u_max + room)
     if beyond.any():
         row, k = np.argwhere(beyond)[0]
+        low, high, value = (each[k] + u_ss[k] for each in (problem.u_min, problem.u_max, u[row]))
         raise ValueError(
-            f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds "
-            f"{problem.u_min[k]:g} and {problem.u_max[k]:g} of the problem. Are these deviations "
-            "from the operating point, in the problem's units?"
+            f"episode {i}: action {k} is {value:g} in row {row}, beyond the bounds {low:g} and "
+            f"{high:g} of the problem. Are these in the problem's units? A log of absolute values "
+            "needs absolute=True."
         )
     return np.clip(u, problem.u_min, problem.u_max)
 
 
 def _theta(
-    problem: LinearMPC, i: int, x: Array, u: Array, given: dict[str, Any], observed: bool
+    problem: LinearMPC,
+    i: int,
+    x: Array,
+    u: Array,
+    given: dict[str, Any],
+    observed: bool,
+    point: Array,
 ) -> Array:
     layout = problem.layout
     theta = np.zeros((len(x), layout.size))
@@ -202,14 +216,14 @@ def _theta(
             raise ValueError(
                 f"episode {i}: {name} have shape {values.shape}, expected ({len(x)}, {size})."
             )
-        theta[:, part] = values
+        theta[:, part] = values - point[part]
     if layout.n_previous:
-        first = np.zeros(u.shape[1])
+        first = point[layout.previous].copy()
         if given["previous"] is not None:
             first = np.atleast_1d(_finite(f"episode {i}: previous", [given["previous"]])[0])
         if first.shape != (u.shape[1],):
             raise ValueError(
                 f"episode {i}: previous has shape {first.shape}, expected ({u.shape[1]},)."
             )
-        theta[:, layout.previous] = np.vstack([first, u])
+        theta[:, layout.previous] = np.vstack([first - point[layout.previous], u])
     return theta

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import as_whole
+from sb3_yann._validation import as_flag, as_whole
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.env import TwinEnv
@@ -111,6 +111,7 @@ class PlantTwin:
         residuals: Sequence[str | Callable[[], Any]] = KINDS,
         n_members: int = 5,
         seed: int = 0,
+        absolute: bool = False,
     ) -> PlantTwin:
         """Return the twin of a plant that was logged.
 
@@ -139,6 +140,9 @@ class PlantTwin:
             The first is fitted to all episodes, the others to as many drawn from them.
         seed : int, default 0
             Of the draws of episodes, and of the weights that networks start from.
+        absolute : bool, default False
+            Whether the log holds absolute values, as the plant shows them: the operating point is
+            taken off states, references and inputs. The twin itself is in deviations.
 
         Raises
         ------
@@ -149,8 +153,10 @@ class PlantTwin:
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
         as_whole("n_members", n_members)
         as_whole("seed", seed, 0)
+        as_flag("absolute", absolute)
         row, given = RowLayout(problem, observer), (references, disturbances, previous)
-        log = as_episodes(problem, episodes, *given, observed=observer is not None)
+        found = observer is not None
+        log = as_episodes(problem, episodes, *given, observed=found, absolute=absolute)
         notes: tuple[str, ...] = ()
         if time is not None:
             log, notes = cut_at_gaps(log, time, problem.model.dt)

@@ -262,7 +262,10 @@ def judge(
             f"{100 * beyond[0]:.3g} % of the logged {beyond[1]} lie beyond the problem's box of "
             "theta."
         )
-        advice.append("Compare units and operating point of the log and the model.")
+        advice.append(
+            "Compare units and operating point of the log and the model; an absolute log needs "
+            "absolute=True."
+        )
     error = relative_error(*costs)
     if n_episodes > 1 and not error <= COST_ERROR:
         problems.append(
