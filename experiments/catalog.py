@@ -33,6 +33,7 @@ from sb3_yann import (
     LinearMPC,
     NoActionNoise,
     PlantTwin,
+    SimulatedEpisodes,
     YannPolicy,
     offset_free,
 )
@@ -157,6 +158,8 @@ def yann(  # noqa: PLR0913 (what the variants vary)
     tau: float = 0.005,
     critic: Any = "afterstate",
     defaults: bool = False,
+    n_steps: int = 1,
+    simulated: bool = False,
     **policy_kwargs: Any,
 ) -> Learner:
     """Return a YANN learner, with the plant's settings; None as guard trains without one.
@@ -176,6 +179,7 @@ def yann(  # noqa: PLR0913 (what the variants vary)
         env,
         gamma=gamma,
         tau=tau,
+        n_steps=n_steps,
         gradient_steps=gradient_steps or plant.gradient_steps,
         seed=seed,
         device="cpu",
@@ -189,6 +193,8 @@ def yann(  # noqa: PLR0913 (what the variants vary)
         **({"target_policy_noise": 0.0} if algorithm is TD3 else {}),
     )
     callbacks: list[BaseCallback] = [NoActionNoise()]
+    if simulated:
+        callbacks.append(SimulatedEpisodes(lambda: plant.taught(gym.make(plant.env_id))))
     if noise:
         m = env.action_space.shape[0]
         model.action_noise = NormalActionNoise(np.zeros(m), np.full(m, noise))
@@ -219,11 +225,12 @@ CHANGES: dict[str, dict[str, Any]] = {
     "nearest outside": {"infeasible": "nearest_region"},
     "one network": {"networks": "shared"},
     "no settings": {"defaults": True, "tau": 0.02},
-    "one set": {
+    "a simulator explored": {
         "defaults": True,
+        "tau": 0.02,
+        "n_steps": 10,
         "gradient_steps": 4,
-        "critic_warmup": 4000,
-        "guard": {"n_starts": 400, "patience": 10, "keep_if_worse": True},
+        "simulated": True,
     },
     "no settings, one network": {"defaults": True, "tau": 0.02, "networks": "shared"},
     "no settings, from the MPC with observer": {"defaults": True, "tau": 0.02},
@@ -281,7 +288,7 @@ def _runs() -> list[Run]:
     add(reactor, [OURS, "residual RL"], ten)
     add(reactor, [f"{OURS}, two gradient steps", f"{OURS}, target rate 0.02"], ten)
     for plant in (reactor, pendulum, printed):
-        add(plant, [f"{OURS}, no settings", f"{OURS}, one set"], ten)
+        add(plant, [f"{OURS}, no settings", f"{OURS}, a simulator explored"], ten)
     add(reactor, ["DDPG"], five)
     add(reactor, [OURS], long, episodes=200)
     add(reactor, ["DDPG"], range(50, 55), episodes=200)

@@ -38,6 +38,7 @@ _NAMES = {
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "
     "YannPolicy register_problem",
     "sb3_yann.reporting": "report",
+    "sb3_yann.simulated_episodes": "SimulatedEpisodes",
     "sb3_yann.twin": "PlantTwin UntrustedTwinError",
     "sb3_yann_envs": "ActionRepeat",
 }

@@ -54,6 +54,8 @@ class FiniteRows:
         parts = (obs, next_obs, action, reward)
         total = sum(float(np.vdot(part, part)) for part in parts)
         if total < LARGE or not (found := _not_finite(buffer, parts)):  # nor is NaN below it
+            if (simulated := vars(buffer).get("simulated")) is not None:
+                simulated[buffer.pos] = False
             type(buffer).add(buffer, obs, next_obs, action, reward, done, infos)
             return
         self.left_out += 1

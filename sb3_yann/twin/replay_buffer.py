@@ -33,6 +33,8 @@ def normalization_of(model: Any) -> Any:
 def episodes_of(model: Any) -> list[tuple[Array, Array]]:
     """Return the episodes (thetas, actions) that a model's replay buffer holds, whole or in part.
 
+    Those of a simulator are left out.
+
     Raises
     ------
     TypeError, ValueError
@@ -65,10 +67,12 @@ def episodes_of(model: Any) -> list[tuple[Array, Array]]:
         ends = buffer.dones[order, env].astype(bool)
         same = np.all(now[1:] == after[:-1], axis=tuple(range(1, now.ndim)))
         ends[:-1] |= ~same
+        simulated = vars(buffer).get("simulated")
+        other = np.zeros(len(order), bool) if simulated is None else simulated[order, env]
         begin = 0
         for end in [*np.flatnonzero(ends), len(order) - 1]:
             rows = slice(begin, end + 1)
-            if end + 1 - begin >= SHORTEST:
+            if end + 1 - begin >= SHORTEST and not other[rows].any():
                 thetas = np.concatenate([theta(now[rows]), theta(after[end : end + 1])])
                 found.append((thetas, u[rows]))
             begin = end + 1

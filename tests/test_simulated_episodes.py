@@ -1,0 +1,239 @@
+"""Episodes of a simulator join the replay buffer, and nothing else changes."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from guard_samples import MPC, STEPS, Slide, build
+from sb3_yann import NoActionNoise, PlantTwin, SimulatedEpisodes
+from sb3_yann.policy import AffineObservation
+from sb3_yann.twin.replay_buffer import episodes_of
+
+FEW = {"per_episode": 3}
+
+
+class Ends(Slide):
+    """Terminates after two steps from some of its starts."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, self.low_start and self.t == 2, truncated, info
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed, options=options)
+        self.low_start = self.x[0] < 0
+        return observation, info
+
+
+def learnt(model, steps: int, *callbacks):
+    return model.learn(steps, callback=[NoActionNoise(), *callbacks], reset_num_timesteps=False)
+
+
+def rows(model) -> slice:
+    return slice(0, model.replay_buffer.size())
+
+
+def test_the_plant_meets_the_policy_alone_and_the_buffer_holds_both_in_whole_episodes() -> None:
+    model = build(learning_rate=0.0)
+    learnt(model, 2 * STEPS + 1, SimulatedEpisodes(Slide, **FEW))
+    buffer, whole = model.replay_buffer, 3 * STEPS
+    expected = [True] * whole + [False] * STEPS + [True] * whole + [False] * STEPS + [True] * whole
+    marks = buffer.simulated[: buffer.size(), 0]
+    assert marks.tolist() == [*expected, False]
+    law = MPC.explicit()(buffer.observations[rows(model), 0].astype(float))
+    noise = np.abs(buffer.actions[rows(model), 0] - law)[:, 0]
+    assert noise[~marks].max() < 1e-5 and 0.1 < noise[marks].mean() < 0.5
+    ends = np.flatnonzero(buffer.dones[rows(model), 0])
+    assert ends.tolist() == [STEPS * (k + 1) - 1 for k in range(11)]
+    assert buffer.timeouts[ends, 0].all()  # Slide truncates
+    follows = buffer.next_observations[: ends[-1], 0] == buffer.observations[1 : ends[-1] + 1, 0]
+    assert follows[:, 0].tolist() == [k not in ends for k in range(ends[-1])]
+
+
+def test_what_is_stored_is_what_the_simulator_did() -> None:
+    model = build(learning_rate=0.0)
+    learnt(model, 1, SimulatedEpisodes(Ends, per_episode=8, seed=5))
+    buffer, at = model.replay_buffer, 0
+    for seed in range(5, 13):
+        env = Ends()
+        observation, over = env.reset(seed=seed)[0], False
+        while not over:
+            np.testing.assert_array_equal(buffer.observations[at, 0], observation)
+            action = buffer.actions[at, 0]
+            observation, reward, terminated, truncated, _ = env.step(action)
+            over = terminated or truncated
+            np.testing.assert_array_equal(buffer.next_observations[at, 0], observation)
+            assert buffer.rewards[at, 0] == pytest.approx(reward, rel=1e-6)
+            assert (buffer.dones[at, 0], buffer.timeouts[at, 0]) == (over, truncated)
+            at += 1
+    assert at == buffer.size() - 1 and 0 < sum(buffer.timeouts[:at, 0]) < 8
+
+
+@pytest.mark.parametrize("source", [Slide, "Slide-v0", Slide()], ids=["function", "id", "env"])
+def test_it_is_the_same_whatever_makes_the_simulator_and_draws_no_other_numbers(source) -> None:
+    model, other = build(learning_rate=0.0), build(learning_rate=0.0)
+    learnt(model, STEPS + 1, SimulatedEpisodes(source, **FEW))
+    learnt(other, STEPS + 1, SimulatedEpisodes(Slide, **FEW))
+    for name in ("observations", "actions", "rewards"):
+        ours, theirs = (getattr(each.replay_buffer, name) for each in (model, other))
+        np.testing.assert_array_equal(ours[rows(model)], theirs[rows(model)])
+    plain = learnt(build(learning_rate=0.0), STEPS + 1)
+    own = ~model.replay_buffer.simulated[: model.replay_buffer.size(), 0]
+    np.testing.assert_array_equal(
+        model.replay_buffer.observations[rows(model)][own], plain.replay_buffer.observations[:5]
+    )
+
+
+def test_a_run_that_is_cut_off_goes_on_where_it_was() -> None:
+    simulated = partial(SimulatedEpisodes, Slide, **FEW)
+    whole = learnt(build(), 3 * STEPS, simulated())
+    parts = learnt(build(), STEPS, simulated())
+    assert parts.simulated.due and parts.simulated.episodes == 3
+    learnt(parts, 2 * STEPS, simulated())
+    assert parts.simulated == whole.simulated and whole.simulated.episodes == 9
+    n = whole.replay_buffer.size()
+    assert n == parts.replay_buffer.size() == 3 * STEPS + 9 * STEPS
+    assert (parts.replay_buffer.simulated == whole.replay_buffer.simulated).all()
+
+
+def test_state_and_marks_are_saved(tmp_path) -> None:
+    model = learnt(build(), STEPS + 1, SimulatedEpisodes(Slide, **FEW))
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    again = DDPG.load(tmp_path / "model", env=Slide())
+    again.load_replay_buffer(tmp_path / "buffer")
+    assert again.simulated == model.simulated
+    learnt(again, STEPS + 1, SimulatedEpisodes(Slide, **FEW))
+    assert again.simulated.episodes == 9
+
+
+@pytest.mark.parametrize("n_envs", [2, 4])
+def test_with_several_envs_each_column_holds_whole_episodes_but_for_its_last(n_envs) -> None:
+    model = build(TD3, env=make_vec_env(Slide, n_envs), learning_rate=0.0, n_steps=3)
+    learnt(model, n_envs * (STEPS + 1), SimulatedEpisodes(Ends, per_episode=5))
+    buffer = model.replay_buffer
+    assert model.simulated.episodes == 10
+    for column in range(n_envs):
+        now, after = (
+            each[rows(model), column, 0] for each in (buffer.observations, buffer.next_observations)
+        )
+        breaks = np.flatnonzero(now[1:] != after[:-1])
+        ended = buffer.dones[rows(model), column].astype(bool)
+        ended |= buffer.timeouts[rows(model), column].astype(bool)
+        assert ended[breaks].all()
+
+
+def test_an_episode_of_another_env_that_is_under_way_is_not_bridged() -> None:
+    class Longer(Slide):
+        def step(self, action):
+            observation, reward, *_ , info = super().step(action)
+            return observation, reward, False, self.t == 2 * STEPS, info
+
+    venv = make_vec_env(iter_of(Slide, Longer), 2)
+    model = build(env=venv, learning_rate=0.0, n_steps=3)
+    learnt(model, 2 * (STEPS + 1), SimulatedEpisodes(Slide, per_episode=2))
+    buffer = model.replay_buffer
+    last = int(np.flatnonzero(~buffer.simulated[:, 0])[STEPS - 1])
+    assert buffer.timeouts[last].tolist() == [1, 1] and buffer.dones[last].tolist() == [1, 0]
+
+
+def iter_of(*makers):
+    given = iter(makers)
+    return lambda: next(given)()
+
+
+def test_observations_are_normalized_for_the_policy_and_kept_as_they_are() -> None:
+    venv = VecNormalize(make_vec_env(Slide, 1), training=False, norm_reward=False)
+    venv.obs_rms.mean, venv.obs_rms.var = np.array([1.0]), np.array([4.0])
+    venv.clip_obs = np.inf
+    seen = AffineObservation.from_vec_normalize(venv)
+    model = build(env=venv, actor={"observation": seen}, learning_rate=0.0)
+    learnt(model, 1, SimulatedEpisodes(Slide, per_episode=3, noise=0.0))
+    shown = model.replay_buffer.observations[: 3 * STEPS, 0].astype(float)
+    taken = model.replay_buffer.actions[: 3 * STEPS, 0]
+    np.testing.assert_allclose(taken, MPC.explicit()(shown), atol=1e-5)
+
+
+def test_a_twin_of_the_buffer_is_of_the_plant_alone() -> None:
+    class Long(Slide):
+        def step(self, action):
+            observation, reward, *_, info = super().step(action)
+            return observation, reward, False, self.t == 8, info
+
+    model = build(env=Long(), learning_rate=0.0, buffer_size=60)
+    learnt(model, 17, SimulatedEpisodes(Slide, per_episode=2))
+    assert [len(u) for _, u in episodes_of(model)] == [8, 8]
+    learnt(model, 50)  # rows of the simulator are overwritten
+    assert sum(len(u) for _, u in episodes_of(model)) > 40
+    assert isinstance(PlantTwin.from_buffer(model), PlantTwin)
+
+
+def test_noise_stays_within_the_action_space() -> None:
+    seen: list[np.ndarray] = []
+
+    class Strict(Slide):
+        def step(self, action):
+            assert action in self.action_space
+            seen.append(action)
+            return super().step(action)
+
+    learnt(build(), 1, SimulatedEpisodes(Strict, per_episode=3, noise=5.0))
+    assert len(seen) == 3 * STEPS and np.abs(seen).max() == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"per_episode": 0}, ValueError, "per_episode = 0 must be"),
+        ({"noise": -1}, ValueError, "noise = -1 must be"),
+        ({"noise": np.nan}, ValueError, "noise = nan must be"),
+        ({"seed": -1}, ValueError, "seed = -1 must be"),
+    ],
+)
+def test_bad_settings_are_named(arguments, error, message) -> None:
+    with pytest.raises(error, match=message):
+        SimulatedEpisodes(Slide, **arguments)
+
+
+def test_the_training_env_itself_and_another_plant_are_refused() -> None:
+    env = Slide()
+    with pytest.raises(ValueError, match="The simulator is the training env"):
+        learnt(build(env=env), 1, SimulatedEpisodes(env))
+    with pytest.raises(ValueError, match=r"observations of shape \(4,\).* the training env \(1,\)"):
+        learnt(build(), 1, SimulatedEpisodes("CSTR-v0"))
+    with pytest.raises(TypeError, match="SimulatedEpisodes needs a YannPolicy"):
+        DDPG("MlpPolicy", "CSTR-v0").learn(1, callback=SimulatedEpisodes("CSTR-v0"))
+    with pytest.raises(ValueError, match="optimize_memory_usage=True"):
+        unlike = {"handle_timeout_termination": False}
+        model = build(optimize_memory_usage=True, replay_buffer_kwargs=unlike)
+        learnt(model, 1, SimulatedEpisodes(Slide))
+
+
+def test_its_envs_are_made_once_and_closed() -> None:
+    made: list[Slide] = []
+
+    class Closing(Slide):
+        def __init__(self) -> None:
+            super().__init__()
+            self.open = True
+            made.append(self)
+
+        def close(self) -> None:
+            self.open = False
+
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            assert all(each.open for each in made)
+            return True
+
+    learnt(build(), 2 * STEPS + 1, SimulatedEpisodes(Closing, **FEW), Stop())
+    assert len(made) == 3 and not any(each.open for each in made)
+    assert gym.spaces.utils.flatdim(made[0].action_space) == 1
