@@ -227,10 +227,10 @@ CHANGES: dict[str, dict[str, Any]] = {
     "no settings": {"defaults": True, "tau": 0.02},
     "a simulator explored": {
         "defaults": True,
-        "tau": 0.02,
         "n_steps": 10,
         "gradient_steps": 4,
         "simulated": True,
+        "guard": {"patience": 10, "keep_if_worse": True},
     },
     "no settings, one network": {"defaults": True, "tau": 0.02, "networks": "shared"},
     "no settings, from the MPC with observer": {"defaults": True, "tau": 0.02},
