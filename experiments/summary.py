@@ -9,13 +9,14 @@ from experiments.markdown import number, table
 from experiments.measures import MPC, OPTIMUM, OURS, Row, Standing, plants_of, standing
 from experiments.runner import Outcome, Run
 
-RIVAL, BARE = "DDPG", f"{OURS}, no settings"
+RIVAL, BARE, EXPLORED = "DDPG", f"{OURS}, no settings", f"{OURS}, a simulator explored"
 HEADER = (
     "plant",
     OPTIMUM,
     MPC,
     f"**{OURS}**",
     "no settings",
+    "a simulator explored",
     "worst start",
     "excess cost",
     RIVAL,
@@ -47,8 +48,9 @@ def quote(text: str, readme: Path, first: str = BEGIN, last: str = END) -> bool:
 
 def _cells(at: Standing) -> list[str]:
     """Return the row of a plant; a learner that was not run leaves its cells empty."""
-    optimum, mpc, ours, bare, rival = (
-        at.row(name) if name in at.learners else None for name in (OPTIMUM, MPC, OURS, BARE, RIVAL)
+    names = OPTIMUM, MPC, OURS, BARE, EXPLORED, RIVAL
+    optimum, mpc, ours, bare, explored, rival = (
+        at.row(name) if name in at.learners else None for name in names
     )
     return [
         at.plant,
@@ -56,6 +58,7 @@ def _cells(at: Standing) -> list[str]:
         _mean(mpc),
         f"**{_mean(ours)}**",
         _mean(bare),
+        _mean(explored),
         number(ours.worst, sign="+") if ours else "",
         _excess(ours),
         _mean(rival),
@@ -85,6 +88,8 @@ def _legend(episodes: int, starts: int) -> str:
         f"Mean cost of a test episode after {episodes} training episodes, over {starts} starts "
         "that training and guard never see: the median over the seeds (and the range). "
         f"*No settings*: {OURS} with `tau=0.02` on every plant, all else as it comes. "
+        "*A simulator explored*: one set for every plant, with `SimulatedEpisodes`, in which noise "
+        "harms nobody. "
         f"*Worst start*: the largest cost above the MPC's over all seeds and starts of {OURS}. "
         "*Excess cost*: what all training episodes together cost above the MPC from the same "
         f"starts, median. *Violations* (training episodes beyond a limit) and *seeds* are those of "

@@ -134,7 +134,7 @@ def test_with_several_envs_each_column_holds_whole_episodes_but_for_its_last(n_e
 def test_an_episode_of_another_env_that_is_under_way_is_not_bridged() -> None:
     class Longer(Slide):
         def step(self, action):
-            observation, reward, *_ , info = super().step(action)
+            observation, reward, *_, info = super().step(action)
             return observation, reward, False, self.t == 2 * STEPS, info
 
     venv = make_vec_env(iter_of(Slide, Longer), 2)

@@ -268,13 +268,15 @@ def test_the_command_reports_what_failed(catalog, tmp_path, capsys) -> None:
 
 def test_the_short_table_has_a_row_for_each_plant() -> None:
     bare = {Run("CSTR", "YANN-RL, no settings", 0, 50): learned([92.0, 292.0])}
+    bare[Run("CSTR", "YANN-RL, a simulator explored", 0, 50)] = learned([91.0, 290.0])
     outcomes = {**reactor(), **bare, **pendulum()}
     header, _, *rows, empty, legend = summary(outcomes, 50).splitlines()
-    assert header.startswith("| plant | optimum | MPC | **YANN-RL** | no settings | worst start |")
+    names = "plant | optimum | MPC | **YANN-RL** | no settings | a simulator explored | worst start"
+    assert header.startswith(f"| {names} |")
     assert rows == [
-        "| CSTR | 190.00 | 200.00 | **191.00 (191.00 to 191.00)** | 192.00 | -9.00 | -20 | "
+        "| CSTR | 190.00 | 200.00 | **191.00 (191.00 to 191.00)** | 192.00 | 190.50 | -9.00 | -20 | "
         "300.00 (300.00 to 300.00) | +4,000 | 0 / 30 | 10 / 10 |",
-        "| pendulum, Q = I | 15.00 | 100.50 | **15.50 (15.50 to 15.50)** |  | +0.00 | +0 |  |  | "
+        "| pendulum, Q = I | 15.00 | 100.50 | **15.50 (15.50 to 15.50)** |  |  | +0.00 | +0 |  |  | "
         "0 | 10 |",
     ]
     assert empty == "" and "after 50 training episodes, over 2 starts" in legend
