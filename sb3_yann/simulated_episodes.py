@@ -47,9 +47,9 @@ class SimulatedEpisodes(BaseCallback):
     """Lets the policy learn from episodes of a simulator as well, and explores there alone.
 
     When training begins, and after each training episode, the policy as it is plays episodes in
-    envs of its own, with noise. Their steps join those of the training env in the replay buffer,
-    and make no others of its episodes: the plant meets the policy without noise. What the buffer
-    holds of a simulator, :meth:`PlantTwin.from_buffer` leaves out.
+    envs of its own, with noise and step tests. Their steps join those of the training env in the
+    replay buffer, and none of its episodes changes: the plant meets the policy alone. What the
+    buffer holds of a simulator, :meth:`PlantTwin.from_buffer` leaves out.
 
     A policy that acts without noise sees little but what it does already. Where the way to a better
     one leads through other actions, a simulator shows them without harm. It may differ from the
@@ -62,10 +62,16 @@ class SimulatedEpisodes(BaseCallback):
         episodes. A given env plays its episodes one after the other.
     per_episode : int, default 10
         Episodes in the simulator for each of training.
-    noise : float, default 0.3
-        Standard deviation of normal noise on each action in [-1, 1], drawn anew at each step.
+    step_tests : float, default 0.03
+        Probability that a step test begins at a sample: an action drawn evenly from all of the
+        action space, and held. A law on a bound goes on there whatever noise is added; this moves
+        it away.
+    longest : int, default 15
+        A step test lasts 1 to so many samples, drawn evenly.
+    noise : float, default 0.1
+        Standard deviation of normal noise on each action in [-1, 1] between step tests.
     seed : int, default 2_000_000
-        Of the first episode in the simulator, from which the others count on, and of the noise.
+        Of the first episode in the simulator, from which the others count on, and of what is drawn.
 
     Raises
     ------
@@ -85,13 +91,22 @@ class SimulatedEpisodes(BaseCallback):
     model: OffPolicyAlgorithm
 
     def __init__(
-        self, env: Source, per_episode: int = 10, noise: float = 0.3, seed: int = 2_000_000
+        self,
+        env: Source,
+        per_episode: int = 10,
+        step_tests: float = 0.03,
+        longest: int = 15,
+        noise: float = 0.1,
+        seed: int = 2_000_000,
     ) -> None:
         super().__init__()
         as_whole("per_episode", per_episode)
+        as_between("step_tests", step_tests, 0, 1)
+        as_whole("longest", longest)
         as_between("noise", noise, 0, np.inf)
         as_whole("seed", seed, 0)
-        self.env, self.per_episode, self.noise, self.seed = env, per_episode, float(noise), seed
+        self.env, self.per_episode, self.seed = env, per_episode, seed
+        self.step_tests, self.longest, self.noise = step_tests, longest, noise
         self._envs: list[gym.Env[Any, Any]] = []
 
     @property
@@ -167,15 +182,14 @@ class SimulatedEpisodes(BaseCallback):
         self, envs: Sequence[gym.Env[Any, Any]], seeds: Sequence[int]
     ) -> list[list[_Row]]:
         """Return the rows of one episode in each env."""
-        noise = [np.random.default_rng([self.seed, seed]) for seed in seeds]
+        explore = [_Exploration(self, np.random.default_rng([self.seed, k])) for k in seeds]
         seen = [np.array(env.reset(seed=k)[0]) for env, k in zip(envs, seeds, strict=True)]
         episodes: list[list[_Row]] = [[] for _ in envs]
         running = [*range(len(envs))]
         while running:
             actions = self._actions(np.stack([seen[i] for i in running]))
             for i, action in zip([*running], actions, strict=True):
-                scaled = action + self.noise * noise[i].standard_normal(action.shape)
-                scaled = np.clip(scaled, -1, 1)
+                scaled = explore[i](action)
                 observation, reward, terminated, truncated, _ = envs[i].step(self._taken(scaled))
                 after, over = np.array(observation), bool(terminated or truncated)
                 cut = bool(truncated and not terminated)
@@ -220,6 +234,26 @@ class SimulatedEpisodes(BaseCallback):
             infos = [{"TimeLimit.truncated": bool(each)} for each in cut]
             buffer.add(obs, after, u, reward.astype(np.float32), done, infos)
             marks[at] = True
+
+
+class _Exploration:
+    """What acts in one episode in the place of the policy's actions."""
+
+    def __init__(self, settings: SimulatedEpisodes, rng: np.random.Generator) -> None:
+        self.settings, self.rng = settings, rng
+        self.left = 0  # samples of a step test
+        self.held: Array = np.zeros(0)
+
+    def __call__(self, action: Array) -> Array:
+        """Return an action in [-1, 1], shape (m,)."""
+        if self.left == 0 and self.rng.random() < self.settings.step_tests:
+            self.left = int(self.rng.integers(1, self.settings.longest + 1))
+            self.held = self.rng.uniform(-1, 1, action.shape)
+        if self.left > 0:
+            self.left -= 1
+            return self.held
+        noise = self.settings.noise * self.rng.standard_normal(action.shape)
+        return np.clip(action + noise, -1, 1)
 
 
 @contextmanager

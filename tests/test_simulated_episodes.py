@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from guard_samples import MPC, STEPS, Slide, build
 from sb3_yann import NoActionNoise, PlantTwin, SimulatedEpisodes
 from sb3_yann.policy import AffineObservation
+from sb3_yann.simulated_episodes import _Exploration
 from sb3_yann.twin.replay_buffer import episodes_of
 
 FEW = {"per_episode": 3}
@@ -50,7 +51,7 @@ def test_the_plant_meets_the_policy_alone_and_the_buffer_holds_both_in_whole_epi
     assert marks.tolist() == [*expected, False]
     law = MPC.explicit()(buffer.observations[rows(model), 0].astype(float))
     noise = np.abs(buffer.actions[rows(model), 0] - law)[:, 0]
-    assert noise[~marks].max() < 1e-5 and 0.1 < noise[marks].mean() < 0.5
+    assert noise[~marks].max() < 1e-5 and 0.03 < noise[marks].mean() < 0.3
     ends = np.flatnonzero(buffer.dones[rows(model), 0])
     assert ends.tolist() == [STEPS * (k + 1) - 1 for k in range(11)]
     assert buffer.timeouts[ends, 0].all()  # Slide truncates
@@ -156,7 +157,7 @@ def test_observations_are_normalized_for_the_policy_and_kept_as_they_are() -> No
     venv.clip_obs = np.inf
     seen = AffineObservation.from_vec_normalize(venv)
     model = build(env=venv, actor={"observation": seen}, learning_rate=0.0)
-    learnt(model, 1, SimulatedEpisodes(Slide, per_episode=3, noise=0.0))
+    learnt(model, 1, SimulatedEpisodes(Slide, per_episode=3, noise=0.0, step_tests=0))
     shown = model.replay_buffer.observations[: 3 * STEPS, 0].astype(float)
     taken = model.replay_buffer.actions[: 3 * STEPS, 0]
     np.testing.assert_allclose(taken, MPC.explicit()(shown), atol=1e-5)
@@ -189,10 +190,25 @@ def test_noise_stays_within_the_action_space() -> None:
     assert len(seen) == 3 * STEPS and np.abs(seen).max() == 1
 
 
+def test_step_tests_hold_an_action_from_all_of_the_space_for_one_to_so_many_samples() -> None:
+    rng = np.random.default_rng(0)
+    explore = _Exploration(SimulatedEpisodes(Slide, step_tests=0.1, longest=4, noise=0.01), rng)
+    acted = np.array([explore(np.array([0.9, -0.9])) for _ in range(20_000)])
+    tested = np.abs(acted - [0.9, -0.9]).max(1) > 0.1
+    assert tested.mean() == pytest.approx(2.5 / (2.5 + 9), abs=0.02)  # after 9 of noise
+    held = np.all(acted[1:] == acted[:-1], axis=1)
+    lengths = np.diff(np.flatnonzero(~held))
+    assert set(lengths[lengths > 1]) == {2, 3, 4}
+    assert np.abs(acted[tested].mean(0)).max() < 0.1 and acted[tested].min() < -0.99
+    assert acted[~tested].std(0) == pytest.approx([0.01, 0.01], rel=0.15)
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
         ({"per_episode": 0}, ValueError, "per_episode = 0 must be"),
+        ({"step_tests": 1.5}, ValueError, "step_tests = 1.5 must be"),
+        ({"longest": 0}, ValueError, "longest = 0 must be"),
         ({"noise": -1}, ValueError, "noise = -1 must be"),
         ({"noise": np.nan}, ValueError, "noise = nan must be"),
         ({"seed": -1}, ValueError, "seed = -1 must be"),
