@@ -362,6 +362,14 @@ def test_with_a_tail_a_dear_start_may_cost_more_in_proportion() -> None:
     assert Tolerance(0.2).excess(mpc, mpc + 1.9) == pytest.approx([9.5, 9.5, 9.5])
 
 
+def test_a_start_that_is_too_dear_is_offset_by_the_others_of_the_tail() -> None:
+    rule, excess = Tolerance(1.0, tail=0.05, typical=1.0), np.zeros(40)
+    for second, refused in ((0.4, False), (0.6, True)):  # the mean of the worst two
+        excess[[7, 3]] = 1.5, second
+        assert bool(rule.objection(excess)) == refused
+    assert "the worst 5 % of the starts cost too much, start 7" in rule.objection(excess)
+
+
 def test_the_worst_of_many_starts_stand_for_all_of_them() -> None:
     excess = np.array([3.0, 2.0, 1.0, 0.0])
     assert tail_average(excess, 0.05, 40)[0] == pytest.approx(2.5)  # two of forty
