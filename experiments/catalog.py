@@ -23,7 +23,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from experiments import FINGERPRINT as FINGERPRINT
 from experiments import optimum, pcgym, twin, yardsticks
-from experiments.measures import MPC, OBSERVER, OPTIMUM, OURS, REIDENTIFIED
+from experiments.measures import BARE, EXPLORED, MPC, OBSERVER, OPTIMUM, OURS, REIDENTIFIED
 from experiments.runner import Outcome, Run
 from experiments.yardsticks import Learner
 from sb3_yann import (
@@ -288,7 +288,8 @@ def _runs() -> list[Run]:
     add(reactor, [OURS, "residual RL"], ten)
     add(reactor, [f"{OURS}, two gradient steps", f"{OURS}, target rate 0.02"], ten)
     for plant in (reactor, pendulum, printed):
-        add(plant, [f"{OURS}, no settings", f"{OURS}, a simulator explored"], ten)
+        add(plant, [BARE, EXPLORED], ten)
+    add(true_model, [EXPLORED], three)
     add(reactor, ["DDPG"], five)
     add(reactor, [OURS], long, episodes=200)
     add(reactor, ["DDPG"], range(50, 55), episodes=200)

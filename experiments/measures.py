@@ -13,6 +13,7 @@ from experiments.runner import Outcome, Run
 from sb3_yann._validation import Array
 
 OURS, MPC, OPTIMUM = "YANN-RL", "MPC", "optimum"
+BARE, EXPLORED = f"{OURS}, no settings", f"{OURS}, a simulator explored"
 OBSERVER, REIDENTIFIED = "MPC with observer", "re-identified MPC"
 FIRST = (OPTIMUM, MPC, OBSERVER, REIDENTIFIED, "LQR", OURS)
 HELD = 50.0

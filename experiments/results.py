@@ -101,13 +101,13 @@ def what_was_reached(outcomes: Mapping[Run, Outcome]) -> str:
     found = criteria(outcomes)
     if not found:
         return ""
-    rows = [(line.plant, line.required, line.figure, line.reached) for line in found]
+    rows = [(line.plant, line.learner, line.required, line.figure, line.reached) for line in found]
     return (
         "## What was required, and what was reached\n\n"
         f"After {EPISODES} training episodes; computed from the runs. {SEEDS} seeds are asked for; "
         f"fewer are marked. A start is held if it costs less than {HELD:g}. Means that agree to "
         "0.01 % count as equal.\n\n"
-        + table(("plant", "required", "found", "reached"), rows, texts=4)
+        + table(("plant", "learner", "required", "found", "reached"), rows, texts=5)
     )
 
 

@@ -6,17 +6,27 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from experiments.markdown import number, table
-from experiments.measures import MPC, OPTIMUM, OURS, Row, Standing, plants_of, standing
+from experiments.measures import (
+    BARE,
+    EXPLORED,
+    MPC,
+    OPTIMUM,
+    OURS,
+    Row,
+    Standing,
+    plants_of,
+    standing,
+)
 from experiments.runner import Outcome, Run
 
-RIVAL, BARE, EXPLORED = "DDPG", f"{OURS}, no settings", f"{OURS}, a simulator explored"
+RIVAL = "DDPG"
 HEADER = (
     "plant",
     OPTIMUM,
     MPC,
     f"**{OURS}**",
-    "no settings",
-    "a simulator explored",
+    "no simulator explored",
+    "settings of its own",
     "worst start",
     "excess cost",
     RIVAL,
@@ -48,17 +58,18 @@ def quote(text: str, readme: Path, first: str = BEGIN, last: str = END) -> bool:
 
 def _cells(at: Standing) -> list[str]:
     """Return the row of a plant; a learner that was not run leaves its cells empty."""
-    names = OPTIMUM, MPC, OURS, BARE, EXPLORED, RIVAL
-    optimum, mpc, ours, bare, explored, rival = (
+    names = OPTIMUM, MPC, EXPLORED, BARE, OURS, RIVAL
+    optimum, mpc, explored, bare, own, rival = (
         at.row(name) if name in at.learners else None for name in names
     )
+    ours = explored or own
     return [
         at.plant,
         _mean(optimum),
         _mean(mpc),
-        f"**{_mean(ours)}**",
+        f"**{_mean(explored)}**" if explored else "",
         _mean(bare),
-        _mean(explored),
+        _mean(own),
         number(ours.worst, sign="+") if ours else "",
         _excess(ours),
         _mean(rival),
@@ -87,10 +98,10 @@ def _legend(episodes: int, starts: int) -> str:
     return (
         f"Mean cost of a test episode after {episodes} training episodes, over {starts} starts "
         "that training and guard never see: the median over the seeds (and the range). "
-        f"*No settings*: {OURS} with `tau=0.02` on every plant, all else as it comes. "
-        "*A simulator explored*: one set for every plant, with `SimulatedEpisodes`, in which noise "
-        "harms nobody. "
-        f"*Worst start*: the largest cost above the MPC's over all seeds and starts of {OURS}. "
+        f"**{OURS}** has one set of options for every plant, and `SimulatedEpisodes`, in which "
+        "noise harms nobody; *no simulator explored*: `tau=0.02`, all else as it comes. "
+        f"*Worst start*: the largest cost above the MPC's over all seeds and starts of {OURS}; "
+        "this and what follows is of its own settings where no simulator was explored. "
         "*Excess cost*: what all training episodes together cost above the MPC from the same "
         f"starts, median. *Violations* (training episodes beyond a limit) and *seeds* are those of "
         f"{OURS} / {RIVAL}."

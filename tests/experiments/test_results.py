@@ -146,14 +146,23 @@ def test_a_criterion_can_be_missed(words, outcomes) -> None:
     assert reached(outcomes, words) == ["**no**"]
 
 
+def test_the_one_set_of_options_has_criteria_of_its_own() -> None:
+    outcomes, name = pendulum(), "YANN-RL, a simulator explored"
+    for seed in range(10):
+        far = learned(np.array([1.0, 29.2 if seed > 1 else 100.0]), np.array([1.0, 200.0]))
+        outcomes[Run("pendulum, Q = I", name, seed, 50)] = far
+    found = {(line.learner, line.reached) for line in criteria(outcomes) if "10 %" in line.required}
+    assert found == {("YANN-RL", "yes"), (name, "**no**")}
+
+
 def test_few_seeds_do_not_reach_a_criterion() -> None:
     assert set(reached(reactor(seeds=3), "")) == {"so far (3 of 10 seeds)"}
     assert reached(reactor(learned(OPTIMUM, unsafe=1), seeds=3), "no violation") == ["**no**"]
 
 
-def test_two_seeds_of_ten_may_be_far_from_the_optimum() -> None:
+def test_one_seed_of_ten_may_be_far_from_the_optimum() -> None:
     outcomes = pendulum()
-    for seed, verdict in ((0, "yes"), (1, "yes"), (2, "**no**")):
+    for seed, verdict in ((0, "yes"), (1, "**no**")):
         far = learned(np.array([1.0, 100.0]), np.array([1.0, 200.0]))
         outcomes[Run("pendulum, Q = I", "YANN-RL", seed, 50)] = far
         assert reached(outcomes, "10 % of the optimum") == [verdict]
@@ -271,12 +280,15 @@ def test_the_short_table_has_a_row_for_each_plant() -> None:
     bare[Run("CSTR", "YANN-RL, a simulator explored", 0, 50)] = learned([91.0, 290.0])
     outcomes = {**reactor(), **bare, **pendulum()}
     header, _, *rows, empty, legend = summary(outcomes, 50).splitlines()
-    names = "plant | optimum | MPC | **YANN-RL** | no settings | a simulator explored | worst start"
+    names = (
+        "plant | optimum | MPC | **YANN-RL** | no simulator explored | settings of its own | "
+        "worst start"
+    )
     assert header.startswith(f"| {names} |")
     assert rows == [
-        "| CSTR | 190.00 | 200.00 | **191.00 (191.00 to 191.00)** | 192.00 | 190.50 | "
-        "-9.00 | -20 | 300.00 (300.00 to 300.00) | +4,000 | 0 / 30 | 10 / 10 |",
-        "| pendulum, Q = I | 15.00 | 100.50 | **15.50 (15.50 to 15.50)** |  |  | "
+        "| CSTR | 190.00 | 200.00 | **190.50** | 192.00 | 191.00 (191.00 to 191.00) | "
+        "-9.00 | +0 | 300.00 (300.00 to 300.00) | +4,000 | 0 / 30 | 1 / 10 |",
+        "| pendulum, Q = I | 15.00 | 100.50 |  |  | 15.50 (15.50 to 15.50) | "
         "+0.00 | +0 |  |  | 0 | 10 |",
     ]
     assert empty == "" and "after 50 training episodes, over 2 starts" in legend
