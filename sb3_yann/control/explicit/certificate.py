@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import NoReturn
 
@@ -78,7 +78,7 @@ class Certificate:
         self.outer = np.column_stack(program.theta_rows())
 
     def check(self) -> list[Region]:
-        """Return the regions, with the laws of steep ones more exact.
+        """Return the regions, with the laws of steep ones more exact, and trimmed by 1e-8 at most.
 
         Raise ExplicitSolutionError, with a theta that shows what is wrong, unless all pass.
         """
@@ -110,10 +110,12 @@ class Certificate:
             own = np.column_stack([region.A, region.b])
             known = np.concatenate([self.outer, each.rows])
             same = np.abs(own[:, None] - known[None]).max(axis=2) < EQUAL
-            self._require_implied(i, np.any(same[:, len(self.outer) :], axis=0), balls[i], each)
+            missing = self._missing(i, np.any(same[:, len(self.outer) :], axis=0), balls[i], each)
             self._require_neighbors(i, same, each)
+            if len(missing):
+                refined[i] = self._trimmed(region, each, missing)
             if np.abs(each.law[:, :-1]).max() > STEEP:
-                refined[i] = replace(region, gain=each.law[:, :-1], offset=each.law[:, -1])
+                refined[i] = replace(refined[i], gain=each.law[:, :-1], offset=each.law[:, -1])
             self.timer.advance()
         self._require_agreement()
         self._require_no_doubles(balls)
@@ -141,22 +143,41 @@ class Certificate:
             i = int(wrong[0])
             self._fail(f"the law of region {i} is not optimal inside it", self.regions[i].ball()[0])
 
-    def _require_implied(
+    def _missing(
         self, i: int, known: NDArray[np.bool_], ball: Ball, kkt: Optimality
-    ) -> None:
-        """Raise unless the half-spaces of region i imply its conditions; they are those known."""
+    ) -> NDArray[np.intp]:
+        """Return which conditions the half-spaces of region i just do not imply.
+
+        They are left out where they seem to touch the region alone. Raise if it lies farther
+        beyond one; ``known`` tells which of the conditions are among the half-spaces.
+        """
         region, n, (inside, radius) = self.regions[i], len(ball[0]), ball
-        limit = kkt.rows[:, n] + IMPLIED
-        if radius <= 0 or np.any(limit < kkt.rows[:, :n] @ inside):
+        if radius <= 0 or np.any(kkt.rows[:, n] + IMPLIED < kkt.rows[:, :n] @ inside):
             self._fail(f"the law of region {i} violates the KKT conditions", inside)
-        if np.all(known):
-            return
-        rows, limit = kkt.rows[~known], limit[~known]
+        others = np.flatnonzero(~known)
+        if not len(others):
+            return others
+        rows = kkt.rows[others]
         points = farthest_points(region.A, region.b, inside, rows[:, :n])
-        beyond = np.sum(rows[:, :n] * points, axis=1) - limit
-        if np.any(beyond > 0):
+        beyond = np.sum(rows[:, :n] * points, axis=1) - rows[:, n]
+        if np.max(beyond) > INSIDE:
             point = points[np.argmax(beyond)]
             self._fail(f"the law of region {i} violates the KKT conditions", point)
+        return np.asarray(others[beyond > IMPLIED])
+
+    def _trimmed(self, region: Region, kkt: Optimality, rows: NDArray[np.intp]) -> Region:
+        """Return a region with some of its conditions besides."""
+        A = np.concatenate([region.A, kkt.rows[rows, :-1]])
+        b = np.append(region.b, kkt.rows[rows, -1])
+        across = region.across
+        if across:
+            across += tuple(self._beyond(kkt.across(row)) for row in rows)
+        return replace(region, A=A, b=b, across=across)
+
+    def _beyond(self, candidates: Iterable[int]) -> tuple[int, ...] | None:
+        """Return the active set of the first of these that is a region, None if none is."""
+        at = next((self.by_set[each] for each in candidates if each in self.by_set), None)
+        return None if at is None else self.regions[at].active_set
 
     def _require_neighbors(self, i: int, same: NDArray[np.bool_], conditions: Optimality) -> None:
         """Raise if a facet of region i has no neighbor; ``same`` tells which conditions are it."""

@@ -95,6 +95,32 @@ def test_a_region_that_reaches_too_far_is_found(monkeypatch: pytest.MonkeyPatch)
     assert solved("benchmark").explicit().locate(theta) != 0
 
 
+@pytest.mark.parametrize("beyond", [3e-9, 9e-9])
+def test_a_region_that_reaches_a_hair_too_far_is_trimmed(
+    beyond: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = solved("benchmark").explicit()
+    find = module._critical_regions
+
+    def spoil(*args: Any) -> Regions:
+        first, *rest = find(*args)
+        inner = np.all(np.abs(first.A) < 0.999, axis=1)  # not a bound of theta
+        return [dataclasses.replace(first, b=first.b + beyond * inner), *rest]
+
+    monkeypatch.setattr(module, "_critical_regions", spoil)
+    law = PROBLEMS["benchmark"]().explicit()
+    assert law.n_regions == right.n_regions
+    more = len(law.b) - len(right.b)
+    assert more > 0 and len(law.neighbors) == len(law.b)
+    # The true conditions of the region are among its half-spaces again, with what lies beyond.
+    own, known = (each.starts[1] for each in (law, right))
+    for k in range(known):
+        off = np.abs(law.A[:own] - right.A[k]).max(axis=1) + np.abs(law.b[:own] - right.b[k])
+        (same,) = np.flatnonzero(off < 1e-12)
+        assert law.neighbors[same] == right.neighbors[k]
+    np.testing.assert_array_equal(law.A[own:], right.A[known:])
+
+
 def test_a_region_that_is_there_twice_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     message, theta = error_of(monkeypatch, "benchmark", lambda regions: [*regions, regions[3]])
     assert "region 3 and region 9 are the same" in message
