@@ -32,6 +32,7 @@ from sb3_yann import (
     LinearMPC,
     NoActionNoise,
     PlantTwin,
+    SimulatedEpisodes,
     YannPolicy,
     improve,
 )
@@ -52,9 +53,9 @@ STEPS = 50_000
 LONG = f", {STEPS:,} steps"
 SEEDS = {
     FROM_A_LOG: range(40, 50),
-    **dict.fromkeys(("DDPG", "TD3", "SAC"), range(40, 43)),
-    **dict.fromkeys((f"DDPG{LONG}", f"PPO{LONG}"), range(40, 41)),
     OURS: range(40, 50),
+    **dict.fromkeys(("DDPG", "TD3", "SAC"), range(40, 41)),
+    **{f"{name}{LONG}": range(40, 41) for name in RIVALS},
 }
 HEADER = ("plant", "controller", "training steps", "PC-Gym's cost", "against offset-free, %",
           "worst episode, %", "stage cost", "against offset-free, %", "ms a step",
@@ -218,9 +219,10 @@ def execute(run: Run) -> Outcome:
         problem = reidentified(case) if run.learner == REIDENTIFIED else case.mpc
         test(0, NonlinearMPC(case) if run.learner == NMPC else problem.explicit())
     elif run.learner == OURS:
-        model = policy_of(case, run.seed)
-        guard = ImprovementGuard(case.taught)
-        model.learn(steps * EPISODES, callback=[NoActionNoise(), guard])
+        model = policy_of(case, run.seed, tau=0.005, n_steps=10, gradient_steps=4)
+        guard = ImprovementGuard(case.taught, patience=10, keep_if_worse=True)
+        explores = SimulatedEpisodes(case.taught)
+        model.learn(steps * EPISODES, callback=[NoActionNoise(), explores, guard])
         test(steps * EPISODES, partial(acted, model))
     elif run.learner == FROM_A_LOG:
         model = policy_of(case, run.seed)
@@ -274,11 +276,11 @@ class TestAt(BaseCallback):
         return True
 
 
-def policy_of(case: Case, seed: int) -> DDPG:
+def policy_of(case: Case, seed: int, **options: Any) -> DDPG:
     """Return a model that starts as the MPC; nothing is set for the plant."""
     return DDPG(
-        YannPolicy, case.taught(), gamma=0.95, tau=0.02, seed=seed, device="cpu",
-        policy_kwargs={"problem": case.mpc},
+        YannPolicy, case.taught(), gamma=0.95, seed=seed, device="cpu",
+        policy_kwargs={"problem": case.mpc}, **{"tau": 0.02, **options},
     )  # fmt: skip
 
 

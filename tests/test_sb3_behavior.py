@@ -108,6 +108,13 @@ def test_a_load_builds_the_policy_from_the_keywords_that_were_saved(tmp_path) ->
     assert loaded.actor.mu[0].out_features == 7
 
 
+def test_a_load_with_n_steps_warns_and_keeps_them_all_the_same(tmp_path) -> None:
+    DDPG("MlpPolicy", Plant(), n_steps=5, gamma=0.9).save(tmp_path / "model")
+    with pytest.warns(UserWarning, match="`n_steps=5` is ignored"):  # docs/troubleshooting.md
+        buffer = DDPG.load(tmp_path / "model").replay_buffer
+    assert (buffer.n_steps, buffer.gamma) == (5, 0.9)
+
+
 def test_what_is_set_on_a_model_travels_in_its_zip(tmp_path) -> None:
     """guard.state keeps `model.guard_state` there."""
     model = build()

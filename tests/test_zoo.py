@@ -26,6 +26,9 @@ EPISODE = {"CSTR-v0": 400, "ClippedPendulum-v0": 200}
 NOT_THE_MODEL_S = {"n_timesteps", "callback"}  # what the zoo itself uses of an entry
 HYPERPARAMETERS = files("sb3_yann") / "hyperparams"
 
+# Stable-Baselines3 says so of each load with n_steps, and keeps the buffer's n_steps all the same.
+pytestmark = pytest.mark.filterwarnings("ignore:`n_steps=10` is ignored:UserWarning")
+
 ENTRIES = pytest.mark.parametrize(
     ("algo", "env_id"), [(algo, env_id) for algo in ALGORITHMS for env_id in EPISODE]
 )
@@ -74,16 +77,24 @@ def test_the_critic_of_an_entry_starts_exact_on_the_linear_plant(algo, env_id, c
 
 
 @ENTRIES
-def test_an_entry_runs_for_fifty_episodes_without_noise_guarded_and_watched(algo, env_id) -> None:
+def test_an_entry_explores_in_a_simulator_alone_guarded_and_watched(algo, env_id) -> None:
     entry = entry_of(algo, env_id)
     assert entry["n_timesteps"] == 50 * gym.spec(env_id).max_episode_steps
-    guard, noise, diagnostics = entry["callback"]  # the Zoo ends the first one after Ctrl-C
+    guard, noise, explores, diagnostics = entry["callback"]  # the Zoo ends the first after Ctrl-C
     assert noise == "sb3_yann.NoActionNoise"
     assert diagnostics == "sb3_yann.ControlDiagnostics"
     (options,) = guard.values()
     assert [*guard] == ["sb3_yann.ImprovementGuard"]
     assert options["env"] == env_id
     sb3_yann.ImprovementGuard(**options)
+    assert explores == {"sb3_yann.SimulatedEpisodes": {"env": env_id}}
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_no_option_is_set_for_a_plant(algo) -> None:
+    reactor, pendulum = (entry_of(algo, env_id) for env_id in EPISODE)
+    del reactor["n_timesteps"], pendulum["n_timesteps"]
+    assert str(pendulum).replace("ClippedPendulum-v0", "CSTR-v0") == str(reactor)
 
 
 @dataclass
@@ -148,6 +159,7 @@ def test_a_trained_model_loads_without_solving_its_problem_again(run, monkeypatc
     mpc = model.policy.problem
     assert model.num_timesteps == EPISODE[run.env_id]
     assert isinstance(model.policy, sb3_yann.YannPolicy)
+    assert model.replay_buffer.n_steps == 10
     assert np.all(np.abs(model.predict(np.zeros((1, mpc.n_theta), np.float32))[0]) <= mpc.u_max)
 
 
