@@ -7,41 +7,32 @@ import numpy as np
 from rich import print
 from stable_baselines3 import DDPG
 
-from sb3_yann import (
-    DisturbanceBounds,
-    DisturbanceObserver,
-    ImprovementGuard,
-    LinearMPC,
-    NoActionNoise,
-)
+from sb3_yann import ImprovementGuard, LinearMPC, NoActionNoise, SimulatedEpisodes, offset_free
 from sb3_yann.evaluation import evaluate, summary_table
 from sb3_yann.wrappers import Deviations, ObserveDisturbance, StageCost
 from sb3_yann_envs.pcgym import PCGymEnv
 
 plant = PCGymEnv("cstr")
-linear = plant.linear_model(offset_free=True)  # a disturbance of each state, to be estimated
 weights = {"Q": np.diag([1e3, 0]), "R": [[2e-3]], "horizon": 5, "gamma": 0.95}
-box = {"disturbances": DisturbanceBounds(-1, 1), "tracking": plant.tracking, **plant.bounds}
-mpc = LinearMPC(linear, **weights, **box, absolute=True)
-moves = np.diag(linear.E)
-noise = {"state_noise": moves, "measurement_noise": 0.01 * moves, "disturbance_noise": 10}
-observer = DisturbanceObserver(linear, **noise)
+box = {"tracking": plant.tracking, **plant.bounds, "absolute": True}
+mpc, observer = offset_free(LinearMPC(plant.linear_model(), **weights, **box))
+d = mpc.disturbances  # one of each state, which the observer estimates
 
 
 def make_env() -> StageCost:
     """Return the plant in deviations, with the estimated disturbance in theta."""
-    env = Deviations(PCGymEnv("cstr"), mpc)
-    d = mpc.disturbances
-    return StageCost(ObserveDisturbance(env, observer, d.d_min, d.d_max), mpc)
+    env = ObserveDisturbance(Deviations(PCGymEnv("cstr"), mpc), observer, d.d_min, d.d_max)
+    return StageCost(env, mpc)
 
 
 def main() -> None:
     """Train under the guard, and compare with the offset-free MPC."""
-    policy = {"problem": mpc}
-    model = DDPG("YannPolicy", make_env(), policy_kwargs=policy, gamma=0.95, gradient_steps=4)
+    options = {"policy_kwargs": {"problem": mpc}, "gamma": 0.95, "n_steps": 10, "gradient_steps": 4}
+    model = DDPG("YannPolicy", make_env(), **options)
+    guard = ImprovementGuard(make_env, n_starts=20, patience=10, keep_if_worse=True)
     before = evaluate(model, make_env, range(2000, 2030))
-    callbacks = [NoActionNoise(), ImprovementGuard(make_env)]
-    model.learn(3570, callback=callbacks, progress_bar=True)  # 30 episodes
+    explores = SimulatedEpisodes(make_env)
+    model.learn(3570, callback=[NoActionNoise(), explores, guard], progress_bar=True)  # 30 episodes
     after = evaluate(model, make_env, range(2000, 2030))
     print(summary_table("Cost of 30 unseen set-point sequences", before, after))
 

@@ -23,6 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from experiments import FINGERPRINT
 from experiments.markdown import number, table
 from experiments.measures import MPC, OURS, REIDENTIFIED
+from experiments.pcgym_vector import registered
 from experiments.runner import Outcome, Run, run_all
 from experiments.summary import quote
 from sb3_yann import (
@@ -220,7 +221,7 @@ def execute(run: Run) -> Outcome:
         test(0, NonlinearMPC(case) if run.learner == NMPC else problem.explicit())
     elif run.learner == OURS:
         model = policy_of(case, run.seed, tau=0.005, n_steps=10, gradient_steps=4)
-        guard = ImprovementGuard(case.taught, patience=10, keep_if_worse=True)
+        guard = ImprovementGuard(registered(name), patience=10, keep_if_worse=True)
         explores = SimulatedEpisodes(case.taught)
         model.learn(steps * EPISODES, callback=[NoActionNoise(), explores, guard])
         test(steps * EPISODES, partial(acted, model))

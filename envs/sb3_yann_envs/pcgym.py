@@ -161,7 +161,8 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
     def advance(self, x: ArrayLike, u: ArrayLike) -> Array:
         """Return the state (n,) one sample after x (n,), with the inputs u (m,) held.
 
-        Raises FloatingPointError where the equations have no value.
+        It takes batches, x (batch, n) and u (batch, m), as well. Raises FloatingPointError where
+        the equations have no value.
         """
         reached = self._flow(x, u)
         if not np.all(np.isfinite(reached)):

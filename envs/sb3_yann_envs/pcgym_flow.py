@@ -32,6 +32,8 @@ def rate_of(model: Any, n: int, m: int) -> Any:
 def flow_of(rate: Any, dt: float, x0: Array, low: Array, width: Array) -> Flow:
     """Return the map from x (n,) and u (m,) to the state one sample later, NaN for no value.
 
+    It takes batches, x (batch, n) and u (batch, m), as well.
+
     Parameters
     ----------
     rate : casadi.Function
@@ -76,6 +78,9 @@ def _cvodes(rate: Any, dt: float) -> Flow:
     sample = casadi.integrator("sample", "cvodes", ode, 0.0, dt, TOLERANCES)
 
     def flow(x: ArrayLike, u: ArrayLike) -> Array:
+        if np.ndim(x) > 1:  # one by one, for one that has no value spoils no other
+            rows = zip(np.asarray(x), np.asarray(u), strict=True)
+            return np.array([flow(*row) for row in rows])
         try:
             return np.array(sample(x0=x, p=u)["xf"], np.float64).ravel()
         except RuntimeError:  # CVODES met no value
@@ -103,4 +108,9 @@ def _runge_kutta(rate: Any, dt: float, steps: int) -> Flow:
         k3 = rate(x + h / 2 * k2, u)
         x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, u))
     sample = casadi.Function("sample", [start, u], [x])
-    return lambda x, u: np.array(sample(x, u), np.float64).ravel()
+
+    def flow(x: ArrayLike, u: ArrayLike) -> Array:
+        after = np.array(sample(np.transpose(x), np.transpose(u)), np.float64)
+        return after.T.reshape(np.shape(x))
+
+    return flow
