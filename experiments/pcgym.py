@@ -143,13 +143,14 @@ class NonlinearMPC:
             before = self.plans.get(i, np.full(m * self.HORIZON, 0.5))
             plan = np.array(self.solve(x0=before, p=row[: self.size], lbx=0, ubx=1)["x"]).ravel()
             self.plans[i] = np.concatenate([plan[m:], plan[-m:]])
-            found[i] = low + width * plan[:m] - self.mpc.model.u_ss
+            found[i] = low + width * np.clip(plan[:m], 0, 1) - self.mpc.model.u_ss
         return found.reshape(*np.shape(theta)[:-1], m)
 
 
 def scaled(name: str) -> gym.Env[Any, Any]:
     """Return a plant with observations and actions in [-1, 1]."""
-    return RescaleObservation(RescaleAction(PCGymEnv(name), -1.0, 1.0), -1.0, 1.0)
+    one: Any = np.float32(1)
+    return RescaleObservation(RescaleAction(PCGymEnv(name), -one, one), -one, one)
 
 
 class Rival:
