@@ -92,6 +92,12 @@ def test_an_environment_of_gymnasium_takes_twelve_lines(at, needs) -> None:
     np.testing.assert_allclose(action.detach().numpy()[0], wanted, atol=0.02)
 
 
+def test_a_plant_of_pc_gym_takes_twenty_lines_up_to_its_trained_policy() -> None:
+    lines = [line for line in blocks(page("docs/pcgym.md"))[0].splitlines() if line.strip()]
+    measured = [line for line in lines if re.search(r"\b(evaluat|before|after)", line)]
+    assert len(measured) == 4 and len(lines) - len(measured) <= 20
+
+
 @pytest.mark.parametrize("name", ["environments", "gallery", "own_plant"])
 def test_the_code_in_a_page_that_does_not_train_runs(name) -> None:
     run(f"docs/{name}.md")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -58,9 +58,46 @@ class Episodes:
     terminated: NDArray[np.bool_]
 
 
+class EnvPool:
+    """Envs that play again and again: making one often takes longer than its episode.
+
+    Parameters
+    ----------
+    source : gymnasium.Env, str or callable
+        As for :func:`evaluate`, which takes a pool in its place.
+    """
+
+    MOST = 200
+    """Envs that are kept."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.envs: list[gym.Env[Any, Any]] = []
+
+    @contextmanager
+    def lend(self, n: int) -> Iterator[list[gym.Env[Any, Any]]]:
+        """Yield n envs. After an error none is kept: their episodes are not over."""
+        try:
+            while len(self.envs) < n:
+                self.envs.append(_made(self.source))
+            yield self.envs[:n]
+        except BaseException:
+            self.close()
+            raise
+        self._close_beyond(self.MOST)
+
+    def close(self) -> None:
+        """Close all envs."""
+        self._close_beyond(0)
+
+    def _close_beyond(self, kept: int) -> None:
+        while len(self.envs) > kept:
+            self.envs.pop().close()
+
+
 def evaluate(
     policy: Predictor | Callable[[Any], Any],
-    env: Source,
+    env: Source | EnvPool,
     seeds: Iterable[int],
     starts: Sequence[ArrayLike] | None = None,
 ) -> Episodes:
@@ -74,7 +111,7 @@ def evaluate(
     env : gymnasium.Env, str or callable
         Must end its episodes within a million steps. A given env runs them one after the other.
         A named one, or a function that makes one, is made for each seed: the episodes run side by
-        side, and the policy sees them as one batch.
+        side, and the policy sees them as one batch. An :class:`EnvPool` keeps them for next time.
     seeds : iterable of int
         ``env.reset(seed=seed)`` starts each episode; the rest of it must follow from that.
     starts : sequence of array_like, optional
@@ -96,6 +133,8 @@ def evaluate(
     options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]
     resets = [*zip(seeds, options, strict=True)]
     act = _as_batch_function(policy)
+    pool = env if isinstance(env, EnvPool) else None
+    env = env.source if isinstance(env, EnvPool) else env
     if isinstance(env, gym.Env):
         _require_same_inputs(policy, env.action_space)
         episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
@@ -104,8 +143,8 @@ def evaluate(
             _require_same_inputs(policy, vector_env.single_action_space)
             return _as_one(act, vector_env, seeds, starts)
     else:
-        with ExitStack() as stack:
-            envs = [stack.enter_context(one_env(env)) for _ in seeds]
+        own = EnvPool(env)
+        with closing(own), (pool or own).lend(len(seeds)) as envs:
             for each in envs[:1]:
                 _require_same_inputs(policy, each.action_space)
             if len({id(each.unwrapped) for each in envs}) < len(envs):
@@ -129,11 +168,18 @@ def one_env(env: Source) -> Iterator[gym.Env[Any, Any]]:
     if isinstance(env, gym.Env):
         yield env
         return
-    made = gym.make(env, disable_env_checker=True) if isinstance(env, str) else env()
+    with closing(_made(env)) as made:
+        yield made
+
+
+def _made(source: Source) -> gym.Env[Any, Any]:
+    """Return the env that is given, or one that is made."""
+    if isinstance(source, gym.Env):
+        return source
+    made = gym.make(source, disable_env_checker=True) if isinstance(source, str) else source()
     if not isinstance(made, gym.Env):
         raise TypeError(f"The function that makes envs returned {made!r}, not a gymnasium.Env.")
-    with closing(made):
-        yield made
+    return made
 
 
 @dataclass

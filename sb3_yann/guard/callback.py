@@ -262,5 +262,6 @@ class ImprovementGuard(BaseCallback):
             self.acceptance.end(self.session)
         finally:
             restore_accepted(self.model)
+            self.session.close()
             if self._handler is not None:
                 self._handler.remove()

@@ -189,9 +189,8 @@ def play_episodes(
     session: GuardSession, checkpoint: ActorCheckpoint, seeds: Sequence[int]
 ) -> Episodes:
     """Return a checkpoint's episodes; raise Unplayable, or what the env raises."""
-    assert session.simulator is not None  # a plant alone plays nothing
     with session.playing(checkpoint), preserve_rng():
-        return evaluate(_FinitePolicy(session), session.simulator, seeds)
+        return evaluate(_FinitePolicy(session), session.envs, seeds)
 
 
 def play(session: GuardSession, checkpoint: ActorCheckpoint, seeds: Sequence[int]) -> Outcome:

@@ -10,10 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.evaluation.episodes import Source
+from sb3_yann.evaluation.episodes import EnvPool, Source
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.options import StepSize
 from sb3_yann.guard.rng import preserve_rng
@@ -52,6 +53,12 @@ class GuardSession:
             self.mpc = known.mpc
         elif self.policy.actor.mu.network.is_zero():
             self.mpc = ActorCheckpoint.of(self.policy)
+
+    @cached_property
+    def envs(self) -> EnvPool:
+        """The envs of the simulator, kept from trial to trial."""
+        assert self.simulator is not None  # a plant alone plays nothing
+        return EnvPool(self.simulator)
 
     @cached_property
     def mpc(self) -> ActorCheckpoint:
@@ -94,6 +101,11 @@ class GuardSession:
             raise
         finally:
             self.before_trial = None
+
+    def close(self) -> None:
+        """Close the envs that were made; one that was given is the caller's."""
+        if self.simulator is not None and not isinstance(self.simulator, gym.Env):
+            self.envs.close()
 
     def leave_accepted(self) -> None:
         """Restore the accepted policy where Ctrl-C is about to end `learn`, also in a trial."""

@@ -11,6 +11,7 @@ from stable_baselines3 import DDPG
 import unit_samples as units
 from sb3_yann import YannPolicy
 from sb3_yann.evaluation import Episodes, evaluate
+from sb3_yann.evaluation.episodes import EnvPool
 from sb3_yann.wrappers import Deviations
 from sb3_yann_envs import problems
 
@@ -206,6 +207,44 @@ def test_envs_are_closed_where_one_of_them_cannot_be_made() -> None:
     before = Countdown.open
     with pytest.raises(RuntimeError, match="no third env"):
         evaluate(Tenth(), make, [3, 1, 4])
+    assert Countdown.open == before
+
+
+def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> None:
+    made: list[Countdown] = []
+
+    def make() -> Countdown:
+        made.append(Countdown())
+        return made[-1]
+
+    before, pool = Countdown.open, EnvPool(make)
+    first = evaluate(Tenth(), pool, [3, 1])
+    again = evaluate(Tenth(), pool, [3, 1, 4])
+    assert len(made) == 3 and Countdown.open == before + 3
+    np.testing.assert_array_equal(again.costs[:2], first.costs)
+    np.testing.assert_array_equal(again.costs, evaluate(Tenth(), Countdown, [3, 1, 4]).costs)
+    pool.close()
+    assert Countdown.open == before
+
+
+def test_a_pool_keeps_so_many_envs_and_none_after_an_error(monkeypatch) -> None:
+    def fails(observation):
+        raise RuntimeError("this policy fails")
+
+    monkeypatch.setattr(EnvPool, "MOST", 2)
+    before, pool = Countdown.open, EnvPool(Countdown)
+    evaluate(Tenth(), pool, [3, 1, 4])
+    assert Countdown.open == before + 2
+    with pytest.raises(RuntimeError, match="this policy fails"):
+        evaluate(fails, pool, [3])
+    assert Countdown.open == before and pool.envs == []
+
+
+def test_a_pool_of_an_env_that_is_given_is_that_env() -> None:
+    env = Countdown()
+    before = Countdown.open
+    costs = evaluate(Tenth(), EnvPool(env), [3, 1]).costs
+    np.testing.assert_array_equal(costs, evaluate(Tenth(), Countdown, [3, 1]).costs)
     assert Countdown.open == before
 
 

@@ -86,6 +86,25 @@ def test_one_env_for_all_starts_is_refused() -> None:
         train(build(), 4, make_guard(lambda: env))
 
 
+def test_envs_are_made_for_the_first_trial_kept_for_the_others_and_closed_at_the_end() -> None:
+    counts = {"made": 0, "closed": 0}
+
+    class Counted(Slide):
+        def __init__(self) -> None:
+            counts["made"] += 1
+            super().__init__()
+
+        def close(self) -> None:
+            counts["closed"] += 1
+
+    guard = make_guard(Counted, n_new_starts=0)
+    train(build(), 12, At([2], better), guard)
+    trials = len(guard.decisions)
+    assert trials > 1
+    # One more, whose spaces are looked at before.
+    assert counts["made"] == counts["closed"] <= len(guard.state.evidence.seeds) + 1
+
+
 def test_a_function_that_makes_no_env_is_named() -> None:
     with pytest.raises(TypeError, match=r"returned None, not a gymnasium\.Env"):
         train(build(), 4, make_guard(lambda: None))
