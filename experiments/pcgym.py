@@ -23,6 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from experiments import FINGERPRINT
 from experiments.markdown import number, table
 from experiments.measures import MPC, OURS, REIDENTIFIED
+from experiments.pcgym_nmpc import NonlinearMPC
 from experiments.pcgym_vector import registered
 from experiments.runner import Outcome, Run, run_all
 from experiments.summary import quote
@@ -95,56 +96,6 @@ class Case:
     def taught(self) -> gym.Env[Any, Any]:
         """Return the same with the MPC's stage cost."""
         return StageCost(self.env(), self.mpc)
-
-
-class NonlinearMPC:
-    """Knows the equations, not the next set-point: single shooting by IPOPT, from theta to u.
-
-    Moves of the inputs, in parts of their range, weigh 1e-4.
-    """
-
-    HORIZON = 15
-    SUBSTEPS = {"cstr": 4, "four_tank": 4, "multistage_extraction": 100}
-
-    def __init__(self, case: Case) -> None:
-        import casadi
-
-        plant, self.mpc = case.plant, case.mpc
-        n, m, p = len(plant.x0), len(plant.u_min), len(plant.outputs)
-        steps = self.SUBSTEPS[case.name]
-        x, u, rate, h = casadi.SX.sym("x", n), casadi.SX.sym("u", m), plant._rate, plant.dt / steps
-        z = x
-        for _ in range(steps):
-            k1 = rate(z, u)
-            k2 = rate(z + h / 2 * k1, u)
-            k3 = rate(z + h / 2 * k2, u)
-            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + h * k3, u))
-        sample = casadi.Function("sample", [x, u], [z])
-        V, start, wanted = (casadi.MX.sym(*each) for each in (
-            ("V", m, self.HORIZON), ("start", n), ("wanted", p)))  # fmt: skip
-        z, cost = start, 0
-        for k in range(self.HORIZON):
-            z = sample(z, plant.u_min + (plant.u_max - plant.u_min) * V[:, k])
-            cost += 1e3 * casadi.sumsqr(z[plant.outputs] - wanted)
-            cost += 1e-4 * casadi.sumsqr(V[:, k] - V[:, max(k - 1, 0)])
-        program = {"x": casadi.vec(V), "p": casadi.vertcat(start, wanted), "f": cost}
-        options = {"print_time": 0, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-        # A Hessian through so many small steps takes seconds.
-        options |= {"ipopt.max_iter": 60, "ipopt.hessian_approximation": "limited-memory"}
-        self.solve = casadi.nlpsol("plan", "ipopt", program, options)
-        self.plant, self.size, self.plans = plant, n + p, {}
-
-    def __call__(self, theta: np.ndarray) -> np.ndarray:
-        """Return inputs (batch, m), as deviations; each row goes on with its own plan."""
-        m, low = len(self.plant.u_min), self.plant.u_min
-        width, given = self.plant.u_max - low, np.atleast_2d(theta) + self.mpc.theta_ss
-        found = np.empty((len(given), m))
-        for i, row in enumerate(given):
-            before = self.plans.get(i, np.full(m * self.HORIZON, 0.5))
-            plan = np.array(self.solve(x0=before, p=row[: self.size], lbx=0, ubx=1)["x"]).ravel()
-            self.plans[i] = np.concatenate([plan[m:], plan[-m:]])
-            found[i] = low + width * np.clip(plan[:m], 0, 1) - self.mpc.model.u_ss
-        return found.reshape(*np.shape(theta)[:-1], m)
 
 
 def scaled(name: str) -> gym.Env[Any, Any]:

@@ -7,7 +7,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from experiments import pcgym
+from experiments import pcgym, pcgym_nmpc
 from experiments.runner import Outcome, Run
 from sb3_yann.evaluation import evaluate
 
@@ -79,6 +79,23 @@ def test_a_case_as_arrays_shows_and_pays_what_it_does_alone(name):
     np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-12)
     np.testing.assert_array_equal(together.observations, alone.observations)
     np.testing.assert_array_equal(together.actions, alone.actions)
+
+
+@needs_pcgym
+@pytest.mark.parametrize("name", pcgym.HORIZONS)
+def test_the_polynomials_of_the_nmpc_end_where_the_plant_does(name):
+    import casadi
+
+    plant = pcgym.PCGymEnv(name)
+    n, (low, width) = len(plant.x0), plant._box()
+    s, v = (plant.x0 - low[:n]) / width[:n], np.full(len(plant.u_min), 0.7)
+    sample = pcgym_nmpc.collocated(plant)
+    z = casadi.MX.sym("z", sample.size1_in(2))
+    missed = casadi.Function("missed", [z], [sample(s, v, z)[1]])
+    inner = casadi.rootfinder("inner", "newton", missed)(np.tile(s, sample.size1_in(2) // n))
+    end = low[:n] + width[:n] * np.array(sample(s, v, inner)[0]).ravel()
+    wanted = plant.advance(plant.x0, low[n:] + width[n:] * v)
+    np.testing.assert_allclose(end, wanted, atol=2e-4 * width[:n].max())
 
 
 @needs_pcgym
