@@ -68,6 +68,7 @@ class Starts:
     tolerance : Tolerance, what they may cost more than with the MPC
     n_starts : int, of so many they are those that count
     sure : float, how many standard errors the mean cost, and the tail's, must be clear of the MPC's
+    least : float, what the mean must gain, as a fraction of the MPC's
     """
 
     seeds: tuple[int, ...]
@@ -75,11 +76,13 @@ class Starts:
     tolerance: Tolerance
     n_starts: int
     sure: float = 0.0
+    least: float = 0.0
 
     def at(self, index: Any) -> Starts:
         """Return some of them, which stand for as many."""
         seeds = tuple(np.array(self.seeds)[index].tolist())
-        return Starts(seeds, self.mpc.at(index), self.tolerance, self.n_starts, self.sure)
+        mpc, bar = self.mpc.at(index), (self.sure, self.least)
+        return Starts(seeds, mpc, self.tolerance, self.n_starts, *bar)
 
     def joined_with(self, other: Starts) -> Starts:
         """Return the starts of both."""
@@ -107,12 +110,18 @@ class Starts:
     def mean_is_above(self, outcome: Outcome) -> bool:
         """Return whether the mean cost is above the MPC's, by more than rounding.
 
-        Where it must be clear of it, the bound is its upper confidence limit.
+        Where it must be clear of it, its upper confidence limit must be below, and it itself by
+        the least gain.
         """
         rounding = ROUNDING * np.abs(self.mpc.costs).mean()
         more = outcome.costs - self.mpc.costs
         error = self.sure * more.std() / np.sqrt(len(more)) if self.sure else 0.0
-        return not more.mean() + error <= rounding
+        return not more.mean() + error <= rounding or self.gains_too_little(outcome)
+
+    def gains_too_little(self, outcome: Outcome) -> bool:
+        """Return whether the mean cost is not below the MPC's by the least gain."""
+        gained = self.mpc.costs.mean() - outcome.costs.mean()
+        return bool(self.least and not gained >= self.least * np.abs(self.mpc.costs).mean())
 
     def objection(self, outcome: Outcome) -> str:
         """Return why a policy is refused on these starts, empty where it is not."""
@@ -127,9 +136,11 @@ class Starts:
             )
         if self.mean_is_above(outcome):
             mean, mpc = outcome.costs.mean(), self.mpc.costs.mean()
-            surely = "surely " if mean <= mpc else ""
             found = f"mean cost {mean:.6g} on {len(self.seeds)} new starts, MPC {mpc:.6g}"
-            return f"{found}: not {surely}below" if surely else found
+            if mean > mpc:
+                return found
+            little = self.gains_too_little(outcome)
+            return f"{found}: too little a gain" if little else f"{found}: not surely below"
         return ""
 
     def hardest(self, outcome: Outcome | None) -> NDArray[np.int64]:
@@ -152,7 +163,7 @@ class Evidence(Starts):
     mpc, accepted : Outcome, what came of the MPC and of the accepted policy
     tolerance : Tolerance, what they may cost more than with the MPC
     n_starts : int, of so many they are those that count
-    sure : float, as of all starts
+    sure, least : float, as of all starts
     """
 
     accepted: Outcome = field(kw_only=True)

@@ -20,7 +20,11 @@ MEMORY, MOST_KEPT = 10_000_000, 20
 
 
 def confirm_on_new_starts(
-    session: GuardSession, n_starts: int, rule: AcceptanceRule, sure: float = 0.0
+    session: GuardSession,
+    n_starts: int,
+    rule: AcceptanceRule,
+    sure: float = 0.0,
+    least: float = 0.0,
 ) -> str:
     """Play what is accepted from new starts; return why it was refused, empty where it was not.
 
@@ -39,19 +43,23 @@ def confirm_on_new_starts(
         Whether regions, and smaller corrections, are tried.
     sure : float, default 0
         How many standard errors its mean cost, and the tail's, must be clear of the MPC's.
+    least : float, default 0
+        What it must gain on average, as a fraction of the MPC's mean cost.
     """
     tried = session.state.accepted
-    reason = _confirm(session, n_starts, rule, sure)
+    reason = _confirm(session, n_starts, rule, (sure, least))
     return f"{reason}; {_what_acts(session, tried)}" if reason else ""
 
 
-def _confirm(session: GuardSession, n_starts: int, rule: AcceptanceRule, sure: float) -> str:
+def _confirm(
+    session: GuardSession, n_starts: int, rule: AcceptanceRule, bar: tuple[float, float]
+) -> str:
     first, state = "", session.state
     for _ in range(ROUNDS):
         lost, evidence = state.accepted, state.evidence
         if n_starts == 0 or not session.has_learned(lost):
             return first
-        new = _new_starts(session, n_starts, sure)
+        new = _new_starts(session, n_starts, bar)
         outcome: Outcome | None = None
         try:
             outcome = play(session, lost, new.seeds)
@@ -107,14 +115,14 @@ def drop_passed(session: GuardSession, checkpoint: ActorCheckpoint) -> None:
     passed[:] = [each for each in passed if not each[0].has_networks_of(checkpoint)]
 
 
-def _new_starts(session: GuardSession, n_starts: int, sure: float) -> Starts:
+def _new_starts(session: GuardSession, n_starts: int, bar: tuple[float, float]) -> Starts:
     """Return as many new starts, without those where the MPC's own cost is not finite."""
     state = session.state
     seeds = range(state.next_start, state.next_start + n_starts)
     state.new_starts, state.next_start = state.new_starts + n_starts, seeds.stop
     mpc, tolerance = play(session, session.mpc, seeds), state.evidence.tolerance
     finite = np.flatnonzero(np.isfinite(mpc.costs))
-    new = Starts((*seeds,), mpc, tolerance, len(finite), sure).at(finite)
+    new = Starts((*seeds,), mpc, tolerance, len(finite), *bar).at(finite)
     if not new.seeds:
         raise ValueError(
             f"The MPC's own cost is a finite number on none of {n_starts} new starts of the "

@@ -34,6 +34,9 @@ class AcceptanceRule:
     significance : float, default 0.05
         Plant alone: probability that a run accepts a policy that is no better, at most. In a
         simulator: that the final trial does, on average over all starts.
+    least_gain : float, default 0.001
+        In a simulator: what the final trial must gain on average, as a fraction of the MPC's mean
+        cost. What gains less changes nothing. A strict rule, ``tail=0``, takes any gain.
     largest_step : float, optional
         In a simulator: how far an input may move from one sample to the next, in multiples of the
         MPC's largest step on the known starts, at least 1. The default is no bound.
@@ -51,6 +54,7 @@ class AcceptanceRule:
     retreat: bool = True
     trial_episodes: int = 10
     significance: float = 0.05
+    least_gain: float = 0.001
     largest_step: float | None = None
 
     def __post_init__(self) -> None:
@@ -58,6 +62,8 @@ class AcceptanceRule:
         as_between(
             "tail", self.tail, 0, 1, hint="It is a share of the starts, 0 for the worst one."
         )
+        hint = "It is a share of the MPC's mean cost, 0 for any gain."
+        as_between("least_gain", self.least_gain, 0, 1, hint=hint)
         if self.largest_step is not None:
             hint = "It is a multiple of the MPC's largest step, or None."
             as_between("largest_step", self.largest_step, 1, np.inf, hint=hint)

@@ -160,9 +160,8 @@ class SimulatorAcceptance:
         if last is self.final:  # the Zoo ends its first callback a second time
             return
         with session.all_or_nothing():
-            reason = confirm_on_new_starts(
-                session, self.n_final_starts, self.rule, self.rule.standard_errors
-            )
+            bar = self.rule.standard_errors, self.rule.least_gain if self.rule.tail else 0.0
+            reason = confirm_on_new_starts(session, self.n_final_starts, self.rule, *bar)
         self.final = accepted = state.accepted
         accepted.restore(session.policy)
         if reason:

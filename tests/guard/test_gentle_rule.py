@@ -97,6 +97,29 @@ def test_a_mean_that_is_not_surely_below_the_mpc_s_does_not_pass_the_final_trial
         assert bool(starts.objection(outcome)) == bool(reason)
 
 
+@pytest.mark.parametrize(("gain", "passes"), [(0.0009, False), (0.0011, True)])
+def test_a_gain_that_is_sure_and_little_does_not_pass_the_final_trial(gain, passes) -> None:
+    mpc, tolerance = np.full(50, -20.0), Tolerance(2.0, 0.05, 20.0)
+    nothing = np.zeros((50, 4), np.int64), np.zeros((50, 1), bool)
+    least, outcome = AcceptanceRule().least_gain, Outcome(mpc - 20 * gain, *nothing)
+    starts = Starts((*range(50),), Outcome(mpc, *nothing), tolerance, 50, 1.6, least)
+    assert starts.objection(outcome).endswith("" if passes else ": too little a gain")
+    assert bool(starts.objection(outcome)) is not passes
+    assert starts.at(range(9)).gains_too_little(outcome.at(range(9))) is not passes
+
+
+@pytest.mark.parametrize("rule", [{}, {"least_gain": 0.0}, {"tail": 0}])
+def test_what_gains_little_is_the_mpc_at_the_end_but_where_any_gain_will_do(rule) -> None:
+    model = build(gradient_steps=0)
+    guard = make_guard(n_final_starts=60, rule={**GENTLE, **rule})
+    train(model, STEPS, At([STEPS], lambda policy: correct(policy, RIGHT, 1e-4)), guard)
+    assert guard.decisions[0].verdict == "accepted"
+    assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
+    assert is_mpc(model) is not bool(rule)
+    last = guard.decisions[-1].reason
+    assert ("too little a gain; the guard falls back to the MPC" in last) is not bool(rule)
+
+
 def test_a_run_that_ends_within_the_warm_up_says_so() -> None:
     model, guard = build(actor={"critic_warmup": 500}), make_guard(rule=GENTLE)
     train(model, STEPS, guard)
