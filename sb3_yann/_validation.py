@@ -26,7 +26,11 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
         isinstance(want, int) and got != want for got, want in zip(array.shape, shape, strict=True)
     ):
         wanted = ", ".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]},"
-        hint = " Write a matrix as rows, [[...], [...]]." if array.ndim < len(shape) == 2 else ""
+        hint = (
+            " Write a matrix as rows, [[...], [...]], or np.diag([...])."
+            if array.ndim < len(shape) == 2
+            else ""
+        )
         raise ValueError(f"{name} has shape {array.shape}, expected ({wanted}).{hint}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds NaN or infinite entries: {array.tolist()}.")

@@ -5,6 +5,7 @@ PC-Gym is optional: ``pip install 'sb3-yann[pcgym]'``. Importing this module doe
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -95,7 +96,7 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         set_points: Mapping[str, tuple[float, float]] | None = None,
         draw: bool = True,
     ) -> None:
-        given = checked(parameters)
+        given = _playable(checked(parameters))
         # do-mpc warns of what of it is not installed, CasADi of the way PC-Gym calls it.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -284,6 +285,43 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         if plant.custom_reward:
             return float(np.squeeze(plant.custom_reward_f(plant, state, u, violation)))
         return float(np.squeeze(plant.reward_fn(state, violation)))
+
+
+class _Split:
+    """A model of PC-Gym that unpacks its states, which CasADi's vectors do not allow.
+
+    Parameters
+    ----------
+    model : object
+        Of ``pcgym.model_classes``.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model, self.int_method = model, "casadi"
+
+    def __call__(self, x: Any, u: Any) -> Any:
+        """Return dx/dt for vectors of CasADi."""
+        import casadi
+
+        return self.model(casadi.vertsplit(x), casadi.vertsplit(u))
+
+    def info(self) -> Any:
+        """Return what the model tells of itself."""
+        return self.model.info()
+
+
+def _playable(given: dict[str, Any]) -> dict[str, Any]:
+    """Return PC-Gym's parameters, with a model that PC-Gym cannot make by name made for it."""
+    name = given.get("model")
+    if given.get("custom_model") is not None or not isinstance(name, str):
+        return given
+    _make_env()
+    from pcgym import model_classes
+
+    made = getattr(model_classes, name, None)
+    if made is None or "int_method" in inspect.signature(made).parameters:
+        return given
+    return {**given, "custom_model": _Split(made())}
 
 
 def _make_env() -> Any:

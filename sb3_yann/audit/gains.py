@@ -21,6 +21,12 @@ ADVICE = {
     "learn": "most of it is beyond a linear model: improve(model, twin), or DDPG under an "
     "ImprovementGuard.",
 }
+UNKNOWN = "not known"
+"""The verdict where what was found may be chance, and where nothing was found in a poor twin."""
+SETTABLE = (
+    'Where the env repeats its steps, let reset(options={"state": x}) put it into a state, or pass '
+    "set_state and get_state: plans are made in the env itself then."
+)
 
 
 @dataclass(frozen=True)
@@ -38,11 +44,16 @@ class Headroom:
         the offset of a plant that is not its model; what the re-identified model gains beyond
         that; the rest.
     verdict : str
-        What to do: one of "do not bother", "add ObserveDisturbance first", "re-identify", "learn".
+        What to do: one of "do not bother", "add ObserveDisturbance first", "re-identify", "learn";
+        "not known" where what was found is worth it but may be chance, and where nothing was found
+        with plans that were made in a poor twin.
     source : str
         Where it was found.
     d_max : ndarray, shape (n,), optional
         Of :func:`offset_free`, where its default is less than the disturbances of this plant.
+    lost : float, optional
+        By how much plans cost more than the MPC when they were played, relative to it, where a twin
+        in which they were made of the env's episodes is so poor.
 
     Examples
     --------
@@ -62,6 +73,7 @@ class Headroom:
     verdict: str
     source: str
     d_max: Array | None = None
+    lost: float | None = None
 
     @property
     def total(self) -> float:
@@ -100,13 +112,21 @@ class Headroom:
     def _advice(self) -> str:
         """Return what the verdict means, and whether more starts might change it."""
         parts = self.offset, self.model_error, self.nonlinearity
-        if self.verdict != verdict_of(*parts):
+        if self.verdict != verdict_of(*parts) != "do not bother":
             return "what was found may be chance on so few starts. Take more: n_starts=."
+        poor = ""
+        if self.lost is not None:
+            poor = (
+                "plans were made in a twin of its episodes that is not the plant: when played, "
+                f"they cost {100 * self.lost:.3g} % more than the MPC. {SETTABLE}"
+            )
+        if self.verdict == UNKNOWN:
+            return f"nothing was found, but {poor}"
         advice = ADVICE[self.verdict]
-        if self.d_max is None:
-            return advice
-        largest = ", ".join(f"{each:.3g}" for each in self.d_max)
-        return advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
+        if self.d_max is not None:
+            largest = ", ".join(f"{each:.3g}" for each in self.d_max)
+            advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
+        return f"{advice} The rest is not known: {poor}" if poor else advice
 
 
 def gain(before: Array, after: Array) -> float:
@@ -115,7 +135,10 @@ def gain(before: Array, after: Array) -> float:
 
 
 def verdict_of(offset: float, model_error: float, nonlinearity: float, doubt: float = 0.0) -> str:
-    """Return what to do: a key of `ADVICE`.
+    """Return what to do: a key of `ADVICE`, or `UNKNOWN` where it may be chance.
+
+    Where the largest part is the rest, and too little to learn, an observer or a new model may be
+    worth it still.
 
     Parameters
     ----------
@@ -132,4 +155,8 @@ def verdict_of(offset: float, model_error: float, nonlinearity: float, doubt: fl
     parts = offset, model_error, nonlinearity
     verdict = [*ADVICE][1 + int(np.argmax(parts))]
     worth = WORTH if verdict == "learn" else LITTLE
-    return verdict if sum(parts) >= max(worth, doubt) else "do not bother"
+    if sum(parts) < worth and max(offset, model_error) >= LITTLE:
+        verdict, worth = [*ADVICE][1 + int(np.argmax(parts[:2]))], LITTLE
+    if sum(parts) < worth or WORTH > sum(parts) < doubt:
+        return "do not bother"
+    return verdict if sum(parts) >= doubt else UNKNOWN

@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import ArrayLike
 from rich.progress import track
 
 from sb3_yann._validation import Array, as_flag, as_whole
@@ -23,9 +24,9 @@ from sb3_yann.audit.closed_loops import (
     of_model,
     play,
 )
-from sb3_yann.audit.gains import Headroom, gain, verdict_of
+from sb3_yann.audit.gains import UNKNOWN, WORTH, Headroom, gain, verdict_of
 from sb3_yann.audit.own_units import require_deviations, showing_theta
-from sb3_yann.audit.plants import Plant, TwinPlant, simulated
+from sb3_yann.audit.plants import Access, Plant, TwinPlant, lack_of_fit, simulated
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.control.mpc.offset_free import SHARE
@@ -36,6 +37,8 @@ from sb3_yann.twin.observers import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.reidentification import reidentified
 
+LACKING = 0.5
+"""A twin is poor where neighboring steps share so much of its errors: that is no noise."""
 SURE = 2.0
 """Standard errors that a gain on a random plant must exceed."""
 
@@ -47,6 +50,8 @@ def headroom(
     n_starts: int = 30,
     seed: int = 0,
     progress_bar: bool = False,
+    set_state: Callable[[Any, Array], object] | None = None,
+    get_state: Callable[[Any], ArrayLike] | None = None,
 ) -> Headroom:
     """Return what a nearly optimal controller would gain over an MPC, and why.
 
@@ -78,6 +83,9 @@ def headroom(
         Of the first start.
     progress_bar : bool, default False
         Whether to show how much is done.
+    set_state, get_state : callable, optional
+        ``set_state(env, x)`` and ``get_state(env)`` of a simulator, as :meth:`LinearModel.from_env`
+        takes them.
 
     Raises
     ------
@@ -99,7 +107,13 @@ def headroom(
     as_whole("n_starts", n_starts, 2)
     as_whole("seed", seed, 0)
     as_flag("progress_bar", progress_bar)
-    search = _Search(mpc, env_or_twin, range(seed, seed + n_starts))
+    access = set_state, get_state
+    for name, given in zip(("set_state", "get_state"), access, strict=True):
+        if given is not None and not callable(given):
+            raise TypeError(f"{name} = {given!r} must be a function.")
+    if isinstance(env_or_twin, PlantTwin) and access != (None, None):
+        raise ValueError("set_state and get_state are those of an env: a twin needs neither.")
+    search = _Search(mpc, env_or_twin, range(seed, seed + n_starts), access)
     stages = (search.play_mpc, search.observe, search.reidentify, search.plan)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", OnlineLawWarning)
@@ -116,11 +130,16 @@ class _Search:
     mpc : LinearMPC
     given : gymnasium.Env, str, callable or PlantTwin
     seeds : range
+    access : tuple of two callables, or None
+        ``set_state`` and ``get_state``.
     """
 
-    def __init__(self, mpc: LinearMPC, given: Source | PlantTwin, seeds: range) -> None:
-        self.mpc, self.seeds = mpc, seeds
+    def __init__(
+        self, mpc: LinearMPC, given: Source | PlantTwin, seeds: range, access: Access
+    ) -> None:
+        self.mpc, self.seeds, self.access = mpc, seeds, access
         self.twin, self.random = None, False
+        self.lost: float | None = None
         self.d_max: Array | None = None
         self.make: Callable[[], gym.Env[Any, Any]]
         if isinstance(given, PlantTwin):
@@ -189,23 +208,36 @@ class _Search:
     def plan(self) -> None:
         """Play plans."""
         plant, low, high = self._plant()
+        self.acting = plant
         base = self.base
         unit = max(float(np.abs(base.costs).sum() / base.lengths.sum()), 1e-300)
         task = Task(self.mpc, low, high, _value(self.mpc), WEIGHT * unit)
         controller = Planning(plant, task, int(base.lengths.max()))
-        self.others["plan"] = play(self.mpc, self.make, self.seeds, controller)
+        self.others["plan"] = plans = play(self.mpc, self.make, self.seeds, controller)
+        lost = -gain(base.costs, plans.costs)
+        if not lost <= WORTH and self.lacking():
+            self.lost = float(lost)
+
+    def lacking(self) -> bool:
+        """Tell whether what plans were made in is a twin of the env that lacks much of it."""
+        if not self.random:
+            return False
+        parts = zip(*(each.steps() for each in self.logged), strict=True)
+        steps = [np.concatenate(part) for part in parts]
+        return lack_of_fit(self.acting, self.mpc, *steps) > LACKING
 
     def _plant(self) -> tuple[Plant, Array, Array]:
         """Return what plans are tried in, and the bounds of its states."""
         if self.twin is not None:
             limits, count = self.twin.limits, len(self.twin.dynamics.members)
             return TwinPlant(self.twin, [s % count for s in self.seeds]), limits.low, limits.high
-        found = simulated(self.mpc, self.make, *self.base.steps())
+        found = simulated(self.mpc, self.make, *self.base.steps(), self.access)
         if found is not None:
             free = np.full(self.mpc.model.n_states, np.inf)
             return found, -free, free
         self.random = True  # or so it must be taken to be
         others = play(self.mpc, self.make, self.seeds, Excited(self.mpc, self.seeds[0]))
+        self.logged = self.base, others
         log = [*self.base.episodes(), *others.episodes()]
         twin = PlantTwin.fit(self.mpc, log, observer=self._observer(), n_members=1)
         return TwinPlant(twin, [0] * len(self.seeds)), twin.limits.low, twin.limits.high
@@ -229,7 +261,9 @@ class _Search:
         parts = offset, max(0.0, known - offset), total - max(offset, known)
         whole = Headroom(base.costs, observer, model, best, *parts, "", self.source, self.d_max)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
-        return dataclasses.replace(whole, verdict=verdict)
+        if self.lost is not None and verdict_of(*parts) == "do not bother":
+            verdict = UNKNOWN
+        return dataclasses.replace(whole, verdict=verdict, lost=self.lost)
 
 
 def _name(mpc: LinearMPC, make: Callable[[], gym.Env[Any, Any]]) -> str:

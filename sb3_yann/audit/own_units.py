@@ -13,7 +13,7 @@ from gymnasium import spaces
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import labels_of
-from sb3_yann.control.mpc.plant_units import InputUnits, misread_state
+from sb3_yann.control.mpc.plant_units import MOST, InputUnits, misread_state
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
 
@@ -85,9 +85,13 @@ def showing_theta(
 
 
 def require_deviations(problem: LinearMPC, theta: Array) -> None:
-    """Raise where theta (steps, n_theta) holds absolute states instead of deviations."""
+    """Raise where theta (steps, n_theta) holds absolute values instead of deviations.
+
+    Nor may references and measured disturbances lie beyond their box in nearly all steps.
+    """
     i = misread_state(problem, theta)
     if i is None:
+        _require_box(problem, theta)
         return
     name = labels_of(problem.model)[0][i]
     raise ValueError(
@@ -95,6 +99,21 @@ def require_deviations(problem: LinearMPC, theta: Array) -> None:
         f"point, {problem.model.x_ss[i]:.6g}: these are absolute values. Wrap the plant in "
         "sb3_yann.wrappers.Deviations(env, mpc.model)."
     )
+
+
+def _require_box(problem: LinearMPC, theta: Array) -> None:
+    """Raise where a reference or a disturbance lies beyond its box in nearly all steps."""
+    rest, room = problem.theta_ss, 1e-3 * problem.theta_half
+    beyond = (theta < problem.theta_min - room) | (theta > problem.theta_max + room)
+    for i in np.flatnonzero(np.mean(beyond, axis=0) >= MOST):
+        if i < problem.model.n_states or i >= problem.layout.disturbance.stop:
+            continue
+        shown = f"{theta[0, i]:.6g}, from the operating point {rest[i]:.6g} on"
+        raise ValueError(
+            f"{problem.labels()[i]} is {shown}, and the MPC was solved for "
+            f"{problem.theta_min[i]:.6g} to {problem.theta_max[i]:.6g}: give the wrapper that "
+            "shows it bounds in the units of the env below it, absolute or deviations."
+        )
 
 
 def _shifted(space: spaces.Box, point: Array) -> Any:

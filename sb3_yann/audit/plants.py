@@ -7,15 +7,17 @@ from itertools import product
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.linearization.simulator import Simulator, borrow
+from sb3_yann.control.linearization.simulator import SHOWN, Simulator, borrow
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.plant_twin import PlantTwin
 
 Rows = NDArray[np.intp]
+Access = tuple[Callable[[Any, Array], object] | None, Callable[[Any], ArrayLike] | None]
+"""How a simulator is put into a state, and how its state is read, where neither is found."""
 CELL = 0.05
 """A derivative holds where states and inputs differ by less than this, in half-widths."""
 STEP = 1e-3
@@ -92,17 +94,18 @@ class SimulatedPlant:
         Whose theta the env shows.
     simulator : Simulator
         Of the env.
-    shift : ndarray, shape (n,)
-        What the state of the simulator has more than that of theta.
+    put, got : ndarray, shape (n,)
+        What a state has more than that of theta where it is set, and where it is read: an env in
+        the plant's own units is put into absolute states, and its wrappers show deviations.
     """
 
-    def __init__(self, problem: LinearMPC, simulator: Simulator, shift: Array) -> None:
-        self.problem, self.simulator, self.shift = problem, simulator, shift
+    def __init__(self, problem: LinearMPC, simulator: Simulator, put: Array, got: Array) -> None:
+        self.problem, self.simulator, self.put, self.got = problem, simulator, put, got
         self._known: dict[bytes, tuple[Array, Array]] = {}
 
     def after(self, x: Array, u: Array) -> Array:
         """Return the state (n,) of theta one step later."""
-        return self.simulator.next_state(x + self.shift, u) - self.shift
+        return self.simulator.next_state(x + self.put, u) - self.got
 
     def step(self, theta: Array, u: Array, rows: Rows) -> Array:
         """Return the next theta (k, n_theta)."""
@@ -145,7 +148,12 @@ class SimulatedPlant:
 
 
 def simulated(
-    problem: LinearMPC, env: Any, thetas: Array, inputs: Array, following: Array
+    problem: LinearMPC,
+    env: Any,
+    thetas: Array,
+    inputs: Array,
+    following: Array,
+    access: Access = (None, None),
 ) -> SimulatedPlant | None:
     """Return a simulator of the env that repeats its steps, None where there is none.
 
@@ -157,19 +165,51 @@ def simulated(
         Makes an env.
     thetas, inputs, following : ndarray, shapes (steps, n_theta), (steps, m) and (steps, n_theta)
         Steps of the env.
+    access : tuple of two callables, or None
+        ``set_state`` and ``get_state`` of :func:`headroom`.
     """
     n, x_ss = problem.model.n_states, problem.model.x_ss
-    simulator = Simulator(borrow(env), None, None)
+    simulator = Simulator(borrow(env), *access)
+    # The wrappers that complete theta append to the states.
+    if SHOWN in simulator.readers:
+        simulator.readers[SHOWN] = lambda env, observation, info: np.ravel(observation)[:n]
     chosen = np.unique(np.linspace(0, len(inputs) - 1, TRIED).astype(int))
     steps = thetas[chosen, :n], inputs[chosen], following[chosen, :n]
     for setter, reader in product(simulator.setters, simulator.readers):
         simulator.setter, simulator.reader = setter, reader
-        for shift in (np.zeros(n), x_ss):
-            plant = SimulatedPlant(problem, simulator, shift)
+        for put, got in product((np.zeros(n), x_ss), repeat=2):
+            plant = SimulatedPlant(problem, simulator, put, got)
             if _error(plant.after, *steps, problem.theta_half[:n]) <= AGREES:
                 return plant
     simulator.env.close()
     return None
+
+
+def lack_of_fit(
+    plant: Plant, problem: LinearMPC, thetas: Array, inputs: Array, following: Array
+) -> float:
+    """Return the share of a plant's one-step errors that neighbors share: 0 for noise, 1 for none.
+
+    Noise of a step says nothing about that of the nearest one, half of whose squared difference is
+    its variance. What a model lacks is alike in both.
+
+    Parameters
+    ----------
+    plant, problem : Plant and LinearMPC
+        What predicts the steps.
+    thetas, inputs, following : ndarray, shapes (steps, n_theta), (steps, m) and (steps, n_theta)
+        Steps of the env.
+    """
+    from scipy.spatial import cKDTree
+
+    states, rows = problem.layout.state, np.zeros(len(inputs), dtype=np.intp)
+    errors = (following - plant.step(thetas, inputs, rows))[:, states]
+    errors = errors / problem.theta_half[states]
+    points = np.hstack([thetas, inputs])
+    points = points / np.maximum(points.std(axis=0), 1e-9)
+    other = cKDTree(points).query(points, k=2)[1][:, 1]
+    whole = max(float(np.sum(errors**2)), 1e-300)
+    return 1.0 - float(np.sum((errors - errors[other]) ** 2)) / 2 / whole
 
 
 def _error(

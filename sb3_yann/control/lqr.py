@@ -97,16 +97,26 @@ def spectral_radius(matrix: Array) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(matrix))))
 
 
-def _why_no_solution(A: Array, B: Array) -> str:
-    """Return which condition of the Riccati equation fails (Hautus' test)."""
+def unreached(A: Array, B: Array) -> complex | None:
+    """Return a pole that does not decay and that no input reaches (Hautus' test), None for none."""
     for pole in np.linalg.eigvals(A):
         hautus = np.hstack([pole * np.eye(len(A)) - A, B])
         smallest = np.linalg.svd(hautus, compute_uv=False)[-1]
         if abs(pole) > 1 - 1e-9 and smallest < 1e-10 * max(1.0, np.abs(hautus).max()):
-            return (
-                f"The model has an unstable mode that no input reaches: eigenvalue {pole:.6g} of "
-                "sqrt(gamma) A. Remove the mode from the model, add an input, or lower gamma."
-            )
+            return complex(pole)
+    return None
+
+
+def _why_no_solution(A: Array, B: Array) -> str:
+    """Return which condition of the Riccati equation fails."""
+    pole = unreached(A, B)
+    if pole is not None:
+        shown = pole if pole.imag else pole.real
+        return (
+            f"The model has an unstable mode that no input reaches: eigenvalue {shown:.6g} of "
+            "sqrt(gamma) A. Remove the mode from the model, add an input, lower gamma, or take "
+            "another steady state: model.report() names those that were found."
+        )
     return (
         "The Riccati equation has no stabilizing solution: a mode on the unit circle carries no "
         "weight in Q. Give it a positive weight, use gamma < 1, or pass a Terminal(cost)."

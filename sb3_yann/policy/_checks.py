@@ -284,6 +284,12 @@ def require_theta(
                 "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
             )
         return
+    if shape == (problem.model.n_states,) != (problem.n_theta,) == (observation.n_obs,):
+        raise ValueError(
+            f"The observation has shape {shape}, but the law of the problem {takes}. Wrap the env "
+            "so that it shows all of theta: SetPoint, MeasuredDisturbance, ObserveDisturbance and "
+            "PreviousInput in sb3_yann.wrappers append what is missing."
+        )
     given = f"The map to theta has a matrix of shape {observation.matrix.shape}, but the"
     if shape is None or observation.n_obs != np.prod(shape):
         raise ValueError(

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +16,7 @@ from sb3_yann._validation import Array, NonFiniteWarning, as_whole
 from sb3_yann.control import DisturbanceObserver
 from sb3_yann.wrappers.appending import Appending, joined
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
+from sb3_yann.wrappers.units import Deviations
 
 Schedule = Callable[[int], ArrayLike]
 """The reference after so many steps of an episode."""
@@ -29,7 +31,7 @@ class PreviousInput(Appending):
     initial : array_like, shape (m,), optional
         What counts as the previous input at the start of an episode, as the env takes it: zeros by
         default, the operating point of an env that takes deviations. One whose bounds leave zero
-        out needs it.
+        out, or begin or end there, needs it.
 
     Examples
     --------
@@ -71,7 +73,8 @@ class PastInputs(Appending):
         For each input, how many of its past values are appended, newest first.
     initial : array_like, shape (m,), optional
         What was on its way at the start of an episode, as the env takes it: zeros by default, the
-        operating point of an env that takes deviations. One whose bounds leave zero out needs it.
+        operating point of an env that takes deviations. One whose bounds leave zero out, or begin
+        or end there, needs it: ``model.u_ss`` of an env in the plant's own units.
 
     Examples
     --------
@@ -112,11 +115,14 @@ class PastInputs(Appending):
 
 
 def _require_zero(bounds: spaces.Box, needed: NDArray[np.bool_]) -> None:
-    """Raise where inputs that are ``needed`` (m,) cannot have been zero before an episode."""
-    if np.any(needed & ((bounds.low > 0) | (bounds.high < 0))):
+    """Raise where inputs that are ``needed`` (m,) were hardly zero before an episode.
+
+    Bounds that leave zero out are those of absolute values, and so are those that begin there.
+    """
+    if np.any(needed & ((bounds.low >= 0) | (bounds.high <= 0))):
         raise ValueError(
             f"The env takes inputs from {bounds.low.tolist()} to {bounds.high.tolist()}: zero, "
-            "the default, cannot be the one before an episode. Pass initial, such as u_ss of the "
+            "the default, is hardly the one before an episode. Pass initial, such as u_ss of the "
             "model."
         )
 
@@ -185,6 +191,8 @@ class SetPoint(Appending):
 class MeasuredDisturbance(Appending):
     """Appends a disturbance d (d,) that the env measures and reports in ``info``.
 
+    Over :class:`Deviations` it counts from the operating point as well: ``d_ss`` is taken off.
+
     An entry that is no finite number is named, and the last one that was holds: at first 0, the
     operating point, or the nearest bound to it.
 
@@ -209,6 +217,7 @@ class MeasuredDisturbance(Appending):
 
     def __init__(self, env: Env, low: ArrayLike, high: ArrayLike, key: str = "disturbance") -> None:
         super().__init__(env, low, high)
+        self.d_ss: Array = _operating_disturbance(env, self.low)
         if not isinstance(key, str):
             raise TypeError(f"key = {key!r} must be a str, the entry of info that holds d.")
         self.key = key
@@ -225,7 +234,7 @@ class MeasuredDisturbance(Appending):
         if d.shape != self.low.shape:
             raise ValueError(f"info[{self.key!r}] has shape {d.shape}, expected {self.low.shape}.")
         failing = ~np.isfinite(d)
-        self.held = np.where(failing, self.held, d)
+        self.held = np.where(failing, self.held, d - self.d_ss)
         if np.any(failing & ~self.failing):  # once, for a sensor that stays so
             warnings.warn(
                 f"info[{self.key!r}] = {d.tolist()} is not finite: {self.held.tolist()} holds "
@@ -235,6 +244,16 @@ class MeasuredDisturbance(Appending):
             )
         self.failing = failing
         return joined(observation, self.held)
+
+
+def _operating_disturbance(env: Env, low: Array) -> Array:
+    """Return what measured disturbances (d,) count from: d_ss of a `Deviations` below."""
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, Deviations) and inner.d_ss.shape == low.shape:
+            return inner.d_ss
+        inner = inner.env
+    return np.zeros_like(low)
 
 
 def _require_deviations(env: Env, u_ss: Array) -> None:

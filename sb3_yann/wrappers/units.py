@@ -16,7 +16,8 @@ from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Shows ``x - x_ss`` and takes ``u - u_ss``, in boxes that are shifted likewise.
 
-    Wrap the plant in it first; what other wrappers append then counts from the operating point too.
+    Wrap the plant in it first; what other wrappers append then counts from the operating point too,
+    as a :class:`MeasuredDisturbance` counts from ``d_ss``.
     Entries of the observation after the n states stay as they are, but for the set-points of a
     plant that shows its own: pass the problem for those. An env that is wrapped in it already is
     refused, and so is an action that is NaN.
@@ -58,6 +59,7 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
         if tracked.size and seen.shape[0] > n:
             self.x_ss[n : n + len(tracked)] = tracked @ model.x_ss
         self.u_ss: Array = model.u_ss
+        self.d_ss: Array = model.d_ss
         self.taken = taken
         self.observation_space = _shifted(seen, self.x_ss)
         self.action_space = _shifted(taken, self.u_ss)

@@ -139,7 +139,10 @@ def test_what_a_linear_model_cannot_do_is_left_to_learning() -> None:
         ((0.004, 0.003, 0.014), 0.0, "learn"),
         ((0.006, 0.0, 0.001), 0.0, "add ObserveDisturbance first"),
         ((0.004, 0.0, 0.0), 0.0, "do not bother"),
-        ((0.0, 0.3, 0.1), 0.5, "do not bother"),  # by chance
+        ((0.0, 0.3, 0.1), 0.5, "not known"),  # it may be chance
+        ((0.0, 0.0, 0.021), 0.03, "not known"),
+        ((0.0, 0.015, 0.004), 0.02, "do not bother"),  # little, and that may be chance
+        ((0.006, 0.0, 0.012), 0.0, "add ObserveDisturbance first"),  # too little to learn
         ((0.0, 0.3, 0.1), 0.3, "re-identify"),
     ],
 )
@@ -149,7 +152,7 @@ def test_two_lines_are_worth_less_than_a_training(parts, doubt, verdict) -> None
 
 def test_what_may_be_chance_is_not_called_little() -> None:
     costs = np.array([1.0, 3.0])
-    found = Headroom(costs, costs, costs, costs / 2, 0.5, 0.0, 0.0, "do not bother", "a plant")
+    found = Headroom(costs, costs, costs, costs / 2, 0.5, 0.0, 0.0, "not known", "a plant")
     assert "may be chance on so few starts. Take more: n_starts" in str(found)
 
 

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 
 import unit_samples as units
-from sb3_yann import headroom
-from sb3_yann.wrappers import Deviations, StageCost
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, headroom
+from sb3_yann.audit.plants import lack_of_fit
+from sb3_yann.wrappers import Deviations, SetPoint, StageCost
 
 MPC = units.absolute_mpc()
+
+
+def tracking() -> LinearMPC:
+    """Return an MPC of the same plant whose temperature follows a set-point."""
+    design = {"Q": np.diag([1, 0]), "R": [[0.1]], "horizon": 3, "absolute": True}
+    return LinearMPC(units.MODEL, **design, **units.LIMITS, tracking=Tracking([0], 349, 351))
 
 
 def test_a_plant_in_its_own_units_has_the_headroom_of_its_deviations() -> None:
@@ -32,3 +41,125 @@ def test_a_plant_in_its_own_units_has_the_headroom_of_its_deviations() -> None:
 def test_units_that_nobody_can_tell_are_refused(takes, mpc, message) -> None:
     with pytest.raises(ValueError, match=message):
         headroom(mpc, units.plant("absolute", takes), n_starts=2)
+
+
+class Settable(units.OwnUnits):
+    """It bends upwards, and can be put into an absolute state."""
+
+    def reset(self, *, seed=None, options=None):
+        shown, info = super().reset(seed=seed)
+        if options:
+            self.x = np.array(options["state"]) - units.X_SS
+            shown = self.shows(self.x)
+        return shown, info
+
+    def step(self, action):
+        found = super().step(action)
+        self.x[0] += 0.05 * self.x[0] ** 2
+        return self.shows(self.x), *found[1:]
+
+
+class Deaf(Settable):
+    """No reset puts it into a state."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)
+
+
+def bent(cls: type[Settable] = Settable) -> gym.Env:
+    return TimeLimit(cls("absolute", "absolute"), 20)
+
+
+def put(env: gym.Env, x: np.ndarray) -> None:
+    env.unwrapped.x = x - units.X_SS
+
+
+class TwinError(Exception):
+    """A twin was asked for: plans are not made in the env."""
+
+
+@pytest.fixture
+def no_twin(monkeypatch) -> None:
+    def fit(*_args: object, **_options: object) -> None:
+        raise TwinError
+
+    monkeypatch.setattr(PlantTwin, "fit", fit)
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: Deviations(env, MPC)])
+@pytest.mark.usefixtures("no_twin")
+def test_a_plant_is_put_into_absolute_states_where_its_wrappers_show_deviations(wrap) -> None:
+    assert headroom(MPC, wrap(bent()), n_starts=2).total > 0
+
+
+@pytest.mark.usefixtures("no_twin")
+def test_a_plant_with_set_points_is_put_into_its_own_states() -> None:
+    assert headroom(tracking(), SetPoint(bent(), 349, 351), n_starts=2).total > 0
+
+
+@pytest.mark.usefixtures("no_twin")
+def test_a_plant_that_no_reset_puts_into_a_state_takes_a_function() -> None:
+    with pytest.raises(TwinError):
+        headroom(MPC, bent(Deaf), n_starts=2)
+    first = headroom(MPC, bent(Deaf), n_starts=2, set_state=put)
+    get = {"get_state": lambda env: env.unwrapped.x + units.X_SS}
+    again = headroom(MPC, bent(Deaf), n_starts=2, set_state=put, **get)
+    np.testing.assert_allclose(first.best_costs, again.best_costs, rtol=1e-6)
+
+
+def test_what_puts_no_state_is_named() -> None:
+    with pytest.raises(TypeError, match="set_state = 3 must be a function"):
+        headroom(MPC, bent(Deaf), set_state=3)
+
+
+@pytest.mark.parametrize("low", [-1, 353])
+def test_set_points_in_other_units_than_the_env_s_are_named(low) -> None:
+    plant = SetPoint(units.plant("absolute", "absolute"), low, low + 2)
+    with pytest.raises(ValueError, match=r"set-point of temperature is .*, and the MPC was solved"):
+        headroom(tracking(), plant, n_starts=2)
+
+
+class Acid(gym.Env):
+    """A pH, and a flow of base that does next to nothing far from neutral."""
+
+    observation_space = gym.spaces.Box(0, 14, (1,), np.float64)
+    action_space = gym.spaces.Box(0, 100, (1,), np.float64)
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.noise = noise
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.excess = np.sinh(self.np_random.uniform(-5, 5, 1))
+        return 7 + np.arcsinh(self.excess), {}
+
+    def step(self, action):
+        self.excess = 0.95 * self.excess + action / 20 - 2.5
+        seen = 7 + np.arcsinh(self.excess) + self.noise * self.np_random.standard_normal(1)
+        return seen, 0.0, False, False, {}
+
+
+def neutral() -> LinearMPC:
+    model = LinearModel([[0.95]], [[0.05]], 1, [7], [50], state_names=["pH"])
+    limits = {"x_min": 0, "x_max": 14, "u_min": 0, "u_max": 100, "absolute": True}
+    return LinearMPC(model, Q=[[1]], R=[[0.01]], horizon=3, **limits)
+
+
+def test_nothing_found_with_plans_of_a_poor_twin_is_not_called_little() -> None:
+    found = headroom(neutral(), TimeLimit(Acid(), 30), n_starts=6)
+    assert found.verdict == "not known" and found.lost > 0.02
+    assert "Where the env repeats its steps" in str(found)
+
+
+def test_what_neighbors_share_is_told_from_noise() -> None:
+    mpc, rng = MPC, np.random.default_rng(0)
+
+    class Model:
+        def step(self, theta, u, rows):
+            return mpc.predict(theta, u)
+
+    theta, u = rng.uniform(-1, 1, (500, 2)), rng.uniform(-1, 1, (500, 1))
+    after = mpc.predict(theta, u)
+    noisy, bent = after + rng.normal(0, 0.1, after.shape), after + 0.1 * theta**2
+    assert abs(lack_of_fit(Model(), mpc, theta, u, noisy)) < 0.2
+    assert lack_of_fit(Model(), mpc, theta, u, bent) > 0.9

@@ -196,3 +196,21 @@ def test_bad_inputs_and_starts_are_named() -> None:
 @pytest.mark.filterwarnings("ignore:.*normalized space")  # inputs are the plant's own
 def test_gymnasiums_checker_has_no_complaint() -> None:
     check_env(PCGymEnv("cstr"), skip_render_check=True)
+
+
+@needs_pcgym
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_a_model_that_pcgym_cannot_make_by_its_name_is_played() -> None:
+    from pcgym.model_classes import cstr_series_recycle
+
+    x0, hot = np.array([80.0, 320.0, 60.0, 325.0]), {"T2": [321.0] * 20}
+    box = {"low": np.array([0, 290, 0, 290.0]), "high": np.array([100, 360, 100, 360.0])}
+    inputs = {"low": np.array([0, 0, 270, 270.0]), "high": np.array([2e-5, 2e-5, 360, 360])}
+    case = {"N": 20, "tsim": 20.0, "SP": hot, "x0": x0, "o_space": box, "a_space": inputs}
+    env = PCGymEnv({**case, "model": "cstr_series_recycle", "r_scale": {"T2": 1.0}})
+    env.reset(seed=0, options={"state": x0})
+    u = np.float32([1e-5, 1e-5, 315, 315])
+    moved = env.step(u)[4]["state"] - x0
+    slope = np.array(cstr_series_recycle()(x0, u.astype(float)))
+    np.testing.assert_allclose(moved, env.dt * slope, rtol=0.3)
+    assert env.input_names == ("F", "L", "Tc1", "Tc2")

@@ -248,3 +248,10 @@ def test_set_points_in_other_units_than_the_policy_s_are_named(
     wrong = SetPoint(plant, low, high)
     with pytest.warns(UserWarning, match=message):
         build(wrong, mpc=mpc).predict(wrong.reset(seed=0)[0])
+
+
+def test_a_plant_that_lacks_a_part_of_theta_is_told_of_the_wrappers() -> None:
+    design = {"Q": np.diag([1, 0]), "R": [[0.1]], "horizon": 2, "absolute": True, **units.LIMITS}
+    mpc = LinearMPC(units.MODEL, tracking=Tracking([0], 349, 351), **design)
+    with pytest.raises(ValueError, match=r"takes theta of shape \(3,\).*SetPoint"):
+        build(units.plant("absolute", "absolute"), mpc=mpc)

@@ -17,6 +17,7 @@ from sb3_yann import (
 )
 from sb3_yann.wrappers import (
     Deviations,
+    MeasuredDisturbance,
     ObserveDisturbance,
     PastInputs,
     PreviousInput,
@@ -174,7 +175,9 @@ def test_what_cannot_have_been_played_before_an_episode_is_asked_for(wrap: Any) 
     with pytest.raises(ValueError, match=r"takes inputs from \[2.0\] to \[8.0\].*Pass initial"):
         wrap(Valve(2.0, 8.0))
     assert wrap(Valve(2.0, 8.0), initial=[5.0]).initial.tolist() == [5.0]
-    wrap(Valve(0.0, 8.0))
+    with pytest.raises(ValueError, match=r"from \[0.0\] to \[8.0\]: zero, .*is hardly the one"):
+        wrap(Valve(0.0, 8.0))  # a valve that is open from 0 to 100 % was open before
+    wrap(Valve(-2.0, 8.0))
     PastInputs(Valve(2.0, 8.0), [0])
 
 
@@ -187,3 +190,18 @@ def test_an_observation_that_is_a_column_is_named() -> None:
     env = StageCost(Column(), MPC, observation="absolute")
     with pytest.raises(ValueError, match=r"observation of shape \(2, 1\), .* has \(2,\)"):
         env.reset(seed=0)
+
+
+class Fed(gym.Wrapper):
+    """Tells its feed, near 10 kg/min."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        return self.env.reset(**kwargs)[0], {"disturbance": [10.5]}
+
+
+def test_a_measured_disturbance_counts_from_its_operating_point_too() -> None:
+    model = LinearModel(np.eye(2) / 2, np.ones((2, 1)), 1.0, X_SS, [10], np.ones((2, 1)), [10.0])
+    env = MeasuredDisturbance(Deviations(Fed(Reactor()), model), -2, 2)
+    assert env.reset(seed=0)[0][-1] == 0.5
+    plain = MeasuredDisturbance(Fed(Reactor()), 8, 12)
+    assert plain.reset(seed=0)[0][-1] == 10.5

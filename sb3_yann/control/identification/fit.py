@@ -29,11 +29,21 @@ from sb3_yann.control.linear_system import LinearSystem, names
 
 @dataclass(frozen=True, eq=False)
 class LogFit:
-    """A system fitted to a log, its regression, and its fits (n,) one and ten steps ahead."""
+    """A system fitted to a log.
+
+    Attributes
+    ----------
+    system, regression : LinearSystem and Regression
+    fits : tuple of ndarray, shapes (n,)
+        One and ten steps ahead.
+    delays : tuple of int
+        Dead time of each input.
+    """
 
     system: LinearSystem
     regression: Regression
     fits: tuple[Array, Array]
+    delays: tuple[int, ...]
 
 
 def fit_log(  # noqa: PLR0913 (those of `identify`)
@@ -87,10 +97,10 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
     if late:
         warnings.warn(" ".join(late), stacklevel=3)
     told = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
-    notes = [*system.notes, *_memory_notes(delays, sizes), *told, *shrunk, *late]
+    notes = [*system.notes, *_memory_notes(delays, sizes, system.u_ss), *told, *shrunk, *late]
     if lost:
         notes.append(f"{lost} steps that took another time than dt were left out.")
-    return LogFit(replace(system, notes=tuple(notes)), found, fits)
+    return LogFit(replace(system, notes=tuple(notes)), found, fits, tuple(delays))
 
 
 def _system(
@@ -167,7 +177,7 @@ def _with_exact_memory(system: LinearSystem, delays: list[int], n: int) -> Linea
     return replace(system, A=A, B=B, E=E, state_names=labels)
 
 
-def _memory_notes(delays: list[int], sizes: tuple[int, int, int]) -> list[str]:
+def _memory_notes(delays: list[int], sizes: tuple[int, int, int], u_ss: Array) -> list[str]:
     """Return a note on the dead time that the model holds."""
     if not any(delays):
         return []
@@ -176,5 +186,6 @@ def _memory_notes(delays: list[int], sizes: tuple[int, int, int]) -> list[str]:
     labels = ", ".join(memory_labels(delays, inputs))
     return [
         f"Dead time: inputs act for {delays} samples. The states from x[{n}] on are the inputs on "
-        f"their way, {labels}. Show them to a policy: sb3_yann.wrappers.PastInputs(env, {delays})."
+        f"their way, {labels}. Show them to a policy: sb3_yann.wrappers.PastInputs(env, {delays}, "
+        f"initial=[{', '.join(f'{each:.6g}' for each in u_ss)}])."
     ]

@@ -1,4 +1,4 @@
-"""The regions of an explicit law in a plane of two coordinates."""
+"""The regions of an explicit law in a plane of two coordinates, or on a line."""
 
 from __future__ import annotations
 
@@ -27,21 +27,23 @@ def plot_regions(
     law: Any,
     axes: Axes | None = None,
     *,
-    entries: Sequence[int] = (0, 1),
+    entries: Sequence[int | str] = (0, 1),
     at: ArrayLike | None = None,
     labels: Sequence[str] | None = None,
     name: Name | None = None,
 ) -> Axes:
     """Draw the regions in the plane of two entries of theta, as the plant shows them.
 
+    Of a law of one parameter the inputs are drawn over it, with a line where a region ends.
+
     Parameters
     ----------
     law : PiecewiseAffine
-        With a bounded box of theta, and at least two parameters.
+        With a bounded box of theta.
     axes : matplotlib Axes, optional
         Where to draw; a new figure's by default.
-    entries : pair of int, default (0, 1)
-        The coordinates to the right and up.
+    entries : pair of int or str, default (0, 1)
+        The coordinates to the right and up, by number or by name of a state.
     at : array_like, shape (n_theta,), optional
         The other entries, as the plant shows them; the operating point by default.
     labels : sequence of str, optional
@@ -53,7 +55,7 @@ def plot_regions(
     Returns
     -------
     Axes
-        Each region is a polygon whose ``get_gid()`` is its number.
+        Each region is a polygon whose ``get_gid()`` is its number, but for a single parameter.
 
     Raises
     ------
@@ -73,7 +75,9 @@ def plot_regions(
             f"{law!r} is solved online and has no regions. Take LinearMPC.explicit(), or draw its "
             "input by sb3_yann.evaluation.plots.plot_surface."
         )
-    across, up = _entries(entries, law.n_theta)
+    if law.n_theta == 1:
+        return _draw_line(law, axes, labels)
+    across, up = _entries(entries, law)
     zero = np.zeros(law.n_theta) if law.theta_ss is None else law.theta_ss
     point = zero if at is None else as_array("at", at, (law.n_theta,))
     polygons = slices(law, (across, up), point - zero)
@@ -145,12 +149,42 @@ def _clipped(polygon: Array, rows: Array, levels: Array) -> Array:
     return polygon
 
 
-def _entries(entries: Sequence[int], n: int) -> tuple[int, int]:
-    chosen = [*entries]
+def _draw_line(law: Any, axes: Axes | None, labels: Sequence[str] | None) -> Axes:
+    """Draw the inputs over the only parameter."""
+    (low,), (high,) = law.theta_min, law.theta_max
+    if not np.all(np.isfinite([low, high])):
+        raise ValueError(
+            "The law's box is not bounded: there is no frame to draw. Solve the problem for a "
+            "bounded theta_min and theta_max."
+        )
+    model, m = law.model, law.n_inputs
+    zero = 0.0 if law.theta_ss is None else law.theta_ss[0]
+    rest = np.zeros(m) if model is None else model.u_ss
+    inputs = [f"u[{k}]" for k in range(m)] if model is None else with_units(model)[1]
+    ends = np.unique(np.clip(law.b / law.A[:, 0], low, high)[law.A[:, 0] != 0])
+    theta = np.unique(np.concatenate([np.linspace(low, high, 401), ends]))
+    axes = axes_or_new(axes, 7.4, 4.4)
+    for k, line in enumerate(np.asarray(law(theta[:, None]) + rest).T):
+        axes.plot(theta + zero, line, color=COLORS[k % len(COLORS)], label=inputs[k])
+    for end in ends[(ends > low) & (ends < high)]:
+        axes.axvline(end + zero, color=REST, linewidth=0.5)
+    called = [*labels] if labels else _labels(law)
+    axes.set(xlim=(low + zero, high + zero), xlabel=called[0])
+    if m == 1:
+        axes.set(ylabel=inputs[0])
+    else:
+        legend_beside(axes)
+    return axes
+
+
+def _entries(entries: Sequence[int | str], law: Any) -> tuple[int, int]:
+    n, names = law.n_theta, [] if law.model is None else labels_of(law.model)[0]
+    chosen: list[Any] = [names.index(each) if each in names else each for each in entries]
     whole = all(isinstance(each, int | np.integer) and 0 <= each < n for each in chosen)
     if len(chosen) != 2 or not whole or chosen[0] == chosen[1]:
         raise ValueError(
-            f"entries = {chosen} must be two different entries of theta, from 0 to {n - 1}."
+            f"entries = {[*entries]} must be two different entries of theta, from 0 to {n - 1}"
+            f"{', or names of ' + ', '.join(names) if names else ''}."
         )
     return int(chosen[0]), int(chosen[1])
 

@@ -17,6 +17,8 @@ ADVICE = (
     "too, or identify the plant: LinearModel.from_data"
 )
 
+PASS = "Pass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."
+
 
 def connect(
     simulator: Simulator, x: Array | None, u: Array, scale: ArrayLike | None
@@ -51,9 +53,10 @@ def connect(
         wanted = "" if x is None else f" of shape {x.shape}, like the one given,"
         tried = [f"a state{wanted} is nowhere to be read: {sizes}"]
     ways = "".join(f"\n  - {each}" for each in tried)
+    given = "set_state" in simulator.setters and "get_state" in simulator.readers
+    advice = "" if given else f"\n{PASS}"
     raise ValueError(
-        f"The environment could not be put into a state and read. Tried:{ways}\n"
-        "Pass set_state=lambda env, x: ... and get_state=lambda env: ... for its state."
+        f"The environment could not be put into a state and read. Tried:{ways}{advice}"
     )
 
 

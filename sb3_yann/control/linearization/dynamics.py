@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from sb3_yann._validation import Array, as_array, as_positive, as_positive_vecto
 from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
 from sb3_yann.control.linearization.differences import curvature, differences, idle_inputs
 from sb3_yann.control.linearization.rate import Rate
+from sb3_yann.control.lqr import unreached
 
 LONGEST = 0.01  # longest step of a difference, relative to the scale of its coordinate
 STEADY = 1e-3  # largest motion of a steady state in one sample, relative to its scale
@@ -57,7 +58,7 @@ def linearize_dynamics(
     _require_steady(rate, point, size, dt, scale is not None)
     rounding = np.finfo(float).eps * np.maximum(np.abs(point), size)[: x.size] / dt
     found = differences(rate, point, LONGEST * size, rounding, names(sizes))
-    A, B, E = np.split(found.value, np.cumsum(sizes[:2]), axis=1)
+    A, B, E = _parts(found.value, sizes)
     A, B, E = zero_order_hold(A, B, E, dt)
     x, u, d = np.split(point, np.cumsum(sizes[:2]))
     notes += [*idle_inputs(B, 4), *curvature(found, names(sizes))]
@@ -93,6 +94,8 @@ def _solve(rate: Rate, given: Array, scale: Array, dt: float) -> tuple[Array, li
             f"{best[n:].tolist()}, which moves in one sample by {least:.2g} scales. Leave more "
             "entries free (NaN), give one that you know, or pass scale=..., how far each moves."
         )
+    # A bioreactor that is washed out is at rest too, and no input brings it back.
+    found.sort(key=lambda each: _is_lost(rate, each, _scale(each, n, scale[:n]), dt))
     notes = [f"Of the steady state {np.count_nonzero(free)} entries were solved for."]
     if np.count_nonzero(free) > n:
         notes[0] += f" The equations determine {n}: it is one of many. Give more entries."
@@ -100,6 +103,24 @@ def _solve(rate: Rate, given: Array, scale: Array, dt: float) -> tuple[Array, li
         others = "; ".join(str([float(f"{v:.4g}") for v in other]) for other in found[1:])
         notes[0] += f" There are others, {others}: give an entry that tells them apart."
     return found[0], notes
+
+
+def _parts(slopes: Array, sizes: Sequence[int]) -> list[Array]:
+    """Return the derivatives by x, u and d."""
+    return np.split(slopes, np.cumsum(sizes[:2]), axis=1)
+
+
+def _is_lost(rate: Rate, point: Array, size: Array, dt: float) -> bool:
+    """Tell whether a mode that does not decay is out of reach of the inputs at a steady state."""
+    steps = np.diag(1e-4 * size)
+    try:
+        rate.choose(point)
+        slopes = np.array([(rate(point + h) - rate(point - h)) / (2 * h.max()) for h in steps]).T
+        A, B, E = _parts(slopes, rate.sizes)
+        A, B, _ = zero_order_hold(A, B, E, dt)
+        return unreached(A, B) is not None
+    except (ArithmeticError, ValueError):  # no value next to it
+        return True
 
 
 def _solved_from(

@@ -23,11 +23,12 @@ Reader = Callable[[Any, Any, dict[str, Any]], Any]  # of an environment, observa
 RESET = 'reset(options={"state": x})'
 ATTRIBUTE = "env.unwrapped.state"
 MUJOCO = "env.unwrapped.data.qpos and qvel"
+SHOWN = "the observation"
 READERS: dict[str, Reader] = {
     'info["state"]': lambda env, observation, info: info.get("state"),
     ATTRIBUTE: lambda env, observation, info: getattr(env.unwrapped, "state", None),
     MUJOCO: lambda env, observation, info: _positions_and_velocities(env.unwrapped),
-    "the observation": lambda env, observation, info: observation,
+    SHOWN: lambda env, observation, info: observation,
 }
 """Where a state may be read, the most precise first: observations are float32."""
 

@@ -14,6 +14,8 @@ from sb3_yann.control.linearization.simulator import Simulator
 MOVED = 1e-3  # largest residual of a given steady state in one step, relative to the scale
 AWAY = 1e-2  # largest distance to the linear model's steady state, relative to the scale
 SOLVED = 1e-6  # largest residual of a steady state that was solved for
+NOTHING = 1e-9  # a solved entry that is smaller, relative to its scale, is zero
+SETTLES = 2_000  # steps in which a plant may come to rest by itself
 
 
 def steady_state(
@@ -37,6 +39,11 @@ def steady_state(
     point = _solve(simulator, start, free, scale)
     moved = residual(simulator, point, scale)
     n = moved.size
+    if not np.max(np.abs(moved)) <= SOLVED and np.all(free[:n]) and not np.any(free[n:]):
+        # A search may run away from where the plant comes to rest by itself.
+        another = _solve(simulator, _settled(simulator, start, scale), free, scale)
+        if np.max(np.abs(residual(simulator, another, scale))) <= SOLVED:
+            return _without_rounding(another, free, scale)
     if not np.max(np.abs(moved)) <= SOLVED and not _is_noise(simulator, point, moved, scale):
         reason = simulator.refusal if np.any(np.isnan(moved)) else f"{(moved * scale[:n]).tolist()}"
         stuck = _at_bounds(simulator, point[n:], scale[n:])
@@ -45,6 +52,25 @@ def steady_state(
             f"{point[n:].tolist()}, which moves in one step by {reason}.{stuck} Leave more entries "
             "free (NaN), or start closer to it."
         )
+    return _without_rounding(point, free, scale)
+
+
+def _without_rounding(point: Array, free: NDArray[np.bool_], scale: Array) -> Array:
+    """Return the point with zeros for solved entries that are next to nothing."""
+    return np.where(free & (np.abs(point) <= NOTHING * scale), 0.0, point)
+
+
+def _settled(simulator: Simulator, start: Array, scale: Array) -> Array:
+    """Return the point that the plant comes to with its action held, the last one with values."""
+    point, n = start, scale.size - simulator.env.action_space.shape[0]
+    for _ in range(SETTLES):
+        reached = simulator.next_state(point[:n], point[n:])
+        if not np.all(np.isfinite(reached)):
+            break
+        moved = np.max(np.abs(reached - point[:n]) / scale[:n])
+        point = np.concatenate([reached, point[n:]])
+        if moved <= SOLVED:
+            break
     return point
 
 

@@ -36,6 +36,8 @@ class Identified(ReadOnlyArrays):
         and ten steps ahead. NaN without such data, or for a constant state.
     excitation : float
         Smallest over largest singular value of the states and inputs, each in units of its spread.
+    delays : tuple of int, length m
+        Dead time of each input in samples, as ``PastInputs(env, delays)`` takes it.
 
     Examples
     --------
@@ -58,7 +60,12 @@ class Identified(ReadOnlyArrays):
     one_step_fit: Array
     ten_step_fit: Array
     excitation: float
+    delays: tuple[int, ...]
     __eq__, __hash__ = object.__eq__, object.__hash__  # fits may be NaN
+
+    def __str__(self) -> str:
+        """Return the report of the model."""
+        return self.model.report()
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
         """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E"."""
@@ -141,4 +148,4 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     n = model.n_states
     A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)
     residuals = (step.covariance, step.degrees_of_freedom, step.autocorrelation)
-    return Identified(model, A, B, E, *residuals, *found.fits, step.excitation)
+    return Identified(model, A, B, E, *residuals, *found.fits, step.excitation, found.delays)

@@ -160,6 +160,8 @@ class LinearMPC(MPCProblem):
             arguments.warn_of_no_rest(*u, model.u_ss, absolute)
             if absolute:
                 arguments.warn_of_no_room(model, *states)
+        elif not absolute and np.all((u[0] < model.u_ss) & (model.u_ss < u[1])):
+            arguments.warn_of_no_rest(*u, model.u_ss, absolute)
         arguments.warn_of_unused_softness(soft.x, x, states)
         arguments.warn_of_drift(model, *states)
         checked = (
@@ -175,7 +177,11 @@ class LinearMPC(MPCProblem):
         return np.asarray(theta) @ A.T + np.asarray(u) @ B.T
 
     def simulate(self, theta0: ArrayLike, steps: int) -> tuple[Array, Array]:
-        """Return thetas (steps + 1, n_theta) and inputs (steps, m) of the law on its own model."""
+        """Return thetas (steps + 1, n_theta) and inputs (steps, m) of the law on its own model.
+
+        All of them count from the operating point: add ``theta_ss`` and ``model.u_ss`` for what the
+        plant shows and takes. Absolute values in place of theta0 are refused where they are told.
+        """
         return simulation.simulate(self, self.law(), theta0, steps)
 
     def is_reachable(self, r: Given = None, d: Given = None) -> NDArray[np.bool_]:

@@ -53,10 +53,11 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
     labels, names = problem.labels(units=True), problem.layout.names
     width = max(10, *map(len, labels))
     low, high = problem.theta_min + points, problem.theta_max + points
+    shown = [f"[{each:.4g}]" if rests else "" for each in points]
+    room = max(10, *(len(each) + 1 for each in shown)) if rests else 0
     for i, (label, name) in enumerate(zip(labels, names, strict=True)):
         kind, index = name[:-1].split("[")
-        point = f"[{points[i]:.4g}]" if rests else ""
-        meaning = f"{point:<{10 * rests}}{meanings[kind]} {index}"
+        meaning = f"{shown[i]:<{room}}{meanings[kind]} {index}"
         yield f"  {label:<{width}} {low[i]:>10.4g} to {high[i]:<10.4g} {meaning}"
 
 

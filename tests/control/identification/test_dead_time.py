@@ -146,3 +146,13 @@ def test_dead_time_of_a_curved_plant_is_found(delay: int) -> None:
 def test_a_bad_delay_is_named(delay: Any) -> None:
     with pytest.raises(ValueError, match=r"delay = .* must be"):
         identify(*late((0, 0), 0.0), dt=1, delay=delay)
+
+
+def test_the_wrapper_that_shows_inputs_on_their_way_is_named_with_what_they_were() -> None:
+    rng = np.random.default_rng(0)
+    u, x = rng.uniform(30, 50, 300), [70.0, 70.0, 70.0]
+    for k in range(2, 300):
+        x.append(70 + 0.9 * (x[-1] - 70) + 0.3 * (u[k - 2] - 40))
+    found = identify(np.array(x)[:, None], u[:, None], dt=1, delay="auto", u_ss=[40])
+    assert found.delays == (2,)
+    assert "PastInputs(env, [2], initial=[40])" in str(found)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from sb3_yann import LinearMPC
+from sb3_yann import LinearModel, LinearMPC
 from sb3_yann._drawing import COLORS, REST
 from sb3_yann.control.law.plot import area, slices
 from sb3_yann_envs import problems
@@ -109,3 +109,28 @@ def test_entries_that_are_not_two_coordinates_are_refused(entries) -> None:
 def test_a_law_that_is_solved_online_has_no_regions_to_draw() -> None:
     with pytest.raises(ValueError, match=r"has no regions.*plot_surface"):
         problems.clipped_pendulum().online().plot()
+
+
+def test_a_law_of_one_parameter_is_a_line_over_it() -> None:
+    tank = LinearModel([[0.9]], [[0.5]], 1, [12], [3], state_names=["level"], units={"level": "cm"})
+    bounds = {"x_min": 0, "x_max": 20, "u_min": 2, "u_max": 4, "absolute": True}
+    law = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **bounds).explicit()
+    axes = law.plot()
+    x, u = axes.lines[0].get_data()
+    assert (axes.get_xlabel(), axes.get_xlim(), len(axes.patches)) == ("level (cm)", (0, 20), 0)
+    np.testing.assert_allclose(u, [law.plant_input([each])[0] for each in x])
+    assert len(axes.lines) > 1  # and where regions end
+
+
+def test_a_law_of_one_parameter_and_two_inputs_names_both() -> None:
+    pair = LinearModel([[0.9]], [[0.5, 0.1]], 1)
+    bounds = {"theta_min": -5, "theta_max": 5, "u_min": [-1, -1], "u_max": [1, 1]}
+    axes = LinearMPC(pair, Q=[[1]], R=np.eye(2), horizon=1, **bounds).explicit().plot()
+    assert [each.get_text() for each in axes.get_legend().get_texts()] == ["u[0]", "u[1]"]
+
+
+def test_coordinates_are_called_by_the_names_of_states() -> None:
+    law = problems.clipped_pendulum().explicit()
+    assert law.plot(entries=("speed", "angle")).get_xlabel().startswith("speed")
+    with pytest.raises(ValueError, match=r"\['speed', 'spin'\] must be .*names of angle, speed"):
+        law.plot(entries=("speed", "spin"))

@@ -76,3 +76,13 @@ def test_more_unknowns_than_equations_are_told() -> None:
 def test_no_steady_state_is_an_error_that_says_how_near() -> None:
     with pytest.raises(ValueError, match=r"No steady state was found\. The best is x_ss = "):
         LinearModel.from_dynamics(lambda x, u: 1 + x**2, [NAN], [0], 0.1)
+
+
+def test_of_several_steady_states_one_that_the_input_holds_is_taken() -> None:
+    def reactor(x: Any, u: Any) -> Any:  # washed out, or with cells that live
+        rate = 0.5 * x[1] / (1 + x[1]) * x[0]
+        return [rate - u[0] * x[0], u[0] * (20 - x[1]) - 2 * rate]
+
+    model = LinearModel.from_dynamics(reactor, [NAN, 3], [NAN], 0.5)
+    np.testing.assert_allclose([*model.x_ss, *model.u_ss], [8.5, 3, 0.375], rtol=1e-6)
+    assert "There are others, [0.0, 3.0, 0.0]" in model.notes[0]

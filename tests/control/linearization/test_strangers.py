@@ -245,3 +245,38 @@ def test_a_state_is_a_vector_of_finite_numbers(value, is_a_vector) -> None:
     found = to_vector(value)
     assert (found is not None) == is_a_vector
     assert found is None or found.tolist() == value
+
+
+class Cone(gym.Env):
+    """A conical tank: the higher its level, the slower, so that a search may run away upwards."""
+
+    observation_space = gym.spaces.Box(0.0, 60.0, (1,), np.float64)
+    action_space = gym.spaces.Box(0.0, 400.0, (1,), np.float64)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.h = np.array(options["state"] if options else [35.0], np.float64)
+        return self.h.copy(), {}
+
+    def step(self, action: Any) -> Any:
+        flow = float(action[0]) - 45 * np.sqrt(self.h)
+        self.h = np.clip(self.h + 5 * flow / (np.pi * (0.4 * np.maximum(self.h, 2)) ** 2), 0, 60)
+        return self.h.copy(), 0.0, False, False, {}
+
+
+def test_a_plant_that_a_search_runs_away_from_is_left_to_settle() -> None:
+    model = LinearModel.from_env(Cone(), dt=5)
+    assert model.u_ss == 200
+    np.testing.assert_allclose(model.x_ss, (200 / 45) ** 2, rtol=1e-6)
+
+
+def test_who_passes_both_functions_is_not_told_to_pass_them() -> None:
+    class Random(Cone):
+        def step(self, action: Any) -> Any:
+            self.h = self.h + np.random.normal()  # noqa: NPY002 (of no seed)
+            return super().step(action)
+
+    def put(env: Any, x: Any) -> None:
+        env.unwrapped.h = x
+
+    with pytest.raises(ValueError, match=r"two steps from the same state .*from_data\)$"):
+        LinearModel.from_env(Random(), dt=5, set_state=put, get_state=lambda env: env.unwrapped.h)

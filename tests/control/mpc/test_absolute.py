@@ -131,3 +131,11 @@ def test_an_absolute_column_is_not_taken_for_a_batch() -> None:
     law = LinearMPC(tanks, x_min=[0, 0], x_max=[20, 3], **given).online()
     with pytest.raises(ValueError, match=r"shown has shape \(2, 1\), expected \(2,\) or"):
         law.plant_input([[12.0], [1.0]])
+
+
+def test_absolute_inputs_that_pass_for_deviations_are_named_beside_disturbances() -> None:
+    with pytest.warns(UserWarning, match=r"leave out u\[0\] = 0.*absolute=True"):
+        LinearMPC(
+            MODEL, **WEIGHTS, theta_min=[-20, -1], theta_max=[20, 3], u_min=8, u_max=15,
+            disturbances=DisturbanceBounds(4, 7),
+        )  # fmt: skip
