@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -161,6 +162,22 @@ def test_what_gains_next_to_nothing_changes_nothing(monkeypatch) -> None:
     monkeypatch.undo()
     assert improve(model, twin(), iterations=40).accepted
     assert policy_bits(model) != before
+
+
+@pytest.mark.parametrize(
+    ("ratio", "error", "least"), [(0.9, 0.0, 2e-3), (0.4, 0.0, 2e-4), (0.4, 0.18, 0.018)]
+)
+def test_a_twin_must_promise_more_the_more_its_costs_err(ratio, error, least) -> None:
+    module = importlib.import_module("sb3_yann.commissioning.improve")
+    trust = SimpleNamespace(error_ratio=ratio, cost_error=error)
+    assert module.least_gain(trust) == pytest.approx(least)
+
+
+def test_what_the_costs_of_a_twin_err_by_asks_for_more_than_it_finds(monkeypatch) -> None:
+    model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
+    monkeypatch.setattr("sb3_yann.twin.trust.Trust.cost_error", 10.0)  # nobody saves all of it
+    found = improve(model, twin(), iterations=40)
+    assert any(each.accepted for each in found.checks) and not found.accepted
 
 
 def test_of_what_is_refused_a_half_and_a_quarter_are_tried(monkeypatch) -> None:
