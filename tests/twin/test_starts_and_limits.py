@@ -73,6 +73,16 @@ def test_what_a_log_shows_are_its_rows_and_where_it_may_begin() -> None:
     np.testing.assert_allclose(high, np.maximum(starts.rows.max(0), middle + further))
 
 
+def test_a_log_of_many_episodes_shows_no_more_than_its_rows() -> None:
+    """Of fifty starts fewer than one in twenty lie beyond their range."""
+    rng = np.random.default_rng(0)
+    first = rng.uniform(-1, 1, (50, 2))
+    starts = Starts(problem(), first.min(0), first.max(0), first, first)
+    low, high = starts.shown
+    np.testing.assert_array_equal(low, first.min(0))
+    np.testing.assert_array_equal(high, first.max(0))
+
+
 def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
     mpc, rng = solved("servo with rates"), np.random.default_rng(0)
     held = mpc.layout.reference
