@@ -62,6 +62,32 @@ def test_a_fault_of_rounding_is_tolerated_and_a_larger_one_is_named(fault, edge,
         LinearModel.from_env(Plant(fault, 1.2 * edge), state=[0.0], action=[0.0])
 
 
+class Clock(Plant):
+    """A plant that is pushed at one sample after a reset."""
+
+    def __init__(self, at: int) -> None:
+        super().__init__()
+        self.at = at
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.t = 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        _, *rest = super().step(action)
+        self.x, self.t = self.x + 0.1 * (self.t == self.at), self.t + 1
+        return self._seen(), *rest
+
+
+@pytest.mark.parametrize("at", [1, 2, 19])
+def test_a_clock_is_noticed_whichever_of_twenty_samples_it_strikes_at(at: int) -> None:
+    with pytest.raises(
+        ValueError, match=r"starts anew \(a delay of the input, an actuator, a clock"
+    ):
+        LinearModel.from_env(Clock(at), state=[0.0], action=[0.0])
+    LinearModel.from_env(Clock(20), state=[0.0], action=[0.0])
+
+
 def test_a_state_s_scale_is_given_or_half_its_range_or_its_own_size() -> None:
     def scale(low: Any, high: Any, x: Any, given: Any = None) -> list[float]:
         env = SimpleNamespace(observation_space=box(low, high))
