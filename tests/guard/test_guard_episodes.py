@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sb3_yann import StepSize
+from sb3_yann.guard import simulator_acceptance as module
 from sb3_yann.guard.episodes import Evidence, Outcome, Starts
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.session import GuardSession
+from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance
 from sb3_yann.guard.state import Decision
 from sb3_yann.guard.statistics import Tolerance
 
@@ -206,3 +209,65 @@ def test_what_a_step_size_may_be_ends_where_it_says(name: str, good: Any, bad: A
     for value in bad:
         with pytest.raises(ValueError, match=name):
             StepSize(**{name: value})
+
+
+def acceptance(**changes: Any) -> SimulatorAcceptance:
+    """Return the acceptance of a guard's simulator with twelve known starts."""
+    given: dict[str, Any] = {
+        "name": "Plant", "seeds": range(12), "n_new_starts": 0, "n_final_starts": 0,
+        "eval_every": 1, "patience": 2, "keep_if_worse": False, "rule": AcceptanceRule(),
+    }  # fmt: skip
+    return SimulatorAcceptance(**(given | changes))
+
+
+@pytest.mark.parametrize(
+    ("level", "times", "plus", "unsafe", "holds"),
+    [
+        (1e6, 1.0, 0.0, 0, True), (1e6, 1 + 0.9e-5, 0.0, 0, True), (1e6, 1 - 1.1e-5, 0.0, 0, False),
+        # Near zero costs are compared in thousandths of the margin, which is 4.
+        (1e-9, 1.0, 3.9e-3, 0, True), (1e-9, 1.0, 4.1e-3, 0, False),
+        (1e6, 1.0, 0.0, 1, False), (1e6, 1.0, 0.0, -1, False),
+    ],
+)  # fmt: skip
+def test_evidence_holds_where_five_of_its_starts_play_as_before(
+    level: float, times: float, plus: float, unsafe: int, holds: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    accepted = outcome(np.full(12, level), np.ones((12, 4)))
+    evidence = Evidence((*range(50, 62),), accepted, Tolerance(4.0), 12, accepted=accepted)
+
+    def again(_: Any, rows: Any) -> Outcome:
+        found = accepted.at(rows)
+        found.costs[-1] = times * level + plus
+        found.unsafe[-1, 2] += unsafe
+        return found
+
+    played: list[Any] = []
+
+    def play(session: Any, checkpoint: Any, seeds: Any) -> Any:
+        played.extend(seeds)
+        return [seed - 50 for seed in seeds]
+
+    monkeypatch.setattr(module, "play_episodes", play)
+    monkeypatch.setattr(module, "outcome_of", again)
+    session: Any = SimpleNamespace(state=SimpleNamespace(evidence=evidence, accepted=None))
+    assert acceptance().still_holds(session) == holds
+    assert played == [50, 52, 55, 58, 61]
+    session.state.evidence = None
+    assert acceptance().still_holds(session) is False
+
+
+def test_a_trial_is_due_where_an_episode_ends_and_so_many_have_passed() -> None:
+    class Counts(SimulatorAcceptance):
+        tried: list[int]
+
+        def try_candidate(self, session: GuardSession) -> None:
+            self.tried.append(session.state.episodes)
+
+    due = Counts(*vars(acceptance(eval_every=3)).values())
+    due.tried = []
+    session: Any = SimpleNamespace(state=SimpleNamespace(last_trial=None, episodes=0))
+    for episodes, dones in enumerate([[0, 1], [1, 0], [0, 0], [1, 1], [1, 0], [1, 0], [1, 0]], 1):
+        session.state.episodes = episodes
+        due.step(session, np.array(dones, bool), None, None)
+    assert due.tried == [1, 4, 7] and session.state.last_trial == 7
