@@ -288,3 +288,28 @@ def test_an_observer_of_another_model_or_of_some_states_is_refused() -> None:
     )  # fmt: skip
     with pytest.raises(ValueError, match="needs an observer that measures all 2 states"):
         RowLayout(one, DisturbanceObserver(model, [0]))
+
+
+@pytest.mark.parametrize(
+    ("C", "block", "name"),
+    [
+        (np.eye(2), [[0.5, 0.0], [0.0, 0.0]], "gain of the states"),
+        ([[1.0, 0.0], [1.0, 1e-11]], [[0.5, 0.0], [0.0, 0.5]], "C"),
+        ([[1.0, 0.0], [1.0, 1e-9]], [[0.5, 0.0], [0.0, 0.5]], ""),
+    ],
+)
+def test_an_observer_that_does_not_tell_the_state_back_is_refused(C, block, name) -> None:
+    model = LinearModel([[0.9, 0.0], [0.0, 0.5]], [[0.0], [1.0]], DT, E=[[1.0], [0.0]])
+    mpc = LinearMPC(
+        model, Q=np.eye(2), R=[[1.0]], horizon=1, u_min=-1, u_max=1, theta_min=-3, theta_max=3,
+        disturbances=DisturbanceBounds(-0.1, 0.1),
+    )  # fmt: skip
+    observer = DisturbanceObserver(model, gain=[*block, [0.1, 0.0]])
+    observer.C = np.array(C)
+    if name:
+        with pytest.raises(
+            ValueError, match=f"observer's {name}, shape .2, 2., cannot be inverted"
+        ):
+            RowLayout(mpc, observer)
+    else:
+        assert RowLayout(mpc, observer).size == 3 + 2 + 1
