@@ -130,6 +130,20 @@ def test_the_edges_of_what_is_trusted() -> None:
     assert "reflux never moves" in named[0] and "step test on reflux" in named[1]
 
 
+def test_what_lies_on_an_edge_is_trusted() -> None:
+    assert judged(runs(GOOD), beyond=(0.05, "x[0]")) == ("", "")
+    costs = np.array([12.5, 12.5]), np.array([10.0, 10.0])  # a quarter
+    assert judged(runs(GOOD), costs=costs) == ("", "")
+    inputs = np.array([0.02]), np.array([1e-4])
+    assert judged(runs(GOOD), inputs=inputs) == ("", "")
+    assert judged(runs([2.0, 0.1])) == ("", "")
+    problems, advice = judged(runs([10.0, 0.1]))
+    assert not problems and "worse than 'nothing moves'" in advice
+    at = dataclasses.replace(twin().trust, excitation=np.array([0.02]))
+    assert "2.00 %: its gain is known from the log" in report(problem(), twin().episodes, "", at)
+    assert judged(runs(GOOD), n_episodes=2) == ("", "")
+
+
 def test_a_log_whose_theta_does_not_hold_the_input_before_is_told_by_its_share() -> None:
     given = problem()
     mpc = LinearMPC(
@@ -139,7 +153,9 @@ def test_a_log_whose_theta_does_not_hold_the_input_before_is_told_by_its_share()
     u = np.linspace(-0.2, 0.2, 40)[:, None]
     thetas = np.hstack([np.zeros((41, 2)), np.vstack([[[0.0]], u])])
     assert trusts.foreign_previous(mpc, (Episode(thetas, u),)) == []
-    thetas[5:15, 2] += 0.02
+    thetas[5:7, 2] += 0.02
+    assert trusts.foreign_previous(mpc, (Episode(thetas, u),)) == []  # one row of twenty
+    thetas[7:15, 2] += 0.02
     (said,) = trusts.foreign_previous(mpc, (Episode(thetas, u),))
     assert said.startswith("In 25 % of the rows theta does not hold the input before it")
     assert trusts.foreign_previous(problem(), as_episodes(problem(), log(2))) == []
