@@ -90,6 +90,7 @@ def broken(change):
         (broken(lambda t: t.__setitem__(1, t[1][1:])), r"episode 1: time has shape \(60,\)"),
         (broken(lambda t: t[1].__setitem__(7, np.nan)), "episode 1: time is nan in row 7"),
         (broken(lambda t: t[1].__setitem__(8, t[1][7])), "does not increase after row 7: 0.7, 0.7"),
+        (broken(lambda t: t[1].__setitem__(8, 0.65)), r"not increase after row 7: 0\.7, 0\.65"),
         (
             broken(lambda t: t[1].__imul__(1.06)),
             r"episode 1: a step takes 0.106 \(the median\), .* dt = 0.1\. .* resample the log",
