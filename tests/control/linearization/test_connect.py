@@ -88,6 +88,37 @@ def test_a_clock_is_noticed_whichever_of_twenty_samples_it_strikes_at(at: int) -
     LinearModel.from_env(Clock(20), state=[0.0], action=[0.0])
 
 
+class Strict(Plant):
+    """A plant that is cut, or ends, after each step, and takes none until it is reset."""
+
+    def __init__(self, ends: bool) -> None:
+        super().__init__()
+        self.ends, self.done = ends, False
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.done = False
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        if self.done:
+            raise RuntimeError("step after the end")
+        seen, reward, *_ = super().step(action)
+        self.done = True
+        return seen, reward, self.ends, not self.ends, {}
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_an_episode_that_is_over_is_begun_anew_before_its_state_is_set(ends: bool) -> None:
+    def put(env: Strict, x: Any) -> None:
+        env.x = np.array(x)
+
+    model = LinearModel.from_env(
+        Strict(ends), state=[0.0], action=[0.0], set_state=put, get_state=lambda env: env.x
+    )
+    np.testing.assert_allclose([model.A, model.B], [[[0.5]], [[0.25]]], atol=1e-9)
+    assert any("terminates the episode" in note for note in model.notes) == ends
+
+
 def test_a_state_s_scale_is_given_or_half_its_range_or_its_own_size() -> None:
     def scale(low: Any, high: Any, x: Any, given: Any = None) -> list[float]:
         env = SimpleNamespace(observation_space=box(low, high))
