@@ -162,7 +162,8 @@ class FreeRuns:
         The error is that of the difference of the two, over episodes (the one-standard-error rule
         of Hastie, Tibshirani and Friedman, section 7.10).
         """
-        scores = self.scores[:, ~np.isnan(self.scores).any(axis=0)]
+        known = ~np.isnan(self.by_episode).all(axis=(0, 2))  # too short a piece says nothing
+        scores = FreeRuns(self.horizons, self.by_episode[:, known], self.names).scores
         best = int(np.argmin(scores.mean(axis=1)))
         behind = scores - scores[best]
         error = behind.std(axis=1, ddof=1) / np.sqrt(behind.shape[1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import importlib
 import pickle
 from functools import partial
 from typing import Any
@@ -41,7 +42,9 @@ def model(n_envs: int = 1, **options: Any) -> DDPG:
 # --- twins ----------------------------------------------------------------------------------------
 
 
-def test_a_twin_that_was_saved_predicts_and_improves_as_before() -> None:
+def test_a_twin_that_was_saved_predicts_and_improves_as_before(monkeypatch) -> None:
+    module = importlib.import_module("sb3_yann.commissioning.improve")
+    monkeypatch.setattr(module, "OF_COST_ERROR", 0.0)  # six iterations gain little
     again = pickle.loads(pickle.dumps(twin()))
     theta, u = np.array([[0.3, -0.2], [1.0, 0.4]]), np.array([[0.5], [-0.1]])
     members = len(again.dynamics.members)

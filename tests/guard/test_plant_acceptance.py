@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy import stats
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -38,7 +39,10 @@ from guard_samples import (
     train,
     verdicts,
 )
+from sb3_yann import AcceptanceRule
 from sb3_yann.guard.covariate import predicted_cost
+from sb3_yann.guard.plant_acceptance import PlantAcceptance
+from sb3_yann.guard.statistics import PlantEpisodes
 from weights import last_layer
 
 
@@ -325,3 +329,32 @@ def test_an_episode_begun_by_a_policy_that_is_then_taken_back_does_not_count() -
     train(model, 2 * 5 * STEPS, guard, move)
     assert [each.reason for each in guard.decisions] == ["the actor was changed while it rested"]
     np.testing.assert_allclose(guard.state.evidence.accepted.costs, [4.25] * 4)
+
+
+def compared(new: Any, old: Any, size: float, margin: float = 0.0) -> tuple[bool, bool, str]:
+    """Return whether a candidate passes a test, whether it has an outlier, and why."""
+    pair = (PlantEpisodes(np.array(each, float), np.full(len(each), 5.0)) for each in (new, old))
+    return PlantAcceptance(AcceptanceRule(margin=margin))._compare(*pair, size)
+
+
+def test_a_comparison_says_by_how_much_and_with_which_probability() -> None:
+    rng = np.random.default_rng(0)
+    old = 40 + rng.normal(size=10)
+    new = old[::-1] - 0.7
+    chance = stats.ttest_ind(new, old, equal_var=False, alternative="less").pvalue
+    said = f"-0.7 from the same starts by {{}}, p = {chance:.3g}"
+    assert compared(new, old, 1.01 * chance) == (True, False, said)
+    not_below = f"{said}, not below {0.99 * chance:.2g}"
+    assert compared(new, old, 0.99 * chance) == (False, False, not_below)
+    for lost in (np.nan, np.inf, -np.inf):
+        result = compared([lost, *new[1:8], lost], old, 0.5)
+        assert result == (False, True, "2 of 9 episodes cost no finite number")
+
+
+def test_an_outlier_fails_whatever_the_mean_and_the_margin_is_of_the_accepted_median() -> None:
+    old = np.array([40.0, 40.0, 40.0, 40.0, 40.0])
+    new = np.array([1.0, 1.0, 1.0, 1.0, 41.0])
+    passed, outlier, why = compared(new, old, 0.5)
+    assert (passed, outlier) == (False, True)
+    assert why.endswith("but one start costs 1 more than it should")
+    assert compared(new, old, 0.5, margin=0.024)[1] and not compared(new, old, 0.5, margin=0.026)[1]

@@ -11,8 +11,10 @@ import pytest
 from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import DDPG
 
-from guard_samples import STEPS, Slide, build, make_guard, train
+from guard_samples import LAW, STEPS, Slide, build, make_guard, train
 from sb3_yann import AcceptanceRule, ImprovementGuard, StepSize
+from sb3_yann.evaluation import evaluate
+from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"env": 3}, TypeError, "env = 3 must be the id of an environment"),
@@ -102,3 +104,95 @@ def test_a_policy_without_an_mpc_is_refused() -> None:
 def test_an_unknown_id_is_gymnasium_s_own_error() -> None:
     with pytest.raises(gym.error.NameNotFound, match="Sldie"):
         train(build(), STEPS, make_guard("Sldie-v0"))
+
+
+def test_what_is_given_reaches_the_acceptance_and_what_is_not_has_its_default() -> None:
+    plain = ImprovementGuard(Slide).acceptance
+    assert plain == SimulatorAcceptance(
+        "Slide", range(1_000_000, 1_000_100), 50, 500, 1, 5, False, AcceptanceRule()
+    )
+    some = ImprovementGuard(
+        "CSTR-v0", n_starts=7, n_new_starts=3, n_final_starts=2, seed=40, eval_every=6, patience=8,
+        keep_if_worse=True, rule={"margin": 0.5},
+    ).acceptance  # fmt: skip
+    rule = AcceptanceRule(margin=0.5)
+    assert some == SimulatorAcceptance("CSTR-v0", range(40, 47), 3, 2, 6, 8, True, rule)
+    assert some.settings == {"env": "CSTR-v0", "seeds": range(40, 47), "margin": 0.5, "tail": 0.05}
+    bounded = ImprovementGuard(Slide, n_new_starts=4, rule={"largest_step": 2.0}).acceptance
+    assert bounded.n_final_starts == 40 and bounded.settings["largest_step"] == 2.0
+    alone = ImprovementGuard(None, rule={"trial_episodes": 4}).acceptance
+    assert alone.settings == {"env": None, "trial_episodes": 4}
+
+
+def test_a_simulator_has_the_same_name_in_another_process() -> None:
+    class Named(Slide):
+        """An env of a test."""
+
+    assert name_of("CSTR-v0") == "CSTR-v0"
+    assert name_of(Slide()) == "Slide" and name_of(Slide) == "Slide"
+    assert name_of(Named).endswith("<locals>.Named")
+    assert name_of(gym.make("Slide-v0")) == "Slide-v0"
+    assert name_of(gym.make("Slide-v0", low=1.0)) == "Slide-v0{'low': 1.0}"
+    assert name_of(partial(Slide, low=2.0)) == "Slide(){'low': 2.0}"
+    assert name_of(partial(partial(Slide), (0, 1))) == "Slide((0, 1),){}"
+    assert "<lambda>" in name_of(lambda: Slide())
+
+
+NOISE = np.random.default_rng(0)
+
+
+class Wobbly(Slide):
+    """Costs that differ from episode to episode by so much, or are not finite from a seed on."""
+
+    def __init__(self, size: float = 0.0, lost: int | None = None) -> None:
+        super().__init__()
+        self.size, self.lost = size, lost
+
+    def reset(self, *, seed=None, options=None):
+        self.bad = self.lost is not None and seed is not None and seed >= self.lost
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        seen, reward, *rest = super().step(action)
+        reward *= 1 + self.size * NOISE.uniform(-1, 1)
+        return seen, np.inf if self.bad else reward, *rest
+
+
+def begun(env: Any, **options: Any) -> ImprovementGuard:
+    """Return a guard that has played its first episodes."""
+    guard = make_guard(env, n_new_starts=0, **options)
+    train(build(gradient_steps=0), 1, guard)
+    return guard
+
+
+def test_costs_of_the_mpc_that_differ_by_more_than_a_millionth_cannot_be_compared() -> None:
+    begun(partial(Wobbly, 1e-7))
+    with pytest.raises(ValueError, match=r"played two episodes .* from the seed 1000000, at costs"):
+        begun(partial(Wobbly, 1e-4))
+    with pytest.raises(ValueError, match=r"from the seed 1000003 costs -inf"):
+        begun(partial(Wobbly, lost=1_000_003))
+
+
+def test_starts_that_are_all_the_same_are_told_and_one_alone_is_not() -> None:
+    same = partial(Slide, low=2.0, high=2.0)
+    with pytest.warns(
+        UserWarning, match="All 10 starts of the guard's env .* are one and the same"
+    ):
+        begun(same)
+    begun(same, n_starts=1)
+
+
+def test_how_far_an_input_may_move_is_a_multiple_of_the_mpc_s_largest_step() -> None:
+    guard = begun(Slide, rule={"largest_step": 2.0})
+    episodes = evaluate(LAW, Slide, range(1_000_000, 1_000_010))
+    most = max(np.abs(np.diff(each, axis=0)).max() for each in episodes.actions)
+    np.testing.assert_allclose(guard.state.input_step, [2 * most + 2e-6], rtol=1e-6)
+    assert begun(Slide).state.input_step is None
+
+
+def test_the_tolerance_is_a_share_of_the_mpc_s_median_cost() -> None:
+    evidence = begun(Slide, rule=AcceptanceRule(margin=0.02, tail=0.1)).state.evidence
+    typical = np.median(evidence.mpc.costs)
+    found = evidence.tolerance
+    assert (found.margin, found.tail, found.typical) == (0.02 * typical, 0.1, typical)
+    assert evidence.n_starts == 10 and evidence.seeds == (*range(1_000_000, 1_000_010),)

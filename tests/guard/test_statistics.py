@@ -381,3 +381,120 @@ def test_the_worst_of_many_starts_stand_for_all_of_them() -> None:
     assert tail_average(10 * draws[0], 0.05, 1000)[1] == pytest.approx(10 * errors[0])
     two, n = np.array([3.0, 1.0] + 18 * [0.0]), 20  # beyond the level, 1, is 2 with p = 1/20
     assert tail_average(two, 0.1, n)[1] == pytest.approx(2 * np.sqrt(0.05 * 0.95 * n) / 2)
+
+
+@pytest.mark.parametrize("covariate", [True, False])
+def test_an_outlier_is_beyond_the_upper_prediction_limit_of_its_start(covariate) -> None:
+    rng = np.random.default_rng(0)
+    predicted = rng.uniform(1, 9, 12)
+    old = episodes(3 + 2 * predicted + rng.normal(size=12), predicted if covariate else [5.0] * 12)
+    at = np.array([2.0, 5.0, 30.0])
+    new = episodes(np.zeros(3), at if covariate else [5.0] * 3)
+    X = np.column_stack([np.ones(12), predicted])[:, : 1 + covariate]
+    A = np.column_stack([np.ones(3), at])[:, : 1 + covariate]
+    coefficients = np.linalg.lstsq(X, old.costs, rcond=None)[0]
+    freedom = 12 - X.shape[1]
+    s = np.sqrt(np.sum((old.costs - X @ coefficients) ** 2) / freedom)
+    leverage = np.diag(A @ np.linalg.inv(X.T @ X) @ A.T)
+    limit = stats.t.isf(OUTLIER / 3, freedom) * s * np.sqrt(1 + leverage)
+    for k in range(3):
+        for share, found in ((0.999, 0.0), (1.001, 1.001 * limit[k])):
+            costs = A @ coefficients
+            costs[k] += share * limit[k]
+            one = PlantEpisodes(costs, new.predicted)
+            assert excess_of_an_outlier(one, old) == pytest.approx(found, rel=1e-6)
+            if found:
+                assert excess_of_an_outlier(one, old, 0.0005 * limit[k]) == pytest.approx(found)
+                assert excess_of_an_outlier(one, old, 0.0015 * limit[k]) == 0
+    costs = A @ coefficients + 2 * limit
+    worst = PlantEpisodes(costs, new.predicted)
+    assert excess_of_an_outlier(worst, old) == pytest.approx(2 * limit.max())
+
+
+def test_where_a_start_has_no_prediction_the_mean_alone_is_the_line() -> None:
+    rng = np.random.default_rng(1)
+    predicted, costs = rng.uniform(1, 9, 10), rng.normal(size=10)
+    old = episodes(costs, predicted)
+    new = PlantEpisodes(np.array([costs.mean() + 50, 0.0]), np.array([1.0, NAN]))
+    assert excess_of_an_outlier(new, old) == pytest.approx(50)
+
+
+def test_the_error_of_a_tail_s_average_is_that_of_what_lies_beyond_its_quantile() -> None:
+    rng = np.random.default_rng(0)
+    excess = rng.exponential(size=200)
+    average, error = tail_average(excess, 0.1, 200)
+    ranked = np.sort(excess)[::-1]
+    assert average == pytest.approx(ranked[:20].mean())
+    beyond = np.maximum(excess - ranked[19], 0)
+    assert error == pytest.approx(beyond.std() / np.sqrt(200) / 0.1)
+    # The worst of many stand for all: those left out are nowhere beyond.
+    assert tail_average(ranked[:40], 0.1, 200) == pytest.approx((average, error))
+    # A share that is no whole number counts the last one in part.
+    part = (ranked[:20].sum() + 0.5 * ranked[20]) / 20.5
+    assert tail_average(excess, 0.1025, 200)[0] == pytest.approx(part)
+    assert tail_average(excess, 1e-6, 200) == (pytest.approx(ranked[0]), 0.0)
+    assert tail_average(excess[:3], 0.5, 200)[0] == pytest.approx(excess[:3].mean())
+
+
+def test_standard_errors_of_the_tail_count_where_it_must_be_sure() -> None:
+    excess = np.concatenate([[3.0, 0.5, 0.3], np.full(57, -1.0)])
+    average, error = tail_average(excess, 0.05, 60)
+    assert average == pytest.approx(3.8 / 3) and average > 1
+    excess[0] = 2.0
+    average, error = tail_average(excess, 0.05, 60)
+    assert average < 1
+    enough = (1 - average) / error
+    allowed = Tolerance(1.0, 0.05)
+    assert allowed.objection(excess, 60, 0.99 * enough) == ""
+    assert allowed.objection(excess, 60, 1.01 * enough).endswith("cost too much, start 0")
+    assert allowed.objection(excess) == ""
+
+
+def test_a_start_ten_times_beyond_what_is_allowed_is_too_much_alone() -> None:
+    allowed = Tolerance(1.0, 0.5)
+    rest = np.full(99, -50.0)
+    assert allowed.objection(np.append(rest, 10.0)) == ""
+    assert allowed.objection(np.append(rest, 10.1)) == "start 99"
+    assert allowed.objection(np.append(rest, 1.0)) == ""
+
+
+def test_what_a_dear_start_may_cost_more_grows_with_its_cost() -> None:
+    mpc = np.array([10.0, -60.0, 20.0])
+    assert Tolerance(2.0, 0.1, 20.0).allowed(mpc).tolist() == [2.0, 6.0, 2.0]
+    assert Tolerance(2.0, 0.0, 20.0).allowed(mpc).tolist() == [2.0, 2.0, 2.0]
+    paired = PairedEpisodes(mpc, mpc, NONE, Tolerance(2.0, 0.1, 20.0))
+    assert paired.lost(mpc + np.array([2.1, 5.9, 1.9])).tolist() == [True, False, False]
+    assert paired.loses_to_the_mpc(mpc + np.array([1e-9, 0, 0])) and not paired.loses_to_the_mpc(
+        mpc
+    )
+    assert paired.loses_to_the_mpc(np.array([NAN, 0.0, 0.0]))
+
+
+def test_the_first_start_of_several_is_named() -> None:
+    now = np.zeros((3, 4), np.int64)
+    now[1:, 3] = 2
+    said = PairedEpisodes(np.ones(3), np.ones(3), NONE, Tolerance(1.0)).objection(np.ones(3), now)
+    assert said == "2 starts with an input that moves too far in one step, the first is number 1"
+
+
+def test_episodes_of_one_policy_add_up() -> None:
+    log = ((np.zeros((3, 1)), np.zeros((2, 1))),)
+    both = PlantEpisodes(np.array([1.0]), np.array([2.0]), log) + PlantEpisodes(
+        np.array([3.0]), np.array([4.0])
+    )
+    assert both.costs.tolist() == [1, 3] and both.predicted.tolist() == [2, 4]
+    assert both.log == log
+
+
+def test_rounding_is_no_difference_and_a_prediction_that_hardly_varies_is_none() -> None:
+    old = episodes([1.0, 1.0 + 1e-13, 1.0])
+    assert analyze_covariance(episodes([1.0, 1.0, 1.0]), old) == (0.0, 1.0)
+    rng = np.random.default_rng(0)
+    costs = rng.normal(size=8)
+    for size, same in ((1e-10, True), (1e-8, False)):
+        predicted = 1.0 + size * rng.uniform(size=8)
+        chance = analyze_covariance(
+            episodes(costs[:4], predicted[:4]), episodes(costs[4:], predicted[4:])
+        )[1]
+        plain = analyze_covariance(episodes(costs[:4]), episodes(costs[4:]))[1]
+        assert (chance == plain) == same

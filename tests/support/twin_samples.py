@@ -17,6 +17,7 @@ from sb3_yann import (
     Tracking,
     offset_free,
 )
+from sb3_yann.twin.log import Episode
 from sb3_yann.wrappers import ObserveDisturbance
 from sb3_yann_envs import ProblemBox
 
@@ -71,6 +72,13 @@ def log(episodes: int, noise: float = 0.0, first: int = 0, act: Any = None) -> l
             states.append(x + noise * rng.standard_normal(2))
         found.append((np.array(states, float), np.array(actions, float)))
     return found
+
+
+def random_episode(mpc: LinearMPC, steps: int = 12, seed: int = 0) -> Episode:
+    """Return an episode whose set-points and disturbances move at each step."""
+    rng = np.random.default_rng(seed)
+    thetas = 0.1 * rng.uniform(mpc.theta_min, mpc.theta_max, (steps + 1, mpc.n_theta))
+    return Episode(thetas, rng.uniform(mpc.u_min, mpc.u_max, (steps, mpc.model.n_inputs)))
 
 
 @cache

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3 import DDPG
 
-from sb3_yann import ImprovementGuard, NoActionNoise, YannPolicy
-from twin_samples import Cart, problem, twin
+from general_problems import solved
+from sb3_yann import ImprovementGuard, NoActionNoise, PlantTwin, YannPolicy
+from sb3_yann.twin.log import Episode
+from twin_samples import Cart, problem, random_episode, twin
 
 
 def test_it_is_an_env_with_the_plant_s_spaces() -> None:
@@ -74,3 +79,71 @@ def test_a_start_that_is_none_is_refused() -> None:
         twin().env().reset(options={"state": [np.nan, 0.0]})
     with pytest.raises(ValueError, match=r"options = \{'start': 0\} must be \{'state': starts\}"):
         twin().vector_env(2).reset(options={"start": 0})
+
+
+def held() -> tuple[PlantTwin, list[Episode]]:
+    """The twin of a servo whose set-point moves at each step, from episodes of two lengths."""
+    mpc = solved("servo")
+    logs = [random_episode(mpc, steps, seed) for seed, steps in enumerate((9, 14, 9))]
+    given = [(each.thetas, each.actions) for each in logs]
+    found = PlantTwin.fit(mpc, given, residuals=["none"], n_members=2)
+    sure = dataclasses.replace(found.trust, problems=())
+    return dataclasses.replace(found, trust=sure), logs
+
+
+def test_an_episode_takes_set_points_and_length_of_a_logged_one() -> None:
+    found, logs = held()
+    env, mpc, seen = found.env(), found.problem, set()
+    for seed in range(12):
+        theta, info = env.reset(seed=seed)
+        np.testing.assert_array_equal(theta, info["state"].astype(np.float32))
+        (k,) = (i for i, each in enumerate(logs) if each.thetas[0, 2] == info["state"][2])
+        seen.add(k)
+        assert np.all(info["state"][:2] >= found.starts.low)
+        assert np.all(info["state"][:2] <= found.starts.high)
+        over, steps = False, 0
+        while not over:
+            before = info["state"]
+            theta, reward, _, over, info = env.step(np.float32([5.0]))  # beyond the bound of 2
+            steps += 1
+            assert info["state"][2] == logs[k].thetas[steps, 2]
+            assert reward == -mpc.stage_cost(before, [2.0])
+            expected = mpc.model.A @ before[:2] + mpc.model.B @ [2.0]
+            np.testing.assert_allclose(info["state"][:2], expected, atol=1e-12)
+            assert info["violation"] == found.limits.violated(info["state"])
+        assert steps == len(logs[k])
+    assert seen == {0, 1, 2}
+
+
+def test_an_episode_may_begin_where_it_is_told() -> None:
+    found, logs = held()
+    env = found.env(member=1)
+    env.reset(seed=0)
+    states = [env.reset(options={"state": [0.3, -0.2, 0.1]})[1]["state"] for _ in range(2)]
+    np.testing.assert_array_equal(states, [[0.3, -0.2, 0.1]] * 2)
+    _, info = env.reset(options={"state": [0.3, -0.2]})
+    np.testing.assert_array_equal(info["state"][:2], [0.3, -0.2])
+    assert info["state"][2] in {each.thetas[0, 2] for each in logs} and info["member"] == 1
+    for given, message in (
+        ([0.3], r"has shape \(1,\), expected \(2,\) or \(3,\)"),
+        ([0.3, np.nan], "must be finite numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            env.reset(options={"state": given})
+    with pytest.raises(gym.error.ResetNeeded):
+        found.env().step(np.zeros(1))
+
+
+def test_without_a_seed_the_members_are_drawn() -> None:
+    env = twin().env()
+    env.reset(seed=0)
+    assert {env.reset()[1]["member"] for _ in range(60)} == set(range(5))
+    assert twin().env(member=4).reset(seed=1)[1]["member"] == 4
+    assert twin().env(member=0).reset(seed=1)[1]["member"] == 0
+
+
+def test_a_member_s_number_is_whole_and_below_their_count() -> None:
+    with pytest.raises(ValueError, match="member = 5 must be below 5"):
+        twin().env(member=5)
+    with pytest.raises(ValueError, match="member = -1"):
+        twin().env(member=-1)

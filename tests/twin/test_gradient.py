@@ -99,3 +99,53 @@ def test_the_actor_s_slopes_are_those_of_differences_on_bounds_as_well(
         slope = (actions(theta + e) - actions(theta - e)) / (2 * step)
         wrong = np.abs(slope - found[..., j]) > 1e-4 * (1 + np.abs(slope))
         assert np.mean(wrong) < 0.01  # of 400 points a few lie on a facet
+
+
+@pytest.mark.parametrize("make", [twin, rated, observed])
+def test_the_slopes_of_an_objective_are_those_of_its_costs_and_its_penalty(make) -> None:
+    found, rng = make(), np.random.default_rng(0)
+    mpc, row = found.problem, found.dynamics.row
+    n, half = mpc.model.n_states, mpc.theta_half[: mpc.model.n_states]
+    root = rng.normal(size=(mpc.n_theta, mpc.n_theta))
+    low, high = -0.3 * half, 0.4 * half
+    objective = Objective(mpc, root @ root.T, low, high, 7.0)
+    rows = 0.8 * rng.uniform(-1, 1, (4, 2, 3, row.size)) * half[0]
+    inputs = rng.uniform(mpc.u_min, mpc.u_max, (3, 2, 3, mpc.model.n_inputs))
+
+    def total(rows: np.ndarray, inputs: np.ndarray) -> float:
+        thetas, x = rows[..., : mpc.n_theta], rows[:-1, ..., row.state]
+        stage = mpc.stage_cost(thetas[:-1], inputs).sum(axis=0)
+        end = np.einsum("...i,ij,...j", thetas[-1], root @ root.T, thetas[-1])
+        np.testing.assert_allclose(objective.costs(rows, inputs), stage + end)
+        over = np.maximum(x - high, 0) + np.maximum(low - x, 0)
+        return float((stage + end).sum() + 7.0 * np.sum((over / half) ** 2))
+
+    by_rows, by_u = objective.slopes(rows, inputs, row)
+    for of, slopes in ((rows, by_rows), (inputs, by_u)):
+        direction = rng.normal(size=of.shape)
+        ends = []
+        for sign in (1, -1):
+            moved = of + sign * 1e-6 * direction
+            ends.append(total(*((moved, inputs) if of is rows else (rows, moved))))
+        slope = (ends[0] - ends[1]) / 2e-6
+        assert slope == pytest.approx(float(np.sum(slopes * direction)), rel=1e-6)
+    assert n == 2 and np.any(rows[:-1, ..., row.state] > high)
+
+
+def test_runs_below_a_reference_count_with_one_weight_and_those_above_with_the_other() -> None:
+    found = twin()
+    mpc, layer, nowhere = found.problem, YannLayer(found.problem.explicit()), np.full(2, np.inf)
+    objective = Objective(mpc, np.eye(2), -nowhere, nowhere, 0.0)
+    starts = np.random.default_rng(0).uniform(-1, 1, (5, 2, 2))
+
+    def gradient(starts, reference=None) -> np.ndarray:
+        layer.zero_grad()
+        accumulate_gradient(layer, found.dynamics, objective, starts, 10, reference)
+        return np.concatenate([each.grad.numpy().ravel() for each in layer.network.weights()])
+
+    rows = found.dynamics.roll_out(actor(layer, mpc), starts, 10)
+    costs = objective.costs(*rows)
+    middle = np.broadcast_to(np.array([1.0, -1.0]), costs.shape)  # the second run is above its own
+    parts = [gradient(starts[:, [k]]) for k in range(2)]
+    mixed = gradient(starts, (costs + middle, np.full((5, 2), 2.0), np.full((5, 2), 5.0)))
+    np.testing.assert_allclose(mixed, (2 * parts[0] + 5 * parts[1]) / 2, rtol=1e-3, atol=1e-5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import DisturbanceBounds, LinearModel, LinearMPC, RateLimits, Tracking
-from sb3_yann.twin.log import as_episodes, pieces
+from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from twin_samples import log, problem
 
 X, U = np.zeros((11, 2)), np.full((10, 1), 0.1)
@@ -87,3 +87,112 @@ def test_few_episodes_are_cut_into_pieces_that_follow_each_other() -> None:
     assert len(parts) == 6 and sum(map(len, parts)) == 120
     np.testing.assert_array_equal(parts[0].thetas[-1], parts[1].thetas[0])
     assert pieces(whole, 2) == whole and pieces(whole[:1], 5) == whole[:1]
+
+
+def test_five_steps_are_an_episode_and_four_are_none() -> None:
+    (episode,) = as_episodes(problem(), [(X[:6], U[:5])])
+    assert len(episode) == 5
+    with pytest.raises(ValueError, match="episode 0 has 4 steps; 5 are the least"):
+        as_episodes(problem(), [(X[:5], U[:4])])
+
+
+def test_an_input_a_thousandth_beyond_its_bound_is_rounding_and_more_is_not() -> None:
+    for sign in (-1, 1):
+        (episode,) = as_episodes(problem(), [(X, sign * 10.009 * U)])
+        np.testing.assert_array_equal(episode.actions, sign)
+        with pytest.raises(ValueError, match="beyond the bounds -1 and 1 of the problem"):
+            as_episodes(problem(), [(X, sign * 10.011 * U)])
+
+
+def test_a_state_and_an_input_alone_may_be_rows() -> None:
+    mpc = LinearMPC(
+        LinearModel([[0.9]], [[1.0]], 1.0), Q=[[1]], R=[[1]], horizon=2, u_min=-1, u_max=1,
+        theta_min=-5, theta_max=5,
+    )  # fmt: skip
+    x, u = np.arange(8.0), np.linspace(-0.3, 0.3, 7)
+    (episode,) = as_episodes(mpc, [(x, u)])
+    np.testing.assert_array_equal(episode.thetas, x[:, None])
+    np.testing.assert_array_equal(episode.actions, u[:, None])
+
+
+def loaded() -> LinearMPC:
+    """A problem whose theta holds a state, a reference, two disturbances and the input before."""
+    return LinearMPC(
+        LinearModel([[0.9]], [[1.0]], 1.0, E=[[0.5, 0.2]], d_ss=[7.0, 8.0]), Q=[[1]], R=[[1]],
+        horizon=2, u_min=-1, u_max=1, theta_min=-5, theta_max=5, tracking=Tracking([0], -1, 1),
+        disturbances=DisturbanceBounds(-1, 1), rate=RateLimits(-0.5, 0.5),
+    )  # fmt: skip
+
+
+def test_an_observer_s_disturbances_are_not_known_where_they_are_not_given() -> None:
+    x, u, r = np.zeros((8, 1)), np.linspace(-0.3, 0.3, 7)[:, None], 0.5
+    (episode,) = as_episodes(loaded(), [(x, u)], [r], observed=True)
+    assert np.isnan(episode.thetas[:, 2:4]).all()
+    known = np.column_stack([x, np.full(8, 0.5), np.r_[0.0, u[:, 0]]])
+    np.testing.assert_array_equal(episode.thetas[:, [0, 1, 4]], known)
+    with pytest.raises(ValueError, match=r"theta holds 2 disturbances: pass disturbances=, shape"):
+        as_episodes(loaded(), [(x, u)], [r])
+    with pytest.raises(ValueError, match="theta holds 1 references"):
+        as_episodes(loaded(), [(x, u)], observed=True)
+
+
+def test_disturbances_are_taken_off_their_own_operating_point() -> None:
+    x, u = np.zeros((8, 1)), np.zeros((7, 1))
+    (episode,) = as_episodes(loaded(), [(x, u)], [0.0], [[7.5, 7.8]], absolute=True)
+    np.testing.assert_allclose(episode.thetas[:, 2:4], np.tile([0.5, -0.2], (8, 1)))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"references": [np.zeros((7, 1))]}, r"references have shape \(7, 1\), expected \(8, 1\)"),
+        ({"disturbances": [np.zeros(8)]}, r"disturbances have shape \(1, 8\), expected \(8, 2\)"),
+        ({"disturbances": [np.full((8, 2), np.nan)]}, "episode 0: disturbances are not finite"),
+        ({"previous": [[0.1, 0.2]]}, r"previous has shape \(2,\), expected \(1,\)"),
+        ({"previous": [[np.inf]]}, "episode 0: previous are not finite"),
+    ],
+)  # fmt: skip
+def test_what_stands_beside_the_states_is_refused_by_name(given, message) -> None:
+    whole = {"references": [0.0], "disturbances": [[0.0, 0.0]]} | given
+    with pytest.raises(ValueError, match=message):
+        as_episodes(loaded(), [(np.zeros((8, 1)), np.zeros((7, 1)))], **whole)
+
+
+def test_all_of_theta_and_something_beside_it_is_too_much() -> None:
+    whole = [(np.zeros((8, 5)), np.zeros((7, 1)))]
+    as_episodes(loaded(), whole)
+    with pytest.raises(ValueError, match=r"\['references'\] is given, but states are all of theta"):
+        as_episodes(loaded(), whole, [0.0])
+    with pytest.raises(ValueError, match=r"expected \(T \+ 1, 1\), or all of theta, \(T \+ 1, 5\)"):
+        as_episodes(loaded(), [(np.zeros((8, 3)), np.zeros((7, 1)))])
+
+
+def test_a_copy_is_left_out_and_what_differs_in_its_inputs_alone_is_not() -> None:
+    given = as_episodes(problem(), [(X, U), (X, 2 * U), (X, U), (X + 1, U), (X, U)])
+    kept, notes = without_copies(given)
+    assert [each is other for each, other in zip(kept, (given[4], given[1], given[3]), strict=True)]
+    assert len(kept) == 3 and notes == ("Left out 2 copies of other episodes.",)
+    assert without_copies(kept) == (kept, ())
+
+
+@pytest.mark.parametrize(
+    ("lengths", "least", "parts"),
+    [
+        ((60, 60), 5, [20, 20, 20] * 2),  # a piece has twenty steps at least
+        ((60, 60), 4, [30, 30] * 2),
+        ((200, 59, 19), 5, [100, 100, 29, 30, 19]),
+        ((200, 200), 40, [20] * 20),
+        ((60, 60, 60), 3, [60, 60, 60]),
+        ((60,), 5, [60]),
+    ],
+)  # fmt: skip
+def test_pieces_are_as_many_as_are_asked_for_and_none_is_too_short(lengths, least, parts) -> None:
+    rng = np.random.default_rng(0)
+    whole = tuple(
+        Episode(rng.uniform(-1, 1, (n + 1, 2)), rng.uniform(-1, 1, (n, 1))) for n in lengths
+    )
+    found = pieces(whole, least)
+    assert [len(each) for each in found] == parts
+    actions = np.concatenate([each.actions for each in found])
+    np.testing.assert_array_equal(actions, np.concatenate([each.actions for each in whole]))
+    assert all(len(each.thetas) == len(each) + 1 for each in found)

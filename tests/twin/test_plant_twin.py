@@ -241,3 +241,69 @@ def test_a_residual_that_is_none_is_named_or_not_trusted() -> None:
     with pytest.raises(ValueError, match=r"predicts shape \(\d+, 7\) for \d+ rows, expected"):
         PlantTwin.fit(problem(), log(2), residuals=[lambda: Nowhere(7)])
     assert not PlantTwin.fit(problem(), log(2), residuals=[lambda: Nowhere(2)]).trusted
+
+
+class Counts(Nowhere):
+    """A regressor of nothing that notes how many rows it was fitted to."""
+
+    seen: list[int]
+
+    def __init__(self) -> None:
+        super().__init__(2)
+
+    def fit(self, z, y) -> None:
+        self.seen.append(len(z))
+
+    def predict(self, z):
+        return np.zeros((len(z), 2))
+
+
+def fits(episodes, **options) -> list[int]:
+    """Return to how many rows the candidate and the members of a twin were fitted, in turn."""
+
+    class Own(Counts):
+        seen: list[int] = []
+
+    PlantTwin.fit(problem(), episodes, residuals=[Own], **options)
+    return Own.seen
+
+
+def test_the_first_member_knows_all_episodes_and_the_others_as_many_drawn_from_them() -> None:
+    lengths = np.array([40, 41, 42, 43, 44, 45])
+    episodes = [(x[: n + 1], u[:n]) for n, (x, u) in zip(lengths, log(6), strict=True)]
+    total = int(lengths.sum())
+    for seed in (0, 7):
+        rng = np.random.default_rng(seed)
+        drawn = [int(lengths[rng.integers(6, size=6)].sum()) for _ in range(3)]
+        folds = [total - 40 - 45, total - 41, total - 42, total - 43, total - 44]
+        left_out = [total - int(n) for n in lengths]
+        expected = [*folds, total, *drawn, *left_out]
+        assert fits(episodes, n_members=4, seed=seed) == expected
+    assert fits(episodes, n_members=1) == [*folds, total, *left_out]
+
+
+def test_few_episodes_are_cut_for_the_choice_and_for_the_members() -> None:
+    (x, u), (y, v) = log(2)
+    seen = fits([(x, u), (y[:51], v[:50])], n_members=3)
+    pieces_of = [20, 20, 20, 25, 25]  # of twenty steps at least
+    rng = np.random.default_rng(0)
+    drawn = [sum(pieces_of[i] for i in rng.integers(5, size=5)) for _ in range(2)]
+    assert seen == [*(110 - n for n in pieces_of), 110, *drawn, *(110 - n for n in pieces_of)]
+
+
+def test_the_second_opinion_is_one_process_that_predicts_the_log() -> None:
+    found = twin().second_opinion
+    assert len(found.members) == 1 and found.members[0].shortest == 0.1
+    assert found.members[0].offset is False
+    (x, act), *_ = log(1)
+    after = found.step(x[None, :-1], act[None])[0]
+    np.testing.assert_allclose(after, x[1:], atol=5e-3)
+
+
+def test_of_a_buffer_what_is_asked_for_reaches_the_fit() -> None:
+    model = DDPG(YannPolicy, Cart(), seed=0, gradient_steps=0, learning_starts=0, buffer_size=500)
+    model.learn(180, callback=NoActionNoise())
+    found = PlantTwin.from_buffer(model, residuals=["linear"], n_members=2)
+    assert found.kind.startswith("linear") and len(found.dynamics.members) == 2
+    assert repr(found).startswith("PlantTwin(linear, shrinkage") and "3 episodes" in repr(found)
+    assert "2 members" in repr(found)

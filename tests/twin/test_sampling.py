@@ -9,6 +9,8 @@ import pytest
 
 from sb3_yann import PlantTwin
 from sb3_yann.evaluation import evaluate
+from sb3_yann.twin.log import as_episodes
+from sb3_yann.twin.sampling import cut_at_gaps
 from sb3_yann_envs import cstr, problems
 from twin_samples import DT, log, problem
 
@@ -36,6 +38,41 @@ def test_an_episode_is_cut_at_gaps_and_what_is_too_short_is_left_out_and_said() 
     assert "Cut at 2 gaps; 1 pieces of less than 5 steps left out, 4 of 180" in found.report()
 
 
+@pytest.mark.parametrize(("longer", "parts"), [(0.49, [20]), (0.51, [7, 12]), (-0.51, [7, 12])])
+def test_a_step_half_of_dt_too_long_or_too_short_is_a_gap(longer, parts) -> None:
+    (episode,) = as_episodes(problem(), [(x[:21], u[:20]) for x, u in log(1)])
+    times = DT * np.arange(21)
+    times[8:] += longer * DT
+    kept, notes = cut_at_gaps((episode,), [times], DT)
+    assert [len(each) for each in kept] == parts
+    np.testing.assert_array_equal(kept[0].thetas, episode.thetas[: parts[0] + 1])
+    np.testing.assert_array_equal(kept[-1].actions, episode.actions[-parts[-1] :])
+    said = "Cut at 1 gaps; 0 pieces of less than 5 steps left out, 1 of 20 steps in all."
+    assert notes == ((said,) if len(parts) > 1 else ())
+
+
+@pytest.mark.parametrize("slower", [1.049, 0.951, 1.051, 0.949])
+def test_a_clock_may_be_five_per_cent_off_and_no_more(slower) -> None:
+    episodes = as_episodes(problem(), log(1))
+    times = [slower * DT * np.arange(61)]
+    if 0.95 < slower < 1.05:
+        (whole,), notes = cut_at_gaps(episodes, times, DT)
+        assert len(whole) == 60 and notes == ()
+    else:
+        with pytest.raises(ValueError, match="the median"):
+            cut_at_gaps(episodes, times, DT)
+
+
+def test_pieces_of_five_steps_are_kept() -> None:
+    (episode,) = as_episodes(problem(), [(x[:21], u[:20]) for x, u in log(1)])
+    times = DT * np.arange(21)
+    times[6:] += DT  # after the fifth step
+    times[11:] += DT  # and four more
+    kept, notes = cut_at_gaps((episode,), [times], DT)
+    assert [len(each) for each in kept] == [5, 9]
+    assert notes[0].startswith("Cut at 2 gaps; 1 pieces") and "6 of 20" in notes[0]
+
+
 def broken(change):
     def times():
         found = clock(log(2))
@@ -53,6 +90,7 @@ def broken(change):
         (broken(lambda t: t.__setitem__(1, t[1][1:])), r"episode 1: time has shape \(60,\)"),
         (broken(lambda t: t[1].__setitem__(7, np.nan)), "episode 1: time is nan in row 7"),
         (broken(lambda t: t[1].__setitem__(8, t[1][7])), "does not increase after row 7: 0.7, 0.7"),
+        (broken(lambda t: t[1].__setitem__(8, 0.65)), r"not increase after row 7: 0\.7, 0\.65"),
         (
             broken(lambda t: t[1].__imul__(1.06)),
             r"episode 1: a step takes 0.106 \(the median\), .* dt = 0.1\. .* resample the log",

@@ -7,7 +7,7 @@ import pytest
 
 from sb3_yann import PlantTwin
 from sb3_yann.twin.gaussian_process import POINTS, GaussianProcess
-from sb3_yann.twin.network import Network
+from sb3_yann.twin.network import UNITS, Network
 from twin_samples import log, problem
 
 KINDS = ("gaussian process", "network")
@@ -110,3 +110,108 @@ def test_the_process_is_carried_by_few_points() -> None:
     fitted = GaussianProcess().fit(z, noisy)
     assert fitted.points.shape == (POINTS, 3)
     assert {tuple(row) for row in fitted.points} <= {tuple(row) for row in z} | {(0.0, 0.0, 0.0)}
+
+
+def kernel(process: GaussianProcess, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The squared-exponential kernel, less what knowing the function at zero takes off it."""
+
+    def k(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.exp(-0.5 * np.sum(((x[:, None] - y) / process.lengths) ** 2, axis=2))
+
+    zero, known = np.zeros((1, a.shape[1])), 0.0 if process.offset else 1.0
+    return k(a, b) - known * k(a, zero) * k(zero, b)
+
+
+@pytest.mark.parametrize("offset", [False, True])
+def test_the_likelihood_is_that_of_the_book(offset) -> None:
+    """Rasmussen and Williams, equation 5.8, the variance y' K^-1 y / N; constants left out."""
+    z, noisy, _ = data()
+    z, y, logs = z[:40], noisy[:40], np.array([0.3, 1.0, 0.5, -2.0, -4.0])
+    process = GaussianProcess(offset)
+    found = process._unlikeliness(logs, z, y)[0]
+    expected = 0.0
+    for i, noise in enumerate(np.exp(logs[3:])):
+        K = kernel(process, z, z) + noise * np.eye(40)
+        variance = y[:, i] @ np.linalg.solve(K, y[:, i]) / 40
+        expected += 0.5 * (np.linalg.slogdet(K)[1] + 40 * np.log(variance))
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("offset", [False, True])
+def test_with_all_points_it_is_the_mean_of_the_process(offset) -> None:
+    z, noisy, _ = data()
+    z, y, at = z[:60], noisy[:60], np.random.default_rng(1).uniform(-1, 1, (9, 3))
+    for stiffness in (1.0, 30.0):
+        process = GaussianProcess(offset, stiffness)
+        # Noise large enough that every point is worth picking, and of one size for each output.
+        process._most_likely = lambda *_: (np.array([0.5, 0.6, 0.7]), np.array([0.01, 0.2]))
+        process.fit(z, y)
+        for i, noise in enumerate((0.01, 0.2)):
+            K = kernel(process, z, z) + stiffness * noise * np.eye(60)
+            expected = kernel(process, at, z) @ np.linalg.solve(K, y[:, i])
+            np.testing.assert_allclose(process.predict(at)[:, i], expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("offset", [False, True])
+def test_the_points_are_those_of_a_pivoted_cholesky_factorization(offset) -> None:
+    z = np.random.default_rng(0).uniform(-1, 1, (POINTS + 40, 2))
+    process = GaussianProcess(offset)
+    process.lengths = np.array([0.05, 0.05])  # so short that each point tells something
+    picked, root = process._factor(z)
+    assert len(picked) == POINTS and root.shape == (POINTS + 40, POINTS)
+    K = kernel(process, z, z)
+    np.testing.assert_allclose((root @ root.T)[picked], K[picked], atol=1e-8)
+    left = np.diag(K).copy()
+    for step, row in enumerate(picked[:30]):
+        assert row == np.argmax(left)
+        left = np.diag(K - root[:, : step + 1] @ root[:, : step + 1].T)
+    process.lengths = np.array([30.0, 30.0])
+    few, root = process._factor(z)
+    assert len(few) < 15
+    np.testing.assert_allclose(root @ root.T, kernel(process, z, z), atol=1e-7)
+
+
+def test_the_lengths_and_noises_are_those_that_made_the_rows() -> None:
+    rng = np.random.default_rng(0)
+    z = rng.uniform(-9, 9, (100, 2))
+    process = GaussianProcess(offset=True)
+    process.lengths = np.array([3.0, 6.0])
+    draw = np.linalg.cholesky(kernel(process, z, z) + 1e-9 * np.eye(100))
+    y = draw @ rng.standard_normal((100, 1)) + 0.1 * rng.standard_normal((100, 1))
+    lengths, noises = process._most_likely(z, y)
+    np.testing.assert_allclose(lengths, [3.0, 6.0], rtol=0.3)
+    assert 0.003 < noises[0] < 0.03
+    twice = np.concatenate([z, z[:50]])  # a row that stands there twice counts once
+    again, _ = process._most_likely(twice, np.concatenate([y, y[:50]]))
+    np.testing.assert_allclose(again, lengths)
+    short, _ = GaussianProcess(True, shortest=4.0)._most_likely(z, y)
+    assert short[0] == pytest.approx(4.0) and short[1] > 4.0
+
+
+def test_residuals_of_any_size_are_learnt_as_well() -> None:
+    z, noisy, _ = data()
+    z, noisy, sizes = z[:60], noisy[:60], np.array([1e-6, 1e5])
+    for kind in KINDS:
+        plain, scaled = make(kind).fit(z, noisy), make(kind).fit(z, sizes * noisy)
+        np.testing.assert_allclose(scaled.predict(z) / sizes, plain.predict(z), atol=0.02)
+
+
+def test_a_network_is_zero_at_zero_unless_it_has_a_constant_and_starts_as_its_seed_says() -> None:
+    z, noisy, _ = data()
+    network = Network(np.random.default_rng(3), 1e-3, offset=True).fit(z, noisy)
+    rng = np.random.default_rng(3)
+    first, shift = rng.standard_normal((3, UNITS)) / np.sqrt(3), rng.uniform(-1, 1, UNITS)
+    begun = []
+
+    class Watched(Network):
+        def _loss(self, flat, z, y):
+            begun.append(flat.copy())
+            return super()._loss(flat, z, y)
+
+    again = Watched(np.random.default_rng(3), 1e-3, offset=True).fit(z, noisy)
+    parts = again._parts(begun[0], 3, 2)
+    np.testing.assert_array_equal(parts[0], first)
+    np.testing.assert_array_equal(parts[1], shift)
+    assert not parts[2].any() and not parts[3].any()
+    np.testing.assert_array_equal(again.predict(z), network.predict(z))
+    np.testing.assert_allclose(network.predict(np.zeros((1, 3)))[0], network.constant)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from general_problems import solved
-from sb3_yann import PlantTwin
+from general_problems import servo, solved
+from sb3_yann import LinearMPC, PlantTwin, SoftBounds
+from sb3_yann.twin.dynamics import Coordinates
+from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.starts import Starts
 from twin_samples import log, problem, twin
 
@@ -69,6 +73,16 @@ def test_what_a_log_shows_are_its_rows_and_where_it_may_begin() -> None:
     np.testing.assert_allclose(high, np.maximum(starts.rows.max(0), middle + further))
 
 
+def test_a_log_of_many_episodes_shows_no_more_than_its_rows() -> None:
+    """Of fifty starts fewer than one in twenty lie beyond their range."""
+    rng = np.random.default_rng(0)
+    first = rng.uniform(-1, 1, (50, 2))
+    starts = Starts(problem(), first.min(0), first.max(0), first, first)
+    low, high = starts.shown
+    np.testing.assert_array_equal(low, first.min(0))
+    np.testing.assert_array_equal(high, first.max(0))
+
+
 def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
     mpc, rng = solved("servo with rates"), np.random.default_rng(0)
     held = mpc.layout.reference
@@ -87,3 +101,113 @@ def test_half_of_the_starts_have_set_points_between_those_of_the_log() -> None:
     assert np.isin(starts.draw(200, rng)[:, held], thetas[:, held]).all()
     never_moved = Starts(mpc, starts.low, starts.high, thetas[:1], thetas[:1])
     assert np.isin(never_moved.draw_between(50, rng)[:, held], thetas[0, held]).all()
+
+
+@pytest.mark.parametrize(("k", "widened"), [(1, 2.0), (2, 2.0), (3, 2.0), (5, 1.5), (11, 1.2)])
+def test_the_box_of_starts_is_wider_than_they_are_the_fewer_there_are(k, widened) -> None:
+    rng, mpc = np.random.default_rng(0), problem()
+    first = rng.uniform(-1, 1, (k, 2))
+    episodes = [
+        Episode(np.vstack([x, rng.uniform(-3, 3, (5, 2))]), np.zeros((5, 1))) for x in first
+    ]
+    found = Starts.of(mpc, tuple(episodes))
+    middle, half = (first.max(0) + first.min(0)) / 2, np.ptp(first, axis=0) / 2
+    np.testing.assert_allclose(found.low, middle - widened * half)
+    np.testing.assert_allclose(found.high, middle + widened * half)
+    assert len(found.rows) == 5 * k  # without the last one, from which nothing was done
+    np.testing.assert_array_equal(found.rows[:5], episodes[0].thetas[:-1])
+    beyond = tuple(Episode(3 * each.thetas, each.actions) for each in episodes)
+    clipped = Starts.of(mpc, beyond)
+    np.testing.assert_allclose(clipped.low, np.maximum(3 * found.low, -3))
+    np.testing.assert_allclose(clipped.high, np.minimum(3 * found.high, 3))
+
+
+def test_a_draw_has_the_rest_of_the_episode_that_is_named() -> None:
+    mpc, rng = solved("servo with rates"), np.random.default_rng(0)
+    thetas = 0.2 * mpc.theta_half * rng.uniform(-1, 1, (4, mpc.n_theta))
+    episodes = (Episode(np.tile(each, (7, 1)), np.zeros((6, 1))) for each in thetas)
+    starts = Starts.of(mpc, tuple(episodes))
+    before = starts.first.copy()
+    which = np.array([3, 0, 0, 2, 1, 3])
+    drawn = starts.draw(6, rng, which)
+    np.testing.assert_array_equal(drawn[:, 2:], thetas[which, 2:])
+    assert np.ptp(drawn[:, 0]) > 0 and np.all(drawn[:, :2] <= starts.high)
+    np.testing.assert_array_equal(starts.first, before)  # drawn from, and not written to
+    counts = [len(starts.draw_anywhere(n, rng)) for n in (0, 1, 2, 3, 50)]
+    assert counts == [0, 1, 2, 3, 50]
+
+
+def test_draws_from_anywhere_are_a_third_each_of_beginnings_of_rows_and_of_around() -> None:
+    starts, rng = twin().starts, np.random.default_rng(0)
+    drawn = starts.draw_anywhere(100, rng)
+    rows = {row.tobytes() for row in starts.rows}
+    logged = [row.tobytes() in rows for row in drawn]
+    assert not any(logged[:34]) and all(logged[34:67])
+    assert np.all((drawn[:34] >= starts.low) & (drawn[:34] <= starts.high))
+    assert not np.all((drawn[67:] >= starts.low) & (drawn[67:] <= starts.high))
+
+
+@pytest.mark.parametrize("k", [2, 4, 12])
+def test_around_the_log_boxes_are_one_to_three_times_as_wide(k) -> None:
+    rng, free = np.random.default_rng(0), np.full(2, 0.1)
+    first = 0.1 * np.column_stack([np.linspace(-1, 1, k), np.linspace(1, -1, k)])
+    starts = Starts(problem(), -free, free, first, np.zeros((1, 2)))
+    drawn = np.abs(starts.draw_around(20_000, rng)) / 0.1
+    assert 2.95 < drawn.max() <= 3.0 + 1e-9
+    widened = min(2.0, (k + 1) / (k - 1))
+    # So wide a box is drawn by one who knows k starts, or evenly where that is wider.
+    even, v = rng.uniform(1, 3, 200_000), rng.uniform(size=200_000)
+    known = ((1 + widened) * v ** (-1 / max(k - 1, 1)) - 1) / widened
+    wide = np.minimum(np.maximum(even, known), 3)
+    expected = wide * np.abs(rng.uniform(-1, 1, 200_000))
+    for share in (0.25, 0.5, 0.75, 0.9):
+        assert np.quantile(drawn, share) == pytest.approx(np.quantile(expected, share), rel=0.03)
+
+
+def limits_of(mpc: LinearMPC, **box: np.ndarray) -> Limits:
+    """Return the limits of a box of data and of starts."""
+    k = mpc.model.n_states + mpc.model.n_inputs
+    low, high = np.full(k, -0.5), np.full(k, 0.7)
+    coordinates = Coordinates(low, high, np.ones(k), np.ones(2), RowLayout(mpc))
+    given = {"low": np.array([-1.0, -0.1]), "high": np.array([0.2, 1.5])} | box
+    row = np.zeros((2, mpc.n_theta))
+    return Limits.of(mpc, coordinates, Starts(mpc, given["low"], given["high"], row, row))
+
+
+def test_the_limits_hold_the_data_and_the_starts_with_a_quarter_of_their_width() -> None:
+    found = limits_of(problem())
+    np.testing.assert_allclose(found.low, [-1.0 - 0.3, -0.5], atol=1e-8)
+    np.testing.assert_allclose(found.high, [0.7, 1.5 + 0.4], atol=1e-8)
+    assert np.all(found.low < [-1.3, -0.5]) and np.all(found.high > [0.7, 1.9])  # by rounding
+    for at, beyond in (([-1.31, 0.0], True), ([-1.29, 1.89], False), ([0.0, 1.91], True)):
+        assert found.violated(np.array(at)) == beyond
+
+
+def test_hard_bounds_cut_the_limits_and_soft_ones_do_not() -> None:
+    own = {"tracking": None, "x_min": [-0.4, -0.3], "x_max": [0.3, 0.6], "theta_min": -5,
+           "theta_max": 5}  # fmt: skip
+    hard, soft = servo(**own), servo(**own, soft=SoftBounds([0.0, 1.0], penalty=300))
+    np.testing.assert_allclose(limits_of(hard).low, [-0.4, -0.3], atol=1e-7)
+    np.testing.assert_allclose(limits_of(hard).high, [0.3, 0.6], atol=1e-7)
+    found = limits_of(soft)
+    np.testing.assert_allclose(found.low, [-0.4, -0.5], atol=1e-7)
+    np.testing.assert_allclose(found.high, [0.3, 1.9], atol=1e-7)
+    at = np.array([[-0.41, 0], [0.31, 0], [0, -0.31], [0, 0.61], [-0.4, 0.6]])
+    assert limits_of(hard).broken(at).tolist() == [True, True, True, True, False]
+    assert found.broken(at).tolist() == [True, True, False, False, False]
+
+
+def test_with_set_points_the_limits_hold_what_the_mpc_plans() -> None:
+    mpc = solved("servo")
+    row = np.array([[0.0, 0.0, 1.0]])
+    rows = np.tile(row, (30, 1))
+    k = np.full(3, 0.01)
+    coordinates = Coordinates(-k, k, np.ones(3), np.ones(2), RowLayout(mpc))
+    zero = np.zeros(2)
+    found = Limits.of(mpc, coordinates, Starts(mpc, zero, zero, row, rows))
+    thetas, _ = mpc.simulate(row[0], 30)
+    low, high = thetas[:, :2].min(0), thetas[:, :2].max(0)
+    width = 0.25 * (high - low)
+    np.testing.assert_allclose(found.high, np.maximum(high + width, k[:2]), atol=1e-6)
+    np.testing.assert_allclose(found.low, np.minimum(low - width, -k[:2]), atol=1e-6)
+    assert found.high[0] > 1.2

@@ -6,16 +6,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from scipy.optimize import check_grad
 
-from sb3_yann import LinearMPC, RateLimits
+from general_problems import solved
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits
 from sb3_yann.twin import trust as trusts
-from sb3_yann.twin.log import Episode, as_episodes
+from sb3_yann.twin.log import Episode, as_episodes, pieces
 from sb3_yann.twin.network import UNITS, Network
+from sb3_yann.twin.plots import draw_twin
 from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import Nothing
 from sb3_yann.twin.selection import Candidate, FreeRuns
-from twin_samples import log, problem, twin
+from twin_samples import log, problem, random_episode, twin
 
 
 def runs(*errors: list[float]) -> FreeRuns:
@@ -88,6 +91,8 @@ def test_what_an_input_does_of_its_own_is_what_no_linear_law_and_no_mpc_explains
     share, moves = trusts.excitation(problem(), (episode,))
     assert share == pytest.approx(np.var(own) / np.var(feedback + own), rel=0.05)
     assert moves == pytest.approx([np.std(feedback + own)])  # half the range is 1
+    (still,) = as_episodes(problem(), [(x, 0 * own + 0.25)])
+    assert [each.tolist() for each in trusts.excitation(problem(), (still,))] == [[0.0], [0.0]]
     (closed,) = as_episodes(problem(), [(x, feedback)])
     assert trusts.excitation(problem(), (closed,))[0] < 1e-20
 
@@ -127,6 +132,20 @@ def test_the_edges_of_what_is_trusted() -> None:
     assert "reflux never moves" in named[0] and "step test on reflux" in named[1]
 
 
+def test_what_lies_on_an_edge_is_trusted() -> None:
+    assert judged(runs(GOOD), beyond=(0.05, "x[0]")) == ("", "")
+    costs = np.array([12.5, 12.5]), np.array([10.0, 10.0])  # a quarter
+    assert judged(runs(GOOD), costs=costs) == ("", "")
+    inputs = np.array([0.02]), np.array([1e-4])
+    assert judged(runs(GOOD), inputs=inputs) == ("", "")
+    assert judged(runs([2.0, 0.1])) == ("", "")
+    problems, advice = judged(runs([10.0, 0.1]))
+    assert not problems and "worse than 'nothing moves'" in advice
+    at = dataclasses.replace(twin().trust, excitation=np.array([0.02]))
+    assert "2.00 %: its gain is known from the log" in report(problem(), twin().episodes, "", at)
+    assert judged(runs(GOOD), n_episodes=2) == ("", "")
+
+
 def test_a_log_whose_theta_does_not_hold_the_input_before_is_told_by_its_share() -> None:
     given = problem()
     mpc = LinearMPC(
@@ -136,7 +155,9 @@ def test_a_log_whose_theta_does_not_hold_the_input_before_is_told_by_its_share()
     u = np.linspace(-0.2, 0.2, 40)[:, None]
     thetas = np.hstack([np.zeros((41, 2)), np.vstack([[[0.0]], u])])
     assert trusts.foreign_previous(mpc, (Episode(thetas, u),)) == []
-    thetas[5:15, 2] += 0.02
+    thetas[5:7, 2] += 0.02
+    assert trusts.foreign_previous(mpc, (Episode(thetas, u),)) == []  # one row of twenty
+    thetas[7:15, 2] += 0.02
     (said,) = trusts.foreign_previous(mpc, (Episode(thetas, u),))
     assert said.startswith("In 25 % of the rows theta does not hold the input before it")
     assert trusts.foreign_previous(problem(), as_episodes(problem(), log(2))) == []
@@ -175,3 +196,144 @@ def test_the_slope_of_a_networks_loss_is_that_of_its_value(offset) -> None:
     silent = np.concatenate([flat[: 4 * UNITS], *(each.ravel() for each in zero)])
     decay = 0.1 * np.sum(weights[0] ** 2)
     assert network._loss(silent, z, y)[0] == pytest.approx(np.sum(y**2) / 30 + decay)
+
+
+def test_standing_still_errs_by_how_far_the_states_move_in_units_of_the_log() -> None:
+    logs = [random_episode(problem(), steps, seed) for seed, steps in enumerate((20, 14))]
+    box = dataclasses.replace(twin().dynamics.coordinates, units=np.array([2.0, 5.0]))
+    found = trusts.standing_still(box, (*logs,), [1, 5, 14])
+    for h, error in zip((1, 5, 14), found, strict=True):
+        squares = [
+            ((each.thetas[i + h, k] - each.thetas[i, k]) / (2.0, 5.0)[k]) ** 2
+            for each in logs
+            for i in range(len(each) + 1 - h)
+            for k in range(2)
+        ]
+        assert error == pytest.approx(np.sqrt(np.mean(squares)))
+
+
+def test_the_actual_cost_of_an_episode_is_that_of_its_steps() -> None:
+    each = random_episode(problem(), 9)
+    expected = sum(
+        x @ problem().Q @ x + u @ problem().R @ u
+        for x, u in zip(each.thetas[:-1], each.actions, strict=True)
+    )
+    assert trusts.costs_of(problem(), each) == pytest.approx(expected)
+
+
+def test_an_episode_that_goes_on_where_another_ends_is_none_of_its_own() -> None:
+    one, two = (random_episode(problem(), 20, seed) for seed in range(2))
+    parts = pieces((one, two), 2), (one, two), (*pieces((one, two), 4), two)
+    assert [trusts.count_apart(each) for each in parts] == [2, 2, 3]
+    halves = [
+        Episode(one.thetas[:11], one.actions[:10]),
+        Episode(one.thetas[10:], one.actions[10:]),
+    ]
+    assert trusts.count_apart((*halves,)) == 1
+    almost = Episode(halves[1].thetas + np.array([0.0, 1e-9]), halves[1].actions)
+    assert trusts.count_apart((halves[0], almost)) == 2
+
+
+def test_a_reading_a_thousand_times_as_far_off_as_most_is_named_with_its_value() -> None:
+    mpc = dataclasses.replace(
+        problem(), model=LinearModel(problem().model.A, problem().model.B, 0.1, x_ss=[10.0, 20.0])
+    )
+    logs = tuple(random_episode(mpc, 30, seed) for seed in range(3))
+    rng = np.random.default_rng(0)
+    left = [0.01 * rng.choice([-1.0, 1.0], (30, 2)) for _ in logs]
+    for size, named in ((9.9, False), (10.1, True)):
+        left[2][11, 1] = -size
+        said = trusts.spikes(mpc, logs, left)
+        value = logs[2].thetas[12, 1] + 20.0
+        assert said == ([f"Look at where state 1 is about {value:.6g}: no other step has moved it "
+                         "so far."] if named else [])  # fmt: skip
+    # Where all else fits to the last bit, rounding is what it is compared with.
+    quiet = [np.zeros((30, 2)) for _ in logs]
+    quiet[0][4, 0] = 2.9e-3  # a half-width is 3
+    assert trusts.spikes(mpc, logs, quiet) == []
+    quiet[0][4, 0] = 3.1e-3
+    assert f"{logs[0].thetas[5, 0] + 10.0:.6g}" in trusts.spikes(mpc, logs, quiet)[0]
+
+
+def test_the_noise_of_the_sensors_is_what_one_step_s_errors_amount_to() -> None:
+    """Noise e of the states leaves e+ - A e of a step."""
+    mpc, rng, sizes = problem(), np.random.default_rng(0), np.array([0.02, 0.005])
+    logs = []
+    for seed in range(4):
+        x, rows = np.random.default_rng(seed).uniform(-0.5, 0.5, 2), []
+        u = 0.3 * rng.uniform(-1, 1, (400, 1))
+        for each in u:
+            rows.append(x)
+            x = mpc.model.step(x, each)
+        rows.append(x)
+        logs.append((np.array(rows) + sizes * rng.standard_normal((401, 2)), u))
+    found = PlantTwin.fit(mpc, logs, residuals=["none"], n_members=1)
+    np.testing.assert_allclose(found.trust.noise, sizes, rtol=0.1)
+
+
+def test_the_evidence_names_the_entry_of_theta_that_lies_beyond_its_box() -> None:
+    mpc = dataclasses.replace(problem(), model=problem().model.named(["place", "speed"]))
+    episodes = log(5)
+    for states, _ in episodes:
+        states[::8, 1] = 3.5
+    found = PlantTwin.fit(mpc, episodes, residuals=["none"], n_members=1)
+    share = 100 * 8 / 61
+    wanted = f"{share:.3g} % of the logged speed lie beyond the problem's box of theta."
+    assert wanted in found.trust.problems
+
+
+def test_the_report_counts_what_it_leaves_out_and_says_what_the_log_does_not_show() -> None:
+    mpc = solved("servo")
+    still = tuple(random_episode(mpc, 10, seed) for seed in range(12))
+    for each in still:
+        each.thetas[:, 2] = 0.25
+    given = dataclasses.replace(
+        twin().trust, predicted=np.arange(12.0), actual=np.arange(12.0) + 0.5
+    )
+    said = report(mpc, still, "linear", given).splitlines()
+    assert said[1] == "The log shows one value alone of r[0]: elsewhere the MPC will act."
+    at = said.index("Cost of held-out episodes (or pieces of them), predicted and actual:")
+    rows = [tuple(map(float, each.split())) for each in said[at + 1 : at + 11]]
+    assert rows == [(i, i + 0.5) for i in range(10)] and said[at + 11] == "  ... and 2 more"
+    still[3].thetas[2, 2] = 0.3
+    ten = dataclasses.replace(given, predicted=np.arange(10.0), actual=np.arange(10.0) + 0.5)
+    text = report(mpc, still, "linear", ten)
+    assert "one value alone" not in text and "more" not in text.split("error")[0]
+    table = [each.split() for each in text.splitlines() if each.startswith("  nothing moves")]
+    assert [float(each) for each in table[0][2:]] == pytest.approx(given.standing, rel=1e-2)
+    rows = {each[:17].strip(): each[19:].split() for each in text.splitlines()}
+    chosen, errors = given.chosen, given.runs.errors
+    assert [float(e) for e in rows["linear model"]] == pytest.approx(errors[0], rel=1e-2)
+    assert [float(e) for e in rows["twin"]] == pytest.approx(errors[chosen], rel=1e-2)
+    none = dataclasses.replace(given, predicted=np.zeros(0), actual=np.zeros(0))
+    for part in ("Error of free runs", "Cost of held-out"):
+        assert part in text and part not in report(mpc, still, "linear", none)
+
+
+def lines(axes: Axes) -> dict[str, np.ndarray]:
+    """Return what is drawn, by its label or its colour."""
+    return {str(each.get_label()): np.array(each.get_data()) for each in axes.lines}
+
+
+def test_the_picture_of_costs_has_a_band_of_a_quarter_of_the_mean() -> None:
+    predicted, actual = np.array([8.0, 18.0, 1e6]), np.array([10.0, 20.0, 30.0])
+    given = dataclasses.replace(twin().trust, predicted=predicted, actual=actual)
+    costs, runs = draw_twin(given)
+    drawn = lines(costs)
+    ends = np.array([8 - 0.08 * 22, 30 + 0.08 * 22])  # without the run that blew up
+    np.testing.assert_allclose(drawn["as predicted"], [ends, ends])
+    np.testing.assert_allclose(drawn["25 % of the mean off"], [ends, ends - 5])
+    (above,) = (each for each in costs.lines if str(each.get_label()).startswith("_"))
+    np.testing.assert_allclose(np.array(above.get_data()), [ends, ends + 5])
+    np.testing.assert_allclose(drawn["held-out episode"], [predicted, actual])
+    np.testing.assert_allclose([costs.get_xlim(), costs.get_ylim()], [ends, ends])
+    assert runs.get_xscale() == runs.get_yscale() == "log"
+    assert runs.get_xticks().tolist() == given.runs.horizons.tolist()
+    np.testing.assert_allclose(lines(runs)["nothing moves"], [given.runs.horizons, given.standing])
+
+
+def test_without_a_second_episode_the_pictures_are_empty() -> None:
+    none = dataclasses.replace(twin().trust, predicted=np.zeros(0), actual=np.zeros(0))
+    costs, runs = draw_twin(none)
+    assert not costs.lines and not runs.lines and runs.get_xscale() == "linear"
+    assert (costs.get_xlabel(), runs.get_xlabel()) == ("predicted cost", "steps ahead")

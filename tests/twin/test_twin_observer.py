@@ -22,7 +22,12 @@ from sb3_yann import (
 )
 from sb3_yann.audit.plants import TwinPlant
 from sb3_yann.twin.dynamics import Dynamics
-from sb3_yann.twin.observers import EstimatedDisturbanceWarning, observer_of
+from sb3_yann.twin.log import Episode
+from sb3_yann.twin.observers import (
+    EstimatedDisturbanceWarning,
+    observer_of,
+    warn_of_estimates,
+)
 from sb3_yann.twin.row_layout import RowLayout
 from twin_samples import (
     D_MAX,
@@ -147,6 +152,59 @@ def test_a_measured_disturbance_is_not_taken_for_an_estimate() -> None:
         PlantTwin.fit(mpc, episodes, disturbances=loads, residuals=["linear"], n_members=1)
 
 
+def followed(steps: int, noise: float = 0.0, still: bool = False) -> Episode:
+    """Return an episode whose disturbance follows the model's errors, but for some noise."""
+    mpc, _ = offset_free_problem()
+    rng = np.random.default_rng(0)
+    thetas, u = np.zeros((steps + 1, mpc.n_theta)), rng.uniform(-1, 1, (steps, 1))
+    errors = 0.01 * rng.standard_normal((steps, 2))
+    for k in range(steps):
+        ahead = mpc.predict(thetas[k], u[k])
+        thetas[k + 1] = ahead
+        thetas[k + 1, :2] += errors[k]
+        if not still:
+            moves = [0.2 * errors[k, 0], 0.1 * errors[k, 1] - 0.1 * errors[k, 0]]
+            own = noise * 1e-3 * rng.standard_normal(2)
+            thetas[k + 1, 3:] = thetas[k, 3:] + np.array(moves) + own
+    return Episode(thetas, u)
+
+
+def warned(*episodes: Episode) -> bool:
+    """Return whether the disturbances are said to be an observer's estimate."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_of_estimates(offset_free_problem()[0], episodes)
+    return bool(caught)
+
+
+def test_a_disturbance_that_moves_with_the_errors_is_an_estimate_and_a_noisy_one_is_not() -> None:
+    assert warned(followed(20)) and warned(followed(9), followed(9))
+    assert not warned(followed(20, noise=3.0))
+    assert not warned(followed(20, still=True))
+
+
+def test_as_few_steps_as_explain_anything_tell_no_estimate() -> None:
+    assert not warned(followed(4)) and warned(followed(5))
+
+
+def test_on_its_bounds_an_estimate_moves_otherwise_and_does_not_count() -> None:
+    clipped = followed(40)
+    d = clipped.thetas[:, 3:]
+    limit = np.sort(np.abs(d).max(axis=1))[30]
+    scaled = clipped.thetas.copy()
+    scaled[:, 3:] = np.clip(d * D_MAX / limit, -D_MAX, D_MAX)
+    assert np.sum(np.abs(scaled[:, 3:]).max(axis=1) >= D_MAX) > 5
+    # The errors are those of the scaled log: of a model that knows of the disturbance.
+    mpc, _ = offset_free_problem()
+    ahead = mpc.predict(scaled[:-1], clipped.actions)
+    again = scaled.copy()
+    moves = np.diff(d, axis=0) * D_MAX / limit
+    again[1:, :2] = ahead[:, :2] + np.column_stack([5 * moves[:, 0], 10 * moves.sum(axis=1)])
+    for k in range(40):
+        again[k + 1, :2] += (mpc.predict(again[k], clipped.actions[k]) - ahead[k])[:2]
+    assert warned(Episode(again, clipped.actions))
+
+
 def test_the_slopes_of_a_step_are_those_of_differences_on_bounds_of_d_as_well() -> None:
     found, rng = observed(), np.random.default_rng(0)
     dynamics, row = found.dynamics, found.dynamics.row
@@ -230,3 +288,28 @@ def test_an_observer_of_another_model_or_of_some_states_is_refused() -> None:
     )  # fmt: skip
     with pytest.raises(ValueError, match="needs an observer that measures all 2 states"):
         RowLayout(one, DisturbanceObserver(model, [0]))
+
+
+@pytest.mark.parametrize(
+    ("C", "block", "name"),
+    [
+        (np.eye(2), [[0.5, 0.0], [0.0, 0.0]], "gain of the states"),
+        ([[1.0, 0.0], [1.0, 1e-11]], [[0.5, 0.0], [0.0, 0.5]], "C"),
+        ([[1.0, 0.0], [1.0, 1e-9]], [[0.5, 0.0], [0.0, 0.5]], ""),
+    ],
+)
+def test_an_observer_that_does_not_tell_the_state_back_is_refused(C, block, name) -> None:
+    model = LinearModel([[0.9, 0.0], [0.0, 0.5]], [[0.0], [1.0]], DT, E=[[1.0], [0.0]])
+    mpc = LinearMPC(
+        model, Q=np.eye(2), R=[[1.0]], horizon=1, u_min=-1, u_max=1, theta_min=-3, theta_max=3,
+        disturbances=DisturbanceBounds(-0.1, 0.1),
+    )  # fmt: skip
+    observer = DisturbanceObserver(model, gain=[*block, [0.1, 0.0]])
+    observer.C = np.array(C)
+    if name:
+        with pytest.raises(
+            ValueError, match=f"observer's {name}, shape .2, 2., cannot be inverted"
+        ):
+            RowLayout(mpc, observer)
+    else:
+        assert RowLayout(mpc, observer).size == 3 + 2 + 1

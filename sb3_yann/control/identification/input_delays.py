@@ -97,7 +97,8 @@ def _correlations(known: Array, residuals: Array, past: Array, weights: Array) -
         What is taken off first; what is correlated; the weight of each residual.
     """
     spread = np.std(known, axis=0)
-    basis = np.column_stack([np.ones(len(known)), known / np.where(spread > 0, spread, 1.0)])
+    moving = spread > 0  # the others would make QR take off a direction of its own choice
+    basis = np.column_stack([np.ones(len(known)), known[:, moving] / spread[moving]])
     orthonormal = np.linalg.qr(basis)[0]
 
     def rest(values: Array) -> Array:

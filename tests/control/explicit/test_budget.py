@@ -12,6 +12,7 @@ from fresh_process import run_python
 from sample_problems import PROBLEMS, benchmark, box_points, solved
 from sb3_yann.control import ExplicitLimitError
 from sb3_yann.control.explicit import budget, certificate, conditions
+from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.law import search_tree
 
 
@@ -171,3 +172,41 @@ problems.cstr().law()
 """
     )
     assert found.stdout.decode().strip() == "compiled meanwhile: []", found.stderr.decode()
+
+
+def test_a_limit_is_reached_by_one_more_and_not_by_as_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [100.0]
+    monkeypatch.setattr("sb3_yann.control.explicit.budget.time.monotonic", lambda: clock[0])
+    with BudgetTimer(SolveBudget(time_limit=5, region_limit=3)) as timer:
+        timer.count()
+        timer.count(2)
+        assert timer.found == 3
+        with pytest.raises(ExplicitLimitError, match="region_limit = 3 regions: 4 regions") as many:
+            timer.count()
+        assert many.value.n_regions == 4
+        clock[0] = 105.0
+        timer.tick()
+        timer.stage("Checked", "and not all were checked", 7)
+        timer.advance(2)
+        clock[0] = 105.1
+        for late in (timer.tick, timer.advance):
+            message = "time_limit = 5 s: 4 regions were found in 5.1 s and not all were checked"
+            with pytest.raises(ExplicitLimitError, match=message):
+                late()
+    budget = SolveBudget(region_limit=3)
+    budget.require(3)
+    with pytest.raises(ExplicitLimitError, match="The law has 4 regions, more than region_limit"):
+        budget.require(4)
+    SolveBudget().require(10**9)
+
+
+def test_the_bar_counts_regions_and_steps_of_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    timer = BudgetTimer(SolveBudget(progress=True))
+    timer.count(3)
+    assert (timer._bar.n, timer._bar.desc, timer._bar.total) == (3, "Critical regions", None)
+    timer.stage("Checked", "", 9)
+    timer.advance()
+    timer.advance(4)
+    assert (timer._bar.n, timer._bar.desc, timer._bar.total) == (5, "Checked", 9)
+    timer.__exit__()
+    assert BudgetTimer(SolveBudget())._bar.disable

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from sb3_yann import Identified, LinearModel, LinearMPC, Tracking, identify
 from sb3_yann.control.identification.fit import fit_log
@@ -359,3 +360,44 @@ def test_bad_interval_is_named(name: str, level: float) -> None:
 def test_identify_and_from_data_take_the_same_options_with_the_same_defaults() -> None:
     ours, theirs = (inspect.signature(each).parameters.values() for each in (identify, fit_log))
     assert [(p.name, p.default) for p in ours] == [(p.name, p.default) for p in theirs]
+
+
+@pytest.mark.parametrize("level", [0.5, 0.95])
+def test_an_interval_is_that_of_student_s_t_about_each_entry(level: float) -> None:
+    x, u, d = record(0, steps=40, process=0.1, disturbed=True)
+    found = identify(x, u, dt=1, disturbances=d, held_out=0)
+    assert found.degrees_of_freedom == 40 - 5
+    Z = np.column_stack([np.ones(40), x[:-1], u, d])
+    coefficients, squares, *_ = np.linalg.lstsq(Z, x[1:], rcond=None)
+    errors = np.sqrt(np.outer(np.diag(np.linalg.inv(Z.T @ Z)), squares / 35)).T
+    np.testing.assert_allclose(np.diag(found.noise_covariance), squares / 35)
+    width = stats.t.isf((1 - level) / 2, 35)
+    for name, columns in (("A", [1, 2]), ("B", [3]), ("E", [4])):
+        value, error = coefficients.T[:, columns], errors[:, columns]
+        np.testing.assert_allclose(getattr(found.model, name), value)
+        np.testing.assert_allclose(getattr(found, f"standard_error_{name}"), error)
+        low, high = found.interval(name, level)
+        np.testing.assert_allclose(low, value - width * error)
+        np.testing.assert_allclose(high, value + width * error)
+    assert found.interval("A")[0][0, 0] < found.interval("A", 0.9)[0][0, 0]
+
+
+def test_what_is_fitted_rests_at_zero_without_an_offset_and_at_the_mean_with_one() -> None:
+    x, u, _ = record(0, process=0.05)
+    without = identify(x, u + 0.5, dt=1, offset=False).model
+    assert not np.any([*without.x_ss, *without.u_ss])
+    model = identify(x, u + 0.5, dt=1).model
+    np.testing.assert_allclose(model.u_ss, np.mean(u[:320] + 0.5, axis=0))
+    given = identify(x, u, dt=1, offset=False, u_ss=[0.25]).model
+    assert given.u_ss.tolist() == [0.25] and given.x_ss.tolist() == [0.0, 0.0]
+
+
+def test_the_notes_stand_in_their_order_and_a_ridge_that_is_given_is_told_once() -> None:
+    x, u, _ = record(0, process=0.05)
+    notes = identify(x, u, dt=1, ridge=0.5).model.notes
+    begins = ["Fitted to 320 steps", "Fit over 80 steps", "A ridge of 0.5 biases", "Poles with"]
+    assert [note[: len(begin)] for note, begin in zip(notes, begins, strict=True)] == begins
+    time = np.arange(401.0)
+    time[201:] += 3
+    last = identify(x, u, dt=1, time=time).model.notes[-1]
+    assert last == "1 steps that took another time than dt were left out."

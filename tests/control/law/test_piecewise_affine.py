@@ -293,6 +293,13 @@ def test_arrays_are_read_only_in_every_copy(name: str, copied: Any) -> None:
         array[...] = 0
 
 
+@pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(PiecewiseAffine)])
+def test_nothing_of_a_law_can_be_set(name: str) -> None:
+    law = law_of("pendulum")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(law, name, getattr(law, name))
+
+
 @pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(PiecewiseAffine) if f.compare])
 def test_laws_that_differ_in_one_field_are_not_equal(name: str) -> None:
     law = law_of("pendulum")

@@ -139,3 +139,27 @@ def test_absolute_inputs_that_pass_for_deviations_are_named_beside_disturbances(
             MODEL, **WEIGHTS, theta_min=[-20, -1], theta_max=[20, 3], u_min=8, u_max=15,
             disturbances=DisturbanceBounds(4, 7),
         )  # fmt: skip
+
+
+def test_a_bound_at_the_operating_point_is_zero_and_no_minus_zero() -> None:
+    mpc = LinearMPC(
+        MODEL, **WEIGHTS, theta_min=[350, 0], theta_max=[400, 2], u_min=10, u_max=15,
+        x_min=[350, -np.inf], x_max=[np.inf, 2], absolute=True,
+        tracking=Tracking([0], 350, 355), disturbances=DisturbanceBounds(4, 5),
+    )  # fmt: skip
+    for ours, expected in (
+        (mpc.u_min, [0]), (mpc.u_max, [5]), (mpc.x_min, [0, -np.inf]), (mpc.x_max, [np.inf, 0]),
+        (mpc.theta_min[:2], [0, -2]), (mpc.theta_max[:2], [50, 0]),
+        (mpc.tracking.r_min, [0]), (mpc.tracking.r_max, [5]), (mpc.disturbances.d_max, [0]),
+    ):  # fmt: skip
+        assert ours.tolist() == expected and not np.any(np.signbit(ours[ours == 0]))
+
+
+def test_a_bound_that_is_not_given_stays_none_of_one_side_alone() -> None:
+    common = {"theta_min": [300, 0], "theta_max": [400, 4], "absolute": True,
+              "disturbances": DisturbanceBounds(4, 7)}  # fmt: skip
+    low = LinearMPC(MODEL, **WEIGHTS, **common, u_min=8, x_min=[340, 1])
+    assert low.u_min.tolist() == [-2] and np.isinf(low.u_max) and np.isinf(low.x_max).all()
+    high = LinearMPC(MODEL, **WEIGHTS, **common, u_max=15, x_max=[360, 3])
+    assert high.u_max.tolist() == [5] and np.isinf(high.u_min) and np.isinf(high.x_min).all()
+    assert high.x_max.tolist() == [10, 1]

@@ -82,3 +82,34 @@ def test_the_state_that_lies_at_the_operating_point_is_found() -> None:
     assert misread_state(mpc, np.array([[1.2, -30.5], [0.8, -29]])) == 1
     assert misread_state(mpc, np.array([[-0.8, 29.5]]), sign=-1) == 1
     assert misread_state(mpc, np.zeros((0, 2))) is None
+
+
+@pytest.mark.parametrize(("beyond", "fits"), [(1.9e-6, True), (2.1e-6, False)])
+def test_bounds_may_be_two_millionths_of_a_half_width_off(beyond: float, fits: bool) -> None:
+    half = np.array([1.5, 4.0])
+    for kind, (low, high) in BOUNDS.items():
+        size = half if kind != "normalized" else np.ones(2)
+        for sign in (1, -1):
+            moved = np.array(low, float) + sign * beyond * size
+            found = InputUnits.of(MPC, moved, np.array(high, float))
+            assert (found is not None) == fits and (found is None or found.kind == kind)
+
+
+def test_nine_rows_of_ten_must_speak_for_an_absolute_state() -> None:
+    mpc = replace(MPC, model=replace(MODEL, x_ss=[1, -30]))
+    absolute, plain = [1.2, -30.5], [0.5, 0.5]
+    assert misread_state(mpc, np.array([absolute] * 9 + [plain])) == 1
+    assert misread_state(mpc, np.array([absolute] * 8 + [plain] * 2)) is None
+    outside = [1.2, -37.0]  # as absolute as as a deviation
+    assert misread_state(mpc, np.array([absolute] * 9 + [outside])) == 1
+    assert misread_state(mpc, np.array([absolute] * 8 + [outside] * 2)) is None
+    assert misread_state(MPC, np.array([absolute] * 9)) is None  # of the first state alone
+
+
+def test_the_state_that_is_farther_from_zero_than_twice_from_its_point_is_named() -> None:
+    mpc = replace(MPC, model=replace(MODEL, x_ss=[5, -30]))
+    assert misread_state(mpc, np.array([[4.0, -30.0]])) == 1
+    mpc = replace(MPC, model=replace(MODEL, x_ss=[3.0, 0.0]))
+    assert misread_state(mpc, np.array([[2.1, 0.0]])) == 0  # 0.9 from the point, 2.1 from zero
+    mpc = replace(MPC, model=replace(MODEL, x_ss=[4.0, 0.0]))
+    assert misread_state(mpc, np.array([[2.5, 0.0]])) is None  # 1.5 is more than half of it

@@ -1,0 +1,217 @@
+"""The program that an MPC is: in other units, at one theta, and what its active sets say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_yann.control.explicit.kkt import optimality
+from sb3_yann.control.explicit.parametric_qp import (
+    FAINT,
+    ParametricQP,
+    as_bits,
+    batches,
+    row_units,
+)
+from sb3_yann.control.explicit.steep import MILD, SteepQP, solvable, steepness
+
+
+def program(seed: int = 0, rows: int = 7, **changes: Any) -> ParametricQP:
+    """Return a random program of four variables and two parameters in the unit box."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(4, 4))
+    given: dict[str, Any] = {
+        "H": root @ root.T + np.eye(4), "F": rng.normal(size=(4, 2)), "c": rng.normal(size=4),
+        "G": rng.normal(size=(rows, 4)), "w": rng.uniform(0.2, 1, rows),
+        "S": 0.1 * rng.normal(size=(rows, 2)), "theta_min": -np.ones(2), "theta_max": np.ones(2),
+    }  # fmt: skip
+    return ParametricQP(**(given | changes))
+
+
+def test_a_solution_and_its_multipliers_meet_the_conditions() -> None:
+    given, rng, active = program(), np.random.default_rng(1), 0
+    for theta in rng.uniform(-1, 1, (40, 2)):
+        U, multipliers = given.solve_with_multipliers(theta)
+        assert U is not None
+        np.testing.assert_array_equal(given.solve(theta), U)
+        slope = given.H @ U + given.F @ theta + given.c + given.G.T @ multipliers
+        np.testing.assert_allclose(slope, 0, atol=1e-8)
+        slack = given.w + given.S @ theta - given.G @ U
+        assert np.all(slack > -1e-9) and np.all(multipliers > -1e-9)
+        np.testing.assert_allclose(slack * multipliers, 0, atol=1e-8)
+        active += np.count_nonzero(multipliers > 1e-9)
+    assert active > 20
+
+
+def test_multipliers_are_those_of_the_rows_as_they_are_whatever_their_length() -> None:
+    given = program()
+    length = np.array([1e-4, 3.0, 1.0, 1e3, 0.3, 7.0, 1e-2])
+    scaled = program(G=given.G * length[:, None], w=given.w * length, S=given.S * length[:, None])
+    for theta in np.random.default_rng(1).uniform(-1, 1, (10, 2)):
+        U, multipliers = given.solve_with_multipliers(theta)
+        same, others = scaled.solve_with_multipliers(theta)
+        np.testing.assert_allclose(same, U, atol=1e-8)
+        np.testing.assert_allclose(others * length, multipliers, atol=1e-7)
+
+
+def test_a_row_without_variables_bounds_theta_alone() -> None:
+    G, S = program().G.copy(), program().S.copy()
+    G[2], S[2], G[5], S[5] = 0.0, [-1.0, 0.0], 0.0, 0.0
+    w = program().w.copy()
+    w[2] = 0.25  # theta[0] <= 0.25
+    given = program(G=G, S=S, w=w)
+    assert given.solve(np.array([0.25, 0.9])) is not None
+    U, multipliers = given.solve_with_multipliers(np.array([0.2501, 0.0]))
+    assert U is None and multipliers.tolist() == [0.0] * 7
+    A, b = given.theta_rows()
+    np.testing.assert_array_equal(A, [[1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]])
+    np.testing.assert_array_equal(b, [1, 1, 1, 1, 0.25])
+    tight = program(G=np.vstack([G, G[:1], -G[:1]]), S=np.vstack([S, 0 * S[:2]]),
+                    w=np.append(w, [-1.0, 0.5]), rows=9)  # fmt: skip
+    assert tight.solve(np.zeros(2)) is None
+
+
+def test_rows_are_brought_to_a_length_of_about_one_by_powers_of_two() -> None:
+    G = np.diag([1.0, 1.4, 1.5, 3e-9, 5e7]) @ np.tile([0.6, 0.8], (5, 1))
+    units = row_units(np.vstack([G, [[0, 0]]]))
+    assert units[:3].tolist() == [1.0, 1.0, 0.5] and units[5] == 1.0
+    assert np.all(np.log2(units) == np.round(np.log2(units)))
+    length = np.linalg.norm(G, axis=1) * units[:5]
+    assert np.all((length >= 2**-0.5 - 1e-12) & (length <= 2**0.5 + 1e-12))
+
+
+def test_active_sets_are_numbers_and_come_in_batches_of_one_size() -> None:
+    assert as_bits([]) == 0 and as_bits([0, 3]) == 9 and as_bits(np.array([2, 1])) == 6
+    assert [*batches([2, 0, 2, 1])] == [(0, [1]), (1, [3]), (2, [0, 2])]
+    assert [(size, len(some)) for size, some in batches([3] * 513)] == [(3, 256), (3, 256), (3, 1)]
+
+
+def test_a_program_in_other_units_has_the_same_solution() -> None:
+    given = program(theta_min=np.array([1.0, -6.0]), theta_max=np.array([3.0, 2.0]))
+    center, half = np.array([2.0, -2.0]), np.array([1.0, 4.0])
+    reach = np.array([2.0, 0.5, 10.0, 1.0])
+    scaled = given.scaled(center, half, reach)
+    np.testing.assert_array_equal([scaled.theta_min, scaled.theta_max], [[-1, -1], [1, 1]])
+    length = np.linalg.norm(np.hstack([scaled.G, scaled.S]), axis=1)
+    np.testing.assert_allclose(length, 1.0)
+    assert np.mean(np.diag(scaled.H)) == pytest.approx(1.0)
+    for z in np.random.default_rng(0).uniform(-1, 1, (20, 2)):
+        U, own = given.solve(center + half * z), scaled.solve(z)
+        assert (U is None) == (own is None)
+        if U is not None:
+            np.testing.assert_allclose(reach * own, U, atol=1e-7)
+    nothing = program(G=np.zeros((7, 4)), S=np.zeros((7, 2)))
+    np.testing.assert_array_equal(nothing.scaled(center, half, reach).w, nothing.w)
+
+
+def test_a_row_that_the_inputs_hardly_move_bounds_theta_alone_by_so_much_less() -> None:
+    most = np.array([1.0, 2.0, 1.0, np.inf])
+    G = np.zeros((5, 4))
+    G[0, 1] = 0.49 * FAINT  # twice that is moved
+    G[1, 1] = 0.51 * FAINT
+    G[2, 3] = 1e-12  # without a bound anything moves it
+    G[3, 0], G[3, 1] = 0.3 * FAINT, -0.3 * FAINT
+    G[4, 1] = 0.1 * FAINT
+    S = np.tile([0.0, 1.0], (5, 1))
+    S[4] = 0.0  # says nothing of theta
+    given = program(G=G, S=S, w=np.ones(5), rows=5)
+    found = given.without_faint_rows(most)
+    np.testing.assert_array_equal(np.any(found.G, axis=1), [False, True, True, False, True])
+    np.testing.assert_array_equal(found.w, 1 - FAINT * np.array([0.98, 0, 0, 0.9, 0]))
+    np.testing.assert_array_equal(found.G[[1, 2, 4]], G[[1, 2, 4]])
+    strong = program()
+    assert strong.without_faint_rows(np.ones(4)) is strong
+
+
+@pytest.mark.parametrize("active", [(), (2,), (1, 4), (0, 3, 6)])
+def test_the_conditions_of_an_active_set_are_those_of_its_equations(
+    active: tuple[int, ...],
+) -> None:
+    given = program()
+    (found,) = optimality(given, [active], everywhere=True)
+    size, index = len(active), [*active]
+    K = np.zeros((4 + size, 4 + size))
+    K[:4, :4], K[4:, :4], K[:4, 4:] = given.H, given.G[index], given.G[index].T
+    right = np.zeros((4 + size, 3))
+    right[:4] = -np.column_stack([given.F, given.c])
+    right[4:] = np.column_stack([given.S, given.w])[index]
+    both = np.linalg.solve(K, right)
+    np.testing.assert_allclose(found.law, both[:4], atol=1e-9)
+    assert found.active == active and found.labels.tolist() == [*range(7)]
+    needed = np.column_stack([given.S, given.w]) - given.G @ both[:4]
+    needed[index] = both[4:]  # slacks, and multipliers, that must not be negative
+    length = np.linalg.norm(needed[:, :2], axis=1, keepdims=True)
+    expected = np.column_stack([-needed[:, :2], needed[:, 2]]) / length
+    np.testing.assert_allclose(found.rows, expected, atol=1e-8)
+    inside = [row for row in range(7) if expected[row, 2] < np.abs(expected[row, :2]).sum()]
+    (some,) = optimality(given, [active])
+    assert some.labels.tolist() == inside  # those that hold in all of the box are left out
+    np.testing.assert_array_equal(some.rows, found.rows[inside])
+    for row in range(7):
+        assert found.across(row) == (as_bits(active) ^ (1 << row),)
+
+
+def test_a_constraint_that_depends_takes_the_place_of_one_that_it_contains() -> None:
+    G = program().G.copy()
+    G[3] = 2 * G[0] + 0.5 * G[1]
+    G[4] = G[0] - G[1]
+    G[5] = -G[0] - 3 * G[1]
+    (found,) = optimality(program(G=G), [(0, 1)], everywhere=True)
+    assert found.depends.tolist() == [False, False, False, True, True, True, False]
+    unit = G / np.linalg.norm(G, axis=1, keepdims=True)
+    for row in (3, 4, 5):
+        np.testing.assert_allclose(found.factors[row] @ unit[:2], unit[row], atol=1e-12)
+    one_and_two = as_bits([0, 1])
+    assert found.across(3) == (one_and_two ^ 1 ^ 8, one_and_two ^ 2 ^ 8)
+    assert found.across(4) == (one_and_two ^ 1 ^ 16,)
+    assert found.across(5) == ()  # nothing feasible lies beyond
+    assert found.across(2) == (one_and_two ^ 4,)
+
+
+def test_a_condition_without_theta_counts_where_it_does_not_hold() -> None:
+    given = program(F=np.zeros((4, 2)), S=np.zeros((7, 2)), w=np.array([9, 9, 9, 9, 9, 9, -1.0]))
+    (found,) = optimality(given, [()], everywhere=True)
+    U = -np.linalg.solve(given.H, given.c)
+    assert np.all((given.w - given.G @ U)[:6] > 0) and (given.w - given.G @ U)[6] < 0
+    assert found.labels.tolist() == [6]
+    assert found.rows[0, :2].tolist() == [0, 0] and found.rows[0, 2] < 0
+
+
+def steep(cost: float) -> ParametricQP:
+    """Return a program of one input and one slack that softens its bound of theta."""
+    return ParametricQP(
+        H=np.diag([2.0, 2 * cost]), F=np.array([[1.0], [0.0]]), c=np.array([0.0, cost]),
+        G=np.array([[1.0, -0.5], [-1.0, 0.0], [0.0, -1.0]]), w=np.array([0.1, 1.0, 0.0]),
+        S=np.array([[1.0], [0.0], [0.0]]), theta_min=-np.ones(1), theta_max=np.ones(1), n_slacks=1,
+    )  # fmt: skip
+
+
+def test_a_slack_costs_at_most_what_its_largest_violation_does() -> None:
+    ratio, largest = steepness(steep(3.0))
+    assert largest.tolist() == [4.0]  # both theta and the input move the bound by one, in halves
+    assert ratio.tolist() == [6.0 * 16 / 2]
+    edge = MILD * 2 / (2 * 16)
+    assert not isinstance(solvable(steep(0.99 * edge)), SteepQP)
+    assert isinstance(solvable(steep(1.01 * edge)), SteepQP)
+    none = program()
+    assert solvable(none) is none and len(steepness(none)[0]) == 0
+
+
+@pytest.mark.parametrize("times", [0.5, 1e5])
+def test_the_milder_program_is_that_of_slacks_in_units_of_the_largest(times: float) -> None:
+    cost = times * MILD / 16
+    given = steep(cost)
+    made = SteepQP(**vars(given))
+    mild, less = made.mild, 1 / max(1.0, times)
+    np.testing.assert_allclose(mild.H, np.diag([2.0, 2 * cost * 16 * less]))
+    np.testing.assert_allclose(mild.c, [0.0, cost * 4 * less])
+    np.testing.assert_allclose(mild.G, given.G * [1.0, 4.0])
+    np.testing.assert_array_equal([mild.w, *mild.S.T], [given.w, *given.S.T])
+    for theta in (-0.9, 0.3, 0.95, -0.05):
+        U, active = made.solve_with_multipliers(np.array([theta]))
+        # The input is -theta / 2 within its bounds: the soft one is 0.1 + theta where it is kept.
+        expected = min(max(-theta / 2, -1.0), 0.1 + theta) if theta > -1.1 else None
+        assert U[0] == pytest.approx(max(expected, -1.0), abs=1e-6)
+        assert set(active) <= {0.0, 1.0}

@@ -1,0 +1,235 @@
+"""How a simulator is set, read and scaled: what is tolerated, and where it ends."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel
+from sb3_yann.control.linearization.connect import _room, _scale
+from sb3_yann.control.linearization.episodes import episode_faults
+from sb3_yann.control.linearization.linearize import _actions
+from sb3_yann.control.linearization.simulator import sample_time, to_vector
+
+
+def box(low: Any, high: Any) -> gym.spaces.Box:
+    return gym.spaces.Box(np.array(low, float), np.array(high, float), dtype=np.float64)
+
+
+class Plant(gym.Env[Any, Any]):
+    """A stable plant of one state, with a fault whose size is given."""
+
+    dt = 0.5
+
+    def __init__(self, fault: str = "", size: float = 0.0, wide: float = 4.0) -> None:
+        self.observation_space, self.action_space = box([-wide], [wide]), box([-1], [1])
+        self.fault, self.size, self.kept = fault, size, 0.0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.x = np.array((options or {}).get("state", [0.0]), float)
+        if self.fault == "shifts":
+            self.x = self.x + self.size
+        return self._seen(), {}
+
+    def step(self, action: Any) -> Any:
+        self.x = 0.5 * self.x + 0.25 * np.asarray(action)
+        if self.fault == "has a lag":
+            self.x = self.x + self.size * self.kept
+            self.kept = float(np.asarray(action)[0])
+        return self._seen(), 0.0, self.fault == "ends", False, {}
+
+    def _seen(self) -> Any:
+        return self.x + (self.size if self.fault == "shows another" else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "edge", "message"),
+    [
+        # Of a scale of 4, the half-width of what is observed.
+        ("shifts", 4e-5, r"set to \[0\.0\] it reads \[4"),
+        ("has a lag", 1e-5, r"after other actions in .* leaves alone \(a delay of the input"),
+    ],
+)
+def test_a_fault_of_rounding_is_tolerated_and_a_larger_one_is_named(fault, edge, message) -> None:
+    small = Plant(fault, 0.9 * edge)
+    model = LinearModel.from_env(small, state=[0.0], action=[0.0])
+    np.testing.assert_allclose([model.A, model.B], [[[0.5]], [[0.25]]], atol=1e-2)
+    with pytest.raises(ValueError, match=message):
+        LinearModel.from_env(Plant(fault, 1.2 * edge), state=[0.0], action=[0.0])
+
+
+class Clock(Plant):
+    """A plant that is pushed at one sample after a reset."""
+
+    def __init__(self, at: int) -> None:
+        super().__init__()
+        self.at = at
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.t = 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        _, *rest = super().step(action)
+        self.x, self.t = self.x + 0.1 * (self.t == self.at), self.t + 1
+        return self._seen(), *rest
+
+
+@pytest.mark.parametrize("at", [1, 2, 19])
+def test_a_clock_is_noticed_whichever_of_twenty_samples_it_strikes_at(at: int) -> None:
+    with pytest.raises(
+        ValueError, match=r"starts anew \(a delay of the input, an actuator, a clock"
+    ):
+        LinearModel.from_env(Clock(at), state=[0.0], action=[0.0])
+    LinearModel.from_env(Clock(20), state=[0.0], action=[0.0])
+
+
+class Strict(Plant):
+    """A plant that is cut, or ends, after each step, and takes none until it is reset."""
+
+    def __init__(self, ends: bool) -> None:
+        super().__init__()
+        self.ends, self.done = ends, False
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.done = False
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        if self.done:
+            raise RuntimeError("step after the end")
+        seen, reward, *_ = super().step(action)
+        self.done = True
+        return seen, reward, self.ends, not self.ends, {}
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_an_episode_that_is_over_is_begun_anew_before_its_state_is_set(ends: bool) -> None:
+    def put(env: Strict, x: Any) -> None:
+        env.x = np.array(x)
+
+    model = LinearModel.from_env(
+        Strict(ends), state=[0.0], action=[0.0], set_state=put, get_state=lambda env: env.x
+    )
+    np.testing.assert_allclose([model.A, model.B], [[[0.5]], [[0.25]]], atol=1e-9)
+    assert any("terminates the episode" in note for note in model.notes) == ends
+
+
+def test_a_state_s_scale_is_given_or_half_its_range_or_its_own_size() -> None:
+    def scale(low: Any, high: Any, x: Any, given: Any = None) -> list[float]:
+        env = SimpleNamespace(observation_space=box(low, high))
+        return _scale(SimpleNamespace(env=env), np.array(x), given).tolist()  # type: ignore[arg-type]
+
+    assert scale([-4, 1], [4, 2], [9.0, 0.0]) == [4.0, 0.5]
+    assert scale([-4, 1], [4, 2], [9.0, 0.0], [3.0, 7.0]) == [3.0, 7.0]
+    assert scale([-4, -1e7], [4, 1e7], [9.0, -5.0]) == [4.0, 5.0]
+    assert scale([-4, -0.9e6], [4, 0.9e6], [9.0, 0.5]) == [4.0, 0.9e6]
+    assert scale([-4], [4], [9.0, -0.5]) == [9.0, 1.0]  # the observation is not the state
+
+
+def test_an_input_is_tried_towards_its_farther_bound_and_a_thousand_at_most() -> None:
+    env = SimpleNamespace(action_space=box([-0.5, -0.5, -9e9, -2, -1e4], [3, 3, 1, 2, -1e3]))
+    at = np.array([0.0, 2.5, 0.0, 0.0, -2e3])
+    found = _room(SimpleNamespace(env=env), at)  # type: ignore[arg-type]
+    assert found.tolist() == [3.0, -3.0, -1e3, 2.0, -1e3]
+
+
+def test_an_unbounded_input_is_taken_from_minus_one_to_one() -> None:
+    middle, half = _actions(box([-1, -2e6, -5, -0.9e6], [3, 4, 2e6, 0.9e6]))
+    assert middle.tolist() == [1, 0, 0, 0] and half.tolist() == [2, 1, 1, 0.9e6]
+
+
+@pytest.mark.parametrize(("room", "refused"), [(0.9e-6, True), (1.1e-6, False)])
+def test_an_input_on_its_bound_has_no_slope_to_both_sides(room: float, refused: bool) -> None:
+    env = Plant()
+    point = {"state": [0.5 * (1 - room)], "action": [1 - room]}
+    if refused:
+        with pytest.raises(ValueError, match="entry 0 lies on its bound"):
+            LinearModel.from_env(env, **point)
+    else:
+        assert LinearModel.from_env(env, **point).B[0, 0] == pytest.approx(0.25, rel=1e-3)
+
+
+def test_the_notes_tell_what_was_solved_for_and_what_is_observed() -> None:
+    model = LinearModel.from_env(Plant(), state=[np.nan], action=[0.4])
+    assert model.x_ss == pytest.approx([0.2])
+    assert any(
+        "Of the 2 entries of the operating point, 1 were solved for" in n for n in model.notes
+    )
+    assert not any("observation is not this state" in n or "terminates" in n for n in model.notes)
+    shown = LinearModel.from_env(
+        Plant("shows another", 1.0), state=[0.0], action=[0.0], get_state=lambda env: env.x
+    )
+    assert any("The observation is not this state." in n for n in shown.notes)
+    ends = LinearModel.from_env(Plant("ends"), state=[0.0], action=[0.0])
+    assert any("terminates the episode at the operating point" in n for n in ends.notes)
+    assert model.dt == 0.5 and model.n_disturbances == 0
+
+
+def test_without_a_state_the_input_in_the_middle_is_held_and_with_one_that_which_holds_it() -> None:
+    plant = Plant()
+    plant.action_space = box([-1], [3])
+    model = LinearModel.from_env(plant)
+    assert model.u_ss == pytest.approx([1.0]) and model.x_ss == pytest.approx([0.5])
+    held = LinearModel.from_env(plant, state=[0.25])
+    assert held.u_ss == pytest.approx([0.5]) and held.x_ss == pytest.approx([0.25])
+
+
+def test_the_time_of_a_step_is_given_or_the_plant_s_own() -> None:
+    assert sample_time(Plant(), None) == 0.5 and sample_time(Plant(), 2) == 2.0
+    for name, value in (("tau", 0.25), ("DT", np.float32(0.125))):
+        plant = Plant()
+        plant.dt = 0.0  # none
+        setattr(plant, name, value)
+        assert sample_time(plant, None) == value
+    plant = Plant()
+    plant.dt = np.inf
+    with pytest.raises(ValueError, match="Plant has no dt, tau or DT to take it from"):
+        sample_time(plant, None)
+
+
+def test_a_vector_of_numbers_is_a_state_and_nothing_else_is() -> None:
+    assert to_vector([1, 2]).tolist() == [1.0, 2.0]
+    for other in (None, "12", {"x": 1}, [[1.0]], 3.0, [], [np.nan], [np.inf], ["a"]):
+        assert to_vector(other) is None
+
+
+class Episodes(gym.Env[Any, Any]):
+    """Episodes that end, or are cut, after so many steps."""
+
+    def __init__(self, ends: Any, cut: Any = None, drifts: float = 0.0) -> None:
+        self.action_space = box([-1], [1])
+        self.ends, self.cut, self.drifts, self.begun = ends, cut, drifts, 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.t, self.begun = 0, self.begun + 1
+        return np.array([self.drifts * self.begun]), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        ends = self.ends(float(action[0])) if callable(self.ends) else self.ends
+        return np.zeros(1), 0.0, self.t == ends, self.t == self.cut, {}
+
+
+def faults(*given: Any, **more: Any) -> str:
+    return " ".join(episode_faults(Episodes(*given, **more), np.zeros(1)))
+
+
+def test_a_termination_after_the_same_number_of_steps_is_a_time_limit() -> None:
+    assert "Episodes terminate after 30 steps whatever happens" in faults(30)
+    assert "TimeLimitIsNoTermination(env, 30)" in faults(30)
+    assert "after 2 steps" in faults(2) and faults(1) == ""
+    assert "after 400 steps" in faults(400) and faults(401) == ""
+    assert faults(None) == "" and faults(30, cut=20) == "" and faults(20, cut=30) != ""
+    # Another input is tried: half of a quarter of its range more.
+    assert faults(lambda u: 30 if u < 0.49 else 31) == ""
+    assert faults(lambda u: 30 if u < 0.51 else 31) != ""
+
+
+def test_starts_that_ignore_the_seed_are_named() -> None:
+    assert "reset(seed=0) starts at [1.0] and then at [2.0]" in faults(None, drifts=1.0)
+    assert faults(None, drifts=0.0) == ""

@@ -1,0 +1,57 @@
+"""The MPC with a disturbance of each state: what is added, and that all else stays."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from general_problems import servo, solved
+from sb3_yann import DisturbanceObserver, offset_free
+
+MPC = servo(x_min=[-5, -2], x_max=[5, 2])
+
+
+def test_a_disturbance_is_a_twentieth_of_a_state_s_half_width_or_what_is_given() -> None:
+    mpc, _ = offset_free(MPC)
+    np.testing.assert_allclose(mpc.disturbances.d_max, [0.25, 0.1])
+    np.testing.assert_allclose(mpc.disturbances.d_min, [-0.25, -0.1])
+    np.testing.assert_array_equal(mpc.model.E, np.eye(2))
+    given, _ = offset_free(MPC, [0.1, 0.5])
+    assert given.disturbances.d_max.tolist() == [0.1, 0.5]
+    assert mpc.theta_min.tolist() == [-5, -2, -1, -0.25, -0.1]
+    for name in ("Q", "R", "u_min", "u_max", "x_min", "x_max"):
+        np.testing.assert_array_equal(getattr(mpc, name), getattr(MPC, name))
+    assert mpc.horizon == MPC.horizon and mpc.gamma == MPC.gamma
+
+
+def test_the_observer_takes_all_noises_for_equal_in_half_widths() -> None:
+    mpc, observer = offset_free(MPC)
+    half = [5.0, 2.0]
+    expected = DisturbanceObserver(
+        mpc.model, state_noise=half, disturbance_noise=half, measurement_noise=half
+    )
+    np.testing.assert_array_equal(observer.gain, expected.gain)
+    assert observer.model is mpc.model and observer.n_measured == 2
+
+
+def test_names_and_operating_point_stay_and_a_terminal_set_is_solved_anew() -> None:
+    model = dataclasses.replace(MPC.model, x_ss=[3.0, 4.0], u_ss=[5.0])
+    named = model.named(["a", "b"], ["c"], {"a": "K"})
+    mpc, _ = offset_free(dataclasses.replace(MPC, model=named))
+    assert (mpc.model.state_names, mpc.model.input_names) == (("a", "b"), ("c",))
+    assert mpc.model.units == ("K", "", "")
+    assert [*mpc.model.x_ss, *mpc.model.u_ss] == [3, 4, 5]
+    assert len(mpc.terminal.set[1]) == 0
+    assert len(offset_free(solved("invariant"))[0].terminal.set[1]) > 0
+
+
+def test_what_knows_disturbances_already_or_is_no_mpc_is_named() -> None:
+    with pytest.raises(ValueError, match="has 1 disturbances already"):
+        offset_free(solved("servo with a disturbance"))
+    with pytest.raises(TypeError, match=r"mpc = LinearModel.* must be a LinearMPC"):
+        offset_free(MPC.model)
+    for wrong in ([0.1, 0.0], [0.1, -1.0], [0.1]):
+        with pytest.raises(ValueError, match="d_max"):
+            offset_free(MPC, wrong)

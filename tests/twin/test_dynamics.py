@@ -1,0 +1,156 @@
+"""What a twin steps with, each number against a loop in plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from general_problems import solved
+from sb3_yann import LinearMPC
+from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, law_of
+from sb3_yann.twin.log import Episode
+from sb3_yann.twin.residuals import Nothing, Polynomial
+from twin_samples import random_episode as episode
+
+
+def bent(mpc: LinearMPC, members: int = 2) -> tuple[Dynamics, Episode]:
+    """Return dynamics with cubic residuals, and the episode that scales them."""
+    log, found = episode(mpc), []
+    coordinates = Coordinates.of(mpc, [log])
+    for seed in range(members):
+        rng = np.random.default_rng(seed)
+        z = rng.uniform(-1, 1, (300, len(coordinates.scale)))
+        found.append(Polynomial(3, 1e-3, offset=True).fit(z, 0.05 * rng.normal(size=(300, 2))))
+    return Dynamics(mpc, coordinates, tuple(found)), log
+
+
+def stepped(dynamics: Dynamics, member: int, theta: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """One row after another: the model, and the residual in scaled, clipped coordinates."""
+    mpc, box = dynamics.problem, dynamics.coordinates
+    n, d = mpc.model.n_states, mpc.layout.disturbance
+    features = np.concatenate([theta[:n], theta[d], u])
+    z = np.clip(features, box.low, box.high) / box.scale
+    after = theta.copy()
+    after[:n] = mpc.model.A @ theta[:n] + mpc.model.B @ u + mpc.model.E @ theta[d]
+    after[:n] += dynamics.members[member].predict(z[None])[0]
+    after[mpc.layout.previous] = u[: mpc.layout.n_previous]
+    return after
+
+
+def test_the_box_of_the_data_is_a_quarter_wider_and_its_scale_the_largest_magnitude() -> None:
+    mpc = solved("servo with a disturbance")
+    logs = [episode(mpc, seed=seed) for seed in range(2)]
+    found = Coordinates.of(mpc, logs)
+    seen = np.vstack([np.column_stack([e.thetas[:-1, [0, 1, 3]], e.actions]) for e in logs])
+    width = np.ptp(seen, axis=0)
+    np.testing.assert_allclose(found.low, seen.min(axis=0) - 0.25 * width)
+    np.testing.assert_allclose(found.high, seen.max(axis=0) + 0.25 * width)
+    np.testing.assert_allclose(found.scale, np.abs(seen).max(axis=0))
+    np.testing.assert_allclose(found.units, np.std(seen, axis=0)[:2])
+    far = np.vstack([found.high + 1, found.low - 1, seen[0]])
+    expected = np.vstack([found.high, found.low, seen[0]]) / found.scale
+    np.testing.assert_allclose(found.scaled(far), expected)
+
+
+def test_what_never_moves_is_scaled_by_its_half_width() -> None:
+    mpc = solved("servo with a disturbance")
+    still = Episode(np.zeros((7, mpc.n_theta)), np.zeros((6, 1)))
+    found, half = Coordinates.of(mpc, [still]), np.array([5.0, 5.0, 0.3, 1.5])
+    np.testing.assert_allclose(found.high, MARGIN * 1e-6 * half)
+    np.testing.assert_allclose(found.low, -MARGIN * 1e-6 * half)
+    np.testing.assert_allclose(found.scale, 1e-3 * half)
+    np.testing.assert_allclose(found.units, 1e-6 * half[:2])
+
+
+def test_the_law_says_nothing_where_a_row_is_not_finite() -> None:
+    mpc = solved("servo with all of it")
+    rows = 0.1 * np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (5, mpc.n_theta))
+    expected = mpc.explicit()(rows)
+    rows[1, 0], rows[3, -1] = np.nan, np.inf
+    found = law_of(mpc)(rows)
+    assert np.isnan(found[[1, 3]]).all()
+    np.testing.assert_array_equal(found[[0, 2, 4]], expected[[0, 2, 4]])
+
+
+@pytest.mark.parametrize("name", ["servo with all of it", "regulator with rates"])
+def test_a_step_is_the_model_with_its_disturbance_and_the_residual_inside_the_box(name) -> None:
+    mpc = solved(name)
+    dynamics, _ = bent(mpc)
+    rng = np.random.default_rng(3)
+    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (2, 30, mpc.n_theta))
+    u = rng.uniform(mpc.u_min, mpc.u_max, (2, 30, 1))
+    after = dynamics.step(theta, u)
+    for member in range(2):
+        for i in range(30):
+            expected = stepped(dynamics, member, theta[member, i], u[member, i])
+            np.testing.assert_allclose(after[member, i], expected, rtol=1e-10, atol=1e-10)
+
+
+def test_a_replay_takes_inputs_set_points_and_disturbances_of_the_log_and_nothing_else() -> None:
+    mpc = solved("servo with all of it")
+    dynamics, log = bent(mpc)
+    starts, given = np.array([0, 3, 7]), mpc.layout.constant
+    found = dynamics.replay(log, starts, 5)
+    assert found.shape == (2, 3, 6, 2)
+    for member in range(2):
+        for i, start in enumerate(starts):
+            theta = log.thetas[start].copy()
+            for k in range(6):
+                np.testing.assert_allclose(found[member, i, k], theta[:2], rtol=1e-10, atol=1e-12)
+                if k < 5:
+                    theta[given] = log.thetas[start + k, given]
+                    theta = stepped(dynamics, member, theta, log.actions[start + k])
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_roll_out_acts_on_what_it_is_given_at_each_step_else_on_what_stays(moving) -> None:
+    mpc = solved("servo with all of it")
+    dynamics, log = bent(mpc)
+    starts = np.stack([log.thetas[:3], log.thetas[4:7]])
+    given = None
+    if moving:
+        rng, part = np.random.default_rng(5), mpc.layout.constant
+        low, high = mpc.theta_min[part], mpc.theta_max[part]
+        given = rng.uniform(0.5 * low, 0.5 * high, (4, 3, 2))
+    law = mpc.explicit()
+    thetas, inputs = dynamics.roll_out(law, starts, 4, given)
+    assert thetas.shape == (5, 2, 3, mpc.n_theta) and inputs.shape == (4, 2, 3, 1)
+    for member in range(2):
+        for i in range(3):
+            theta = starts[member, i].copy()
+            for t in range(4):
+                if given is not None:
+                    theta[mpc.layout.constant] = given[t, i]
+                np.testing.assert_allclose(thetas[t, member, i], theta, rtol=1e-9, atol=1e-10)
+                u = law(theta)
+                np.testing.assert_allclose(inputs[t, member, i], u, rtol=1e-9, atol=1e-9)
+                theta = stepped(dynamics, member, theta, u)
+            np.testing.assert_allclose(thetas[4, member, i], theta, rtol=1e-9, atol=1e-10)
+
+
+def test_in_a_closed_loop_the_logged_inputs_are_corrected_by_the_law() -> None:
+    mpc = solved("servo with all of it")
+    dynamics, log = bent(mpc)
+    law, given, expected = mpc.explicit(), mpc.layout.constant, np.zeros(2)
+    corrected = 0
+    for member in range(2):
+        theta = log.thetas[0].copy()
+        for k, logged in enumerate(log.actions):
+            theta[given] = log.thetas[k, given]
+            wanted = logged + law(theta) - law(log.thetas[k])
+            u = np.clip(wanted, mpc.u_min, mpc.u_max)
+            corrected += int(np.any(u != wanted))
+            expected[member] += mpc.stage_cost(theta, u)
+            theta = stepped(dynamics, member, theta, u)
+    assert corrected  # on a bound, at times
+    np.testing.assert_allclose(dynamics.replay_in_closed_loop(log), expected, rtol=1e-9)
+
+
+def test_the_linear_model_repeats_its_own_log_at_its_own_cost() -> None:
+    mpc = solved("servo")
+    thetas, inputs = mpc.simulate([2.0, -1.0, 0.5], 15)
+    log = Episode(thetas, inputs)
+    alone = Dynamics(mpc, Coordinates.of(mpc, [log]), (Nothing(2),))
+    np.testing.assert_allclose(alone.replay(log, np.array([0]), 15)[0, 0], thetas[:, :2])
+    cost = mpc.stage_cost(thetas[:-1], inputs).sum()
+    np.testing.assert_allclose(alone.replay_in_closed_loop(log), [cost])
