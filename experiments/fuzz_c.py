@@ -261,13 +261,13 @@ def fuzz(chosen: str, precisions: Sequence[str], seconds: float, keep: Path | No
         Where the code, the corpora and what crashes are kept.
     """
     pairs = [
-        (name, precision, case)
-        for name, case in cases().items()
+        (number + (precision == "float"), name, precision, case)
+        for number, (name, case) in enumerate(cases().items())
         for precision in precisions
         if chosen in name
     ]
     outcomes = []
-    for number, (name, precision, case) in enumerate(pairs):
+    for number, name, precision, case in pairs:
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
             if keep is not None:
