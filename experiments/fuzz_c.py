@@ -10,6 +10,7 @@ clang), the tests beside it, and Linux or macOS.
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import resource
 import shutil
@@ -17,18 +18,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sb3_yann import Checks, Controller, LinearModel, LinearMPC, export
-from sb3_yann.deployment.c_text import literal
-from sb3_yann.deployment.c_text import table as c_table
+from experiments.fuzz_cases import cases, write
 
-HERE = Path(__file__).parent
 SANITIZERS = "address,undefined,float-divide-by-zero,float-cast-overflow"
 FLAGS = ["-std=c99", "-O1", "-g", "-fno-sanitize-recover=all", "-Wall", "-Wextra"]
 LONGEST = 2048
@@ -36,21 +34,11 @@ LONGEST = 2048
 PARTS = ["plant.o", "fuzz_target.o", "plant_selftest.o"]
 SAYS = re.compile(r"does not hold|runtime error|ERROR: |    #\d .*plant|Test unit written")
 """Lines of a crash that say what it was."""
+ROUND = 20.0
+"""Seconds of a core that a case has before the next one's turn."""
 SEEDS = 20
 """Inputs at random that the corpus begins with."""
-ROOM = {"double": 1e-9, "float": 2e-5}
-"""How far an output may be beyond a bound, in parts of the input's range."""
 NONE = "clang's fuzzer is not there: on Debian and Ubuntu, apt install clang libclang-rt-14-dev"
-
-
-@dataclass(frozen=True)
-class Case:
-    """What is exported, and how."""
-
-    make: Callable[[], Any]
-    options: dict[str, Any] = field(default_factory=dict)
-    tested: bool = True
-    """Whether its self-test must pass."""
 
 
 @dataclass
@@ -67,42 +55,13 @@ class Found:
     seconds: float = 0.0
     crashes: list[str] = field(default_factory=list)
 
-
-def cases() -> dict[str, Case]:
-    """Return the ten kinds of policies of the tests, a law without bounds and an MPC with rates."""
-    sys.path[:0] = [str(HERE.parent / "tests" / "support")]
-    from torch import nn
-
-    import deployed
-    import general_problems
-    import sample_laws
-
-    def unbounded() -> LinearMPC:
-        model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
-        return LinearMPC(
-            model, Q=np.eye(2), R=[[0.1]], horizon=3, x_min=[-5, -2], x_max=[5, 2]
-        )  # fmt: skip
-
-    found = {name: Case(lambda n=name: deployed.policy_of(n)) for name in deployed.CASES}
-    found["no bounds of the inputs"] = Case(unbounded)
-    found["an MPC with rates, absolute"] = Case(
-        lambda: general_problems.solved("servo with rates"), {"absolute": True}
-    )
-    found["networks that overflow"] = Case(
-        lambda: deployed.disturbed(sample_laws.solved("reactor"), size=1e25, activation_fn=nn.ReLU),
-        tested=False,
-    )
-    return found
-
-
-def checks_of(number: int, rest: Any, half: Any) -> Checks:
-    """Return the checks of the case of a number: by default, strict, or none at all in between."""
-    if number % 3 == 0:
-        return Checks()
-    if number % 3 == 1:
-        low, high = rest - 1.5 * half, rest + 1.5 * half
-        return Checks(low, high, frozen_after=3, hold=2, recover=2, transfer=3)
-    return Checks(frozen_after=1, hold=0, recover=0, transfer=0, late_after=None)
+    def add(self, later: Found) -> None:
+        """Add what came of the same case later."""
+        self.executions += later.executions
+        self.steps += later.steps
+        self.seconds += later.seconds
+        self.edges, self.all_edges = later.edges, later.all_edges
+        self.crashes += later.crashes
 
 
 def missing(folder: Path) -> str:
@@ -122,67 +81,6 @@ def missing(folder: Path) -> str:
         return ""
     said = made.stderr.strip().splitlines() or ["nothing"]
     return f"{NONE}. It said: {said[0]}"
-
-
-def limits(data: dict[str, Any], precision: str, tested: bool) -> str:
-    """Return fuzz_limits.h: what must hold, taken from the controller in Python."""
-    m, rated = len(data["action_scale"]), len(data["change"]) > 0
-    scale, shift = data["action_scale"], data["action_shift"]
-    low, high = np.sort(data["bounds"] * scale + shift, axis=0)
-    middle, half = box_of(data)
-    bounded = np.isfinite(low) & np.isfinite(high)
-    span = np.where(bounded, high - low, 2 * scale)
-    numbers = {
-        "lowest": low, "highest": high, "range_of": span,
-        "room": ROOM[precision] * (span + np.abs(shift)),
-        "middle": middle, "half": half,
-        "reading_min": data["obs_min"], "reading_max": data["obs_max"],
-    }  # fmt: skip
-    if rated:  # what the env shows of an output: output * shown_per + shown_at
-        assert np.array_equal(data["obs_matrix"], np.eye(len(middle)))
-        per = 1 / (scale * data["per_input"])
-        numbers["change_min"], numbers["change_max"] = data["change"] * scale
-        numbers["shown_per"] = per
-        numbers["shown_at"] = data["middle"] / data["per_input"] - shift * per
-        numbers["shown_at"] = numbers["shown_at"] - data["obs_offset"][-m:]
-    flags: dict[str, Any] = {
-        "MOST": "FLT_MAX" if precision == "float" else "DBL_MAX",
-        "LEAST": "1e-45f" if precision == "float" else "5e-324",
-        "LATE_AFTER": literal(float(data["late_after"]), precision),
-        **{name.upper(): int(data[name]) for name in ("frozen_after", "hold", "recover")},
-        "TRANSFER": int(data["transfer"]),
-        "RATED": int(rated),
-        "TESTED": int(tested),
-        "READS_THETA": int(np.array_equal(data["obs_matrix"], np.eye(len(middle)))),
-        "UNBOUNDED": int(not bounded.all()),
-    }
-    lines = [f"#define {name} {value}" for name, value in flags.items()]
-    real = np.float32 if precision == "float" else np.float64
-    lines += [
-        c_table("plant_real", name, np.asarray(each, real), precision)
-        for name, each in numbers.items()
-    ]
-    return "\n".join([*lines, ""])
-
-
-def box_of(data: dict[str, Any]) -> tuple[Any, Any]:
-    """Return the middle and the half-widths of the readings (n_obs,) in the box of theta."""
-    low, high = data["box"]
-    back = np.linalg.pinv(data["obs_matrix"])
-    half = np.abs(back) @ ((high - low) / 2)
-    return back @ ((low + high) / 2 - data["obs_offset"]), np.where(half > 0, half, 1.0)
-
-
-def write(case: Case, number: int, precision: str, folder: Path) -> None:
-    """Export a case with the checks of its number, and write what must hold of it."""
-    given = case.make()
-    export(given, folder / "plant.npz", **case.options)
-    own = checks_of(number, *box_of(Controller.load(folder / "plant.npz").data))
-    export(given, folder / "plant.npz", checks=own, **case.options)
-    export(given, folder / "plant.c", checks=own, precision=precision, **case.options)
-    data = Controller.load(folder / "plant.npz").data
-    (folder / "fuzz_limits.h").write_text(limits(data, precision, case.tested))
-    shutil.copy(HERE / "fuzz_target.c", folder)
 
 
 def build(folder: Path) -> None:
@@ -206,33 +104,35 @@ def build(folder: Path) -> None:
 def feed(folder: Path, seconds: float, seed: int = 1) -> Found:
     """Run a fuzzer for so many seconds of one core, and return what it found.
 
-    Its corpus is kept in the folder, and what crashed it beside.
+    Its corpus is kept in the folder and grows; what crashed it lies beside.
     """
     found, corpus, rng = Found(), folder / "corpus", np.random.default_rng(seed)
     corpus.mkdir(exist_ok=True)
     for k in range(SEEDS):  # long ones too, from the start
         (corpus / f"seed{k}").write_bytes(rng.bytes(int(LONGEST ** rng.uniform(0.3, 1))))
-    while not found.crashes and found.seconds < seconds - 0.5:
-        rest = max(1, round(seconds - found.seconds))
-        words = [
-            "./fuzz", "corpus", f"-max_total_time={rest}", f"-max_len={LONGEST}", "-timeout=25",
-            "-print_final_stats=1", "-artifact_prefix=crash-", "-use_value_profile=1",
-            f"-seed={seed}", "-rss_limit_mb=4096",
-        ]  # fmt: skip
-        before = _used()
-        ran = subprocess.run(words, cwd=folder, capture_output=True, text=True, errors="replace")
-        found.seconds += _used() - before
-        seed += 1
-        found.executions += _last(r"stat::number_of_executed_units: (\d+)", ran.stderr)
-        found.steps += _last(r"^steps: (\d+)", ran.stderr)
-        if ran.returncode:
-            lines = [each for each in ran.stderr.splitlines() if SAYS.search(each)]
-            found.crashes.append("\n".join(lines) or ran.stderr[-2000:])
-    words = ["./bare", "corpus", "-runs=0"]
-    ran = subprocess.run(words, cwd=folder, capture_output=True, text=True, errors="replace")
-    found.edges = _last(r"cov: (\d+)", ran.stderr)
-    found.all_edges = _last(r"Loaded 1 modules +\((\d+) inline 8-bit counters\)", ran.stderr)
+    words = [
+        "./fuzz", "corpus", f"-max_len={LONGEST}", "-timeout=60", "-print_final_stats=1",
+        "-artifact_prefix=crash-", "-use_value_profile=1", f"-seed={seed}", "-rss_limit_mb=4096",
+    ]  # fmt: skip
+    before = _used()
+    said = _said(words, folder, FUZZ_SECONDS=f"{seconds:g}")
+    found.seconds = _used() - before
+    found.executions = _last(r"stat::number_of_executed_units: (\d+)", said)
+    found.steps = _last(r"^steps: (\d+)", said)
+    if "exiting as requested" not in said:
+        lines = [each for each in said.splitlines() if SAYS.search(each)]
+        found.crashes.append("\n".join(lines) or said[-2000:])
+    said = _said(["./bare", "corpus", "-runs=0"], folder)
+    found.edges = _last(r"cov: (\d+)", said)
+    found.all_edges = _last(r"Loaded 1 modules +\((\d+) inline 8-bit counters\)", said)
     return found
+
+
+def _said(words: Sequence[str], folder: Path, **environment: str) -> str:
+    """Return what a program says as errors."""
+    options: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace"}
+    ran = subprocess.run(words, cwd=folder, env={**os.environ, **environment}, **options)
+    return str(ran.stderr)
 
 
 def _used() -> float:
@@ -266,22 +166,31 @@ def fuzz(chosen: str, precisions: Sequence[str], seconds: float, keep: Path | No
         for precision in precisions
         if chosen in name
     ]
-    outcomes = []
-    for number, name, precision, case in pairs:
-        with tempfile.TemporaryDirectory() as temporary:
-            folder = Path(temporary)
-            if keep is not None:
-                folder = keep / re.sub(r"\W+", "_", f"{name} {precision}")
-                folder.mkdir(parents=True, exist_ok=True)
-            write(case, number, precision, folder)
-            build(folder)
-            found = feed(folder, seconds / len(pairs))
-        outcomes.append(found)
-        print(
-            f"{name}, {precision}: {_in_words([found])}",
-            *found.crashes, sep="\n", flush=True,
-        )  # fmt: skip
-    return outcomes
+    with tempfile.TemporaryDirectory() as temporary:
+        folders = {}
+        for number, name, precision, case in pairs:
+            own = (keep or Path(temporary)) / re.sub(r"\W+", "_", f"{name} {precision}")
+            own.mkdir(parents=True, exist_ok=True)
+            write(case, number, precision, own)
+            build(own)
+            folders[f"{name}, {precision}"] = own
+        return _in_rounds(folders, seconds)
+
+
+def _in_rounds(folders: dict[str, Path], seconds: float) -> list[Found]:
+    """Feed all fuzzers, each for a while, again and again, but for those that crashed."""
+    found = {name: Found() for name in folders}
+    share = seconds / max(1, len(folders))
+    rounds = max(1, round(share / ROUND))
+    for k in range(rounds):
+        for name, folder in folders.items():
+            if found[name].crashes:
+                continue
+            found[name].add(feed(folder, share / rounds, seed=k + 1))
+            if k == rounds - 1 or found[name].crashes:
+                print(f"{name}: {_in_words([found[name]])}", *found[name].crashes, sep="\n")
+        print(f"round {k + 1} of {rounds}: {_in_words([*found.values()])}", flush=True)
+    return [*found.values()]
 
 
 def _in_words(found: Sequence[Found]) -> str:
