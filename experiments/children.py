@@ -7,6 +7,8 @@ import signal
 import time
 from collections.abc import Callable
 
+import psutil
+
 
 def fork(work: Callable[[], None]) -> int:
     """Return the process that does some work; it exits with 0, or with 1 after an error."""
@@ -43,3 +45,13 @@ def end(child: int, sign: int | None = None, patience: float = 30) -> str:
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     return "hangs"
+
+
+def let_work(child: int, seconds: float) -> None:
+    """Wait until a process has worked for so many seconds of a core, or has ended."""
+    process = psutil.Process(child)
+    while process.status() != psutil.STATUS_ZOMBIE:
+        used = process.cpu_times()
+        if used.user + used.system >= seconds:
+            return
+        time.sleep(0.005)

@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from experiments import killed_trainings as trainings
 from experiments.children import end, fork
+from experiments.endless_solver import ENDS, ended
 from experiments.faulty_plants import ENV, PAIRS, met
 from experiments.markdown import table
 from experiments.runner import Outcome, Run, load, save
@@ -280,17 +281,40 @@ def row(what: str, fault: str, found: Sequence[str]) -> list[str]:
 
 
 def rows_of(page: Path) -> dict[tuple[str, str], list[str]]:
-    """Return the rows of all tables of a page by their first two cells."""
+    """Return the rows of all tables of a page by their first two cells, and by the first alone."""
     lines = page.read_text(encoding="utf-8").splitlines() if page.exists() else []
     cells = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
-    return {(each[0], each[1]): each for each in cells if len(each) > 1}
+    several = [each for each in cells if len(each) > 1]
+    return {(each[0], ""): each for each in several} | {
+        (each[0], each[1]): each for each in several
+    }
+
+
+def tables(count: int, only: str, known: dict[tuple[str, str], list[str]]) -> dict[str, str]:
+    """Return all tables by their marks; arguments as those of `rows`."""
+    kills = rows(count, only, known)
+    plants = (
+        [way, where, *met(way, where)]
+        if only in f"{way} | {where}"
+        else known.get((way, where), [way, where, "not tried", "not tried"])
+        for way, where in PAIRS
+    )
+    laws = (
+        [way, *ended(way)] if only in way else known.get((way, ""), [way, "", "not tried"])
+        for way in ENDS
+    )
+    return {
+        "kills": table(("what", "fault", "trials", "left"), kills, texts=4),
+        "plants": table(("the env", "in", "what is said", "policy afterwards"), plants, texts=4),
+        "laws": table(("a law of too many regions", "seconds", "what is said"), laws, texts=3),
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Try all faults, print the tables and quote them."""
     parser = argparse.ArgumentParser(prog="python -m experiments.faults", description=__doc__)
     parser.add_argument("--trials", type=int, default=200, help="of each thing and fault")
-    parser.add_argument("--only", default="", help="rows whose first two cells hold this")
+    parser.add_argument("--only", default="", help="rows that hold this in their first cells")
     parser.add_argument("--report", type=Path, default=Path("docs"), help="folder of the page")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
@@ -299,17 +323,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for version in range(2):
         law(version), model(version)  # children find them solved
     page = options.report / "faults.md"
-    known = rows_of(page)
-    kills = rows(options.trials, options.only, known)
-    written = table(("what", "fault", "trials", "left"), kills, texts=4)
-    plants = [
-        [way, where, *met(way, where)]
-        if options.only in f"{way} | {where}"
-        else known.get((way, where), [way, where, "not tried", "not tried"])
-        for way, where in PAIRS
-    ]
-    found = table(("the env", "in", "what is said", "policy afterwards"), plants, texts=4)
-    for mark, text in (("kills", written), ("plants", found)):
+    for mark, text in tables(options.trials, options.only, rows_of(page)).items():
         print(text)
         if quote(text, page, f"<!-- {mark}: begin -->\n", f"<!-- {mark}: end -->"):
             print(f"Written: {page}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -19,12 +18,14 @@ import torch
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
-from experiments.children import end, fork
+from experiments.children import end, fork, let_work
 from experiments.faulty_plants import ENV
 from sb3_yann import Commissioning, ImprovementGuard, NoActionNoise
 
-TRAIN = 4.0
-"""Seconds within which a training is hit."""
+TRAIN = 2.0
+"""Seconds of a core within which a training is hit."""
+PATIENCE = 600.0
+"""Seconds after which what goes on, or ends, counts as hung; there may be others on the cores."""
 BRIEF = 40
 """Steps of an episode of the plant that is commissioned."""
 BATCHES = 2
@@ -88,8 +89,8 @@ def interrupted(rng: np.random.Generator, model: DDPG) -> str:
             (folder / _whose(model)).touch()
 
         child = fork(learn)
-        time.sleep(rng.uniform(0, TRAIN))
-        said = end(child, signal.SIGINT)
+        let_work(child, rng.uniform(0, TRAIN))
+        said = end(child, signal.SIGINT, PATIENCE)
         otherwise = "hangs" if said == "hangs" else TOO_SOON
         return next((each.name for each in folder.iterdir()), otherwise)
 
@@ -114,7 +115,7 @@ def killed(rng: np.random.Generator, model: DDPG) -> str:
     with TemporaryDirectory() as name:
         path = Path(name) / "model.zip"
         child = fork(lambda: _learn(model, 4_000, Saved(path)))
-        time.sleep(rng.uniform(0, TRAIN))
+        let_work(child, rng.uniform(0, TRAIN))
         end(child, signal.SIGKILL)
         if not path.exists():
             return TOO_SOON
@@ -126,7 +127,7 @@ def killed(rng: np.random.Generator, model: DDPG) -> str:
             whole = loaded.num_timesteps >= before + 300
             (Path(name) / (_whose(loaded) if whole else "it stopped")).touch()
 
-        said = end(fork(go_on), patience=120)
+        said = end(fork(go_on), patience=PATIENCE)
         found = {each.name for each in Path(name).iterdir()} - {"model.zip", "part.zip"}
         return f"goes on, {found.pop()}" if said == "done" else f"going on: {said}"
 
@@ -170,11 +171,14 @@ def _events(folder: Path) -> list[dict[str, Any]]:
 
 
 def commissioned(model: DDPG) -> tuple[float, list[Any]]:
-    """Return how many seconds a commissioning takes that nothing hits, and its batches."""
+    """Return how many seconds of a core an unhurt commissioning takes, and its batches."""
     with TemporaryDirectory() as name:
-        begun = time.monotonic()
-        end(fork(lambda: _commission(model, Path(name))), patience=600)
-        return time.monotonic() - begun, _batches(_events(Path(name)))
+        before = os.times()
+        end(fork(lambda: _commission(model, Path(name))), patience=PATIENCE)
+        after = os.times()
+        used = after.children_user - before.children_user
+        used += after.children_system - before.children_system
+        return used, _batches(_events(Path(name)))
 
 
 def _batches(events: list[dict[str, Any]]) -> list[Any]:
@@ -189,14 +193,14 @@ def cut_off(rng: np.random.Generator, model: DDPG, seconds: float, wanted: list[
     with TemporaryDirectory() as name:
         folder = Path(name)
         child = fork(lambda: _commission(model, folder))
-        time.sleep(rng.uniform(0, seconds))
+        let_work(child, rng.uniform(0, seconds))
         if end(child, signal.SIGKILL) == "done":
             return TOO_LATE
         events = _events(folder)
         if not events:
             return TOO_SOON
         MOMENTS[_moment(events[-1])] += 1
-        said = end(fork(lambda: _commission(model, folder)), patience=600)
+        said = end(fork(lambda: _commission(model, folder)), patience=PATIENCE)
         if said != "done":
             return f"going on: {said}"
         same = _batches(_events(folder)) == wanted
