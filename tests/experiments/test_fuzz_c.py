@@ -32,18 +32,23 @@ def test_a_second_of_it_finds_nothing(needs_fuzzer, tmp_path: Path) -> None:
     assert 100 < found.edges <= found.all_edges
 
 
+RATED = "references and rates"
 FAULTS = {
-    "a bound": ("= between(target[i], low[i], high[i]);", "= target[i];", "action[i] <= highest"),
-    "a rate": ("&& previous_is_lost(state, obs)", "&& 0", "change_m"),
-    "an index": ("for (int i = 0; i < N_OBS; i++)", "for (int i = 0; i <= N_OBS; i++)", "index"),
-}
+    "a bound": (
+        "reactor", "= between(target[i], low[i], high[i]);", "= target[i];", "action[i] <= highest",
+    ),
+    "a rate": (RATED, "&& previous_is_lost(state, obs)", "&& 0", "change_m"),
+    "an index": (
+        RATED, "for (int i = 0; i < N_OBS; i++)", "for (int i = 0; i <= N_OBS; i++)", "index",
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_would_be_found(fault: str, needs_fuzzer, tmp_path: Path) -> None:
-    right, wrong, said = FAULTS[fault]
-    write(cases()["references and rates"], 1, "double", tmp_path)
+    name, right, wrong, said = FAULTS[fault]
+    write(cases()[name], 1, "double", tmp_path)
     code, limits = tmp_path / "plant.c", tmp_path / "fuzz_limits.h"
     assert right in code.read_text()
     code.write_text(code.read_text().replace(right, wrong))
