@@ -1,4 +1,4 @@
-"""Kills, Ctrl-C, full disks and worse: `python -m experiments.faults`, a quarter of an hour.
+"""Kills, Ctrl-C, full disks and worse: `python -m experiments.faults`, an hour.
 
 Each trial runs in a process of its own, which is killed at a random moment of what it writes; then
 it is looked what is left. Faults of a plant or a simulator meet guarded training. Writes the tables
@@ -8,13 +8,11 @@ into docs/faults.md. It forks, so it needs Linux or macOS.
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import resource
 import signal
 import threading
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,17 +25,20 @@ import torch
 from stable_baselines3 import DDPG
 from tqdm import tqdm
 
-from experiments.faulty_plants import ENV, WAYS, WHERE, met
+from experiments import killed_trainings as trainings
+from experiments.children import end, fork
+from experiments.endless_solver import ENDS, ended
+from experiments.faulty_plants import ENV, PAIRS, met
 from experiments.markdown import table
 from experiments.runner import Outcome, Run, load, save
 from experiments.summary import quote
-from sb3_yann import Commissioning, Controller, ImprovementGuard, NoActionNoise, export
+from sb3_yann import Controller, export
 from sb3_yann.commissioning.record import Record
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann_envs import problems
 
-WRITE, TRAIN = 0.08, 4.0
-"""Seconds within which a writer, and a training, is killed."""
+WRITE = 0.08
+"""Seconds within which a writer is killed."""
 ROOM = 3_000
 """Bytes that a full disk has left at most."""
 RUN = Run("plant", "learner", 0, 0)
@@ -131,12 +132,41 @@ def read_record(folder: Path) -> int:
     return int(found[-1])
 
 
+@cache
+def model(version: int) -> DDPG:
+    """Return a small model, or one of other weights."""
+    return DDPG(
+        "YannPolicy", ENV, device="cpu", seed=version, buffer_size=10,
+        policy_kwargs={"critic_warmup": 50, "problem": problems.cstr()},
+    )  # fmt: skip
+
+
+def write_model(folder: Path, version: int) -> None:
+    """Save one of two models, in place."""
+    model(version % 2).save(folder / "model.zip")
+
+
+def read_model(folder: Path) -> int:
+    """Return which of them is there, to the bit; half a zip is refused."""
+    try:
+        found = DDPG.load(folder / "model.zip", device="cpu").policy.state_dict()
+    except Exception as error:
+        raise NoticedError("half a zip, which `load` refuses") from error
+    wanted = [model(version).policy.state_dict() for version in range(2)]
+    return next(
+        version
+        for version, each in enumerate(wanted)
+        if all(torch.equal(each[name], found[name]) for name in each)
+    )
+
+
 TARGETS = (
     Target("`law.save`", write_law, read_law),
     Target("`export` to `.npz`", write_controller, read_controller),
     Target("`export` to C", write_code, read_code),
     Target("a run of `make paper`", write_run, read_run),
     Target("the record of `Commissioning`", write_record, read_record, grows=True),
+    Target("`model.save`", write_model, read_model),
 )
 
 
@@ -145,9 +175,9 @@ def killed(target: Target, sign: int, rng: np.random.Generator) -> str:
     with TemporaryDirectory() as name:
         folder = Path(name)
         target.write(folder, 0)
-        child = _fork(lambda: _for_ever(target, folder))
+        child = fork(lambda: _for_ever(target, folder))
         time.sleep(rng.uniform(0, WRITE))
-        hangs = _end(child, sign) == "hangs"
+        hangs = end(child, sign) == "hangs"
         return "goes on, " * hangs + _left(target, folder)
 
 
@@ -165,7 +195,7 @@ def full(target: Target, rng: np.random.Generator) -> str:
             for version in range(1, 9):
                 target.write(folder, version)
 
-        said = _end(_fork(write))
+        said = end(fork(write))
         return f"{said}, {_left(target, folder)}"
 
 
@@ -174,10 +204,10 @@ def two_writers(target: Target, rng: np.random.Generator) -> str:
     with TemporaryDirectory() as name:
         folder = Path(name)
         target.write(folder, 0)
-        both = [_fork(lambda: _for_ever(target, folder)) for _ in range(2)]
+        both = [fork(lambda: _for_ever(target, folder)) for _ in range(2)]
         time.sleep(rng.uniform(0.5 * WRITE, 3 * WRITE))
         for child in both:
-            _end(child, signal.SIGKILL)
+            end(child, signal.SIGKILL)
         return _left(target, folder)
 
 
@@ -198,93 +228,9 @@ def _left(target: Target, folder: Path) -> str:
     return "whole"
 
 
-def training(sign: int, rng: np.random.Generator, model: DDPG) -> str:
-    """Return what Ctrl-C leaves of guarded training: the accepted policy, or another."""
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-
-        def learn() -> None:
-            guard = ImprovementGuard(ENV, n_starts=3, n_new_starts=3, n_final_starts=3)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                try:
-                    model.learn(4_000, callback=[NoActionNoise(), guard])
-                except KeyboardInterrupt:
-                    pass
-            if hasattr(model, "guard_state"):
-                saved = [each.clone() for each in model.actor.state_dict().values()]
-                model.guard_state.accepted.restore(model.policy)
-                kept = [*model.actor.state_dict().values()]
-                same = all(torch.equal(*pair) for pair in zip(saved, kept, strict=True))
-                (folder / ("the accepted policy" if same else "another policy")).touch()
-            else:
-                (folder / "not begun").touch()
-
-        child = _fork(learn)
-        time.sleep(rng.uniform(0, TRAIN))
-        _end(child, sign)
-        return next((each.name for each in folder.iterdir()), "not begun")
-
-
-def commissioning(rng: np.random.Generator, model: DDPG) -> str:
-    """Return whether a commissioning goes on after a kill."""
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-
-        def run() -> None:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                Commissioning(
-                    model, ENV, batch=2, iterations=3, log_path=folder / "record", shadow=True
-                ).run(1)
-
-        child = _fork(run)
-        time.sleep(rng.uniform(0, TRAIN))
-        _end(child, signal.SIGKILL)
-        end = _end(_fork(run), patience=120)
-        return "goes on to its end" if end == "done" else f"going on: {end}"
-
-
-def _fork(work: Callable[[], None]) -> int:
-    """Return the process that does some work; it exits with 0, or with 1 after an error."""
-    # A signal waits until the child can meet it: before, it would be lost or end the parent's work.
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    child = os.fork()
-    if child:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        return child
-    code = 1
-    try:
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever forks may ignore it
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-        work()
-        code = 0
-    except BaseException:
-        code = 1
-    finally:
-        os._exit(code)
-
-
-def _end(child: int, sign: int | None = None, patience: float = 30) -> str:
-    """Send a signal to a process, wait for its end, and say how that was."""
-    if sign is not None:
-        os.kill(child, sign)
-    until = time.monotonic() + patience
-    while time.monotonic() < until:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            code = os.waitstatus_to_exitcode(status)
-            return {0: "done", 1: "an error"}.get(code, f"signal {-code}")
-        time.sleep(0.005)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return "hangs"
-
-
-def rows(trials: int, trainings: int) -> Iterator[list[str]]:
-    """Yield a row for each thing that is written and each fault: what was left, how often."""
-    rng = np.random.default_rng(0)
+def trials(rng: np.random.Generator) -> dict[tuple[str, str], Callable[[], str]]:
+    """Return a trial for each thing that is written, or goes on, and each fault."""
+    found: dict[tuple[str, str], Callable[[], str]] = {}
     for target in TARGETS:
         ways: dict[str, Callable[[], str]] = {
             "kill -9": lambda t=target: killed(t, signal.SIGKILL, rng),
@@ -294,12 +240,37 @@ def rows(trials: int, trainings: int) -> Iterator[list[str]]:
         }
         if target.grows:  # one record belongs to one run, and a second one is refused by it
             del ways["two writers, both killed"]
-        for way, trial in ways.items():
-            yield row(target.name, way, [trial() for _ in range(trials)])
-    model = DDPG("YannPolicy", ENV, device="cpu", seed=0, policy_kwargs={"critic_warmup": 50})
-    found = [training(signal.SIGINT, rng, model) for _ in range(trainings)]
-    yield row("guarded training", "Ctrl-C", found)
-    yield row("`Commissioning`", "kill -9", [commissioning(rng, model) for _ in range(trainings)])
+        found |= {(target.name, way): trial for way, trial in ways.items()}
+    learner, commissioned = cache(trainings.learner), cache(trainings.commissioned)
+    return found | {
+        ("guarded training", "Ctrl-C"): lambda: trainings.interrupted(rng, learner()),
+        ("guarded training, saved and renamed", "kill -9"): lambda: trainings.killed(
+            rng, learner()
+        ),
+        ("`Commissioning`", "kill -9"): lambda: trainings.cut_off(
+            rng, learner(), *commissioned(learner())
+        ),
+    }
+
+
+def rows(count: int, only: str, known: dict[tuple[str, str], list[str]]) -> Iterator[list[str]]:
+    """Yield a row for each thing and each fault: what was left, how often.
+
+    Parameters
+    ----------
+    count : int
+        Trials of each.
+    only : str
+        Those are tried in whose names it is; "" is all.
+    known : dict of (str, str) to list of str
+        Rows that are there already, for the others.
+    """
+    rng = np.random.default_rng(0)
+    for (what, fault), trial in trials(rng).items():
+        if only in f"{what} | {fault}":
+            yield row(what, fault, trainings.counted(trial, count))
+        elif (what, fault) in known:
+            yield known[what, fault]
 
 
 def row(what: str, fault: str, found: Sequence[str]) -> list[str]:
@@ -309,29 +280,54 @@ def row(what: str, fault: str, found: Sequence[str]) -> list[str]:
     return [what, fault, f"{len(found)}", "; ".join(f"{n} {text}" for text, n in counts)]
 
 
+def rows_of(page: Path) -> dict[tuple[str, str], list[str]]:
+    """Return the rows of all tables of a page by their first two cells, and by the first alone."""
+    lines = page.read_text(encoding="utf-8").splitlines() if page.exists() else []
+    cells = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
+    several = [each for each in cells if len(each) > 1]
+    return {(each[0], ""): each for each in several} | {
+        (each[0], each[1]): each for each in several
+    }
+
+
+def tables(count: int, only: str, known: dict[tuple[str, str], list[str]]) -> dict[str, str]:
+    """Return all tables by their marks; arguments as those of `rows`."""
+    kills = rows(count, only, known)
+    plants = (
+        [way, where, *met(way, where)]
+        if only in f"{way} | {where}"
+        else known.get((way, where), [way, where, "not tried", "not tried"])
+        for way, where in PAIRS
+    )
+    laws = (
+        [way, *ended(way)] if only in way else known.get((way, ""), [way, "", "not tried"])
+        for way in ENDS
+    )
+    return {
+        "kills": table(("what", "fault", "trials", "left"), kills, texts=4),
+        "plants": table(("the env", "in", "what is said", "policy afterwards"), plants, texts=4),
+        "laws": table(("a law of too many regions", "seconds", "what is said"), laws, texts=3),
+    }
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Try all faults, print the tables and quote them."""
     parser = argparse.ArgumentParser(prog="python -m experiments.faults", description=__doc__)
-    parser.add_argument("--trials", type=int, default=200, help="of each writer and fault")
-    parser.add_argument("--trainings", type=int, default=200, help="that are killed")
+    parser.add_argument("--trials", type=int, default=200, help="of each thing and fault")
+    parser.add_argument("--only", default="", help="rows that hold this in their first cells")
     parser.add_argument("--report", type=Path, default=Path("docs"), help="folder of the page")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    tqdm.set_lock(
-        threading.RLock()
-    )  # its own is shared with children, and one that is killed keeps it
+    # tqdm's own lock is shared with children, and one that is killed keeps it.
+    tqdm.set_lock(threading.RLock())
     for version in range(2):
-        law(version)  # children find them solved
-    killed_ones = table(
-        ("what", "fault", "trials", "left"), rows(options.trials, options.trainings), texts=4
-    )
-    plants = [[way, where, *met(way, where)] for way in WAYS for where in WHERE]
-    found = table(("the env", "in", "what is said", "policy afterwards"), plants, texts=4)
+        law(version), model(version)  # children find them solved
     page = options.report / "faults.md"
-    for mark, text in (("kills", killed_ones), ("plants", found)):
+    for mark, text in tables(options.trials, options.only, rows_of(page)).items():
         print(text)
         if quote(text, page, f"<!-- {mark}: begin -->\n", f"<!-- {mark}: end -->"):
             print(f"Written: {page}")
+    print("Commissionings were killed at", dict(trainings.MOMENTS))
 
 
 if __name__ == "__main__":

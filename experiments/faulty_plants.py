@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import DDPG
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_yann import ImprovementGuard, NoActionNoise
 
@@ -25,8 +26,13 @@ WAYS = (
     "shows another shape",
     "shows float64",
     "never ends",
+    "loses a worker",
 )
 WHERE = "training", "the guard's trials"
+PAIRS = [
+    (way, where) for way in WAYS for where in WHERE if (way, where) != ("loses a worker", WHERE[1])
+]
+"""The guard's env is one, in the same process."""
 SHOWN = 160
 PATIENCE = 20
 """Seconds after which what never ends meets Ctrl-C."""
@@ -52,6 +58,8 @@ class Faulty(gym.Wrapper[Any, Any, Any, Any]):
             return seen, reward, True, truncated, info
         if self.way == "never ends" or self.taken < self.at:
             return seen, reward, terminated, truncated and self.way != "never ends", info
+        if self.way == "loses a worker":
+            os.kill(os.getpid(), signal.SIGKILL)
         if self.way == "raises an error":
             raise RuntimeError("the simulator has lost its licence")
         found = {
@@ -69,11 +77,13 @@ def met(way: str, where: str) -> tuple[str, str]:
     makers: dict[str, Any] = dict.fromkeys(WHERE, ENV)
     makers[where] = lambda: Faulty(way)
     env = makers["training"]
+    if way == "loses a worker":
+        env = SubprocVecEnv([lambda: Faulty(way), lambda: Faulty(way, at=10_000)])
     said: list[str] = []
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         try:
-            model = DDPG("YannPolicy", env if isinstance(env, str) else env(), device="cpu", seed=0)
+            model = DDPG("YannPolicy", env() if callable(env) else env, device="cpu", seed=0)
             first = [each.clone() for each in model.actor.state_dict().values()]
             guard = ImprovementGuard(
                 makers["the guard's trials"], n_starts=2, n_new_starts=2, n_final_starts=2

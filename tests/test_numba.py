@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from numba.core.dispatcher import Dispatcher
+
 import sb3_yann
-from sb3_yann._numba import compiled_sources
+from sb3_yann._numba import compiled, compiled_sources
 
 PACKAGE = Path(sb3_yann.__file__).parent
 
@@ -29,3 +31,11 @@ def test_a_file_that_moves_or_is_new_is_found(tmp_path: Path) -> None:
 def test_nothing_else_compiles_in_the_package() -> None:
     plain = [each for each in PACKAGE.rglob("*.py") if "njit" in each.read_text("utf-8")]
     assert plain == [PACKAGE / "_numba.py"]
+
+
+def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(monkeypatch) -> None:
+    def no_folder(self) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr(Dispatcher, "enable_caching", no_folder)
+    assert compiled("float64(float64)")(lambda x: x + 1.0)(1.0) == 2.0
