@@ -25,7 +25,7 @@ from experiments.markdown import number, table
 from experiments.measures import MPC, OURS, REIDENTIFIED
 from experiments.pcgym_nmpc import NonlinearMPC
 from experiments.pcgym_vector import registered
-from experiments.runner import Outcome, Run, run_all
+from experiments.runner import Outcome, Run, load_all, run_all
 from experiments.summary import quote
 from sb3_yann import (
     DisturbanceBounds,
@@ -307,9 +307,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.pcgym", description=__doc__)
     parser.add_argument("--jobs", type=int, default=-1, help="processes (all cores)")
     parser.add_argument("--results", type=Path, default=Path("out/paper"), help="of the runs")
+    parser.add_argument("--report-only", action="store_true", help="of the runs that are done")
     parser.add_argument("--report", type=Path, default=Path("docs"), help="folder of the page")
     options = parser.parse_args(arguments)
-    found = run_all(runs(), execute, options.results, fingerprint=FINGERPRINT, jobs=options.jobs)
+    if options.report_only:
+        found = load_all(runs(), options.results, FINGERPRINT)
+    else:
+        jobs = options.jobs
+        found = run_all(runs(), execute, options.results, fingerprint=FINGERPRINT, jobs=jobs)
     print(table(HEADER, rows(found), texts=2))
     for path in write_report(found, options.report):
         print(f"Written: {path}")
