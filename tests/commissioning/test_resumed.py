@@ -16,6 +16,7 @@ from stable_baselines3 import DDPG
 from resumed import Checkpoint, all_bits, envs, go_on, loaded, model_bits
 from sb3_yann import Commissioning, ImproveInTwin, Improvement, NoActionNoise, YannPolicy, improve
 from sb3_yann.commissioning import Check, callback, commissioning
+from sb3_yann.commissioning.comparison import why_taken_back
 from twin_samples import Cart, twin
 
 STEPS = 20
@@ -39,12 +40,17 @@ def model(n_envs: int = 1, **options: Any) -> DDPG:
     return DDPG(YannPolicy, envs(n_envs, Short), **options)
 
 
+@pytest.fixture(autouse=True)
+def small_gains_count(monkeypatch) -> None:
+    """These runs are short, and gain little."""
+    module = importlib.import_module("sb3_yann.commissioning.improve")
+    monkeypatch.setattr(module, "OF_COST_ERROR", 0.0)
+
+
 # --- twins ----------------------------------------------------------------------------------------
 
 
-def test_a_twin_that_was_saved_predicts_and_improves_as_before(monkeypatch) -> None:
-    module = importlib.import_module("sb3_yann.commissioning.improve")
-    monkeypatch.setattr(module, "OF_COST_ERROR", 0.0)  # six iterations gain little
+def test_a_twin_that_was_saved_predicts_and_improves_as_before() -> None:
     again = pickle.loads(pickle.dumps(twin()))
     theta, u = np.array([[0.3, -0.2], [1.0, 0.4]]), np.array([[0.5], [-0.1]])
     members = len(again.dynamics.members)
@@ -165,6 +171,6 @@ def test_what_the_model_had_learnt_before_still_waits_after_a_stop(tmp_path, mon
     again = commission(tmp_path, learnt())
     assert all_bits(again.incumbent.candidate) == all_bits(first.incumbent.candidate)
     assert again.incumbent.candidate is not None
-    monkeypatch.undo()
+    monkeypatch.setattr(commissioning, "why_taken_back", why_taken_back)
     again.run(2)
     assert commission(tmp_path, learnt()).incumbent.candidate is None  # it has been tried

@@ -46,7 +46,8 @@ def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> Non
     model.learn(120, callback=[NoActionNoise(), ControlDiagnostics(), guard])
     seen = law().locate(model.policy.theta(env.normalize_obs(env.get_original_obs())).numpy())
     assert guard.state.evidence.visits[:, seen].any()
-    assert guard.state.evidence.paired.mpc_costs == pytest.approx(mpc_costs(guard.acceptance.seeds))
+    evidence = guard.state.evidence
+    assert evidence.paired.mpc_costs == pytest.approx(mpc_costs(evidence.seeds))
     model.save(tmp_path / "model")
     loaded = DDPG.load(tmp_path / "model", env=env)
     np.testing.assert_array_equal(loaded.predict(obs)[0], model.predict(obs)[0])
