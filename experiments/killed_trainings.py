@@ -132,29 +132,15 @@ def killed(rng: np.random.Generator, model: DDPG) -> str:
         return f"goes on, {found.pop()}" if said == "done" else f"going on: {said}"
 
 
-class Brief(gym.Wrapper[Any, Any, Any, Any]):
-    """The reactor with short episodes: a commissioning of it takes a second."""
-
-    def __init__(self) -> None:
-        super().__init__(gym.make(ENV))
-        self.taken = 0
-
-    def reset(self, **kwargs: Any) -> Any:
-        """Begin an episode."""
-        self.taken = 0
-        return self.env.reset(**kwargs)
-
-    def step(self, action: Any) -> Any:
-        """Step."""
-        seen, reward, terminated, truncated, info = self.env.step(action)
-        self.taken += 1
-        return seen, reward, terminated, truncated or self.taken >= BRIEF, info
+def brief() -> gym.Env[Any, Any]:
+    """Return the reactor with short episodes: a commissioning of it takes a second."""
+    return gym.wrappers.TimeLimit(gym.make(ENV), BRIEF)
 
 
 def _commission(model: DDPG, folder: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        Commissioning(model, Brief, batch=2, iterations=3, log_path=folder).run(BATCHES)
+        Commissioning(model, brief, batch=2, iterations=3, log_path=folder).run(BATCHES)
 
 
 def _events(folder: Path) -> list[dict[str, Any]]:
