@@ -234,13 +234,15 @@ class Planning:
     def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
         """Return the inputs (k, m)."""
         problem, constant = self.task.problem, self.task.problem.layout.constant
-        if t == 0:
+        if not self._plans:
             self._constants = np.full_like(theta[:, constant], np.nan)
+        known = np.isin(np.arange(len(theta)), [*self._plans])
         away = np.abs(theta[:, constant] - self._constants) / problem.theta_half[constant]
-        stale = running & (np.any(~(away <= CHANGED), axis=1) | (t == 0))
-        if stale.any() and t < self.steps:
-            self._plan(t, theta, np.flatnonzero(stale))
-        u = np.empty((len(theta), problem.model.n_inputs))
+        changed = known & np.any(~(away <= CHANGED), axis=1)
+        for rows in (running & ~known, running & changed):
+            if rows.any() and t < self.steps:
+                self._plan(t, theta, np.flatnonzero(rows))
+        u = np.zeros((len(theta), problem.model.n_inputs))
         for i, (begun, plan) in self._plans.items():
             at = min(t, self.steps - 1) - begun
             u[i] = np.nan_to_num(follow(plan, at, theta[i : i + 1])[0])
@@ -250,7 +252,7 @@ class Planning:
         problem, left = self.task.problem, self.steps - t
         law = law_of(problem)
         policies: list[Policy] = [lambda _, at: law(at)]
-        if t == 0:
+        if rows[0] not in self._plans:
             policies += [partial(_burst, law, u, left // BURSTS)
                          for u in (problem.u_min, problem.u_max)]  # fmt: skip
         found = planned(self.plant, self.task, policies, theta[rows], left, rows)

@@ -101,7 +101,7 @@ class SimulatedPlant:
 
     def __init__(self, problem: LinearMPC, simulator: Simulator, put: Array, got: Array) -> None:
         self.problem, self.simulator, self.put, self.got = problem, simulator, put, got
-        self._known: dict[bytes, tuple[Array, Array]] = {}
+        self._known: dict[bytes, Array] = {}
 
     def after(self, x: Array, u: Array) -> Array:
         """Return the state (n,) of theta one step later."""
@@ -121,18 +121,28 @@ class SimulatedPlant:
         problem, n = self.problem, self.problem.model.n_states
         A, B = (np.tile(M, (*theta.shape[:2], 1, 1)) for M in problem.prediction)
         A[:, :, :n, n : problem.layout.disturbance.stop] = 0.0
+        slopes = self.slopes(np.concatenate([theta[..., :n], u], axis=-1))
+        A[..., :n, :n], B[..., :n, :] = np.split(slopes, [n], axis=-1)
+        return A, B
+
+    def slopes(self, points: Array) -> Array:
+        """Return the derivatives (..., n, n + m) at points ``[x, u]``, shape (..., n + m).
+
+        They are forward differences; one that is known of nearby holds.
+        """
+        problem, n = self.problem, self.problem.model.n_states
         unit = np.concatenate([problem.theta_half[:n], problem.u_half])
-        points = np.concatenate([theta[..., :n], u], axis=-1)
         cells = np.round(points / (CELL * unit)).astype(np.int64)
-        for at in np.ndindex(theta.shape[:2]):
+        found = np.empty((*points.shape[:-1], n, len(unit)))
+        for at in np.ndindex(points.shape[:-1]):
             key = cells[at].tobytes()
             if key not in self._known:
                 self._known[key] = self._differences(points[at], unit)
-            A[at][:n, :n], B[at][:n] = self._known[key]
-        return A, B
+            found[at] = self._known[key]
+        return found
 
-    def _differences(self, point: Array, unit: Array) -> tuple[Array, Array]:
-        """Return the derivatives by x (n, n) and by u (n, m) at ``[x, u]``."""
+    def _differences(self, point: Array, unit: Array) -> Array:
+        """Return the derivatives (n, n + m) at ``[x, u]``."""
         n = self.problem.model.n_states
         limit = np.concatenate([np.full(n, np.inf), self.problem.u_max])
         steps = np.where(point + STEP * unit < limit, STEP, -STEP) * unit
@@ -143,8 +153,7 @@ class SimulatedPlant:
             if i >= n:  # in the precision of the action space
                 taken = (self.simulator.actual(moved[n:]) - self.simulator.actual(point[n:]))[i - n]
             J[:, i] = (self.after(moved[:n], moved[n:]) - base) / taken
-        J = np.nan_to_num(J, posinf=0.0, neginf=0.0)
-        return J[:, :n], J[:, n:]
+        return np.nan_to_num(J, posinf=0.0, neginf=0.0)
 
 
 def simulated(

@@ -67,17 +67,32 @@ def distill(layer: LawLayer, twin: PlantTwin, seed: int) -> bool:
     with np.errstate(all="ignore"):
         thetas, inputs = twin.dynamics.roll_out(law, starts, STEPS)
     rows = thetas[:-1].reshape(-1, problem.n_theta)
-    wanted = (inputs.reshape(len(rows), -1) - problem.u_min) / (problem.u_max - problem.u_min)
+    fit_layer(layer, problem, rows, inputs.reshape(len(rows), -1), rng)
+    return True
+
+
+def fit_layer(
+    layer: LawLayer,
+    problem: LinearMPC,
+    rows: Array,
+    inputs: Array,
+    rng: np.random.Generator,
+    updates: int = UPDATES,
+) -> None:
+    """Fit a layer to inputs (rows, m) at theta (rows, n_theta): least squares, with Adam.
+
+    Rows that are not finite are left out.
+    """
+    wanted = (inputs - problem.u_min) / (problem.u_max - problem.u_min)
     wanted = np.clip(2 * wanted - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
     at, to = th.as_tensor(rows[finite]), th.as_tensor(wanted[finite], dtype=th.float32)
     kind = RowAdam if layer.row_gradients else th.optim.Adam
     optimizer: Any = kind(layer.network.weights(), lr=RATE)
-    for k in range(UPDATES):
-        optimizer.param_groups[0]["lr"] = RATE * (1 - k / UPDATES)
+    for k in range(updates):
+        optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
         chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
         optimizer.zero_grad()
         th.nn.functional.mse_loss(layer(at[chosen]), to[chosen]).backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     optimizer.zero_grad()
-    return True

@@ -58,9 +58,9 @@ class Grounds:
         )
         self.length = min(LONGEST, max(map(len, twin.episodes)), settling_steps(problem))
         self.trial = self.draw(self.drawing)
-        penalty, value = PENALTY * self.trial.mean, _value(problem)
+        penalty, value = PENALTY * self.trial.mean, value_at_end(problem)
         self.objective = Objective(problem, value, twin.limits.low, twin.limits.high, penalty)
-        drawn = self.rng.permutation(twin.starts.draw_anywhere(members * POOL, self.rng))
+        drawn = self.rng.permutation(self.draw_pool(members * POOL))
         starts = drawn.reshape(members, POOL, -1)
         self.pool = [*zip(starts, self.costs_of_mpc(starts), strict=True)]
 
@@ -68,6 +68,10 @@ class Grounds:
     def batch(self) -> int:
         """Runs of each member in a gradient."""
         return max(1, self.n_runs // len(self.twin.dynamics.members))
+
+    def draw_pool(self, count: int) -> Array:
+        """Return rows (count, size) where runs of a gradient begin."""
+        return self.twin.starts.draw_anywhere(count, self.rng)
 
     def draw(self, rng: np.random.Generator) -> Trial:
         """Return a trial on new starts, the same for every member.
@@ -103,7 +107,7 @@ def settling_steps(problem: LinearMPC) -> int:
     return int(np.ceil(np.log(SETTLED) / np.log(radius))) if 0 < radius < 1 else LONGEST
 
 
-def _value(problem: LinearMPC) -> Array:
+def value_at_end(problem: LinearMPC) -> Array:
     """Return the undiscounted value of the law, or one discounted a little where there is none."""
     try:
         return problem.value_matrix(1.0)

@@ -15,6 +15,9 @@ from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.critic import refit_critic
 from sb3_yann.commissioning.distillation import distill
 from sb3_yann.commissioning.grounds import Grounds
+from sb3_yann.commissioning.imitation import imitate
+from sb3_yann.commissioning.simulator_grounds import SimulatorGrounds
+from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.incumbent import all_or_nothing
 from sb3_yann.commissioning.search import Pace, Search
 from sb3_yann.commissioning.trial import Check
@@ -175,9 +178,11 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     if not isinstance(model, OffPolicyAlgorithm):
         raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
     policy = require_yann_policy(model.policy, "improve")
-    if not isinstance(twin, PlantTwin):
-        raise TypeError(f"twin = {twin!r} must be a PlantTwin.")
-    require_problem_of_twin(policy, twin.problem)
+    sim = not isinstance(twin, PlantTwin)
+    if sim:
+        twin = SimulatorTwin.of(policy.problem, twin, seed)
+    else:
+        require_problem_of_twin(policy, twin.problem)
     counts = {"iterations": iterations, "batch": batch, "n_starts": n_starts}
     for name, value in (counts | {"check_every": check_every, "patience": patience}).items():
         as_whole(name, value)
@@ -186,18 +191,27 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     as_flag("progress_bar", progress_bar)
     as_flag("reidentify", reidentify)
     as_flag("confine", confine)
-    twin.require_trust()
-    layer, grounds = copy.deepcopy(policy.actor.mu).cpu(), Grounds(twin, batch, n_starts, seed)
-    layer.confine(*twin.starts.shown) if confine else layer.confine(None, None)
+    layer = copy.deepcopy(policy.actor.mu).cpu()
+    if sim:
+        grounds = SimulatorGrounds(twin, batch, n_starts, seed)
+    else:
+        twin.require_trust()
+        grounds = Grounds(twin, batch, n_starts, seed)
+        layer.confine(*twin.starts.shown) if confine else layer.confine(None, None)
     searches = [Search(layer, grounds, Pace(iterations, learning_rate, check_every, patience))]
     today = copy.deepcopy(layer)
-    if reidentify and distill(today, twin, seed):
+    if not sim and reidentify and distill(today, twin, seed):
         slower = replace(searches[0].pace, learning_rate=REFINED * learning_rate)
         searches.append(Search(today, grounds, slower))
+    if sim:
+        taught = copy.deepcopy(layer)
+        imitate(taught, grounds, seed)
+        slower = replace(searches[0].pace, learning_rate=REFINED * learning_rate)
+        searches = [Search(taught, grounds, slower)]
     before = None if layer.network.is_zero() else searches[0].checks[0]
     leg = min(iterations, max(check_every, -(-iterations // RACE)))
     total = iterations + (len(searches) - 1) * leg
-    least = least_gain(twin.trust)
+    least = 1e-3 if sim else least_gain(twin.trust)
     for _ in track(_race(searches, leg, least), "improving", total, disable=not progress_bar):
         pass
     search = min(searches, key=lambda each: each.change)
