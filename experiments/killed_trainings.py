@@ -157,14 +157,19 @@ def _events(folder: Path) -> list[dict[str, Any]]:
 
 
 def commissioned(model: DDPG) -> tuple[float, list[Any]]:
-    """Return how many seconds of a core an unhurt commissioning takes, and its batches."""
-    with TemporaryDirectory() as name:
-        before = os.times()
-        end(fork(lambda: _commission(model, Path(name))), patience=PATIENCE)
-        after = os.times()
-        used = after.children_user - before.children_user
-        used += after.children_system - before.children_system
-        return used, _batches(_events(Path(name)))
+    """Return how many seconds of a core an unhurt commissioning takes, and its batches.
+
+    The first one, which may compile what others find on the disk, is not timed.
+    """
+    for _ in range(2):
+        with TemporaryDirectory() as name:
+            before = os.times()
+            end(fork(lambda at=Path(name): _commission(model, at)), patience=PATIENCE)
+            after = os.times()
+            used = after.children_user - before.children_user
+            used += after.children_system - before.children_system
+            found = used, _batches(_events(Path(name)))
+    return found
 
 
 def _batches(events: list[dict[str, Any]]) -> list[Any]:

@@ -69,8 +69,8 @@ class Loops:
         ]
 
 
-def maker(env: Source) -> Callable[[], gym.Env[Any, Any]]:
-    """Return a function that makes envs like the one that is given, named or made."""
+def maker(env: Source, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]]:
+    """Return a function that makes envs like the one that is given, by this name, or made."""
     if isinstance(env, str):
         return partial(gym.make, env, disable_env_checker=True)
     if isinstance(env, gym.Env):
@@ -78,13 +78,13 @@ def maker(env: Source) -> Callable[[], gym.Env[Any, Any]]:
             copy.deepcopy(env)
         except Exception as error:  # whatever a simulator raises that cannot be copied
             raise TypeError(
-                f"env_or_twin = {env!r} cannot be copied ({error}). Pass a function that makes "
+                f"{name} = {env!r} cannot be copied ({error}). Pass a function that makes "
                 "such an env: the starts are played side by side."
             ) from error
         return partial(copy.deepcopy, env)
     if not callable(env):
         raise TypeError(
-            f"env_or_twin = {env!r} must be a single gymnasium.Env, its id, a function that makes "
+            f"{name} = {env!r} must be a single gymnasium.Env, its id, a function that makes "
             "one, or a PlantTwin."
         )
     return env
@@ -224,26 +224,31 @@ class Planning:
         What the plans are made with.
     steps : int
         Length of an episode.
+
+    Attributes
+    ----------
+    plans : dict of int to (int, Plans)
+        The present one of each episode, and the step at which it was made.
     """
 
     def __init__(self, plant: Plant, task: Task, steps: int) -> None:
         self.plant, self.task, self.steps = plant, task, steps
-        self._plans: dict[int, tuple[int, Plans]] = {}  # when each was made
+        self.plans: dict[int, tuple[int, Plans]] = {}
         self._constants: Array = np.zeros((0, 0))
 
     def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
         """Return the inputs (k, m)."""
         problem, constant = self.task.problem, self.task.problem.layout.constant
-        if not self._plans:
+        if not self.plans:
             self._constants = np.full_like(theta[:, constant], np.nan)
-        known = np.isin(np.arange(len(theta)), [*self._plans])
+        known = np.isin(np.arange(len(theta)), [*self.plans])
         away = np.abs(theta[:, constant] - self._constants) / problem.theta_half[constant]
         changed = known & np.any(~(away <= CHANGED), axis=1)
         for rows in (running & ~known, running & changed):
             if rows.any() and t < self.steps:
                 self._plan(t, theta, np.flatnonzero(rows))
         u = np.zeros((len(theta), problem.model.n_inputs))
-        for i, (begun, plan) in self._plans.items():
+        for i, (begun, plan) in self.plans.items():
             at = min(t, self.steps - 1) - begun
             u[i] = np.nan_to_num(follow(plan, at, theta[i : i + 1])[0])
         return np.clip(u, *self.task.limits(theta))
@@ -252,12 +257,12 @@ class Planning:
         problem, left = self.task.problem, self.steps - t
         law = law_of(problem)
         policies: list[Policy] = [lambda _, at: law(at)]
-        if rows[0] not in self._plans:
+        if rows[0] not in self.plans:
             policies += [partial(_burst, law, u, left // BURSTS)
                          for u in (problem.u_min, problem.u_max)]  # fmt: skip
         found = planned(self.plant, self.task, policies, theta[rows], left, rows)
         for k, row in enumerate(rows):
-            self._plans[row] = t, found.of(np.array([k]))
+            self.plans[row] = t, found.of(np.array([k]))
         self._constants[rows] = theta[rows, problem.layout.constant]
 
 

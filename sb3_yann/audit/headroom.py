@@ -230,7 +230,8 @@ class _Search:
         """Return what plans are tried in, and the bounds of its states."""
         if self.twin is not None:
             limits, count = self.twin.limits, len(self.twin.dynamics.members)
-            return TwinPlant(self.twin, [s % count for s in self.seeds]), limits.low, limits.high
+            acting = TwinPlant(self.twin.dynamics, [s % count for s in self.seeds])
+            return acting, limits.low, limits.high
         found = simulated(self.mpc, self.make, *self.base.steps(), self.access)
         if found is not None:
             free = np.full(self.mpc.model.n_states, np.inf)
@@ -240,7 +241,7 @@ class _Search:
         self.logged = self.base, others
         log = [*self.base.episodes(), *others.episodes()]
         twin = PlantTwin.fit(self.mpc, log, observer=self._observer(), n_members=1)
-        return TwinPlant(twin, [0] * len(self.seeds)), twin.limits.low, twin.limits.high
+        return TwinPlant(twin.dynamics, [0] * len(self.seeds)), twin.limits.low, twin.limits.high
 
     def _observer(self) -> DisturbanceObserver | None:
         with closing(self.make()) as env:

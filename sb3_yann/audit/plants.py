@@ -13,13 +13,14 @@ from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linearization.simulator import SHOWN, Simulator, borrow
 from sb3_yann.twin.dynamics import Dynamics
-from sb3_yann.twin.plant_twin import PlantTwin
 
 Rows = NDArray[np.intp]
 Access = tuple[Callable[[Any, Array], object] | None, Callable[[Any], ArrayLike] | None]
 """How a simulator is put into a state, and how its state is read, where neither is found."""
 CELL = 0.05
 """A derivative holds where states and inputs differ by less than this, in half-widths."""
+KNOWN = 100_000
+"""Derivatives that are kept, at most."""
 STEP = 1e-3
 """Of forward differences, in half-widths."""
 AGREES, TRIED = 1e-4, 100
@@ -41,17 +42,18 @@ class TwinPlant:
 
     Parameters
     ----------
-    twin : PlantTwin
+    dynamics : Dynamics
+        The twin's.
     members : sequence of int
         Which acts after each start.
     """
 
-    def __init__(self, twin: PlantTwin, members: Iterable[int]) -> None:
-        self.twin, self.members = twin, [*members]
+    def __init__(self, dynamics: Dynamics, members: Iterable[int]) -> None:
+        self.dynamics, self.members = dynamics, [*members]
         self._known: dict[bytes, Dynamics] = {}
 
     def _acting(self, rows: Rows) -> Dynamics:
-        key, every = rows.tobytes(), self.twin.dynamics
+        key, every = rows.tobytes(), self.dynamics
         if key not in self._known:
             chosen = tuple(every.members[self.members[row]] for row in rows)
             self._known[key] = Dynamics(every.problem, every.coordinates, chosen)
@@ -59,9 +61,9 @@ class TwinPlant:
 
     def step(self, theta: Array, u: Array, rows: Rows) -> Array:
         """Return the next theta (k, n_theta); an estimated d stays, as in an env's plan."""
-        row, acting = self.twin.dynamics.row, self._acting(rows)
+        row, acting = self.dynamics.row, self._acting(rows)
         after = acting.step(row.begin(theta)[:, None], u[:, None])[:, 0]
-        found, parts = row.shown(after).copy(), self.twin.problem.layout
+        found, parts = row.shown(after).copy(), self.dynamics.problem.layout
         if row.observer is not None:
             found[:, parts.state] = after[:, row.state]
             found[:, parts.disturbance] = theta[:, parts.disturbance]
@@ -69,7 +71,7 @@ class TwinPlant:
 
     def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
-        row, parts = self.twin.dynamics.row, self.twin.problem.layout
+        row, parts = self.dynamics.row, self.dynamics.problem.layout
         swapped = row.begin(np.swapaxes(theta, 0, 1)), np.swapaxes(u, 0, 1)
         A, B = (np.swapaxes(each, 0, 1) for each in self._acting(rows).jacobians(*swapped))
         if row.observer is None:
@@ -137,6 +139,8 @@ class SimulatedPlant:
         for at in np.ndindex(points.shape[:-1]):
             key = cells[at].tobytes()
             if key not in self._known:
+                if len(self._known) >= KNOWN:
+                    self._known.clear()
                 self._known[key] = self._differences(points[at], unit)
             found[at] = self._known[key]
         return found

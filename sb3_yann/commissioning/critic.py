@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
+from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.policy.policies import YannPolicy
 from sb3_yann.twin.gradient import actor
@@ -18,7 +19,7 @@ SPREAD = 0.1
 """Standard deviation of the first input, in half-widths: the critic must know its slope."""
 
 
-def refit_critic(policy: YannPolicy, twin: PlantTwin, seed: int) -> None:
+def refit_critic(policy: YannPolicy, twin: PlantTwin | SimulatorTwin, seed: int) -> None:
     """Fit the critics to the returns of the policy in the twin, from inputs near its own."""
     problem, rng = policy.problem, np.random.default_rng([seed, 2])
     layer, half = copy.deepcopy(policy.actor.mu).cpu(), problem.u_half
@@ -39,7 +40,9 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin, seed: int) -> None:
     policy.critic_target.load_state_dict(policy.critic.state_dict())
 
 
-def _costs(policy: YannPolicy, twin: PlantTwin, layer: LawLayer, at: Array, u: Array) -> Array:
+def _costs(
+    policy: YannPolicy, twin: PlantTwin | SimulatorTwin, layer: LawLayer, at: Array, u: Array
+) -> Array:
     """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
     problem, gamma, dynamics = policy.problem, policy.gamma, twin.dynamics
     shape = len(dynamics.members), -1

@@ -79,9 +79,20 @@ def fit_layer(
     rng: np.random.Generator,
     updates: int = UPDATES,
 ) -> None:
-    """Fit a layer to inputs (rows, m) at theta (rows, n_theta): least squares, with Adam.
+    """Fit a layer to inputs at theta: least squares on actions in [-1, 1], with Adam.
 
-    Rows that are not finite are left out.
+    Parameters
+    ----------
+    layer : LawLayer
+        Its networks go on from where they are.
+    problem : LinearMPC
+        Whose theta and inputs they are.
+    rows, inputs : ndarray, shapes (rows, n_theta) and (rows, m)
+        Rows that are not finite are left out.
+    rng : numpy.random.Generator
+        Draws the batches.
+    updates : int
+        Steps of Adam.
     """
     wanted = (inputs - problem.u_min) / (problem.u_max - problem.u_min)
     wanted = np.clip(2 * wanted - 1, -1, 1)

@@ -1,13 +1,16 @@
-"""Where searches in a twin run: starts, what the MPC costs from them, what is minimized."""
+"""Where searches run: starts, what the MPC costs from them, what is minimized."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.commissioning.trial import Trial
+from sb3_yann.commissioning.simulator_twin import SimulatorTwin
+from sb3_yann.commissioning.trial import Check, Inputs, Outcome, Trial
 from sb3_yann.control import LinearMPC, lqr
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import Objective
@@ -26,28 +29,51 @@ Valued = tuple[Array, Array]
 """Starts (rows, n_theta), and costs (rows,)."""
 
 
+class Paired(Protocol):
+    """Starts from which policies are compared with the MPC."""
+
+    mpc: Outcome
+
+    @property
+    def mean(self) -> float:
+        """The MPC's mean cost."""
+
+    def play(self, act: Inputs) -> Outcome:
+        """Return what comes of a policy."""
+
+    def check(self, iteration: int, played: Outcome, accepted: Outcome) -> Check:
+        """Compare a policy with the accepted one and the MPC, by what came of them."""
+
+    def second_objection(self, act: Inputs) -> str:
+        """Return what else speaks against a policy; empty where nothing."""
+
+    def hard(self, played: Outcome) -> list[Array]:
+        """Return the starts of each member that a policy loses, or nearly."""
+
+
 @dataclass
-class Grounds:
-    """What all searches in a twin share: one trial, and a pool of starts for gradients.
+class Grounds(ABC):
+    """What all searches share: one trial, and a pool of starts for gradients.
 
     Attributes
     ----------
-    twin : PlantTwin
+    twin : PlantTwin or SimulatorTwin
     n_runs : int
         Runs in each gradient, shared out among the members: ``batch`` for each.
     n_starts : int
-        Of a trial, for each member, twice: as the log begins, and around.
+        Of a trial, for each member, twice: as the log begins, and around; those of a simulator's
+        trial, twice.
     seed : int
     """
 
-    twin: PlantTwin
+    twin: PlantTwin | SimulatorTwin
     n_runs: int
     n_starts: int
     seed: int
     drawing: np.random.Generator = field(init=False)
     rng: np.random.Generator = field(init=False)
     length: int = field(init=False)
-    trial: Trial = field(init=False)
+    trial: Paired = field(init=False)
     objective: Objective = field(init=False)
     pool: list[Valued] = field(init=False)
 
@@ -60,8 +86,7 @@ class Grounds:
         self.trial = self.draw(self.drawing)
         penalty, value = PENALTY * self.trial.mean, value_at_end(problem)
         self.objective = Objective(problem, value, twin.limits.low, twin.limits.high, penalty)
-        drawn = self.rng.permutation(self.draw_pool(members * POOL))
-        starts = drawn.reshape(members, POOL, -1)
+        starts = self.rng.permutation(self.draw_pool(members * POOL)).reshape(members, POOL, -1)
         self.pool = [*zip(starts, self.costs_of_mpc(starts), strict=True)]
 
     @property
@@ -69,9 +94,33 @@ class Grounds:
         """Runs of each member in a gradient."""
         return max(1, self.n_runs // len(self.twin.dynamics.members))
 
+    @abstractmethod
+    def draw(self, rng: np.random.Generator) -> Paired:
+        """Return a trial on new starts."""
+
+    @abstractmethod
     def draw_pool(self, count: int) -> Array:
         """Return rows (count, size) where runs of a gradient begin."""
-        return self.twin.starts.draw_anywhere(count, self.rng)
+
+    def costs_of_mpc(self, starts: Array) -> Array:
+        """Return the MPC's costs (members, starts) of the runs of a gradient."""
+        with np.errstate(all="ignore"):
+            runs = self.twin.dynamics.roll_out(law_of(self.twin.problem), starts, self.length)
+            return self.objective.costs(*runs)
+
+
+@dataclass
+class TwinGrounds(Grounds):
+    """Those of a twin.
+
+    Attributes
+    ----------
+    twin : PlantTwin
+    n_runs, n_starts, seed : int
+        As in `Grounds`.
+    """
+
+    twin: PlantTwin
 
     def draw(self, rng: np.random.Generator) -> Trial:
         """Return a trial on new starts, the same for every member.
@@ -90,11 +139,9 @@ class Grounds:
         rows = np.repeat(drawn[None], len(twin.dynamics.members), axis=0)
         return Trial(twin, rows, count, follow)
 
-    def costs_of_mpc(self, starts: Array) -> Array:
-        """Return the MPC's costs (members, starts) of the runs of a gradient."""
-        with np.errstate(all="ignore"):
-            runs = self.twin.dynamics.roll_out(law_of(self.twin.problem), starts, self.length)
-            return self.objective.costs(*runs)
+    def draw_pool(self, count: int) -> Array:
+        """Return rows (count, size): beginnings, logged ones, and what lies around."""
+        return self.twin.starts.draw_anywhere(count, self.rng)
 
 
 def settling_steps(problem: LinearMPC) -> int:

@@ -1,4 +1,4 @@
-"""A better policy from a plant's twin: the gradient of the cost through twin and actor."""
+"""A better policy from a twin or a simulator: the gradient of the cost through it and the actor."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from rich.progress import track
@@ -14,14 +15,16 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.critic import refit_critic
 from sb3_yann.commissioning.distillation import distill
-from sb3_yann.commissioning.grounds import Grounds
-from sb3_yann.commissioning.imitation import imitate
-from sb3_yann.commissioning.simulator_grounds import SimulatorGrounds
-from sb3_yann.commissioning.simulator_twin import SimulatorTwin
+from sb3_yann.commissioning.grounds import TwinGrounds
+from sb3_yann.commissioning.imitation import ROUNDS, imitate
 from sb3_yann.commissioning.incumbent import all_or_nothing
 from sb3_yann.commissioning.search import Pace, Search
+from sb3_yann.commissioning.simulator_grounds import RULE, SimulatorGrounds
+from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.trial import Check
-from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
+from sb3_yann.evaluation.episodes import Source
+from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.trust import Trust
 
@@ -35,7 +38,7 @@ RACE = 3
 """Of two searches the better one goes on after such a part of the iterations."""
 
 REFINED = 0.2
-"""Factor of the learning rate where the re-identified MPC is refined."""
+"""Factor of the learning rate where the re-identified MPC, or what plans taught, is refined."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +48,17 @@ class Improvement:
     Attributes
     ----------
     checks : tuple of Check
-        The comparisons with the MPC in the twin, of the better search.
+        The comparisons with the MPC in the twin, or in the simulator, of the better search.
     change : float
-        The accepted policy's mean cost in the twin against the MPC's: -0.02 is 2 % less.
+        The accepted policy's mean cost there against the MPC's: -0.02 is 2 % less.
     accepted : bool
         Whether a policy passed that gains at least 0.2 %, or 0.02 % where the twin errs less than
         half as much as the given model, a tenth of what the twin's costs err by, and two standard
-        errors on episodes like the log's; if none did, the model is as it was.
+        errors on episodes like the log's; in a simulator 0.1 %, and two standard errors of what an
+        episode gains. If none did, the model is as it was.
     before : Check, optional
         Of what the model had learnt before, if it had.
+    where : {"the twin", "the simulator"}
 
     Examples
     --------
@@ -65,6 +70,7 @@ class Improvement:
     change: float
     accepted: bool
     before: Check | None = None
+    where: str = "the twin"
 
     @property
     def reason(self) -> str:
@@ -72,7 +78,7 @@ class Improvement:
         if self.accepted:
             return ""
         gain = f"a gain of {100 * abs(self.change):.2g} %" if self.change < 0 else "no gain"
-        last = self.checks[-1].reason or f"{gain} in the twin is too small, or not sure"
+        last = self.checks[-1].reason or f"{gain} in {self.where} is too small, or not sure"
         return f"Nothing better was found: {last}."
 
     def report(self) -> str:
@@ -82,10 +88,12 @@ class Improvement:
         if not self.accepted:
             return f"{self.reason} The model is as it was. {taken}"
         last = next((each for each in reversed(self.checks) if each.accepted), None)
-        said = f"Accepted: {100 * self.change:+.2f} % of the mean cost in the twin"
+        said = f"Accepted: {100 * self.change:+.2f} % of the mean cost in {self.where}"
         if last is not None:
-            said += f", {100 * last.logged:+.2f} % (± {100 * last.error:.2f}) on episodes like the"
-            said += f" log's, {100 * last.worst:+.2f} % from the worst start"
+            twin = self.where == "the twin"
+            whose = "on episodes like the log's" if twin else "of an episode's own on average"
+            said += f", {100 * last.logged:+.2f} % (± {100 * last.error:.2f}) {whose}"
+            said += f", {100 * last.worst:+.2f} % from the worst start"
         return f"{said}. {taken}"
 
     __str__ = report
@@ -93,7 +101,7 @@ class Improvement:
 
 def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     model: OffPolicyAlgorithm,
-    twin: PlantTwin,
+    twin: PlantTwin | Source,
     iterations: int = 120,
     *,
     batch: int = 50,
@@ -106,7 +114,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     seed: int = 0,
     progress_bar: bool = False,
 ) -> Improvement:
-    """Improve a model's policy in a twin of its plant; nothing acts on the plant.
+    """Improve a model's policy in a twin of its plant, or in a simulator; the plant sees nothing.
 
     The actor's parameters follow the gradient of the summed stage cost through unrolled runs of
     twin and actor, with the linear-quadratic value at the end. Every so many steps the policy is
@@ -125,6 +133,13 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     Two searches run, one from the present policy and one from the re-identified MPC. After a third
     of the iterations the better one goes on.
 
+    In a *simulator* the first search begins at nearly optimal plans, those of :func:`headroom`,
+    which the actor imitates; what it then loses is planned anew, and learnt. The gradient goes
+    through the simulator's own steps where it can be put into a state and repeats them, else
+    through a twin of its episodes. Checks are its own episodes, by the rule that an
+    :class:`ImprovementGuard` has by default. Where this search finds nothing, one from the present
+    policy follows.
+
     The model ends with the policy accepted last and a critic that is refitted to it, else as it
     was. It saves and goes on learning as any other.
 
@@ -132,22 +147,26 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     ----------
     model : DDPG or TD3
         With a :class:`YannPolicy` of the twin's problem.
-    twin : PlantTwin
-        It must be trusted.
+    twin : PlantTwin, gymnasium.Env, str or callable
+        A twin, which must be trusted; or a simulator, which shows theta of the model's problem, or
+        absolute values where that is absolute. A function or an id makes as many as are played
+        side by side, a given env is copied.
     iterations : int, default 120
         Gradient steps, at most.
     batch : int, default 50
         Runs in each.
     learning_rate : float, default 5e-3
-        Of Adam at first; it falls to zero.
+        Of Adam at first; it falls to zero. A search from plans or from the re-identified MPC has a
+        fifth of it.
     reidentify : bool, default True
         Whether a search begins at the re-identified MPC (:meth:`PlantTwin.reidentified`), if its
-        law has at most ten times as many regions.
+        law has at most ten times as many regions. Not in a simulator, where one begins at plans.
     confine : bool, default True
         Whether the MPC acts alone beyond what the log shows: see
-        :meth:`YannPolicy.confine_correction`.
+        :meth:`YannPolicy.confine_correction`. A simulator knows the plant there too.
     n_starts : int, default 40
-        Starts of a check, for each member: so many as the log begins, and as many around.
+        Starts of a check, for each member: so many as the log begins, and as many around. In a
+        simulator each check has twice as many episodes, and so many are planned.
     check_every : int, default 20
         Steps from one check to the next.
     patience : int, default 5
@@ -162,7 +181,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     UntrustedTwinError
         If the twin is not to be trusted: the model stays as it is.
     TypeError, ValueError
-        If the model has no YannPolicy, or another problem than the twin.
+        If the model has no YannPolicy, or another problem than the twin or the simulator.
 
     Examples
     --------
@@ -174,58 +193,110 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     >>> twin = PlantTwin.fit(model.policy.problem, [*zip(log.observations, log.actions)])
     >>> improve(model, twin, iterations=40).change < -0.005
     True
+
+    ``improve(model, "CSTR-v0")`` does it in the simulator.
     """
     if not isinstance(model, OffPolicyAlgorithm):
         raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
     policy = require_yann_policy(model.policy, "improve")
-    sim = not isinstance(twin, PlantTwin)
-    if sim:
-        twin = SimulatorTwin.of(policy.problem, twin, seed)
-    else:
+    if not (isinstance(twin, PlantTwin | str | gym.Env) or callable(twin)):
+        raise TypeError(
+            f"twin = {twin!r} must be a PlantTwin; or a simulator: a single gymnasium.Env, its id, "
+            "or a function that makes one."
+        )
+    if isinstance(twin, PlantTwin):
         require_problem_of_twin(policy, twin.problem)
     counts = {"iterations": iterations, "batch": batch, "n_starts": n_starts}
     for name, value in (counts | {"check_every": check_every, "patience": patience}).items():
         as_whole(name, value)
     as_between("learning_rate", learning_rate, 0, np.inf, "()")
     as_whole("seed", seed, 0)
+    for name, flag in {"reidentify": reidentify, "confine": confine}.items():
+        as_flag(name, flag)
     as_flag("progress_bar", progress_bar)
-    as_flag("reidentify", reidentify)
-    as_flag("confine", confine)
     layer = copy.deepcopy(policy.actor.mu).cpu()
-    if sim:
-        grounds = SimulatorGrounds(twin, batch, n_starts, seed)
-    else:
+    pace = Pace(iterations, learning_rate, check_every, patience)
+    if isinstance(twin, PlantTwin):
         twin.require_trust()
-        grounds = Grounds(twin, batch, n_starts, seed)
         layer.confine(*twin.starts.shown) if confine else layer.confine(None, None)
-    searches = [Search(layer, grounds, Pace(iterations, learning_rate, check_every, patience))]
-    today = copy.deepcopy(layer)
-    if not sim and reidentify and distill(today, twin, seed):
-        slower = replace(searches[0].pace, learning_rate=REFINED * learning_rate)
+        searches = _in_twin(layer, TwinGrounds(twin, batch, n_starts, seed), pace, reidentify)
+        leg, least, where = -(-iterations // RACE), least_gain(twin.trust), "the twin"
+        return _improved(policy, searches, max(check_every, leg), least, where, progress_bar)
+    simulator = SimulatorTwin.of(policy.problem, twin, seed)
+    try:
+        grounds = SimulatorGrounds(simulator, batch, n_starts, seed)
+        searches = _in_simulator(layer, grounds, pace, progress_bar)
+        least = RULE.least_gain
+        return _improved(policy, searches, 0, least, "the simulator", progress_bar)
+    finally:
+        simulator.close()
+
+
+def _in_twin(layer: LawLayer, grounds: TwinGrounds, pace: Pace, reidentify: bool) -> list[Search]:
+    """Return a search from a layer as it is, and one from the re-identified MPC."""
+    searches, today = [Search(layer, grounds, pace)], copy.deepcopy(layer)
+    if reidentify and distill(today, grounds.twin, grounds.seed):
+        slower = replace(pace, learning_rate=REFINED * pace.learning_rate)
         searches.append(Search(today, grounds, slower))
-    if sim:
-        taught = copy.deepcopy(layer)
-        imitate(taught, grounds, seed)
-        slower = replace(searches[0].pace, learning_rate=REFINED * learning_rate)
-        searches = [Search(taught, grounds, slower)]
-    before = None if layer.network.is_zero() else searches[0].checks[0]
-    leg = min(iterations, max(check_every, -(-iterations // RACE)))
-    total = iterations + (len(searches) - 1) * leg
-    least = 1e-3 if sim else least_gain(twin.trust)
+    return searches
+
+
+def _in_simulator(
+    layer: LawLayer, grounds: SimulatorGrounds, pace: Pace, progress_bar: bool
+) -> list[Search]:
+    """Return a search from a layer as it is, and one from plans that it has imitated."""
+    taught = copy.deepcopy(layer)
+    fits = imitate(taught, grounds, grounds.seed)
+    for _ in track(fits, "imitating plans", ROUNDS, disable=not progress_bar):
+        pass
+    slower = replace(pace, learning_rate=REFINED * pace.learning_rate)
+    return [Search(layer, grounds, pace), Search(taught, grounds, slower)]
+
+
+def _improved(
+    policy: YannPolicy,
+    searches: list[Search],
+    leg: int,
+    least: float,
+    where: str,
+    progress_bar: bool,
+) -> Improvement:
+    """Search, and give the policy what was accepted.
+
+    Parameters
+    ----------
+    policy : YannPolicy
+        Whose actor and critic are changed, or not.
+    searches : list of Search
+        The first one begins at the policy.
+    leg : int
+        Iterations that all of them run before the better one goes on.
+    least : float
+        What must be gained, as a fraction of the MPC's mean cost.
+    where : {"the twin", "the simulator"}
+        For the report.
+    progress_bar : bool
+        Whether to show one.
+    """
+    own = policy.actor.mu.state_dict()
+    grounds, pace = searches[0].grounds, searches[0].pace
+    before = None if policy.actor.mu.network.is_zero() else searches[0].checks[0]
+    leg = min(pace.iterations, leg)
+    total = pace.iterations + (len(searches) - 1) * leg
     for _ in track(_race(searches, leg, least), "improving", total, disable=not progress_bar):
         pass
     search = min(searches, key=lambda each: each.change)
-    change, own = search.change, policy.actor.mu.state_dict()
+    change = search.change
     moved = any(not th.equal(own[key].cpu(), each) for key, each in search.accepted.items())
     if not moved or not search.gains(least):
-        return Improvement(tuple(search.checks), 0.0 if moved else change, False, before)
+        return Improvement(tuple(search.checks), 0.0 if moved else change, False, before, where)
     with all_or_nothing(policy):
         policy.actor.mu.load_state_dict(search.accepted)
         policy.actor_target.load_state_dict(policy.actor.state_dict())
         for network in (policy.actor, policy.critic):
             network.optimizer.state.clear()  # what other weights were moved by
-        refit_critic(policy, twin, seed)
-    return Improvement(tuple(search.checks), change, True, before)
+        refit_critic(policy, grounds.twin, grounds.seed)
+    return Improvement(tuple(search.checks), change, True, before, where)
 
 
 def least_gain(trust: Trust) -> float:
@@ -241,12 +312,14 @@ def least_gain(trust: Trust) -> float:
 def _race(searches: list[Search], leg: int, least: float) -> Iterator[int]:
     """Yield after each gradient step: of all searches in the first leg, then of the best one.
 
-    The others follow where that finds nothing worth a change.
+    The others follow where that finds nothing worth a change. Of two that are as good, the one
+    that begins elsewhere goes first, where there is no leg.
     """
     if len(searches) > 1:
         for each in searches:
             yield from each.steps(leg)
-    for each in sorted(searches, key=lambda each: each.change):
+    order = searches if leg else [*reversed(searches)]
+    for each in sorted(order, key=lambda each: each.change):
         yield from each.steps(each.pace.iterations)
         if each.gains(least):
             break

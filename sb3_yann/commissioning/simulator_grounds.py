@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.closed_loops import Controller, Loops, of_law
@@ -14,27 +16,39 @@ from sb3_yann.commissioning.trial import NEARLY, Check, Inputs, Outcome
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
 
+RULE = AcceptanceRule()
+"""When a policy counts as no worse: as a guard has it by default."""
+
 
 @dataclass
 class SimulatedTrial:
-    """Episodes of a simulator, and what came of the MPC and of the accepted policy there.
+    """Episodes of a simulator, and what came of the MPC there.
 
     Attributes
     ----------
     twin : SimulatorTwin
-    seeds : range
-        Of the episodes.
-    rule : AcceptanceRule
-        When a policy counts as no worse.
+    seeds : sequence of int
+        Of the episodes. Those where the MPC's own cost is not finite are left out.
     """
 
     twin: SimulatorTwin
-    seeds: range
-    rule: AcceptanceRule
+    seeds: Sequence[int]
+    base: Loops = field(init=False)
+    last: Loops = field(init=False)
     mpc: Outcome = field(init=False)
 
     def __post_init__(self) -> None:
-        self.base = self.twin.play(of_law(self.twin.problem), self.seeds)
+        given, law = self.seeds, of_law(self.twin.problem)
+        self.base = self.twin.play(law, given)
+        finite = np.isfinite(self.base.costs)
+        if not finite.any():
+            raise ValueError(
+                f"The MPC's own cost is finite in none of {len(given)} episodes of the simulator, "
+                "so nothing can be compared there. What it shows must be finite."
+            )
+        if not finite.all():
+            self.seeds = [given[i] for i in np.flatnonzero(finite)]
+            self.base = self.twin.play(law, self.seeds)
         self.last = self.base
         self.mpc = self._outcome(self.base)
 
@@ -45,9 +59,9 @@ class SimulatedTrial:
 
     @property
     def tolerance(self) -> Tolerance:
-        """What starts may cost more."""
+        """What episodes may cost more than with the MPC."""
         typical = float(np.median(np.abs(self.mpc[0])))
-        return Tolerance(self.rule.margin * typical, self.rule.tail, typical)
+        return Tolerance(RULE.margin * typical, RULE.tail, typical)
 
     def play(self, act: Inputs) -> Outcome:
         """Return what comes of a policy."""
@@ -56,78 +70,90 @@ class SimulatedTrial:
 
     def _outcome(self, loops: Loops) -> Outcome:
         short = self.base.lengths.max() - loops.lengths
-        infinite = ~np.isfinite(loops.costs)
-        unsafe = np.column_stack([loops.violations, short, infinite, 0 * short])
-        return loops.costs, unsafe.astype(np.int64)
+        columns = loops.violations, short, ~np.isfinite(loops.costs), 0 * short
+        return loops.costs, np.column_stack(columns).astype(np.int64)
 
     def check(self, iteration: int, played: Outcome, accepted: Outcome) -> Check:
         """Compare a policy with the accepted one and the MPC, by what came of them."""
         costs, unsafe = played
-        allowed = np.minimum(accepted[1], self.mpc[1])
+        allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
         paired = PairedEpisodes(self.mpc[0], accepted[0], allowed, self.tolerance)
-        excess, mean = costs - self.mpc[0], self.mean
-        reason = paired.objection(costs, unsafe)
-        change, error = excess.mean() / mean, excess.std(ddof=1) / np.sqrt(len(excess)) / mean
-        safe = not np.any(unsafe > allowed)
-        shown = float(change), float(excess.max() / mean), safe, float(change), float(error)
-        return Check(iteration, not reason, reason, *shown)
+        reason, excess = paired.objection(costs, unsafe), costs - self.mpc[0]
+        # Where a few episodes cost a thousand times as much as most, their mean is never sure.
+        own = np.maximum(np.abs(self.mpc[0]), self.tolerance.typical)
+        each = excess / np.where(own > 0, own, 1.0)
+        error = each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else 0.0
+        change, worst = excess.mean() / self.mean, excess.max() / self.mean
+        safe, shown = not np.any(unsafe > allowed), map(float, (each.mean(), error))
+        return Check(iteration, not reason, reason, float(change), float(worst), safe, *shown)
 
     def second_objection(self, act: Inputs) -> str:
         """Return nothing: the simulator has spoken."""
         return ""
 
-    def lost(self, played: Outcome) -> Array:
+    def lost(self, played: Outcome) -> NDArray[np.intp]:
         """Return the numbers of the episodes that a policy loses, or nearly, the worst first."""
         relative = self.tolerance.excess(self.mpc[0], played[0])
         relative[np.any(played[1] > self.mpc[1], axis=1)] = np.inf
         worst = np.argsort(-relative, kind="stable")
-        return worst[relative[worst] > NEARLY]
+        return np.asarray(worst[relative[worst] > NEARLY])
 
     def hard(self, played: Outcome) -> list[Array]:
-        """Return where the episodes begin, or change, that the policy lost last, or nearly."""
-        row, given = self.twin.dynamics.row, self.twin.problem.layout.constant
-        found = []
+        """Return where episodes begin, or are given something new, that were lost last."""
+        row, constant = self.twin.dynamics.row, self.twin.problem.layout.constant
+        found: list[Array] = [np.empty((0, row.size))]
         for i in self.lost(played):
-            thetas = self.last.thetas[: self.last.lengths[i] + 1, i]
+            length = self.last.lengths[i]
+            thetas, inputs = self.last.thetas[: length + 1, i], self.last.inputs[:length, i]
             if not np.isfinite(thetas).all():
                 continue
-            rows = row.recovered(thetas, self.last.inputs[: self.last.lengths[i], i])[0]
-            moved = np.any(np.diff(thetas[:, given], axis=0) != 0, axis=1) & (row.observer is None)
-            found.append(rows[[0, *(1 + np.flatnonzero(moved[: len(rows) - 1]))]])
-        empty = np.empty((0, row.size))
-        return [np.concatenate([empty, *found])]
+            rows = row.recovered(thetas, inputs)[0][:length]
+            new = np.any(np.diff(thetas[:length, constant], axis=0) != 0, axis=1)
+            later = np.flatnonzero(new) + 1 if row.observer is None else np.empty(0, np.intp)
+            found.append(rows[[0, *later]])
+        return [np.concatenate(found)]
 
 
 def controller_of(act: Inputs) -> Controller:
-    """Return a policy as what acts in episodes side by side."""
+    """Return a policy as what acts in episodes side by side; on what is not finite, as at rest."""
 
-    def controller(t: int, theta: Array, running: Array) -> Array:
-        finite = np.isfinite(theta).all(axis=1)
-        return act(np.where(finite[:, None], theta, 0.0))
+    def controller(t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
+        finite = np.isfinite(theta).all(axis=1, keepdims=True)
+        return act(np.where(finite, theta, 0.0))
 
     return controller
 
 
 @dataclass
 class SimulatorGrounds(Grounds):
-    """What all searches in a simulator share: see `Grounds`."""
+    """Those of a simulator.
 
-    twin: SimulatorTwin  # type: ignore[assignment]
-    rule: AcceptanceRule = AcceptanceRule()
+    Attributes
+    ----------
+    twin : SimulatorTwin
+    n_runs, n_starts, seed : int
+        As in `Grounds`.
+    trial : SimulatedTrial
+    next_seed : int
+        Of the first episode of the next trial.
+    """
+
+    twin: SimulatorTwin
+    trial: SimulatedTrial = field(init=False)
+    next_seed: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self.next = self.twin.seeds.stop
+        self.next_seed = self.twin.seeds.stop
         super().__post_init__()
 
-    def draw(self, rng: np.random.Generator) -> SimulatedTrial:  # type: ignore[override]
+    def draw(self, rng: np.random.Generator) -> SimulatedTrial:
         """Return a trial on new starts."""
-        seeds = range(self.next, self.next + 2 * self.n_starts)
-        self.next = seeds.stop
-        return SimulatedTrial(self.twin, seeds, self.rule)
+        first = self.next_seed
+        self.next_seed += 2 * self.n_starts
+        return SimulatedTrial(self.twin, range(first, self.next_seed))
 
     def draw_pool(self, count: int) -> Array:
-        """Return rows (count, size) where runs of a gradient begin."""
-        starts = self.twin.starts
-        half = count // 2
-        first = starts.first[self.rng.integers(len(starts.first), size=count - half)]
-        return np.concatenate([first, starts.draw_logged(half, self.rng)])
+        """Return rows (count, size): beginnings of the MPC's episodes, and what comes later."""
+        starts, half = self.twin.starts, count // 2
+        first = starts.row.begin(starts.first[self.rng.integers(len(starts.first), size=half)])
+        return np.concatenate([first, starts.draw_logged(count - half, self.rng)])

@@ -22,18 +22,19 @@ from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import SHORTEST, Episode
 from sb3_yann.twin.observers import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
-from sb3_yann.twin.reidentification import reidentified
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.starts import Starts
 
 LOGGED = 40
-"""Episodes of the MPC that a simulator plays first: they tell where runs of a gradient begin."""
+"""Episodes of the MPC that are played first: they tell where runs of a gradient begin."""
 FIRST, APART = 3_000_000, 1_000_000
-"""Seed of the first episode; how far the episodes of two seeds are apart."""
+"""Seed of the first episode; how far those of two seeds are apart."""
 
 
 class SimulatedResidual:
-    """What a simulator does beyond the linear model: see `Residual`.
+    """What a simulator does beyond the linear model: a residual of `Dynamics`.
+
+    Where it cannot go on from a state, it stays there.
 
     Parameters
     ----------
@@ -45,15 +46,21 @@ class SimulatedResidual:
 
     def __init__(self, plant: SimulatedPlant, linear: Array) -> None:
         self.plant, self.linear = plant, linear
-        n, m = plant.problem.model.n_states, plant.problem.model.n_inputs
-        number = np.arange(linear.shape[1])
-        self.n, self.own = n, np.concatenate([number[:n], number[len(number) - m :]])
+        self.n, number = plant.problem.model.n_states, np.arange(linear.shape[1])
+        self.own = np.concatenate([number[: self.n], number[-plant.problem.model.n_inputs :]])
 
     def predict(self, z: Array) -> Array:
         """Return the residual (batch, n)."""
-        points = z[:, self.own]
-        after = np.array([self.plant.after(each[: self.n], each[self.n :]) for each in points])
+        after = np.array([self._after(each) for each in z[:, self.own]])
         return np.asarray(after.reshape(len(z), self.n) - z @ self.linear.T)
+
+    def _after(self, point: Array) -> Array:
+        x, u = point[: self.n], point[self.n :]
+        try:
+            found = self.plant.after(x, u)
+        except Exception:  # whatever an env raises that cannot go on from this state
+            return x
+        return np.where(np.isfinite(found), found, x)
 
     def jacobian(self, z: Array) -> Array:
         """Return its derivatives (batch, n, k)."""
@@ -76,7 +83,7 @@ class _Kept(gym.Wrapper[Any, Any, Any, Any]):
 
 @dataclass(frozen=True, eq=False)
 class SimulatorTwin:
-    """A simulator that stands where a :class:`PlantTwin` may stand, with one exact member.
+    """A simulator that stands where a :class:`PlantTwin` may, with one member.
 
     Attributes
     ----------
@@ -85,18 +92,24 @@ class SimulatorTwin:
     episodes : tuple of Episode
         Those of the MPC that were played first, in rows of ``dynamics.row``.
     dynamics : Dynamics
-        Its own steps.
-    make : callable
-        Makes an env that shows theta and takes deviations; one that is closed is used again.
+        Its own steps; of one that is random, or cannot be put into a state, those of a twin.
+    units : ndarray, shape (n,)
+        How far the states move in the episodes: standard deviations.
     seeds : range
         Of the episodes.
+    make : callable
+        Makes an env that shows theta and takes deviations; one that is closed is used again.
+    free : list of gymnasium.Env
+        Those that were.
     """
 
     problem: LinearMPC
     episodes: tuple[Episode, ...]
     dynamics: Dynamics
-    make: Callable[[], gym.Env[Any, Any]]
+    units: Array
     seeds: range
+    make: Callable[[], gym.Env[Any, Any]]
+    free: list[gym.Env[Any, Any]]
 
     @classmethod
     def of(cls, problem: LinearMPC, env: Source, seed: int = 0) -> SimulatorTwin:
@@ -105,9 +118,9 @@ class SimulatorTwin:
         Parameters
         ----------
         problem : LinearMPC
+            Of the policy.
         env : gymnasium.Env, str or callable
-            It shows theta of the problem, or absolute values where the problem is absolute, can be
-            put into a state, and repeats its steps.
+            It shows theta of the problem, or absolute values where the problem is absolute.
         seed : int, default 0
             Of the episodes.
 
@@ -116,51 +129,53 @@ class SimulatorTwin:
         TypeError, ValueError
             If it is no such env.
         """
-        make, free = showing_theta(maker(env), problem), list[gym.Env[Any, Any]]()
+        make = showing_theta(maker(env, "twin"), problem)
+        free: list[gym.Env[Any, Any]] = []
 
         def kept() -> gym.Env[Any, Any]:
             return free.pop() if free else _Kept(make(), free)
 
+        with closing(kept()) as one:
+            row = RowLayout(problem, observer_of(one))
+            require_spaces(problem, one)
         first = FIRST + APART * seed
         seeds = range(first, first + LOGGED)
         loops = play(problem, kept, seeds, of_law(problem))
         require_deviations(problem, loops.steps()[0])
-        with closing(kept()) as one:
-            row = RowLayout(problem, observer_of(one))
-        whole = [each for each in loops.episodes() if len(each[1]) >= SHORTEST]
-        if not whole or not all(np.isfinite(each).all() for pair in whole for each in pair):
+        logged = _usable(loops)
+        if not logged:
             raise ValueError(
-                f"The MPC's episodes of the simulator are shorter than {SHORTEST} steps, or show "
-                "what is not finite: there is nothing to start from."
+                f"None of {LOGGED} episodes of the MPC in the simulator has {SHORTEST} steps that "
+                "are all finite: there is nothing to learn from."
             )
-        episodes = tuple(Episode(*row.recovered(*each)) for each in whole)
-        steps = (
-            np.concatenate([each.thetas[:-1, row.state] for each in episodes]),
-            np.concatenate([each.actions for each in episodes]),
-            np.concatenate([each.thetas[1:, row.state] for each in episodes]),
-        )
-        plant = simulated(problem, make, *steps)
-        if plant is None:  # one that is random, or cannot be put into a state
-            excited = play(problem, kept, seeds, Excited(problem, seed))
-            log = [each for each in excited.episodes() if len(each[1]) >= SHORTEST]
-            twin = PlantTwin.fit(
-                problem, [*whole, *log], observer=row.observer, n_members=1, seed=seed
-            )
-            return cls(problem, episodes, twin.dynamics, kept, seeds)
+        episodes = tuple(Episode(*row.recovered(*each)) for each in logged)
         box = Coordinates.of(problem, episodes, row.observer)
-        anywhere = np.full_like(box.low, np.inf)
-        free_box = replace(box, low=-anywhere, high=anywhere, scale=np.ones_like(box.scale))
-        residual = SimulatedResidual(plant, row.linear[row.state][:, row.inputs])
-        return cls(problem, episodes, Dynamics(problem, free_box, (residual,)), kept, seeds)
+        before, after = (
+            np.concatenate([each.thetas[part, row.state] for each in episodes])
+            for part in (slice(-1), slice(1, None))
+        )
+        inputs = np.concatenate([each.actions for each in episodes])
+        plant = simulated(problem, make, before, inputs, after)
+        if plant is None:
+            log = [*logged, *_usable(play(problem, kept, seeds, Excited(problem, seed)))]
+            twin = PlantTwin.fit(problem, log, observer=row.observer, n_members=1, seed=seed)
+            dynamics = twin.dynamics
+        else:
+            anywhere = np.full_like(box.low, np.inf)
+            free_box = replace(box, low=-anywhere, high=anywhere, scale=np.ones_like(box.scale))
+            residual = SimulatedResidual(plant, row.linear[row.state][:, row.inputs])
+            dynamics = Dynamics(problem, free_box, (residual,))
+        return cls(problem, episodes, dynamics, box.units, seeds, kept, free)
 
     def play(self, controller: Controller, seeds: Sequence[int]) -> Loops:
         """Return episodes of the simulator itself."""
         return play(self.problem, self.make, seeds, controller)
 
-    def reidentified(self) -> LinearMPC:
-        """Return the MPC with a model of the episodes: see :meth:`PlantTwin.reidentified`."""
-        box = Coordinates.of(self.problem, self.episodes, self.dynamics.row.observer)
-        return reidentified(self.problem, box, self.episodes)
+    def close(self) -> None:
+        """Close all envs."""
+        for each in self.free:
+            each.env.close()  # type: ignore[attr-defined]
+        self.free.clear()
 
     @cached_property
     def starts(self) -> Starts:
@@ -174,3 +189,24 @@ class SimulatorTwin:
         low = np.where(soft, -np.inf, problem.x_min)
         high = np.where(soft, np.inf, problem.x_max)
         return Limits(problem, low, high, self.dynamics.row)
+
+
+def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
+    """Raise unless an env shows theta and takes the inputs."""
+    shape, actions = env.observation_space.shape, env.action_space.shape
+    if shape != (problem.n_theta,) or actions != (problem.model.n_inputs,):
+        raise ValueError(
+            f"The simulator shows {shape} and takes {actions}; theta of the model's problem has "
+            f"{problem.n_theta} entries {problem.layout.names}, and there are "
+            f"{problem.model.n_inputs} inputs. Give the env that the model is trained in, or one "
+            "that is wrapped like it."
+        )
+
+
+def _usable(loops: Loops) -> list[tuple[Array, Array]]:
+    """Return the episodes of some steps whose values are all finite."""
+    return [
+        (thetas, inputs)
+        for thetas, inputs in loops.episodes()
+        if len(inputs) >= SHORTEST and np.isfinite(thetas).all() and np.isfinite(inputs).all()
+    ]

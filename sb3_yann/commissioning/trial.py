@@ -53,7 +53,8 @@ class Check:
         Whether no start violates more than with the MPC.
     logged, error : float
         Mean cost against the MPC's of the episodes that go on as those of the log, and its standard
-        error: over the logged episodes, and over the members.
+        error: over the logged episodes, and over the members. In a simulator: what an episode costs
+        against the MPC's on average, relative to its own cost, and the standard error of that.
     """
 
     iteration: int

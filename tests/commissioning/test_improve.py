@@ -14,7 +14,7 @@ from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import NoActionNoise, PlantTwin, UntrustedTwinError, YannPolicy, improve
 from sb3_yann.commissioning import Improvement
-from sb3_yann.commissioning.grounds import Grounds
+from sb3_yann.commissioning.grounds import TwinGrounds
 from sb3_yann.commissioning.search import Pace, Search
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.evaluation import evaluate
@@ -116,8 +116,8 @@ def test_what_cannot_be_improved_is_refused_and_left() -> None:
         improve(model, PlantTwin.fit(problem(), log(1)))
     with pytest.raises(ValueError, match=r"Fit the twin with model\.policy\.problem"):
         improve(DDPG("YannPolicy", "CSTR-v0", device="cpu"), twin())
-    with pytest.raises(TypeError, match="twin = 'CSTR-v0' must be a PlantTwin"):
-        improve(model, "CSTR-v0")
+    with pytest.raises(TypeError, match="twin = 3 must be a PlantTwin; or a simulator"):
+        improve(model, 3)
     with pytest.raises(TypeError, match="improve needs a YannPolicy"):
         improve(DDPG("MlpPolicy", Cart(), device="cpu"), twin())
     for wrong in ({"iterations": 0}, {"batch": 0}, {"learning_rate": 0}, {"patience": 0}):
@@ -182,7 +182,7 @@ def test_what_the_costs_of_a_twin_err_by_asks_for_more_than_it_finds(monkeypatch
 
 def test_of_what_is_refused_a_half_and_a_quarter_are_tried(monkeypatch) -> None:
     layer = copy.deepcopy(DDPG(YannPolicy, Cart(), seed=0, device="cpu").policy.actor.mu)
-    search = Search(layer, Grounds(twin(), n_runs=5, n_starts=2, seed=0), Pace(1, 1e-3, 1, 1))
+    search = Search(layer, TwinGrounds(twin(), n_runs=5, n_starts=2, seed=0), Pace(1, 1e-3, 1, 1))
     mpc = copy.deepcopy(search.accepted)
     for each in layer.network.parameters():
         th.nn.init.normal_(each, std=0.3)

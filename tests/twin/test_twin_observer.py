@@ -244,7 +244,7 @@ def test_starts_begin_with_the_estimate_of_an_observer_that_begins() -> None:
 
 def test_a_plan_in_it_takes_the_estimate_for_constant() -> None:
     found, rng = observed(), np.random.default_rng(0)
-    plant, rows = TwinPlant(found, [0, 3]), np.arange(2)
+    plant, rows = TwinPlant(found.dynamics, [0, 3]), np.arange(2)
     theta, u = found.dynamics.row.shown(found.starts.draw_logged(2, rng)), np.full((2, 1), 0.3)
     A, B = (each[0] for each in plant.jacobians(theta[None], u[None], rows))
     after, step = plant.step(theta, u, rows), 1e-6
