@@ -118,7 +118,7 @@ class Headroom:
         if self.lost is not None:
             poor = (
                 "plans were made in a twin of its episodes that is not the plant: when played, "
-                f"they cost {100 * self.lost:.3g} % more than the MPC. {SETTABLE}"
+                f"they cost {_more(self.lost)} the MPC. {SETTABLE}"
             )
         if self.verdict == UNKNOWN:
             return f"nothing was found, but {poor}"
@@ -127,6 +127,10 @@ class Headroom:
             largest = ", ".join(f"{each:.3g}" for each in self.d_max)
             advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
         return f"{advice} The rest is not known: {poor}" if poor else advice
+
+
+def _more(lost: float) -> str:
+    return f"{100 * lost:.3g} % more than" if lost >= LITTLE / 10 else "as much as"
 
 
 def gain(before: Array, after: Array) -> float:

@@ -26,16 +26,24 @@ from sb3_yann.audit.closed_loops import (
 )
 from sb3_yann.audit.gains import UNKNOWN, WORTH, Headroom, gain, verdict_of
 from sb3_yann.audit.own_units import require_deviations, showing_theta
-from sb3_yann.audit.plants import Access, Plant, TwinPlant, lack_of_fit, simulated
+from sb3_yann.audit.plants import (
+    Access,
+    Plant,
+    TwinPlant,
+    lack_of_fit,
+    simulated,
+    simulated_dynamics,
+)
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.control.mpc.offset_free import SHARE
 from sb3_yann.evaluation.episodes import Source
 from sb3_yann.twin.dynamics import Coordinates
-from sb3_yann.twin.log import as_episodes
+from sb3_yann.twin.log import Episode, as_episodes
 from sb3_yann.twin.observers import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.reidentification import reidentified
+from sb3_yann.twin.row_layout import RowLayout
 
 LACKING = 0.5
 """A twin is poor where neighboring steps share so much of its errors: that is no noise."""
@@ -138,7 +146,7 @@ class _Search:
         self, mpc: LinearMPC, given: Source | PlantTwin, seeds: range, access: Access
     ) -> None:
         self.mpc, self.seeds, self.access = mpc, seeds, access
-        self.twin, self.random = None, False
+        self.twin, self.random, self.doubted = None, False, False
         self.lost: float | None = None
         self.d_max: Array | None = None
         self.make: Callable[[], gym.Env[Any, Any]]
@@ -215,8 +223,8 @@ class _Search:
         controller = Planning(plant, task, int(base.lengths.max()))
         self.others["plan"] = plans = play(self.mpc, self.make, self.seeds, controller)
         lost = -gain(base.costs, plans.costs)
-        if not lost <= WORTH and self.lacking():
-            self.lost = float(lost)
+        if (self.doubted or not lost <= WORTH) and self.lacking():
+            self.lost = max(float(lost), 0.0)
 
     def lacking(self) -> bool:
         """Tell whether what plans were made in is a twin of the env that lacks much of it."""
@@ -232,16 +240,26 @@ class _Search:
             limits, count = self.twin.limits, len(self.twin.dynamics.members)
             acting = TwinPlant(self.twin.dynamics, [s % count for s in self.seeds])
             return acting, limits.low, limits.high
-        found = simulated(self.mpc, self.make, *self.base.steps(), self.access)
+        free, found = np.full(self.mpc.model.n_states, np.inf), self._simulated()
         if found is not None:
-            free = np.full(self.mpc.model.n_states, np.inf)
             return found, -free, free
         self.random = True  # or so it must be taken to be
         others = play(self.mpc, self.make, self.seeds, Excited(self.mpc, self.seeds[0]))
         self.logged = self.base, others
         log = [*self.base.episodes(), *others.episodes()]
         twin = PlantTwin.fit(self.mpc, log, observer=self._observer(), n_members=1)
+        self.doubted = not twin.trusted
         return TwinPlant(twin.dynamics, [0] * len(self.seeds)), twin.limits.low, twin.limits.high
+
+    def _simulated(self) -> Plant | None:
+        """Return the env itself where it can be put into a state, and repeats its steps."""
+        observer = self._observer()
+        if observer is None:
+            return simulated(self.mpc, self.make, *self.base.steps(), self.access)
+        row = RowLayout(self.mpc, observer)
+        log = [Episode(*row.recovered(*each)) for each in self.base.episodes()]
+        found = simulated_dynamics(row, self.make, log, self.access)
+        return None if found is None else TwinPlant(found, [0] * len(self.seeds))
 
     def _observer(self) -> DisturbanceObserver | None:
         with closing(self.make()) as env:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any, Protocol
 
@@ -12,7 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linearization.simulator import SHOWN, Simulator, borrow
-from sb3_yann.twin.dynamics import Dynamics
+from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.log import Episode
+from sb3_yann.twin.row_layout import RowLayout
 
 Rows = NDArray[np.intp]
 Access = tuple[Callable[[Any, Array], object] | None, Callable[[Any], ArrayLike] | None]
@@ -196,6 +199,77 @@ def simulated(
                 return plant
     simulator.env.close()
     return None
+
+
+class SimulatedResidual:
+    """What a simulator does beyond the linear model: a residual of `Dynamics`.
+
+    Where it cannot go on from a state, it stays there.
+
+    Parameters
+    ----------
+    plant : SimulatedPlant
+        Its steps, and their differences.
+    linear : ndarray, shape (n, k)
+        What the linear model makes of ``[x, d, u]``, or of ``[x, u]``.
+    """
+
+    def __init__(self, plant: SimulatedPlant, linear: Array) -> None:
+        self.plant, self.linear = plant, linear
+        self.n, number = plant.problem.model.n_states, np.arange(linear.shape[1])
+        self.own = np.concatenate([number[: self.n], number[-plant.problem.model.n_inputs :]])
+
+    def predict(self, z: Array) -> Array:
+        """Return the residual (batch, n)."""
+        after = np.array([self._after(each) for each in z[:, self.own]])
+        return np.asarray(after.reshape(len(z), self.n) - z @ self.linear.T)
+
+    def _after(self, point: Array) -> Array:
+        x, u = point[: self.n], point[self.n :]
+        try:
+            found = self.plant.after(x, u)
+        except Exception:  # whatever an env raises that cannot go on from this state
+            return x
+        return np.where(np.isfinite(found), found, x)
+
+    def jacobian(self, z: Array) -> Array:
+        """Return its derivatives (batch, n, k)."""
+        found = np.tile(-self.linear, (len(z), 1, 1))
+        found[:, :, self.own] += self.plant.slopes(z[:, self.own])
+        return found
+
+
+def simulated_dynamics(
+    row: RowLayout, env: Any, episodes: Sequence[Episode], access: Access = (None, None)
+) -> Dynamics | None:
+    """Return a simulator's own steps as those of a twin, with an observer where the row has one.
+
+    None where no simulator repeats its steps: see `simulated`.
+
+    Parameters
+    ----------
+    row : RowLayout
+        What the episodes hold.
+    env : callable
+        Makes an env.
+    episodes : sequence of Episode
+        Of the env.
+    access : tuple of two callables, or None
+        ``set_state`` and ``get_state`` of :func:`headroom`.
+    """
+    before, after = (
+        np.concatenate([each.thetas[part, row.state] for each in episodes])
+        for part in (slice(-1), slice(1, None))
+    )
+    inputs = np.concatenate([each.actions for each in episodes])
+    plant = simulated(row.problem, env, before, inputs, after, access)
+    if plant is None:
+        return None
+    box = Coordinates.of(row.problem, episodes, row.observer)
+    anywhere = np.full_like(box.low, np.inf)
+    whole = replace(box, low=-anywhere, high=anywhere, scale=np.ones_like(box.scale))
+    residual = SimulatedResidual(plant, row.linear[row.state][:, row.inputs])
+    return Dynamics(row.problem, whole, (residual,))
 
 
 def lack_of_fit(

@@ -124,7 +124,10 @@ def planned(
     costs = np.array([each.costs for each in found])[best, every]
     plans = improved(plant, soft, Plans(**kept, costs=costs), rows, ROUNDS)
     hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
-    return improved(plant, task, hard, rows, ROUNDS)
+    plans = improved(plant, task, hard, rows, ROUNDS)
+    # The last search may have been damped, and its feedback with it.
+    _, gains = _backward(plant, task, plans, rows, np.zeros(len(rows)))
+    return dataclasses.replace(plans, gains=gains)
 
 
 def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:

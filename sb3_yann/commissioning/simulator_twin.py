@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.audit.closed_loops import Controller, Excited, Loops, maker, of_law, play
 from sb3_yann.audit.own_units import require_deviations, showing_theta
-from sb3_yann.audit.plants import SimulatedPlant, simulated
+from sb3_yann.audit.plants import simulated_dynamics
 from sb3_yann.control import LinearMPC
 from sb3_yann.evaluation.episodes import Source
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
@@ -29,44 +29,6 @@ LOGGED = 40
 """Episodes of the MPC that are played first: they tell where runs of a gradient begin."""
 FIRST, APART = 3_000_000, 1_000_000
 """Seed of the first episode; how far those of two seeds are apart."""
-
-
-class SimulatedResidual:
-    """What a simulator does beyond the linear model: a residual of `Dynamics`.
-
-    Where it cannot go on from a state, it stays there.
-
-    Parameters
-    ----------
-    plant : SimulatedPlant
-        Its steps, and their differences.
-    linear : ndarray, shape (n, k)
-        What the linear model makes of ``[x, d, u]``, or of ``[x, u]``.
-    """
-
-    def __init__(self, plant: SimulatedPlant, linear: Array) -> None:
-        self.plant, self.linear = plant, linear
-        self.n, number = plant.problem.model.n_states, np.arange(linear.shape[1])
-        self.own = np.concatenate([number[: self.n], number[-plant.problem.model.n_inputs :]])
-
-    def predict(self, z: Array) -> Array:
-        """Return the residual (batch, n)."""
-        after = np.array([self._after(each) for each in z[:, self.own]])
-        return np.asarray(after.reshape(len(z), self.n) - z @ self.linear.T)
-
-    def _after(self, point: Array) -> Array:
-        x, u = point[: self.n], point[self.n :]
-        try:
-            found = self.plant.after(x, u)
-        except Exception:  # whatever an env raises that cannot go on from this state
-            return x
-        return np.where(np.isfinite(found), found, x)
-
-    def jacobian(self, z: Array) -> Array:
-        """Return its derivatives (batch, n, k)."""
-        found = np.tile(-self.linear, (len(z), 1, 1))
-        found[:, :, self.own] += self.plant.slopes(z[:, self.own])
-        return found
 
 
 class _Kept(gym.Wrapper[Any, Any, Any, Any]):
@@ -149,23 +111,13 @@ class SimulatorTwin:
                 "are all finite: there is nothing to learn from."
             )
         episodes = tuple(Episode(*row.recovered(*each)) for each in logged)
-        box = Coordinates.of(problem, episodes, row.observer)
-        before, after = (
-            np.concatenate([each.thetas[part, row.state] for each in episodes])
-            for part in (slice(-1), slice(1, None))
-        )
-        inputs = np.concatenate([each.actions for each in episodes])
-        plant = simulated(problem, make, before, inputs, after)
-        if plant is None:
+        dynamics = simulated_dynamics(row, make, episodes)
+        if dynamics is None:
             log = [*logged, *_usable(play(problem, kept, seeds, Excited(problem, seed)))]
             twin = PlantTwin.fit(problem, log, observer=row.observer, n_members=1, seed=seed)
             dynamics = twin.dynamics
-        else:
-            anywhere = np.full_like(box.low, np.inf)
-            free_box = replace(box, low=-anywhere, high=anywhere, scale=np.ones_like(box.scale))
-            residual = SimulatedResidual(plant, row.linear[row.state][:, row.inputs])
-            dynamics = Dynamics(problem, free_box, (residual,))
-        return cls(problem, episodes, dynamics, box.units, seeds, kept, free)
+        units = Coordinates.of(problem, episodes, row.observer).units
+        return cls(problem, episodes, dynamics, units, seeds, kept, free)
 
     def play(self, controller: Controller, seeds: Sequence[int]) -> Loops:
         """Return episodes of the simulator itself."""
