@@ -25,6 +25,8 @@ Controller = Callable[[int, Array, NDArray[np.bool_]], Array]
 """From the step, thetas (k, n_theta) and who still runs (k,) to inputs (k, m)."""
 CHANGED = 0.05
 """A reference or disturbance that has moved by so many half-widths is planned for anew."""
+PAUSE = 10
+"""Steps after a plan for which an estimated disturbance makes no new one."""
 DITHER, HELD = 0.1, 5
 """Half-widths by which a log for a twin is excited, and for how many steps each time."""
 ROOM = 1e-3
@@ -224,6 +226,9 @@ class Planning:
         What the plans are made with.
     steps : int
         Length of an episode.
+    pause : int, default 0
+        Steps after a plan for which a disturbance makes no new one: an observer's estimate moves at
+        every step until it has settled.
 
     Attributes
     ----------
@@ -231,8 +236,8 @@ class Planning:
         The present one of each episode, and the step at which it was made.
     """
 
-    def __init__(self, plant: Plant, task: Task, steps: int) -> None:
-        self.plant, self.task, self.steps = plant, task, steps
+    def __init__(self, plant: Plant, task: Task, steps: int, pause: int = 0) -> None:
+        self.plant, self.task, self.steps, self.pause = plant, task, steps, pause
         self.plans: dict[int, tuple[int, Plans]] = {}
         self._constants: Array = np.zeros((0, 0))
 
@@ -243,7 +248,13 @@ class Planning:
             self._constants = np.full_like(theta[:, constant], np.nan)
         known = np.isin(np.arange(len(theta)), [*self.plans])
         away = np.abs(theta[:, constant] - self._constants) / problem.theta_half[constant]
-        changed = known & np.any(~(away <= CHANGED), axis=1)
+        moved, p = (
+            ~(away <= CHANGED),
+            problem.layout.reference.stop - problem.layout.reference.start,
+        )
+        for i, (begun, _) in self.plans.items():
+            moved[i, p:] &= t >= begun + self.pause
+        changed = known & moved.any(axis=1)
         for rows in (running & ~known, running & changed):
             if rows.any() and t < self.steps:
                 self._plan(t, theta, np.flatnonzero(rows))

@@ -15,6 +15,7 @@ from rich.progress import track
 
 from sb3_yann._validation import Array, as_flag, as_whole
 from sb3_yann.audit.closed_loops import (
+    PAUSE,
     Excited,
     Loops,
     Observing,
@@ -220,7 +221,8 @@ class _Search:
         base = self.base
         unit = max(float(np.abs(base.costs).sum() / base.lengths.sum()), 1e-300)
         task = Task(self.mpc, low, high, _value(self.mpc), WEIGHT * unit)
-        controller = Planning(plant, task, int(base.lengths.max()))
+        pause = PAUSE if self._observer() is not None else 0
+        controller = Planning(plant, task, int(base.lengths.max()), pause)
         self.others["plan"] = plans = play(self.mpc, self.make, self.seeds, controller)
         lost = -gain(base.costs, plans.costs)
         if (self.doubted or not lost <= WORTH) and self.lacking():

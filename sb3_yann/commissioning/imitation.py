@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.closed_loops import Planning
+from sb3_yann.audit.closed_loops import PAUSE, Planning
 from sb3_yann.audit.plants import Plant, TwinPlant
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.audit.trajectory import Plans, follow
@@ -56,7 +56,9 @@ class Teacher:
     def show(self, seeds: Sequence[int], begins: NDArray[np.int64], act: Inputs) -> None:
         """Plan from the steps ``begins`` (k,) of episodes on, until which a policy acts."""
         plant = TwinPlant(self.twin.dynamics, [0] * len(seeds))
-        self.twin.play(_Later(plant, self.task, self.steps, begins, act, self._keep), seeds)
+        pause = PAUSE if self.twin.dynamics.row.observer is not None else 0
+        later = _Later(plant, self.task, self.steps, begins, act, self._keep, pause)
+        self.twin.play(later, seeds)
 
     def _keep(self, theta: Array, u: Array, plan: Plans, at: int) -> None:
         states, unit = self.task.problem.layout.state, self.twin.units
@@ -77,7 +79,7 @@ class _Later(Planning):
 
     Parameters
     ----------
-    plant, task, steps
+    plant, task, steps, pause
         As those of `Planning`.
     begins : ndarray of int, shape (k,)
         The steps.
@@ -95,8 +97,9 @@ class _Later(Planning):
         begins: NDArray[np.int64],
         act: Inputs,
         keep: Keep,
+        pause: int,
     ) -> None:
-        super().__init__(plant, task, steps)
+        super().__init__(plant, task, steps, pause)
         self.begins, self.act, self.keep = begins, controller_of(act), keep
 
     def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
