@@ -12,7 +12,7 @@ import importlib.util
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +82,6 @@ if importlib.util.find_spec("pcgym") is not None:
 assert STRANGERS.keys() <= CASES.keys()
 
 
-@cache
 def case_of(name: str) -> Case:
     """Return the MPC of a plant, and what makes the plant."""
     sys.path.append(plants.EXAMPLES)
