@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.audit.beginnings import beginnings
 from sb3_yann.audit.plants import Plant
 from sb3_yann.audit.task import Bounds, Task
 from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
@@ -31,8 +32,6 @@ DITHER, HELD = 0.1, 5
 """Half-widths by which a log for a twin is excited, and for how many steps each time."""
 ROOM = 1e-3
 """Half-widths beyond a bound that count as on it."""
-BURSTS = 25
-"""Some searches begin with all inputs on a bound, for this part of the episode."""
 
 
 @dataclass(frozen=True)
@@ -265,18 +264,12 @@ class Planning:
         return np.clip(u, *self.task.limits(theta))
 
     def _plan(self, t: int, theta: Array, rows: NDArray[np.intp]) -> None:
-        problem, left = self.task.problem, self.steps - t
+        problem, left, starts = self.task.problem, self.steps - t, theta[rows]
         law = law_of(problem)
         policies: list[Policy] = [lambda _, at: law(at)]
         if rows[0] not in self.plans:
-            policies += [partial(_burst, law, u, left // BURSTS)
-                         for u in (problem.u_min, problem.u_max)]  # fmt: skip
-        found = planned(self.plant, self.task, policies, theta[rows], left, rows)
+            policies = beginnings(self.plant, self.task, starts, left, rows)
+        found = planned(self.plant, self.task, policies, starts, left, rows)
         for k, row in enumerate(rows):
             self.plans[row] = t, found.of(np.array([k]))
         self._constants[rows] = theta[rows, problem.layout.constant]
-
-
-def _burst(law: Callable[[Array], Array], u: Array, until: int, t: int, theta: Array) -> Array:
-    """Return inputs u (m,) for some steps, those of the law after them."""
-    return np.tile(u, (len(theta), 1)) if t < until else law(theta)

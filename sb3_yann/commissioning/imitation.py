@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import copy
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.closed_loops import PAUSE, Planning
-from sb3_yann.audit.plants import Plant, TwinPlant
+from sb3_yann.audit.closed_loops import PAUSE, Controller, Planning
+from sb3_yann.audit.plants import TwinPlant
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.audit.trajectory import Plans, follow
 from sb3_yann.commissioning.distillation import fit_layer
 from sb3_yann.commissioning.grounds import value_at_end
-from sb3_yann.commissioning.simulator_grounds import SimulatorGrounds, controller_of
+from sb3_yann.commissioning.simulator_grounds import RULE, SimulatorGrounds, controller_of
 from sb3_yann.commissioning.trial import Inputs
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.gradient import actor
 
-UPDATES = 5000
+UPDATES = 10_000
 """Of a fit: where a plant is steep, the last digits of an input decide."""
 NEARBY, SPREAD = 3, 0.1
 """States beside each of a plan that its feedback answers; how far, in standard deviations of the
 logged states."""
-ROUNDS, HARDEST = 3, 20
-"""Fits, at most; lost episodes of which the next one learns."""
-
-Keep = Callable[[Array, Array, Plans, int], None]
+ROUNDS, PATIENCE, HARDEST = 14, 5, 20
+"""Fits, at most; fits in a row that lose no fewer episodes than one before, at most; lost episodes
+of a trial of which the next fit learns."""
 
 
 class Teacher:
@@ -53,20 +53,34 @@ class Teacher:
         self.thetas: list[Array] = []
         self.inputs: list[Array] = []
 
-    def show(self, seeds: Sequence[int], begins: NDArray[np.int64], act: Inputs) -> None:
-        """Plan from the steps ``begins`` (k,) of episodes on, until which a policy acts."""
+    def show(self, seeds: Sequence[int], begins: NDArray[np.int64], act: Inputs) -> float:
+        """Plan from the steps ``begins`` (k,) of episodes on, until which a policy acts.
+
+        Episodes that cost more than with the MPC from there on show nothing. Return what the others
+        gain, as a fraction of what all cost with the MPC.
+        """
         plant = TwinPlant(self.twin.dynamics, [0] * len(seeds))
         pause = PAUSE if self.twin.dynamics.row.observer is not None else 0
-        later = _Later(plant, self.task, self.steps, begins, act, self._keep, pause)
-        self.twin.play(later, seeds)
+        law = self.task.problem.law()
+        mpc = self.twin.play(_Later(controller_of(law), begins, act), seeds)
+        planning = _Later(Planning(plant, self.task, self.steps, pause), begins, act)
+        shown = self.twin.play(planning, seeds)
+        better = (shown.costs <= mpc.costs) & shown.no_worse(mpc)
+        for i in np.flatnonzero(better):
+            for t in range(begins[i], shown.lengths[i]):
+                when, plan = planning.plans[t][i]
+                at, near = min(t, self.steps - 1) - when, self._nearby(shown.thetas[t, i])
+                answers = np.concatenate([follow(plan, at, each[None]) for each in near])
+                self.thetas += [shown.thetas[t, i], *near]
+                self.inputs += [shown.inputs[t, i], *np.clip(answers, *self.task.limits(near))]
+        gained = float(np.sum((mpc.costs - shown.costs)[better]))
+        return gained / max(float(np.abs(mpc.costs).sum()), 1e-300)
 
-    def _keep(self, theta: Array, u: Array, plan: Plans, at: int) -> None:
+    def _nearby(self, theta: Array) -> Array:
         states, unit = self.task.problem.layout.state, self.twin.units
         near = np.tile(theta, (NEARBY, 1))
         near[:, states] += SPREAD * unit * self.rng.standard_normal(near[:, states].shape)
-        answers = np.concatenate([follow(plan, at, each[None]) for each in near])
-        self.thetas += [theta, *near]
-        self.inputs += [u, *np.clip(answers, *self.task.limits(near))]
+        return near
 
     def teach(self, layer: LawLayer) -> None:
         """Fit a layer to all that was shown."""
@@ -74,66 +88,70 @@ class Teacher:
         fit_layer(layer, self.task.problem, rows, inputs, self.rng, UPDATES)
 
 
-class _Later(Planning):
-    """Plans from a step of each episode on.
+class _Later:
+    """A controller from a step of each episode on.
 
     Parameters
     ----------
-    plant, task, steps, pause
-        As those of `Planning`.
+    controller : callable
+        Acts from there on.
     begins : ndarray of int, shape (k,)
         The steps.
     act : callable
         The policy that acts before.
-    keep : callable
-        Told of each theta, its input, the plan, and its step.
+
+    Attributes
+    ----------
+    plans : list of dict
+        Those of `Planning` at every step.
     """
 
-    def __init__(
-        self,
-        plant: Plant,
-        task: Task,
-        steps: int,
-        begins: NDArray[np.int64],
-        act: Inputs,
-        keep: Keep,
-        pause: int,
-    ) -> None:
-        super().__init__(plant, task, steps, pause)
-        self.begins, self.act, self.keep = begins, controller_of(act), keep
+    def __init__(self, controller: Controller, begins: NDArray[np.int64], act: Inputs) -> None:
+        self.controller, self.begins, self.act = controller, begins, controller_of(act)
+        self.plans: list[dict[int, tuple[int, Plans]]] = []
 
     def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
         """Return the inputs (k, m)."""
         begun = self.begins <= t
         u = self.act(t, theta, running)
         if np.any(running & begun):
-            u = np.where(begun[:, None], super().__call__(t, theta, running & begun), u)
-        for i in np.flatnonzero(running & begun):
-            when, plan = self.plans[i]
-            self.keep(theta[i], u[i], plan, min(t, self.steps - 1) - when)
+            u = np.where(begun[:, None], self.controller(t, theta, running & begun), u)
+        self.plans.append({**getattr(self.controller, "plans", {})})
         return u
 
 
 def imitate(layer: LawLayer, grounds: SimulatorGrounds, seed: int) -> Iterator[int]:
     """Fit a layer to plans of a simulator's episodes, and to their feedback nearby.
 
-    Then the policy plays new ones. From those that it loses, or nearly, it learns more: plans begin
-    where they do, and where it had got to (S. Ross, G. Gordon and D. Bagnell, *A reduction of
-    imitation learning and structured prediction to no-regret online learning*, AISTATS 2011).
-    Yields after each fit.
+    Then the policy plays the trial, and new ones. From the episodes that it loses, or nearly, it
+    learns more: plans begin where they do, and where it had got to (S. Ross, G. Gordon and
+    D. Bagnell, *A reduction of imitation learning and structured prediction to no-regret online
+    learning*, AISTATS 2011). The layer ends with the fit that lost the fewest. Yields after each.
+    Where plans gain less than would be accepted, there is none.
     """
     teacher, problem = Teacher(grounds, seed), grounds.twin.problem
     first = grounds.twin.seeds[: grounds.n_starts]
-    teacher.show(first, np.zeros(len(first), dtype=np.int64), problem.law())
-    for more in range(ROUNDS):
+    if teacher.show(first, np.zeros(len(first), dtype=np.int64), problem.law()) < RULE.least_gain:
+        return
+    fewest, best, failed = np.inf, layer.state_dict(), 0
+    for fit in range(ROUNDS):
         teacher.teach(layer)
-        yield more
-        if more == ROUNDS - 1:
-            return
-        trial, act = grounds.draw(grounds.drawing), actor(layer, problem)
-        lost = trial.lost(trial.play(act))[:HARDEST]
-        if not len(lost):
-            return
-        seeds = [trial.seeds[i] for i in lost]
-        later = teacher.rng.integers(1, np.maximum(2, trial.last.lengths[lost]))
+        yield fit
+        act = actor(layer, problem)
+        lost = [*_lost(grounds, act)]
+        failed = 0 if len(lost) < fewest else failed + 1
+        if len(lost) <= fewest:
+            fewest, best = len(lost), copy.deepcopy(layer.state_dict())
+        if not lost or failed == PATIENCE or fit == ROUNDS - 1:
+            break
+        seeds, lengths = zip(*lost, strict=True)
+        later = teacher.rng.integers(1, np.maximum(2, lengths))
         teacher.show([*seeds, *seeds], np.concatenate([0 * later, later]), act)
+    layer.load_state_dict(best)
+
+
+def _lost(grounds: SimulatorGrounds, act: Inputs) -> Iterator[tuple[int, int]]:
+    """Yield seeds and lengths of episodes that a policy loses, in the trial and in a new one."""
+    for trial in (grounds.trial, grounds.draw(grounds.drawing)):
+        for i in trial.lost(trial.play(act))[:HARDEST]:
+            yield trial.seeds[i], int(trial.last.lengths[i])

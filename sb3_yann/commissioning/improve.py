@@ -244,11 +244,11 @@ def _in_twin(layer: LawLayer, grounds: TwinGrounds, pace: Pace, reidentify: bool
 def _in_simulator(
     layer: LawLayer, grounds: SimulatorGrounds, pace: Pace, progress_bar: bool
 ) -> list[Search]:
-    """Return a search from a layer as it is, and one from plans that it has imitated."""
+    """Return a search from a layer as it is, and one from plans that it imitated, if worth it."""
     taught = copy.deepcopy(layer)
     fits = imitate(taught, grounds, grounds.seed)
-    for _ in track(fits, "imitating plans", ROUNDS, disable=not progress_bar):
-        pass
+    if not [*track(fits, "imitating plans", ROUNDS, disable=not progress_bar)]:
+        return [Search(layer, grounds, pace)]
     slower = replace(pace, learning_rate=REFINED * pace.learning_rate)
     return [Search(layer, grounds, pace), Search(taught, grounds, slower)]
 

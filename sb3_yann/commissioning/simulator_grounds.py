@@ -18,6 +18,8 @@ from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
 
 RULE = AcceptanceRule()
 """When a policy counts as no worse: as a guard has it by default."""
+MORE = 3
+"""How many times as many episodes as a check has must confirm it."""
 
 
 @dataclass
@@ -147,9 +149,10 @@ class SimulatorGrounds(Grounds):
         super().__post_init__()
 
     def draw(self, rng: np.random.Generator) -> SimulatedTrial:
-        """Return a trial on new starts."""
+        """Return a trial on new starts, more of them than the first one has."""
         first = self.next_seed
-        self.next_seed += 2 * self.n_starts
+        times = 1 if first == self.twin.seeds.stop else MORE
+        self.next_seed += 2 * times * self.n_starts
         return SimulatedTrial(self.twin, range(first, self.next_seed))
 
     def draw_pool(self, count: int) -> Array:
