@@ -67,7 +67,8 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    "cloned_policy commissioning export guard headroom policy report simulator tutorial twin".split(),
+    "cloned_policy commissioning export guard headroom policy report".split()
+    + "simulator tutorial twin".split(),
 )
 def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)

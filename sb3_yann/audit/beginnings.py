@@ -20,13 +20,16 @@ BURSTS = 25
 WEIGHTS = 0.1, 10.0
 """Factors of weights of the MPC, for laws that are tried instead of it."""
 
+Law = Callable[[Array], Array]
+
 
 def beginnings(plant: Plant, task: Task, starts: Array, steps: int, rows: Rows) -> list[Policy]:
     """Return the policies whose trajectories plans may begin with; the first one is the MPC.
 
-    Others have inputs on their bounds for a while, then the MPC. The last one is, for each start,
-    the cheapest of some unconstrained laws with other weights: an MPC that leaves a pendulum
-    hanging shows no plan that it can swing. There is none where the MPC is as cheap.
+    Two have inputs on their bounds for a while, then the MPC. The last one is, for each start, the
+    cheapest of these and of unconstrained laws with other weights, after such a push or without: an
+    MPC that leaves a pendulum hanging shows no plan that it can swing. There is none where the MPC
+    is as cheap.
 
     Parameters
     ----------
@@ -39,27 +42,32 @@ def beginnings(plant: Plant, task: Task, starts: Array, steps: int, rows: Rows) 
     rows : ndarray of int, shape (k,)
         Numbers of the starts, as the plant knows them.
     """
-    problem = task.problem
-    law = law_of(problem)
-    bursts = [partial(_burst, law, u, steps // BURSTS) for u in (problem.u_min, problem.u_max)]
+    problem, until = task.problem, steps // BURSTS
+    none = partial(_pushed, problem.u_min, 0)
+    pushes = [none, *(partial(_pushed, u, until) for u in (problem.u_min, problem.u_max))]
+    first = [push(law_of(problem)) for push in pushes]
 
     def played(policy: Policy) -> tuple[Array, Array]:
         thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
         return task.costs(thetas, inputs), inputs
 
-    least, best = played(lambda _, theta: law(theta))
+    least, best = played(first[0])
     cheaper: NDArray[np.bool_] = np.zeros(len(starts), dtype=bool)
-    for K in _gains(problem):
-        costs, inputs = played(lambda _, theta, K=K: theta @ K.T)  # type: ignore[misc]
+    others = [push(partial(_linear, K)) for K in _gains(problem) for push in pushes]
+    for policy in (*first[1:], *others):
+        costs, inputs = played(policy)
         won = costs < least
         best[:, won], least, cheaper = inputs[:, won], np.minimum(costs, least), cheaper | won
-    others: list[Policy] = [lambda t, theta: best[t]] if cheaper.any() else []
-    return [lambda _, theta: law(theta), *bursts, *others]
+    return [*first, lambda t, theta: best[t]] if cheaper.any() else first
 
 
-def _burst(law: Callable[[Array], Array], u: Array, until: int, t: int, theta: Array) -> Array:
-    """Return inputs u (m,) for some steps, those of the law after them."""
-    return np.tile(u, (len(theta), 1)) if t < until else law(theta)
+def _pushed(u: Array, until: int, law: Law) -> Policy:
+    """Return a policy with inputs u (m,) for some steps, those of a law after them."""
+    return lambda t, theta: np.tile(u, (len(theta), 1)) if t < until else law(theta)
+
+
+def _linear(K: Array, theta: Array) -> Array:
+    return theta @ K.T
 
 
 def _gains(problem: LinearMPC) -> Iterator[Array]:

@@ -13,7 +13,7 @@ from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import LinearMPC, Tracking, YannPolicy, improve, offset_free
-from sb3_yann.audit.closed_loops import of_law
+from sb3_yann.audit.closed_loops import Planning, of_law
 from sb3_yann.audit.plants import SimulatedResidual
 from sb3_yann.commissioning import critic, grounds, imitation
 from sb3_yann.commissioning.improve import Improvement
@@ -177,6 +177,48 @@ def test_whatever_plans_teach_nothing_worse_is_accepted(monkeypatch, share) -> N
     model = model_of()
     improve(model, Movable, **FEW)
     assert relative(model).mean() <= 1.0 and relative(model).max() < 1.1
+
+
+def test_plans_that_lose_to_the_mpc_teach_nothing(monkeypatch) -> None:
+    begins = np.array([0, 0, 7])
+    grounds = SimulatorGrounds(SimulatorTwin.of(problem(), Movable), 20, 4, 0)
+    teacher = imitation.Teacher(grounds, 0)
+    assert teacher.show(range(3), begins, problem().law()) > 0
+    rows = 40 + 40 + 33
+    assert len(teacher.thetas) == len(teacher.inputs) == (1 + imitation.NEARBY) * rows
+
+    class Wrong(Planning):
+        def __call__(self, t, theta, running):
+            return 0 * super().__call__(t, theta, running) + 0.8
+
+    monkeypatch.setattr(imitation, "Planning", Wrong)
+    teacher = imitation.Teacher(grounds, 0)
+    assert teacher.show(range(3), begins, problem().law()) == 0.0
+    assert not teacher.thetas
+    layer = copy.deepcopy(model_of().policy.actor.mu)
+    before = copy.deepcopy(layer.state_dict())
+    assert [*imitation.imitate(layer, grounds, 0)] == []
+    assert all(th.equal(before[name], each) for name, each in layer.state_dict().items())
+
+
+def test_the_fit_that_loses_the_fewest_is_kept(monkeypatch) -> None:
+    lost = iter([[(1, 40)] * 3, [(1, 40)], [(1, 40)] * 2, [(1, 40)] * 2])
+    monkeypatch.setattr(imitation, "_lost", lambda grounds, act: next(lost))
+    monkeypatch.setattr(imitation, "ROUNDS", 9)
+    monkeypatch.setattr(imitation, "PATIENCE", 2)
+    fits = []
+
+    def mark(layer, problem, rows, inputs, rng, updates):
+        fits.append(len(rows))
+        with th.no_grad():
+            layer.network.weights()[-1].fill_(len(fits))
+
+    monkeypatch.setattr(imitation, "fit_layer", mark)
+    grounds = SimulatorGrounds(SimulatorTwin.of(problem(), Movable), 20, 4, 0)
+    layer = copy.deepcopy(model_of().policy.actor.mu)
+    assert [*imitation.imitate(layer, grounds, 0)] == [0, 1, 2, 3]
+    assert fits == sorted(set(fits))  # each has learnt more
+    assert (layer.network.weights()[-1] == 2).all()
 
 
 def test_a_violation_more_is_refused() -> None:
@@ -410,7 +452,7 @@ def test_envs_are_made_once_and_closed_in_the_end() -> None:
             closed.append(self)
 
     improve(model_of(), Counted, **(FEW | {"iterations": 2}))
-    assert len(made) <= 46  # forty that play side by side, and a few to look at
+    assert len(made) <= 78  # as many as confirm side by side, and a few to look at
     assert {id(each) for each in made} >= {id(each) for each in closed}
     assert len(closed) >= 40
 
