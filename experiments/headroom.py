@@ -99,6 +99,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "twin of a log of the reactor": partial(twin_of_a_log, 0),
     "twin of another log": partial(twin_of_a_log, 1000),
     "pendulum, Q = diag(1, 0.1)": partial(of_catalog, "pendulum, Q = diag(1, 0.1)"),
+    "pendulum, Q = I": partial(of_catalog, "pendulum, Q = I"),
     "worn tank, set-points": worn_tank,
     "`examples/own_plant.py`": own_plant,
     "`examples/quadrotor.py`": quadrotor,

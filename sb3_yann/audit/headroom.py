@@ -66,8 +66,9 @@ def headroom(
 
     From the same starts are played: the MPC; the MPC with a disturbance observer; an MPC whose
     model is re-identified from the MPC's episodes; and plans, optimized by differential dynamic
-    programming, on which feedback keeps the plant. Plans begin their search at the MPC's runs, and
-    with inputs on their bounds for a while. They know neither noise nor the references to come: a
+    programming, on which feedback keeps the plant. Plans begin their search at the MPC's runs, with
+    inputs on their bounds for a while, and at the cheapest runs of unconstrained laws with other
+    weights. They know neither noise nor the references to come: a
     change makes a new plan. All costs are those of episodes that were played, so the gain can be
     had; more may be there to be found. A part of it needs to know the plant, and none of a
     controller's robustness is in it: take it for a bound of what learning can bring.

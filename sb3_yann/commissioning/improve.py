@@ -134,7 +134,8 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     of the iterations the better one goes on.
 
     In a *simulator* the first search begins at nearly optimal plans, those of :func:`headroom`,
-    which the actor imitates; what it then loses is planned anew, and learnt. The gradient goes
+    which the actor imitates; what it then loses is planned anew, and learnt, until new episodes
+    show no loss or it becomes no less. The gradient goes
     through the simulator's own steps where it can be put into a state and repeats them, else
     through a twin of its episodes. Checks are its own episodes, by the rule that an
     :class:`ImprovementGuard` has by default. Where this search finds nothing, one from the present
@@ -166,7 +167,8 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
         :meth:`YannPolicy.confine_correction`. A simulator knows the plant there too.
     n_starts : int, default 40
         Starts of a check, for each member: so many as the log begins, and as many around. In a
-        simulator each check has twice as many episodes, and so many are planned.
+        simulator so many episodes are planned; a check has twice as many, and six times as many
+        new ones confirm it.
     check_every : int, default 20
         Steps from one check to the next.
     patience : int, default 5
