@@ -88,7 +88,14 @@ def maker(env: Source, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, A
             f"{name} = {env!r} must be a single gymnasium.Env, its id, a function that makes "
             "one, or a PlantTwin."
         )
-    return env
+
+    def made() -> gym.Env[Any, Any]:
+        found = env()
+        if not isinstance(found, gym.Env):
+            raise TypeError(f"{name} = {env!r} made {found!r}. It must return a gymnasium.Env.")
+        return found
+
+    return made
 
 
 def play(
@@ -137,6 +144,31 @@ def play(
     beyond = np.any(Bounds.of(problem).beyond(states[1:], ROOM) != 0, axis=-1)
     violations = np.sum(np.array(told) | beyond, axis=0, where=taken)
     return Loops(costs, violations, lengths, states, played)
+
+
+def require_repeated(
+    problem: LinearMPC, make: Callable[[], gym.Env[Any, Any]], seed: int, cost: float
+) -> None:
+    """Raise unless the MPC's episode from a seed costs the same again.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta the env shows.
+    make : callable
+        Makes an env.
+    seed : int
+        Of the episode.
+    cost : float
+        What it cost; what is not finite is not compared.
+    """
+    again = play(problem, make, [seed], of_law(problem)).costs[0]
+    if np.isfinite(cost) and not np.isclose(again, cost, rtol=1e-6, atol=0):
+        raise ValueError(
+            f"The MPC's episode from the seed {seed} cost {cost:.6g}, then {again:.6g}: the env "
+            "does not repeat it. All that is random must come from reset(seed=...). If it draws "
+            "from numpy's global generator, wrap it in sb3_yann.wrappers.SeededGlobals."
+        )
 
 
 def of_law(problem: LinearMPC) -> Controller:

@@ -24,6 +24,7 @@ from sb3_yann.audit.closed_loops import (
     of_law,
     of_model,
     play,
+    require_repeated,
 )
 from sb3_yann.audit.gains import UNKNOWN, WORTH, Headroom, gain, verdict_of
 from sb3_yann.audit.own_units import require_deviations, showing_theta
@@ -177,12 +178,7 @@ class _Search:
                 "env shows must be finite numbers."
             )
         require_deviations(self.mpc, base.steps()[0])
-        again = play(self.mpc, self.make, self.seeds[:1], of_law(self.mpc)).costs[0]
-        if not np.isclose(again, base.costs[0], rtol=1e-6, atol=0):
-            raise ValueError(
-                f"The MPC's episode from the first seed cost {base.costs[0]:.6g}, then {again:.6g}:"
-                " the env does not repeat it. All that is random must come from reset(seed=...)."
-            )
+        require_repeated(self.mpc, self.make, self.seeds[0], base.costs[0])
 
     def observe(self) -> None:
         """Play the same MPC with an observer, unless it has one or measures disturbances."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import product
 from typing import Any, Protocol
@@ -112,13 +113,20 @@ class SimulatedPlant:
         """Return the state (n,) of theta one step later."""
         return self.simulator.next_state(x + self.put, u) - self.got
 
+    def after_if_any(self, x: Array, u: Array) -> Array:
+        """Return the same, NaN where the simulator cannot go on from there."""
+        if np.isfinite(x).all():
+            with suppress(Exception):  # whatever an env raises in a state that it cannot be in
+                return self.after(x, u)
+        return np.full(len(x), np.nan)
+
     def step(self, theta: Array, u: Array, rows: Rows) -> Array:
-        """Return the next theta (k, n_theta)."""
+        """Return the next theta (k, n_theta); NaN where the simulator cannot go on."""
         A, B = self.problem.prediction
         following = theta @ A.T + u @ B.T
         states = self.problem.layout.state
         for i, x in enumerate(theta[:, states]):
-            following[i, states] = self.after(x, u[i])
+            following[i, states] = self.after_if_any(x, u[i])
         return np.asarray(following)
 
     def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
@@ -133,14 +141,13 @@ class SimulatedPlant:
     def slopes(self, points: Array) -> Array:
         """Return the derivatives (..., n, n + m) at points ``[x, u]``, shape (..., n + m).
 
-        They are forward differences; one that is known of nearby holds.
+        They are forward differences; one that is known of nearby holds. Where there is none, 0.
         """
         problem, n = self.problem, self.problem.model.n_states
         unit = np.concatenate([problem.theta_half[:n], problem.u_half])
-        cells = np.round(points / (CELL * unit)).astype(np.int64)
-        found = np.empty((*points.shape[:-1], n, len(unit)))
-        for at in np.ndindex(points.shape[:-1]):
-            key = cells[at].tobytes()
+        found = np.zeros((*points.shape[:-1], n, len(unit)))
+        for at in zip(*np.nonzero(np.isfinite(points).all(axis=-1)), strict=True):
+            key = np.round(points[at] / (CELL * unit)).tobytes()
             if key not in self._known:
                 if len(self._known) >= KNOWN:
                     self._known.clear()
@@ -153,13 +160,13 @@ class SimulatedPlant:
         n = self.problem.model.n_states
         limit = np.concatenate([np.full(n, np.inf), self.problem.u_max])
         steps = np.where(point + STEP * unit < limit, STEP, -STEP) * unit
-        base = self.after(point[:n], point[n:])
+        base = self.after_if_any(point[:n], point[n:])
         J: Array = np.empty((n, len(unit)))
         for i, moved in enumerate(point + np.diag(steps)):
             taken = steps[i]
             if i >= n:  # in the precision of the action space
                 taken = (self.simulator.actual(moved[n:]) - self.simulator.actual(point[n:]))[i - n]
-            J[:, i] = (self.after(moved[:n], moved[n:]) - base) / taken
+            J[:, i] = (self.after_if_any(moved[:n], moved[n:]) - base) / taken
         return np.nan_to_num(J, posinf=0.0, neginf=0.0)
 
 
@@ -226,10 +233,7 @@ class SimulatedResidual:
 
     def _after(self, point: Array) -> Array:
         x, u = point[: self.n], point[self.n :]
-        try:
-            found = self.plant.after(x, u)
-        except Exception:  # whatever an env raises that cannot go on from this state
-            return x
+        found = self.plant.after_if_any(x, u)
         return np.where(np.isfinite(found), found, x)
 
     def jacobian(self, z: Array) -> Array:

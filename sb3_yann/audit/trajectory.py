@@ -147,7 +147,9 @@ def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) ->
     plans = Plans(*(each.copy() for each in vars(plans).values()))
     k = len(rows)
     damping: Array = np.zeros(k)
-    active: Rows = np.arange(k)
+    active: Rows = np.flatnonzero(np.isfinite(plans.costs))
+    if not len(active):
+        return plans
     failed: Rows = np.zeros(k, dtype=np.intp)
     for _ in range(rounds):
         old = plans.of(active)

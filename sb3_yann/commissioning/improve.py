@@ -77,8 +77,10 @@ class Improvement:
         """Why nothing was accepted; empty where something was."""
         if self.accepted:
             return ""
-        gain = f"a gain of {100 * abs(self.change):.2g} %" if self.change < 0 else "no gain"
-        last = self.checks[-1].reason or f"{gain} in {self.where} is too small, or not sure"
+        small = (
+            f"a gain of {100 * abs(self.change):.2g} % in {self.where} is too small, or not sure"
+        )
+        last = self.checks[-1].reason or (small if self.change < 0 else f"no gain in {self.where}")
         return f"Nothing better was found: {last}."
 
     def report(self) -> str:

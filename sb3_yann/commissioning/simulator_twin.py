@@ -12,7 +12,15 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.closed_loops import Controller, Excited, Loops, maker, of_law, play
+from sb3_yann.audit.closed_loops import (
+    Controller,
+    Excited,
+    Loops,
+    maker,
+    of_law,
+    play,
+    require_repeated,
+)
 from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import simulated_dynamics
 from sb3_yann.control import LinearMPC
@@ -104,6 +112,7 @@ class SimulatorTwin:
         seeds = range(first, first + LOGGED)
         loops = play(problem, kept, seeds, of_law(problem))
         require_deviations(problem, loops.steps()[0])
+        require_repeated(problem, kept, first, loops.costs[0])
         logged = _usable(loops)
         if not logged:
             raise ValueError(

@@ -232,6 +232,34 @@ def test_a_twin_that_cannot_be_trusted_is_refused() -> None:
         headroom(mpc, twin)
 
 
+@pytest.mark.parametrize("fails", ["raises", "is nan"])
+def test_a_simulator_may_fail_where_no_plan_should_go(fails) -> None:
+    class Movable(Heater):
+        limit, failed = np.inf, 0
+
+        def reset(self, *, seed=None, options=None):
+            found = super().reset(seed=seed)
+            if options:
+                self.theta[0] = options["state"][0]
+            return found[0], {"state": self.theta[:1].copy()}
+
+        def step(self, action):
+            if abs(self.theta[0]) > self.limit:
+                type(self).failed += 1
+                if fails == "raises":
+                    raise RuntimeError("beyond what the equations are for")
+                self.theta[0] = np.nan
+            *rest, info = super().step(action)
+            return *rest, {**info, "state": self.theta[:1].copy()}
+
+    class Fragile(Movable):
+        limit = 1.3
+
+    healthy, found = (headroom(heater(), make(bend=0.1), n_starts=3) for make in (Movable, Fragile))
+    assert Fragile.failed
+    np.testing.assert_allclose(found.best_costs, healthy.best_costs, rtol=1e-3)
+
+
 def test_what_it_cannot_use_is_named() -> None:
     with pytest.raises(ValueError, match=r"The env shows \(4,\).*Deviations"):
         headroom(heater(), "CSTR-v0")

@@ -387,9 +387,21 @@ class Broken(Movable):
         return np.full(2, np.nan, np.float32), -1.0, False, self.t >= 9, {"state": self.x}
 
 
+class Unseeded(Movable):
+    """Draws its starts from elsewhere."""
+
+    def reset(self, *, seed=None, options=None):
+        found = super().reset(seed=seed, options=options)
+        if options:
+            return found
+        self.x = np.random.default_rng().uniform(-1, 1, 2)
+        return self.x.astype(np.float32), {"state": self.x.copy()}
+
+
 @pytest.mark.parametrize(
     ("make", "what"),
     [
+        (Unseeded, r"the env does not repeat it.*wrap it in sb3_yann.wrappers.SeededGlobals"),
         (Short, r"None of 40 episodes of the MPC in the simulator has 5 steps that are all finite"),
         (Broken, r"None of 40 episodes of the MPC in the simulator has 5 steps that are all finit"),
         (Strange, r"The simulator shows \(3,\) and takes \(1,\); theta of the model's problem has"),
@@ -406,6 +418,8 @@ def test_a_simulator_that_will_not_do_is_named(make, what) -> None:
 def test_a_vector_env_is_no_simulator() -> None:
     with pytest.raises(TypeError, match="or a function that makes one"):
         improve(model_of(), [Movable(), Movable()])
+    with pytest.raises(TypeError, match=r"made None. It must return a gymnasium.Env"):
+        improve(model_of(), lambda: None)
 
 
 class Rare(Movable):
@@ -455,6 +469,12 @@ def test_envs_are_made_once_and_closed_in_the_end() -> None:
     assert len(made) <= 78  # as many as confirm side by side, and a few to look at
     assert {id(each) for each in made} >= {id(each) for each in closed}
     assert len(closed) >= 40
+
+
+def test_a_report_says_where_there_is_no_gain() -> None:
+    check = Check(20, True, "", 0.0, 0.0, True, 0.0, 0.0)
+    found = Improvement((check,), 0.0, False, where="the simulator")
+    assert found.reason == "Nothing better was found: no gain in the simulator."
 
 
 def test_a_report_says_what_an_episode_gains() -> None:
