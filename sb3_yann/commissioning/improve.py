@@ -77,10 +77,10 @@ class Improvement:
         """Why nothing was accepted; empty where something was."""
         if self.accepted:
             return ""
-        small = (
-            f"a gain of {100 * abs(self.change):.2g} % in {self.where} is too small, or not sure"
-        )
-        last = self.checks[-1].reason or (small if self.change < 0 else f"no gain in {self.where}")
+        passed = (each for each in self.checks if each.accepted and each is not self.before)
+        best = min((each.change for each in passed), default=0.0)
+        small = f"a gain of {-100 * best:.2g} % in {self.where} is too small, or not sure"
+        last = small if best < 0 else self.checks[-1].reason or f"no gain in {self.where}"
         return f"Nothing better was found: {last}."
 
     def report(self) -> str:

@@ -475,6 +475,10 @@ def test_a_report_says_where_there_is_no_gain() -> None:
     check = Check(20, True, "", 0.0, 0.0, True, 0.0, 0.0)
     found = Improvement((check,), 0.0, False, where="the simulator")
     assert found.reason == "Nothing better was found: no gain in the simulator."
+    small = (Check(20, True, "", -4e-4, 0.0, True, 0.0, 0.0), Check(40, False, "no", 0.0, 0, True))
+    assert "a gain of 0.04 % in the simulator is too small" in str(
+        Improvement(small, 0.0, False, where="the simulator")
+    )
 
 
 def test_a_report_says_what_an_episode_gains() -> None:
