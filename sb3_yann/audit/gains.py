@@ -18,8 +18,8 @@ ADVICE = {
     "add ObserveDisturbance first": f"that brings most of it: {CURE}",
     "re-identify": "a linear model of the plant as it is brings most of it: see "
     "LinearModel.from_data, PlantTwin.reidentified, improve(model, twin).",
-    "learn": "most of it is beyond a linear model: improve(model, twin), or DDPG under an "
-    "ImprovementGuard.",
+    "learn": "most of it is beyond a linear model: improve(model, simulator or twin), or DDPG "
+    "under an ImprovementGuard.",
 }
 UNKNOWN = "not known"
 """The verdict where what was found may be chance, and where nothing was found in a poor twin."""
