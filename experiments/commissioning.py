@@ -19,6 +19,7 @@ import numpy as np
 import torch as th
 from stable_baselines3 import DDPG
 
+from experiments.markdown import spread
 from experiments.optimum import cstr_optimum
 from experiments.twin import NOISE, STARTS
 from sb3_yann import Commissioning
@@ -113,11 +114,9 @@ def row(case: str, outcomes: list[Outcome], possible: float) -> str:
     """Return a case's row of the table."""
     change, worst, excess, violations, alarms, strange = map(np.array, zip(*outcomes, strict=True))
     closed = 100 * change / possible
-    spread = f"{np.median(change):+.2f} ({change.min():+.2f} to {change.max():+.2f})"
-    gap = f"{np.median(closed):.0f} ({closed.min():.0f} to {closed.max():.0f})"
-    costs = f"{np.median(excess):+.2f} ({excess.min():+.2f} to {excess.max():+.2f})"
     counts = f"{violations.sum()}", f"{alarms.sum()}", f"{strange.sum()}"
-    parts = (case, spread, gap, f"{np.sum(closed >= 85)}", f"{worst.max():+.2f}", costs, *counts)
+    gap, close = spread(closed, 0, ""), f"{np.sum(closed >= 85)}"
+    parts = case, spread(change), gap, close, f"{worst.max():+.2f}", spread(excess), *counts
     return " | ".join(("", *parts, "")).strip()
 
 

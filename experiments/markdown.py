@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
@@ -30,3 +31,10 @@ def number(value: float | None, digits: int = 2, sign: str = "") -> str:
     if not np.isfinite(value) or abs(value) >= 1e5:
         return f"{value:{sign}.2e}"
     return f"{round(value, digits) + 0.0:{sign},.{digits}f}"
+
+
+def spread(values: Sequence[float] | NDArray[np.float64], digits: int = 2, sign: str = "+") -> str:
+    """Return the median and the range for a cell."""
+    figures = np.median(values), np.min(values), np.max(values)
+    middle, low, high = (number(float(each), digits, sign) for each in figures)
+    return f"{middle} ({low} to {high})"

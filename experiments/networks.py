@@ -11,9 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from experiments import catalog
+from experiments.markdown import spread
 from experiments.measures import OURS
 from experiments.runner import Outcome, Run, run_all
 
@@ -35,7 +34,8 @@ def rows(plant: str, mpc: Outcome, runs: dict[str, list[Outcome]]) -> list[str]:
         )
         violations = sum(int(run.training_violations.sum()) for run in found)
         violations += sum(int(run.test_violations[-1].sum()) for run in found)
-        measured = spread(costs), f"{worst:+.2f}", spread(steps), spread(variations)
+        cost, step, variation = (spread(each, sign="") for each in (costs, steps, variations))
+        measured = cost, f"{worst:+.2f}", step, variation
         lines.append(f"|  | {form} | {' | '.join(measured)} | {violations} | {len(found)} |")
     return lines
 
@@ -48,11 +48,6 @@ def step_ratio(run: Outcome, mpc: Outcome) -> float:
 def variation_ratio(run: Outcome, mpc: Outcome) -> float:
     """Return how far the input moves in all test episodes together, over the same of the MPC."""
     return float(run.extra["variation"].sum() / mpc.extra["variation"].sum())
-
-
-def spread(values: Sequence[float]) -> str:
-    """Return the median and the range."""
-    return f"{np.median(values):.2f} ({min(values):.2f} to {max(values):.2f})"
 
 
 def main(seeds: Sequence[int] = SEEDS) -> None:

@@ -1,6 +1,6 @@
 """What `improve` makes of a simulator: `python -m experiments.simulator`, two hours of one core.
 
-Three seeds on each plant, fifty episodes that nothing has seen, beside what `headroom` finds on the
+Five seeds on each plant, fifty episodes that nothing has seen, beside what `headroom` finds on the
 same fifty. Nothing was set for any plant. Writes the table of docs/simulator.md; with names of
 plants it does their runs. PC-Gym's plants are among them where it is installed.
 """
@@ -21,7 +21,7 @@ from stable_baselines3 import DDPG
 
 from experiments import FINGERPRINT, tank_disturbed
 from experiments import headroom as plants
-from experiments.markdown import number, table
+from experiments.markdown import number, spread, table
 from experiments.runner import Outcome, Run, load_all, run_all
 from experiments.strangers import STRANGERS
 from experiments.strangers import case as stranger
@@ -32,7 +32,7 @@ from sb3_yann.audit.own_units import showing_theta
 from sb3_yann.evaluation.episodes import Source
 from sb3_yann.twin.gradient import actor
 
-SEEDS, TESTS = range(40, 43), range(2000, 2050)
+SEEDS, TESTS = range(40, 45), range(2000, 2050)
 OURS, PLANS = "improve in a simulator", "headroom"
 HEADER = (
     "plant", "MPC", "headroom, %", "`improve`, %", "of the headroom, %", "worst episode, %",
@@ -136,16 +136,11 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[list[str]]:
         if plans is not None:
             best = 100 * (plans.test_costs[1].mean() / plans.test_costs[0].mean() - 1)
             total = number(best)
-            share = spread(100 * change / best, ".0f") if best < -0.5 else ""
+            share = spread(100 * change / best, 0, "") if best < -0.5 else ""
         seconds = f"{np.median([each.seconds for each in ours]):.0f}"
-        cells = number(base.mean()), total, spread(change, "+.2f"), share, f"{worst:+.2f}"
+        cells = number(base.mean()), total, spread(change), share, f"{worst:+.2f}"
         found.append([name, *cells, f"{accepted} of {len(ours)}", f"{more}", seconds])
     return found
-
-
-def spread(values: np.ndarray, form: str) -> str:
-    """Return the median and the range."""
-    return f"{np.median(values):{form}} ({values.min():{form}} to {values.max():{form}})"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -18,7 +18,7 @@ import torch as th
 from stable_baselines3 import DDPG
 
 from experiments import headroom as plants
-from experiments.markdown import number, table
+from experiments.markdown import number, spread, table
 from sb3_yann import DisturbanceObserver, LinearMPC, PlantTwin, headroom, improve, offset_free
 from sb3_yann._validation import Array
 from sb3_yann.evaluation import evaluate
@@ -84,15 +84,11 @@ def rows(name: str, case: Case) -> list[list[str]]:
         share = -change / best.total
         worst = max(100 * (costs - base).max() / base.mean() for _, costs in outcomes)
         accepted = sum(accepted for accepted, _ in outcomes)
-        figures = number(base.mean()), number(-100 * best.total), _spread(change, "+.2f")
-        shown = _spread(share, ".0f"), f"{worst:+.2f}", f"{accepted} of {len(outcomes)}"
+        figures = number(base.mean()), number(-100 * best.total), spread(change)
+        shown = spread(share, 0, ""), f"{worst:+.2f}", f"{accepted} of {len(outcomes)}"
         found.append([name, f"{episodes}", *figures, *shown])
         print(*found[-1], sep=" | ", flush=True)
     return found
-
-
-def _spread(values: Array, form: str) -> str:
-    return f"{np.median(values):{form}} ({values.min():{form}} to {values.max():{form}})"
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from stable_baselines3 import DDPG
 
 from experiments import FINGERPRINT
-from experiments.markdown import table
+from experiments.markdown import spread, table
 from experiments.measures import MPC, OPTIMUM
 from experiments.optimum import cstr_optimum
 from experiments.pictures import save_from_a_log
@@ -124,16 +124,12 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
             np.array([100 * (each.extra[name].mean() / mpc - 1) for each in of])
             for name in ("unconfined", "reidentified")
         )
-        spreads = [
-            f"{np.median(each):+.2f} ({each.min():+.2f} to {each.max():+.2f})"
-            for each in (change, free, linear)
-        ]
         worst_free = max((each.extra["unconfined"] - base).max() for each in of)
         seconds = [each.seconds for each in of if each.extra["trusted"]]
         found.append((
             case,
             f"{len(seconds)} of {len(of)}",
-            *spreads,
+            *map(spread, (change, free, linear)),
             f"{100 * np.median(change) / best + 0.0:.0f}",
             f"{np.sum(change < -1.9)}",
             f"{more[case].max():+.2f}",

@@ -14,7 +14,7 @@ import experiments
 from experiments import twin
 from experiments.__main__ import main
 from experiments.criteria import criteria
-from experiments.markdown import number, table
+from experiments.markdown import number, spread, table
 from experiments.measures import OURS, interval_of, standing
 from experiments.pictures import _cut_above, save_in_short
 from experiments.published import paper_table
@@ -185,6 +185,8 @@ def test_numbers_and_tables() -> None:
     cells = [number(None), number(-0.001), number(12345.678), number(2.5e5), number(1.0, 1, "+")]
     assert cells == ["—", "0.00", "12,345.68", "2.50e+05", "+1.0"]
     assert table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
+    assert spread([10, -10.0, 4]) == "+4.00 (-10.00 to +10.00)"
+    assert spread([-1e-9, 0.0, -0.4], 0, "") == "0 (0 to 0)"  # never -0
 
 
 def test_the_report_is_whole(tmp_path) -> None:
