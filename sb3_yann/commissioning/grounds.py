@@ -29,20 +29,24 @@ Valued = tuple[Array, Array]
 """Starts (rows, n_theta), and costs (rows,)."""
 
 
-class Paired(Protocol):
+class Compared(Protocol):
     """Starts from which policies are compared with the MPC."""
 
     mpc: Outcome
-
-    @property
-    def mean(self) -> float:
-        """The MPC's mean cost."""
 
     def play(self, act: Inputs) -> Outcome:
         """Return what comes of a policy."""
 
     def check(self, iteration: int, played: Outcome, accepted: Outcome) -> Check:
         """Compare a policy with the accepted one and the MPC, by what came of them."""
+
+
+class Paired(Compared, Protocol):
+    """Starts that tell a search as well what it loses."""
+
+    @property
+    def mean(self) -> float:
+        """The MPC's mean cost."""
 
     def second_objection(self, act: Inputs) -> str:
         """Return what else speaks against a policy; empty where nothing."""
@@ -97,6 +101,10 @@ class Grounds(ABC):
     @abstractmethod
     def draw(self, rng: np.random.Generator) -> Paired:
         """Return a trial on new starts."""
+
+    def draw_final(self) -> Compared | None:
+        """Return the trial that decides in the end; None where every check has decided."""
+        return None
 
     @abstractmethod
     def draw_pool(self, count: int) -> Array:

@@ -15,7 +15,7 @@ from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.audit.trajectory import Plans, follow
 from sb3_yann.commissioning.distillation import fit_layer
 from sb3_yann.commissioning.grounds import value_at_end
-from sb3_yann.commissioning.simulator_grounds import RULE, SimulatorGrounds, controller_of
+from sb3_yann.commissioning.simulator_grounds import FINAL, RULE, SimulatorGrounds, controller_of
 from sb3_yann.commissioning.trial import Inputs
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.gradient import actor
@@ -26,7 +26,7 @@ NEARBY, SPREAD = 3, 0.1
 """States beside each of a plan that its feedback answers; how far, in standard deviations of the
 logged states."""
 ROUNDS, PATIENCE, HARDEST = 14, 5, 20
-"""Fits, at most; fits in a row that lose no fewer episodes than one before, at most; lost episodes
+"""Fits, at most; fits in a row that lose no smaller share than one before, at most; lost episodes
 of a trial of which the next fit learns."""
 
 
@@ -126,22 +126,22 @@ def imitate(layer: LawLayer, grounds: SimulatorGrounds, seed: int) -> Iterator[i
     Then the policy plays the trial, and new ones. From the episodes that it loses, or nearly, it
     learns more: plans begin where they do, and where it had got to (S. Ross, G. Gordon and
     D. Bagnell, *A reduction of imitation learning and structured prediction to no-regret online
-    learning*, AISTATS 2011). The layer ends with the fit that lost the fewest. Yields after each.
+    learning*, AISTATS 2011). The layer ends with the fit that lost the least. Yields after each.
     Where plans gain less than would be accepted, there is none.
     """
     teacher, problem = Teacher(grounds, seed), grounds.twin.problem
     first = grounds.twin.seeds[: grounds.n_starts]
     if teacher.show(first, np.zeros(len(first), dtype=np.int64), problem.law()) < RULE.least_gain:
         return
-    fewest, best, failed = np.inf, layer.state_dict(), 0
+    smallest, best, failed = np.inf, layer.state_dict(), 0
     for fit in range(ROUNDS):
         teacher.teach(layer)
         yield fit
         act = actor(layer, problem)
-        lost = [*_lost(grounds, act)]
-        failed = 0 if len(lost) < fewest else failed + 1
-        if len(lost) <= fewest:
-            fewest, best = len(lost), copy.deepcopy(layer.state_dict())
+        lost, share = _lost(grounds, act)
+        failed = 0 if share < smallest else failed + 1
+        if share <= smallest:
+            smallest, best = share, copy.deepcopy(layer.state_dict())
         if not lost or failed == PATIENCE or fit == ROUNDS - 1:
             break
         seeds, lengths = zip(*lost, strict=True)
@@ -150,8 +150,19 @@ def imitate(layer: LawLayer, grounds: SimulatorGrounds, seed: int) -> Iterator[i
     layer.load_state_dict(best)
 
 
-def _lost(grounds: SimulatorGrounds, act: Inputs) -> Iterator[tuple[int, int]]:
-    """Yield seeds and lengths of episodes that a policy loses, in the trial and in a new one."""
-    for trial in (grounds.trial, grounds.draw(grounds.drawing)):
-        for i in trial.lost(trial.play(act))[:HARDEST]:
-            yield trial.seeds[i], int(trial.last.lengths[i])
+def _lost(grounds: SimulatorGrounds, act: Inputs) -> tuple[list[tuple[int, int]], float]:
+    """Return seeds and lengths of episodes that a policy loses, and the share of all that it lost.
+
+    It plays the trial and a new one; where it loses nothing there, so many more new ones as decide
+    in the end, until it does.
+    """
+    found: list[tuple[int, int]] = []
+    lost = played = 0
+    for number in range(2 + FINAL):
+        trial = grounds.draw(grounds.drawing) if number else grounds.trial
+        numbers = trial.lost(trial.play(act))
+        lost, played = lost + len(numbers), played + len(trial.seeds)
+        found += [(trial.seeds[i], int(trial.last.lengths[i])) for i in numbers[:HARDEST]]
+        if number and lost:
+            break
+    return found, lost / played

@@ -18,7 +18,7 @@ from sb3_yann.commissioning.distillation import distill
 from sb3_yann.commissioning.grounds import TwinGrounds
 from sb3_yann.commissioning.imitation import ROUNDS, imitate
 from sb3_yann.commissioning.incumbent import all_or_nothing
-from sb3_yann.commissioning.search import Pace, Search
+from sb3_yann.commissioning.search import Pace, Search, decisive
 from sb3_yann.commissioning.simulator_grounds import RULE, SimulatorGrounds
 from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.trial import Check
@@ -77,7 +77,8 @@ class Improvement:
         """Why nothing was accepted; empty where something was."""
         if self.accepted:
             return ""
-        passed = (each for each in self.checks if each.accepted and each is not self.before)
+        found = decisive(self.checks)
+        passed = (each for each in found if each.accepted and each is not self.before)
         best = min((each.change for each in passed), default=0.0)
         small = f"a gain of {-100 * best:.2g} % in {self.where} is too small, or not sure"
         last = small if best < 0 else self.checks[-1].reason or f"no gain in {self.where}"
@@ -316,8 +317,8 @@ def least_gain(trust: Trust) -> float:
 def _race(searches: list[Search], leg: int, least: float) -> Iterator[int]:
     """Yield after each gradient step: of all searches in the first leg, then of the best one.
 
-    The others follow where that finds nothing worth a change. Of two that are as good, the one
-    that begins elsewhere goes first, where there is no leg.
+    The others follow where that finds nothing worth a change, or loses the final trial. Of two that
+    are as good, the one that begins elsewhere goes first, where there is no leg.
     """
     if len(searches) > 1:
         for each in searches:
@@ -325,5 +326,5 @@ def _race(searches: list[Search], leg: int, least: float) -> Iterator[int]:
     order = searches if leg else [*reversed(searches)]
     for each in sorted(order, key=lambda each: each.change):
         yield from each.steps(each.pace.iterations)
-        if each.gains(least):
+        if each.confirm(least):
             break

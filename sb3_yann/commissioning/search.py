@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -78,8 +78,7 @@ class Search:
         self.iteration = self.refused = 0
         self.checks: list[Check] = []
         if not layer.network.is_zero():  # what has been learnt before must pass here as well
-            last = [key for key in self.accepted if key.startswith("network.rest.")][-1]
-            self.accepted[last].zero_()  # the MPC
+            self.accepted = _without_correction(self.accepted)
             self._check()
 
     def steps(self, until: int) -> Iterator[int]:
@@ -108,11 +107,33 @@ class Search:
     @property
     def best(self) -> Check | None:
         """The check of the accepted weights; None where none are."""
-        return next((each for each in reversed(self.checks) if each.accepted), None)
+        return next((each for each in reversed(decisive(self.checks)) if each.accepted), None)
 
     def gains(self, least: float) -> bool:
         """Return whether the accepted weights gain so much, and surely something."""
         return self.best is not None and self.best.gains(least)
+
+    def confirm(self, least: float) -> bool:
+        """Return whether the accepted weights gain so much in the final trial, if there is one.
+
+        Where they do not, half and a quarter of their correction are tried.
+        """
+        if not self.gains(least):
+            return False
+        final = self.grounds.draw_final()
+        if final is None:
+            return True
+        whole, mpc = self.accepted, _without_correction(self.accepted)
+        for share in RETREATS:
+            self.accepted = _between(mpc, whole, share)
+            self.layer.load_state_dict(self.accepted)
+            played = final.play(actor(self.layer, self.grounds.twin.problem))
+            found = final.check(self.iteration, played, final.mpc)
+            reason = found.reason and f"in the final trial, {found.reason}"
+            self.checks.append(replace(found, reason=reason, final=True))
+            if found.accepted and found.gains(least):
+                return True
+        return False
 
     def _check(self) -> bool:
         """Check the present actor, else what lies between it and the accepted one."""
@@ -178,6 +199,17 @@ class Search:
         starts = np.array([[*rows, *pool[0][: most - len(rows)]] for rows, pool in filled])
         costs = self.grounds.costs_of_mpc(starts) if most else np.empty((len(hard), 0))
         self.hard = [(rows, known[: len(rows)]) for rows, known in zip(hard, costs, strict=True)]
+
+
+def decisive(checks: Sequence[Check]) -> Sequence[Check]:
+    """Return the checks of the final trial; all of them where there was none."""
+    return [each for each in checks if each.final] or checks
+
+
+def _without_correction(weights: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
+    """Return the weights of the MPC: a part of the way from them is a part of the correction."""
+    last = [key for key in weights if key.startswith("network.rest.")][-1]
+    return weights | {last: th.zeros_like(weights[last])}
 
 
 def _finite(gradient: th.Tensor) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,10 +20,51 @@ RULE = AcceptanceRule()
 """When a policy counts as no worse: as a guard has it by default."""
 MORE = 3
 """How many times as many episodes as a check has must confirm it."""
+FINAL = 12
+"""How many confirmations together decide in the end. If none of 2,880 episodes is lost, less than
+one in 960 is, with a confidence of 95 %."""
 
 
 @dataclass
-class SimulatedTrial:
+class Comparison:
+    """Episodes of a simulator in which policies are compared with the MPC.
+
+    Attributes
+    ----------
+    mpc : tuple of ndarray
+        What came of the MPC.
+    """
+
+    mpc: Outcome = field(init=False)
+
+    @property
+    def mean(self) -> float:
+        """The MPC's mean cost."""
+        return max(float(np.abs(self.mpc[0]).mean()), 1e-300)
+
+    @property
+    def tolerance(self) -> Tolerance:
+        """What episodes may cost more than with the MPC."""
+        typical = float(np.median(np.abs(self.mpc[0])))
+        return Tolerance(RULE.margin * typical, RULE.tail, typical)
+
+    def check(self, iteration: int, played: Outcome, accepted: Outcome) -> Check:
+        """Compare a policy with the accepted one and the MPC, by what came of them."""
+        costs, unsafe = played
+        allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
+        paired = PairedEpisodes(self.mpc[0], accepted[0], allowed, self.tolerance)
+        reason, excess = paired.objection(costs, unsafe), costs - self.mpc[0]
+        # Where a few episodes cost a thousand times as much as most, their mean is never sure.
+        own = np.maximum(np.abs(self.mpc[0]), self.tolerance.typical)
+        each = excess / np.where(own > 0, own, 1.0)
+        error = each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else 0.0
+        change, worst = float(excess.mean() / self.mean), float(excess.max() / self.mean)
+        safe, logged = not np.any(unsafe > allowed), float(each.mean())
+        return Check(iteration, not reason, reason, change, worst, safe, logged, float(error))
+
+
+@dataclass
+class SimulatedTrial(Comparison):
     """Episodes of a simulator, and what came of the MPC there.
 
     Attributes
@@ -37,7 +78,6 @@ class SimulatedTrial:
     seeds: Sequence[int]
     base: Loops = field(init=False)
     last: Loops = field(init=False)
-    mpc: Outcome = field(init=False)
 
     def __post_init__(self) -> None:
         given, law = self.seeds, of_law(self.twin.problem)
@@ -54,17 +94,6 @@ class SimulatedTrial:
         self.last = self.base
         self.mpc = self._outcome(self.base)
 
-    @property
-    def mean(self) -> float:
-        """The MPC's mean cost."""
-        return max(float(np.abs(self.mpc[0]).mean()), 1e-300)
-
-    @property
-    def tolerance(self) -> Tolerance:
-        """What episodes may cost more than with the MPC."""
-        typical = float(np.median(np.abs(self.mpc[0])))
-        return Tolerance(RULE.margin * typical, RULE.tail, typical)
-
     def play(self, act: Inputs) -> Outcome:
         """Return what comes of a policy."""
         self.last = self.twin.play(controller_of(act), self.seeds)
@@ -74,20 +103,6 @@ class SimulatedTrial:
         short = self.base.lengths.max() - loops.lengths
         columns = loops.violations, short, ~np.isfinite(loops.costs), 0 * short
         return loops.costs, np.column_stack(columns).astype(np.int64)
-
-    def check(self, iteration: int, played: Outcome, accepted: Outcome) -> Check:
-        """Compare a policy with the accepted one and the MPC, by what came of them."""
-        costs, unsafe = played
-        allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
-        paired = PairedEpisodes(self.mpc[0], accepted[0], allowed, self.tolerance)
-        reason, excess = paired.objection(costs, unsafe), costs - self.mpc[0]
-        # Where a few episodes cost a thousand times as much as most, their mean is never sure.
-        own = np.maximum(np.abs(self.mpc[0]), self.tolerance.typical)
-        each = excess / np.where(own > 0, own, 1.0)
-        error = each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else 0.0
-        change, worst = excess.mean() / self.mean, excess.max() / self.mean
-        safe, shown = not np.any(unsafe > allowed), map(float, (each.mean(), error))
-        return Check(iteration, not reason, reason, float(change), float(worst), safe, *shown)
 
     def second_objection(self, act: Inputs) -> str:
         """Return nothing: the simulator has spoken."""
@@ -114,6 +129,31 @@ class SimulatedTrial:
             later = np.flatnonzero(new) + 1 if row.observer is None else np.empty(0, np.intp)
             found.append(rows[[0, *later]])
         return [np.concatenate(found)]
+
+
+@dataclass
+class FinalTrial(Comparison):
+    """The episodes that decide in the end, some hundred of them side by side.
+
+    Attributes
+    ----------
+    blocks : sequence of SimulatedTrial
+        What is played at a time.
+    """
+
+    blocks: Sequence[SimulatedTrial]
+
+    def __post_init__(self) -> None:
+        self.mpc = _joined(each.mpc for each in self.blocks)
+
+    def play(self, act: Inputs) -> Outcome:
+        """Return what comes of a policy."""
+        return _joined(each.play(act) for each in self.blocks)
+
+
+def _joined(outcomes: Iterable[Outcome]) -> Outcome:
+    costs, unsafe = zip(*outcomes, strict=True)
+    return np.concatenate(costs), np.concatenate(unsafe)
 
 
 def controller_of(act: Inputs) -> Controller:
@@ -154,6 +194,10 @@ class SimulatorGrounds(Grounds):
         times = 1 if first == self.twin.seeds.stop else MORE
         self.next_seed += 2 * times * self.n_starts
         return SimulatedTrial(self.twin, range(first, self.next_seed))
+
+    def draw_final(self) -> FinalTrial:
+        """Return the episodes that decide in the end, new ones."""
+        return FinalTrial([self.draw(self.drawing) for _ in range(FINAL)])
 
     def draw_pool(self, count: int) -> Array:
         """Return rows (count, size): beginnings of the MPC's episodes, and what comes later."""

@@ -55,6 +55,8 @@ class Check:
         Mean cost against the MPC's of the episodes that go on as those of the log, and its standard
         error: over the logged episodes, and over the members. In a simulator: what an episode costs
         against the MPC's on average, relative to its own cost, and the standard error of that.
+    final : bool
+        Whether it decided in the end.
     """
 
     iteration: int
@@ -65,6 +67,7 @@ class Check:
     safe: bool
     logged: float = 0.0
     error: float = 0.0
+    final: bool = False
 
     def gains(self, least: float) -> bool:
         """Return whether it gains so much, and surely something on episodes like the log's."""

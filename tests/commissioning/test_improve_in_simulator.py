@@ -15,9 +15,10 @@ from stable_baselines3 import DDPG, TD3
 from sb3_yann import LinearMPC, Tracking, YannPolicy, improve, offset_free
 from sb3_yann.audit.closed_loops import Planning, of_law
 from sb3_yann.audit.plants import SimulatedResidual
-from sb3_yann.commissioning import critic, grounds, imitation
+from sb3_yann.commissioning import critic, grounds, imitation, simulator_grounds
 from sb3_yann.commissioning.improve import Improvement
-from sb3_yann.commissioning.simulator_grounds import SimulatedTrial, SimulatorGrounds
+from sb3_yann.commissioning.search import Pace, Search
+from sb3_yann.commissioning.simulator_grounds import FinalTrial, SimulatedTrial, SimulatorGrounds
 from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.evaluation import evaluate
@@ -112,6 +113,8 @@ def brisk(monkeypatch, request) -> None:
         return
     monkeypatch.setattr(imitation, "UPDATES", 500)
     monkeypatch.setattr(imitation, "ROUNDS", 2)
+    monkeypatch.setattr(imitation, "FINAL", 1)
+    monkeypatch.setattr(simulator_grounds, "FINAL", 1)
     monkeypatch.setattr(grounds, "POOL", 60)
     monkeypatch.setattr(critic, "SAMPLES", 256)
     monkeypatch.setattr(critic, "STEPS", 30)
@@ -202,7 +205,7 @@ def test_plans_that_lose_to_the_mpc_teach_nothing(monkeypatch) -> None:
 
 
 def test_the_fit_that_loses_the_fewest_is_kept(monkeypatch) -> None:
-    lost = iter([[(1, 40)] * 3, [(1, 40)], [(1, 40)] * 2, [(1, 40)] * 2])
+    lost = iter([([(1, 40)] * n, 0.01 * n) for n in (3, 1, 2, 2)])
     monkeypatch.setattr(imitation, "_lost", lambda grounds, act: next(lost))
     monkeypatch.setattr(imitation, "ROUNDS", 9)
     monkeypatch.setattr(imitation, "PATIENCE", 2)
@@ -234,6 +237,113 @@ def test_a_violation_more_is_refused() -> None:
     check = trial.check(5, (0.5 * trial.mpc[0], unsafe), trial.mpc)
     assert not check.accepted and not check.safe
     assert "1 starts with violations, the first is number 3" in check.reason
+
+
+class Rarely(Movable):
+    """In few episodes, of which no check has one, whoever leaves the MPC breaks a limit."""
+
+    rare = range(0)
+
+    def reset(self, *, seed=None, options=None):
+        self.bad = seed in self.rare
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        theta = self.x.astype(np.float32).astype(float)
+        left = np.abs(problem().explicit()(theta) - action).max() > 1e-3
+        *rest, info = super().step(action)
+        return *rest, {**info, "violation": bool(self.bad and left)}
+
+
+def test_a_loss_that_no_check_meets_is_met_in_the_final_trial(monkeypatch) -> None:
+    drawn = []
+    draw = SimulatorGrounds.draw_final
+
+    def noted(self):
+        drawn.append(self.next_seed)
+        Rarely.rare = range(self.next_seed, self.next_seed + 1)
+        return draw(self)
+
+    monkeypatch.setattr(SimulatorGrounds, "draw_final", noted)
+    model = model_of()
+    before = bits(model)
+    found = improve(model, Rarely, **FEW)
+    assert drawn and not found.accepted
+    assert bits(model) == before
+    assert any(each.accepted for each in found.checks if not each.final)
+    assert [each.final for each in found.checks][-3:] == [True] * 3  # all of it, half, a quarter
+    assert "in the final trial, 1 starts with violations" in str(found)
+    assert found.change == 0.0
+
+
+@pytest.mark.parametrize("most", [1.0, 0.5, 0.25, 0.1])
+def test_what_the_final_trial_refuses_is_halved(monkeypatch, most) -> None:
+    grounds = SimulatorGrounds(SimulatorTwin.of(problem(), Movable), 20, 12, 0)
+    search = Search(model_of().policy.actor.mu, grounds, Pace(20, 5e-3, 20, 5))
+    assert [*search.steps(20)][-1] == 20 and search.gains(0.001)
+    whole = copy.deepcopy(search.accepted)
+    law, theta = problem().law(), np.array([[0.5, -0.2]])
+
+    def correction(weights):
+        search.layer.load_state_dict(weights)
+        return actor(search.layer, problem())(theta) - law(theta)
+
+    limit = 1.05 * most * np.abs(correction(whole))
+
+    class Strict(FinalTrial):
+        def play(self, act):
+            costs, unsafe = super().play(act)
+            unsafe[0, 0] += int(np.any(np.abs(act(theta) - law(theta)) > limit))
+            return costs, unsafe
+
+    monkeypatch.setattr(grounds, "draw_final", lambda: Strict([grounds.draw(grounds.drawing)]))
+    assert search.confirm(1e-6) == (most >= 0.25)
+    assert search.gains(1e-6) == (most >= 0.25)
+    if most >= 0.25:
+        np.testing.assert_allclose(
+            correction(search.accepted), most * correction(whole), rtol=1e-3
+        )
+
+
+def test_a_final_trial_joins_its_episodes() -> None:
+    grounds = SimulatorGrounds(SimulatorTwin.of(problem(), Movable), 20, 2, 0)
+    first, second = (SimulatedTrial(grounds.twin, seeds) for seeds in (range(5), range(5, 9)))
+    final, whole = FinalTrial([first, second]), SimulatedTrial(grounds.twin, range(9))
+    for ours, theirs in zip(final.mpc, whole.mpc, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+    def act(theta):
+        return 0.9 * problem().law()(theta)
+
+    played = final.play(act)
+    assert final.check(0, played, final.mpc) == whole.check(0, whole.play(act), whole.mpc)
+
+
+def test_final_episodes_are_new_ones(monkeypatch) -> None:
+    monkeypatch.setattr(simulator_grounds, "FINAL", 3)
+    grounds = SimulatorGrounds(SimulatorTwin.of(problem(), Movable), 20, 2, 0)
+    later = grounds.draw(grounds.drawing).seeds
+    seeds = [seed for each in grounds.draw_final().blocks for seed in each.seeds]
+    assert len(seeds) == len(set(seeds)) == 3 * 3 * 2 * 2
+    assert min(seeds) > max(later) > max(grounds.trial.seeds) > max(grounds.twin.seeds)
+
+
+def test_where_a_policy_loses_nothing_more_episodes_are_asked(monkeypatch) -> None:
+    monkeypatch.setattr(imitation, "FINAL", 3)
+    grounds = SimulatorGrounds(SimulatorTwin.of(problem(), Movable), 20, 2, 0)
+    asked = []
+
+    def lost(self, played):
+        asked.append(len(self.seeds))
+        return np.array([4, 1] if len(asked) == 4 else [], dtype=np.intp)
+
+    monkeypatch.setattr(SimulatedTrial, "lost", lost)
+    found, share = imitation._lost(grounds, problem().law())
+    assert asked == [4, 12, 12, 12] and share == 2 / 40
+    assert [seed - found[1][0] for seed, _ in found] == [3, 0]
+    asked.extend([0] * 4)
+    assert imitation._lost(grounds, problem().law()) == ([], 0.0)
+    assert len(asked) == 8 + 5
 
 
 def test_what_was_learnt_before_is_kept_or_bettered() -> None:
