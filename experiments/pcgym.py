@@ -45,7 +45,8 @@ from sb3_yann_envs.pcgym import PCGymEnv
 HORIZONS = {"cstr": 5, "four_tank": 3, "multistage_extraction": 1}
 """Of the MPCs, chosen on episodes 100 to 109."""
 PLANTS = {f"PC-Gym, {name}": name for name in HORIZONS}
-OFFSET_FREE, NMPC, FROM_A_LOG = "offset-free MPC", "NMPC", f"{OURS}, from a log"
+OFFSET_FREE, NMPC = "offset-free MPC", "NMPC"
+IN_SIMULATOR, FROM_A_LOG = f"{OURS}, `improve` in a simulator", f"{OURS}, from a log"
 FIXED = MPC, OFFSET_FREE, REIDENTIFIED, NMPC
 RIVALS: dict[str, type[Any]] = {"DDPG": DDPG, "TD3": TD3, "SAC": SAC, "PPO": PPO}
 TESTS = range(3000, 3030)
@@ -56,6 +57,7 @@ LONG = f", {STEPS:,} steps"
 SEEDS = {
     FROM_A_LOG: range(40, 50),
     OURS: range(40, 50),
+    IN_SIMULATOR: range(40, 50),
     **dict.fromkeys(("DDPG", "TD3", "SAC"), range(40, 41)),
     **{f"{name}{LONG}": range(40, 41) for name in RIVALS},
 }
@@ -151,7 +153,7 @@ def runs() -> list[Run]:
     longest = max(map(len, SEEDS.values()))
     for i in range(longest):
         for name, seeds in SEEDS.items():
-            episodes = LOG if name == FROM_A_LOG else EPISODES
+            episodes = {FROM_A_LOG: LOG, IN_SIMULATOR: 0}.get(name, EPISODES)
             found += [Run(plant, name, seeds[i], episodes) for plant in PLANTS if i < len(seeds)]
     return found
 
@@ -159,7 +161,7 @@ def runs() -> list[Run]:
 def execute(run: Run) -> Outcome:
     """Return the outcome of a run: PC-Gym's costs as those of its tests."""
     began, name = time.perf_counter(), PLANTS[run.plant]
-    case = Case(name, offset_free=run.learner in (OFFSET_FREE, OURS, FROM_A_LOG))
+    case = Case(name, offset_free=run.learner in (OFFSET_FREE, OURS, IN_SIMULATOR, FROM_A_LOG))
     tested: dict[int, tuple[Episodes, float]] = {}
 
     def test(steps: int, act: Callable[[Any], Any]) -> None:
@@ -177,6 +179,10 @@ def execute(run: Run) -> Outcome:
         explores = SimulatedEpisodes(case.taught)
         model.learn(steps * EPISODES, callback=[NoActionNoise(), explores, guard])
         test(steps * EPISODES, partial(acted, model))
+    elif run.learner == IN_SIMULATOR:
+        model = policy_of(case, run.seed)
+        improve(model, case.taught, seed=run.seed)
+        test(0, partial(acted, model))
     elif run.learner == FROM_A_LOG:
         model = policy_of(case, run.seed)
         twin = twin_of(case, run.seed)
@@ -265,7 +271,7 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
         base = outcomes.get(Run(plant, OFFSET_FREE, 0, 0))
         if base is None:
             continue
-        for name in (*FIXED, OURS, FROM_A_LOG, *RIVALS):
+        for name in (*FIXED, OURS, IN_SIMULATOR, FROM_A_LOG, *RIVALS):
             at: dict[int, dict[int, tuple[Outcome, int]]] = {}
             for run, each in outcomes.items():
                 if run.plant == plant and run.learner.removesuffix(LONG) == name:
