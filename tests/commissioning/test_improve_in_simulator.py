@@ -300,9 +300,7 @@ def test_what_the_final_trial_refuses_is_halved(monkeypatch, most) -> None:
     assert search.confirm(1e-6) == (most >= 0.25)
     assert search.gains(1e-6) == (most >= 0.25)
     if most >= 0.25:
-        np.testing.assert_allclose(
-            correction(search.accepted), most * correction(whole), rtol=1e-3
-        )
+        np.testing.assert_allclose(correction(search.accepted), most * correction(whole), rtol=1e-3)
 
 
 def test_a_final_trial_joins_its_episodes() -> None:
