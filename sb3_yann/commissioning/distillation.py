@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.control import ExplicitLimitError, LinearMPC, OnlineLaw
+from sb3_yann.control import ExplicitLimitError, ExplicitSolutionError, LinearMPC, OnlineLaw
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import law_of
@@ -33,8 +33,8 @@ def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
         if today is twin.problem:
             return None
         _choose_law(today, twin.problem)
-    except (ValueError, ExplicitLimitError):  # no steady state, no Riccati solution, or too large
-        return None
+    except (ValueError, ExplicitLimitError, ExplicitSolutionError):
+        return None  # no steady state, no Riccati solution, too large, or too badly conditioned
     layout, before, law = today.layout, twin.problem.model, law_of(today)
     x, u = today.model.x_ss - before.x_ss, today.model.u_ss - before.u_ss
     shift = np.zeros(layout.size)

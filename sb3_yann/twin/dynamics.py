@@ -121,14 +121,16 @@ class Dynamics:
         return self.coordinates.row
 
     def residual(self, theta: Array, u: Array) -> Array:
-        """Return the residuals (members, batch, n) at rows (members, batch, size)."""
+        """Return the residuals (members, batch, n) at rows (members, or 1 for all, batch, size)."""
         return self._each("predict", self.coordinates.scaled(self.row.features(theta, u)))
 
     def _each(self, method: str, z: Array) -> Array:
-        """Return what the members say of z (members, batch, k)."""
+        """Return what the members say of z (members, batch, k), or all of them of one (1, ...)."""
         if self._stack is not None:
             return np.asarray(getattr(self._stack, method)(z))
-        pairs = zip(self.members, z, strict=True)
+        pairs = zip(
+            self.members, np.broadcast_to(z, (len(self.members), *z.shape[1:])), strict=True
+        )
         return np.array([getattr(member, method)(rows) for member, rows in pairs])
 
     def step(self, theta: Array, u: Array) -> Array:

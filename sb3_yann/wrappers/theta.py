@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, NonFiniteWarning, as_whole
@@ -168,6 +169,16 @@ class SetPoint(Appending):
             as_whole("hold", hold, hint="It counts steps; None is one reference in each episode.")
         self.hold, self.schedule, self.steps = hold, schedule, 0
         self.reference: Array = np.zeros(len(self.low))
+        self._own: np.random.Generator | None = None
+
+    def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
+        """Start an episode, with another reference: a seed draws the same one again."""
+        observation, info = self.env.reset(**kwargs)
+        seed = kwargs.get("seed")
+        if seed is not None:  # an env that does not seed its own generator lends none
+            seeded = self.unwrapped.np_random_seed == seed
+            self._own = None if seeded else seeding.np_random(seed)[0]
+        return self._shown(observation, None, info), info
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         self.steps = 0 if u is None else self.steps + 1
@@ -178,7 +189,8 @@ class SetPoint(Appending):
 
     def _next(self) -> Array:
         if self.schedule is None:
-            return np.asarray(self.np_random.uniform(self.low, self.high))
+            generator = self.np_random if self._own is None else self._own
+            return np.asarray(generator.uniform(self.low, self.high))
         r = np.atleast_1d(np.array(self.schedule(self.steps), np.float64))
         if r.shape != self.low.shape or not np.all((self.low <= r) & (r <= self.high)):
             raise ValueError(

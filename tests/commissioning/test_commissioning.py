@@ -386,3 +386,15 @@ def test_a_first_reading_that_is_no_number_is_an_error(tmp_path) -> None:
         run.run(1)
     assert not run.episodes
     assert "start" not in (tmp_path / "commissioning.jsonl").read_text()  # nothing was played
+
+
+def test_a_plant_that_its_model_describes_keeps_the_mpc(tmp_path) -> None:
+    class Described(Cart):
+        def step(self, action):
+            now = self.x
+            found = super().step(action)
+            self.x = problem().model.A @ now + problem().model.B @ np.asarray(action, float)
+            return self.x.astype(np.float32), *found[1:]
+
+    found = commission(tmp_path / "record", Described()).run(3)
+    assert [each.acted for each in found] == ["MPC"] * 3

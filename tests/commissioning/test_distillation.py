@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_yann import YannPolicy, improve
+from sb3_yann import ExplicitSolutionError, YannPolicy, improve
 from sb3_yann.commissioning import distillation
 from sb3_yann.commissioning.distillation import distill, law_today
 from sb3_yann.twin.gradient import actor
@@ -48,6 +48,15 @@ def test_a_law_of_today_that_would_be_much_larger_is_left_out(monkeypatch) -> No
     today = twin().reidentified()  # with more regions than the one that it may have here
     monkeypatch.setattr(type(twin()), "reidentified", lambda self: today)
     monkeypatch.setattr(distillation, "LARGER", 1 / problem().explicit().n_regions)
+    assert law_today(twin()) is None
+
+
+def test_a_law_of_today_that_fails_its_check_is_left_out(monkeypatch) -> None:
+    def failing(*arguments, **options):
+        raise ExplicitSolutionError("The explicit solution failed its check.")
+
+    assert law_today(twin()) is not None
+    monkeypatch.setattr(distillation, "_choose_law", failing)
     assert law_today(twin()) is None
 
 

@@ -66,6 +66,24 @@ def test_a_reference_is_drawn_for_each_episode_and_follows_the_seed() -> None:
         assert env.observation_space.contains(env.reset()[0])
 
 
+def test_a_reference_follows_the_seed_where_the_env_does_not_seed_its_generator() -> None:
+    class Unseeded(Counter):
+        def reset(self, *, seed=None, options=None):
+            return super().reset()
+
+    def references(seed):
+        env = SetPoint(Unseeded(), [-1], [1], hold=1)
+        return [env.reset(seed=seed)[0][2], env.step(np.zeros(1))[0][2], env.reset()[0][2]]
+
+    assert references(3) == references(3) != references(4)
+    assert len(set(references(3))) == 3
+
+
+def test_a_reference_of_an_env_that_seeds_is_drawn_from_its_generator() -> None:
+    drawn = np.random.default_rng(np.random.PCG64(np.random.SeedSequence(3))).uniform(-1, 1)
+    assert SetPoint(Counter(), [-1], [1]).reset(seed=3)[0][2] == np.float32(drawn)
+
+
 def test_a_reference_may_change_every_few_steps() -> None:
     env = SetPoint(Counter(), [-1], [1], hold=2)
     seen = [env.reset(seed=0)[0][2], *(env.step(np.zeros(1))[0][2] for _ in range(5))]
