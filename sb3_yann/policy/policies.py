@@ -260,7 +260,8 @@ class YannPolicy(TD3Policy):
         space = cast(Any, self.action_space)
         # SB3's formula rounds: where bounds are asymmetric it may end one bit beyond them.
         action = super().unscale_action(scaled_action)
-        return np.clip(action, space.low, space.high)
+        # A space of float16 holds no action of float32.
+        return np.clip(action, space.low, space.high).astype(space.dtype, copy=False)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Return the map from an observation to theta."""
