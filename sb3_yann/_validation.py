@@ -221,6 +221,12 @@ def to_float(name: str, value: Any) -> Array:
         if np.iscomplexobj(value):
             raise TypeError("it is complex")
         return np.array(value, dtype=np.float64)
+    except RuntimeError as error:  # torch's, and torch is not loaded here
+        fault = str(error).rstrip(".")
+        raise TypeError(
+            f"{name} is not an array of real numbers ({fault}). Detach a tensor that has a "
+            f"gradient first: pass {name}.detach()."
+        ) from None
     except (OverflowError, TypeError, ValueError) as error:
         fault = f"{name} = {_short(value)} is not an array of real numbers ({error})."
         raise TypeError(fault) from None
@@ -228,7 +234,10 @@ def to_float(name: str, value: Any) -> Array:
 
 def _short(value: Any) -> str:
     """Return the representation of a value, without the middle of a long one."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes out no whole number of more than 4300 digits
+        text = f"<{type(value).__name__} of too many digits to show>"
     return text if len(text) <= 200 else f"{text[:120]} ... {text[-40:]}"
 
 

@@ -8,7 +8,13 @@ from pathlib import Path
 CATALOGUE = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "messages.py"))
 MESSAGES = CATALOGUE["messages"]()
 OF_PYTHON = {"AttributeError", "FileNotFoundError", "IsADirectoryError", "ImportError", "OSError"}
-OWN = {"CostMismatchError", "ExplicitLimitError", "ExplicitSolutionError", "UntrustedTwinError"}
+OWN = {
+    "CostMismatchError",
+    "ExplicitLimitError",
+    "ExplicitSolutionError",
+    "OtherProblemError",
+    "UntrustedTwinError",
+}
 
 
 def test_the_page_lists_the_messages_of_the_code():

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 
 from sb3_yann._validation import (
     as_between,
@@ -15,6 +16,7 @@ from sb3_yann._validation import (
     as_positive,
     as_positive_vector,
     as_whole,
+    to_float,
 )
 
 
@@ -62,3 +64,17 @@ def test_what_is_allowed_comes_back_as_pythons_own() -> None:
     assert (as_whole("x", np.int64(3)), type(as_whole("x", np.int64(3)))) == (3, int)
     assert (as_flag("x", True), as_flag("x", np.False_)) == (True, False)
     assert as_choice("x", "a", ("a", "b")) == "a"
+
+
+@pytest.mark.parametrize("as_list", [False, True])
+def test_a_tensor_with_a_gradient_is_refused_with_the_word_detach(as_list: bool) -> None:
+    tensor = th.zeros(2, requires_grad=True)
+    with pytest.raises(TypeError, match=r"x is not an array of real .*: pass x\.detach\(\)\."):
+        to_float("x", [tensor, tensor] if as_list else tensor)
+
+
+@pytest.mark.parametrize("digits", [400, 5000])  # Python writes out no more than 4300
+@pytest.mark.parametrize("check", [as_number, as_whole, to_float])
+def test_a_whole_number_that_no_float_holds_is_named(check: Any, digits: int) -> None:
+    with pytest.raises((TypeError, ValueError), match=r"^x = .* (must be|is not) "):
+        check("x", 10**digits)

@@ -145,7 +145,7 @@ class Plant:
             law = self.mpc(known[None])[0]
             apart = max(apart, float(np.max(np.abs(wanted - law) / self.range)))
             action = u if self.as_is else self.yann.input_units.action(u).astype(np.float32)
-            action = np.clip(action, space.low, space.high)  # to the last bit
+            action = np.clip(action, space.low, space.high).astype(space.dtype)  # to the last bit
             observation, gained, terminated, over, info = self.env.step(action)
             unsafe = bool(info.get("violation", False)) or terminated
             reward, violations = reward + float(gained), violations + unsafe

@@ -89,7 +89,7 @@ def _tables(data: Arrays, precision: str) -> str:
         "LATE_AFTER": literal(data["late_after"], precision),
         **{name.upper(): literal(value, precision) for name, value in rounding.items()},
     }
-    numbers, whole = tables_of(data)
+    numbers, whole = tables_of(data, precision)
     of_search, indices_of_search = search_tables(data)
     numbers, whole = {**numbers, **of_search}, {**whole, **indices_of_search}
     if walks:

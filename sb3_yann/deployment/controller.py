@@ -107,6 +107,23 @@ def _check_indices(data: Mapping[str, Any], p: int, q: int, k: int) -> None:
         raise ValueError(f"network_of does not fit {k} networks")
 
 
+def _as_readings(name: str, value: Any) -> Array:
+    """Return numbers as float64, NaN where they are masked; raise TypeError if they are none."""
+    try:
+        if isinstance(value, np.ma.MaskedArray):
+            wide: Any = value.astype(np.result_type(value, np.float64))
+            value = wide.filled(np.nan)
+        found = np.asarray(value)
+        if found.dtype.kind == "c":
+            raise TypeError("they are complex")
+        return found.astype(np.float64, copy=False)
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
+        raise TypeError(
+            f"{name} must be real numbers ({error}). Pass floats, and NaN for a reading that is "
+            "missing."
+        ) from None
+
+
 class Controller:
     """What runs in production: ``controller(obs)`` is the action, with a fallback at every step.
 
@@ -307,13 +324,13 @@ class Controller:
         return MPC if self.request == MPC or self._sound < recover else POLICY
 
     def _as_manual(self, manual: ArrayLike | None) -> Array:
-        given = np.asarray(manual, np.float64)
+        given = _as_readings("manual", manual)
         if given.shape != self._output.shape:
             raise ValueError(f"manual has shape {given.shape}, expected {self._output.shape}.")
         return np.where(np.isfinite(given), given, self._output)
 
     def _rows(self, obs: ArrayLike) -> tuple[Array, bool]:
-        given, n_obs = np.asarray(obs, np.float64), len(self.data["obs_rest"])
+        given, n_obs = _as_readings("obs", obs), len(self.data["obs_rest"])
         if given.ndim not in (1, 2) or given.shape[-1] != n_obs:
             raise ValueError(
                 f"obs has shape {given.shape}, expected ({n_obs},) or (batch, {n_obs}): "

@@ -52,7 +52,7 @@ class Cost:
 
 def cost_of(data: Arrays) -> Cost:
     """Return what a controller of these arrays costs."""
-    tables = zip(tables_of(data), search_tables(data), strict=True)
+    tables = zip(tables_of(data, "double"), search_tables(data), strict=True)
     numbers, whole = ({**own, **of_search} for own, of_search in tables)
     (_, m, n), q = data["gains"].shape, len(data["b"])
     widths = [data[f"layer{i}"].shape[1] for i in range(int(data["n_layers"]))]

@@ -14,6 +14,7 @@ from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.controller import FORMAT
+from sb3_yann.deployment.output_range import scale_within
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from sb3_yann.networks.law_layer import ALL, NONE, LawLayer
 from sb3_yann.policy._features import AffineFeatures, keeps_entries
@@ -65,10 +66,7 @@ def describe(given: Exportable, name: str, checks: Checks, absolute: bool = Fals
         **checks.arrays(law.n_theta),
         "watched": np.arange(law.n_theta) < len(states),
     }
-    _, middle, half = input_range(law)
-    units: Units = np.eye(law.n_theta), np.zeros(law.n_theta), half, middle
-    if absolute:
-        units = _plant_units(law)
+    units = _plant_units(law) if absolute else _own_units(law)
     return arrays | _with_units(name, law, units, shown, inputs)
 
 
@@ -82,7 +80,8 @@ def _of_policy(policy: YannPolicy, name: str, checks: Checks, absolute: bool) ->
     kept = keeps_entries(extractor) or absolute
     box: Any = policy.action_space
     low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
-    units: Units = matrix, offset, (high - low) / 2, (high + low) / 2
+    half, middle = (high - low) / 2, (high + low) / 2
+    units: Units = matrix, offset, scale_within(half, middle, low, high), middle
     if absolute:
         units = _plant_units(law)
     names = list(problem.labels()) if kept else [f"obs[{i}]" for i in range(matrix.shape[1])]
@@ -264,8 +263,16 @@ def _plant_units(law: PiecewiseAffine) -> Units:
             "absolute = True needs a law that knows its operating point: one from LinearMPC, not "
             "one built by hand."
         )
-    _, middle, half = input_range(law)
-    return np.eye(law.n_theta), -law.theta_ss, half, law.model.u_ss + middle
+    return _own_units(law, -law.theta_ss, law.model.u_ss)
+
+
+def _own_units(law: PiecewiseAffine, offset: Any = 0.0, u_ss: Any = 0.0) -> Units:
+    """Return theta as observations, and inputs as outputs; or both from an operating point on."""
+    finite, middle, half = input_range(law)
+    low, high = np.where(finite, law.u_min, -1.0) + u_ss, np.where(finite, law.u_max, 1.0) + u_ss
+    shift = u_ss + middle
+    scale = scale_within(half, shift, low, high)
+    return np.eye(law.n_theta), np.zeros(law.n_theta) + offset, scale, shift
 
 
 def _with_units(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sb3_yann.deployment.controller import ACTIVATIONS
 from sb3_yann.deployment.describe import Arrays
+from sb3_yann.deployment.output_range import scale_in
 from sb3_yann.deployment.rounding import rounding_of
 
 OPSET = 17
@@ -40,7 +41,7 @@ def onnx_model(data: Arrays, precision: str, digest: str) -> bytes:
     except ImportError:
         raise ImportError("An ONNX file needs onnx: pip install onnx.") from None
     graph = _Graph(precision)
-    action, outside = _policy(graph, data, rounding_of(data, precision))
+    action, outside = _policy(graph, data, precision)
     kind = onnx.TensorProto.DOUBLE if precision == "double" else onnx.TensorProto.FLOAT
     value = onnx.helper.make_tensor_value_info
     n_obs, m = data["obs_matrix"].shape[1], len(data["action_scale"])
@@ -127,7 +128,7 @@ class _Graph:
         return self.op("Squeeze", self.op("MatMul", matrices, column), last)
 
 
-def _policy(graph: _Graph, data: Arrays, rounding: Any) -> tuple[str, str]:
+def _policy(graph: _Graph, data: Arrays, precision: str) -> tuple[str, str]:
     """Return the names of action and outside."""
     op, constant = graph.op, graph.constant
     zero = constant(0.0)
@@ -138,7 +139,7 @@ def _policy(graph: _Graph, data: Arrays, rounding: Any) -> tuple[str, str]:
     shown = constant((data["obs_matrix"] != 0).astype(float).T)
     depends = op("Greater", op("MatMul", graph.number(lost), shown), zero)
     theta = op("Where", op("Or", depends, graph.not_finite(theta)), zero, theta)
-    region, inside = _locate(graph, data, theta, rounding)
+    region, inside = _locate(graph, data, theta, rounding_of(data, precision))
     law = graph.times(op("Gather", constant(data["gains"]), region), theta)
     law = op("Add", law, op("Gather", constant(data["offsets"]), region))
     law = op("Where", graph.not_finite(law), zero, law)
@@ -159,7 +160,7 @@ def _policy(graph: _Graph, data: Arrays, rounding: Any) -> tuple[str, str]:
         added = _correction(graph, data, theta, region)
         added = op("Where", graph.any(lost), zero, added)
         law = graph.between(op("Add", law, added), low, high)
-    action = op("Mul", law, constant(data["action_scale"][None]))
+    action = op("Mul", law, constant(scale_in(data, precision)[None]))
     action = op("Add", action, constant(data["action_shift"][None]))
     return action, op("Squeeze", op("Not", inside), constant(np.array([1])))
 

@@ -198,7 +198,7 @@ def _numbers(data: Arrays, precision: str) -> Iterator[str]:
 
 def _tables(data: Arrays, precision: str) -> Iterator[str]:
     """Yield declarations of arrays, flat: their rows follow each other."""
-    numbers, whole = tables_of(data)
+    numbers, whole = tables_of(data, precision)
     for name, values in numbers.items():
         kept = np.where(np.abs(values) < SMALLEST, 0.0, np.clip(values, -LARGEST, LARGEST))
         texts = [real(float(each), precision) for each in kept.flat]

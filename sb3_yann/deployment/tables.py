@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from sb3_yann.deployment.controller import FAR
 from sb3_yann.deployment.describe import Arrays
+from sb3_yann.deployment.output_range import scale_in
 
 Tables = dict[str, NDArray[Any]]
 
 
-def tables_of(data: Arrays) -> tuple[Tables, Tables]:
+def tables_of(data: Arrays, precision: str) -> tuple[Tables, Tables]:
     """Return the tables of numbers and those of whole numbers; nothing for what there is not."""
-    same = (
-        "A b gains offsets obs_matrix obs_offset obs_rest obs_min obs_max action_scale action_shift"
-    )
+    same = "A b gains offsets obs_matrix obs_offset obs_rest obs_min obs_max action_shift"
     numbers: Tables = {name: data[name] for name in same.split()}
+    numbers["action_scale"] = scale_in(data, precision)
     numbers["input_min"], numbers["input_max"] = data["bounds"]
     numbers["far"] = FAR * np.abs(data["box"]).max(0)
     starts = np.array([*data["starts"], len(data["b"])])

@@ -10,11 +10,13 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
-from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork
+from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
+
+SAMPLES = 32
 
 
 class SharedYannLayer(LawLayer):
@@ -23,7 +25,8 @@ class SharedYannLayer(LawLayer):
     At first the network is exactly zero and the layer is the law, to float32 rounding. The network
     does not grow with the law, and leaves it as continuous as it is.
 
-    The law is evaluated by numpy, on the processor. It is not part of the state_dict.
+    The law is evaluated by numpy, on the processor. Of it the state_dict has some answers alone, by
+    which parameters of another law are told.
 
     Parameters
     ----------
@@ -44,6 +47,8 @@ class SharedYannLayer(LawLayer):
     True
     """
 
+    samples: th.Tensor
+
     def __init__(
         self,
         law: Law,
@@ -59,6 +64,8 @@ class SharedYannLayer(LawLayer):
         import_module("sb3_yann.networks._kernels.yann_layer")
         law(np.zeros(law.n_theta))  # compiled now, not in the midst of learn: see YannLayer
         self._set_ranges(law, rate, always=True)
+        theta = sample_points(law)
+        register_constants(self, samples=np.hstack([theta, self._actions(theta)]))
         stay, sizes = th.tensor([pinned]), (law.n_theta, law.n_inputs)
         self.network = ZeroOutputNetwork(*sizes, hidden, activation=activation, pinned=stay)
         self.limit(max_correction)
@@ -112,6 +119,25 @@ class SharedYannLayer(LawLayer):
         u[finite] = self.given(points[finite])
         return u, finite
 
+    def _actions(self, theta: Array) -> Array:
+        middle, half = self.middle.double().cpu().numpy(), self.half_range.double().cpu().numpy()
+        actions: Array = (self.given(theta) - middle) / half
+        return actions
+
+    def answers_as(self, samples: th.Tensor, rounding: float) -> bool:
+        """Return whether rows ``[theta, action]`` are the law's, where the MPC has a solution."""
+        rows: Array = samples.double().cpu().numpy()
+        if not np.isfinite(rows).all():
+            return False
+        theta, actions = np.split(rows, [self.given.n_theta], axis=1)
+        apart = np.abs(self._actions(theta) - actions).max(1)
+        return bool(np.all(apart[self.given.in_domain(theta)] <= rounding))
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
+        # Weights that were saved before there were samples.
+        state_dict.setdefault(f"{prefix}samples", self.samples)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
     @property
     def explicit_law(self) -> PiecewiseAffine | None:
         """The law in use; None where it is solved online."""
@@ -130,6 +156,19 @@ class SharedYannLayer(LawLayer):
         if isinstance(self.given, PiecewiseAffine) and self.given.infeasible == "zero_input":
             slopes[~self.given.in_domain(theta)] = 0.0  # as the gain of an online law is
         return slopes
+
+
+def sample_points(law: Law) -> Array:
+    """Return points (rows, n) in the box of a law, most of them near its middle.
+
+    Far from there many laws have the same answer: a bound.
+    """
+    bounded = np.isfinite(law.theta_min) & np.isfinite(law.theta_max)
+    middle = np.where(bounded, law.theta_max / 2 + law.theta_min / 2, 0.0)
+    shares = np.random.default_rng(0).uniform(-1, 1, (SAMPLES, law.n_theta))
+    near = 2.0 ** -(np.arange(SAMPLES) % 8)[:, None]
+    points: Array = middle + near * shares * half_widths(law.theta_min, law.theta_max)
+    return points
 
 
 class _Law(th.autograd.Function):

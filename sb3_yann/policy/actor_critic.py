@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
 import torch as th
@@ -23,6 +23,7 @@ from sb3_yann.networks import AfterstateValue, SharedYannLayer, YannLayer
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.policy._features import SeesTheta, keeps_entries, without_entries
 from sb3_yann.policy._finite import what_is_not_finite
+from sb3_yann.policy._own_parameters import require_own_problem
 from sb3_yann.policy.critic_options import CriticOptions
 
 LONGEST = 100
@@ -116,6 +117,13 @@ class YannActor(SeesTheta, Actor):
             warnings.warn(said, NonFiniteWarning, stacklevel=3)
         self.named = said
         return th.where(whole, actions, self.mu.law(theta).to(actions))
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Load parameters of an actor with the same law; ValueError for others, before any."""
+        require_own_problem(self, state_dict, strict)
+        return super().load_state_dict(state_dict, strict, assign)
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
         """Yield the weights, without the search of all modules for them at every step of SB3."""

@@ -25,6 +25,7 @@ from sb3_yann.networks.zero_output import FEW
 from sb3_yann.policy import _checks, _sb3_hooks
 from sb3_yann.policy._features import AffineFeatures
 from sb3_yann.policy._finite import finite_gradient, warn_of_refused_step, watch_buffer
+from sb3_yann.policy._own_parameters import require_own_problem
 from sb3_yann.policy.actor_critic import YannActor, YannCritic, layer_for
 from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
 from sb3_yann.policy.observations import AffineObservation, Shown, as_observation
@@ -224,6 +225,13 @@ class YannPolicy(TD3Policy):
             self.critic_updates.add_(1)
         _sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
 
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Load parameters of a policy with the same problem; ValueError for others, before any."""
+        require_own_problem(self, state_dict, strict)
+        return super().load_state_dict(state_dict, strict, assign)
+
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
         # Weights that were saved when the scale was a setting.
         state_dict.setdefault(f"{prefix}mean_stage_cost", th.zeros_like(self.mean_stage_cost))
@@ -260,7 +268,8 @@ class YannPolicy(TD3Policy):
         space = cast(Any, self.action_space)
         # SB3's formula rounds: where bounds are asymmetric it may end one bit beyond them.
         action = super().unscale_action(scaled_action)
-        return np.clip(action, space.low, space.high)
+        # A space of float16 holds no action of float32.
+        return np.clip(action, space.low, space.high).astype(space.dtype, copy=False)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Return the map from an observation to theta."""

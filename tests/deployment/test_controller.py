@@ -296,6 +296,38 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
         Controller({**controller.data, "format": 99})
 
 
+def test_a_masked_reading_counts_as_nan(tmp_path):
+    masked, plain = (controller_of(policy_of("reactor"), tmp_path) for _ in range(2))
+    good, lost = [0.1, 0.0, 0.0, -5.0], [np.nan, 0.0, 0.0, -6.0]
+    for readings in (good, lost):
+        hidden = np.ma.array(np.nan_to_num(readings, nan=30.0), mask=np.isnan(readings))
+        np.testing.assert_array_equal(masked(hidden), plain(readings))
+    assert masked.status == Status.NOT_FINITE
+    np.testing.assert_array_equal(masked.evaluate(hidden), plain.evaluate(lost))
+
+
+@pytest.mark.parametrize("mask", [False, True])
+def test_a_masked_output_of_the_operator_is_none(mask, tmp_path):
+    controller = controller_of(policy_of("reactor"), tmp_path)
+    held = controller(np.full(4, 0.1))
+    controller.request = "manual"
+    output = controller(np.full(4, 0.1), manual=np.ma.array([3.0], mask=[mask]))
+    assert output == (held if mask else 3.0)
+
+
+NO_READINGS = [np.full(4, 1j), [1j, 0, 0, 0], np.ma.array(np.full(4, 1j), mask=[1, 0, 0, 0]),
+               [10**400, 0, 0, 0], th.zeros(4, requires_grad=True), ["a"] * 4]  # fmt: skip
+
+
+@pytest.mark.parametrize("obs", NO_READINGS, ids=range(6))
+def test_readings_that_are_no_real_numbers_are_refused_and_no_step(obs, tmp_path):
+    controller = controller_of(policy_of("reactor"), tmp_path)
+    for call in (controller, controller.evaluate, controller.in_domain):
+        with pytest.raises(TypeError, match=r"obs must be real numbers \(.*\)\. Pass floats"):
+            call(obs)
+    assert controller.counters["steps"] == 0
+
+
 def test_arrays_that_do_not_fit_together_are_named(tmp_path):
     data = controller_of(policy_of("references and rates"), tmp_path).data
     wrong = [

@@ -1,4 +1,4 @@
-"""Every action lies in the action space, to the last bit of float32."""
+"""Every action lies in the action space, to the last bit of its type."""
 
 from __future__ import annotations
 
@@ -24,13 +24,23 @@ def problem(low: float, high: float) -> LinearMPC:
     return LinearMPC(MODEL, **design, u_min=low, u_max=high)
 
 
-def box(low: float, high: float) -> spaces.Box:
-    return spaces.Box(np.float32([low]), np.float32([high]), dtype=np.float32)
+def box(low: float, high: float, dtype=np.float32) -> spaces.Box:
+    return spaces.Box(np.array([low], dtype), np.array([high], dtype), dtype=dtype)
 
 
+def problem_within(space: spaces.Box) -> LinearMPC:
+    return problem(float(space.low[0]), float(space.high[0]))
+
+
+def policy_of(space: spaces.Box) -> YannPolicy:
+    observed = spaces.Box(-np.inf, np.inf, (2,))
+    return make_policy(observed, space, problem=problem_within(space))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("bounds", BOUNDS)
-def test_a_saturated_prediction_lies_in_the_action_space(bounds) -> None:
-    policy = make_policy(spaces.Box(-np.inf, np.inf, (2,)), box(*bounds), problem=problem(*bounds))
+def test_a_saturated_prediction_lies_in_the_action_space(bounds, dtype) -> None:
+    policy = policy_of(box(*bounds, dtype))
     seen = np.random.default_rng(0).uniform(-50, 50, (300, 2)).astype(np.float32)
     actions = policy.predict(seen)[0]
     assert np.ptp(actions) > 0.99 * (bounds[1] - bounds[0])
@@ -39,7 +49,7 @@ def test_a_saturated_prediction_lies_in_the_action_space(bounds) -> None:
 
 @pytest.mark.parametrize("bounds", BOUNDS)
 def test_a_scaled_action_of_one_is_the_bound(bounds) -> None:
-    policy = make_policy(spaces.Box(-np.inf, np.inf, (2,)), box(*bounds), problem=problem(*bounds))
+    policy = policy_of(box(*bounds))
     ends = policy.unscale_action(np.float32([[-1], [1]]))
     assert all(policy.action_space.contains(each) for each in ends)
     np.testing.assert_allclose(ends[:, 0], bounds, rtol=1e-6)
@@ -50,9 +60,8 @@ class Strict(gym.Env):
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
 
-    def __init__(self) -> None:
-        self.action_space, self.taken = box(*BOUNDS[0]), 0
-        self.saturated = 0
+    def __init__(self, dtype) -> None:
+        self.action_space, self.saturated = box(*BOUNDS[0], dtype), 0
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -69,17 +78,21 @@ class Strict(gym.Env):
         return self.np_random.uniform(-5, 5, 2).astype(np.float32)
 
 
-def test_no_step_of_training_leaves_the_action_space() -> None:
-    env, noise = Strict(), NormalActionNoise(np.zeros(1), np.ones(1))
-    kwargs = {"problem": problem(*BOUNDS[0])}
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_no_step_of_training_leaves_the_action_space(dtype) -> None:
+    env, noise = Strict(dtype), NormalActionNoise(np.zeros(1), np.ones(1))
+    kwargs = {"problem": problem_within(env.action_space)}
     model = DDPG(YannPolicy, env, policy_kwargs=kwargs, action_noise=noise, learning_starts=20)
     model.learn(100)
     assert env.saturated > 10
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
 @pytest.mark.parametrize("by", ["mpc", "policy"])
-def test_no_step_of_a_commissioning_leaves_the_action_space(by) -> None:
-    env = Strict()
-    plant = Plant(env, DDPG(YannPolicy, env, policy_kwargs={"problem": problem(*BOUNDS[0])}))
+def test_no_step_of_a_commissioning_leaves_the_action_space(by, dtype) -> None:
+    env = Strict(dtype)
+    plant = Plant(
+        env, DDPG(YannPolicy, env, policy_kwargs={"problem": problem_within(env.action_space)})
+    )
     plant.play(plant.begin(seed=0), getattr(plant, by), watchdog=None)
     assert env.saturated > 3

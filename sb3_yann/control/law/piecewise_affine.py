@@ -153,15 +153,11 @@ class PiecewiseAffine(OnPlant):
 
     def __call__(self, theta: ArrayLike) -> Array:
         """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
-        if isinstance(theta, np.ndarray) and theta.ndim == 1:
-            if theta.dtype.kind in "fiu":  # numba takes a quarter of a millisecond to refuse others
-                theta = theta.astype(np.float64, copy=False)
+        # Real numbers, none of them masked: all else is looked at below.
+        if type(theta) is np.ndarray and theta.ndim == 1 and theta.dtype.kind in "fiu":
             u = np.empty(len(self.u_min))
-            try:
-                if self._at(theta, u):
-                    return u
-            except TypeError:  # not of numbers
-                pass
+            if self._at(theta.astype(np.float64, copy=False), u):
+                return u
         from sb3_yann.control.law._kernels import law_of_batch
 
         points, rows = self._as_theta(theta)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, as_array, as_bounds, as_symmetric
+from sb3_yann._validation import Array, as_array, as_bounds, as_symmetric, to_float
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.budget import SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
@@ -174,7 +174,7 @@ class LinearMPC(MPCProblem):
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the next theta on the model; theta is (n_theta,) or (batch, n_theta)."""
         A, B = self.prediction
-        return np.asarray(theta) @ A.T + np.asarray(u) @ B.T
+        return np.asarray(to_float("theta", theta) @ A.T + to_float("u", u) @ B.T)
 
     def simulate(self, theta0: ArrayLike, steps: int) -> tuple[Array, Array]:
         """Return thetas (steps + 1, n_theta) and inputs (steps, m) of the law on its own model.
@@ -206,7 +206,7 @@ class LinearMPC(MPCProblem):
 
     def stage_cost(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the stage cost, without penalties, at theta (..., n_theta) and u (..., m)."""
-        at, v, errors = np.asarray(theta, np.float64), np.asarray(u, np.float64), self.error_system
+        at, v, errors = to_float("theta", theta), to_float("u", u), self.error_system
         z, v = at @ errors.to_error.T, v - at @ errors.to_input.T
         cost = np.sum((z @ errors.Q) * z, axis=-1) + np.sum((v @ errors.R) * v, axis=-1)
         if errors.cross is not None:

@@ -325,6 +325,7 @@ BAD_THETA: list[tuple[Any, type[Exception], str]] = [
     ([1j, 0], TypeError, "theta = .* is not an array of real numbers"),
     (np.array([1j, 0]), TypeError, "theta = .* is not an array of real numbers"),
     (object(), TypeError, "theta = .* is not an array of real numbers"),
+    (np.ma.array([1.0, 0.0], mask=[1, 0]), ValueError, "theta has masked entries"),
 ]
 
 

@@ -1,0 +1,185 @@
+"""Parameters of another problem are refused before anything is changed; own ones load."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG, TD3
+
+from policy_samples import build, scalar_mpc
+from sb3_yann import AffineObservation
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+
+Make = Callable[..., Any]
+KINDS: dict[str, dict[str, Any]] = {
+    "a network for each region": {},
+    "a shared network": {"networks": "shared"},
+    "an online law": {"law": "online"},
+    "the paper's critic": {"critic": "state_action"},
+    "a map of observations": {"observation": AffineObservation(2 * np.eye(1), np.ones(1))},
+}
+OTHERS = {
+    "same count": {"R": [[2]]},
+    "other count": {"horizon": 3, "R": [[2]]},
+    "other range": {"u_max": 2},
+}
+
+
+def model_of(kind: str, algorithm=DDPG, **changes) -> Any:
+    """A model whose networks, and whose target's, have learnt something: noise."""
+    model = build(algorithm, scalar_mpc(**changes), KINDS[kind])
+    generator = th.Generator().manual_seed(len(changes))
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.add_(0.01 * th.randn(parameter.shape, generator=generator))
+    return model
+
+
+def state_of(model) -> dict[str, th.Tensor]:
+    return {name: each.clone() for name, each in model.policy.state_dict().items()}
+
+
+def same(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> bool:
+    return one.keys() == other.keys() and all(th.equal(one[name], other[name]) for name in one)
+
+
+def require_refused(model, load: Callable[[], Any], what: str = "") -> None:
+    before = state_of(model)
+    message = rf"with another problem, observation or networks: .*{what}.*DDPG\.load\(path\)"
+    with pytest.raises(ValueError, match=message):
+        load()
+    assert same(state_of(model), before)
+
+
+def test_the_other_problems_have_as_many_regions_and_not() -> None:
+    regions = [scalar_mpc(**each).explicit().n_regions for each in ({}, *OTHERS.values())]
+    assert regions[0] == regions[1] != regions[2]
+
+
+@pytest.mark.parametrize("exact_match", [True, False])
+@pytest.mark.parametrize("other", OTHERS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_parameters_of_another_problem_change_nothing(kind, other, exact_match) -> None:
+    model, foreign = model_of(kind), model_of(kind, **OTHERS[other]).get_parameters()
+    require_refused(model, lambda: model.set_parameters(foreign, exact_match), r"actor\.mu\.")
+
+
+@pytest.mark.parametrize("part", ["actor", "actor_target"])
+def test_an_actor_of_another_problem_changes_nothing(part) -> None:
+    model, other = model_of("a shared network"), model_of("a shared network", R=[[2]])
+    foreign = getattr(other.policy, part).state_dict()
+    require_refused(model, lambda: getattr(model.policy, part).load_state_dict(foreign))
+
+
+def test_a_guards_checkpoint_of_another_problem_changes_nothing() -> None:
+    model, foreign = build(), ActorCheckpoint.of(build(mpc=scalar_mpc(R=[[2]])).policy)
+    require_refused(model, lambda: foreign.restore(model.policy))
+
+
+@pytest.mark.parametrize("part", ["actor", "actor_target", "critic", "critic_target"])
+def test_one_foreign_part_is_enough(part) -> None:
+    model, foreign = build(TD3), state_of(build(TD3, scalar_mpc(R=[[2]])))
+    own = state_of(model).items()
+    mixed = {name: foreign[name] if name.startswith(f"{part}.") else each for name, each in own}
+    require_refused(model, lambda: model.policy.load_state_dict(mixed), rf"{part}\.")
+
+
+def test_a_critic_of_other_weights_is_told_where_the_law_is_the_same() -> None:
+    model, foreign = build(), build(mpc=scalar_mpc(Q=[[2]], R=[[2]]))
+    require_refused(
+        model, lambda: model.set_parameters(foreign.get_parameters()), r"critic\.qf0\.W"
+    )
+
+
+def test_another_map_of_observations_is_told() -> None:
+    own, other = (AffineObservation(k * np.eye(1), np.zeros(1)) for k in (2, 3))
+    model, foreign = (build(policy_kwargs={"observation": each}) for each in (own, other))
+    parameters = foreign.get_parameters()
+    require_refused(model, lambda: model.set_parameters(parameters), r"features_extractor\.matrix")
+
+
+@pytest.mark.parametrize("own", [0, 1])
+def test_networks_of_the_other_kind_change_nothing(own) -> None:
+    kinds = ["a shared network", "a network for each region"]
+    model, foreign = model_of(kinds[own]), model_of(kinds[1 - own]).get_parameters()
+    require_refused(model, lambda: model.set_parameters(foreign), r"there is (no )?actor\.mu\.")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_parameters_of_the_same_problem_are_loaded_exactly(kind, algorithm) -> None:
+    learnt, model = model_of(kind, algorithm), build(algorithm, scalar_mpc(), KINDS[kind])
+    model.set_parameters(learnt.get_parameters())
+    assert same(state_of(model), state_of(learnt))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_saved_model_is_loaded_exactly(kind, tmp_path) -> None:
+    learnt = model_of(kind)
+    learnt.save(tmp_path / "model")
+    assert same(state_of(DDPG.load(tmp_path / "model")), state_of(learnt))
+    model = build(mpc=scalar_mpc(), policy_kwargs=KINDS[kind])
+    model.set_parameters(str(tmp_path / "model"))
+    assert same(state_of(model), state_of(learnt))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_another_machine_has_solved_is_loaded(kind) -> None:
+    model, state = model_of(kind), state_of(model_of(kind))
+    generator = th.Generator().manual_seed(0)
+    for name, each in state.items():
+        if each.dtype == th.float64 and ".network." not in name:
+            noise = th.randn(each.shape, generator=generator, dtype=th.float64)
+            each.mul_(1 + 1e-12 * noise).add_(1e-13 * noise.nan_to_num() * each.isfinite())
+    model.policy.load_state_dict(state)
+    assert same(state_of(model), state)
+
+
+def test_a_law_is_the_same_online_and_explicit() -> None:
+    explicit, online = model_of("a shared network"), model_of("an online law")
+    online.set_parameters(explicit.get_parameters())
+    explicit.set_parameters(online.get_parameters())
+
+
+def test_a_save_from_before_there_were_samples_is_loaded() -> None:
+    learnt, model = model_of("an online law"), model_of("an online law", R=[[1]])
+    state = {name: each for name, each in state_of(learnt).items() if not name.endswith("samples")}
+    model.policy.load_state_dict(state)
+    assert same(state_of(model), state_of(learnt))
+
+
+def test_some_parameters_may_be_loaded_alone() -> None:
+    learnt, model = model_of("a shared network"), build(policy_kwargs={"networks": "shared"})
+    given = {name: each for name, each in state_of(learnt).items() if ".network." in name}
+    optimizer = learnt.get_parameters()["actor.optimizer"]
+    model.set_parameters({"policy": given}, exact_match=False)
+    model.set_parameters({"actor.optimizer": optimizer}, exact_match=False)
+    assert all(th.equal(state_of(model)[name], each) for name, each in given.items())
+
+
+def test_a_load_with_another_problem_names_it(tmp_path) -> None:
+    """Stable-Baselines3 takes a plain ValueError for that of an old DQN, which is a KeyError."""
+    model = build()
+    model.save(tmp_path / "model")
+    changed = {"policy_kwargs": {"problem": scalar_mpc(R=[[2]])}}
+    with pytest.raises(ValueError, match="with another problem"):
+        DDPG.load(tmp_path / "model", custom_objects=changed)
+
+
+def test_the_correction_stays_within_its_bound_of_the_policys_own_mpc() -> None:
+    model = build(policy_kwargs={"max_correction": 0.1})
+    foreign = build(mpc=scalar_mpc(R=[[2]]), policy_kwargs={"max_correction": 0.1})
+    require_refused(model, lambda: model.set_parameters(foreign.get_parameters()))
+    theta = np.linspace(-5, 5, 101, dtype=np.float32)[:, None]
+    own = model.policy.problem.explicit()(theta)
+    assert np.max(np.abs(model.predict(theta)[0] - own)) <= 0.1 * 2
+
+
+@pytest.mark.parametrize("changes", [{"x_max": 4.9}, {"u_min": -0.99}, {"R": [[1.001]]}])
+def test_online_laws_of_problems_alike_are_told_apart(changes) -> None:
+    model, other = model_of("an online law"), model_of("an online law", **changes)
+    require_refused(model, lambda: model.set_parameters(other.get_parameters()))
