@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Options = TypeVar("Options")
+Kind = TypeVar("Kind")
 LARGEST_BOUND = 1e100
 """Squares and sums of larger ones overflow."""
 
@@ -186,6 +187,13 @@ def as_choice(name: str, value: Any, options: Sequence[str]) -> str:
     """Return ``value`` if it is one of the options, else raise ValueError."""
     if not isinstance(value, str) or value not in options:
         raise ValueError(f"{name} = {_short(value)} must be one of {tuple(options)}.")
+    return value
+
+
+def as_kind(name: str, value: Kind, kind: Any, wanted: str) -> Kind:
+    """Return ``value`` if it is of a class, named by ``wanted``, else raise TypeError."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} = {_short(value)} must be {wanted}.")
     return value
 
 
