@@ -100,6 +100,7 @@ def as_output_rows(
     if entries.ndim == 0:
         raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value!r}].")
     if entries.ndim != 1:
+        _require_moderate(name, entries, "Take another unit of the outputs.")
         return as_array(name, value, ("q", "n"))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
     if not whole or np.any(entries < 0) or np.any(entries > most):
@@ -274,13 +275,18 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
         raise ValueError(f"{name} has shape {array.shape}, expected ({size},) or a single number.")
     if np.any(np.isnan(array)):
         raise ValueError(f"{name} holds NaN: {array.tolist()}. Use inf for 'no bound'.")
-    huge = np.flatnonzero(np.isfinite(array) & (np.abs(array) > LARGEST_BOUND))
-    if len(huge):
-        raise ValueError(
-            f"{name}[{huge[0]}] = {array[huge[0]]:g} must be at most {LARGEST_BOUND:g} in size, or "
-            "infinite. Use inf for 'no bound'."
-        )
+    _require_moderate(name, array, "Use inf for 'no bound'.")
     return _frozen(array)
+
+
+def _require_moderate(name: str, array: Array, hint: str) -> None:
+    """Raise where a finite entry is so large that squares and sums of such overflow."""
+    huge = np.argwhere(np.isfinite(array) & (np.abs(array) > LARGEST_BOUND))
+    if len(huge):
+        at = tuple(map(int, huge[0]))
+        raise ValueError(
+            f"{name}{[*at]} = {array[at]:g} must be at most {LARGEST_BOUND:g} in size. {hint}"
+        )
 
 
 def _frozen(array: Array) -> Array:
