@@ -15,6 +15,7 @@ from sb3_yann import (
     LinearModel,
     NoActionNoise,
     SimulatedEpisodes,
+    export,
     restore_accepted,
 )
 from sb3_yann.evaluation import comparison_table, evaluate, summary_table
@@ -93,6 +94,10 @@ def test_a_wrong_kind_is_a_type_error_that_names_the_argument(call, message) -> 
 WRONG_VALUES = {
     "a seed below zero": (lambda: played(-1), "seeds = -1 must be a whole number of at least 0"),
     "a word for a seed": (lambda: played("a"), "seeds = 'a' must be a whole number"),
+    "a number for a name": (
+        lambda: export(scalar_mpc(), "law.c", name=3),
+        "name = 3 must be a word of letters",
+    ),
     "no episodes to compare": (
         lambda: comparison_table("", played(), played()),
         "before has 0 episodes and after 0; .* one at least",

@@ -72,7 +72,7 @@ def test_a_model_that_cannot_be_sampled_says_why(A, B, dt, message) -> None:
 
 
 def test_what_grows_is_named_where_more_decays_beside_it() -> None:
-    with pytest.raises(ValueError, match="grows too far within dt = 1 .* its pole 800 times dt"):
+    with pytest.raises(ValueError, match=r"grows too far within dt = 1 .* its pole 800 times dt"):
         LinearModel.from_continuous([[800, 0], [0, -900]], [[1], [1]], 1)
 
 
