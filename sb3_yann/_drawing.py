@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec
 
 if TYPE_CHECKING:
@@ -26,6 +28,15 @@ def new_figure(width: float = 6.4, height: float = 4.0) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def save_figure(figure: Figure, path: str | PathLike[str], dpi: int) -> Path:
+    """Write a picture, a PNG where the path has no suffix; return the path of what was written."""
+    target = Path(path)
+    target = target if target.suffix else target.with_name(f"{target.name}.png")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(target, dpi=dpi)
+    return target
 
 
 def axes_or_new(axes: Axes | None, width: float = 6.4, height: float = 4.0) -> Axes:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Options = TypeVar("Options")
+Kind = TypeVar("Kind")
 LARGEST_BOUND = 1e100
 """Squares and sums of larger ones overflow."""
 
@@ -99,6 +100,7 @@ def as_output_rows(
     if entries.ndim == 0:
         raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value!r}].")
     if entries.ndim != 1:
+        _require_moderate(name, entries, "Take another unit of the outputs.")
         return as_array(name, value, ("q", "n"))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
     if not whole or np.any(entries < 0) or np.any(entries > most):
@@ -189,6 +191,13 @@ def as_choice(name: str, value: Any, options: Sequence[str]) -> str:
     return value
 
 
+def as_kind(name: str, value: Kind, kind: Any, wanted: str) -> Kind:
+    """Return ``value`` if it is of a class, named by ``wanted``, else raise TypeError."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} = {_short(value)} must be {wanted}.")
+    return value
+
+
 def as_options(name: str, value: Any, kind: type[Options]) -> Options:
     """Return a group of options; a mapping, as YAML gives it, holds some of their names.
 
@@ -275,13 +284,18 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
         raise ValueError(f"{name} has shape {array.shape}, expected ({size},) or a single number.")
     if np.any(np.isnan(array)):
         raise ValueError(f"{name} holds NaN: {array.tolist()}. Use inf for 'no bound'.")
-    huge = np.flatnonzero(np.isfinite(array) & (np.abs(array) > LARGEST_BOUND))
-    if len(huge):
-        raise ValueError(
-            f"{name}[{huge[0]}] = {array[huge[0]]:g} must be at most {LARGEST_BOUND:g} in size, or "
-            "infinite. Use inf for 'no bound'."
-        )
+    _require_moderate(name, array, "Use inf for 'no bound'.")
     return _frozen(array)
+
+
+def _require_moderate(name: str, array: Array, hint: str) -> None:
+    """Raise where a finite entry is so large that squares and sums of such overflow."""
+    huge = np.argwhere(np.isfinite(array) & (np.abs(array) > LARGEST_BOUND))
+    if len(huge):
+        at = tuple(map(int, huge[0]))
+        raise ValueError(
+            f"{name}{[*at]} = {array[at]:g} must be at most {LARGEST_BOUND:g} in size. {hint}"
+        )
 
 
 def _frozen(array: Array) -> Array:

@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure as LoggedFigure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_whole
+from sb3_yann._validation import as_kind, as_whole
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import require_frozen, require_same_statistics
 from sb3_yann.policy.policies import YannPolicy, require_yann_policy
@@ -177,7 +177,8 @@ class FigureLog(BaseCallback):
         self, figures: Mapping[str, Callable[[], Axes | Figure]], every: int = 10_000
     ) -> None:
         super().__init__()
-        for name, draw in figures.items():
+        wanted = "a mapping of names to functions that draw, such as {'guard': guard.plot}"
+        for name, draw in as_kind("figures", figures, Mapping, wanted).items():
             if not callable(draw):
                 raise TypeError(
                     f"figures[{name!r}] = {draw!r} must be a function that draws, such as "

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, as_between, as_whole
-from sb3_yann.evaluation.episodes import Source, watch_length
+from sb3_yann.evaluation.episodes import Source, as_source, make_env, watch_length
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import require_yann_policy
 
@@ -105,7 +105,7 @@ class SimulatedEpisodes(BaseCallback):
         as_whole("longest", longest)
         as_between("noise", noise, 0, np.inf)
         as_whole("seed", seed, 0)
-        self.env, self.per_episode, self.seed = env, per_episode, seed
+        self.env, self.per_episode, self.seed = as_source(env), per_episode, seed
         self.step_tests, self.longest, self.noise = step_tests, longest, noise
         self._envs: list[gym.Env[Any, Any]] = []
 
@@ -128,7 +128,7 @@ class SimulatedEpisodes(BaseCallback):
         self._envs = [self.env] if isinstance(self.env, gym.Env) else []
         with _same_random_states():
             while not isinstance(self.env, gym.Env) and len(self._envs) < self._count:
-                self._envs.append(gym.make(self.env) if isinstance(self.env, str) else self.env())
+                self._envs.append(make_env(self.env))
         own = [each.unwrapped for each in getattr(training, "envs", [])]
         if any(env.unwrapped is each for env in self._envs for each in own):
             raise ValueError(

@@ -10,9 +10,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from sb3_yann._validation import as_whole
+
 
 def solve(options: Namespace) -> None:
     """Solve a problem, print its report, and save the law."""
+    if options.save:
+        _require_place(Path(options.save))
     problem = problem_of(options.problem)
     law = problem.explicit(
         time_limit=options.time_limit, region_limit=options.region_limit, progress=True
@@ -29,8 +33,8 @@ def evaluate(options: Namespace) -> None:
 
     from sb3_yann import evaluation
 
-    model = model_of(options.model)
-    env, seeds = env_of(options.env), range(options.seed, options.seed + options.episodes)
+    seeds = _seeds(options.episodes, options.seed)
+    model, env = model_of(options.model), env_of(options.env)
     policy = evaluation.evaluate(model, env, seeds)
     model.policy.limit_correction(0.0)  # what is left is the MPC
     mpc = evaluation.evaluate(model, env, seeds)
@@ -40,20 +44,19 @@ def evaluate(options: Namespace) -> None:
 
 def plot(options: Namespace) -> None:
     """Draw the regions of a law."""
-    from matplotlib.figure import Figure
+    from sb3_yann._drawing import new_figure, save_figure
 
-    figure = Figure(layout="constrained")
+    figure = new_figure()
     law_of(options.law).plot(figure.subplots(), entries=tuple(options.axes))
-    figure.savefig(options.picture, dpi=150)
-    print(f"Written: {options.picture}")
+    print(f"Written: {save_figure(figure, options.picture, dpi=150)}")
 
 
 def report(options: Namespace) -> None:
     """Write the report on a model."""
     from sb3_yann import report as write
 
-    env = env_of(options.env) if options.env else None
-    written = write(model_of(options.model), options.page, env=env, seeds=range(options.episodes))
+    seeds, env = _seeds(options.episodes), env_of(options.env) if options.env else None
+    written = write(model_of(options.model), options.page, env=env, seeds=seeds)
     print(f"Written: {written}")
 
 
@@ -119,16 +122,23 @@ def model_of(path: str) -> Any:
     DDPG is TD3 with other defaults: what TD3 loads acts and learns as it was saved.
     """
     from stable_baselines3 import TD3
+    from stable_baselines3.common.save_util import load_from_zip_file
 
-    from sb3_yann.policy.policies import require_yann_policy
+    from sb3_yann import YannPolicy
 
     if not Path(path).exists() and not Path(f"{path}.zip").exists():
         raise FileNotFoundError(f"There is no model {path}: model.save(path) writes one.")
     if not _is_model(path):
         raise ValueError(f"{path} is no model: pass a .zip file that model.save(path) has written.")
-    model = TD3.load(path, device="cpu")
-    require_yann_policy(model.policy, "sb3-yann")
-    return model
+    data = load_from_zip_file(path, device="cpu")[0] or {}  # TD3 fails at others' without a word
+    kind = data.get("policy_class")
+    if not (isinstance(kind, type) and issubclass(kind, YannPolicy)):
+        found = kind.__name__ if isinstance(kind, type) else "nothing that is known"
+        raise ValueError(
+            f"{path} holds {found} as its policy: sb3-yann needs a YannPolicy. Build the model as "
+            'DDPG("YannPolicy", env), and save it by model.save(path).'
+        )
+    return TD3.load(path, device="cpu")
 
 
 def checks_of(path: str | None) -> Any:
@@ -152,16 +162,29 @@ def checks_of(path: str | None) -> Any:
 def law_of(given: str) -> Any:
     """Return a law from its file, from a model, or from a problem."""
     from sb3_yann import OnlineLaw, PiecewiseAffine
+    from sb3_yann.control.law._files import read_law
 
     if _is_model(given):
         policy = model_of(given).policy
         return policy.problem.law(policy.law)
     if not Path(given).suffix == ".npz":
         return problem_of(given).law()
-    try:
-        return PiecewiseAffine.load(given)
-    except ValueError:
-        return OnlineLaw.load(given)
+    is_explicit = read_law("a law", given, lambda data: "gains" in data)
+    return PiecewiseAffine.load(given) if is_explicit else OnlineLaw.load(given)
+
+
+def _seeds(episodes: int, first: int = 0) -> range:
+    """Return the seeds of so many episodes, one at least."""
+    first = as_whole("--seed", first, 0)
+    return range(first, first + as_whole("--episodes", episodes))
+
+
+def _require_place(path: Path) -> None:
+    """Raise unless a file can lie there: what takes long is not done in vain."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; name a file in it.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"There is no folder {path.parent}: make it first.")
 
 
 def _is_model(given: str) -> bool:

@@ -9,6 +9,9 @@ import numpy as np
 
 from sb3_yann._validation import Array, ReadOnlyArrays
 
+LARGEST_EXPONENT = 709.0
+"""Beyond it the exponential function exceeds what numbers hold."""
+
 
 @dataclass(frozen=True, eq=False)
 class LinearSystem(ReadOnlyArrays):
@@ -81,5 +84,27 @@ def zero_order_hold(A: Array, B: Array, E: Array, dt: float) -> tuple[Array, Arr
 
     m, driven = B.shape[1], np.hstack([B, E])
     plant = control.ss(A, driven, np.eye(len(A)), np.zeros(driven.shape))
-    sampled = control.sample_system(plant, dt, method="zoh")
+    with np.errstate(all="ignore"):
+        sampled = control.sample_system(plant, dt, method="zoh")
+    if not np.all(np.isfinite(np.hstack([sampled.A, sampled.B]))):
+        raise ValueError(_why_not_sampled(A, dt))
     return sampled.A, sampled.B[:, :m], sampled.B[:, m:]
+
+
+def _why_not_sampled(A: Array, dt: float) -> str:
+    """Return why ``exp(A dt)`` and what follows from it are no finite numbers."""
+    poles = np.linalg.eigvals(A)
+    pole = poles[np.argmax(poles.real)]
+    if pole.real * dt < LARGEST_EXPONENT:
+        pole = poles[np.argmax(np.abs(poles))]
+    if abs(pole) * dt <= 1:
+        return (
+            f"Sampled every dt = {dt:g}, the continuous model has entries that are too large for "
+            "numbers. Give its states, inputs and disturbances other units."
+        )
+    shown = pole if pole.imag else pole.real
+    return (
+        f"The continuous model {'grows' if pole.real > 0 else 'decays'} too far within dt = {dt:g} "
+        f"to be sampled: its pole {shown:g} times dt is {shown * dt:g}. Look at the unit of time, "
+        f"sample about every {1 / abs(pole):.2g}, or leave the mode out of the model."
+    )

@@ -12,6 +12,9 @@ from scipy import linalg
 from sb3_yann._validation import Array
 from sb3_yann.control.linear_system import LinearSystem
 
+ON_CIRCLE = 1e-3
+"""Distance from the unit circle at which rounding may put the poles of a chain of integrators."""
+
 
 def riccati(
     model: LinearSystem, Q: Array, R: Array, gamma: float = 1.0, cross: Array | None = None
@@ -30,7 +33,8 @@ def riccati(
     """
     A, B = np.sqrt(gamma) * model.A, np.sqrt(gamma) * model.B
     try:
-        P = linalg.solve_discrete_are(A, B, Q, R, s=cross)
+        with np.errstate(all="ignore"):
+            P = linalg.solve_discrete_are(A, B, Q, R, s=cross)
         radius = spectral_radius(A - B @ gain(model, R, P, gamma, cross))
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
@@ -117,7 +121,14 @@ def _why_no_solution(A: Array, B: Array) -> str:
             "sqrt(gamma) A. Remove the mode from the model, add an input, lower gamma, or take "
             "another steady state: model.report() names those that were found."
         )
+    if np.any(np.abs(np.abs(np.linalg.eigvals(A)) - 1) < ON_CIRCLE):
+        return (
+            "The Riccati equation has no stabilizing solution: a mode on the unit circle carries "
+            "no weight in Q. Give it a positive weight, use gamma < 1, or pass a Terminal(cost)."
+        )
+    sizes = np.abs(np.hstack([A, B]))
     return (
-        "The Riccati equation has no stabilizing solution: a mode on the unit circle carries no "
-        "weight in Q. Give it a positive weight, use gamma < 1, or pass a Terminal(cost)."
+        "The Riccati equation has a stabilizing solution, but rounding hides it: the model is "
+        f"badly scaled, with entries of A and B from {sizes[sizes > 0].min():.2g} to "
+        f"{sizes.max():.2g} in size. Give states and inputs units in which they move alike."
     )

@@ -77,10 +77,10 @@ class DisturbanceObserver:
         drifts = as_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD)
         errors = as_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
         if gain is None:
-            self.gain = self._kalman_gain(np.concatenate([moves, drifts]), errors)
+            self.gain = self._kalman_gain(moves, drifts, errors)
         else:
             self.gain = as_array("gain", gain, (n + d, q))
-        radius = lqr.spectral_radius((np.eye(n + d) - self.gain @ self.seen) @ self.A)
+        radius = self._radius(self.gain)
         if not radius < 1:
             raise ValueError(
                 f"gain = {self.gain.tolist()} does not make the error of the estimate decay: its "
@@ -125,12 +125,27 @@ class DisturbanceObserver:
             self.A @ self.estimate + self.B @ as_array("u", u, (self.model.n_inputs,))
         )
 
-    def _kalman_gain(self, moves: Array, errors: Array) -> Array:
+    def _kalman_gain(self, moves: Array, drifts: Array, errors: Array) -> Array:
         """Return the steady-state gain of the filter from the standard deviations."""
-        R = np.diag(errors**2)
-        P = linalg.solve_discrete_are(self.A.T, self.seen.T, np.diag(moves**2), R)
-        spread = self.seen @ P @ self.seen.T + R
-        return np.asarray(np.linalg.solve(spread, self.seen @ P).T)
+        try:
+            with np.errstate(all="ignore"):
+                Q, R = np.diag(np.append(moves, drifts) ** 2), np.diag(errors**2)
+                P = linalg.solve_discrete_are(self.A.T, self.seen.T, Q, R)
+                spread = self.seen @ P @ self.seen.T + R
+                gain = np.asarray(np.linalg.solve(spread, self.seen @ P).T)
+            if self._radius(gain) < 1:
+                return gain
+        except ValueError:  # a LinAlgError is one
+            pass
+        raise ValueError(
+            f"state_noise = {moves.tolist()}, disturbance_noise = {drifts.tolist()} and "
+            f"measurement_noise = {errors.tolist()} are too far apart, or too large, for a Kalman "
+            "filter: rounding hides its gain. Only their ratios matter: keep these below 1e6."
+        )
+
+    def _radius(self, gain: Array) -> float:
+        """Return by which factor the error of the estimate changes in a sample, in the end."""
+        return lqr.spectral_radius((np.eye(len(self.A)) - gain @ self.seen) @ self.A)
 
 
 def _require_observable(model: LinearModel, C: Array) -> None:

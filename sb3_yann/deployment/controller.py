@@ -164,7 +164,22 @@ class Controller:
     """
 
     def __init__(self, data: Mapping[str, Any]) -> None:
+        if not isinstance(data, Mapping):
+            raise TypeError(
+                f"data = {data!r} must be the arrays of an export by their names: take "
+                "Controller.load(path)."
+            )
         self.data = {name: np.asarray(each) for name, each in data.items()}
+        try:
+            self._read()
+        except KeyError as error:
+            raise ValueError(
+                f"data has no {error}: take all arrays that export wrote, by Controller.load(path)."
+            ) from None
+        self.reset()
+
+    def _read(self) -> None:
+        """Check the arrays, and take the names from them."""
         version = int(self.data["format"])
         if version != FORMAT:
             raise ValueError(
@@ -175,7 +190,6 @@ class Controller:
         self.name, self.activation = str(self.data["name"]), str(self.data["activation"])
         self.obs_names = tuple(map(str, self.data["obs_names"]))
         self.action_names = tuple(map(str, self.data["action_names"]))
-        self.reset()
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Controller:

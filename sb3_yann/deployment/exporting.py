@@ -118,7 +118,7 @@ def export(
     kind = as_choice("format", format or target.suffix.lstrip("."), tuple(FORMATS))
     as_choice("precision", precision, PRECISIONS)
     called = target.stem if name is None else name
-    if not WORDS.fullmatch(called):
+    if not isinstance(called, str) or not WORDS.fullmatch(called):
         raise ValueError(
             f"name = {called!r} must be a word of letters, digits and underscores that begins with "
             "a letter: it goes into the names of the code. Pass another name."

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, as_kind, as_whole
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.mpc.plant_units import InputUnits
 
@@ -58,6 +58,11 @@ class Episodes:
     terminated: NDArray[np.bool_]
 
 
+def as_played(name: str, value: Episodes) -> Episodes:
+    """Return ``value`` if it is Episodes, else raise TypeError."""
+    return as_kind(name, value, Episodes, "the Episodes that evaluate returns")
+
+
 class EnvPool:
     """Envs that play again and again: making one often takes longer than its episode.
 
@@ -79,7 +84,7 @@ class EnvPool:
         """Yield n envs. After an error none is kept: their episodes are not over."""
         try:
             while len(self.envs) < n:
-                self.envs.append(_made(self.source))
+                self.envs.append(make_env(self.source))
             yield self.envs[:n]
         except BaseException:
             self.close()
@@ -129,7 +134,7 @@ def evaluate(
     >>> bool(evaluate(law, "CSTR-v0", seeds=[0]).costs[0] > 0)
     True
     """
-    seeds = [*seeds]
+    seeds = as_seeds(seeds)
     options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]
     resets = [*zip(seeds, options, strict=True)]
     act = _as_batch_function(policy)
@@ -168,12 +173,30 @@ def one_env(env: Source) -> Iterator[gym.Env[Any, Any]]:
     if isinstance(env, gym.Env):
         yield env
         return
-    with closing(_made(env)) as made:
+    with closing(make_env(env)) as made:
         yield made
 
 
-def _made(source: Source) -> gym.Env[Any, Any]:
+def as_seeds(seeds: Iterable[int]) -> list[int]:
+    """Return the seeds of episodes, whole numbers of at least 0."""
+    if not isinstance(seeds, Iterable):
+        raise TypeError(f"seeds = {seeds!r} must hold a seed for each episode, e.g. range(20).")
+    return [as_whole("seeds", each, 0) for each in seeds]
+
+
+def as_source(env: Any) -> Any:
+    """Return what names, is or makes an env, else raise TypeError."""
+    if not (isinstance(env, str | gym.Env) or callable(env)):
+        raise TypeError(
+            f"env = {env!r} must be the id of an environment, a gymnasium.Env, or a function that "
+            "makes one."
+        )
+    return env
+
+
+def make_env(source: Source) -> gym.Env[Any, Any]:
     """Return the env that is given, or one that is made."""
+    as_source(source)
     if isinstance(source, gym.Env):
         return source
     made = gym.make(source, disable_env_checker=True) if isinstance(source, str) else source()

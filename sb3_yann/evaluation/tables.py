@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_yann.evaluation.episodes import Episodes
+from sb3_yann.evaluation.episodes import Episodes, as_played
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,6 +25,7 @@ def comparison_table(title: str, before: Episodes, after: Episodes) -> Table:
     3
     """
     table = _table("episode", title)
+    _require_pairs(before, after)
     rows = [*zip(before.costs, after.costs, strict=True)]
     for number, (old, new) in enumerate(rows, start=1):
         table.add_row(str(number), f"{old:,.2f}", f"{new:,.2f}", _change(new - old))
@@ -48,6 +49,7 @@ def summary_table(title: str, before: Episodes, after: Episodes) -> Table:
     >>> summary_table("no input, full input", none, full).row_count
     6
     """
+    _require_pairs(before, after)
     change = after.costs - before.costs
     same = 1e-6 * np.abs(before.costs)
     table = _table("", title)
@@ -60,6 +62,16 @@ def summary_table(title: str, before: Episodes, after: Episodes) -> Table:
         table.add_row(f"{name} episodes", "", f"{count.sum()} of {len(change)}", "")
     table.add_row("largest increase", "", "", _change(max(change.max(), 0.0)))
     return table
+
+
+def _require_pairs(before: Episodes, after: Episodes) -> None:
+    """Raise unless there are episodes, and as many before as after."""
+    counts = [len(as_played(*each).costs) for each in (("before", before), ("after", after))]
+    if counts[0] != counts[1] or not counts[0]:
+        raise ValueError(
+            f"before has {counts[0]} episodes and after {counts[1]}; they must be those of the "
+            "same seeds, one at least. Pass both what evaluate returns for these seeds."
+        )
 
 
 def _table(rows: str, title: str) -> Table:

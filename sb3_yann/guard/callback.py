@@ -158,15 +158,16 @@ class ImprovementGuard(BaseCallback):
 
     def summary(self) -> str:
         """Return some lines: what is accepted, what was refused most often, and what may help."""
-        updates, needed = int(self.session.policy.critic_updates), self.session.policy.critic_warmup
-        if not self.decisions and updates <= needed:
+        decisions, policy = self.decisions, self.session.policy
+        updates, needed = int(policy.critic_updates), policy.critic_warmup
+        if not decisions and updates <= needed:
             return (
                 f"The policy is still the MPC: the critic has had {updates} updates, and the actor "
                 f"moves after critic_warmup = {needed}. Train longer, or lower critic_warmup."
             )
         evidence = self.state.evidence
         known = evidence.accepted or evidence.mpc
-        return summary_of(self.decisions, 0 if known is None else len(known.costs))
+        return summary_of(decisions, 0 if known is None else len(known.costs))
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the mean cost of each candidate by the verdict on it; return the axes.

@@ -14,7 +14,7 @@ from sb3_yann.evaluation.episodes import Episodes, evaluate
 from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
-from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
+from sb3_yann.guard.statistics import PairedEpisodes, Tolerance, told_apart
 
 HARDEST = 10
 """New starts that join those of every later candidate at a time."""
@@ -136,7 +136,8 @@ class Starts:
             )
         if self.mean_is_above(outcome):
             mean, mpc = outcome.costs.mean(), self.mpc.costs.mean()
-            found = f"mean cost {mean:.6g} on {len(self.seeds)} new starts, MPC {mpc:.6g}"
+            costs = told_apart(mean, mpc)
+            found = f"mean cost {costs[0]} on {len(self.seeds)} new starts, MPC {costs[1]}"
             if mean > mpc:
                 return found
             little = self.gains_too_little(outcome)

@@ -148,8 +148,15 @@ class PairedEpisodes:
             worst = np.argmax(relative)
             return f"{why} costs {costs[worst] - self.mpc_costs[worst]:.4g} more than with the MPC"
         if not costs.mean() <= self.costs.mean():
-            return f"mean cost {costs.mean():.6g}, accepted {self.costs.mean():.6g}"
+            mean, accepted = told_apart(costs.mean(), self.costs.mean())
+            return f"mean cost {mean}, accepted {accepted}"
         return ""
+
+
+def told_apart(one: float, other: float) -> tuple[str, str]:
+    """Return two numbers in six digits, or in as many more as tell them apart."""
+    shown = [(f"{one:.{digits}g}", f"{other:.{digits}g}") for digits in range(6, 18)]
+    return next((pair for pair in shown if pair[0] != pair[1]), shown[0])
 
 
 Logged = tuple[Array, Array]

@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_yann._validation import Array, as_array, as_bounds, as_positive_vector
+from sb3_yann._validation import Array, as_array, as_bounds, as_positive, as_positive_vector
 from sb3_yann.networks.prediction import (
     LinearPrediction,
     PredictionModel,
@@ -193,6 +193,7 @@ class AfterstateValue(nn.Module):
         scale: float | None = None,
     ) -> None:
         super().__init__()
+        known = 0.0 if scale is None else as_positive("scale", scale)  # 0: not known yet
         import_module("sb3_yann.networks._kernels.afterstate_value")  # see YannLayer
         self.model = untrained(model) if isinstance(model, nn.Module) else model
         self.gamma = gamma
@@ -203,7 +204,7 @@ class AfterstateValue(nn.Module):
             to_input=ranges.u_half,
             middle=ranges.u_middle,
             network_scale=1 / ranges.theta_half,
-            value_scale=np.array(scale or 0.0),  # 0: not known yet
+            value_scale=np.array(known),
         )
         n, m = len(ranges.theta_half), len(ranges.u_min)
         require_prediction(self.model, n, m)

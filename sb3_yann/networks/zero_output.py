@@ -16,7 +16,7 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, as_between, as_whole
 
 Activation = Callable[[th.Tensor], th.Tensor]
 FEW = 32
@@ -48,13 +48,11 @@ class PairedLinear(nn.Module):
         scale: float = 0.01,
     ) -> None:
         super().__init__()
-        if n_nodes < 2:
-            raise ValueError(f"n_nodes = {n_nodes} must be at least 2: zero needs a pair of nodes.")
+        as_whole("n_nodes", n_nodes, 2, "Zero needs a pair of nodes.")
         n_pairs = n_nodes // 2
         self.parts = [n_pairs, n_pairs, n_nodes % 2]
-        shape = (out_features, in_features + 1)  # the last column is the bias
-        first = th.empty(n_stacked, n_pairs, *shape).uniform_(-scale, scale)
-        rest = th.zeros(n_stacked, n_nodes % 2, *shape)
+        first = _drawn((n_stacked, n_pairs), in_features, out_features, scale)
+        rest = th.zeros(n_stacked, n_nodes % 2, *first.shape[2:])
         self.nodes = nn.Parameter(th.cat([first, -first, rest], 1))
 
     def matrix(self) -> th.Tensor:
@@ -81,13 +79,20 @@ class StackedLinear(nn.Module):
         self, in_features: int, out_features: int, *, n_stacked: int = 1, scale: float = 0.01
     ) -> None:
         super().__init__()
-        weight = th.empty(n_stacked, out_features, in_features + 1).uniform_(-scale, scale)
+        weight = _drawn((n_stacked,), in_features, out_features, scale)
         weight[..., -1] = 0  # Theorem 2: the biases of later layers start at zero
         self.weight = nn.Parameter(weight)
 
     def matrix(self) -> th.Tensor:
         """Return weights and, as the last column, biases: (n_stacked, out_features, n + 1)."""
         return self.weight
+
+
+def _drawn(stack: tuple[int, ...], in_features: int, out_features: int, scale: float) -> th.Tensor:
+    """Return random weights and, as the last column, biases: (*stack, out_features, n + 1)."""
+    shape = as_whole("out_features", out_features), as_whole("in_features", in_features) + 1
+    scale = as_between("scale", scale, 0, np.inf, "[)")
+    return th.empty(*stack, *shape).uniform_(-scale, scale)
 
 
 class Rows:
@@ -176,8 +181,9 @@ class ZeroOutputNetwork(nn.Module):
         scale: float = 0.01,
     ) -> None:
         super().__init__()
-        if len(hidden) not in (1, 2) or min(hidden) < 1:
-            raise ValueError(f"hidden = {hidden} must name one or two widths of at least 1.")
+        if np.ndim(hidden) != 1 or len(hidden) not in (1, 2):
+            raise ValueError(f"hidden = {hidden!r} must name one or two widths, such as (16, 16).")
+        hidden = tuple(as_whole("hidden", each) for each in hidden)
         with th.enable_grad():
             zero = th.zeros((), requires_grad=True)
             at_zero = activation(zero)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from typing import Any
 
@@ -56,6 +57,20 @@ def require_sb3_kwargs(given: dict[str, Any], own: list[str]) -> None:
             "features_extractor_class must stay FlattenExtractor: the law takes theta."
         )
     as_whole("n_critics", given.get("n_critics", 1))
+    _require_optimizer(given.get("optimizer_class", th.optim.Adam))
+
+
+def _require_optimizer(given: Any) -> None:
+    """Raise unless it makes optimizers whose steps need no more than gradients."""
+    if not callable(given):
+        raise TypeError(f"optimizer_class = {given!r} must be a class such as torch.optim.Adam.")
+    step = getattr(given, "step", None)
+    closure = inspect.signature(step).parameters.get("closure") if step is not None else None
+    if closure is not None and closure.default is inspect.Parameter.empty:
+        raise ValueError(
+            f"optimizer_class = {given.__name__} computes the loss several times a step, by a "
+            "function that TD3 and DDPG do not pass. Take one such as torch.optim.Adam."
+        )
 
 
 def with_fused_adam(given: dict[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -50,7 +50,7 @@ class AffineObservation(ReadOnlyArrays):
     @classmethod
     def identity(cls, size: int) -> AffineObservation:
         """Return ``theta = obs``."""
-        return cls(np.eye(size))
+        return cls(np.eye(as_whole("size", size)))
 
     @classmethod
     def deviation(cls, x_ss: ArrayLike) -> AffineObservation:
@@ -88,33 +88,33 @@ class AffineObservation(ReadOnlyArrays):
         """
         bottom = as_array("low", low, ("n",))
         top = as_array("high", high, (len(bottom),))
-        width = float(to[1]) - float(to[0])
-        if np.any(top <= bottom) or not width > 0:
+        start, end = as_array("to", to, (2,))
+        if np.any(top <= bottom) or not end > start:
             raise ValueError(
                 f"low = {bottom.tolist()} must lie below high = {top.tolist()}, and to = {to} rise."
             )
-        slope = (top - bottom) / width
-        return cls(np.diag(slope), bottom - slope * float(to[0]))
+        slope = (top - bottom) / (end - start)
+        return cls(np.diag(slope), bottom - slope * start)
 
     @classmethod
     def pick(cls, entries: Sequence[int], size: int) -> AffineObservation:
         """Return ``theta[i] = obs[entries[i]]``, of an observation with ``size`` entries."""
-        return cls(np.eye(size)[_as_entries("entries", entries, size)])
+        return cls(_rows("entries", entries, size))
 
     @classmethod
     def minus_set_point(
         cls, entries: Sequence[int], set_points: Sequence[int | None], size: int
     ) -> AffineObservation:
         """Return ``theta[i] = obs[entries[i]] - obs[set_points[i]]``, None for no set-point."""
-        if len(set_points) != len(entries):
+        matrix = _rows("entries", entries, size)
+        if np.ndim(set_points) != 1 or len(set_points) != len(matrix):  # type: ignore[arg-type]
             raise ValueError(
-                f"set_points = {set_points} has {len(set_points)} items for {len(entries)} "
+                f"set_points = {set_points!r} must have an item for each of the {len(matrix)} "
                 "entries; write None for an entry without a set-point."
             )
-        matrix = np.eye(size)[_as_entries("entries", entries, size)]
         for row, set_point in zip(matrix, set_points, strict=True):
             if set_point is not None:
-                row -= np.eye(size)[_as_entries("set_points", [set_point], size)[0]]
+                row -= _rows("set_points", [set_point], size)[0]
         return cls(matrix)
 
     @classmethod
@@ -123,7 +123,7 @@ class AffineObservation(ReadOnlyArrays):
 
         It comes last in SB3's `VecFrameStack` and in gymnasium's `FrameStackObservation`.
         """
-        as_whole("frames", frames)
+        frames, size = as_whole("frames", frames), as_whole("size", size)
         return cls.pick(range((frames - 1) * size, frames * size), frames * size)
 
     @classmethod
@@ -283,8 +283,11 @@ def require_outermost(normalize: VecNormalize, seen: tuple[int, ...] | None) -> 
         )
 
 
-def _as_entries(name: str, entries: Sequence[int], size: int) -> list[int]:
-    found = [int(entry) for entry in entries]
-    if not all(0 <= entry < size for entry in found):
-        raise ValueError(f"{name} = {found} must be indices from 0 to {size - 1}.")
-    return found
+def _rows(name: str, entries: Sequence[int], size: int) -> Array:
+    """Return the rows (k, size) of the identity that pick so many entries of an observation."""
+    size, found = as_whole("size", size), [*entries] if isinstance(entries, Iterable) else [None]
+    whole = all(isinstance(each, int | np.integer) for each in found)
+    if not whole or not all(0 <= each < size for each in found):
+        given = found if isinstance(entries, Iterable) else entries
+        raise ValueError(f"{name} = {given!r} must be a list of indices from 0 to {size - 1}.")
+    return np.eye(size)[found]

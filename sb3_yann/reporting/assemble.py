@@ -11,9 +11,8 @@ from pathlib import Path
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_whole
 from sb3_yann.audit import Headroom
-from sb3_yann.evaluation.episodes import Source
+from sb3_yann.evaluation.episodes import Source, as_seeds
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.reporting.evidence_parts import guard_part, headroom_part, twin_part
@@ -114,9 +113,7 @@ def _subject(
         )
     if twin is not None:
         require_problem_of_twin(policy, twin.problem)
-    if not isinstance(seeds, Iterable):
-        raise TypeError(f"seeds = {seeds!r} must hold a seed for each episode, e.g. range(20).")
-    chosen = tuple(as_whole("seeds", each, 0) for each in seeds)
+    chosen = tuple(as_seeds(seeds))
     if not chosen:
         raise ValueError("seeds is empty: pass one whole number for each episode, e.g. range(20).")
     played = guard.env if env is None and guard is not None else env

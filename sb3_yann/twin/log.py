@@ -89,7 +89,8 @@ def as_episodes(
             wanted = f"(T + 1, {layout.n_states})"
             if layout.size > layout.n_states:
                 wanted += f", or all of theta, (T + 1, {layout.size})"
-            raise ValueError(f"episode {i}: states have shape {x.shape}, expected {wanted}.")
+            wanted += f".{_lacking(problem, x)}"
+            raise ValueError(f"episode {i}: states have shape {x.shape}, expected {wanted}")
         if len(x) != len(u) + 1:
             raise ValueError(
                 f"episode {i}: {len(x)} states and {len(u)} actions; there is one state more than "
@@ -129,6 +130,23 @@ def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
             rows = episode.thetas[first : last + 1], episode.actions[first:last]
             found.append(Episode(*rows))
     return tuple(found)
+
+
+def _lacking(problem: LinearMPC, states: Array) -> str:
+    """Return a hint where states (T + 1, k) lack the inputs on their way, empty elsewhere."""
+    model, past = problem.model, list[int]()
+    rows = np.hstack([model.A, model.B])
+    taken_over = (np.count_nonzero(rows, axis=1) == 1) & (rows.max(axis=1) == 1.0)
+    for _ in range(model.n_states):  # each is an input of the step before, or such a state's value
+        known = {*past, *range(model.n_states, rows.shape[1])}
+        past = [int(k) for k in np.flatnonzero(taken_over) if int(np.argmax(rows[k])) in known]
+    if not past or states.ndim != 2 or states.shape[1] != model.n_states - len(past):
+        return ""
+    names = ", ".join(problem.labels()[k] for k in past)
+    return (
+        f" They lack the past inputs {names}, which are states of the model: log the env in "
+        "sb3_yann.wrappers.PastInputs, or append them as columns."
+    )
 
 
 def _pairs(episodes: Iterable[Any]) -> list[tuple[Any, Any]]:

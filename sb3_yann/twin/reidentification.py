@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearModel, LinearMPC, OutputBounds, Terminal
+from sb3_yann.control.mpc.linear_mpc import derived
 from sb3_yann.control.mpc.steady_state import steady_states
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import Episode, pieces
@@ -61,7 +60,7 @@ def _with(problem: LinearMPC, model: LinearModel, x: Array, u: Array) -> LinearM
     """Return the problem with another model, whose operating point lies x and u from its own."""
     outputs, states = problem.outputs, problem.layout.state
     y = outputs.C @ x
-    return dataclasses.replace(
+    return derived(
         problem,
         model=model,
         x_min=problem.x_min - x,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from decimal import ROUND_CEILING, Context
 
 import numpy as np
 
@@ -80,8 +81,14 @@ def _inputs(problem: LinearMPC, trust: Trust) -> Iterator[str]:
 
 def _noise(problem: LinearMPC, trust: Trust) -> Iterator[str]:
     names = labels_of(problem.model)[0]
-    found = ", ".join(f"{n} {s:.2g}" for n, s in zip(names, trust.noise, strict=True))
+    found = ", ".join(f"{n} {_rounded_up(s)}" for n, s in zip(names, trust.noise, strict=True))
     yield f"Sensor noise, at most (standard deviations): {found}."
+
+
+def _rounded_up(value: float) -> str:
+    """Return a number in two digits that is no less: what holds at most stays true."""
+    digits = Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(float(value)))
+    return f"{float(digits):.2g}"
 
 
 def _verdict(trust: Trust) -> Iterator[str]:

@@ -31,8 +31,8 @@ class Appending(gym.Wrapper[Vector, Vector, Vector, Vector]):
     def __init__(
         self, env: Env, low: ArrayLike, high: ArrayLike, n_replaced: int = 0, n_new: int = 0
     ) -> None:
+        inner = require_vector(env, "observation_space")
         super().__init__(env)
-        inner = require_vector(self, "observation_space")
         self.inputs = require_vector(self, "action_space")
         self.low, self.high = (np.atleast_1d(np.array(side, np.float64)) for side in (low, high))
         if self.low.ndim != 1 or self.low.shape != self.high.shape:

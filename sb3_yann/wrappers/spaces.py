@@ -9,12 +9,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_yann._validation import as_kind
+
 Vector = NDArray[np.floating[Any]]
 Env = gym.Env[Vector, Vector]
 
 
 def require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:
     """Return a space of the env, a Box with one dimension."""
+    as_kind("env", env, gym.Env, "a gymnasium.Env: gymnasium.make(id), or one of your own")
     space = getattr(env, name)
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise TypeError(

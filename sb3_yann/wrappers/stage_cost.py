@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_number
+from sb3_yann._validation import Array, as_kind, as_number
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.plant_units import InputUnits
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
@@ -49,8 +49,9 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         violation_cost: float = 0.0,
         observation: Callable[[ArrayLike], Array] | str | Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        super().__init__(env)
         space = require_vector(env, "observation_space")
+        super().__init__(env)
+        as_kind("problem", problem, LinearMPC, "a LinearMPC, such as that of the policy")
         self.inputs = require_vector(env, "action_space")
         names = problem.layout.names
         units = InputUnits.of(problem, self.inputs.low, self.inputs.high)

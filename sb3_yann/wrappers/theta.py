@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, NonFiniteWarning, as_whole
+from sb3_yann._validation import Array, NonFiniteWarning, as_vector, as_whole
 from sb3_yann.control import DisturbanceObserver
 from sb3_yann.wrappers.appending import Appending, joined
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
@@ -45,17 +45,7 @@ class PreviousInput(Appending):
     def __init__(self, env: Env, initial: ArrayLike | None = None) -> None:
         bounds = require_vector(env, "action_space")
         super().__init__(env, bounds.low, bounds.high)
-        if initial is None:
-            _require_zero(bounds, np.ones(bounds.shape, dtype=bool))
-        start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
-        if start.shape != bounds.shape:
-            raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
-        if not np.all(np.isfinite(start)):
-            raise ValueError(
-                f"initial = {start.tolist()} must be finite: the input that acts before the first "
-                "step, or None for the operating point."
-            )
-        self.initial: Array = np.clip(start, bounds.low, bounds.high)
+        self.initial = _as_initial(initial, bounds, np.ones(bounds.shape, dtype=bool))
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         return joined(observation, self.initial if u is None else u)
@@ -89,6 +79,8 @@ class PastInputs(Appending):
     def __init__(self, env: Env, delays: Sequence[int], initial: ArrayLike | None = None) -> None:
         bounds = require_vector(env, "action_space")
         hint = "It counts past values of an input."
+        if not isinstance(delays, Iterable):
+            raise TypeError(f"delays = {delays!r} must be a list, one entry for each input. {hint}")
         self.delays = [as_whole("delays", each, 0, hint) for each in delays]
         if len(self.delays) != bounds.shape[0]:
             raise ValueError(
@@ -97,12 +89,7 @@ class PastInputs(Appending):
             )
         low, high = np.repeat(bounds.low, self.delays), np.repeat(bounds.high, self.delays)
         super().__init__(env, low, high)
-        if initial is None:
-            _require_zero(bounds, np.array(self.delays) > 0)
-        start = np.zeros(bounds.shape) if initial is None else np.array(initial, np.float64)
-        if start.shape != bounds.shape:
-            raise ValueError(f"initial has shape {start.shape}, expected {bounds.shape}.")
-        self.initial: Array = np.clip(start, bounds.low, bounds.high)
+        self.initial = _as_initial(initial, bounds, np.array(self.delays) > 0)
         self.past: list[Array] = []
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
@@ -115,17 +102,19 @@ class PastInputs(Appending):
         return joined(observation, np.array(shown, np.float64))
 
 
-def _require_zero(bounds: spaces.Box, needed: NDArray[np.bool_]) -> None:
-    """Raise where inputs that are ``needed`` (m,) were hardly zero before an episode.
+def _as_initial(initial: ArrayLike | None, bounds: spaces.Box, needed: NDArray[np.bool_]) -> Array:
+    """Return the inputs (m,) before an episode, by default zero.
 
-    Bounds that leave zero out are those of absolute values, and so are those that begin there.
+    Raise where inputs that are ``needed`` (m,) were hardly zero. Bounds that leave zero out are
+    those of absolute values, and so are those that begin there.
     """
-    if np.any(needed & ((bounds.low >= 0) | (bounds.high <= 0))):
+    if initial is None and np.any(needed & ((bounds.low >= 0) | (bounds.high <= 0))):
         raise ValueError(
             f"The env takes inputs from {bounds.low.tolist()} to {bounds.high.tolist()}: zero, "
             "the default, is hardly the one before an episode. Pass initial, such as u_ss of the "
             "model."
         )
+    return np.clip(as_vector("initial", initial, len(bounds.low)), bounds.low, bounds.high)
 
 
 class SetPoint(Appending):

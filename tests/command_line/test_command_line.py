@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import zipfile
 
 import numpy as np
 import pytest
-from stable_baselines3 import DDPG, TD3
+from stable_baselines3 import DDPG, PPO, SAC, TD3
 
-from sb3_yann import Controller, LinearMPC, PiecewiseAffine, YannPolicy
+from sb3_yann import Controller, LinearMPC, PiecewiseAffine, YannPolicy, export
 from sb3_yann.command_line import main
 from twin_samples import Cart, problem
 
@@ -48,6 +49,17 @@ def test_solve_prints_the_report_and_saves_the_law(folder, capsys) -> None:
     law = PiecewiseAffine.load(folder / "law.npz")
     assert f"The law has {law.n_regions} regions" in capsys.readouterr().out
     assert law == problem().explicit()
+
+
+def test_a_picture_without_a_suffix_is_said_to_lie_where_it_does(folder, capsys) -> None:
+    assert main(["plot", "my_cart:cart", "law"]) == 0
+    assert capsys.readouterr().out == "Written: law.png\n" and (folder / "law.png").exists()
+
+
+def test_an_online_law_s_file_is_told_from_an_explicit_one_s(folder, capsys) -> None:
+    problem().online().save(folder / "law.npz")
+    assert main(["plot", "law.npz", "law.png"]) == 1
+    assert "is solved online and has no regions" in capsys.readouterr().err
 
 
 def test_a_limit_that_is_too_small_is_said(folder, capsys) -> None:
@@ -132,6 +144,18 @@ def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys) -
     assert main([*again, "--batches", "1"]) == 0  # nothing is left to do
 
 
+def write_files(folder) -> None:
+    """Write a law, and files that hold none."""
+    problem().explicit().save(folder / "law.npz")
+    export(problem(), folder / "controller.npz")
+    content = bytearray((folder / "law.npz").read_bytes())
+    content[len(content) // 2] ^= 0x40
+    (folder / "damaged.npz").write_bytes(bytes(content))
+    (folder / "text.npz").write_text("a law")
+    with zipfile.ZipFile(folder / "empty.zip", "w") as archive:
+        archive.writestr("note", "no model")
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -139,7 +163,19 @@ def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys) -
         (["solve", "no_such_module:mpc"], "no module"),
         (["solve", "my_cart:Cart"], "expected a LinearMPC"),
         (["evaluate", "none.zip", "--env", "my_cart:Cart"], "There is no model none.zip"),
-        (["evaluate", "mlp", "--env", "Pendulum-v1"], "needs a YannPolicy"),
+        (["evaluate", "mlp", "--env", "Pendulum-v1"], "holds TD3Policy as its policy: sb3-yann ne"),
+        (["evaluate", "sac", "--env", "Pendulum-v1"], "sac holds SACPolicy as its policy"),
+        (["export", "ppo", "p.c"], "ppo holds ActorCriticPolicy as its policy"),
+        (["plot", "empty.zip", "p.png"], "empty.zip holds nothing that is known as its policy"),
+        (["evaluate", "m", "--env", "E", "--episodes", "0"], "--episodes = 0 must be a whole numb"),
+        (["evaluate", "m", "--env", "E", "--seed", "-1"], "--seed = -1 must be a whole number of"),
+        (["report", "m", "page.html", "--episodes", "-1"], "--episodes = -1 must be a whole num"),
+        (["plot", "text.npz", "p.png"], "text.npz does not hold a law (it is no .npz file"),
+        (["plot", "damaged.npz", "p.png"], "damaged.npz does not hold a law ("),
+        (["export", "damaged.npz", "p.c"], "damaged.npz does not hold a law ("),
+        (["export", "controller.npz", "p.c"], "does not hold a PiecewiseAffine (it has no '"),
+        (["solve", "nowhere", "--save", "no/law.npz"], "There is no folder no: make it first"),
+        (["solve", "nowhere", "--save", "."], ". is a folder; name a file in it"),
         (["report", "law.npz", "page.html"], "law.npz is no model"),
         (["commission", "none", "--env", "my_cart:Cart", "--record", "r"], "There is no model"),
     ],
@@ -147,9 +183,10 @@ def test_commission_writes_a_record_and_goes_on_with_it(model, folder, capsys) -
 def test_what_cannot_be_done_is_an_exit_code_of_one_and_a_sentence(
     arguments, said, folder, capsys
 ) -> None:
-    if "mlp" in arguments:
-        DDPG("MlpPolicy", "Pendulum-v1", device="cpu").save(folder / "mlp")
-    problem().explicit().save(folder / "law.npz")
+    for name, kind in (("mlp", DDPG), ("sac", SAC), ("ppo", PPO)):
+        if name in arguments:
+            kind("MlpPolicy", "Pendulum-v1", device="cpu").save(folder / name)
+    write_files(folder)
     assert main(arguments) == 1
     printed = capsys.readouterr().err
     assert printed.startswith(f"sb3-yann {arguments[0]}: ") and said in printed

@@ -66,6 +66,18 @@ def test_a_reset_forgets_what_was_estimated() -> None:
         (LOADED, {"gain": np.zeros((3, 2))}, "does not make the error of the estimate decay"),
         (LOADED, {"gain": np.zeros((2, 2))}, r"gain has shape \(2, 2\), expected \(3, 2\)"),
         (LOADED, {"measurement_noise": 0}, "measurement_noise = .* standard deviations, above 0"),
+        (
+            LOADED,
+            {"state_noise": 1e300},
+            r"state_noise = \[1e\+300, 1e\+300\].* ratios.* below 1e6",
+        ),
+        (LOADED, {"state_noise": 2**63}, "too far apart, or too large, for a Kalman filter"),
+        (LOADED, {"measurement_noise": 1e100}, r"measurement_noise = \[1e\+100, 1e\+100\] are too"),
+        (
+            LinearModel([[0.9, 0.2], [0, 0.8]], [[0], [1]], 1.0, E=np.eye(2)),
+            {"state_noise": [1e-96, 1], "disturbance_noise": [1, 1e96]},
+            "rounding hides its gain",
+        ),
         (LOADED, {"measured": 0}, r"measured = 0 must be a list of indices of states: \[0\]"),
         (LOADED, {"measured": [5]}, r"measured = \[5\] must be indices of states"),
     ],

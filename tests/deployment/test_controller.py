@@ -328,6 +328,24 @@ def test_readings_that_are_no_real_numbers_are_refused_and_no_step(obs, tmp_path
     assert controller.counters["steps"] == 0
 
 
+@pytest.mark.parametrize("lost", ["format", "gains", "bounds", "layer0", "name", "activation"])
+def test_arrays_that_are_not_there_are_named(lost, tmp_path):
+    data = dict(controller_of(policy_of("references and rates"), tmp_path).data)
+    del data[lost]
+    with pytest.raises(
+        ValueError, match=f"data has no '{lost}': take all arrays that export wrote"
+    ):
+        Controller(data)
+
+
+@pytest.mark.parametrize("data", [None, "law.npz", 3])
+def test_what_is_no_mapping_of_arrays_is_no_controller(data):
+    with pytest.raises(
+        TypeError, match=r"data = .* must be the arrays .* Controller\.load\(path\)"
+    ):
+        Controller(data)
+
+
 def test_arrays_that_do_not_fit_together_are_named(tmp_path):
     data = controller_of(policy_of("references and rates"), tmp_path).data
     wrong = [

@@ -103,6 +103,11 @@ def test_the_reason_names_the_hardest_start_and_how_many_are_lost() -> None:
     assert given.objection(outcome([10.5, 10.0, 10.0])) == (
         "mean cost 10.1667 on 3 new starts, MPC 10"
     )
+    assert given.objection(outcome([10.0, 10.0, 10.0003])) == (
+        "mean cost 10.0001 on 3 new starts, MPC 10"
+    )
+    near = given.objection(outcome([10.0, 10.0, 10.00006]))
+    assert near == "mean cost 10.00002 on 3 new starts, MPC 10"
     assert given.objection(outcome([10.0, 10.0, 10.0])) == ""
     surely = starts([10.0] * 4, Tolerance(9.0), 50.0)
     assert surely.objection(outcome([9.0, 9.0, 9.9, 10.0])) == (

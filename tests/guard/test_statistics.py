@@ -44,6 +44,7 @@ def objection(costs, violations=NONE, accepted=(10.0, 20.0, 30.0), margin=1.0) -
         ([11.01, 5, 5], "start 0 costs 1.01 more than with the MPC"),
         ([5, 5, 31.5], "start 2 costs 1.5 more"),
         ([10, 20.5, 30], "mean cost 20.1667, accepted 20"),
+        ([10, 20, 30.0000003], "mean cost 20.0000001, accepted 20"),
         ([NAN, 1, 1], "start 0 costs nan more"),
         ([1, 1, INF], "start 2 costs inf more"),
         ([-INF, NAN, 1], "start 1 costs nan more"),

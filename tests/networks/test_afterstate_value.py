@@ -256,6 +256,12 @@ def test_a_prediction_model_is_tried_when_it_is_given(model, message) -> None:
         critic("pendulum", model=model)
 
 
+@pytest.mark.parametrize("scale", [-1, 0, float("nan")])
+def test_a_scale_that_is_not_above_zero_is_named(scale) -> None:
+    with pytest.raises(ValueError, match=f"scale = {scale} must be a finite number above 0"):
+        critic("pendulum", scale=scale)
+
+
 def test_a_module_in_float32_is_converted() -> None:
     module = Halving().float()
     rows = random_rows("pendulum", 20)

@@ -137,3 +137,18 @@ def test_fixed_parameters_get_no_gradient() -> None:
     network = PaperYann(law, 8)
     network(box_points(law, 100)).sum().backward()
     assert all(parameter.grad is None for parameter in network.fixed.values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"law": None}, TypeError, "law = None must be a PiecewiseAffine"),
+        ({"width": -1}, ValueError, "width = -1 must be a whole number of at least 0"),
+        ({"width": "wide"}, ValueError, "width = 'wide' must be a whole number"),
+        ({"scale": -1}, ValueError, "scale = -1 must be a finite number of at least 0"),
+        ({"scale": float("nan")}, ValueError, "scale = nan must be a finite number"),
+    ],
+)
+def test_bad_argument_is_named(changes, error, message) -> None:
+    with pytest.raises(error, match=message):
+        PaperYann(**{"law": law_of("reactor"), "width": 2} | changes)

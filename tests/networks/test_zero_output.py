@@ -292,15 +292,36 @@ def test_activation_that_is_not_zero_at_zero_is_refused(
         ZeroOutputNetwork(2, 1, activation=activation)
 
 
-@pytest.mark.parametrize("hidden", [(), (4, 4, 4), (0,), (4, 0)])
+@pytest.mark.parametrize("hidden", [(), (4, 4, 4), -1])
 def test_other_than_one_or_two_hidden_layers_are_refused(hidden: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"hidden = .* one or two widths of at least 1"):
+    with pytest.raises(ValueError, match=r"hidden = .* must name one or two widths, such as"):
         ZeroOutputNetwork(2, 1, hidden)
 
 
 def test_fewer_than_two_nodes_are_refused() -> None:
-    with pytest.raises(ValueError, match="n_nodes = 1 must be at least 2"):
+    with pytest.raises(
+        ValueError, match=r"n_nodes = 1 must be a whole number of at least 2\. Zero needs"
+    ):
         ZeroOutputNetwork(2, 1, n_nodes=1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"in_features": 0}, "in_features = 0 must be a whole number of at least 1"),
+        ({"in_features": -2}, "in_features = -2 must be a whole number of at least 1"),
+        ({"out_features": -1}, "out_features = -1 must be a whole number of at least 1"),
+        ({"out_features": 1.5}, "out_features = 1.5 must be a whole number"),
+        ({"hidden": (0,)}, "hidden = 0 must be a whole number of at least 1"),
+        ({"hidden": (8, -1)}, "hidden = -1 must be a whole number of at least 1"),
+        ({"n_nodes": 2.5}, "n_nodes = 2.5 must be a whole number of at least 2"),
+        ({"scale": -1}, "scale = -1 must be a finite number of at least 0"),
+        ({"scale": float("inf")}, "scale = inf must be a finite number"),
+    ],
+)
+def test_bad_argument_of_a_network_is_named(changes, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        ZeroOutputNetwork(**{"in_features": 2, "out_features": 1} | changes)
 
 
 def test_stack_without_an_index_is_refused() -> None:

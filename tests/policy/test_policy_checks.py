@@ -122,6 +122,8 @@ def test_stochastic_algorithms_are_refused_by_name(algorithm) -> None:
         ({"actor_lr_mult": "a"}, TypeError, "actor_lr_mult = 'a'"),
         ({"actor_lr_mult": None}, TypeError, "actor_lr_mult = None"),
         ({"n_critics": 0}, ValueError, "n_critics = 0"),
+        ({"optimizer_class": th.optim.LBFGS}, ValueError, "optimizer_class = LBFGS computes the l"),
+        ({"optimizer_class": 3}, TypeError, "optimizer_class = 3 must be a class such as torch"),
         ({"net_arch": {"pi": [4, 4, 4], "qf": [8, 8]}}, ValueError, r"net_arch\['pi'\]"),
         ({"net_arch": {"pi": ["a"]}}, ValueError, r"net_arch\['pi'\]"),
         ({"net_arch": {"vf": [4]}}, ValueError, "net_arch"),

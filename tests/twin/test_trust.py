@@ -173,6 +173,9 @@ def test_the_report_shows_these_numbers() -> None:
     assert "  u[0]: 12.3 % of half the range, 4.56 %: its gain is known from the log" in said
     assert f"  error {100 * np.sqrt(2) / 15:.3g} % of the mean cost" in said
     assert "Sensor noise, at most (standard deviations): x[0] 0.01, x[1] 0.5." in said
+    little = dataclasses.replace(given, noise=np.array([0.1401, 0.00102]))
+    said_of_little = report(problem(), twin().episodes, "quadratic", little)
+    assert "x[0] 0.15, x[1] 0.0011." in said_of_little
     rests = dataclasses.replace(given, excitation=np.array([0.0199]))
     assert "1.99 %: its gain rests on the given B" in report(problem(), twin().episodes, "", rests)
 

@@ -209,7 +209,7 @@ def test_an_env_whose_observation_is_no_vector_is_named() -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_previous_input_that_is_not_finite_is_refused(value) -> None:
-    with pytest.raises(ValueError, match=r"initial = \[(nan|inf)\] must be finite"):
+    with pytest.raises(ValueError, match=r"initial holds NaN or infinite entries: \[(nan|inf)\]"):
         PreviousInput(Counter(), initial=[value])
 
 

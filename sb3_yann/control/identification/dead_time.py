@@ -22,8 +22,8 @@ def as_delays(delay: int | str | Sequence[int], n_inputs: int) -> list[int] | No
         if delay != "auto":
             raise ValueError(f'delay = {delay!r} must be "auto" or a number of samples.')
         return None
-    given = np.ravel(np.asarray(delay, dtype=object))
-    values = list(given) * n_inputs if np.ndim(delay) == 0 else list(given)
+    given = np.asarray(delay, dtype=object)
+    values = given.ravel().tolist() * (n_inputs if given.ndim == 0 else 1)
     whole = [isinstance(v, (int, np.integer)) and not isinstance(v, bool) for v in values]
     if len(values) != n_inputs or not all(whole) or min(values) < 0:
         raise ValueError(

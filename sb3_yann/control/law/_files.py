@@ -35,7 +35,8 @@ def read_law(kind: str, path: str | PathLike[str], build: Callable[[dict[str, An
     except OSError:
         raise
     except Exception as error:  # arrays of a stranger raise nearly all there is
-        what = str(error) or type(error).__name__
+        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        what = what or type(error).__name__
         raise ValueError(
             f"{fspath(path)} does not hold {kind} ({what}). Write it with law.save(path)."
         ) from None

@@ -68,10 +68,10 @@ def linearize_dynamics(
 def _partly_known(name: str, value: ArrayLike) -> Array:
     """Return a vector in which NaN stands for what is to be solved for."""
     array = to_float(name, value)
-    if array.ndim != 1 or np.any(np.isinf(array)):
+    if array.ndim != 1 or not array.size or np.any(np.isinf(array)):
         raise ValueError(
             f"{name} has shape {array.shape} and the entries {array.tolist()}; expected a vector "
-            "of finite numbers, or NaN where the steady state is to be solved for."
+            "of finite numbers, or NaN where the steady state is to be solved for; one at least."
         )
     return array
 
@@ -175,6 +175,7 @@ def _scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
     size: Array = np.maximum(np.nan_to_num(np.abs(point), nan=1.0), 1.0)
     if scale is None:
         return size
-    k = point.size if np.shape(scale) == point.shape else n
-    size[:k] = as_positive_vector("scale", scale, k)
+    given = to_float("scale", scale)
+    k = point.size if given.shape == point.shape else n
+    size[:k] = as_positive_vector("scale", given, k)
     return size

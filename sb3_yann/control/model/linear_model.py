@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_positive, as_vector
+from sb3_yann._validation import Array, as_array, as_positive, as_vector, to_float
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.linear_system import names, zero_order_hold
@@ -86,7 +86,7 @@ class LinearModel(Plant):
         if B.shape[1] == 0:
             raise ValueError(f"B has shape {B.shape}: the model needs at least one input.")
         E = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
-        if d_ss is not None and np.size(d_ss) and not E.size:
+        if d_ss is not None and to_float("d_ss", d_ss).size and not E.size:
             raise ValueError(f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E.")
         x, u = as_vector("x_ss", x_ss, n), as_vector("u_ss", u_ss, B.shape[1])
         d, moved = as_vector("d_ss", d_ss, E.shape[1]), as_vector("drift", drift, n)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -310,7 +310,15 @@ class LinearMPC(MPCProblem):
     def report(self, samples: int = 500, seed: int = 0) -> str:
         """Return :func:`~sb3_yann.control.mpc.report.report` of the problem and its law."""
         check.as_whole("samples", samples)
+        check.as_whole("seed", seed, 0)
         return report(self, self.law(), samples, seed)
+
+
+def derived(problem: LinearMPC, **changes: Any) -> LinearMPC:
+    """Return a problem with changes, in deviations, which counts as stated in the same values."""
+    found = replace(problem, **changes)
+    found._store(absolute=problem.absolute)
+    return found
 
 
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:

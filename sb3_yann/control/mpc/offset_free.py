@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import as_positive_vector
+from sb3_yann._validation import as_kind, as_positive_vector
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.groups import DisturbanceBounds, Terminal
-from sb3_yann.control.mpc.linear_mpc import LinearMPC
+from sb3_yann.control.mpc.linear_mpc import LinearMPC, derived
 from sb3_yann.control.observer import DisturbanceObserver
 
 SHARE = 0.05
@@ -51,8 +49,7 @@ def offset_free(
     >>> env.observation_space.shape
     (8,)
     """
-    if not isinstance(mpc, LinearMPC):
-        raise TypeError(f"mpc = {mpc!r} must be a LinearMPC.")
+    as_kind("mpc", mpc, LinearMPC, "a LinearMPC")
     old, n = mpc.model, mpc.model.n_states
     if old.n_disturbances:
         raise ValueError(
@@ -66,7 +63,7 @@ def offset_free(
     model = LinearModel(old.A, old.B, old.dt, old.x_ss, old.u_ss, np.eye(n), **names)
     terminal = Terminal(set="invariant" if len(mpc.terminal.set[1]) else None)
     states = mpc.layout.state
-    found = dataclasses.replace(
+    found = derived(
         mpc,
         model=model,
         disturbances=DisturbanceBounds(-bound, bound),

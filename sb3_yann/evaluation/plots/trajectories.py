@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from sb3_yann._drawing import COLORS
-from sb3_yann._validation import Array, as_flag
+from sb3_yann._drawing import COLORS, new_figure, save_figure
+from sb3_yann._validation import Array, as_flag, as_kind
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import with_units
-from sb3_yann.evaluation.episodes import Episodes
+from sb3_yann.evaluation.episodes import Episodes, as_played
 
 
 def save_trajectories(
@@ -27,12 +27,12 @@ def save_trajectories(
     limits: Mapping[int, tuple[float, str]] | None = None,
     references: Mapping[int, int] | None = None,
 ) -> Path:
-    """Save a PNG of some states and all inputs over time, a color for each run; return its path.
+    """Save a picture of states and all inputs over time, a color for each run; return its path.
 
     Parameters
     ----------
     path : path-like
-        Folders are made as needed.
+        Folders are made as needed. Without a suffix it gets ``.png``.
     runs : mapping of str to Episodes
         Every episode of every run is drawn.
     states : mapping of int to str
@@ -57,11 +57,8 @@ def save_trajectories(
     >>> save_trajectories(f"{folder}/run.png", runs, {0: "level"}, ["flow"], 1.0, "s").name
     'run.png'
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # slow to import
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 2.4 * (len(states) + len(inputs))), layout="constrained")
-    FigureCanvasAgg(figure)
+    runs = _as_runs(runs)
+    figure = new_figure(8, 2.4 * (len(states) + len(inputs)))
     panels = figure.subplots(len(states) + len(inputs), 1, sharex=True, squeeze=False)[:, 0]
     _draw(panels, runs, [*states], dt, references or {})
     for panel, i in zip(panels, states, strict=False):
@@ -73,10 +70,7 @@ def save_trajectories(
         panel.grid(alpha=0.3)
     panels[0].legend(loc="best")
     panels[-1].set_xlabel(f"time ({time_unit})")
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(target, dpi=120)
-    return target
+    return save_figure(figure, path, dpi=120)
 
 
 def save_plant_trajectories(
@@ -96,7 +90,7 @@ def save_plant_trajectories(
     Parameters
     ----------
     path : path-like
-        Folders are made as needed.
+        Folders are made as needed. Without a suffix it gets ``.png``.
     runs : mapping of str to Episodes
         Their observations are theta.
     problem : LinearMPC
@@ -128,13 +122,14 @@ def save_plant_trajectories(
     >>> save_plant_trajectories(f"{folder}/run.png", runs, mpc, "h", entries=[3]).name
     'run.png'
     """
+    as_kind("problem", problem, LinearMPC, "a LinearMPC")
     whole = 0 if as_flag("absolute", absolute) else 1
     shift = whole * problem.theta_ss, whole * problem.model.u_ss
     shown = [*range(problem.model.n_states)] if entries is None else [*entries]
     names = dict(enumerate(problem.labels(units=True))) | dict(labels or {})
     return save_trajectories(
         path,
-        {name: shifted(name, episodes, *shift) for name, episodes in runs.items()},
+        {name: shifted(name, episodes, *shift) for name, episodes in _as_runs(runs).items()},
         {i: names[i] for i in shown},
         with_units(problem.model)[1],
         problem.model.dt,
@@ -168,6 +163,12 @@ def shifted(name: str, episodes: Episodes, theta_ss: Array, u_ss: Array) -> Epis
         observations=tuple(x + theta_ss for x in episodes.observations),
         actions=tuple(u + u_ss for u in episodes.actions),
     )
+
+
+def _as_runs(runs: Mapping[str, Episodes]) -> dict[str, Episodes]:
+    """Return runs by their names, else raise TypeError."""
+    as_kind("runs", runs, Mapping, "a mapping of names to episodes: {'MPC': evaluate(...)}")
+    return {name: as_played(f"runs[{name!r}]", each) for name, each in runs.items()}
 
 
 def _draw(

@@ -142,7 +142,7 @@ def test_dead_time_of_a_curved_plant_is_found(delay: int) -> None:
     assert identify(x, u, dt=1, delay="auto").model.n_states == 2 + delay
 
 
-@pytest.mark.parametrize("delay", ["soon", -1, [1, 2, 3], 1.5, True])
+@pytest.mark.parametrize("delay", ["soon", -1, [1, 2, 3], 1.5, True, [[1], [1, 2]]])
 def test_a_bad_delay_is_named(delay: Any) -> None:
     with pytest.raises(ValueError, match=r"delay = .* must be"):
         identify(*late((0, 0), 0.0), dt=1, delay=delay)

@@ -47,6 +47,35 @@ def test_sampling_takes_a_singular_state_matrix() -> None:
     np.testing.assert_allclose(model.B, [[0.005], [0.1]], atol=1e-15)
 
 
+@pytest.mark.parametrize(
+    ("A", "B", "dt", "message"),
+    [
+        (800, 1, 1, "grows too far within dt = 1 .* pole 800 times dt is 800.* about every 0.0013"),
+        (
+            -1e150,
+            1,
+            1,
+            r"decays too far within dt = 1 .* pole -1e\+150 times dt .* leave the mode out",
+        ),
+        (
+            0.1,
+            1,
+            1e5,
+            "grows too far within dt = 100000 .* times dt is 10000.* sample about every 10",
+        ),
+        (0, 1e308, 1e10, r"every dt = 1e\+10, .* too large for numbers. Give its states, inputs"),
+    ],
+)
+def test_a_model_that_cannot_be_sampled_says_why(A, B, dt, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        LinearModel.from_continuous([[A]], [[B]], dt)
+
+
+def test_what_grows_is_named_where_more_decays_beside_it() -> None:
+    with pytest.raises(ValueError, match=r"grows too far within dt = 1 .* its pole 800 times dt"):
+        LinearModel.from_continuous([[800, 0], [0, -900]], [[1], [1]], 1)
+
+
 def test_sampling_keeps_the_operating_point_and_the_sampling_time() -> None:
     model = LinearModel.from_continuous([[-1.0]], [[1.0]], 0.25, x_ss=[2.0], u_ss=[3.0])
     assert (model.dt, model.x_ss.tolist(), model.u_ss.tolist()) == (0.25, [2.0], [3.0])

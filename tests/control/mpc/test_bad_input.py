@@ -39,6 +39,7 @@ BAD_MODELS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"u_ss": [1, 2]}, ValueError, r"u_ss has shape \(2,\), expected \(1,\)"),
     ({"E": [[1]]}, ValueError, r"E has shape \(1, 1\), expected \(2, d\)"),
     ({"E": [[1], [NAN]]}, ValueError, "E holds NaN or infinite entries"),
+    ({"d_ss": [[1], [1, 2]]}, TypeError, r"d_ss = \[\[1\], \[1, 2\]\] is not an array of real num"),
     ({"d_ss": [1]}, ValueError, r"d_ss = \[1\] is given, but there are no disturbances: pass E"),
 ]
 
@@ -59,6 +60,13 @@ BAD_DYNAMICS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"f": lambda x, u: x + 1j}, TypeError, r"f\(x, u\) = .* is not an array of real"),
     ({"x_ss": [np.inf, 0]}, ValueError, r"x_ss has .* expected a vector of finite numbers, or NaN"),
     ({"u_ss": 0.0}, ValueError, r"u_ss has shape \(\) .* expected a vector"),
+    ({"x_ss": []}, ValueError, r"x_ss has shape \(0,\) .* finite numbers, .* one at least"),
+    ({"u_ss": []}, ValueError, r"u_ss has shape \(0,\) .* finite numbers, .* one at least"),
+    (
+        {"scale": [[1], [1, 2]]},
+        TypeError,
+        r"scale = \[\[1\], \[1, 2\]\] is not an array of real num",
+    ),
     ({"f": lambda x, u: [1, 0]}, ValueError, "is no steady state.*NaN to have them solved"),
     ({"f": 3}, TypeError, "f = 3 must be a function"),
     ({"dt": 0}, ValueError, "dt = 0 must be a finite number above 0"),
@@ -194,6 +202,15 @@ def test_a_mode_on_the_unit_circle_without_weight_is_an_error(
     model = LinearModel(A, np.ones((len(A), 1)), 1.0)
     with pytest.raises(ValueError, match=r"on the unit circle carries no weight in Q. Give it a"):
         LinearMPC(model, Q=np.diag(Q), R=[[1]], horizon=2, gamma=gamma)
+
+
+@pytest.mark.parametrize("size", [1e20, 1e50])
+def test_a_model_that_is_badly_scaled_is_called_that(size: float) -> None:
+    model = LinearModel([[0.5, size], [0, 0.5]], [[0], [1]], 1.0)
+    with pytest.raises(
+        ValueError, match=rf"badly scaled, .* from 0\.5 to {size:.2g} in".replace("+", ".")
+    ):
+        LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=2)
 
 
 def test_a_terminal_cost_stands_in_for_the_riccati_solution() -> None:

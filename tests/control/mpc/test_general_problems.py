@@ -218,6 +218,12 @@ BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [
         ValueError,
         r"Tracking.C has shape \(1, 3\), expected \(q, 2\)",
     ),
+    (
+        lambda: Tracking([[0, 1e308]]),
+        ValueError,
+        r"Tracking.C\[0, 1\] = 1e\+308 must be at most 1e\+1",
+    ),
+    (lambda: OutputBounds([[-1e150, 0]]), ValueError, r"OutputBounds.C\[0, 0\] = -1e\+150 must be"),
     (lambda: Tracking([0], r_min=2, r_max=1), ValueError, "r_min must lie below r_max"),
     (lambda: Tracking([0], r_max=[1, 2]), ValueError, r"r_max has shape \(2,\), expected \(1,\)"),
     (lambda: Tracking(r_max=1), ValueError, "there is no output in Tracking.C"),

@@ -64,6 +64,11 @@ def test_it_shows_the_law_at_the_origin_first() -> None:
     assert "(x[0], x[1], r[0]):\n  [0, 0, 0] -> u = [0]" in text.replace("-0]", "0]")
 
 
+def test_a_seed_below_zero_is_named() -> None:
+    with pytest.raises(ValueError, match="seed = -1 must be a whole number of at least 0"):
+        solved("servo").report(seed=-1)
+
+
 def test_the_same_seed_gives_the_same_text() -> None:
     mpc = solved("servo")
     assert mpc.report(samples=30, seed=1) == mpc.report(samples=30, seed=1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from general_problems import servo, solved
-from sb3_yann import DisturbanceObserver, offset_free
+from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, offset_free
 
 MPC = servo(x_min=[-5, -2], x_max=[5, 2])
 
@@ -45,6 +45,14 @@ def test_names_and_operating_point_stay_and_a_terminal_set_is_solved_anew() -> N
     assert [*mpc.model.x_ss, *mpc.model.u_ss] == [3, 4, 5]
     assert len(mpc.terminal.set[1]) == 0
     assert len(offset_free(solved("invariant"))[0].terminal.set[1]) > 0
+
+
+def test_bounds_that_were_given_as_the_plant_shows_them_are_shown_so() -> None:
+    tank = LinearModel([[0.5]], [[1.0]], 1, x_ss=[3], u_ss=[1.5])
+    box = {"x_min": 2, "x_max": 4, "u_min": 1, "u_max": 2, "absolute": True}
+    mpc, _ = offset_free(LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **box))
+    assert "x_min=[2], x_max=[4], u_min=[1], u_max=[2]" in repr(mpc)
+    assert "absolute=True" in repr(mpc) and "absolute" not in repr(offset_free(MPC)[0])
 
 
 def test_what_knows_disturbances_already_or_is_no_mpc_is_named() -> None:
