@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.beginnings import beginnings
+from sb3_yann.audit.own_reward import as_reward
 from sb3_yann.audit.plants import Plant
 from sb3_yann.audit.task import Bounds, Task
 from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
@@ -45,6 +46,8 @@ class Loops:
         steps.
     thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
         After its end an episode stays where it is.
+    rewards : ndarray, shape (T, k)
+        The env's own; NaN where it reports a violation or terminates, and after the end.
     """
 
     costs: Array
@@ -52,6 +55,7 @@ class Loops:
     lengths: NDArray[np.int64]
     thetas: Array
     inputs: Array
+    rewards: Array
 
     def no_worse(self, others: Loops) -> NDArray[np.bool_]:
         """Tell which episodes are as long as others, and violate no more."""
@@ -123,19 +127,24 @@ def play(
         now: Array = np.array(begun, dtype=np.float64)
         thetas, running = [now], np.ones(len(envs), dtype=bool)
         inputs: list[Array] = []
+        rewards: list[Array] = []
         told: list[NDArray[np.bool_]] = []
         lengths = np.zeros(len(envs), dtype=np.int64)
         while running.any():
             u = controller(len(inputs), now, running)
             now, violated = now.copy(), np.zeros(len(envs), dtype=bool)
+            earned = np.full(len(envs), np.nan)
             for i in np.flatnonzero(running):
                 action = u[i].astype(envs[i].action_space.dtype)
-                now[i], _, terminated, truncated, info = envs[i].step(action)
+                now[i], reward, terminated, truncated, info = envs[i].step(action)
                 violated[i] = info.get("violation", False)
+                if not (violated[i] or terminated):
+                    earned[i] = as_reward(reward)
                 running[i] = not (terminated or truncated)
                 lengths[i] += 1
             thetas.append(now)
             inputs.append(u)
+            rewards.append(earned)
             told.append(violated)
             watch_length(envs[0], len(inputs))
     states, played = np.array(thetas), np.array(inputs)
@@ -143,7 +152,7 @@ def play(
     costs = np.sum(problem.stage_cost(states[:-1], played), axis=0, where=taken)
     beyond = np.any(Bounds.of(problem).beyond(states[1:], ROOM) != 0, axis=-1)
     violations = np.sum(np.array(told) | beyond, axis=0, where=taken)
-    return Loops(costs, violations, lengths, states, played)
+    return Loops(costs, violations, lengths, states, played, np.array(rewards))
 
 
 def require_repeated(

@@ -54,6 +54,8 @@ class Headroom:
     lost : float, optional
         By how much plans cost more than the MPC when they were played, relative to it, where a twin
         in which they were made of the env's episodes is so poor.
+    rest : str, optional
+        How far from its set-points the MPC comes to rest though an observer gains nothing, and why.
 
     Examples
     --------
@@ -74,6 +76,7 @@ class Headroom:
     source: str
     d_max: Array | None = None
     lost: float | None = None
+    rest: str = ""
 
     @property
     def total(self) -> float:
@@ -91,19 +94,20 @@ class Headroom:
         mpc, best = self.mpc_costs.mean(), self.best_costs.mean()
         each = 100 * (self.best_costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
         parts = (
-            ("offset, which a disturbance observer removes", self.offset),
+            ("offset, what a disturbance observer gains", self.offset),
             ("model error beyond that", self.model_error),
             ("nonlinearity and constraints", self.nonlinearity),
         )
         lines = [
-            f"The MPC costs {mpc:.5g} from {len(self.mpc_costs)} starts of {self.source}; "
-            f"the best that was found {best:.5g}: {-100 * self.total:+.2f} % +- "
+            f"By its own stage cost the MPC costs {mpc:.5g} from {len(self.mpc_costs)} starts of "
+            f"{self.source}; the best that was found {best:.5g}: {-100 * self.total:+.2f} % +- "
             f"{100 * self.standard_error:.2f} (from {each.min():+.2f} to {each.max():+.2f} % by "
             "start).",
             *(f"  {name}: {-100 * part:+.2f} %" for name, part in parts),
             f"An MPC with a re-identified model: "
             f"{-100 * gain(self.mpc_costs, self.reidentified_costs):+.2f} %.",
             f"Verdict: {self.verdict}; {self._advice()}",
+            *([self._with_d_max(self.rest)] if self.rest else []),
         ]
         return "\n".join(lines)
 
@@ -122,11 +126,15 @@ class Headroom:
             )
         if self.verdict == UNKNOWN:
             return f"nothing was found, but {poor}"
-        advice = ADVICE[self.verdict]
-        if self.d_max is not None:
-            largest = ", ".join(f"{each:.3g}" for each in self.d_max)
-            advice = advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
+        advice = self._with_d_max(ADVICE[self.verdict])
         return f"{advice} The rest is not known: {poor}" if poor else advice
+
+    def _with_d_max(self, advice: str) -> str:
+        """Return advice that gives `offset_free` the disturbances of this plant."""
+        if self.d_max is None:
+            return advice
+        largest = ", ".join(f"{each:.3g}" for each in self.d_max)
+        return advice.replace("offset_free(mpc)", f"offset_free(mpc, d_max=[{largest}])")
 
 
 def _more(lost: float) -> str:

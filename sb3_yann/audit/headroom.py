@@ -26,7 +26,10 @@ from sb3_yann.audit.closed_loops import (
     play,
     require_repeated,
 )
-from sb3_yann.audit.gains import UNKNOWN, WORTH, Headroom, gain, verdict_of
+from sb3_yann.audit.gains import LITTLE, UNKNOWN, WORTH, Headroom, gain, verdict_of
+from sb3_yann.audit.observed_order import warn_of_order
+from sb3_yann.audit.offset import remaining_offset
+from sb3_yann.audit.own_reward import warn_of_own_reward
 from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import (
     Access,
@@ -82,7 +85,8 @@ def headroom(
     Parameters
     ----------
     mpc : LinearMPC
-        Its stage cost is what counts.
+        Its stage cost is what counts. A :class:`CostMismatchWarning` says where the env's own
+        reward is another one.
     env_or_twin : gymnasium.Env, str, callable or PlantTwin
         A simulator that shows theta of the MPC and takes its inputs, both as deviations, or both
         absolute where the MPC has ``absolute=True``. It plays the same episode again from the same
@@ -179,6 +183,9 @@ class _Search:
             )
         require_deviations(self.mpc, base.steps()[0])
         require_repeated(self.mpc, self.make, self.seeds[0], base.costs[0])
+        if self.twin is None:
+            warn_of_order(self.mpc, *base.steps(), stacklevel=4)
+            warn_of_own_reward(self.mpc, base.thetas, base.inputs, base.rewards, stacklevel=4)
 
     def observe(self) -> None:
         """Play the same MPC with an observer, unless it has one or measures disturbances."""
@@ -281,7 +288,14 @@ class _Search:
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
         if self.lost is not None and verdict_of(*parts) == "do not bother":
             verdict = UNKNOWN
-        return dataclasses.replace(whole, verdict=verdict, lost=self.lost)
+        rest = self._rest() if offset < LITTLE else ""
+        return dataclasses.replace(whole, verdict=verdict, lost=self.lost, rest=rest)
+
+    def _rest(self) -> str:
+        """Return what is said of an offset that remains though an observer gains nothing."""
+        runs, observer = [x for x, _ in self.base.episodes()], self.others.get("observer")
+        observed = None if observer is None else [x for x, _ in observer.episodes()]
+        return remaining_offset(self.mpc, runs, observed)
 
 
 def _name(mpc: LinearMPC, make: Callable[[], gym.Env[Any, Any]]) -> str:

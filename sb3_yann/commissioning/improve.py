@@ -91,7 +91,7 @@ class Improvement:
         if not self.accepted:
             return f"{self.reason} The model is as it was. {taken}"
         last = next((each for each in reversed(self.checks) if each.accepted), None)
-        said = f"Accepted: {100 * self.change:+.2f} % of the mean cost in {self.where}"
+        said = f"Accepted: {100 * self.change:+.2f} % of the MPC's stage cost in {self.where}"
         if last is not None:
             twin = self.where == "the twin"
             whose = "on episodes like the log's" if twin else "of an episode's own on average"
@@ -154,8 +154,9 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
         With a :class:`YannPolicy` of the twin's problem.
     twin : PlantTwin, gymnasium.Env, str or callable
         A twin, which must be trusted; or a simulator, which shows theta of the model's problem, or
-        absolute values where that is absolute. A function or an id makes as many as are played
-        side by side, a given env is copied.
+        absolute values where that is absolute. The problem's stage cost counts, and no reward: a
+        :class:`CostMismatchWarning` says where that is another one. A function or an id makes as
+        many as are played side by side, a given env is copied.
     iterations : int, default 120
         Gradient steps, at most.
     batch : int, default 50

@@ -21,6 +21,8 @@ from sb3_yann.audit.closed_loops import (
     play,
     require_repeated,
 )
+from sb3_yann.audit.observed_order import warn_of_order
+from sb3_yann.audit.own_reward import warn_of_own_reward
 from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import simulated_dynamics
 from sb3_yann.control import LinearMPC
@@ -113,6 +115,8 @@ class SimulatorTwin:
         loops = play(problem, kept, seeds, of_law(problem))
         require_deviations(problem, loops.steps()[0])
         require_repeated(problem, kept, first, loops.costs[0])
+        warn_of_order(problem, *loops.steps(), stacklevel=4)
+        warn_of_own_reward(problem, loops.thetas, loops.inputs, loops.rewards, stacklevel=4)
         logged = _usable(loops)
         if not logged:
             raise ValueError(

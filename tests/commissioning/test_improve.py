@@ -63,8 +63,8 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
         str(found)
         == found.report()
         == (
-            "Accepted: -2.10 % of the mean cost in the twin, -1.50 % (± 0.30) on episodes like the "
-            "log's, +0.04 % from the worst start. 1 of 2 checks passed."
+            "Accepted: -2.10 % of the MPC's stage cost in the twin, -1.50 % (± 0.30) on episodes "
+            "like the log's, +0.04 % from the worst start. 1 of 2 checks passed."
         )
     )
     assert Improvement((refused,), 0.0, accepted=False).report() == (

@@ -143,7 +143,7 @@ def test_a_policy_gains_on_starts_that_it_has_not_seen(kind, tmp_path) -> None:
     model = model_of(kind=kind)
     found = improve(model, Movable, **FEW)
     assert found.accepted and found.where == "the simulator"
-    assert "of the mean cost in the simulator" in str(found)
+    assert "of the MPC's stage cost in the simulator" in str(found)
     assert relative(model).mean() < 0.98 and relative(model).max() < 1.005
     target, own = model.actor_target.state_dict(), model.actor.state_dict()
     assert all(th.equal(target[name], each) for name, each in own.items())
@@ -592,8 +592,8 @@ def test_a_report_says_where_there_is_no_gain() -> None:
 def test_a_report_says_what_an_episode_gains() -> None:
     check = Check(20, True, "", -0.5, 0.002, True, -0.3, 0.01)
     assert Improvement((check,), -0.5, True, where="the simulator").report() == (
-        "Accepted: -50.00 % of the mean cost in the simulator, -30.00 % (± 1.00) of an episode's "
-        "own on average, +0.20 % from the worst start. 1 of 1 checks passed."
+        "Accepted: -50.00 % of the MPC's stage cost in the simulator, -30.00 % (± 1.00) of an "
+        "episode's own on average, +0.20 % from the worst start. 1 of 1 checks passed."
     )
 
 

@@ -93,7 +93,7 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
     system = _system(found, sizes, given, dt, delays)
     system = _with_exact_memory(system, delays, sizes[0])
-    late = [] if any(delays) else input_notes(found, fitted, sizes)
+    late = [] if any(delays) else input_notes(found, fitted, sizes, episodes)
     if late:
         warnings.warn(" ".join(late), stacklevel=3)
     told = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))

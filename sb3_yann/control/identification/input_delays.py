@@ -7,6 +7,7 @@ from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.curvature import bent, features
+from sb3_yann.control.identification.dead_time import GAIN, found_delays
 from sb3_yann.control.identification.least_squares import Regression
 from sb3_yann.control.identification.logs import Episode
 from sb3_yann.control.linear_system import names
@@ -18,27 +19,59 @@ FOLLOWS = 0.25  # least correlation of residuals with an earlier input: sensor n
 
 
 def input_notes(
-    found: Regression, episodes: list[Episode], sizes: tuple[int, int, int]
+    found: Regression,
+    episodes: list[Episode],
+    sizes: tuple[int, int, int],
+    log: list[Episode] | None = None,
 ) -> list[str]:
-    """Return notes on inputs and disturbances without effect, or with a delay."""
-    n = sizes[0]
+    """Return notes on inputs and disturbances without effect, or with a delay.
+
+    Parameters
+    ----------
+    found : Regression
+        The fit.
+    episodes : list of Episode
+        Those it was fitted to.
+    sizes : tuple of int
+        Numbers of states, inputs and disturbances.
+    log : list of Episode, optional
+        All of them, in which ``delay="auto"`` looks for dead time.
+    """
+    n, m, _ = sizes
     delays, notes = _delays(found, episodes, sizes), []
     driven = zip(names(sizes)[n:], delays, strict=True)
     for column, (name, (lag, correlation)) in enumerate(driven, n):
         idle = _chance(found, n, column) > CHANCE
         late = (
             f"he residuals follow {name} of {lag} steps before (correlation {correlation:.2f}): "
-            f"it acts {lag} samples late. Pass delay={lag}, or delay='auto'."
+            f"it acts {lag} samples late."
         )
         if lag:
             start = f"{name} has no effect that can be told from 0, and t" if idle else "T"
-            notes.append(start + late)
+            cure = f" Move its measurements {lag} samples down, in the log and on the plant."
+            notes.append(start + late + (cure if column >= n + m else ""))
         elif idle:
             notes.append(
                 f"{name} has no effect on the next state that can be told from 0. Is it delayed by "
                 "more than the log shows, too small beside the noise, or not what the plant got?"
             )
-    return notes
+    lags = [lag for lag, _ in delays[:m]]
+    return [*notes, _advice(lags, found_delays(log or episodes, m))] if any(lags) else notes
+
+
+def _advice(lags: list[int], automatic: list[int]) -> str:
+    """Return what to pass as delay, by lags of the residuals and what "auto" finds."""
+    if any(automatic):
+        return f"Pass delay={_argument(automatic)}, or delay='auto'."
+    return (
+        f"Pass delay={_argument(lags)}, and keep it where the fit of held-out data becomes better. "
+        f"delay='auto' takes none: the log is too short, or a delay explains less than "
+        f"{100 * GAIN:.0f} % of what the fit leaves. A state that is not measured looks alike."
+    )
+
+
+def _argument(delays: list[int]) -> str:
+    return str(delays if len(delays) > 1 else delays[0])
 
 
 def _chance(found: Regression, n: int, column: int) -> float:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, as_array, as_bounds, as_whole, to_float
-from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
@@ -94,41 +93,6 @@ def softened_box(bounds: Bounds, softness: Array) -> Bounds:
     width = bounds[1] - bounds[0]
     beyond = np.where((softness > 0) & np.isfinite(width), BEYOND * width, 0.0)
     return bounds[0] - beyond, bounds[1] + beyond
-
-
-def warn_of_no_rest(low: Array, high: Array, u_ss: Array, absolute: bool) -> None:
-    """Warn of inputs (m,) that cannot rest at the operating point.
-
-    Parameters
-    ----------
-    low, high, u_ss : ndarray, shape (m,)
-        Bounds in deviations, and the operating point.
-    absolute : bool
-        Whether u_ss was taken off the bounds.
-    """
-    cure = "Give absolute bounds with absolute=True, or take u_ss of the model off them."
-    if absolute:
-        cure = "Linearize where the inputs keep their bounds, or correct u_ss of the model."
-    rest = u_ss if absolute else np.zeros_like(u_ss)
-    for i in np.flatnonzero((low > 0) | (high < 0)):
-        warnings.warn(
-            f"u_min = {low[i] + rest[i]:g} and u_max = {high[i] + rest[i]:g} leave out u[{i}] = "
-            f"{rest[i]:g}, the operating point: the law cannot rest there. {cure}",
-            stacklevel=3,
-        )
-
-
-def warn_of_no_room(model: LinearModel, low: Array, high: Array) -> None:
-    """Warn of a box of states (n,), given in absolute values, without the operating point."""
-    names, x_ss = labels_of(model)[0], model.x_ss
-    for i in np.flatnonzero((low > 0) | (high < 0)):
-        warnings.warn(
-            f"{names[i]} = {x_ss[i]:g}, the operating point, lies outside its bounds, "
-            f"{low[i] + x_ss[i]:g} to {high[i] + x_ss[i]:g}: the law cannot rest there. Look at "
-            "the order of the states, and whether these bounds are deviations: then leave out "
-            "absolute=True.",
-            stacklevel=3,
-        )
 
 
 def warn_of_drift(model: LinearModel, lower: Array, upper: Array) -> None:

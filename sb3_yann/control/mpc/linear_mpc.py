@@ -32,6 +32,7 @@ from sb3_yann.control.mpc.groups import (
     Terminal,
     Tracking,
 )
+from sb3_yann.control.mpc.misread_bounds import Range, warn_of_misread_bounds
 from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.terminal_set import invariant_set
@@ -156,12 +157,13 @@ class LinearMPC(MPCProblem):
         fallback = arguments.softened_box(x, soft.x)
         theta = arguments.theta_box(layout, given.theta, fallback, rest)
         states = theta[0][:n], theta[1][:n]
-        if not layout.has_constants:  # otherwise there are other places to rest
-            arguments.warn_of_no_rest(*u, model.u_ss, absolute)
-            if absolute:
-                arguments.warn_of_no_room(model, *states)
-        elif not absolute and np.all((u[0] < model.u_ss) & (model.u_ss < u[1])):
-            arguments.warn_of_no_rest(*u, model.u_ss, absolute)
+        ranges = [
+            Range("x", *x, model.x_ss), Range("theta", *states, model.x_ss),
+            Range("u", *u, model.u_ss), Range("d", d.d_min, d.d_max, model.d_ss),
+            Range("r", tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
+            Range("y", outputs.y_min, outputs.y_max, outputs.C @ model.x_ss),
+        ]  # fmt: skip
+        warn_of_misread_bounds(model, ranges, layout.has_constants, absolute)
         arguments.warn_of_unused_softness(soft.x, x, states)
         arguments.warn_of_drift(model, *states)
         checked = (

@@ -112,7 +112,7 @@ def test_a_law_with_dead_time_is_better_than_one_that_ignores_it() -> None:
             way = [v, way[0]]
         return total
 
-    with pytest.warns(UserWarning, match=r"acts 2 samples late\. Pass delay=2"):
+    with pytest.warns(UserWarning, match=r"acts 2 samples late\. Pass delay=\[2, 0\], or"):
         ignorant = cost(0)
     assert cost([2, 0]) < 0.97 * ignorant
 

@@ -81,10 +81,10 @@ def test_the_lag_of_the_largest_correlation_is_named_with_it(lag: int) -> None:
     found, episode = late(lag, 0.6)
     (first, _), (best, size) = _delays(found, [episode], SIZES)
     assert (first, best) == (0, lag) and size == pytest.approx(0.6, abs=0.1)
-    (note,) = input_notes(found, [episode], SIZES)
+    note, advice = input_notes(found, [episode], SIZES)
     assert note.startswith(f"The residuals follow u[1] of {lag} steps before (")
-    assert f"(correlation {size:.2f})" in note
-    assert f"acts {lag} samples late. Pass delay={lag}" in note
+    assert f"(correlation {size:.2f})" in note and f"acts {lag} samples late." in note
+    assert advice.startswith(f"Pass delay=[0, {lag}], ")
 
 
 def test_a_lag_beyond_ten_and_a_faint_one_are_none() -> None:
@@ -112,10 +112,28 @@ def test_an_input_without_effect_is_told_with_its_lag_or_alone() -> None:
     for k in range(300):
         x[k + 1] = 0.5 * x[k] + u[k, 0] + (u[k - 3, 1] if k > 2 else 0)
     found = regress([idle], SIZES, None, 0.0)
-    (note,) = input_notes(found, [idle], SIZES)
+    note, advice = input_notes(found, [idle], SIZES)
     assert note.startswith("u[1] has no effect that can be told from 0, and the residuals follow")
+    assert advice == "Pass delay=[0, 3], or delay='auto'."
     little = dataclasses.replace(found, degrees_of_freedom=0)  # no verdict
     assert input_notes(little, [idle], SIZES)[0].startswith("The residuals follow u[1] of 3")
+
+
+def test_a_late_input_that_auto_leaves_out_gets_other_advice_than_auto() -> None:
+    found, episode = late(2, 0.35)
+    assert found_delays([episode], 2) == [0, 0]  # it explains too little
+    advice = input_notes(found, [episode], SIZES)[-1]
+    assert advice.startswith("Pass delay=[0, 2], and keep it where the fit of held-out data")
+    assert "delay='auto' takes none" in advice and "or delay='auto'." not in advice
+    with pytest.warns(UserWarning, match="delay='auto' takes none: .* less than 30 %"):
+        fit_log(episode.states, episode.driven, 1.0, delay="auto")
+
+
+def test_a_late_disturbance_gets_no_delay_of_the_inputs() -> None:
+    found, episode = late(3, 0.6)
+    (note,) = input_notes(found, [episode], (1, 1, 1))
+    assert note.startswith("The residuals follow d[0] of 3 steps") and "delay=" not in note
+    assert note.endswith("Move its measurements 3 samples down, in the log and on the plant.")
 
 
 def test_what_past_inputs_leave_of_a_target_is_that_of_least_squares() -> None:

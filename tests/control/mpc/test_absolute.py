@@ -125,6 +125,59 @@ def test_a_box_that_leaves_out_the_operating_point_is_told() -> None:
     ]
 
 
+REACTOR = LinearModel(np.eye(2) / 2, [[1], [1]], 1, x_ss=[300, 0], u_ss=[40])
+PLAIN: dict[str, Any] = {"Q": np.eye(2), "R": [[1]], "horizon": 2}
+WIDE: dict[str, Any] = {"x_min": [-100, -5], "x_max": [100, 5], "u_min": -40, "u_max": 60}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"x_min": [250, -5], "x_max": [350, 5]}, "x_min = 250 and x_max = 350 of entry 0 are"),
+        (
+            {"x_min": -np.inf, "x_max": np.inf, "theta_min": [250, -5], "theta_max": [350, 5]},
+            "theta_min = 250 and theta_max = 350 of entry 0",
+        ),
+        ({"outputs": OutputBounds([[1, 1]], 250, 350)}, "y_min = 250 and y_max = 350 of entry 0"),
+        (
+            {"x_min": [0, -5], "x_max": [400, 5], "u_min": 0, "u_max": 100},
+            "x_min = 0 and x_max = 400 of entry 0",
+        ),
+        (
+            {"x_min": [-200, -5], "x_max": [400, 5], "u_min": -20, "u_max": 100,
+             "tracking": Tracking([0], 280, 320)},
+            "r_min = 280 and r_max = 320 of entry 0",
+        ),
+    ],
+)  # fmt: skip
+def test_absolute_bounds_without_the_flag_are_told(given: dict[str, Any], message: str) -> None:
+    with pytest.warns(UserWarning, match=rf"{message}.*the operating point, .*pass absolute=True"):
+        LinearMPC(REACTOR, **PLAIN, **{**WIDE, **given})
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"tracking": Tracking([0], 280, 320)},  # the other bounds are deviations
+        {"u_min": 0, "u_max": 95},  # it rests at its limit
+        {"x_min": [5, -5], "x_max": [90, 5], "tracking": Tracking([0], 10, 80)},
+    ],
+)
+def test_deviations_that_may_well_be_meant_are_not_told(given: dict[str, Any]) -> None:
+    LinearMPC(REACTOR, **PLAIN, **{**WIDE, **given})  # a warning would be an error
+
+
+def test_deviations_with_the_flag_are_told_with_what_to_pass() -> None:
+    plant = LinearModel([[0.9]], [[1.0]], 1, x_ss=[1500], u_ss=[3])
+    box: dict[str, Any] = {"x_min": 0, "x_max": 3000, "u_min": 0, "u_max": 6, "absolute": True}
+    given = {"Q": [[1]], "R": [[1]], "horizon": 2, **box}
+    with pytest.warns(UserWarning, match=r"r_min = -900 and .* pass r_min = 600 and r_max = 2400"):
+        LinearMPC(plant, **given, tracking=Tracking([0], -900, 900))
+    LinearMPC(plant, **given, tracking=Tracking([0], 600, 2400))
+    LinearMPC(plant, **given, tracking=Tracking([0], 1600, 2400))  # beside it, as may be
+
+
 def test_an_absolute_column_is_not_taken_for_a_batch() -> None:
     tanks = LinearModel(np.eye(2) / 2, [[1], [1]], 1, x_ss=[12, 1], u_ss=[3])
     given = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 0, "u_max": 9, "absolute": True}

@@ -1,0 +1,107 @@
+"""States that an env shows in another order than the model has are told, and nothing else is."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel, LinearMPC, headroom
+from sb3_yann.audit.closed_loops import of_law, play
+from sb3_yann.audit.observed_order import warn_of_order
+from sb3_yann_envs import problems
+
+A = np.array([[0.9, 0.3, 0.0], [0.0, 0.7, 0.2], [0.1, 0.0, 0.5]])
+MODEL = LinearModel(A, [[0], [0], [1]], dt=1.0, state_names=["a", "b", "c"])
+MPC = LinearMPC(
+    MODEL, Q=np.eye(3), R=[[1]], horizon=2, theta_min=-9, theta_max=9, u_min=-1, u_max=1
+)
+
+
+class Shuffled(gym.Env):
+    """The model, its states shown in some order, with noise of sensors and another gain."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+
+    def __init__(self, order: list[int], noise: float = 0.0, gain: float = 1.0) -> None:
+        self.order, self.noise, self.gain = order, noise, gain
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.t = self.np_random.uniform(-3, 3, 3), 0
+        return self.shown(), {}
+
+    def step(self, action):
+        cost = float(MPC.stage_cost(self.x, action))
+        self.x, self.t = MODEL.step(self.x, self.gain * action), self.t + 1
+        return self.shown(), -cost, False, self.t == 20, {}
+
+    def shown(self) -> np.ndarray:
+        return self.x[self.order] + self.noise * self.np_random.normal(size=3)
+
+
+def told(env: gym.Env, mpc: LinearMPC = MPC, episodes: int = 3) -> list[str]:
+    loops = play(mpc, lambda: env, [0], of_law(mpc))
+    steps = [np.concatenate([part] * episodes) for part in loops.steps()]
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        warn_of_order(mpc, *steps, stacklevel=2)
+    return [str(each.message) for each in found]
+
+
+@pytest.mark.parametrize("order", [[1, 0, 2], [2, 1, 0], [1, 2, 0], [2, 0, 1]])
+def test_another_order_is_told_with_what_to_show(order: list[int]) -> None:
+    (message,) = told(Shuffled(order))
+    back = [order.index(i) for i in range(3)]
+    names = [MODEL.state_names[i] for i in order]
+    assert f"in the order {names}: so the model predicts 100 %" in message
+    assert f"Show x[{back}] of what the plant shows" in message
+    assert not told(
+        gym.wrappers.TransformObservation(
+            Shuffled(order), lambda x: x[back], Shuffled.observation_space
+        )
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 3.0])
+@pytest.mark.parametrize("gain", [1.0, -2.0])
+def test_noise_and_a_wrong_model_are_no_other_order(noise: float, gain: float) -> None:
+    assert not told(Shuffled([0, 1, 2], noise, gain))
+
+
+def test_of_two_states_that_are_alike_neither_order_is_told() -> None:
+    twins = LinearModel(np.eye(2) / 2, [[1], [1]], dt=1.0)
+    mpc = LinearMPC(twins, Q=np.eye(2), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
+    theta, u = np.random.default_rng(0).normal(size=(40, 2)), np.zeros((40, 1))
+    warn_of_order(mpc, theta, u, theta[:, ::-1] / 2, stacklevel=2)  # a warning would be an error
+
+
+BOX = {"theta_min": -9, "theta_max": 9}
+
+
+def test_of_six_states_two_that_are_exchanged_are_told() -> None:
+    rng = np.random.default_rng(0)
+    model = LinearModel(0.3 * rng.normal(size=(6, 6)), np.ones((6, 1)), dt=1.0)
+    mpc = LinearMPC(model, Q=np.eye(6), R=[[1]], horizon=1, u_min=-1, u_max=1, **BOX)
+    theta, u, order = rng.normal(size=(80, 6)), rng.uniform(-1, 1, (80, 1)), [0, 4, 2, 3, 1, 5]
+    after = mpc.predict(theta, u)
+    with pytest.warns(UserWarning, match=r"Show x\[\[0, 4, 2, 3, 1, 5\]\]"):
+        warn_of_order(mpc, theta[:, order], u, after[:, order], stacklevel=2)
+    few = slice(59)
+    warn_of_order(mpc, theta[few, order], u[few], after[few, order], stacklevel=2)
+
+
+@pytest.mark.parametrize("name", ["CSTR-v0", "ClippedPendulum-v0"])
+def test_the_built_in_plants_show_theirs(name: str) -> None:
+    made = {"CSTR-v0": problems.cstr, "ClippedPendulum-v0": problems.clipped_pendulum}
+    assert not told(gym.make(name), made[name]())
+
+
+def test_headroom_tells_it_and_points_to_the_call() -> None:
+    with pytest.warns(UserWarning) as found:
+        headroom(MPC, Shuffled([1, 0, 2]), n_starts=2)
+    (order,) = [each for each in found if "in the order" in str(each.message)]
+    assert order.filename == __file__

@@ -1,0 +1,131 @@
+"""A reward that is not the stage cost is told where the stage cost is what counts, and no other."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG
+
+from sb3_yann import CostMismatchWarning, LinearModel, LinearMPC, headroom, improve
+from sb3_yann.audit.closed_loops import of_law, play
+from sb3_yann.audit.own_reward import as_reward, warn_of_own_reward
+from sb3_yann.wrappers import StageCost
+from sb3_yann_envs import problems
+
+PLANT = LinearModel([[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0)
+
+
+def mpc() -> LinearMPC:
+    bounds = {"theta_min": -9, "theta_max": 9, "u_min": -2, "u_max": 2}
+    return LinearMPC(PLANT, Q=np.diag([1, 0.1]), R=[[0.1]], horizon=3, **bounds)
+
+
+class Rewarded(gym.Env):
+    """A linear plant, and a reward that is a function of state, input and next state."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Box(-2, 2, (1,), np.float64)
+
+    def __init__(self, reward) -> None:
+        self.reward = reward
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.t = self.np_random.uniform(-3, 3, 2), 0
+        if options is not None:
+            self.state = np.array(options["state"])
+        return self.state.copy(), {}
+
+    def step(self, action):
+        before, self.t = self.state, self.t + 1
+        self.state = PLANT.step(before, action)
+        reward = self.reward(before, action, self.state)
+        return self.state.copy(), reward, False, self.t == 25, {}
+
+
+def stage(x, u, after) -> float:
+    return -float(mpc().stage_cost(x, u))
+
+
+OTHER = {
+    "another weight": lambda x, u, after: -float(x[1] ** 2),
+    "the cost itself": lambda x, u, after: float(mpc().stage_cost(x, u)),
+    "a profit": lambda x, u, after: float(x[0]),
+    "one for each step": lambda x, u, after: 1.0,
+}
+SAME = {
+    "minus the cost": stage,
+    "in other units": lambda x, u, after: 7 * stage(x, u, after) + 3,
+    "of the next state": lambda x, u, after: stage(after, u, after),
+    "none": lambda x, u, after: 0.0,
+    "no number": lambda x, u, after: None,
+}
+
+
+def told(env, problem: LinearMPC, seeds: int = 4) -> list[str]:
+    loops = play(problem, env, range(seeds), of_law(problem))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        warn_of_own_reward(problem, loops.thetas, loops.inputs, loops.rewards, stacklevel=2)
+    return [str(each.message) for each in found]
+
+
+@pytest.mark.parametrize("kind", OTHER)
+def test_a_reward_of_its_own_is_told(kind: str) -> None:
+    (message,) = told(partial(Rewarded, OTHER[kind]), mpc())
+    assert "The env has a reward of its own, and it is ignored" in message
+    assert "over 100 steps" in message and "state it in Q and R" in message
+
+
+@pytest.mark.parametrize("kind", SAME)
+def test_minus_the_stage_cost_is_none_in_any_units(kind: str) -> None:
+    assert not told(partial(Rewarded, SAME[kind]), mpc())
+
+
+@pytest.mark.parametrize("kind", OTHER)
+def test_the_reward_of_the_wrapper_is_none(kind: str) -> None:
+    assert not told(lambda: StageCost(Rewarded(OTHER[kind]), mpc()), mpc())
+
+
+@pytest.mark.parametrize("name", ["CSTR-v0", "ClippedPendulum-v0"])
+def test_the_rewards_of_the_built_in_envs_are_none(name: str) -> None:
+    with_problem = {"CSTR-v0": problems.cstr, "ClippedPendulum-v0": problems.clipped_pendulum}
+    assert not told(partial(gym.make, name), with_problem[name]())
+
+
+def test_what_a_violation_or_a_termination_costs_does_not_count() -> None:
+    class Ends(gym.Wrapper):
+        def step(self, action):
+            seen, reward, *_ = self.env.step(action)
+            t = self.unwrapped.t
+            return seen, reward - 1e4 * (t in (3, 20)), t == 20, False, {"violation": t == 3}
+
+    assert not told(lambda: Ends(Rewarded(stage)), mpc())
+
+
+def test_a_few_steps_and_a_plant_at_rest_say_nothing() -> None:
+    problem = mpc()
+    theta, u, rewards = np.ones((10, 1, 2)), np.zeros((9, 1, 1)), np.arange(9.0)[:, None]
+    warn_of_own_reward(problem, theta, u, rewards, stacklevel=2)  # nine steps
+    theta, u = np.zeros((31, 1, 2)), np.zeros((30, 1, 1))
+    warn_of_own_reward(problem, theta, u, np.arange(30.0)[:, None], stacklevel=2)
+
+
+def test_a_reward_is_a_number_or_none() -> None:
+    assert as_reward(2) == as_reward(np.array([2.0])) == 2
+    assert all(np.isnan(as_reward(each)) for each in (None, "much", [1, 2], {}))
+
+
+def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:
+    env, problem = Rewarded(OTHER["a profit"]), mpc()
+    with pytest.warns(CostMismatchWarning, match="it is ignored") as found:
+        assert "By its own stage cost the MPC costs" in str(headroom(problem, env, n_starts=2))
+    assert [each.filename for each in found] == [__file__]
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": problem}, device="cpu")
+    with pytest.warns(CostMismatchWarning, match="it is ignored") as found:
+        improve(model, env, iterations=1, n_starts=2)
+    assert [each.filename for each in found] == [__file__]
