@@ -29,7 +29,7 @@ from sb3_yann.audit.closed_loops import (
 from sb3_yann.audit.gains import LITTLE, UNKNOWN, WORTH, Headroom, gain, verdict_of
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.offset import remaining_offset
-from sb3_yann.audit.own_reward import warn_of_own_reward
+from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
 from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import (
     Access,
@@ -185,7 +185,10 @@ class _Search:
         require_repeated(self.mpc, self.make, self.seeds[0], base.costs[0])
         if self.twin is None:
             warn_of_order(self.mpc, *base.steps(), stacklevel=4)
-            warn_of_own_reward(self.mpc, base.thetas, base.inputs, base.rewards, stacklevel=4)
+            with closing(self.make()) as env:
+                unaware = below_set_points(env)
+            if not unaware:
+                warn_of_own_reward(self.mpc, base.thetas, base.inputs, base.rewards, stacklevel=4)
 
     def observe(self) -> None:
         """Play the same MPC with an observer, unless it has one or measures disturbances."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.finding import CostMismatchWarning
 from sb3_yann.control import LinearMPC
+from sb3_yann.wrappers import SetPoint
 
 Mask = NDArray[np.bool_]
 EXPLAINED = 0.95
@@ -26,6 +28,15 @@ def as_reward(value: Any) -> float:
     except (TypeError, ValueError):
         return np.nan
     return float(number.ravel()[0]) if number.size == 1 else np.nan
+
+
+def below_set_points(env: gym.Env[Any, Any]) -> bool:
+    """Tell whether a wrapper draws set-points, of which the env's reward knows nothing."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, SetPoint):
+            return True
+        env = env.env
+    return False
 
 
 def warn_of_own_reward(

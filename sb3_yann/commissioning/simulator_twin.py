@@ -22,7 +22,7 @@ from sb3_yann.audit.closed_loops import (
     require_repeated,
 )
 from sb3_yann.audit.observed_order import warn_of_order
-from sb3_yann.audit.own_reward import warn_of_own_reward
+from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
 from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import simulated_dynamics
 from sb3_yann.control import LinearMPC
@@ -108,7 +108,7 @@ class SimulatorTwin:
             return free.pop() if free else _Kept(make(), free)
 
         with closing(kept()) as one:
-            row = RowLayout(problem, observer_of(one))
+            row, unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
             require_spaces(problem, one)
         first = FIRST + APART * seed
         seeds = range(first, first + LOGGED)
@@ -116,7 +116,8 @@ class SimulatorTwin:
         require_deviations(problem, loops.steps()[0])
         require_repeated(problem, kept, first, loops.costs[0])
         warn_of_order(problem, *loops.steps(), stacklevel=4)
-        warn_of_own_reward(problem, loops.thetas, loops.inputs, loops.rewards, stacklevel=4)
+        if not unaware:
+            warn_of_own_reward(problem, loops.thetas, loops.inputs, loops.rewards, stacklevel=4)
         logged = _usable(loops)
         if not logged:
             raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from functools import partial
 
@@ -10,10 +11,10 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_yann import CostMismatchWarning, LinearModel, LinearMPC, headroom, improve
+from sb3_yann import CostMismatchWarning, LinearModel, LinearMPC, Tracking, headroom, improve
 from sb3_yann.audit.closed_loops import of_law, play
-from sb3_yann.audit.own_reward import as_reward, warn_of_own_reward
-from sb3_yann.wrappers import StageCost
+from sb3_yann.audit.own_reward import as_reward, below_set_points, warn_of_own_reward
+from sb3_yann.wrappers import SetPoint, StageCost
 from sb3_yann_envs import problems
 
 PLANT = LinearModel([[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0)
@@ -105,6 +106,13 @@ def test_what_a_violation_or_a_termination_costs_does_not_count() -> None:
             return seen, reward - 1e4 * (t in (3, 20)), t == 20, False, {"violation": t == 3}
 
     assert not told(lambda: Ends(Rewarded(stage)), mpc())
+
+
+def test_a_reward_that_knows_nothing_of_the_set_points_is_none() -> None:
+    plain, held = Rewarded(stage), SetPoint(Rewarded(stage), -1, 1)
+    assert below_set_points(gym.wrappers.TimeLimit(held, 9)) and not below_set_points(plain)
+    tracking = dataclasses.replace(mpc(), tracking=Tracking([0], -1, 1))
+    headroom(tracking, held, n_starts=2)  # a warning would be an error
 
 
 def test_a_few_steps_and_a_plant_at_rest_say_nothing() -> None:
