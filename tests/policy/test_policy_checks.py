@@ -70,6 +70,12 @@ def heater_mpc(u_min: float, u_max: float) -> LinearMPC:
     return LinearMPC(model, u_min=u_min, u_max=u_max, **weights)
 
 
+def absolute_mpc() -> LinearMPC:
+    """Return one with bounds that the plant shows, which are taken as deviations."""
+    with pytest.warns(UserWarning, match="pass absolute=True"):
+        return heater_mpc(0, 10)
+
+
 def test_an_env_with_absolute_inputs_is_told_the_wrapper_that_fits() -> None:
     kwargs = {"problem": heater_mpc(-3, 7)}
     with pytest.raises(ValueError, match=r"takes absolute inputs.*RescaleAction") as caught:
@@ -84,14 +90,15 @@ def test_an_env_with_absolute_inputs_is_told_the_wrapper_that_fits() -> None:
 
 
 def test_bounds_that_are_not_deviations_are_warned_of() -> None:
-    kwargs = {"problem": heater_mpc(0, 10)}
+    kwargs = {"problem": absolute_mpc()}
     with pytest.warns(UserWarning, match=r"u_min = \[-3.0\] and u_max = \[7.0\], and wrap"):
         DDPG(YannPolicy, Heater(), policy_kwargs=kwargs)
 
 
 def test_the_wrapper_that_the_warning_names_is_the_cure() -> None:
+    mistaken = absolute_mpc()
     with pytest.warns(UserWarning, match="wrap the env") as caught:
-        DDPG(YannPolicy, Heater(), policy_kwargs={"problem": heater_mpc(0, 10)})
+        DDPG(YannPolicy, Heater(), policy_kwargs={"problem": mistaken})
     mpc, line = heater_mpc(-3, 7), str(caught[0].message).partition("wrap the env: ")[2]
     env = eval(line.partition(". If")[0], {"sb3_yann": sb3_yann, "mpc": mpc, "env": Heater()})
     theta, _ = env.reset(seed=0)

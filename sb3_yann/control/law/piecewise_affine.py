@@ -153,8 +153,8 @@ class PiecewiseAffine(OnPlant):
 
     def __call__(self, theta: ArrayLike) -> Array:
         """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
-        # Real numbers, none of them masked: all else is looked at below.
-        if type(theta) is np.ndarray and theta.ndim == 1 and theta.dtype.kind in "fiu":
+        # Real numbers, none of them masked, as compiled code takes them: see below for all else.
+        if type(theta) is np.ndarray and _is_plain(theta):
             u = np.empty(len(self.u_min))
             if self._at(theta.astype(np.float64, copy=False), u):
                 return u
@@ -297,6 +297,11 @@ class PiecewiseAffine(OnPlant):
 
     def _as_theta(self, theta: ArrayLike) -> tuple[Array, Array]:
         return as_points(theta, self.n_theta)
+
+
+def _is_plain(theta: NDArray[Any]) -> bool:
+    """Tell whether an array is of real numbers in one row that compiled code may write to."""
+    return theta.ndim == 1 and theta.dtype.kind in "fiu" and theta.flags.carray
 
 
 def as_points(theta: ArrayLike, n: int) -> tuple[Array, Array]:
