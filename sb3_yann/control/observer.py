@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -105,7 +106,7 @@ class DisturbanceObserver:
 
     def reset(self, y: ArrayLike) -> tuple[Array, Array]:
         """Restart with d_hat = 0 and the smallest x_hat that gives y (q,); return both."""
-        start = np.linalg.pinv(self.C) @ as_array("y", y, (self.n_measured,))
+        start = self._smallest @ as_array("y", y, (self.n_measured,))
         self.estimate = np.concatenate([start, np.zeros(self.model.n_disturbances)])
         return self.x_hat, self.d_hat
 
@@ -119,6 +120,11 @@ class DisturbanceObserver:
     def expected(self, u: ArrayLike) -> Array:
         """Return the outputs y (q,) that the estimate makes expect after the input u (m,)."""
         return np.asarray(self.seen @ self._after(u))
+
+    @cached_property
+    def _smallest(self) -> Array:
+        """The matrix (n, q) from outputs to the smallest state that gives them."""
+        return np.asarray(np.linalg.pinv(self.C))
 
     def _after(self, u: ArrayLike) -> Array:
         return np.asarray(
