@@ -73,6 +73,7 @@ class Search:
         self.known_hard = self.new_hard = nothing
         self.hard = [(each[:0], costs[:0]) for each, costs in grounds.pool]
         self.accepted = copy.deepcopy(layer.state_dict())
+        self.earliest: dict[str, th.Tensor] | None = None  # of all that were accepted
         kind = RowAdam if layer.row_gradients else th.optim.Adam
         self.optimizer: Any = kind(layer.network.weights())
         self.iteration = self.refused = 0
@@ -116,17 +117,17 @@ class Search:
     def confirm(self, least: float) -> bool:
         """Return whether the accepted weights gain so much in the final trial, if there is one.
 
-        Where they do not, half and a quarter of their correction are tried.
+        Where they do not, those are tried that were accepted first, then half and a quarter of the
+        correction.
         """
         if not self.gains(least):
             return False
         final = self.grounds.draw_final()
         if final is None:
             return True
-        whole, mpc = self.accepted, _without_correction(self.accepted)
-        for share in RETREATS:
-            self.accepted = _between(mpc, whole, share)
-            self.layer.load_state_dict(self.accepted)
+        for weights in self._retreats():
+            self.accepted = weights
+            self.layer.load_state_dict(weights)
             played = final.play(actor(self.layer, self.grounds.twin.problem))
             found = final.check(self.iteration, played, final.mpc)
             reason = found.reason and f"in the final trial, {found.reason}"
@@ -134,6 +135,12 @@ class Search:
             if found.accepted and found.gains(least):
                 return True
         return False
+
+    def _retreats(self) -> list[dict[str, th.Tensor]]:
+        """Return what is left of the accepted weights, from all of it on."""
+        whole, mpc = self.accepted, _without_correction(self.accepted)
+        earliest = [each for each in [self.earliest] if each is not None and each is not whole]
+        return [whole, *earliest, *(_between(mpc, whole, share) for share in RETREATS[1:])]
 
     def _check(self) -> bool:
         """Check the present actor, else what lies between it and the accepted one."""
@@ -144,6 +151,7 @@ class Search:
             self.checks.append(self._try())
             if self.checks[-1].accepted:
                 self.accepted = weights
+                self.earliest = self.earliest or weights
                 break
         self.layer.load_state_dict(present)
         self._value_hard_starts()

@@ -272,6 +272,7 @@ def test_a_loss_that_no_check_meets_is_met_in_the_final_trial(monkeypatch) -> No
     assert bits(model) == before
     assert any(each.accepted for each in found.checks if not each.final)
     assert [each.final for each in found.checks][-3:] == [True] * 3  # all of it, half, a quarter
+    assert not any(each.final for each in found.checks[:-4])
     assert "in the final trial, 1 starts with violations" in str(found)
     assert found.change == 0.0
 
@@ -301,6 +302,30 @@ def test_what_the_final_trial_refuses_is_halved(monkeypatch, most) -> None:
     assert search.gains(1e-6) == (most >= 0.25)
     if most >= 0.25:
         np.testing.assert_allclose(correction(search.accepted), most * correction(whole), rtol=1e-3)
+
+
+def test_what_was_accepted_first_is_tried_before_a_part_of_the_way(monkeypatch) -> None:
+    grounds = SimulatorGrounds(SimulatorTwin.of(problem(), Movable), 20, 12, 0)
+    search = Search(model_of().policy.actor.mu, grounds, Pace(40, 5e-3, 20, 5))
+    assert [*search.steps(20)][-1] == 20
+    first = copy.deepcopy(search.accepted)
+    assert [*search.steps(40)][-1] == 40
+    assert all(each.accepted for each in search.checks) and len(search.checks) == 2
+    theta = np.array([[0.5, -0.2]])
+    search.layer.load_state_dict(first)
+    wanted = actor(search.layer, problem())(theta)
+    played = []
+
+    class Strict(FinalTrial):
+        def play(self, act):
+            costs, unsafe = super().play(act)
+            played.append(act(theta))
+            unsafe[0, 0] += int(np.any(played[-1] != wanted))
+            return costs, unsafe
+
+    monkeypatch.setattr(grounds, "draw_final", lambda: Strict([grounds.draw(grounds.drawing)]))
+    assert search.confirm(1e-6) and len(played) == 2
+    assert all(np.array_equal(search.accepted[key], each) for key, each in first.items())
 
 
 def test_a_final_trial_joins_its_episodes() -> None:
