@@ -142,8 +142,9 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     through the simulator's own steps where it can be put into a state and repeats them, else
     through a twin of its episodes. Checks are its own episodes, by the rule that an
     :class:`ImprovementGuard` has by default. In the end many new ones decide, of which none has
-    been played before; half and a quarter of a correction that they refuse are tried. Where this
-    search finds nothing, one from the present policy follows.
+    been played before; of what they refuse, the policy that was accepted first is tried, then half
+    and a quarter of the correction. Where this search finds nothing, one from the present policy
+    follows.
 
     The model ends with the policy accepted last and a critic that is refitted to it, else as it
     was. It saves and goes on learning as any other.
@@ -292,7 +293,8 @@ def _improved(
     total = pace.iterations + (len(searches) - 1) * leg
     for _ in track(_race(searches, leg, least), "improving", total, disable=not progress_bar):
         pass
-    search = min(searches, key=lambda each: each.change)
+    # Where none gains, the one that came to the final trial tells most.
+    search = min(searches, key=lambda each: (each.change, not any(c.final for c in each.checks)))
     change = search.change
     moved = any(not th.equal(own[key].cpu(), each) for key, each in search.accepted.items())
     if not moved or not search.gains(least):
