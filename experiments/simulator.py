@@ -1,4 +1,4 @@
-"""What `improve` makes of a simulator: `python -m experiments.simulator`, two hours of one core.
+"""What `improve` makes of a simulator: `python -m experiments.simulator`, some hours of one core.
 
 Three seeds on each plant, fifty episodes that nothing has seen, beside what `headroom` finds on the
 same fifty. Nothing was set for any plant. Writes the table of docs/simulator.md; with names of
