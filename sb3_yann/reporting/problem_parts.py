@@ -242,7 +242,8 @@ def _compared(subject: Subject) -> tuple[int, float, int, float]:
         if (U is not None) != known:
             apart += not _near_the_border(subject, theta, bool(known))
         elif U is not None:
-            rows.append(np.abs(U[:m] * units.reach[:m] - u) / problem.u_half)
+            own = units.program.first_input(U * units.reach, theta, m)
+            rows.append(np.abs(own - u) / problem.u_half)
     error = float(np.max(rows)) if rows else 0.0
     layer = subject.policy.actor.mu
     with th.no_grad():

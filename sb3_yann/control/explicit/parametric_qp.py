@@ -60,6 +60,10 @@ class ParametricQP:
     theta_min, theta_max : ndarray, shape (n,)
     n_slacks : int, default 0
         How many of the last variables are slacks of soft constraints, and no inputs.
+    n_input_rows : int, default 0
+        How many of the first rows are bounds of one input each.
+    feedback : ndarray, shape (m, n), or None
+        The first input is ``U[:m] + feedback theta``; None is no such part.
 
     Examples
     --------
@@ -78,7 +82,13 @@ class ParametricQP:
     theta_min: Array
     theta_max: Array
     n_slacks: int = 0
+    n_input_rows: int = 0
+    feedback: Array | None = None
     steep: ClassVar[bool] = False
+
+    def first_input(self, U: Array, theta: Array, m: int) -> Array:
+        """Return the first input (m,) of a solution U (v,) at theta (n,)."""
+        return U[:m] if self.feedback is None else np.asarray(U[:m] + self.feedback @ theta)
 
     def solve(self, theta: Array) -> Array | None:
         """Return the optimal U (v,) at one theta (n,) from DAQP, or None where none is feasible."""
@@ -133,7 +143,10 @@ class ParametricQP:
         return replace(self, G=np.where(faint[:, None], 0.0, self.G), w=w)
 
     def scaled(self, center: Array, half: Array, reach: Array) -> ParametricQP:
-        """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows."""
+        """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows.
+
+        It knows no ``feedback``: that is of the units of the plant.
+        """
         size = np.mean(np.diag(self.H) * reach**2)
         G, S = self.G * reach, self.S * half
         length = np.linalg.norm(np.hstack([G, S]), axis=1)
@@ -148,4 +161,5 @@ class ParametricQP:
             S=S / length[:, None],
             theta_min=(self.theta_min - center) / half,
             theta_max=(self.theta_max - center) / half,
+            feedback=None,
         )

@@ -68,7 +68,9 @@ def solve_explicit(
     with BudgetTimer(budget) as timer:
         regions = _critical_regions(units.scaled, solver, timer)
         try:
-            regions = Certificate(units.scaled, regions, units.center, units.half, timer).check()
+            regions = Certificate(
+                units.scaled, regions, len(u_min), units.center, units.half, timer
+            ).check()
         except ExplicitSolutionError as error:
             if solver == "walk":
                 raise
@@ -97,6 +99,9 @@ class ProgramUnits:
         self.reach = np.concatenate([reach, np.ones(program.n_slacks)])
         self.program, self.input_range = program, (u_min, u_max)
         most = np.maximum(np.abs(u_min), np.abs(u_max)) / reach[: len(u_min)]
+        if program.feedback is not None:  # v = u - feedback theta
+            box = np.maximum(np.abs(program.theta_min), np.abs(program.theta_max))
+            most = most + np.abs(program.feedback) @ box / reach[: len(u_min)]
         most = np.concatenate([np.tile(most, steps), np.full(program.n_slacks, np.inf)])
         scaled = program.scaled(self.center, self.half, self.reach)
         self.scaled = solvable(scaled.without_faint_rows(most))
@@ -111,6 +116,8 @@ class ProgramUnits:
         starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
         ranges = *self.input_range, self.program.theta_min, self.program.theta_max
         offsets = offsets - gains @ self.center
+        if self.program.feedback is not None:
+            gains = gains + self.program.feedback
         beyond = _neighbors(regions)
         return PiecewiseAffine(gains, offsets, A, b, starts, *ranges, infeasible, True, beyond)
 
@@ -144,8 +151,10 @@ def asked_of_inputs(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
     m, count = len(u_min), len(program.c) - program.n_slacks
     unit = 1 / np.sqrt(np.diag(program.H))
     H, F = unit[:, None] * program.H * unit, unit[:, None] * program.F
-    gains = np.linalg.lstsq(H, F, rcond=None)[0]
-    gains = np.abs(unit[:, None] * gains)[:count].reshape(-1, m, program.F.shape[1]).max(axis=0)
+    gains = -(unit[:, None] * np.linalg.lstsq(H, F, rcond=None)[0])[:count]
+    if program.feedback is not None:
+        gains[:m] += program.feedback
+    gains = np.abs(gains).reshape(-1, m, program.F.shape[1]).max(axis=0)
     width = program.theta_max / 2 - program.theta_min / 2
     box = np.where(np.isfinite(width), width, 0.0)
     return np.asarray(gains * box / half_widths(u_min, u_max)[:, None])

@@ -3,24 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from scipy import linalg
 
 from sb3_yann._validation import Array
+from sb3_yann.control import lqr
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc._arguments import Bounds
 from sb3_yann.control.mpc.problem import MPCProblem
 
 
-class _Prediction:
-    """``theta_k = powers[k] theta + forced[k] U`` for k = 0 ... N."""
+GROWTH = 1e3
+"""How many times as large the fastest mode may become over the horizon, uncontrolled.
 
-    def __init__(self, problem: MPCProblem) -> None:
+Predictions lose so many digits, and the Hessian twice as many.
+"""
+OFF = 1e-8
+"""How far the law without constraints may be off, in half-widths of the input range."""
+
+
+class _Prediction:
+    """``theta_k = powers[k] theta + forced[k] V`` for k = 0 ... N, where ``u_k = K theta_k + v_k``.
+
+    ``feedback`` is K (m, n_theta). Without any the variables V are the inputs.
+    """
+
+    def __init__(self, problem: MPCProblem, feedback: Array | None) -> None:
         A, B = problem.prediction
         n, m, N = problem.n_theta, problem.model.n_inputs, problem.horizon
+        self.feedback = np.zeros((m, n)) if feedback is None else feedback
+        A = A + B @ self.feedback
         self.powers: list[Array] = [np.eye(n)]
         self.forced: list[Array] = [np.zeros((n, N * m))]
         for k in range(N):
@@ -29,13 +45,20 @@ class _Prediction:
             reach[:, k * m : (k + 1) * m] += B
             self.forced.append(reach)
 
+    def inputs(self, k: int) -> tuple[Array, Array]:
+        """Return rows (m, N m) and (m, n_theta) for ``u_k = rows V + rows theta``."""
+        m = len(self.feedback)
+        rows = self.feedback @ self.forced[k]
+        rows[:, k * m : (k + 1) * m] += np.eye(m)
+        return rows, self.feedback @ self.powers[k]
+
     def rate(self, problem: MPCProblem, k: int) -> tuple[Array, Array]:
-        """Return rows (m, N m) and (m, n_theta) for ``u_k - u_{k-1} = rows U + rows theta``."""
-        m, N = problem.model.n_inputs, problem.horizon
-        inputs, start = np.zeros((m, N * m)), np.zeros((m, problem.n_theta))
-        inputs[:, k * m : (k + 1) * m] = np.eye(m)
-        before = inputs[:, (k - 1) * m : k * m] if k > 0 else start[:, problem.layout.previous]
-        before[:] = -np.eye(m)
+        """Return rows (m, N m) and (m, n_theta) for ``u_k - u_{k-1} = rows V + rows theta``."""
+        inputs, start = self.inputs(k)
+        if k > 0:
+            inputs_before, start_before = self.inputs(k - 1)
+            return inputs - inputs_before, start - start_before
+        start[:, problem.layout.previous] -= np.eye(len(inputs))
         return inputs, start
 
 
@@ -80,8 +103,92 @@ class _Rows:
 
 
 def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
-    """Return the program in ``(u_0, ..., u_{N-1})`` and slacks, and what each row bounds."""
-    prediction = _Prediction(problem)
+    """Return the program in ``(u_0, ..., u_{N-1})`` and slacks, and what each row bounds.
+
+    Where the model's modes grow too much over the horizon for float64, the variables are
+    ``v_k = u_k - K theta_k`` instead, for a gain K that stabilizes: what is predicted then decays.
+    ``feedback`` of the program is that K. The change of variables is exact: the law is the same.
+
+    Raises
+    ------
+    ValueError
+        If digits are lost all the same. The law without constraints must be that of the Riccati
+        recursion, which loses none, to 1e-8 of the input range.
+    """
+    plain = _condensed(problem, None) if _growth(problem) <= GROWTH else None
+    if plain is not None and _error(problem, plain[0]) <= OFF / 100:
+        return plain
+    found = _condensed(problem, _stabilizing_feedback(problem))
+    if plain is not None and _error(problem, plain[0]) <= _error(problem, found[0]):
+        found = plain
+    error = _error(problem, found[0])
+    if not error <= OFF:
+        poles = np.linalg.eigvals(problem.model.A)
+        pole = poles[np.argmax(np.abs(poles))]
+        raise ValueError(
+            f"With horizon = {problem.horizon} and the pole {pole if pole.imag else pole.real:.6g} "
+            f"of the model, rounding hides the law: without constraints it is off by {error:.1e} "
+            f"half-widths of the input range, and may be by {OFF:g}. Pass a shorter horizon, leave "
+            "the terminal cost to the Riccati equation, or bring states, inputs and weights to "
+            "similar magnitudes."
+        )
+    return found
+
+
+def _growth(problem: MPCProblem) -> float:
+    """Return how many times as large the fastest mode of the model becomes over the horizon."""
+    with np.errstate(over="ignore"):
+        return float(np.float64(lqr.spectral_radius(problem.model.A)) ** problem.horizon)
+
+
+def _stabilizing_feedback(problem: MPCProblem) -> Array:
+    """Return K (m, n_theta) with ``u = K theta`` a law that brings the model to its steady state.
+
+    It is the gain of the terminal cost where that stabilizes: then the Hessian is as well
+    conditioned as a single step's. Else it is the one of the problem without a discount.
+    """
+    errors = problem.error_system
+    weights = errors.R, problem.terminal.cost
+    gain = lqr.gain(errors.model, *weights, problem.gamma, errors.cross)
+    if lqr.spectral_radius(errors.model.A - errors.model.B @ gain) >= 1:
+        with suppress(ValueError):  # a mode on the unit circle without weight: it does not grow
+            P = lqr.riccati(errors.model, errors.Q, errors.R, cross=errors.cross)
+            gain = lqr.gain(errors.model, errors.R, P, cross=errors.cross)
+    return np.asarray(errors.to_input - gain @ errors.to_error)
+
+
+def _error(problem: MPCProblem, program: ParametricQP) -> float:
+    """Return how far the law without constraints is off in the box of theta, in half-widths of u.
+
+    It is compared with the Riccati recursion. Of a law that asks for many input ranges in its box,
+    as many times more is rounding.
+    """
+    errors, gamma = problem.error_system, problem.gamma
+    A, B, P = errors.model.A, errors.model.B, problem.terminal.cost
+    count, m = len(program.c) - program.n_slacks, problem.model.n_inputs
+    try:
+        for _ in range(problem.horizon):
+            gain = lqr.gain(errors.model, errors.R, P, gamma, errors.cross)
+            slope = (
+                gamma * A.T @ P @ B if errors.cross is None else gamma * A.T @ P @ B + errors.cross
+            )
+            P = errors.Q + gamma * A.T @ P @ A - slope @ gain
+            P = (P + P.T) / 2
+        factor = linalg.cho_factor(program.H[:count, :count])
+    except np.linalg.LinAlgError:
+        return np.inf
+    own = -linalg.cho_solve(factor, program.F[:count])[:m]
+    if program.feedback is not None:
+        own = own + program.feedback
+    exact = errors.to_input - gain @ errors.to_error
+    unit = problem.theta_half / problem.u_half[:, None]
+    asked = max(1.0, float(np.abs(exact * unit).max()))
+    return float(np.nan_to_num(np.abs(own - exact) * unit, nan=np.inf).max()) / asked
+
+
+def _condensed(problem: MPCProblem, feedback: Array | None) -> tuple[ParametricQP, tuple[str, ...]]:
+    """Return the program in ``v_k = u_k - feedback theta_k``, and what each row bounds."""
+    prediction = _Prediction(problem, feedback)
     slacks = [kind for kind in "xy" if np.any(getattr(problem.soft, kind))]
     H, F = _cost(problem, prediction)
     G, w, S, names = _constraints(problem, prediction, slacks)
@@ -91,15 +198,23 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
         H = linalg.block_diag(H, np.diag(2 * penalty))
         F = np.vstack([F, np.zeros((len(slacks), problem.n_theta))])
     box = problem.theta_min, problem.theta_max
-    return ParametricQP(H, F, c, G, w, S, *box, n_slacks=len(slacks)), names
+    bounded = np.isfinite([problem.u_min, problem.u_max]).sum() * problem.horizon
+    program = ParametricQP(
+        H, F, c, G, w, S, *box, n_slacks=len(slacks), n_input_rows=int(bounded), feedback=feedback
+    )
+    return program, names
 
 
 def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array]:
-    """Return H and F of ``1/2 U'HU + (F theta)'U``, whence the factors 2."""
+    """Return H and F of ``1/2 V'HV + (F theta)'V``, whence the factors 2."""
     N, gamma, errors = problem.horizon, problem.gamma, problem.error_system
     to_error, states = errors.to_error, errors.to_error[: problem.model.n_states]
-    H: Array = np.asarray(2 * np.kron(np.diag(gamma ** np.arange(N)), problem.R), np.float64)
-    F: Array = -H @ np.tile(errors.to_input, (N, 1))
+    size = N * problem.model.n_inputs
+    H, F = np.zeros((size, size)), np.zeros((size, problem.n_theta))
+    for k in range(N):
+        inputs, start = prediction.inputs(k)
+        weighted = 2 * gamma**k * inputs.T @ problem.R
+        H, F = H + weighted @ inputs, F + weighted @ (start - errors.to_input)
     for k in range(1, N + 1):
         coordinates = to_error if k == N else states
         weight = gamma**k * (problem.terminal.cost if k == N else problem.Q)
@@ -118,10 +233,11 @@ def _constraints(
     problem: MPCProblem, prediction: _Prediction, slacks: list[str]
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
     n, m, N = problem.n_theta, problem.model.n_inputs, problem.horizon
-    free, rows = np.zeros((N * m, n)), _Rows(slacks)
+    rows = _Rows(slacks)
     called, inputs = labels_of(problem.model)
     limits = np.tile(problem.u_min, N), np.tile(problem.u_max, N)
-    rows.add_bounds(inputs * N, np.eye(N * m), limits, free)
+    moved, free = (np.vstack(each) for each in zip(*map(prediction.inputs, range(N)), strict=True))
+    rows.add_bounds(inputs * N, moved, limits, free)
 
     states, rate = slice(0, problem.model.n_states), problem.rate
     x = problem.x_min, problem.x_max

@@ -98,6 +98,8 @@ class DualProgram:
         np.fill_diagonal(gram, 1.0)
         E, K = (unit * by_row[:m, moved] / own[:, 0]).T, -unit * by_theta[:m]
         D, gram, E, K = map(np.ascontiguousarray, (D.T, gram, E, K))
+        if program.feedback is not None:
+            K = K + program.feedback
         fixed = scaled.S[~moved], scaled.w[~moved]
         k0, bounds = -reach[:m] * by_one[:m, 0], np.stack([u_min, u_max])
         return cls(
@@ -177,6 +179,7 @@ def _hard(program: ParametricQP) -> NDArray[np.bool_]:
     """Tell which rows never give way: bounds of one input, and what has a slack already."""
     inputs = len(program.c) - program.n_slacks
     alone = (np.count_nonzero(program.G, axis=1) == 1) & ~np.any(program.S, axis=1)
+    alone |= np.arange(len(alone)) < program.n_input_rows
     return np.asarray(alone | np.any(program.G[:, inputs:], axis=1))
 
 

@@ -57,8 +57,8 @@ class OnlineLaw(OnPlant):
         Bounds of the input, infinite where there is none.
     theta_min, theta_max : ndarray, shape (n,)
         The box of theta; a network scales its inputs by it.
-    n_slacks : int, default 0
-        How many of the last variables are slacks.
+    n_slacks, n_input_rows, feedback
+        Likewise.
     infeasible : {"nearest_region", "zero_input"}, default "nearest_region"
 
     Examples
@@ -84,6 +84,8 @@ class OnlineLaw(OnPlant):
     theta_max: Array
     n_slacks: int = 0
     infeasible: str = "nearest_region"
+    n_input_rows: int = 0
+    feedback: Array | None = None
 
     def __post_init__(self) -> None:
         """Check the arrays against each other and store them as read-only float64."""
@@ -98,11 +100,14 @@ class OnlineLaw(OnPlant):
             values[low], values[high] = bounds
         check.as_choice("infeasible", self.infeasible, INFEASIBLE)
         slacks = check.as_whole("n_slacks", self.n_slacks, 0)
+        check.as_whole("n_input_rows", self.n_input_rows, 0)
         if m == 0 or (v - slacks) % m or v == slacks:
             raise ValueError(
                 f"The program has {v} variables, {slacks} of them slacks: the others must be the "
                 f"{m} inputs of each step."
             )
+        feedback = np.zeros((m, n)) if self.feedback is None else self.feedback
+        values["feedback"] = as_array("feedback", feedback, (m, n))
         _require_positive_definite(values["H"])
         self._store(F=F, G=G, **values)
 
@@ -181,8 +186,9 @@ class OnlineLaw(OnPlant):
 
     @classmethod
     def _from_arrays(cls, data: dict[str, Any]) -> OnlineLaw:
+        data = {"n_input_rows": 0, "feedback": None, **data}  # which older files lack
         values = {field.name: data[field.name] for field in fields(cls)}
-        for name, kind in (("infeasible", str), ("n_slacks", int)):
+        for name, kind in (("infeasible", str), ("n_slacks", int), ("n_input_rows", int)):
             values[name] = kind(values[name])
         return with_plant(cls(**values), data)
 
@@ -253,7 +259,7 @@ class OnlineLaw(OnPlant):
             U, tight = answer, multipliers[self.dual.rows] > 0
         active = np.flatnonzero(tight)[: found.active.shape[1]]
         found.sizes[at], found.active[at, : len(active)] = len(active), active
-        u[:] = (reach * U)[: len(u)]
+        u[:] = self.program.first_input(reach * U, theta, len(u))
         return True
 
     def _exact_gain(self, active: Integers) -> Array | None:
@@ -263,7 +269,9 @@ class OnlineLaw(OnPlant):
             return None
         found = scaled.conditions_of(as_bits(self.dual.rows[active]))
         m = self.n_inputs
-        return None if found is None else reach[:m, None] * found.law[:m, :-1] / self.half
+        if found is None:
+            return None
+        return np.asarray(reach[:m, None] * found.law[:m, :-1] / self.half + self.feedback)
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""
