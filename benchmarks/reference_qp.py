@@ -51,102 +51,101 @@ class ReferenceQP:
         All of it is in half-widths of the boxes. The constraints come in the order of the condensed
         program's.
         """
-        mpc, N, n, m = self.mpc, self.mpc.horizon, self.mpc.n_theta, self.mpc.model.n_inputs
-        slacks = self.program.n_slacks
-        self.size = N * (n + m) + slacks
+        mpc, slacks = self.mpc, self.program.n_slacks
+        N, m = mpc.horizon, mpc.model.n_inputs
+        self.size = N * (mpc.n_theta + m) + slacks
+        self.units = np.concatenate([
+            np.tile(self.half, N), np.tile(self.unit, N), np.ones(slacks)
+        ])  # fmt: skip
         A, B = mpc.prediction
-        errors, gamma = mpc.error_system, mpc.gamma
-        H = np.zeros((self.size, self.size))
-        cost = np.zeros((self.size, n))  # of theta_0 beside the variables
-        equal, start = np.zeros((N * n, self.size)), np.zeros((N * n, n))
+        equal = [self._theta(k + 1)[0] - A @ self._theta(k)[0] - B @ self._u(k) for k in range(N)]
+        start = [A @ self._theta(k)[1] for k in range(N)]
+        H, cost, linear = self._cost()
+        size = np.mean(np.diag(H) * self.units**2)
+        self.H = H * np.outer(self.units, self.units) / size
+        self.linear = linear * self.units / size
+        self.cost = cost * self.units[:, None] / size
+        rows, S = np.vstack(equal) * self.units, np.vstack(start)
+        self.equal, self.start, _ = self._unit(rows, S, np.zeros(len(rows)))
+        rows, w, S = (np.concatenate(each) for each in zip(*self._rows(), strict=True))
+        bounded = np.isfinite(w)
+        self.G, self.S, self.w = self._unit(rows[bounded] * self.units, S[bounded], w[bounded])
 
-        def theta(k: int) -> tuple[Array, Array]:
-            rows = np.zeros((n, self.size))
-            if k == 0:
-                return rows, np.eye(n)
-            rows[:, (k - 1) * n : k * n] = np.eye(n)
-            return rows, np.zeros((n, n))
+    def _theta(self, k: int) -> tuple[Array, Array]:
+        """Return rows of the variables, and of theta_0, that make up theta_k."""
+        n = self.mpc.n_theta
+        rows = np.zeros((n, self.size))
+        if k == 0:
+            return rows, np.eye(n)
+        rows[:, (k - 1) * n : k * n] = np.eye(n)
+        return rows, np.zeros((n, n))
 
-        def u(k: int) -> Array:
-            rows = np.zeros((m, self.size))
-            rows[:, N * n + k * m : N * n + (k + 1) * m] = np.eye(m)
-            return rows
+    def _u(self, k: int) -> Array:
+        m, first = self.mpc.model.n_inputs, self.mpc.horizon * self.mpc.n_theta
+        rows = np.zeros((m, self.size))
+        rows[:, first + k * m : first + (k + 1) * m] = np.eye(m)
+        return rows
 
-        for k in range(N + 1):
-            at, free = theta(k)
-            z, z_free = errors.to_error @ at, errors.to_error @ free
-            weight = gamma**k * (mpc.terminal.cost if k == N else errors.Q)
-            H, cost = H + 2 * z.T @ weight @ z, cost + 2 * z.T @ weight @ z_free
-            if k < N:
-                v, v_free = u(k) - errors.to_input @ at, -errors.to_input @ free
-                R = gamma**k * errors.R
-                H, cost = H + 2 * v.T @ R @ v, cost + 2 * v.T @ R @ v_free
-                if errors.cross is not None:
-                    cross = gamma**k * errors.cross
-                    H = H + 2 * (z.T @ cross @ v + v.T @ cross.T @ z)
-                    cost = cost + 2 * (z.T @ cross @ v_free + v.T @ cross.T @ z_free)
-                after = theta(k + 1)[0]
-                equal[k * n : (k + 1) * n] = after - A @ at - B @ u(k)
-                start[k * n : (k + 1) * n] = A @ free
+    def _cost(self) -> tuple[Array, Array, Array]:
+        """Return the Hessian, what theta_0 and what nothing multiplies."""
+        mpc, N = self.mpc, self.mpc.horizon
+        errors, slacks = mpc.error_system, self.program.n_slacks
+        H, cost = np.zeros((self.size, self.size)), np.zeros((self.size, mpc.n_theta))
+        weight = errors.stage_matrix
+        for k in range(N):
+            at, free = self._theta(k)
+            both = np.vstack([at, self._u(k)])
+            both_free = np.vstack([free, np.zeros((len(self.unit), mpc.n_theta))])
+            weighted = 2 * mpc.gamma**k * both.T @ weight
+            H, cost = H + weighted @ both, cost + weighted @ both_free
+        z = errors.to_error @ self._theta(N)[0]
+        H = H + 2 * mpc.gamma**N * z.T @ mpc.terminal.cost @ z
         linear = np.zeros(self.size)
+        linear[self.size - slacks :] = mpc.soft.penalty
+        H[range(self.size - slacks, self.size), range(self.size - slacks, self.size)] += (
+            2 * mpc.soft.penalty
+        )
+        return H, cost, linear
+
+    def _rows(self) -> Iterator[tuple[Array, Array, Array]]:
+        """Yield constraints ``rows variables <= w + S theta_0``."""
+        mpc, N, n = self.mpc, self.mpc.horizon, self.mpc.n_theta
         kinds = [kind for kind in "xy" if np.any(getattr(mpc.soft, kind))]
-        for i in range(slacks):
-            H[self.size - slacks + i, self.size - slacks + i] += 2 * mpc.soft.penalty
-            linear[self.size - slacks + i] = mpc.soft.penalty
 
         def slack(kind: str, softness: Array) -> Array:
             rows = np.zeros((len(softness), self.size))
             if kind in kinds:
-                rows[:, self.size - slacks + kinds.index(kind)] = -softness
+                rows[:, self.size - len(kinds) + kinds.index(kind)] = -softness
             return rows
 
-        G: list[tuple[Array, Array, Array]] = []
-
-        def add(
+        def between(
             rows: Array, free: Array, low: Array, high: Array, soft: Array | float = 0.0
-        ) -> None:
-            G.append((rows + soft, high, -free))
-            G.append((-rows + soft, -low, free))
+        ) -> Iterator[tuple[Array, Array, Array]]:
+            yield rows + soft, high, -free
+            yield -rows + soft, -low, free
 
-        states, none = mpc.layout.state, np.zeros((N * m, n))
-        all_inputs = np.vstack([u(k) for k in range(N)])
-        add(all_inputs, none, np.tile(mpc.u_min, N), np.tile(mpc.u_max, N))
+        inputs = np.vstack([self._u(k) for k in range(N)])
+        yield from between(
+            inputs, np.zeros((len(inputs), n)), np.tile(mpc.u_min, N), np.tile(mpc.u_max, N)
+        )
+        state, C = mpc.layout.state, mpc.outputs.C
         for k in range(1, N + 1):
-            add(
-                theta(k)[0][states],
-                0 * np.eye(n)[states],
-                mpc.x_min,
-                mpc.x_max,
-                slack("x", mpc.soft.x),
+            rows = self._theta(k)[0][state]
+            yield from between(
+                rows, np.zeros((len(rows), n)), mpc.x_min, mpc.x_max, slack("x", mpc.soft.x)
             )
         F, g = mpc.terminal.set
-        G.append((F @ theta(N)[0], g, np.zeros((len(g), n))))
+        yield F @ self._theta(N)[0], g, np.zeros((len(g), n))
         for k in range(N) if mpc.layout.n_previous else ():
-            at, free = theta(k)
-            part = mpc.layout.previous
-            add(u(k) - at[part], -free[part], mpc.rate.du_min, mpc.rate.du_max)
-        C = mpc.outputs.C
+            at, free = (each[mpc.layout.previous] for each in self._theta(k))
+            yield from between(self._u(k) - at, -free, mpc.rate.du_min, mpc.rate.du_max)
         for k in range(1, N + 1) if len(C) else ():
-            rows = C @ theta(k)[0][states]
-            add(
-                rows,
-                np.zeros((len(C), n)),
-                mpc.outputs.y_min,
-                mpc.outputs.y_max,
-                slack("y", mpc.soft.y),
-            )
+            rows = C @ self._theta(k)[0][state]
+            free = np.zeros((len(C), n))
+            soft = slack("y", mpc.soft.y)
+            yield from between(rows, free, mpc.outputs.y_min, mpc.outputs.y_max, soft)
         for kind in kinds:
-            G.append((slack(kind, np.ones(1)), np.zeros(1), np.zeros((1, n))))
-        rows, w, S = (np.concatenate(each) for each in zip(*G, strict=True))
-        bounded = np.isfinite(w)
-        units = np.concatenate([np.tile(self.half, N), np.tile(self.unit, N), np.ones(slacks)])
-        self.units = units
-        size = np.mean(np.diag(H * np.outer(units, units)))
-        self.H, self.linear = H * np.outer(units, units) / size, linear * units / size
-        self.cost = cost * units[:, None] / size
-        self.equal, self.start = self._unit(equal * units, start, np.zeros(len(equal)))[:2]
-        self.G, self.S, self.w = self._unit(rows[bounded] * units, S[bounded], w[bounded])
-        assert len(self.w) == len(self.program.w)
+            yield slack(kind, np.ones(1)), np.zeros(1), np.zeros((1, n))
 
     @staticmethod
     def _unit(rows: Array, S: Array, w: Array) -> tuple[Array, Array, Array]:

@@ -153,7 +153,7 @@ class Certificate:
             self._fail(f"the law of region {i} is not optimal inside it", middle)
 
     def _checked(self, i: int, ball: Ball, kkt: Optimality) -> Region:
-        """Return region i, trimmed, with the exact law where it is steep; raise where it is wrong."""
+        """Return region i, trimmed, with the exact law where that is steep; raise if wrong."""
         region = self.regions[i]
         exact, offset = kkt.law[: self.n_inputs, :-1], kkt.law[: self.n_inputs, -1]
         off = max(np.abs(exact - self.gains[i]).max(), np.abs(offset - self.offsets[i]).max())
