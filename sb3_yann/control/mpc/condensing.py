@@ -115,13 +115,13 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
         recursion, which loses none, to 1e-8 of the input range.
     """
     plain = _condensed(problem, None) if _growth(problem) <= GROWTH else None
-    if plain is not None and _error(problem, plain[0]) <= OFF / 100:
+    if plain is not None and not _error(problem, plain[0]) > OFF / 100:
         return plain
     found = _condensed(problem, _stabilizing_feedback(problem))
-    if plain is not None and _error(problem, plain[0]) <= _error(problem, found[0]):
+    if plain is not None and not _error(problem, plain[0]) > _error(problem, found[0]):
         found = plain
     error = _error(problem, found[0])
-    if not error <= OFF:
+    if error > OFF:
         poles = np.linalg.eigvals(problem.model.A)
         pole = poles[np.argmax(np.abs(poles))]
         raise ValueError(
@@ -160,7 +160,8 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     """Return how far the law without constraints is off in the box of theta, in half-widths of u.
 
     It is compared with the Riccati recursion. Of a law that asks for many input ranges in its box,
-    as many times more is rounding.
+    as many times more is rounding. It is nan where the program has no unique minimum: the laws say
+    so.
     """
     errors, gamma = problem.error_system, problem.gamma
     A, B, P = errors.model.A, errors.model.B, problem.terminal.cost
@@ -175,7 +176,7 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
             P = (P + P.T) / 2
         factor = linalg.cho_factor(program.H[:count, :count])
     except np.linalg.LinAlgError:
-        return np.inf
+        return np.nan
     own = -linalg.cho_solve(factor, program.F[:count])[:m]
     if program.feedback is not None:
         own = own + program.feedback
