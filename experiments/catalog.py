@@ -153,7 +153,6 @@ def yann(  # noqa: PLR0913 (what the variants vary)
     noise: float = 0.0,
     gamma: float = 0.99,
     infeasible: str | None = None,
-    plant_alone: bool = False,
     gradient_steps: int | None = None,
     tau: float = 0.005,
     critic: Any = "afterstate",
@@ -201,9 +200,8 @@ def yann(  # noqa: PLR0913 (what the variants vary)
         model.learning_starts = 0
         callbacks = []
     if guard is not None:
-        simulator = None if plant_alone else plant.env
         rule = {**plant.guard.get("rule", {}), **guard.get("rule", {})}
-        callbacks.append(ImprovementGuard(simulator, **{**plant.guard, **guard, "rule": rule}))
+        callbacks.append(ImprovementGuard(plant.env, **{**plant.guard, **guard, "rule": rule}))
     return Learner(model, model.policy, callbacks)
 
 
@@ -214,7 +212,6 @@ def _yardstick(build: Callable[..., Learner], **options: Any) -> Callable[..., L
 CHANGES: dict[str, dict[str, Any]] = {
     "guard off": {"guard": None},
     "guard off, noise 0.1": {"guard": None, "noise": 0.1},
-    "guard: plant alone": {"plant_alone": True},
     "paper's critic": {"critic": "state_action"},
     "paper's critic, TD3, guard off": {"critic": "state_action", "guard": None, "algorithm": TD3},
     "at most 5 % from the MPC": {"max_correction": 0.05},
@@ -251,7 +248,6 @@ VARIANTS = {
     "CSTR": [
         "guard off",
         "guard off, noise 0.1",
-        "guard: plant alone",
         "paper's critic",
         "at most 5 % from the MPC",
         "discount 0.95",

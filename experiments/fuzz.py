@@ -255,7 +255,7 @@ def _record(folder: Path) -> Target:
 
 SETTINGS = """
 guard: {n_starts: 20, n_new_starts: 5, patience: 3, seed: 1, eval_every: 2, keep_if_worse: true}
-rule: {margin: 0.01, tail: 0.05, trial_episodes: 10, by_region: true}
+rule: {margin: 0.01, tail: 0.05, by_region: true}
 step_size: {shrink: 0.5, grow: 1.5, smallest: 0.1}
 critic: {kind: afterstate, reward_scale: 1.0}
 checks: {hold: 5, recover: 10, transfer: 5, frozen_after: 30, late_after: 1.5}

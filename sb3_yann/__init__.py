@@ -27,7 +27,7 @@ _NAMES = {
     "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning Headroom "
     "SteadyOffsetWarning headroom",
     "sb3_yann.callbacks": "ControlDiagnostics FigureLog NoActionNoise",
-    "sb3_yann.commissioning": "Batch Commissioning ImproveInTwin Improvement improve",
+    "sb3_yann.commissioning": "Batch Commissioning Improvement improve",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
     "ExplicitSolutionError Identified LinearMPC LinearModel OnlineLaw OnlineLawWarning "
     "OutputBounds PiecewiseAffine RateLimits SoftBounds Terminal Tracking identify offset_free",

@@ -10,7 +10,6 @@ from sb3_yann.callbacks import FigureLog as FigureLog
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
 from sb3_yann.commissioning import Batch as Batch
 from sb3_yann.commissioning import Commissioning as Commissioning
-from sb3_yann.commissioning import ImproveInTwin as ImproveInTwin
 from sb3_yann.commissioning import Improvement as Improvement
 from sb3_yann.commissioning import improve as improve
 from sb3_yann.control import DisturbanceBounds as DisturbanceBounds

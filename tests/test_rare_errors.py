@@ -97,7 +97,7 @@ def with_two_outputs() -> ObserveDisturbance:
             "features_extractor_class must stay FlattenExtractor: the law takes theta",
         ),
         (
-            lambda: ImprovementGuard(None, log_path="/"),
+            lambda: ImprovementGuard("CSTR-v0", log_path="/"),
             ValueError,
             "log_path = '/' is a folder; name a file in it",
         ),

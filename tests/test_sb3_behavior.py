@@ -170,7 +170,7 @@ def test_targets_follow_the_parameters_and_leave_other_buffers_alone() -> None:
 
 
 def test_a_callback_sees_a_step_before_its_observation_becomes_the_last_one() -> None:
-    """callbacks, guard.plant_acceptance and audit.callback read `_last_obs` as s_t."""
+    """callbacks and audit.callback read `_last_obs` as s_t."""
     seen = Seen()
     learn(callback=seen)
     assert [row["last_obs"].item() for row in seen.rows] == [0, 1, 2, 3, 0]
@@ -187,7 +187,7 @@ def test_the_end_of_an_episode_carries_its_last_observation_and_its_cause() -> N
 
 
 def test_buffer_actions_are_in_one_and_actions_in_the_envs_units() -> None:
-    """guard.plant_acceptance and callbacks take the former for inputs in [-1, 1]."""
+    """callbacks takes the former for inputs in [-1, 1]."""
     seen = Seen()
     learn(callback=seen)
     for row in seen.rows:
@@ -240,22 +240,6 @@ def test_the_buffer_of_an_instance_may_have_its_own_add() -> None:
     assert [each.item() for each in buffer.next_observations[: STEPS + 1]] == [1, 2, 3, 4, 1]
     assert buffer.dones[3].item() == 1 and buffer.timeouts[3].item() == 1
     assert buffer.actions.shape[1:] == (*buffer.rewards.shape[1:], 1) == (1, 1)
-
-
-@pytest.mark.parametrize("goes_on", [True, False])
-def test_a_second_learn_goes_on_amid_an_episode_or_begins_anew(goes_on) -> None:
-    """guard.plant_acceptance leaves out an episode that is under way."""
-    model, seen = learn(2), Seen()
-    model.learn(1, callback=seen, reset_num_timesteps=not goes_on)
-    assert seen.rows[0]["last_obs"].item() == (2 if goes_on else 0)
-
-
-def test_a_loaded_model_resets_its_env(tmp_path) -> None:
-    """guard.plant_acceptance then counts the first episode."""
-    learn(2).save(tmp_path / "m")
-    loaded, seen = DDPG.load(tmp_path / "m", env=Plant(), device="cpu"), Seen()
-    loaded.learn(1, callback=seen, reset_num_timesteps=False)
-    assert seen.rows[0]["last_obs"].item() == 0
 
 
 def test_scaled_actions_are_unscaled_by_the_policy() -> None:

@@ -150,11 +150,8 @@ CASES: dict[str, Callable[[], object]] = {
     "All 3 starts of the guard's env": lambda: learn(
         ImprovementGuard(lambda: gym.wrappers.TimeLimit(Plant(deaf=True), 5), n_starts=3)
     ),
-    "learning_starts = 100: SB3 plays so many actions at random": lambda: learn(
-        ImprovementGuard(None)
-    ),
     "The guard is within a callback of the class EveryNTimesteps": lambda: learn(
-        EveryNTimesteps(2, ImprovementGuard(None))
+        EveryNTimesteps(2, ImprovementGuard(Plant))
     ),
     # Logs and twins
     "The data do not excite the plant": lambda: LinearModel.from_data(

@@ -1,6 +1,5 @@
 """From a plant's log to a better controller on the plant."""
 
-from sb3_yann.commissioning.callback import Attempt, ImproveInTwin
 from sb3_yann.commissioning.commissioning import Commissioning
 from sb3_yann.commissioning.improve import Improvement, improve
 from sb3_yann.commissioning.journal import Batch
@@ -9,11 +8,9 @@ from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 
 __all__ = [
     "Alarm",
-    "Attempt",
     "Batch",
     "Check",
     "Commissioning",
-    "ImproveInTwin",
     "Improvement",
     "Watchdog",
     "improve",

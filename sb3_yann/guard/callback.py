@@ -1,4 +1,4 @@
-"""The callback, and the part of it that both ways to decide share."""
+"""The callback that is passed to `learn`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from sb3_yann.evaluation.plots.decisions import plot_decisions
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.options import AcceptanceRule, StepSize
-from sb3_yann.guard.plant_acceptance import PlantAcceptance
 from sb3_yann.guard.preconditions import check_alone, check_not_nested, check_twin
 from sb3_yann.guard.session import GuardSession, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
@@ -42,19 +41,18 @@ class ImprovementGuard(BaseCallback):
     candidate, also after another exception and in the zips of a CheckpointCallback:
     :func:`restore_accepted` gives it the accepted policy.
 
-    With a simulator, candidates, accepted policy and MPC play the same seeded starts. On a plant
-    alone (``env=None``) the training episodes decide, by tests that share one error probability.
-    `docs/guard.md` says when a candidate is refused. A refusal restores actor, target actor and the
-    actor's optimizer bit for bit, at once or when ``patience`` is over. No random numbers are
-    drawn. The state travels with the model, as ``model.guard_state``: a guard with the same
-    settings goes on there.
+    Candidates, accepted policy and MPC play the same seeded starts in a simulator. Where there is
+    none, use :class:`Commissioning`. `docs/guard.md` says when a candidate is refused. A refusal
+    restores actor, target actor and the actor's optimizer bit for bit, at once or when ``patience``
+    is over. No random numbers are drawn. The state travels with the model, as
+    ``model.guard_state``: a guard with the same settings goes on there.
 
     Parameters
     ----------
-    env : str, gymnasium.Env, callable, PlantTwin or None
+    env : str, gymnasium.Env, callable or PlantTwin
         The simulator: an id, a function that makes an env, or an env other than the training env.
         The first two play all starts side by side. Of a twin all members are played, start by
-        start. None is for a plant alone.
+        start.
     n_starts : int, default 100
         Number of seeded starts.
     n_new_starts : int, default 50
@@ -85,8 +83,8 @@ class ImprovementGuard(BaseCallback):
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range. When training starts: if the policy is no YannPolicy, the
-        simulator cannot compare policies, or noise acts on a plant alone.
+        If an argument is out of range. When training starts: if the policy is no YannPolicy, or
+        the simulator cannot compare policies.
 
     Examples
     --------
@@ -106,7 +104,7 @@ class ImprovementGuard(BaseCallback):
 
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
         self,
-        env: Source | PlantTwin | None,
+        env: Source | PlantTwin,
         *,
         n_starts: int = 100,
         n_new_starts: int = 50,
@@ -125,10 +123,11 @@ class ImprovementGuard(BaseCallback):
             env.require_trust()
             # The seed of an episode names a member: all of them are played.
             self.twin, env = env, env.env
-        if not (env is None or isinstance(env, str | gym.Env) or callable(env)):
+        if not (isinstance(env, str | gym.Env) or callable(env)):
             raise TypeError(
-                f"env = {env!r} must be the id of an environment, a gymnasium.Env, a function that "
-                "makes one, a PlantTwin, or None to decide from the training episodes."
+                f"env = {env!r} must be a simulator of the plant: the id of an environment, a "
+                "gymnasium.Env, a function that makes one, or a PlantTwin. On a plant without a "
+                "simulator use Commissioning (docs/commissioning.md)."
             )
         if log_path is not None and Path(log_path).is_dir():
             raise ValueError(f"log_path = {log_path!r} is a folder; name a file in it.")
@@ -143,13 +142,16 @@ class ImprovementGuard(BaseCallback):
         rule = as_options("rule", rule, AcceptanceRule)
         self.env, self.step_size = env, as_options("step_size", step_size, StepSize)
         self.log_path = None if log_path is None else Path(log_path)
-        self.acceptance: SimulatorAcceptance | PlantAcceptance
-        if env is None:
-            self.acceptance = PlantAcceptance(rule)
-        else:
-            seeds = range(seed, seed + n_starts)
-            counts = n_new_starts, n_final, eval_every, patience
-            self.acceptance = SimulatorAcceptance(name_of(env), seeds, *counts, keep_if_worse, rule)
+        self.acceptance = SimulatorAcceptance(
+            name_of(env),
+            range(seed, seed + n_starts),
+            n_new_starts,
+            n_final,
+            eval_every,
+            patience,
+            keep_if_worse,
+            rule,
+        )
 
     @property
     def decisions(self) -> list[Decision]:
@@ -212,7 +214,7 @@ class ImprovementGuard(BaseCallback):
             self._start_afresh(known)
         self.state.mpc = self.session.mpc
         self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
-        self.session.policy.actor_step = self.acceptance.actor_step(self.session)
+        self.session.policy.actor_step = self.state.step
         self._has_begun = True
         if self.log_path is not None:
             self.session.log_lacks_rows = not begin_record(self.log_path, self.decisions)
@@ -223,7 +225,6 @@ class ImprovementGuard(BaseCallback):
         state = GuardState(self.acceptance.settings, present, evidence=None)
         if known is not None:  # other starts or another plant: the policies are tried anew
             state.decisions, state.episodes = [*known.decisions], known.episodes
-            state.budget = known.budget
         self.model.guard_state = state  # type: ignore[attr-defined]
         try:
             self.acceptance.first_evidence(self.session, known)
@@ -232,16 +233,11 @@ class ImprovementGuard(BaseCallback):
             self.model.guard_state = known  # type: ignore[attr-defined]
             raise
 
-    def _on_rollout_start(self) -> None:
-        self.acceptance.before_steps(self.session)
-
     def _on_step(self) -> bool:
-        dones, rewards, infos = (self.locals[each] for each in ("dones", "rewards", "infos"))
+        dones = self.locals["dones"]
         self.state.episodes += int(np.sum(dones))
         self._warn_of_an_endless_episode(dones)
-        if isinstance(self.acceptance, PlantAcceptance):
-            self.acceptance.record(self.session, self.locals["buffer_actions"])
-        self.acceptance.step(self.session, dones, rewards, infos)
+        self.acceptance.step(self.session, dones)
         return True
 
     def _warn_of_an_endless_episode(self, dones: Any) -> None:
@@ -249,8 +245,8 @@ class ImprovementGuard(BaseCallback):
         if np.any(self._steps == LONG):
             warnings.warn(
                 f"An episode of the training env has not ended after {LONG} steps, and the guard "
-                "decides at the ends of episodes; on a plant alone it keeps all steps of one in "
-                "memory. Give it a limit, by gymnasium.wrappers.TimeLimit.",
+                "decides at the ends of episodes. Give it a limit, by "
+                "gymnasium.wrappers.TimeLimit.",
                 stacklevel=2,
             )
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from sb3_yann._validation import as_between, as_flag, as_whole
+from sb3_yann._validation import as_between, as_flag
 
 
 @dataclass(frozen=True)
@@ -19,27 +19,24 @@ class AcceptanceRule:
     margin : float, default 0.01
         What the worst starts may cost more than with the MPC on average, as a fraction of the
         MPC's median cost, or of its cost of that start where that is more. No single start may
-        cost ten times as much more. Plant alone: what an episode may cost beyond its prediction
-        limit, of the accepted median.
+        cost ten times as much more.
     tail : float, default 0.05
-        In a simulator: share of the starts that count as the worst ones. 0 is strict: no single
+        Share of the starts that count as the worst ones. 0 is strict: no single
         start may cost more than the margin, of the median.
     by_region : bool, default True
         Whether single regions are tried where the whole candidate is refused.
     retreat : bool, default True
-        In a simulator: whether half and a quarter of the way are tried where no region is accepted
-        either, and half and a quarter of the correction where a policy loses on new starts.
-    trial_episodes : int, default 10
-        Plant alone: training episodes of a block, at least 3.
+        Whether half and a quarter of the way are tried where no region is accepted either, and
+        half and a quarter of the correction where a policy loses on new starts.
     significance : float, default 0.05
-        Plant alone: probability that a run accepts a policy that is no better, at most. In a
-        simulator: that the final trial does, on average over all starts.
+        Probability that the final trial accepts a policy that is no better on average over all
+        starts.
     least_gain : float, default 0.001
-        In a simulator: what the final trial must gain on average, as a fraction of the MPC's mean
-        cost. What gains less changes nothing. A strict rule, ``tail=0``, takes any gain.
+        What the final trial must gain on average, as a fraction of the MPC's mean cost. What gains
+        less changes nothing. A strict rule, ``tail=0``, takes any gain.
     largest_step : float, optional
-        In a simulator: how far an input may move from one sample to the next, in multiples of the
-        MPC's largest step on the known starts, at least 1. The default is no bound.
+        How far an input may move from one sample to the next, in multiples of the MPC's largest
+        step on the known starts, at least 1. The default is no bound.
 
     Examples
     --------
@@ -52,7 +49,6 @@ class AcceptanceRule:
     tail: float = 0.05
     by_region: bool = True
     retreat: bool = True
-    trial_episodes: int = 10
     significance: float = 0.05
     least_gain: float = 0.001
     largest_step: float | None = None
@@ -69,7 +65,6 @@ class AcceptanceRule:
             as_between("largest_step", self.largest_step, 1, np.inf, hint=hint)
         as_flag("by_region", self.by_region)
         as_flag("retreat", self.retreat)
-        as_whole("trial_episodes", self.trial_episodes, 3)
         as_between("significance", self.significance, 0, 0.5)
 
     @property

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann.control import LinearMPC
 from sb3_yann.evaluation.episodes import Episodes, one_env
@@ -21,7 +20,7 @@ from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin
 def check_simulator(session: GuardSession, name: str) -> None:
     """Raise ValueError if the simulator is the training env, or an env of another shape."""
     training_env = session.model.get_env()
-    assert session.simulator is not None and training_env is not None
+    assert training_env is not None
     training = [env.unwrapped for env in getattr(training_env, "envs", [])]
     with preserve_rng(), one_env(session.simulator) as env:
         if any(env.unwrapped is each for each in training):
@@ -36,20 +35,6 @@ def check_simulator(session: GuardSession, name: str) -> None:
                 f"the training env {theirs} and {training_env.action_space}. "
                 "Give the guard a simulator of this plant."
             )
-
-
-def check_acts_alone(model: OffPolicyAlgorithm) -> None:
-    """Raise ValueError if anything but the policy, whose episodes are the evidence, would act."""
-    if model.num_timesteps < model.learning_starts:
-        cause = f"learning_starts = {model.learning_starts}: SB3 plays so many actions at random"
-    elif model.action_noise is not None:
-        cause = f"action_noise = {model.action_noise} acts as well"
-    else:
-        return
-    raise ValueError(
-        f"{cause}, and ImprovementGuard(None) takes the training episodes for the policy's own. "
-        "Pass the callback NoActionNoise() as well, or learning_starts=0 and no noise."
-    )
 
 
 def check_not_nested(guard: BaseCallback) -> None:

@@ -31,7 +31,7 @@ class GuardSession:
     ----------
     model : OffPolicyAlgorithm, in training
     policy : YannPolicy, the model's
-    simulator : gymnasium.Env, str, callable or None, where candidates play; None on a plant alone
+    simulator : gymnasium.Env, str or callable, where candidates play
     step_size, log_path, verbose : StepSize, Path or None and int, as in :class:`ImprovementGuard`
     interrupted : bool, whether Ctrl-C has restored the accepted policy: nothing else may be then
     log_lacks_rows : bool, whether decisions could not be written to the log
@@ -40,7 +40,7 @@ class GuardSession:
 
     model: OffPolicyAlgorithm
     policy: YannPolicy
-    simulator: Source | None
+    simulator: Source
     step_size: StepSize
     log_path: Path | None
     verbose: int
@@ -58,7 +58,6 @@ class GuardSession:
     @cached_property
     def envs(self) -> EnvPool:
         """The envs of the simulator, kept from trial to trial."""
-        assert self.simulator is not None  # a plant alone plays nothing
         return EnvPool(self.simulator)
 
     @cached_property
@@ -105,7 +104,7 @@ class GuardSession:
 
     def close(self) -> None:
         """Close the envs that were made; one that was given is the caller's."""
-        if self.simulator is not None and not isinstance(self.simulator, gym.Env):
+        if not isinstance(self.simulator, gym.Env):
             self.envs.close()
 
     def leave_accepted(self) -> None:
@@ -181,7 +180,8 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     >>> from stable_baselines3 import DDPG
     >>> from sb3_yann import ImprovementGuard, NoActionNoise, restore_accepted
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> _ = model.learn(1, callback=[NoActionNoise(), ImprovementGuard(None)])
+    >>> guard = ImprovementGuard("CSTR-v0", n_starts=2, n_new_starts=2)
+    >>> _ = model.learn(1, callback=[NoActionNoise(), guard])
     >>> restore_accepted(model)
     """
     as_kind("model", model, BaseAlgorithm, "a DDPG or TD3 model")

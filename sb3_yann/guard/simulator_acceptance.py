@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.episodes import (
@@ -126,21 +127,8 @@ class SimulatorAcceptance:
         self._report(session, outcome, f"before training, {reason}", [], restored=True)
         return session.state.accepted
 
-    def before_steps(self, session: GuardSession) -> None:
-        """Do nothing: the training env may meet any candidate."""
-
-    def actor_step(self, session: GuardSession) -> float:
-        """Return the factor of the actor's learning rate."""
-        return session.state.step
-
-    def step(self, session: GuardSession, dones: Any, rewards: Any, infos: Any) -> None:
-        """Try the policy where an episode has ended and it is time.
-
-        Parameters
-        ----------
-        session, dones, rewards, infos
-            As in `PlantAcceptance.step`; the last two are not used.
-        """
+    def step(self, session: GuardSession, dones: NDArray[np.bool_]) -> None:
+        """Try the policy where an episode (n_envs,) has ended and it is time."""
         state = session.state
         last, now = state.last_trial, state.episodes
         if np.any(dones) and (last is None or now - last >= self.eval_every):

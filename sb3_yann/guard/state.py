@@ -15,7 +15,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._validation import Array
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
-from sb3_yann.guard.statistics import ErrorBudget
 
 Verdict = Literal["accepted", "accepted in part", "rejected"]
 
@@ -74,14 +73,13 @@ class GuardState:
     ----------
     settings : dict, what the evidence depends on
     accepted : ActorCheckpoint, the one accepted last
-    evidence : Evidence, BlockEvidence or None, what candidates are compared with
+    evidence : Evidence or None, what candidates are compared with
     step : float, factor of the actor's learning rate
     episodes, rejections : int, training episodes so far, and refusals in a row
     new_starts, next_start : int, number of new starts so far, and the seed of the next
     passed : list of (ActorCheckpoint, Outcome or None), the latest last
         Earlier accepted checkpoints, with their outcomes on the first of the known starts.
     decisions : list of Decision, all so far
-    budget : ErrorBudget, what is left to the tests on a plant alone
     input_step : ndarray, shape (m,), or None, how far inputs may move from one sample to the next
     mpc : ActorCheckpoint or None, the MPC, with the weights that it goes on to learn from
     last_trial : int or None, training episodes until the last trial in a simulator
@@ -97,7 +95,6 @@ class GuardState:
     next_start: int = 0
     passed: list[tuple[ActorCheckpoint, Any]] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
-    budget: ErrorBudget = ErrorBudget()  # noqa: RUF009 (frozen)
     input_step: Array | None = None
     mpc: ActorCheckpoint | None = None
     last_trial: int | None = None

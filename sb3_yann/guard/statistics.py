@@ -1,4 +1,4 @@
-"""Why a candidate is refused: in paired episodes of a simulator, or on a plant alone."""
+"""Why a candidate is refused: paired episodes of a simulator."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
 
 from sb3_yann._validation import Array
 
-OUTLIER = 1e-3
-"""Probability that one episode of a policy like the accepted one is taken for far outside."""
 MOST = 10.0
 """With a tail: how many times as much as its average one start may cost more."""
 UNSAFE = (
@@ -157,148 +154,3 @@ def told_apart(one: float, other: float) -> tuple[str, str]:
     """Return two numbers in six digits, or in as many more as tell them apart."""
     shown = [(f"{one:.{digits}g}", f"{other:.{digits}g}") for digits in range(6, 18)]
     return next((pair for pair in shown if pair[0] != pair[1]), shown[0])
-
-
-Logged = tuple[Array, Array]
-"""The thetas (T + 1, n_theta) and the inputs (T, m) of an episode."""
-
-
-@dataclass(frozen=True)
-class PlantEpisodes:
-    """Training episodes of one policy.
-
-    Attributes
-    ----------
-    costs, predicted : ndarray, shape (episodes,)
-        What each cost, and what it should cost from its start, whoever plays: the covariate.
-    log : tuple of pairs of ndarray, shapes (T + 1, n_theta) and (T, m)
-        Thetas and inputs of each; empty where they are not known.
-    """
-
-    costs: Array
-    predicted: Array
-    log: tuple[Logged, ...] = ()
-
-    def __add__(self, other: PlantEpisodes) -> PlantEpisodes:
-        """Return the episodes of both, which one policy has played."""
-        return PlantEpisodes(
-            np.concatenate([self.costs, other.costs]),
-            np.concatenate([self.predicted, other.predicted]),
-            self.log + other.log,
-        )
-
-
-@dataclass(frozen=True)
-class ErrorBudget:
-    """How much of the probability of an error each test of a run may use.
-
-    The tests of a run share ``significance``: number i has ``1 / (i (i + 1))`` of it, which adds up
-    to 1, and a test that passes hands its size on to the next one. So a run passes a policy that is
-    no better with probability ``significance`` at most, however many tests it makes, whenever it
-    stops, and however the tests depend on each other (online fallback: Tian and Ramdas, *Online
-    control of the familywise error rate*, Statistical Methods in Medical Research, 2021).
-
-    Attributes
-    ----------
-    tests : int, so many have been made
-    handed_on : float, the size of the last one if it passed, else 0
-
-    Examples
-    --------
-    >>> budget = ErrorBudget()
-    >>> [round(budget.size(0.05), 4), round(budget.after(0.025, passed=False).size(0.05), 4)]
-    [0.025, 0.0083]
-    """
-
-    tests: int = 0
-    handed_on: float = 0.0
-
-    def size(self, significance: float) -> float:
-        """Return the size of the next test."""
-        return significance / ((self.tests + 1) * (self.tests + 2)) + self.handed_on
-
-    def after(self, size: float, passed: bool) -> ErrorBudget:
-        """Return what is left after a test of that size."""
-        return ErrorBudget(self.tests + 1, size if passed else 0.0)
-
-
-def is_promising(candidate: PlantEpisodes, accepted: PlantEpisodes, size: float) -> bool:
-    """Return whether a test of that size would pass if both played all their episodes once more."""
-    return analyze_covariance(candidate + candidate, accepted + accepted)[1] < size
-
-
-def excess_of_an_outlier(
-    candidate: PlantEpisodes, accepted: PlantEpisodes, margin: float = 0.0
-) -> float:
-    """Return by how much one of the candidate's episodes costs more than the accepted policy's.
-
-    0 where none is beyond the upper prediction limit, of size ``OUTLIER`` for all of them, of the
-    least-squares line of the accepted costs on the predicted ones (e.g. Montgomery, chapter 10), by
-    more than a margin: the line may leave next to no scatter.
-    """
-    covariate = _varies(accepted.predicted) and bool(np.all(np.isfinite(candidate.predicted)))
-    X, new = (
-        np.column_stack([np.ones(len(each.costs)), each.predicted][: 1 + covariate])
-        for each in (accepted, candidate)
-    )
-    freedom = len(X) - X.shape[1]
-    coefficients, *_ = np.linalg.lstsq(X, accepted.costs, rcond=None)
-    scatter = np.sqrt(np.sum((accepted.costs - X @ coefficients) ** 2) / freedom)
-    leverage = np.einsum("ij,jk,ik->i", new, np.linalg.pinv(X.T @ X), new)
-    excess = candidate.costs - new @ coefficients
-    limit = stats.t.isf(OUTLIER / len(new), freedom) * scatter * np.sqrt(1 + leverage)
-    beyond = excess > limit + margin + 1e-9 * np.abs(accepted.costs).max()
-    return float(np.max(excess, where=beyond, initial=0.0))
-
-
-def _varies(predicted: Array) -> bool:
-    finite = bool(np.all(np.isfinite(predicted)))
-    return finite and bool(np.ptp(predicted) > 1e-9 * np.abs(predicted).max())
-
-
-def analyze_covariance(candidate: PlantEpisodes, accepted: PlantEpisodes) -> tuple[float, float]:
-    """Return how much more the candidate costs from the same starts, and the one-sided p-value.
-
-    Ordinary least squares of the cost on the cost that was predicted and on which policy played;
-    Welch's t test of the policy's coefficient (Welch, *Biometrika* 34, 1947, with Satterthwaite's
-    degrees of freedom). A prediction for the accepted policy fits the candidate less well, so each
-    policy has a variance of its own. The test assumes independent episodes and residuals that are
-    nearly normal. Where nothing can be told: nan and p = 1.
-    """
-    costs = np.concatenate([candidate.costs, accepted.costs])
-    predicted = np.concatenate([candidate.predicted, accepted.predicted])
-    if not np.all(np.isfinite(costs)):
-        return np.nan, 1.0
-    covariate, count = _varies(predicted), len(candidate.costs)
-    if min(count, len(accepted.costs)) < 2:
-        raise ValueError(f"{len(costs)} episodes are too few to compare two policies.")
-    # Deviations from each policy's own means tell the slope; the means tell the difference.
-    y, difference = _within(costs, count)
-    is_candidate = np.arange(len(costs)) < count
-    weights = np.where(is_candidate, 1 / count, -1 / len(accepted.costs))
-    if covariate:
-        x, apart = _within(predicted, count)
-        spread = float(x @ x)
-        if spread <= 1e-12 * np.sum((predicted - predicted.mean()) ** 2):
-            return np.nan, 1.0  # the starts alone tell the two policies' episodes apart
-        slope = float(x @ y) / spread
-        difference -= slope * apart
-        weights = weights - apart * x / spread
-        y = y - slope * x
-    if abs(difference) <= 1e-12 * np.abs(costs).max():
-        return 0.0, 1.0  # rounding: "no difference" is no improvement
-    each = np.array([is_candidate, ~is_candidate])
-    freedom = each.sum(1) - 1 - covariate / 2  # the slope takes half a degree of each
-    variances = (each @ weights**2) * (each @ y**2) / freedom
-    variance = variances.sum()
-    if not variance > 0:  # without any scatter the sign alone decides
-        return difference, float(difference > 0)
-    joint = variance**2 / np.sum(variances**2 / freedom)
-    return difference, float(special.stdtr(joint, difference / np.sqrt(variance)))
-
-
-def _within(values: Array, count: int) -> tuple[Array, float]:
-    """Return the deviations from each policy's mean, and how far apart the two means are."""
-    new, old = values[:count], values[count:]
-    parts = new - new.mean(), old - old.mean()
-    return np.concatenate(parts), float(new.mean() - old.mean())

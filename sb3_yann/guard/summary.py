@@ -30,7 +30,7 @@ def summary_of(decisions: Sequence[Decision], n_starts: int) -> str:
     decisions : sequence of Decision
         All of them.
     n_starts : int
-        Number of starts, or of episodes, that the costs are means over.
+        Number of starts that the costs are means over.
     """
     if not decisions:
         return (

@@ -5,11 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.monitor import Monitor
 
 
 def algorithm_under_construction() -> BaseAlgorithm | None:
@@ -31,18 +28,6 @@ def own_policy_kwargs(algorithm: BaseAlgorithm | None) -> dict[str, Any]:
         return {}
     algorithm.policy_kwargs = dict(algorithm.policy_kwargs)
     return algorithm.policy_kwargs
-
-
-def is_under_way(algorithm: BaseAlgorithm) -> NDArray[np.bool_]:
-    """Return in which of its envs an episode is past its start, (n_envs,).
-
-    SB3 does not tell whether it has just reset them, but a Monitor does. Where one of them has
-    none, all of them count.
-    """
-    env: Any = algorithm.get_env()
-    if not all(env.env_is_wrapped(Monitor)):
-        return np.ones(env.num_envs, dtype=bool)
-    return np.array([each != [] for each in env.get_attr("rewards")])
 
 
 def multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:

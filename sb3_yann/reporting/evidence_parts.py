@@ -38,7 +38,7 @@ def guard_part(subject: Subject) -> Part:
     starts = 0 if known is None else len(known.costs)
     caption = (
         "Mean cost of each candidate by the verdict on it, of the accepted policy and of the MPC, "
-        f"over the guard's {starts} starts or episodes."
+        f"over the guard's {starts} starts."
     )
     parts = [
         say(text),
@@ -65,7 +65,7 @@ def _settings(subject: Subject, settings: dict[str, Any]) -> Html:
 def _short(value: Any) -> str:
     if isinstance(value, range):
         return f"{value.start} to {value.stop - 1}"
-    return "none: the plant alone" if value is None else str(value)
+    return str(value)
 
 
 def _decisions(decisions: Sequence[Decision]) -> list[Html]:

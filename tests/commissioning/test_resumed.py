@@ -13,9 +13,9 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG
 
-from resumed import Checkpoint, all_bits, envs, go_on, loaded, model_bits
-from sb3_yann import Commissioning, ImproveInTwin, Improvement, NoActionNoise, YannPolicy, improve
-from sb3_yann.commissioning import Check, callback, commissioning
+from resumed import all_bits, envs, model_bits
+from sb3_yann import Commissioning, Improvement, YannPolicy, improve
+from sb3_yann.commissioning import Check, commissioning
 from sb3_yann.commissioning.comparison import why_taken_back
 from twin_samples import Cart, twin
 
@@ -66,50 +66,6 @@ def test_a_twin_that_was_saved_predicts_and_improves_as_before() -> None:
         found.append([all_bits(said), model_bits(learner)])
         assert said.accepted
     assert found[0] == found[1]
-
-
-@pytest.mark.parametrize("n_envs", [pytest.param(1, marks=pytest.mark.slow), 4])
-def test_a_training_with_a_twin_that_stops_goes_on_as_if_it_had_not(n_envs, tmp_path) -> None:
-    def in_twin() -> ImproveInTwin:
-        return ImproveInTwin(every=4, iterations=2)
-
-    whole, halfway = model(n_envs), 4 * STEPS
-    callbacks = [NoActionNoise(), in_twin(), Checkpoint(halfway, tmp_path)]
-    whole.learn(2 * halfway, callback=callbacks)
-    resumed, again = loaded(tmp_path, envs(n_envs, Short)), in_twin()
-    go_on(resumed, halfway, again)
-    assert [each.episode for each in again.attempts] == [4, 8]
-    assert any(each.trusted for each in again.attempts)
-    assert model_bits(resumed) == model_bits(whole)
-
-
-def test_a_given_twin_acts_before_the_first_step_of_the_first_learn_only(
-    tmp_path, monkeypatch
-) -> None:
-    monkeypatch.setattr(callback, "improve", lambda *_, **__: Improvement((), 0.0, True))
-    learner, options = model(gradient_steps=0), {"every": 9, "iterations": 1}
-    learner.learn(1, callback=[NoActionNoise(), ImproveInTwin(twin(), **options)])
-    learner.save(tmp_path / "model")
-    again = DDPG.load(tmp_path / "model", env=envs(1, Short), device="cpu")
-    same = ImproveInTwin(pickle.loads(pickle.dumps(twin())), **options)
-    again.learn(1, callback=[NoActionNoise(), same], reset_num_timesteps=False)
-    assert [each.timestep for each in same.attempts] == [0]
-    other = ImproveInTwin(twin(6), **options)
-    again.learn(1, callback=[NoActionNoise(), other], reset_num_timesteps=False)
-    assert [each.timestep for each in other.attempts] == [0, 2]
-
-
-def test_two_callbacks_of_one_learn_count_for_themselves() -> None:
-    learner = model(gradient_steps=0)
-    pair = [ImproveInTwin(every=9) for _ in range(2)]
-    learner.learn(2 * STEPS, callback=[NoActionNoise(), *pair])
-    assert [each.state.episodes for each in pair] == [2, 2]
-    assert learner.twin_state is pair[0].state
-    learner.learn(2 * STEPS, callback=[NoActionNoise(), *pair], reset_num_timesteps=False)
-    assert [each.state.episodes for each in pair] == [4, 4]
-    other = model(gradient_steps=0)
-    other.learn(STEPS, callback=[NoActionNoise(), *pair])
-    assert [each.state.episodes for each in pair] == [1, 1]
 
 
 # --- on the plant ---------------------------------------------------------------------------------

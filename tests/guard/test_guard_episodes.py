@@ -190,7 +190,7 @@ def test_the_step_grows_with_an_acceptance_and_shrinks_with_a_restoration(
     ("name", "good", "bad"),
     [
         ("margin", (0.0, 5.0), (-1e-9, np.inf)), ("tail", (0.0, 1.0), (-0.1, 1.1)),
-        ("largest_step", (1.0, 7.0, None), (0.99, np.inf)), ("trial_episodes", (3, 40), (2, 3.5)),
+        ("largest_step", (1.0, 7.0, None), (0.99, np.inf)),
         ("significance", (0.0, 0.5), (-0.1, 0.51)), ("by_region", (True, False), (1, "no")),
         ("retreat", (True, False), (0, None)),
     ],
@@ -274,5 +274,5 @@ def test_a_trial_is_due_where_an_episode_ends_and_so_many_have_passed() -> None:
     session: Any = SimpleNamespace(state=SimpleNamespace(last_trial=None, episodes=0))
     for episodes, dones in enumerate([[0, 1], [1, 0], [0, 0], [1, 1], [1, 0], [1, 0], [1, 0]], 1):
         session.state.episodes = episodes
-        due.step(session, np.array(dones, bool), None, None)
+        due.step(session, np.array(dones, bool))
     assert due.tried == [1, 4, 7] and session.state.last_trial == 7

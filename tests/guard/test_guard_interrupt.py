@@ -11,9 +11,7 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from guard_samples import (
-    BLOCK,
     FIRST,
-    RIGHT,
     STEPS,
     At,
     CutOff,
@@ -22,10 +20,7 @@ from guard_samples import (
     better,
     bits,
     build,
-    correct,
-    guard_alone,
     make_guard,
-    still,
     train,
 )
 from sb3_yann.guard.interrupt import Handler
@@ -126,15 +121,6 @@ def test_where_the_end_of_training_fails_the_accepted_policy_is_left(monkeypatch
         train(model, 8, At([5], better), guard)
     left(model)
     assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_on_a_plant_alone_a_trial_that_was_cut_off_is_no_refusal() -> None:
-    model, guard = still(), guard_alone()
-    moves = At([BLOCK + 1], partial(correct, region=RIGHT, value=0.5))
-    interrupted(model, 4 * BLOCK, moves, guard, At([2 * BLOCK + 2], ctrl_c))
-    assert guard.state.evidence.phase == "trial" and guard.decisions == []
-    train(model, BLOCK, again := guard_alone(), reset_num_timesteps=False)
-    assert again.decisions == [] and again.state.step == 1.0
 
 
 def test_a_handler_of_ones_own_that_raises_nothing_goes_unnoticed() -> None:

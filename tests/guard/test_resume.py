@@ -7,17 +7,12 @@ from typing import Any
 
 import pytest
 from stable_baselines3 import DDPG, TD3
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from guard_samples import (
-    BLOCK,
     STEPS,
     At,
     better,
     build,
-    guard_alone,
-    plant,
-    still,
     train,
 )
 from resumed import (
@@ -60,12 +55,6 @@ def test_with_a_simulator_nothing_is_lost(n_envs, algorithm, options, tmp_path) 
     assert whole == resumed
 
 
-@pytest.mark.parametrize("n_envs", [1, 4])
-def test_on_a_plant_alone_nothing_is_lost(n_envs, tmp_path) -> None:
-    whole, resumed = whole_and_resumed(tmp_path, guard_alone, n_envs, episodes=32)
-    assert whole == resumed
-
-
 def test_moments_of_single_rows_are_kept(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(policies, "FEW", 2)  # regions, from which on there is a RowAdam
     whole, resumed = whole_and_resumed(tmp_path, guard_in_simulator, 1)
@@ -95,30 +84,3 @@ def test_the_mpc_that_is_restored_has_the_same_weights_after_loading(tmp_path) -
     again, other = DDPG.load(tmp_path / "model", env=envs(1), device="cpu"), guard_in_simulator()
     train(again, 1, other, reset_num_timesteps=False)
     assert all_bits(other.session.mpc) == all_bits(guard.session.mpc)
-
-
-def phases(model: Any, *callbacks: Any) -> list[str]:
-    """Return the phase after each of the next episodes under a new guard."""
-    found: list[str] = []
-    steps = range(STEPS, 4 * STEPS, STEPS)
-    look = At(steps, lambda _: found.append(model.guard_state.evidence.phase))
-    train(model, 3 * STEPS, *callbacks, guard_alone(), look, reset_num_timesteps=False)
-    return found
-
-
-def test_on_a_plant_alone_the_first_episode_after_loading_counts(tmp_path) -> None:
-    model = still()
-    train(model, BLOCK + STEPS, At([BLOCK + 1], better), guard_alone())
-    model.save(tmp_path / "model")
-    again = DDPG.load(tmp_path / "model", env=plant(), device="cpu")
-    assert phases(again) == ["learning", "learning", "trial"]
-
-
-@pytest.mark.parametrize("kind", ["amid an episode", "no Monitor"])
-def test_an_episode_that_may_be_under_way_does_not_count(kind) -> None:
-    env = DummyVecEnv([plant]) if kind == "no Monitor" else plant()
-    model = still(env=env)
-    train(model, BLOCK + STEPS, At([BLOCK + 1], better), guard_alone())
-    if kind == "amid an episode":
-        train(model, 1, reset_num_timesteps=False)
-    assert phases(model) == ["learning", "learning", "learning"]

@@ -10,11 +10,10 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG, TD3
 
-from general_problems import LOADED, servo, solved
+from general_problems import LOADED, solved
 from sample_plants import LinearPlant, feasible_states
 from sb3_yann import NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceObserver, LinearMPC
-from sb3_yann.guard.covariate import predicted_cost
 from sb3_yann.wrappers import ObserveDisturbance, PreviousInput, SetPoint, StageCost
 
 NAMES = [
@@ -198,11 +197,3 @@ def test_the_equilibrium_is_pinned_only_where_there_is_one(name: str, pinned: bo
     kwargs = {"problem": mpc, "pin_equilibrium": True}
     policy = DDPG(YannPolicy, LinearPlant(mpc), policy_kwargs=kwargs).policy
     assert policy.pin_equilibrium is True
-
-
-def test_the_guard_predicts_the_cost_of_a_start_with_its_reference() -> None:
-    mpc = solved("servo")
-    start = np.array([0.0, 0.0, 0.5])
-    value = float(start @ mpc.value_matrix(1.0) @ start)
-    assert predicted_cost(mpc, start, 300) == pytest.approx(value, rel=1e-6)
-    assert predicted_cost(servo(u_max=0.15), start, 300) > value

@@ -133,15 +133,6 @@ def test_commissioning_plays_the_plant_in_its_units(shows: str, takes: str) -> N
     np.testing.assert_allclose(episode.thetas[1:], moved, atol=1e-5)
 
 
-@pytest.mark.parametrize(("shows", "takes"), [("absolute", "absolute"), ("normalized",) * 2])
-def test_the_guard_predicts_costs_in_the_units_of_the_plant(shows: str, takes: str) -> None:
-    model = build(units.plant(shows, takes), units.SAYS[shows])
-    guard = ImprovementGuard(None, rule={"trial_episodes": 3})
-    model.learn(80, callback=[NoActionNoise(), guard])
-    mpc = guard.state.evidence.mpc  # on its own linear model
-    np.testing.assert_allclose(mpc.predicted, mpc.costs, rtol=1e-4)
-
-
 def test_the_guard_s_simulator_shows_what_the_plant_shows() -> None:
     make = partial(units.plant, "absolute", "absolute")
     model = build(make())

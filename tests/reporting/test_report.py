@@ -168,15 +168,6 @@ def subject_of(model, **given):
     return assemble._subject(model, **{**defaults, "seeds": SEEDS, **given})
 
 
-def test_a_guard_of_a_plant_alone_has_no_simulator_to_play(tmp_path) -> None:
-    model, guard = guard_samples.build(), guard_samples.guard_alone()
-    model.learn(3 * guard_samples.BLOCK, callback=[NoActionNoise(), guard])
-    assert guard.decisions
-    text = read(report(model, tmp_path / "r.html", guard=guard))[1]
-    assert "No env was given" in text and "env none: the plant alone" in text
-    assert all(each.reason in text for each in guard.decisions)
-
-
 def test_a_sensor_that_fails_is_the_operating_point_to_the_mpc_too() -> None:
     subject = subject_of(guard_samples.build())
     actions, _ = subject_module._Mpc(subject).predict(np.array([[np.nan]]), deterministic=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import random
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +14,6 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from sb3_yann import (
-    AcceptanceRule,
     ImprovementGuard,
     LinearModel,
     LinearMPC,
@@ -116,22 +114,6 @@ def make_guard(env: Any = Slide, *, rule: Any = {}, **kwargs) -> ImprovementGuar
     if isinstance(rule, dict):
         rule = STRICT | rule
     return ImprovementGuard(env, rule=rule, **({"n_starts": 10, "patience": 1} | kwargs))
-
-
-def guard_alone(
-    trial_episodes: int = 3, significance: float = 0.05, **kwargs: Any
-) -> ImprovementGuard:
-    rule = AcceptanceRule(trial_episodes=trial_episodes, significance=significance)
-    return make_guard(None, rule=rule, **kwargs)
-
-
-BLOCK = 3 * STEPS  # of a guard_alone
-# One step in the right region, then near the origin: 4.25 with the MPC, whatever the start is.
-plant = partial(Slide, low=2.0, high=2.8)
-
-
-def still(**kwargs):
-    return build(**({"env": plant(), "gradient_steps": 0} | kwargs))
 
 
 @th.no_grad()

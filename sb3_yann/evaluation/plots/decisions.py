@@ -121,7 +121,7 @@ def _range(costs: Array, accepted: Array, mpc: Array) -> tuple[float, float]:
     """Return the range that shows what was accepted, and the candidates not far beyond."""
     known = np.concatenate([accepted, mpc])
     known = known[np.isfinite(known)]
-    if not known.size:  # a plant alone, before its first block is over
+    if not known.size:
         known = costs[np.isfinite(costs)] if np.isfinite(costs).any() else np.zeros(1)
     low, high = float(known.min()), float(known.max())
     width = max(high - low, 0.02 * max(abs(low), abs(high)), 1e-12)
