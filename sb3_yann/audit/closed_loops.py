@@ -17,9 +17,11 @@ from sb3_yann._validation import Array
 from sb3_yann.audit.beginnings import beginnings
 from sb3_yann.audit.own_reward import as_reward
 from sb3_yann.audit.plants import Plant
-from sb3_yann.audit.task import Bounds, Task
+from sb3_yann.audit.task import Task
 from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
+from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
 from sb3_yann.evaluation.episodes import Source, watch_length
 from sb3_yann.twin.dynamics import law_of
 
@@ -31,8 +33,6 @@ PAUSE = 10
 """Steps after a plan for which an estimated disturbance makes no new one."""
 DITHER, HELD = 0.1, 5
 """Half-widths by which a log for a twin is excited, and for how many steps each time."""
-ROOM = 1e-3
-"""Half-widths beyond a bound that count as on it."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,10 @@ class Loops:
     Attributes
     ----------
     costs, violations, lengths : ndarray, shape (k,)
-        Sums of stage costs; steps that the env reports, or that exceed bounds of the problem;
-        steps.
+        Sums of stage costs, with the penalty of soft bounds; steps in which the env reports a
+        violation; steps.
+    excess : BoundExcess
+        By how much each exceeds the bounds of the problem.
     thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
         After its end an episode stays where it is.
     rewards : ndarray, shape (T, k)
@@ -56,10 +58,15 @@ class Loops:
     thetas: Array
     inputs: Array
     rewards: Array
+    excess: BoundExcess
 
     def no_worse(self, others: Loops) -> NDArray[np.bool_]:
-        """Tell which episodes are as long as others, and violate no more."""
-        return (self.lengths >= others.lengths) & (self.violations <= others.violations)
+        """Tell which episodes are as long as others, and break no bound by more."""
+        unsafe = [
+            unsafe_columns(each.violations, -each.lengths, ~np.isfinite(each.costs), each.excess)
+            for each in (self, others)
+        ]
+        return np.asarray(~less_safe(*unsafe).any(axis=1))
 
     def steps(self) -> tuple[Array, Array, Array]:
         """Return thetas, inputs and following thetas of all steps, (steps, ...)."""
@@ -149,10 +156,10 @@ def play(
             watch_length(envs[0], len(inputs))
     states, played = np.array(thetas), np.array(inputs)
     taken = np.arange(len(inputs))[:, None] < lengths
-    costs = np.sum(problem.stage_cost(states[:-1], played), axis=0, where=taken)
-    beyond = np.any(Bounds.of(problem).beyond(states[1:], ROOM) != 0, axis=-1)
-    violations = np.sum(np.array(told) | beyond, axis=0, where=taken)
-    return Loops(costs, violations, lengths, states, played, np.array(rewards))
+    excess = bound_excess(problem, states, played, taken)
+    costs = np.sum(problem.stage_cost(states[:-1], played), axis=0, where=taken) + excess.penalty
+    violations = np.sum(np.array(told), axis=0, where=taken)
+    return Loops(costs, violations, lengths, states, played, np.array(rewards), excess)
 
 
 def require_repeated(

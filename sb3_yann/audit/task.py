@@ -6,55 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.mpc.bound_excess import Bounds
 
 INSIDE, WEIGHT = 1e-3, 1e4
 """How far inside of the bounds plans stay, in half-widths; what one half-width beyond that costs in
 a step, in mean costs of a step."""
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds of states and outputs.
-
-    Attributes
-    ----------
-    C : ndarray, shape (k, n)
-        Combinations of the states.
-    low, high, half : ndarray, shape (k,)
-        Their bounds, one of which is finite at least, and half-widths.
-    states : slice
-        Where theta has the states.
-    """
-
-    C: Array
-    low: Array
-    high: Array
-    half: Array
-    states: slice
-
-    @classmethod
-    def of(cls, problem: LinearMPC, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
-        """Return those of a problem, and of its states (n,) besides."""
-        outputs, size = problem.outputs, problem.theta_half[problem.layout.state]
-        C = np.vstack([np.eye(len(size)), outputs.C])
-        lowest = np.concatenate([np.maximum(problem.x_min, low), outputs.y_min])
-        highest = np.concatenate([np.minimum(problem.x_max, high), outputs.y_max])
-        half = np.concatenate([size, np.abs(outputs.C) @ size])
-        used = np.isfinite(lowest) | np.isfinite(highest)
-        return cls(C[used], lowest[used], highest[used], half[used], problem.layout.state)
-
-    def beyond(self, thetas: Array, room: float) -> Array:
-        """Return by how much bounds that are moved out by some room are exceeded (..., k).
-
-        Room and result are in half-widths.
-        """
-        y = thetas[..., self.states] @ self.C.T
-        above = np.maximum((y - self.high) / self.half - room, 0)
-        return np.asarray(above - np.maximum((self.low - y) / self.half - room, 0))
 
 
 @dataclass(frozen=True)

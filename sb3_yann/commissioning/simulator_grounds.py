@@ -13,6 +13,7 @@ from sb3_yann.audit.closed_loops import Controller, Loops, of_law
 from sb3_yann.commissioning.grounds import Grounds
 from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.trial import NEARLY, Check, Inputs, Outcome
+from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
 
@@ -59,7 +60,7 @@ class Comparison:
         each = excess / np.where(own > 0, own, 1.0)
         error = each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else 0.0
         change, worst = float(excess.mean() / self.mean), float(excess.max() / self.mean)
-        safe, logged = not np.any(unsafe > allowed), float(each.mean())
+        safe, logged = not np.any(less_safe(unsafe, allowed)), float(each.mean())
         return Check(iteration, not reason, reason, change, worst, safe, logged, float(error))
 
 
@@ -101,8 +102,8 @@ class SimulatedTrial(Comparison):
 
     def _outcome(self, loops: Loops) -> Outcome:
         short = self.base.lengths.max() - loops.lengths
-        columns = loops.violations, short, ~np.isfinite(loops.costs), 0 * short
-        return loops.costs, np.column_stack(columns).astype(np.int64)
+        lost = ~np.isfinite(loops.costs)
+        return loops.costs, unsafe_columns(loops.violations, short, lost, loops.excess)
 
     def second_objection(self, act: Inputs) -> str:
         """Return nothing: the simulator has spoken."""
@@ -111,7 +112,7 @@ class SimulatedTrial(Comparison):
     def lost(self, played: Outcome) -> NDArray[np.intp]:
         """Return the numbers of the episodes that a policy loses, or nearly, the worst first."""
         relative = self.tolerance.excess(self.mpc[0], played[0])
-        relative[np.any(played[1] > self.mpc[1], axis=1)] = np.inf
+        relative[np.any(less_safe(played[1], self.mpc[1]), axis=1)] = np.inf
         worst = np.argsort(-relative, kind="stable")
         return np.asarray(worst[relative[worst] > NEARLY])
 

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
 from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -31,8 +33,8 @@ SURE = 2.0
 """Standard errors by which episodes that go on as those of the log must gain."""
 
 Inputs = Callable[[Array], Array]
-Outcome = tuple[Array, NDArray[np.int64]]
-"""Costs, and what is unsafe, of all starts."""
+Outcome = tuple[Array, Array]
+"""Costs, and what is unsafe (`unsafe_columns`), of all starts."""
 
 
 @dataclass(frozen=True)
@@ -129,12 +131,12 @@ class Trial:
     def _outcome(self, thetas: Array, inputs: Array) -> Outcome:
         twin = self.twin
         shown = twin.dynamics.row.shown(thetas[:-1])
+        excess = bound_excess(twin.problem, twin.dynamics.row.shown(thetas), inputs)
+        excess = BoundExcess(*(each.ravel() for each in excess))
         with np.errstate(all="ignore"):
-            costs = twin.problem.stage_cost(shown, inputs).sum(axis=0).ravel()
+            costs = twin.problem.stage_cost(shown, inputs).sum(axis=0).ravel() + excess.penalty
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
-        broken = twin.limits.broken(thetas[1:]).sum(axis=0).ravel()
-        unsafe = np.column_stack([left + broken, 0 * broken, ~np.isfinite(costs), 0 * broken])
-        return costs, unsafe.astype(np.int64)
+        return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
 
     def second_objection(self, act: Inputs) -> str:
         """Return what the twin's second opinion says against a policy; empty where nothing.
@@ -170,7 +172,7 @@ class Trial:
         costs, unsafe = played
         known, mean, excess = self.known, self.mean, costs - self.mpc[0]
         allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
-        safe = not np.any(unsafe > allowed)
+        safe = not np.any(less_safe(unsafe, allowed))
         paired = PairedEpisodes(
             self.mpc[0][known], accepted[0][known], allowed[known], Tolerance(MARGIN * mean)
         )
@@ -211,6 +213,6 @@ class Trial:
     def hard(self, played: Outcome) -> list[Array]:
         """Return the starts of each member that a policy loses, or nearly."""
         loses = ~(played[0] - self.mpc[0] <= NEARLY * self.room())
-        unsafe = np.any(played[1] > self.mpc[1], axis=1)
+        unsafe = np.any(less_safe(played[1], self.mpc[1]), axis=1)
         chosen = (loses | unsafe).reshape(self.starts.shape[:2])
         return [starts[which] for starts, which in zip(self.starts, chosen, strict=True)]

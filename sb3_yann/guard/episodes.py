@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.evaluation.episodes import Episodes, evaluate
 from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint
 from sb3_yann.guard.rng import preserve_rng
@@ -20,27 +22,26 @@ HARDEST = 10
 """New starts that join those of every later candidate at a time."""
 ROUNDING = 1e-6
 """Relative difference of mean costs that float32 makes between batches of other sizes."""
-BREAKS = 3
-"""The first columns of what is unsafe: after these there is no patience."""
+WEARS = 3
+"""The column of large steps of an input: after all others there is no patience."""
 VIOLATES: Final = "violates a limit"
 
 
 class Outcome(NamedTuple):
     """What came of a policy's episodes, in the order of their seeds.
 
-    The columns of ``unsafe`` (episodes, 4) are steps with a violation, whether the env terminated
-    the episode, whether its cost or an observation is not finite, and steps in which an input moves
-    farther than the rule allows. ``visits`` (episodes,
-    regions) tells which regions it comes through: other networks have no effect on it.
+    Costs count the penalty of soft bounds. What is ``unsafe`` (episodes, 7) is that of
+    :func:`~sb3_yann.compare.unsafe_columns`. ``visits`` (episodes, regions) tells which regions it
+    comes through: other networks have no effect on it.
     """
 
     costs: Array
-    unsafe: NDArray[np.int64]
+    unsafe: Array
     visits: NDArray[np.bool_]
 
     def breaks_more_than(self, other: Outcome) -> bool:
         """Return whether it is less safe: a large step of an input wears, and breaks nothing."""
-        return bool(np.any((self.unsafe > other.unsafe)[:, :BREAKS]))
+        return bool(np.any(np.delete(less_safe(self.unsafe, other.unsafe), WEARS, axis=1)))
 
     def at(self, index: Any) -> Outcome:
         """Return some of the episodes."""
@@ -95,7 +96,7 @@ class Starts:
 
     def more_unsafe(self, outcome: Outcome) -> NDArray[np.bool_]:
         """Return which break a limit, end early or are not finite, more often than with the MPC."""
-        return np.asarray((outcome.unsafe > self.mpc.unsafe).any(1))
+        return np.asarray(less_safe(outcome.unsafe, self.mpc.unsafe).any(1))
 
     def lost(self, outcome: Outcome) -> NDArray[np.bool_]:
         """Return which a policy loses against the MPC."""
@@ -229,13 +230,16 @@ def outcome_of(session: GuardSession, episodes: Episodes) -> Outcome:
     bound = session.state.input_step
     moved = [np.abs(np.diff(each, axis=0)) for each in episodes.actions]
     far = [0 if bound is None else np.any(each > bound, axis=1).sum() for each in moved]
-    counts: Any = [episodes.violations, episodes.terminated, lost, far]
-    unsafe = np.column_stack(counts).astype(np.int64)
-    layer = session.policy.actor.mu
+    policy, layer = session.policy, session.policy.actor.mu
+    thetas = [policy.theta(session.seen(states)) for states in episodes.observations]
+    inputs = [policy.inputs(actions) for actions in episodes.actions]
+    pairs = zip((each.double().cpu().numpy() for each in thetas), inputs, strict=True)
+    excess = excess_of_episodes(policy.problem, pairs)
+    unsafe = unsafe_columns(episodes.violations, episodes.terminated, lost, excess, far)
     visits = np.zeros((len(episodes.costs), layer.n_networks), dtype=bool)
-    for visited, states in zip(visits, episodes.observations, strict=True):
-        visited[layer.regions(session.policy.theta(session.seen(states[:-1])))] = True
-    return Outcome(episodes.costs, unsafe, visits)
+    for visited, theta in zip(visits, thetas, strict=True):
+        visited[layer.regions(theta[:-1])] = True
+    return Outcome(episodes.costs + excess.penalty, unsafe, visits)
 
 
 def evaluate_candidate(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_yann.compare import less_safe
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.episodes import Evidence, Outcome, Unplayable, play
 from sb3_yann.guard.session import GuardSession
@@ -90,7 +91,7 @@ def _accept_one_by_one(
             known = starts[~outcome.visits[starts][:, other].any(1)]
             trial = trial.replaced(known, outcome.at(known))
             lost = len(known) and evidence.at(known).loses(outcome.at(known))
-            if lost or np.any(trial.unsafe[known] > evidence.accepted.unsafe[known]):
+            if lost or np.any(less_safe(trial.unsafe[known], evidence.accepted.unsafe[known])):
                 continue  # whatever the others cost
         others = np.setdiff1d(starts, known)
         try:

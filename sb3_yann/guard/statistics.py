@@ -8,15 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.compare import UNSAFE, less_safe
 
 MOST = 10.0
 """With a tail: how many times as much as its average one start may cost more."""
-UNSAFE = (
-    "violations",
-    "an episode that the env terminates",
-    "a cost or an observation that is no finite number",
-    "an input that moves too far in one step",
-)
 
 
 @dataclass(frozen=True)
@@ -109,16 +104,15 @@ class PairedEpisodes:
     Attributes
     ----------
     mpc_costs, costs : ndarray, shape (episodes,), those of the MPC and of the accepted policy
-    unsafe : ndarray of int, shape (episodes, 4), the accepted policy's
-        The columns, named in ``UNSAFE``, are compared one by one: an episode cut short has fewer
-        steps to violate in.
+    unsafe : ndarray, shape (episodes, 7), the accepted policy's
+        As :func:`~sb3_yann.compare.unsafe_columns` returns it.
     tolerance : Tolerance, what starts may cost more than with the MPC
     n_starts : int, optional, the number of starts that these are the worst ones of
     """
 
     mpc_costs: Array
     costs: Array
-    unsafe: NDArray[np.int64]
+    unsafe: Array
     tolerance: Tolerance
     n_starts: int | None = None
 
@@ -130,13 +124,13 @@ class PairedEpisodes:
         """Return whether the mean cost is above the MPC's."""
         return not costs.mean() <= self.mpc_costs.mean()
 
-    def objection(self, costs: Array, unsafe: NDArray[np.int64]) -> str:
+    def objection(self, costs: Array, unsafe: Array) -> str:
         """Return why a policy with these episodes is refused, empty where it is not.
 
         Comparisons are written so that a cost that is not a number is refused.
         """
-        for what, now, before in zip(UNSAFE, unsafe.T, self.unsafe.T, strict=True):
-            more = np.flatnonzero(now > before)
+        for what, column in zip(UNSAFE, less_safe(unsafe, self.unsafe).T, strict=True):
+            more = np.flatnonzero(column)
             if len(more):
                 return f"{len(more)} starts with {what}, the first is number {more[0]}"
         relative = self.tolerance.excess(self.mpc_costs, costs)

@@ -10,8 +10,10 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.control import PiecewiseAffine
+from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of, with_units
+from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.evaluation.episodes import Episodes
 from sb3_yann.evaluation.plots import regions_figure
 from sb3_yann.evaluation.plots.regions import ActiveConstraints
@@ -73,15 +75,14 @@ def constraints_part(subject: Subject) -> Part:
     loops = subject.loops or {}
     head = ["quantity", "lower", "upper", "kind", "acts in the plan"]
     head += [f"{name}: {what}" for name in loops for what in ("range", "steps beyond")]
-    rows, broken = [], dict.fromkeys(loops, 0)
+    rows = []
     for each in _bounds(subject):
         name, key, low, high, kind, series = each
         row = [name, number(low), number(high), kind, _percent(acting.get(key, 0.0))]
         room = 1e-6 * (high - low if np.isfinite(high - low) else 1.0)
-        for who, episodes in loops.items():
+        for episodes in loops.values():
             values = np.concatenate([series(x, u) for x, u in _pairs(episodes)])
             beyond = int(np.sum((values < low - room) | (values > high + room)))
-            broken[who] += beyond if kind == "hard" else 0
             row += [f"{number(np.nanmin(values))} to {number(np.nanmax(values))}", str(beyond)]
         rows.append(row)
     last = subject.problem.terminal.set[1]
@@ -92,17 +93,45 @@ def constraints_part(subject: Subject) -> Part:
     ]
     if not loops:
         said.append("Without an env, what closed loops do to the bounds is left out.")
-    found = _constraint_findings(broken) if loops else ()
+    found = _constraint_findings(subject.problem, loops) if loops else ()
     return Part("Constraints register", join([say(*said), table(head, rows)]), found)
 
 
-def _constraint_findings(broken: dict[str, int]) -> tuple[Finding, ...]:
-    verdict = "failed" if broken[POLICY] > broken[MPC] else "note" if broken[POLICY] else "passed"
+def _constraint_findings(problem: LinearMPC, loops: dict[str, Episodes]) -> tuple[Finding, ...]:
+    """Return whether the policy exceeds bounds of the problem by more than the MPC does."""
+    mpc, policy = (excess_of_episodes(problem, _pairs(loops[who])) for who in (MPC, POLICY))
+    sides = [unsafe_columns(0, 0, 0, each) for each in (policy, mpc)]
+    breach = bool(np.any(less_safe(*sides)))
+    worst = int(np.argmax(policy.largest - mpc.largest))
     text = (
-        f"Steps beyond a hard bound of the problem: {broken[POLICY]} with the policy, "
-        f"{broken[MPC]} with the MPC."
+        "Excess over the hard bounds of the problem, in half-widths: "
+        f"{policy.largest.max():.3g} at most with the policy, {mpc.largest.max():.3g} with the "
+        f"MPC; {policy.summed.mean():.3g} and {mpc.summed.mean():.3g} summed over an episode, on "
+        "average."
     )
-    return (Finding(verdict, text),)
+    if breach:
+        text += (
+            f" In episode {worst} the policy exceeds them by {policy.largest[worst]:.3g}, the MPC "
+            f"by {mpc.largest[worst]:.3g}: the policy breaks a bound that the MPC keeps."
+        )
+    exceeded = bool(np.any(policy.largest > 0))
+    found = [Finding("failed" if breach else "note" if exceeded else "passed", text)]
+    if problem.soft.penalty:
+        costs = [
+            np.mean([np.sum(problem.stage_cost(x[:-1], u)) for x, u in _pairs(loops[who])])
+            + each.penalty.mean()
+            for who, each in ((POLICY, policy), (MPC, mpc))
+        ]
+        dear = costs[0] > costs[1] * (1 + 1e-6) and policy.penalty.mean() > mpc.penalty.mean()
+        found.append(
+            Finding(
+                "failed" if dear else "passed",
+                "Penalty of the soft bounds in an episode, on average: "
+                f"{policy.penalty.mean():.4g} with the policy, {mpc.penalty.mean():.4g} with the "
+                f"MPC. Stage costs and penalty together: {costs[0]:.6g} and {costs[1]:.6g}.",
+            )
+        )
+    return tuple(found)
 
 
 def _pairs(episodes: Episodes) -> Iterator[tuple[Array, Array]]:
@@ -242,8 +271,8 @@ def _compared(subject: Subject) -> tuple[int, float, int, float]:
         if (U is not None) != known:
             apart += not _near_the_border(subject, theta, bool(known))
         elif U is not None:
-            own = units.program.first_input(U * units.reach, theta, m)
-            rows.append(np.abs(own - u) / problem.u_half)
+            planned = units.program.first_input(U * units.reach, theta, m)
+            rows.append(np.abs(planned - u) / problem.u_half)
     error = float(np.max(rows)) if rows else 0.0
     layer = subject.policy.actor.mu
     with th.no_grad():

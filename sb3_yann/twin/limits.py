@@ -54,13 +54,6 @@ class Limits:
         limited = np.minimum(high, np.where(soft, np.inf, problem.x_max))
         return cls(problem, bounded - room, limited + room, coordinates.row)
 
-    def broken(self, thetas: Array) -> NDArray[np.bool_]:
-        """Return whether states of rows (..., size) break a hard bound of the problem itself."""
-        x, problem = thetas[..., self.row.state], self.problem
-        room, hard = ROUNDING * problem.theta_half[problem.layout.state], problem.soft.x <= 0
-        beyond = (x < problem.x_min - room) | (x > problem.x_max + room)
-        return np.asarray((beyond & hard).any(axis=-1))
-
     def violated(self, thetas: Array) -> NDArray[np.bool_]:
         """Return whether states lie beyond, for rows (..., size); NaN does."""
         x = thetas[..., self.row.state]

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, as_kind, as_number
+from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.control.mpc.plant_units import InputUnits
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
@@ -18,8 +20,10 @@ from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     """Makes the reward minus the stage cost of the problem, for which the critic is exact.
 
-    The cost is that of the observed theta and of the input played there. A step in which the input
-    moves by more than the problem allows reports ``info["violation"]``.
+    The cost is that of the observed theta and of the input played there. A step that takes a state,
+    an output or an input beyond a hard bound of the problem, or moves an input too far, reports
+    ``info["violation"]``; by how much is ``info["excess"]``, in half-widths. What soft bounds cost
+    is no part of the reward, since the critic is exact without it: it is ``info["penalty"]``.
 
     Parameters
     ----------
@@ -92,21 +96,14 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         u = self.units.input(u)
         cost = float(self.problem.stage_cost(self.theta, u))
         observation, _, terminated, truncated, info = self.env.step(action)
-        if self._too_fast(u):
-            info = {**info, "violation": True}
+        after = self.seen(observation)
+        excess = bound_excess(self.problem, np.array([self.theta, after]), u[None])
+        info = {**info, "excess": float(excess.largest), "penalty": float(excess.penalty)}
+        if excess.largest > EXCESS_ROOM:
+            info["violation"] = True
         cost += self.violation_cost if info.get("violation") else 0.0
-        self.theta = self.seen(observation)
+        self.theta = after
         return observation, -cost, terminated, truncated, info
-
-    def _too_fast(self, u: Array) -> bool:
-        """Tell whether u moves from u_prev by more than its bounds, and rounding, allow."""
-        mpc = self.problem
-        if not mpc.has_rate_bounds:
-            return False
-        moved = u - self.theta[mpc.layout.previous]
-        rounding = 1e-6 * (np.abs(mpc.u_max - mpc.u_min) + np.abs(u))
-        low, high = mpc.rate.du_min - rounding, mpc.rate.du_max + rounding
-        return bool(np.any((moved < low) | (moved > high)))
 
 
 def _as_it_is(observation: ArrayLike) -> Array:

@@ -210,7 +210,8 @@ def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array]:
     N, gamma, errors = problem.horizon, problem.gamma, problem.error_system
     to_error, states = errors.to_error, errors.to_error[: problem.model.n_states]
     size = N * problem.model.n_inputs
-    H, F = np.zeros((size, size)), np.zeros((size, problem.n_theta))
+    H: Array = np.zeros((size, size))
+    F: Array = np.zeros((size, problem.n_theta))
     for k in range(N):
         inputs, start = prediction.inputs(k)
         weighted = 2 * gamma**k * inputs.T @ problem.R

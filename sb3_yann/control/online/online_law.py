@@ -271,7 +271,8 @@ class OnlineLaw(OnPlant):
         m = self.n_inputs
         if found is None:
             return None
-        return np.asarray(reach[:m, None] * found.law[:m, :-1] / self.half + self.feedback)
+        feedback = np.asarray(self.feedback, np.float64)
+        return np.asarray(reach[:m, None] * found.law[:m, :-1] / self.half + feedback)
 
     def __hash__(self) -> int:
         """Return a hash that equal laws share."""

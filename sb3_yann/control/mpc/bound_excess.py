@@ -1,0 +1,166 @@
+"""By how much trajectories exceed the bounds of their problem: the only place that says so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.control.mpc.problem import MPCProblem
+
+ROUNDING = 1e-6
+"""Half-widths beyond a bound that float32 observations and actions make."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of states and outputs.
+
+    Attributes
+    ----------
+    C : ndarray, shape (k, n)
+        Combinations of the states.
+    low, high, half : ndarray, shape (k,)
+        Their bounds, one of which is finite at least, and half-widths: of theta's box, or of the
+        outputs in it.
+    softness : ndarray, shape (k,)
+        The violation that counts as one unit where a bound is soft, 0 where it is hard.
+    states : slice
+        Where theta has the states.
+    """
+
+    C: Array
+    low: Array
+    high: Array
+    half: Array
+    softness: Array
+    states: slice
+
+    @classmethod
+    def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
+        """Return those of a problem, and of its states (n,) besides."""
+        outputs, size = problem.outputs, problem.theta_half[problem.layout.state]
+        C = np.vstack([np.eye(len(size)), outputs.C])
+        lowest = np.concatenate([np.maximum(problem.x_min, low), outputs.y_min])
+        highest = np.concatenate([np.minimum(problem.x_max, high), outputs.y_max])
+        half = np.concatenate([size, np.abs(outputs.C) @ size])
+        softness = np.concatenate([problem.soft.x, problem.soft.y])
+        used = np.isfinite(lowest) | np.isfinite(highest)
+        return cls(
+            C=C[used],
+            low=lowest[used],
+            high=highest[used],
+            half=half[used],
+            softness=softness[used],
+            states=problem.layout.state,
+        )
+
+    def beyond(self, thetas: Array, room: float = 0.0) -> Array:
+        """Return by how much bounds that are moved out by some room are exceeded (..., k).
+
+        Room and result are in half-widths; below a lower bound it is negative.
+        """
+        y = thetas[..., self.states] @ self.C.T
+        above = np.maximum((y - self.high) / self.half - room, 0)
+        return np.asarray(above - np.maximum((self.low - y) / self.half - room, 0))
+
+
+class BoundExcess(NamedTuple):
+    """By how much trajectories exceed the bounds of their problem, one number for each.
+
+    Attributes
+    ----------
+    largest, summed : ndarray, shape (...,)
+        Of the hard bounds, in half-widths: at the worst step, and summed over steps and bounds.
+    any_bound : ndarray, shape (...,)
+        The largest of hard and soft bounds.
+    penalty : ndarray, shape (...,)
+        What soft bounds cost, summed over the steps: ``penalty (s + s^2)`` of the largest
+        violation s of the states' bounds at a step, and of the outputs'.
+    """
+
+    largest: Array
+    summed: Array
+    any_bound: Array
+    penalty: Array
+
+
+def bound_excess(
+    problem: MPCProblem, thetas: Array, inputs: Array, taken: ArrayLike = True
+) -> BoundExcess:
+    """Return by how much trajectories exceed the bounds of states, outputs, inputs and rates.
+
+    What is not finite exceeds by inf. The state that a trajectory begins in is nobody's doing.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta and inputs they are.
+    thetas, inputs : ndarray, shapes (T + 1, ..., n_theta) and (T, ..., m)
+        Of trajectories, in deviations.
+    taken : ndarray of bool, shape (T, ...), optional
+        Which steps count.
+
+    Examples
+    --------
+    >>> from sb3_yann import LinearModel, LinearMPC
+    >>> cart = LinearModel([[1, 1], [0, 1]], [[0], [1]], dt=1.0)
+    >>> mpc = LinearMPC(cart, Q=[[1, 0], [0, 1]], R=[[1]], horizon=2, x_min=-5, x_max=5, u_max=1)
+    >>> float(bound_excess(mpc, np.array([[4.0, 2], [6.0, 2]]), np.zeros((1, 1))).largest)
+    0.2
+    """
+    bounds = Bounds.of(problem)
+    with np.errstate(invalid="ignore", over="ignore"):
+        over = np.abs(bounds.beyond(thetas[1:]))
+        parts = [np.maximum(inputs - problem.u_max, problem.u_min - inputs) / problem.u_half]
+        if problem.has_rate_bounds:
+            moved = inputs - thetas[:-1][..., problem.layout.previous]
+            rate = problem.rate
+            parts.append(np.maximum(moved - rate.du_max, rate.du_min - moved) / problem.u_half)
+        hard = np.concatenate([over[..., bounds.softness <= 0], *parts], axis=-1)
+        counted = np.asarray(taken)[..., None]
+        hard = _counted(hard, counted)
+        either = _counted(np.concatenate([over, *parts], axis=-1), counted)
+        penalty = np.zeros(thetas.shape[1:-1])
+        for first in (True, False):  # the states' bounds share a slack, the outputs' another
+            soft = (bounds.softness > 0) & (_of_states(bounds, problem) == first)
+            if np.any(soft):
+                unit = bounds.half[soft] / bounds.softness[soft]
+                s = np.max(_counted(over[..., soft], counted) * unit, axis=-1)
+                penalty = penalty + problem.soft.penalty * np.sum(s + s**2, axis=0)
+    return BoundExcess(
+        largest=np.max(hard, axis=(0, -1), initial=0.0),
+        summed=np.sum(hard, axis=(0, -1)),
+        any_bound=np.max(either, axis=(0, -1), initial=0.0),
+        penalty=penalty,
+    )
+
+
+def _counted(over: Array, taken: NDArray[np.bool_]) -> Array:
+    """Return an excess without rounding, 0 where a step does not count, inf for NaN."""
+    over = np.where(np.isnan(over), np.inf, over)
+    return np.where(taken & (over > ROUNDING), over, 0.0)
+
+
+def _of_states(bounds: Bounds, problem: MPCProblem) -> NDArray[np.bool_]:
+    """Tell which bounds are of single states, which come first."""
+    states = np.isfinite(problem.x_min) | np.isfinite(problem.x_max)
+    return np.arange(len(bounds.half)) < np.count_nonzero(states)
+
+
+def excess_of_episodes(problem: MPCProblem, episodes: Iterable[tuple[Array, Array]]) -> BoundExcess:
+    """Return the same of episodes of any lengths, one entry for each.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta and inputs they are.
+    episodes : iterable of pairs of ndarray, shapes (T + 1, n_theta) and (T, m)
+        Thetas and inputs of each.
+    """
+    found = [bound_excess(problem, thetas, inputs) for thetas, inputs in episodes]
+    return BoundExcess(*np.array(found, dtype=np.float64).reshape(-1, 4).T)
