@@ -10,13 +10,15 @@ from sb3_yann.control.mpc.bound_excess import BoundExcess
 
 UNSAFE = (
     "violations",
-    "an episode that the env terminates",
+    "an episode that the env ends, or ends sooner",
     "a cost or an observation that is no finite number",
     "an input that moves too far in one step",
     "a larger excess over the problem's bounds",
     "a larger summed excess over the problem's bounds",
 )
 """What the columns of ``unsafe`` are. A seventh is the excess over hard and soft bounds."""
+SUCCESS = 'where an end is a success, the env says so by info["is_success"]'
+"""What to do about an env that ends an episode because its goal is reached."""
 EXCESS_ROOM = 1e-3
 """Half-widths of a bound by which an excess may be larger: less is noise."""
 EXCESS_SHARE = 0.1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -42,7 +44,8 @@ class Episodes:
     observations : tuple of ndarray, shapes (steps + 1, n)
     actions : tuple of ndarray, shapes (steps, m)
     terminated : ndarray of bool, shape (episodes,)
-        Whether the env ended the episode itself, other than by a time limit.
+        Whether the env ended the episode itself, other than by a time limit, or with
+        ``info["is_success"]``.
 
     Examples
     --------
@@ -76,7 +79,7 @@ class EnvPool:
     """Envs that are kept."""
 
     def __init__(self, source: Source) -> None:
-        self.source = source
+        self.source = as_source(source)
         self.envs: list[gym.Env[Any, Any]] = []
 
     @contextmanager
@@ -139,7 +142,7 @@ def evaluate(
     resets = [*zip(seeds, options, strict=True)]
     act = _as_batch_function(policy)
     pool = env if isinstance(env, EnvPool) else None
-    env = env.source if isinstance(env, EnvPool) else env
+    env = env.source if isinstance(env, EnvPool) else as_source(env)
     if isinstance(env, gym.Env):
         _require_same_inputs(policy, env.action_space)
         episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
@@ -185,7 +188,25 @@ def as_seeds(seeds: Iterable[int]) -> list[int]:
 
 
 def as_source(env: Any) -> Any:
-    """Return what names, is or makes an env, else raise TypeError."""
+    """Return the id of an env, an env, or what makes one; else raise TypeError or ValueError.
+
+    Of ``"module:name"`` the function is imported, unless the module registers an env of that name.
+    """
+    if isinstance(env, str) and ":" in env:
+        module, name = env.split(":", 1)
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise ValueError(f"env = {env!r}: {module!r} cannot be imported ({error}).") from error
+        if name in gym.registry:
+            return env
+        found = getattr(sys.modules[module], name, None)
+        if not (callable(found) or isinstance(found, gym.Env)):
+            raise ValueError(
+                f"env = {env!r}: {module!r} has no function {name!r} that makes an env, and "
+                "registers no env of that id."
+            )
+        return found
     if not (isinstance(env, str | gym.Env) or callable(env)):
         raise TypeError(
             f"env = {env!r} must be the id of an environment, a gymnasium.Env, or a function that "
@@ -196,7 +217,7 @@ def as_source(env: Any) -> Any:
 
 def make_env(source: Source) -> gym.Env[Any, Any]:
     """Return the env that is given, or one that is made."""
-    as_source(source)
+    source = as_source(source)
     if isinstance(source, gym.Env):
         return source
     made = gym.make(source, disable_env_checker=True) if isinstance(source, str) else source()
@@ -278,7 +299,8 @@ def _as_one(
         costs[running] -= np.asarray(rewards, dtype=np.float64)[running]
         violations[running] += np.asarray(info.get("violation", np.zeros(n)), dtype=bool)[running]
         lengths[running] += 1
-        ended[running] |= terminated[running]
+        success = np.asarray(info.get("is_success", np.zeros(n)), dtype=bool)
+        ended[running] |= (terminated & ~success)[running]
         running &= ~(terminated | truncated)
         watch_length(env, len(actions))
     states, inputs = np.array(observations, float), np.array(actions, float)
@@ -325,7 +347,7 @@ def _side_by_side(
             episode.actions.append(action)
             episode.cost -= float(reward)
             episode.violations += bool(info.get("violation", False))
-            episode.terminated = bool(terminated)
+            episode.terminated = bool(terminated) and not info.get("is_success", False)
             if not (terminated or truncated):
                 going_on.append((env, episode))
             if episode is running[0][1]:  # the others are as long

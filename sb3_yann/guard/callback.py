@@ -15,13 +15,18 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_flag, as_options, as_whole
-from sb3_yann.evaluation.episodes import LONG, Source
+from sb3_yann.evaluation.episodes import LONG, Source, as_source
 from sb3_yann.evaluation.plots.decisions import plot_decisions
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.options import AcceptanceRule, StepSize
-from sb3_yann.guard.preconditions import check_alone, check_not_nested, check_twin
-from sb3_yann.guard.session import GuardSession, restore_accepted
+from sb3_yann.guard.preconditions import (
+    all_callbacks,
+    check_alone,
+    check_not_nested,
+    check_twin,
+)
+from sb3_yann.guard.session import ACCEPTED, GuardSession, restore_accepted
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
 from sb3_yann.guard.state import Decision, GuardState, begin_record
 from sb3_yann.guard.summary import summary_of
@@ -77,6 +82,11 @@ class ImprovementGuard(BaseCallback):
         A CSV file of all decisions, up to date after each one; ``guard.decisions`` has them too.
         What it held of another run is kept beside it, in a file with a number. Training goes on
         where it cannot be written, with a warning.
+    save_path : path-like, optional
+        A folder for ``accepted_model.zip``, the model with the policy accepted last, up to date
+        after each acceptance. The default is the ``best_model_save_path`` of an EvalCallback of the
+        same `learn`, whose own ``best_model.zip`` is a candidate that no guard has accepted; none
+        without one.
     verbose : int, default 0
         1 prints each decision.
 
@@ -116,6 +126,7 @@ class ImprovementGuard(BaseCallback):
         rule: AcceptanceRule | Mapping[str, Any] = AcceptanceRule(),  # noqa: B008 (frozen)
         step_size: StepSize | Mapping[str, Any] = StepSize(),  # noqa: B008 (frozen)
         log_path: str | PathLike[str] | None = None,
+        save_path: str | PathLike[str] | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
@@ -129,8 +140,11 @@ class ImprovementGuard(BaseCallback):
                 "gymnasium.Env, a function that makes one, or a PlantTwin. On a plant without a "
                 "simulator use Commissioning (docs/commissioning.md)."
             )
+        as_source(env)  # a name that cannot be imported is told here
         if log_path is not None and Path(log_path).is_dir():
             raise ValueError(f"log_path = {log_path!r} is a folder; name a file in it.")
+        if save_path is not None and Path(save_path).is_file():
+            raise ValueError(f"save_path = {save_path!r} is a file; name a folder.")
         as_whole("n_starts", n_starts)
         as_whole("n_new_starts", n_new_starts, 0)
         n_final = 10 * n_new_starts if n_final_starts is None else n_final_starts
@@ -142,6 +156,7 @@ class ImprovementGuard(BaseCallback):
         rule = as_options("rule", rule, AcceptanceRule)
         self.env, self.step_size = env, as_options("step_size", step_size, StepSize)
         self.log_path = None if log_path is None else Path(log_path)
+        self.save_path = None if save_path is None else Path(save_path)
         self.acceptance = SimulatorAcceptance(
             name_of(env),
             range(seed, seed + n_starts),
@@ -160,16 +175,7 @@ class ImprovementGuard(BaseCallback):
 
     def summary(self) -> str:
         """Return some lines: what is accepted, what was refused most often, and what may help."""
-        decisions, policy = self.decisions, self.session.policy
-        updates, needed = int(policy.critic_updates), policy.critic_warmup
-        if not decisions and updates <= needed:
-            return (
-                f"The policy is still the MPC: the critic has had {updates} updates, and the actor "
-                f"moves after critic_warmup = {needed}. Train longer, or lower critic_warmup."
-            )
-        evidence = self.state.evidence
-        known = evidence.accepted or evidence.mpc
-        return summary_of(decisions, 0 if known is None else len(known.costs))
+        return summary_of(self.state, self.session.policy)
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the mean cost of each candidate by the verdict on it; return the axes.
@@ -195,6 +201,7 @@ class ImprovementGuard(BaseCallback):
         self.session = GuardSession(
             self.model, policy, self.env, self.step_size, self.log_path, self.verbose
         )
+        self._saved: ActorCheckpoint | None = None
 
     def _on_training_start(self) -> None:
         check_not_nested(self)
@@ -216,6 +223,8 @@ class ImprovementGuard(BaseCallback):
         self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
         self.session.policy.actor_step = self.state.step
         self._has_begun = True
+        self._folder = self.save_path or self._folder_of_best_models()
+        self._save_accepted()
         if self.log_path is not None:
             self.session.log_lacks_rows = not begin_record(self.log_path, self.decisions)
 
@@ -238,7 +247,36 @@ class ImprovementGuard(BaseCallback):
         self.state.episodes += int(np.sum(dones))
         self._warn_of_an_endless_episode(dones)
         self.acceptance.step(self.session, dones)
+        self._save_accepted()
         return True
+
+    def _folder_of_best_models(self) -> Path | None:
+        """Return where another callback keeps its best model, and warn that it is a candidate."""
+        for each in all_callbacks(self.locals.get("callback")):
+            if folder := getattr(each, "best_model_save_path", None):
+                warnings.warn(
+                    f"The best_model.zip that {type(each).__name__} keeps in {folder} is a "
+                    "candidate, which no guard has accepted. Load "
+                    f"{Path(folder) / ACCEPTED} instead, or the model that learn leaves behind.",
+                    stacklevel=2,
+                )
+                return Path(folder)
+        return None
+
+    def _save_accepted(self) -> None:
+        """Save the model with the accepted policy, if it is another one than was saved last."""
+        accepted = self.state.accepted
+        if self._folder is None or accepted is self._saved:
+            return
+        self._saved = accepted
+        try:
+            self.session.save_accepted(self._folder / ACCEPTED)
+        except OSError as error:
+            self._saved = None
+            warnings.warn(
+                f"{self._folder / ACCEPTED} could not be written ({error}). Training goes on.",
+                stacklevel=2,
+            )
 
     def _warn_of_an_endless_episode(self, dones: Any) -> None:
         self._steps = np.where(dones, 0, self._steps + 1)
@@ -259,6 +297,7 @@ class ImprovementGuard(BaseCallback):
             self.acceptance.end(self.session)
         finally:
             restore_accepted(self.model)
+            self._save_accepted()
             self.session.close()
             if self._handler is not None:
                 self._handler.remove()

@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
-from sb3_yann.evaluation.episodes import Episodes, evaluate
+from sb3_yann.evaluation.episodes import LONGEST, Episodes, evaluate
 from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
-from sb3_yann.guard.statistics import PairedEpisodes, Tolerance, told_apart
+from sb3_yann.guard.statistics import PairedEpisodes, Tolerance, is_above, told_apart
 
 HARDEST = 10
 """New starts that join those of every later candidate at a time."""
-ROUNDING = 1e-6
-"""Relative difference of mean costs that float32 makes between batches of other sizes."""
 WEARS = 3
 """The column of large steps of an input: after all others there is no patience."""
 VIOLATES: Final = "violates a limit"
@@ -114,10 +112,10 @@ class Starts:
         Where it must be clear of it, its upper confidence limit must be below, and it itself by
         the least gain.
         """
-        rounding = ROUNDING * np.abs(self.mpc.costs).mean()
         more = outcome.costs - self.mpc.costs
         error = self.sure * more.std() / np.sqrt(len(more)) if self.sure else 0.0
-        return not more.mean() + error <= rounding or self.gains_too_little(outcome)
+        above = is_above(outcome.costs, self.mpc.costs, error)
+        return above or self.gains_too_little(outcome)
 
     def gains_too_little(self, outcome: Outcome) -> bool:
         """Return whether the mean cost is not below the MPC's by the least gain."""
@@ -235,7 +233,9 @@ def outcome_of(session: GuardSession, episodes: Episodes) -> Outcome:
     inputs = [policy.inputs(actions) for actions in episodes.actions]
     pairs = zip((each.double().cpu().numpy() for each in thetas), inputs, strict=True)
     excess = excess_of_episodes(policy.problem, pairs)
-    unsafe = unsafe_columns(episodes.violations, episodes.terminated, lost, excess, far)
+    lengths = np.array([len(each) for each in episodes.actions])
+    sooner = np.where(episodes.terminated, LONGEST + 1 - lengths, 0)  # 0 where it did not end it
+    unsafe = unsafe_columns(episodes.violations, sooner, lost, excess, far)
     visits = np.zeros((len(episodes.costs), layer.n_networks), dtype=bool)
     for visited, theta in zip(visits, thetas, strict=True):
         visited[layer.regions(theta[:-1])] = True

@@ -10,6 +10,7 @@ from sb3_yann.guard.episodes import Evidence, Outcome, Starts, Unplayable, play
 from sb3_yann.guard.options import AcceptanceRule
 from sb3_yann.guard.region_mixing import accept_parts, accepted_regions
 from sb3_yann.guard.session import GuardSession
+from sb3_yann.guard.statistics import is_above
 
 ROUNDS = 3
 """How often the parts of what lost on new starts are played from others."""
@@ -141,15 +142,15 @@ def _accept_less(
     state = session.state
     known = state.evidence.joined_with(new.at(hard))
     smaller = [(lost.shrunk(share), None) for share in SMALLER if session.has_learned(lost)]
-    best, least, outcome = session.mpc, known.mpc.costs.mean(), known.mpc
+    best, outcome = session.mpc, known.mpc
     for group in (smaller, [*reversed(state.passed)]):
         for checkpoint, had in group:
             try:
                 found = _passing(session, checkpoint, had, new, hard)
             except Unplayable:
                 continue
-            if found.costs.mean() <= least:
-                best, least, outcome = checkpoint, found.costs.mean(), found
+            if not is_above(found.costs, outcome.costs):
+                best, outcome = checkpoint, found
             break
     state.accept(best, _evidence(known, outcome))
     if best is not session.mpc:

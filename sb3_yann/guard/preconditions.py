@@ -11,9 +11,10 @@ from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 
 from sb3_yann.control import LinearMPC
 from sb3_yann.evaluation.episodes import Episodes, one_env
-from sb3_yann.guard.episodes import ROUNDING, Outcome, outcome_of, play_episodes
+from sb3_yann.guard.episodes import Outcome, outcome_of, play_episodes
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.session import GuardSession
+from sb3_yann.guard.statistics import ROUNDING
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin
 
 
@@ -51,18 +52,22 @@ def check_not_nested(guard: BaseCallback) -> None:
 
 def check_alone(guard: BaseCallback) -> None:
     """Raise ValueError if another guard is among what was passed to learn."""
-    waiting, found = [guard.locals.get("callback")], []
-    while waiting:
-        each = waiting.pop()
-        waiting += [*getattr(each, "callbacks", [])]
-        waiting += [getattr(each, name, None) for name in ("callback", "callback_on_new_best")]
-        waiting = [other for other in waiting if isinstance(other, BaseCallback)]
-        found += [each] if isinstance(each, type(guard)) else []
+    callbacks = all_callbacks(guard.locals.get("callback"))
+    found = [each for each in callbacks if isinstance(each, type(guard))]
     if len(found) > 1:
         raise ValueError(
             f"{len(found)} guards were passed to learn, expected is one: each would restore what "
             "it accepted itself. Give one guard all starts, by n_starts or a simulator of both."
         )
+
+
+def all_callbacks(callback: Any) -> list[BaseCallback]:
+    """Return a callback that was passed to learn, and those within it."""
+    if not isinstance(callback, BaseCallback):
+        return []
+    within = [*getattr(callback, "callbacks", [])]
+    within += [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]
+    return [callback, *(found for each in within for found in all_callbacks(each))]
 
 
 def _event_above(

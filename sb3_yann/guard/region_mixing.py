@@ -11,6 +11,7 @@ from sb3_yann.compare import less_safe
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.episodes import Evidence, Outcome, Unplayable, play
 from sb3_yann.guard.session import GuardSession
+from sb3_yann.guard.statistics import is_above
 
 MOST_LOST = 0.2
 """Share of losing starts beyond which no part of a candidate is looked for."""
@@ -122,8 +123,8 @@ def accept_part_way(session: GuardSession, candidate: ActorCheckpoint) -> float:
 
 def _improves(evidence: Evidence, outcome: Outcome) -> bool:
     """Return whether the mean cost falls, and nothing speaks against the policy."""
-    gained = outcome.costs.mean() < evidence.paired.costs.mean()
-    return bool(gained) and not evidence.paired.objection(outcome.costs, outcome.unsafe)
+    gained = is_above(evidence.accepted.costs, outcome.costs)
+    return gained and not evidence.paired.objection(outcome.costs, outcome.unsafe)
 
 
 def _play_some(

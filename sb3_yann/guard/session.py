@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ from sb3_yann.guard.options import StepSize
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.guard.state import Decision, GuardState, Verdict, log_last
 from sb3_yann.policy.policies import YannPolicy
+
+ACCEPTED = "accepted_model.zip"
+"""The file of the model with the accepted policy."""
 
 
 @dataclass
@@ -113,6 +117,20 @@ class GuardSession:
             self.state.accepted, self.state.evidence, self.state.passed = self.before_trial
         self.interrupted = True
         restore_accepted(self.model)
+
+    def save_accepted(self, path: Path) -> None:
+        """Save the model with the accepted policy, as a whole; it goes on with its own."""
+        own = ActorCheckpoint.of(self.policy)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_name(f"{path.name}.unfinished")
+        try:
+            self.state.accepted.restore(self.policy)
+            self.model.save(unfinished)
+            os.replace(unfinished, path)
+        finally:
+            if not self.interrupted:
+                own.restore(self.policy)
+            unfinished.unlink(missing_ok=True)
 
     def has_learned(self, checkpoint: ActorCheckpoint) -> bool:
         """Return whether the networks of a checkpoint correct the MPC anywhere."""

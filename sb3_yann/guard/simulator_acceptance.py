@@ -147,6 +147,7 @@ class SimulatorAcceptance:
         finally:
             state.rejections = 0
         last = state.accepted
+        known: Outcome = state.evidence.accepted
         if last is self.final:  # the Zoo ends its first callback a second time
             return
         with session.all_or_nothing():
@@ -156,7 +157,7 @@ class SimulatorAcceptance:
         accepted.restore(session.policy)
         if reason:
             regions = accepted_regions(session.mpc, last, accepted)
-            self._report(session, None, f"at the end, {reason}", regions, restored=True)
+            self._report(session, known, f"at the end, {reason}", regions, restored=True)
 
     def try_candidate(self, session: GuardSession) -> None:
         """Accept the present policy, whole or in part, or refuse it."""
@@ -214,10 +215,11 @@ class SimulatorAcceptance:
         share: float = 0.0,
     ) -> None:
         paired = session.state.evidence.paired
+        fixed = slice(len(self.seeds))  # the hard starts come and go: costs must be comparable
         verdict: Verdict = "accepted" if not reason else PART if regions or share else "rejected"
-        cost = np.nan if outcome is None else float(outcome.costs.mean())
-        costs = cost, float(paired.costs.mean()), float(paired.mpc_costs.mean())
-        worst_start = float(np.max(paired.costs - paired.mpc_costs))
+        cost = np.nan if outcome is None else float(outcome.costs[fixed].mean())
+        costs = cost, float(paired.costs[fixed].mean()), float(paired.mpc_costs[fixed].mean())
+        worst_start = float(np.max((paired.costs - paired.mpc_costs)[fixed]))
         session.decide(verdict, reason, restored, costs, worst_start, tuple(regions), share=share)
 
 

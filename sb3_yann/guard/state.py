@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import warnings
 from dataclasses import asdict, dataclass, field, fields
@@ -34,9 +35,11 @@ class Decision:
     restored : bool
         Whether the accepted checkpoint was restored.
     candidate_cost, accepted_cost, mpc_cost : float
-        Mean cost of the candidate, the policy accepted now and the MPC, over the known starts.
+        Mean cost of the candidate, the policy accepted now and the MPC, over the first
+        ``n_starts``: the same in each decision. The hard starts that joined them are left out.
+        That of a candidate that could not be played is nan; the reason says why.
     worst_start : float
-        Largest excess of the accepted policy over the MPC on one start, nan if not known.
+        Largest excess of the accepted policy over the MPC on one of these starts.
     regions : tuple of int
         Regions whose networks were accepted, where it was a part.
     step : float
@@ -63,6 +66,11 @@ class Decision:
     regions: tuple[int, ...]
     step: float
     share: float = 0.0
+
+
+def relative_change(cost: float, mpc_cost: float) -> float:
+    """Return how much more than the MPC's a cost is, relative to it; nan if the MPC's is 0."""
+    return (cost - mpc_cost) / abs(mpc_cost) if mpc_cost else math.nan
 
 
 @dataclass
@@ -128,17 +136,33 @@ def log_last(
         Whether the file holds all decisions. Training goes on where it does not: a warning says so.
     """
     last = decisions[-1]
-    for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
-        model.logger.record(f"guard/{name}", getattr(last, name))
+    names = ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step")
+    shown = {name: getattr(last, name) for name in names}
+    for who in ("candidate", "accepted"):
+        change = relative_change(shown[f"{who}_cost"], last.mpc_cost)
+        shown[f"{who}_change_percent"] = 100 * change
+    for name, value in shown.items():
+        if math.isfinite(value):  # that of a candidate that could not be played is not
+            model.logger.record(f"guard/{name}", value)
     rejected = sum(each.verdict == "rejected" for each in decisions)
     model.logger.record("guard/rejected", rejected)
     model.logger.record("guard/accepted", len(decisions) - rejected)
     model.logger.dump(model.num_timesteps)  # as EvalCallback does, or the next would replace it
     if verbose:
         reason = f" ({last.reason})" if last.reason else ""
-        costs = f"mean cost {last.accepted_cost:.6g}, MPC {last.mpc_cost:.6g}"
-        print(f"Episode {last.episode}: {last.verdict}{reason}; {costs}")
+        told = [_told("candidate", last.candidate_cost, last.mpc_cost)]
+        told += [_told("accepted policy", last.accepted_cost, last.mpc_cost)]
+        told += [f"MPC {last.mpc_cost:.6g}"]
+        print(f"Episode {last.episode}: {last.verdict}{reason}; mean costs: {', '.join(told)}")
     return path is None or write_record(path, decisions, anew)
+
+
+def _told(who: str, cost: float, mpc_cost: float) -> str:
+    if not math.isfinite(cost):
+        return f"{who} not known"
+    change = relative_change(cost, mpc_cost)
+    percent = f" ({100 * change:+.2f} %)" if math.isfinite(change) else ""
+    return f"{who} {cost:.6g}{percent}"
 
 
 def write_record(path: Path, decisions: list[Decision], anew: bool) -> bool:

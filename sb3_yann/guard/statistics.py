@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.compare import UNSAFE, less_safe
+from sb3_yann.compare import SUCCESS, UNSAFE, less_safe
 
+ROUNDING = 1e-6
+"""Of a mean cost: what float32 actions and batches of other sizes make of one policy's."""
 MOST = 10.0
 """With a tail: how many times as much as its average one start may cost more."""
 
@@ -44,10 +46,11 @@ class Tolerance:
         return np.asarray(np.nan_to_num(more, nan=np.inf, posinf=np.inf, neginf=-np.inf))
 
     def allowed(self, mpc_costs: Array) -> Array:
-        """Return what each start may cost more."""
+        """Return what each start may cost more, rounding at least."""
+        rounding = ROUNDING * np.abs(mpc_costs)
         if not self.tail:
-            return np.full(len(mpc_costs), self.margin)
-        return np.asarray(self.margin * np.maximum(1.0, np.abs(mpc_costs) / self.typical))
+            return np.maximum(self.margin, rounding)
+        return np.maximum(self.margin * np.maximum(1.0, np.abs(mpc_costs) / self.typical), rounding)
 
     def objection(self, excess: Array, n_starts: int | None = None, sure: float = 0.0) -> str:
         """Return what speaks against such an excess over the MPC, empty where nothing does.
@@ -122,7 +125,7 @@ class PairedEpisodes:
 
     def loses_to_the_mpc(self, costs: Array) -> bool:
         """Return whether the mean cost is above the MPC's."""
-        return not costs.mean() <= self.mpc_costs.mean()
+        return is_above(costs, self.mpc_costs)
 
     def objection(self, costs: Array, unsafe: Array) -> str:
         """Return why a policy with these episodes is refused, empty where it is not.
@@ -132,16 +135,28 @@ class PairedEpisodes:
         for what, column in zip(UNSAFE, less_safe(unsafe, self.unsafe).T, strict=True):
             more = np.flatnonzero(column)
             if len(more):
-                return f"{len(more)} starts with {what}, the first is number {more[0]}"
+                told = f"{len(more)} starts with {what}, the first is number {more[0]}"
+                return f"{told}; {SUCCESS}" if what == UNSAFE[1] else told
         relative = self.tolerance.excess(self.mpc_costs, costs)
         why = self.tolerance.objection(relative, self.n_starts)
         if why:
             worst = np.argmax(relative)
             return f"{why} costs {costs[worst] - self.mpc_costs[worst]:.4g} more than with the MPC"
-        if not costs.mean() <= self.costs.mean():
+        if is_above(costs, self.costs):
             mean, accepted = told_apart(costs.mean(), self.costs.mean())
             return f"mean cost {mean}, accepted {accepted}"
+        if self.loses_to_the_mpc(costs):  # by as much as rounding in many acceptances adds up to
+            mean, mpc = told_apart(costs.mean(), self.mpc_costs.mean())
+            return f"mean cost {mean}, MPC {mpc}"
         return ""
+
+
+def is_above(costs: Array, others: Array, error: float = 0.0) -> bool:
+    """Return whether the mean of costs, and an error, is above that of others beyond rounding.
+
+    A mean that is not a number is.
+    """
+    return not costs.mean() + error - others.mean() <= ROUNDING * np.abs(others).mean()
 
 
 def told_apart(one: float, other: float) -> tuple[str, str]:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
 
-from sb3_yann.guard.state import Decision
+from sb3_yann.guard.state import GuardState, relative_change
+from sb3_yann.policy.policies import YannPolicy
 
 LITTLE = 1e-3
 """A gain below this, relative to the MPC's cost, is called none."""
 ADVICE = {
     "new starts": "raise n_starts: the known starts do not show what the new ones do",
     "violation": "bound the policy (max_correction), or tighten the MPC's own limits",
-    "terminates": "bound the policy (max_correction), or tighten the MPC's own limits",
+    "the env ends": "bound the policy (max_correction), or tighten the MPC's own limits",
     "finite": "lower the learning rate; CostAudit shows what the critic is told",
     "too far": "take networks='shared', whose policy is continuous",
     "costs": "bound the policy (max_correction), or allow the worst starts more (rule.margin)",
@@ -22,31 +23,32 @@ ADVICE = {
 """What helps against a reason for a refusal that holds such words: the first one that does."""
 
 
-def summary_of(decisions: Sequence[Decision], n_starts: int) -> str:
-    """Return some lines for a reader: what is accepted, what was refused and why, what helps.
-
-    Parameters
-    ----------
-    decisions : sequence of Decision
-        All of them.
-    n_starts : int
-        Number of starts that the costs are means over.
-    """
-    if not decisions:
-        return (
-            "The guard has tried no candidate yet: the policy is the one that training began with."
+def summary_of(state: GuardState, policy: YannPolicy) -> str:
+    """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
+    decisions, n_starts = state.decisions, len(state.settings["seeds"])
+    costs, mpc_costs = (
+        each.costs[:n_starts] for each in (state.evidence.accepted, state.evidence.mpc)
+    )
+    lines = [_accepted(state, float(costs.mean()), float(mpc_costs.mean()), n_starts)]
+    if not state.accepted.is_actor_of(policy):
+        lines.append(
+            "The model's policy is another one, which no guard has accepted: "
+            "restore_accepted(model) gives it the accepted one."
         )
+    if not decisions:
+        updates, needed = int(policy.critic_updates), policy.critic_warmup
+        lines.append("The guard has tried no candidate yet.")
+        if updates <= needed:
+            lines.append(
+                f"The critic has had {updates} updates, and the actor moves after critic_warmup = "
+                f"{needed}. Train longer, or lower critic_warmup."
+            )
+        return "\n".join(lines)
     last, counts = decisions[-1], Counter(each.verdict for each in decisions)
-    change = (last.accepted_cost - last.mpc_cost) / abs(last.mpc_cost or 1.0)
-    gain = f"{100 * abs(change):.2g} % {'less' if change < 0 else 'more'} than the MPC's"
-    what = f"costs {last.accepted_cost:.6g}, {gain} {last.mpc_cost:.6g}, on {n_starts} starts"
-    if abs(change) < LITTLE:
-        what = f"gains nothing: it costs {last.accepted_cost:.6g} on {n_starts} starts, as the MPC"
-    lines = [
-        f"The policy accepted last {what}.",
+    lines.append(
         f"Candidates: {counts['accepted']} accepted, {counts['accepted in part']} in part, "
-        f"{counts['rejected']} refused, in {last.episode} episodes.",
-    ]
+        f"{counts['rejected']} refused, in {last.episode} episodes."
+    )
     refusals = Counter(_kind(each.reason) for each in decisions if each.verdict == "rejected")
     if refusals:
         kind, count = refusals.most_common(1)[0]
@@ -54,6 +56,23 @@ def summary_of(decisions: Sequence[Decision], n_starts: int) -> str:
         lines.append(f"Refused most often ({count} times): {example}.")
         lines.append(f"What may help: {ADVICE[kind]}." if kind in ADVICE else "")
     return "\n".join(filter(None, lines))
+
+
+def _accepted(state: GuardState, cost: float, mpc_cost: float, n_starts: int) -> str:
+    if state.mpc is not None and state.accepted.has_networks_of(state.mpc):
+        return f"The policy accepted last is the MPC: it costs {mpc_cost:.6g} on {n_starts} starts."
+    change = relative_change(cost, mpc_cost)
+    if abs(cost - mpc_cost) <= LITTLE * abs(mpc_cost):
+        return (
+            f"The policy accepted last is not the MPC, and gains nothing: it costs {cost:.6g} on "
+            f"{n_starts} starts, the MPC {mpc_cost:.6g}."
+        )
+    less = "less" if cost < mpc_cost else "more"
+    size = f"{100 * abs(change):.2g} % {less} than" if math.isfinite(change) else f"{less} than"
+    return (
+        f"The policy accepted last costs {cost:.6g}, {size} the MPC's {mpc_cost:.6g}, on "
+        f"{n_starts} starts."
+    )
 
 
 def _kind(reason: str) -> str:

@@ -34,15 +34,14 @@ def guard_part(subject: Subject) -> Part:
             "changed since. restore_accepted(model) gives the accepted one."
         )
     finding = Finding("passed" if accepted else "failed", text)
-    known = getattr(state.evidence, "accepted", None) or getattr(state.evidence, "mpc", None)
-    starts = 0 if known is None else len(known.costs)
+    starts = len(state.settings["seeds"])
     caption = (
         "Mean cost of each candidate by the verdict on it, of the accepted policy and of the MPC, "
         f"over the guard's {starts} starts."
     )
     parts = [
         say(text),
-        lines(summary_of(state.decisions, starts)),
+        lines(summary_of(state, subject.policy)),
         _settings(subject, state.settings),
     ]
     if state.decisions:
