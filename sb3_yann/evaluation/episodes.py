@@ -199,7 +199,7 @@ def as_source(env: Any) -> Any:
         except ImportError as error:
             raise ValueError(f"env = {env!r}: {module!r} cannot be imported ({error}).") from error
         if name in gym.registry:
-            return env
+            return name
         found = getattr(sys.modules[module], name, None)
         if not (callable(found) or isinstance(found, gym.Env)):
             raise ValueError(

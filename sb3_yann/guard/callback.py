@@ -223,7 +223,7 @@ class ImprovementGuard(BaseCallback):
         self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
         self.session.policy.actor_step = self.state.step
         self._has_begun = True
-        self._folder = self.save_path or self._folder_of_best_models()
+        self._folder = self._folder_of_accepted()
         self._save_accepted()
         if self.log_path is not None:
             self.session.log_lacks_rows = not begin_record(self.log_path, self.decisions)
@@ -250,18 +250,19 @@ class ImprovementGuard(BaseCallback):
         self._save_accepted()
         return True
 
-    def _folder_of_best_models(self) -> Path | None:
-        """Return where another callback keeps its best model, and warn that it is a candidate."""
+    def _folder_of_accepted(self) -> Path | None:
+        """Return where to save; warn of a callback whose best model is a candidate."""
         for each in all_callbacks(self.locals.get("callback")):
             if folder := getattr(each, "best_model_save_path", None):
+                instead = (self.save_path or Path(folder)) / ACCEPTED
                 warnings.warn(
                     f"The best_model.zip that {type(each).__name__} keeps in {folder} is a "
-                    "candidate, which no guard has accepted. Load "
-                    f"{Path(folder) / ACCEPTED} instead, or the model that learn leaves behind.",
+                    f"candidate, which no guard has accepted. Load {instead} instead, or the model "
+                    "that learn leaves behind.",
                     stacklevel=2,
                 )
-                return Path(folder)
-        return None
+                return instead.parent
+        return self.save_path
 
     def _save_accepted(self) -> None:
         """Save the model with the accepted policy, if it is another one than was saved last."""

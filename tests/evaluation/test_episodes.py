@@ -274,3 +274,52 @@ def test_a_law_in_deviations_is_not_played_on_an_absolute_env() -> None:
 def test_a_problem_is_not_its_law() -> None:
     with pytest.raises(TypeError, match=r"pass its law, mpc\.explicit"):
         evaluate(problems.cstr(), "CSTR-v0", SEEDS)  # type: ignore[arg-type]
+
+
+def short_reactor() -> gym.Env:
+    """Return an env that no registry knows."""
+    return gym.make("CSTR-v0", max_episode_steps=3)
+
+
+NOT_A_FUNCTION = 3
+
+
+def test_a_function_that_makes_envs_may_be_named_by_its_module() -> None:
+    law = gym.make("CSTR-v0").observation_space.problem.explicit()
+    named, given = (
+        evaluate(law, each, [4, 5]) for each in (f"{__name__}:short_slide", short_slide)
+    )
+    assert [len(each) for each in named.actions] == [3, 3]
+    np.testing.assert_array_equal(named.costs, given.costs)
+    registered = evaluate(law, "sb3_yann_envs:CSTR-v0", [4])  # as gymnasium has it
+    assert [len(each) for each in registered.actions] == [400]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("no_such_module:make", "'no_such_module' cannot be imported"),
+        (f"{__name__}:nothing", "has no function 'nothing' that makes an env"),
+        (f"{__name__}:NOT_A_FUNCTION", "has no function 'NOT_A_FUNCTION' that makes an env"),
+    ],
+)
+def test_a_name_that_leads_to_no_env_is_told(name, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        evaluate(lambda _: [0.0], name, [0])
+
+
+class Goal(gym.Wrapper):
+    def step(self, action):
+        observation, reward, _, truncated, info = self.env.step(action)
+        return (
+            observation,
+            reward,
+            True,
+            truncated,
+            {**info, "is_success": self.np_random.random() < 2},
+        )
+
+
+def test_an_end_that_is_a_success_is_no_termination_that_counts() -> None:
+    act = lambda _: [0.0]  # noqa: E731
+    assert not evaluate(act, lambda: Goal(gym.make("CSTR-v0")), [0]).terminated.any()

@@ -182,7 +182,8 @@ def test_the_step_grows_with_an_acceptance_and_shrinks_with_a_restoration(
     assert session.model.recorded == {
         "guard/candidate_cost": 3.0, "guard/accepted_cost": 2.0, "guard/mpc_cost": 1.0,
         "guard/worst_start": 0.5, "guard/step": step, "guard/rejected": refused,
-        "guard/accepted": 1 - refused,
+        "guard/accepted": 1 - refused, "guard/candidate_change_percent": 200.0,
+        "guard/accepted_change_percent": 100.0,
     }  # fmt: skip
 
 

@@ -54,7 +54,7 @@ def interrupted(model, steps: int, *callbacks: BaseCallback) -> None:
 
 
 def test_between_two_steps_the_candidate_gives_way_to_what_was_accepted() -> None:
-    model, guard = build(), make_guard(eval_every=100)
+    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
     interrupted(model, 40, At([5], better), guard, At([17], ctrl_c))
     assert is_mpc(model)  # no trial has been
 

@@ -152,7 +152,7 @@ class Tripping(Slide):
 def test_termination_is_refused_where_the_accepted_policy_violates_a_limit() -> None:
     model, guard = build(gradient_steps=0), make_guard(partial(Tripping, low=2.0), n_new_starts=5)
     train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
-    assert "an episode that the env terminates" in guard.decisions[0].reason
+    assert "an episode that the env ends" in guard.decisions[0].reason
     assert is_mpc(model)
 
 

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from guard_samples import At, Slide, better, build, make_guard, train
 from sb3_yann.guard.state import Decision
 from sb3_yann.guard.summary import ADVICE, summary_of
 
@@ -10,16 +17,31 @@ def decision(verdict: str, accepted: float, reason: str = "", mpc: float = 40.0)
     return Decision(9, 7, verdict, reason, False, 1.0, accepted, mpc, 0.0, (), 1.0)
 
 
-def test_nothing_was_tried() -> None:
-    assert "has tried no candidate yet" in summary_of([], 10)
+def said_of(
+    decisions: list[Decision], n: int = 5, is_mpc: bool = False, updates: int = 9, acts: bool = True
+) -> list[str]:
+    """Return the lines about decisions on n starts, and one hard start that is left out."""
+    last = decisions[-1] if decisions else decision("accepted", 40.0)
+    costs = SimpleNamespace(costs=np.array([last.accepted_cost] * n + [999.0]))
+    mpc = SimpleNamespace(costs=np.array([last.mpc_cost] * n + [999.0]))
+    checkpoint = SimpleNamespace(has_networks_of=lambda _: is_mpc, is_actor_of=lambda _: acts)
+    state: Any = SimpleNamespace(
+        decisions=decisions,
+        settings={"seeds": range(n)},
+        evidence=SimpleNamespace(accepted=costs, mpc=mpc),
+        accepted=checkpoint,
+        mpc=checkpoint,
+    )
+    policy: Any = SimpleNamespace(critic_updates=updates, critic_warmup=5)
+    return summary_of(state, policy).splitlines()
 
 
 def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
     kind = next(iter(ADVICE))
     refused = [decision("rejected", 39.0, f"seed {i}: {kind}, by {i}") for i in (3, 4)]
     others = [decision("rejected", 39.0, "mean cost 5"), decision("accepted", 39.0)]
-    said = summary_of([*refused, *others, decision("accepted in part", 30.0, "half")], 12)
-    assert said.splitlines() == [
+    decisions = [*refused, *others, decision("accepted in part", 30.0, "half")]
+    assert said_of(decisions, 12) == [
         "The policy accepted last costs 30, 25 % less than the MPC's 40, on 12 starts.",
         "Candidates: 1 accepted, 1 in part, 3 refused, in 7 episodes.",
         f"Refused most often (2 times): seed 3: {kind}, by 3.",
@@ -27,13 +49,36 @@ def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
     ]
 
 
-def test_more_than_the_mpc_nothing_and_an_mpc_that_costs_nothing() -> None:
-    assert "costs 41, 2.5 % more than the MPC's 40" in summary_of([decision("accepted", 41.0)], 5)
-    assert "gains nothing: it costs 40 on 5" in summary_of([decision("rejected", 40.0, "x")], 5)
-    free = decision("accepted", -2.0, mpc=0.0)
-    assert "costs -2, 2e+02 % less than the MPC's 0" in summary_of([free], 5)
+@pytest.mark.parametrize(
+    ("last", "words"),
+    [
+        (decision("accepted", 41.0), "costs 41, 2.5 % more than the MPC's 40"),
+        (decision("rejected", 40.0, "x"), "is not the MPC, and gains nothing: it costs 40 on 5"),
+        (decision("accepted", -2.0, mpc=0.0), "costs -2, less than the MPC's 0"),
+        (decision("accepted", -50.0, mpc=-40.0), "costs -50, 25 % less than the MPC's -40"),
+    ],
+    ids=["more", "as much", "an MPC that costs nothing", "negative costs"],
+)
+def test_the_change_is_against_the_size_of_the_mpc_s_cost(last, words) -> None:
+    assert words in said_of([last])[0]
 
 
-def test_a_reward_that_makes_costs_negative_is_compared_by_its_size() -> None:
-    gained = decision("accepted", -50.0, mpc=-40.0)
-    assert "costs -50, 25 % less than the MPC's -40" in summary_of([gained], 5)
+def test_nothing_was_tried_and_why() -> None:
+    mpc = "The policy accepted last is the MPC: it costs 40 on 5 starts."
+    assert said_of([], is_mpc=True) == [mpc, "The guard has tried no candidate yet."]
+    assert "had 3 updates, and the actor moves after" in said_of([], is_mpc=True, updates=3)[2]
+
+
+def test_a_changed_policy_is_never_called_the_mpc() -> None:
+    """What a policy learnt before training is not the MPC, nor is what changed it since."""
+    model, guard = build(gradient_steps=0, actor={"critic_warmup": 99}), make_guard(Slide)
+    better(model.policy)
+    train(model, 2, guard)
+    said = guard.summary()
+    assert "is the MPC" not in said and "% less than the MPC's" in said
+    assert "tried no candidate yet" in said and "critic_warmup = 99" in said
+    other, guard = build(gradient_steps=0), make_guard(Slide)
+    train(other, 2, At([], better), guard)
+    assert "accepted last is the MPC" in guard.summary()
+    better(other.policy)
+    assert "The model's policy is another one, which no guard has accepted" in guard.summary()

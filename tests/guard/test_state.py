@@ -152,8 +152,13 @@ def test_tensorboard_shows_every_decision_the_last_one_too(tmp_path) -> None:
     assert shown["guard/accepted"] == [1, 1, 2, 2]
     assert shown["guard/rejected"] == [0, 1, 1, 2]
     for name in ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step"):
-        expected = [getattr(each, name) for each in guard.decisions]
+        values = [getattr(each, name) for each in guard.decisions]
+        expected = [value for value in values if np.isfinite(value)]  # one could not be played
         np.testing.assert_allclose(shown[f"guard/{name}"], expected, rtol=1e-6, atol=1e-6)
+    change = [100 * (each.accepted_cost / each.mpc_cost - 1) for each in guard.decisions]
+    np.testing.assert_allclose(shown["guard/accepted_change_percent"], change, rtol=1e-5)
+    assert len(shown["guard/candidate_change_percent"]) == len(shown["guard/candidate_cost"]) == 3
+    assert all(np.isfinite(values).all() for values in shown.values())
 
 
 def test_verbose_prints_a_line_for_each_decision_and_silence_is_the_default(capsys) -> None:
@@ -164,7 +169,9 @@ def test_verbose_prints_a_line_for_each_decision_and_silence_is_the_default(caps
     assert len(lines) == 3
     assert lines[0].startswith("Episode 1: accepted in part (start ")
     assert lines[1].startswith("Episode 2: rejected (a parameter of the actor is not a finite")
-    assert lines[2].startswith("Episode 3: accepted; mean cost 4, MPC 4.175")
+    assert "candidate not known, accepted policy 4" in lines[1]
+    ends = "candidate 4 (-4.19 %), accepted policy 4 (-4.19 %), MPC 4.175"
+    assert lines[2].startswith("Episode 3: accepted; mean costs: ") and lines[2].endswith(ends)
 
 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
