@@ -13,6 +13,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 import yaml
 from stable_baselines3 import DDPG, TD3
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -171,6 +172,10 @@ def test_no_training_step_explored(run) -> None:
 
 def test_evaluation_keeps_the_best_model_and_the_rewards(run) -> None:
     assert (run.log() / "best_model.zip").is_file()
+    # Which is a candidate; the guard keeps what it accepted beside it.
+    accepted = ALGORITHMS[run.algo].load(run.log() / "accepted_model.zip")
+    own, left = accepted.policy.actor.state_dict(), run.model().policy.actor.state_dict()
+    assert all(th.equal(each, left[name]) for name, each in own.items())
     assert np.load(run.log() / "evaluations.npz")["results"].shape == (1, 1)
 
 

@@ -137,7 +137,7 @@ class Starts:
             mean, mpc = outcome.costs.mean(), self.mpc.costs.mean()
             costs = told_apart(mean, mpc)
             found = f"mean cost {costs[0]} on {len(self.seeds)} new starts, MPC {costs[1]}"
-            if mean > mpc:
+            if is_above(outcome.costs, self.mpc.costs):
                 return found
             little = self.gains_too_little(outcome)
             return f"{found}: too little a gain" if little else f"{found}: not surely below"

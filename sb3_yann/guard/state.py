@@ -161,7 +161,7 @@ def _told(who: str, cost: float, mpc_cost: float) -> str:
     if not math.isfinite(cost):
         return f"{who} not known"
     change = relative_change(cost, mpc_cost)
-    percent = f" ({100 * change:+.2f} %)" if math.isfinite(change) else ""
+    percent = f" ({100 * change:+.3g} %)" if math.isfinite(change) else ""
     return f"{who} {cost:.6g}{percent}"
 
 

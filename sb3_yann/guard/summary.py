@@ -11,6 +11,7 @@ from sb3_yann.policy.policies import YannPolicy
 LITTLE = 1e-3
 """A gain below this, relative to the MPC's cost, is called none."""
 ADVICE = {
+    "too little a gain": "see by headroom(mpc, env) what there is to gain",
     "new starts": "raise n_starts: the known starts do not show what the new ones do",
     "violation": "bound the policy (max_correction), or tighten the MPC's own limits",
     "the env ends": "bound the policy (max_correction), or tighten the MPC's own limits",

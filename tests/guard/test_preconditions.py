@@ -11,7 +11,7 @@ import pytest
 from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import DDPG
 
-from guard_samples import LAW, STEPS, Slide, build, make_guard, train
+from guard_samples import LAW, STEPS, At, Slide, better, build, make_guard, train, verdicts
 from sb3_yann import AcceptanceRule, ImprovementGuard, StepSize
 from sb3_yann.evaluation import evaluate
 from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
@@ -120,6 +120,17 @@ def test_what_is_given_reaches_the_acceptance_and_what_is_not_has_its_default() 
     assert some.settings == {"env": "CSTR-v0", "seeds": range(40, 47), "margin": 0.5, "tail": 0.05}
     bounded = ImprovementGuard(Slide, n_new_starts=4, rule={"largest_step": 2.0}).acceptance
     assert bounded.n_final_starts == 40 and bounded.settings["largest_step"] == 2.0
+
+
+def test_a_simulator_may_be_named_by_its_module_as_in_a_yaml_file() -> None:
+    model, guard = build(learning_rate=0.0), make_guard("guard_samples:Slide", n_new_starts=4)
+    train(model, 8, At([2], better), guard)
+    assert verdicts(guard)[0] == "accepted"
+    assert guard.state.settings["env"] == "guard_samples:Slide"
+    with pytest.raises(
+        ValueError, match="'guard_samples' has no function 'Slid' that makes an env"
+    ):
+        make_guard("guard_samples:Slid")
 
 
 def test_a_simulator_has_the_same_name_in_another_process() -> None:
