@@ -181,7 +181,7 @@ def test_the_first_start_of_several_is_named() -> None:
 
 def test_rounding_adds_up_to_no_loss_however_many_policies_are_accepted_in_turn() -> None:
     mpc = np.array([40.0, 60.0])
-    nothing = np.zeros((2, 4), np.int64)
+    nothing = np.zeros((2, 7))
     accepted = mpc
     for _ in range(50):
         paired = PairedEpisodes(mpc, accepted, nothing, Tolerance(1.0))
