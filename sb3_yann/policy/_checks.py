@@ -44,6 +44,20 @@ def require_plain_td3(algorithm: BaseAlgorithm | None) -> None:
         )
 
 
+def as_gamma(gamma: float | None, algorithm: BaseAlgorithm | None) -> float:
+    """Return the discount that is given, else the algorithm's."""
+    if gamma is not None:
+        return gamma
+    if isinstance(algorithm, TD3):
+        return algorithm.gamma
+    raise ValueError(
+        "YannPolicy does not find the DDPG or TD3 that builds it, and so neither its discount nor "
+        "a VecNormalize. Let the algorithm build it, in the same thread: DDPG(YannPolicy, env). "
+        "For a policy that stands alone, or else, pass the discount: policy_kwargs={'gamma': ...}; "
+        "its observations must then not be normalized."
+    )
+
+
 def require_sb3_kwargs(given: dict[str, Any], own: list[str]) -> None:
     """Raise unless all keywords that are not the policy's ``own`` are SB3's, and make sense."""
     if unknown := [name for name in given if name not in SB3_KWARGS]:
