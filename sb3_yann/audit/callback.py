@@ -64,6 +64,7 @@ class CostAudit(BaseCallback):
     """
 
     model: OffPolicyAlgorithm
+    reward_alone = False  # a guard does not ask where outputs rest
 
     def __init__(
         self, steps: int = 100, tolerance: float = 1e-3, strict: bool = False, verbose: int = 0
@@ -129,7 +130,9 @@ class CostAudit(BaseCallback):
             cause = absolute_observation(self.policy.problem, sample.theta) or cause
         if lost.any():
             cause = not_finite(lost, records, cause)
-        beside = steady_offset(self.policy.problem, sample) if enough else ""
+        beside = ""
+        if enough and not self.reward_alone:
+            beside = steady_offset(self.policy.problem, sample)
         self.finding = judged(sample, cause, self.training_env, beside)
         if beside:
             warnings.warn(beside, SteadyOffsetWarning, stacklevel=2)

@@ -68,11 +68,11 @@ def likely_cause(sample: Sample, tolerance: float) -> Cause:
             Cause(name, text, cure=cure) for name, text, cure in scaled_entries(sample, width)
         ]
         if found := [each for each in causes if each is not None] + scaled:
-            return _all_of(found)
+            return all_of(found)
     return _repeated_action(sample, 20 * tolerance) or UNKNOWN
 
 
-def _all_of(found: list[Cause]) -> Cause:
+def all_of(found: list[Cause]) -> Cause:
     """Return the only cause with its cure, or the first that names the others, without any."""
     first, others = found[0], found[1:]
     if not others:

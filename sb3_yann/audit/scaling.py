@@ -13,7 +13,6 @@ from scipy import optimize
 from sb3_yann._validation import Array
 from sb3_yann.audit.sample import Mask, Sample
 
-
 APART = 0.02
 """Share of a scale by which two explanations differ that are not one and the same."""
 

@@ -51,18 +51,24 @@ def check_not_nested(guard: BaseCallback) -> None:
 
 def check_alone(guard: BaseCallback) -> None:
     """Raise ValueError if another guard is among what was passed to learn."""
+    found = passed_to_learn(guard, type(guard))
+    if len(found) > 1:
+        raise ValueError(
+            f"{len(found)} guards were passed to learn, expected is one: each would restore what "
+            "it accepted itself. Give one guard all starts, by n_starts or a simulator of both."
+        )
+
+
+def passed_to_learn(guard: BaseCallback, kind: type[BaseCallback]) -> list[BaseCallback]:
+    """Return the callbacks of a kind beside a guard, those within others too."""
     waiting, found = [guard.locals.get("callback")], []
     while waiting:
         each = waiting.pop()
         waiting += [*getattr(each, "callbacks", [])]
         waiting += [getattr(each, name, None) for name in ("callback", "callback_on_new_best")]
         waiting = [other for other in waiting if isinstance(other, BaseCallback)]
-        found += [each] if isinstance(each, type(guard)) else []
-    if len(found) > 1:
-        raise ValueError(
-            f"{len(found)} guards were passed to learn, expected is one: each would restore what "
-            "it accepted itself. Give one guard all starts, by n_starts or a simulator of both."
-        )
+        found += [each] if isinstance(each, kind) else []
+    return found
 
 
 def _event_above(

@@ -145,7 +145,7 @@ def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> 
 
 
 def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) -> None:
-    """Raise unless the space is a Box, with one dimension where nothing flattens it."""
+    """Raise unless the space is a Box of floats of one dimension, where no map makes theta."""
     if not isinstance(space, spaces.Box):
         raise TypeError(
             f"{name} is a {type(space).__name__}, YannPolicy needs a Box. "
@@ -156,6 +156,12 @@ def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) ->
             f"{name} has shape {space.shape}, YannPolicy needs one dimension, (n,). "
             "Wrap the env in gymnasium.wrappers.FlattenObservation, observe the plant's state, or "
             "pass policy_kwargs={'observation': AffineObservation(matrix, offset)}."
+        )
+    if name == "observation_space" and not (flattened or np.issubdtype(space.dtype, np.floating)):
+        raise TypeError(
+            f"{name} has dtype {space.dtype}: rounded to whole numbers, it is not the state. Use "
+            "numpy.float32, or say what the numbers mean: policy_kwargs={'observation': "
+            "AffineObservation(matrix, offset)}."
         )
 
 

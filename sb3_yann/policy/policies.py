@@ -29,6 +29,7 @@ from sb3_yann.policy import _checks, _sb3_hooks
 from sb3_yann.policy._features import AffineFeatures
 from sb3_yann.policy._finite import finite_gradient, warn_of_refused_step, watch_buffer
 from sb3_yann.policy._own_parameters import require_own_problem
+from sb3_yann.policy._precision import KeepsPrecision, single_precision
 from sb3_yann.policy.actor_critic import YannActor, YannCritic, layer_for
 from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
 from sb3_yann.policy.observations import AffineObservation, Shown, as_observation
@@ -36,7 +37,7 @@ from sb3_yann.policy.problem_registry import resolve_problem
 from sb3_yann.policy.value_scale import EPS, follow_scale
 
 
-class YannPolicy(TD3Policy):
+class YannPolicy(KeepsPrecision, TD3Policy):
     """A TD3 or DDPG policy that starts as a linear MPC, exactly, with the critic that goes with it.
 
     The actor is the law of the MPC plus networks that are zero at first. The critic is
@@ -202,7 +203,8 @@ class YannPolicy(TD3Policy):
             self._met = weakref.ref(env)
 
     def _build(self, lr_schedule: Schedule) -> None:
-        super()._build(lr_schedule)
+        with single_precision():
+            super()._build(lr_schedule)
         chosen = {name: each for name, each in self.optimizer_kwargs.items() if name != "fused"}
         adam = self.optimizer_class is th.optim.Adam and chosen.keys() <= {"betas", "eps"}
         if adam and (mu := self.actor.mu).n_networks > FEW:
@@ -309,13 +311,16 @@ class YannPolicy(TD3Policy):
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         kwargs |= {"max_correction": self.max_correction, "pin_equilibrium": self.pin_equilibrium}
         kwargs |= {"law": self.law, "networks": self.networks}
-        return YannActor(self.problem, **kwargs).to(self.device)
+        with single_precision():
+            return YannActor(self.problem, **kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannCritic:
         """Return a critic that is the law's value on the linear model, with networks of zero."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         options, pinned = self.critic_options, self.pin_equilibrium
-        return YannCritic(self.problem, self.gamma, options, pinned, **kwargs).to(self.device)
+        with single_precision():
+            critic = YannCritic(self.problem, self.gamma, options, pinned, **kwargs)
+        return critic.to(self.device)
 
     def limit_correction(self, max_correction: float | None) -> None:
         """Bound what the actor's networks may add to the law, as a fraction of the input range.
