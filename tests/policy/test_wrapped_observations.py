@@ -94,7 +94,7 @@ def test_statistics_that_move_are_refused_wherever_an_env_is_met(wrap) -> None:
             evaluate(policy, plant(wrap), [0])
     evaluate(lambda observation: np.zeros(2), plant(wrap), [0])  # others may act on what they like
     with pytest.raises(ValueError, match=match):
-        headroom(MPC, lambda: plant(wrap), 3)
+        headroom(MPC, lambda: plant(wrap))
     with pytest.raises(ValueError, match=match):
         model.learn(1, callback=[NoActionNoise(), ImprovementGuard(lambda: plant(wrap))])
 
@@ -137,7 +137,7 @@ def test_fixed_scales_are_refused_with_the_map_that_undoes_them() -> None:
     undo = str(refused.value).split("'observation': ")[1].split("}")[0]
     undo = eval(undo, {"AffineObservation": AffineObservation})
     model = build(rescaled(), observation=undo)
-    theta = model.policy.theta(rescaled().reset(seed=3)[0]).ravel()
+    theta = model.policy.theta(rescaled().reset(seed=3)[0][None]).ravel()
     np.testing.assert_allclose(theta, boxed().reset(seed=3)[0], atol=1e-5)
     assert np.isclose(
         evaluate(model, rescaled, [3]).costs, evaluate(MPC.explicit(), boxed, [3]).costs, rtol=1e-4

@@ -144,6 +144,11 @@ def _shapes(layer: Any) -> set[tuple[int, ...]]:
     return {shape for shape in shapes if shape}
 
 
+def _space(layer: Any) -> Any:
+    """Return the space of one observation."""
+    return getattr(layer, "single_observation_space", layer.observation_space)
+
+
 def _shape(value: Any) -> tuple[int, ...] | None:
     """Return the shape of numbers, None of anything else."""
     if not isinstance(value, list | tuple) and not hasattr(value, "shape"):
@@ -162,13 +167,13 @@ def _other_observation(layer: Any) -> str:
         mean = np.ravel(layer.obs_rms.mean).tolist()
         return f"AffineObservation.normalized({mean}, {np.ravel(spread).tolist()})"
     if "RescaleObservation" in names:
-        layer = getattr(layer, "wrapper", layer)  # of a vector env
-        inner, to = layer.env.observation_space, (layer.min_obs, layer.max_obs)
-        if all(np.array_equal(*pair) for pair in zip(to, (inner.low, inner.high), strict=True)):
+        shown, meant = _space(layer), _space(layer.env)
+        if np.array_equal([shown.low, shown.high], [meant.low, meant.high]):
             return ""
-        low, high = inner.low.tolist(), inner.high.tolist()
-        ends = tuple(float(np.ravel(each)[0]) for each in to)
-        return f"AffineObservation.rescaled({low}, {high}, {ends})"
+        low, high = (np.asarray(each, np.float64) for each in (meant.low, meant.high))
+        scale = (high - low) / (np.asarray(shown.high, np.float64) - shown.low)
+        mean = np.ravel(low - scale * shown.low).tolist()
+        return f"AffineObservation.normalized({mean}, {np.ravel(scale).tolist()})"
     if names & {"VecFrameStack", "FrameStackObservation"}:
         held = vars(layer)
         frames = held.get("n_stack") or held.get("stack_size") or held["stacked_obs"].n_stack
