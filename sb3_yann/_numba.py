@@ -55,7 +55,10 @@ def _compile(dispatcher: Any, signatures: Sequence[str], keep: bool) -> Any:
     if keep:
         dispatcher.enable_caching()
         # numba looks at the function's own file; what it calls may have changed in another.
-        dispatcher._cache._cache_file._source_stamp = SOURCES
+        kept = dispatcher._cache._cache_file
+        if not hasattr(kept, "_source_stamp"):  # another numba: rather slow than out of date
+            raise AttributeError("numba keeps no stamp of the sources.")
+        kept._source_stamp = SOURCES
     for signature in signatures:
         dispatcher.compile(signature)
     dispatcher.disable_compile()

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, as_between, as_whole
+from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.evaluation.episodes import Source, as_source, make_env, watch_length
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.policies import require_yann_policy
@@ -136,6 +137,7 @@ class SimulatedEpisodes(BaseCallback):
                 "it another one, e.g. its id."
             )
         ours, theirs = self._envs[0], training
+        require_state_shown(ours, self.policy.told)
         if (
             ours.observation_space.shape != theirs.observation_space.shape
             or ours.action_space != theirs.action_space

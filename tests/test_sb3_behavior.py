@@ -81,15 +81,19 @@ def learn(steps: int = STEPS + 1, callback=None, **kwargs):
 
 
 def test_a_policy_is_built_by_a_method_of_its_algorithm() -> None:
-    """policy._sb3_hooks.algorithm_under_construction asks for the frame of that method."""
+    """policy._sb3_hooks.algorithm_under_construction looks for it, or for the learning rate."""
 
     class Asks(TD3Policy):
         def __init__(self, *args, **kwargs) -> None:
-            self.built_by = sys._getframe(1).f_locals.get("self")
+            caller = sys._getframe(1)
+            self.built_by = caller.f_locals.get("self")
+            self.method = caller.f_code.co_name
+            self.same_rate = args[2] is self.built_by.lr_schedule
             super().__init__(*args, **kwargs)
 
     model = DDPG(Asks, Plant(), device="cpu")
     assert model.policy.built_by is model and isinstance(model, BaseAlgorithm)
+    assert model.policy.method == "_setup_model" and model.policy.same_rate
 
 
 def test_ddpg_finds_the_policies_of_td3_by_their_names() -> None:

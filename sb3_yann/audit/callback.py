@@ -64,6 +64,7 @@ class CostAudit(BaseCallback):
     """
 
     model: OffPolicyAlgorithm
+    reward_alone = False  # a guard does not ask where outputs rest
 
     def __init__(
         self, steps: int = 100, tolerance: float = 1e-3, strict: bool = False, verbose: int = 0
@@ -129,7 +130,7 @@ class CostAudit(BaseCallback):
             cause = absolute_observation(self.policy.problem, sample.theta) or cause
         if lost.any():
             cause = not_finite(lost, records, cause)
-        beside = steady_offset(self.policy.problem, sample) if enough else ""
+        beside = self._resting_beside(sample) if enough else ""
         self.finding = judged(sample, cause, self.training_env, beside)
         if beside:
             warnings.warn(beside, SteadyOffsetWarning, stacklevel=2)
@@ -139,6 +140,10 @@ class CostAudit(BaseCallback):
             warnings.warn(self.finding.message, CostMismatchWarning, stacklevel=2)
         elif self.verbose:
             print(f"Cost audit: {self.finding.message}")
+
+    def _resting_beside(self, sample: Sample) -> str:
+        """Return how far outputs rest beside their references, empty where nobody asks."""
+        return "" if self.reward_alone else steady_offset(self.policy.problem, sample)
 
     def _sample(self, records: list[dict[str, Any]], lost: NDArray[np.bool_]) -> Sample:
         """Return the records without the lost ones, after which another episode begins."""

@@ -18,11 +18,15 @@ MOST_REPEATS = 10
 
 
 class Cause(NamedTuple):
-    """A short name, an explanation with what to do, and whether options of the reward may help."""
+    """A short name, an explanation, whether options of the reward may help, and a cure.
+
+    The cure holds where no other cause explains as much; until then it is not in the explanation.
+    """
 
     name: str
     explanation: str
     scales: bool = False
+    cure: str = ""
 
 
 UNKNOWN = Cause(
@@ -49,17 +53,36 @@ def not_finite(
 
 
 def likely_cause(sample: Sample, tolerance: float) -> Cause:
-    """Return the first explanation that is exact, or else the first within the tolerance.
+    """Return what is exact, or else what is within the tolerance; all of it where it is several.
 
     Near a steady state many explanations are nearly right, hence exact ones go first.
     """
     if np.ptp(sample.rewards[sample.counted]) <= 1e-9 * np.abs(sample.rewards).max():
         return Cause("constant", f"every reward is {sample.rewards[0]:g}, whatever happens.")
     for width in (EXACT, tolerance):
-        for explain in _EXPLANATIONS:
-            if (cause := explain(sample, width)) is not None:
-                return cause
+        straight = _straight_line(sample, width)
+        if straight is not None:
+            return straight
+        causes = [explain(sample, width) for explain in _EXPLANATIONS]
+        scaled = [
+            Cause(name, text, cure=cure) for name, text, cure in scaled_entries(sample, width)
+        ]
+        if found := [each for each in causes if each is not None] + scaled:
+            return all_of(found)
     return _repeated_action(sample, 20 * tolerance) or UNKNOWN
+
+
+def all_of(found: list[Cause]) -> Cause:
+    """Return the only cause with its cure, or the first that names the others, without any."""
+    first, others = found[0], found[1:]
+    if not others:
+        return first._replace(explanation=first.explanation + first.cure)
+    listed = " ".join(f"({i}) {each.name}: {each.explanation}" for i, each in enumerate(found, 1))
+    return first._replace(
+        explanation=f"one of {len(found)} that explain these steps equally well, so none is sure. "
+        f"{listed} Compare the env's reward with problem.stage_cost(theta, u) at states and inputs "
+        "far apart before you change anything."
+    )
 
 
 def _straight_line(sample: Sample, tolerance: float) -> Cause | None:
@@ -214,17 +237,10 @@ def _sums(sample: Sample, k: int) -> Iterator[Array]:
     yield np.sum([sample.stage_cost(sample.theta + way * i / k, sample.u) for i in range(k)], 0)
 
 
-def _scaled_entries(sample: Sample, tolerance: float) -> Cause | None:
-    found = scaled_entries(sample, tolerance)
-    return None if found is None else Cause(*found)
-
-
 _EXPLANATIONS = (
-    _straight_line,
     _clipped,
     _timing,
     _sticky_action,
     _normalized_reward,
     _repeated_action,
-    _scaled_entries,
 )

@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.plant_units import MOST, InputUnits, misread_state
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
@@ -50,7 +51,7 @@ class FromOperatingPoint(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
 
 def showing_theta(
-    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC
+    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC, told: bool = False
 ) -> Callable[[], gym.Env[Any, Any]]:
     """Return a function that makes envs that show theta and take deviations.
 
@@ -60,6 +61,8 @@ def showing_theta(
         Makes an env that shows as many values as theta has.
     problem : LinearMPC
         Where it is absolute, an env that takes absolute inputs shows absolute values.
+    told : bool, default False
+        Whether the user said what the env shows.
 
     Raises
     ------
@@ -68,6 +71,7 @@ def showing_theta(
     """
     with closing(make()) as env:
         space = require_vector(env, "action_space")
+        require_state_shown(env, told)
     units = InputUnits.of(problem, space.low, space.high)
     if units is None or units.kind == "deviation":
         return make

@@ -13,6 +13,9 @@ from scipy import optimize
 from sb3_yann._validation import Array
 from sb3_yann.audit.sample import Mask, Sample
 
+APART = 0.02
+"""Share of a scale by which two explanations differ that are not one and the same."""
+
 
 @dataclass(frozen=True)
 class _Quadratic:
@@ -55,29 +58,38 @@ class _Quadratic:
         squares = self.z[:, scaled] ** 2 * weight[scaled]
         # Unscaled entries act together as W says: their part is known, and linear in the shift.
         linear = 2 * self.z @ self.W[:, shifted]
-        columns = np.column_stack([squares, linear, np.ones(len(self.z))])
+        # The square of a shift is a constant: without one, an entry that hardly moves is no other.
+        constant = np.ones((len(self.z), 1 if shifted.any() else 0))
+        columns = np.column_stack([squares, linear, constant])
         size = np.maximum(np.abs(columns).max(axis=0), 1e-300)
         found = np.linalg.lstsq(columns / size, self.implied - fixed, rcond=1e-12)[0] / size
         n = np.count_nonzero(scaled)
         s[scaled] = np.sqrt(np.maximum(found[:n], 1e-12))
-        z0[shifted] = found[n:-1] / s[shifted]
+        z0[shifted] = found[n : n + np.count_nonzero(shifted)] / s[shifted]
         return s, z0
 
 
-def scaled_entries(sample: Sample, tolerance: float) -> tuple[str, str] | None:
-    """Return the name of what fits and an explanation, None where nothing does."""
+def scaled_entries(sample: Sample, tolerance: float) -> list[tuple[str, str, str]]:
+    """Return the names of all that fit with other numbers, with an explanation and a cure.
+
+    What is freer fits as well: it counts where it comes to another point, since then the sample
+    does not tell the two apart.
+    """
     z = np.column_stack([sample.theta, sample.u])
     if (W := _matrix(sample)) is None:
-        return None
+        return []
+    fitting: list[tuple[str, Array, Array]] = []
     quadratic = _Quadratic(z[sample.counted], W, sample.implied[sample.counted])
     moves = np.ptp(quadratic.z, axis=0) > 0
     acts = np.any(W != 0, axis=1) & moves
+    # What stands still has a weight all the same: a saturated input costs the same at each step.
+    weighed = np.any(W != 0, axis=1) & np.any(quadratic.z != 0, axis=0)
     state = np.arange(len(W)) < sample.theta.shape[1]
     none = np.zeros(len(W), dtype=bool)
     for name, scaled, shifted in (
         ("shifted observation", none, acts & state),
         ("rescaled action", acts & ~state, acts & ~state),
-        ("other weights", acts, none),
+        ("other weights", weighed, none),
         ("normalized observation", acts & state, acts & state),
         ("normalized observation and action", acts, acts),
     ):
@@ -87,8 +99,11 @@ def scaled_entries(sample: Sample, tolerance: float) -> tuple[str, str] | None:
         s, z0 = quadratic.fit(scaled, shifted)
         if sample.agrees(quadratic.predicted(s, z0, z), tolerance):
             z0[np.abs(z0) < 1e-5 * np.abs(s)] = 0.0
-            return name, _explanation(name, s, z0, state)
-    return None
+            found = np.r_[s, z0]
+            near = [np.allclose(found, np.r_[each[1:]], rtol=APART, atol=APART) for each in fitting]
+            if not any(near):
+                fitting.append((name, s, z0))
+    return [(name, *_explanation(name, s, z0, state)) for name, s, z0 in fitting]
 
 
 def _matrix(sample: Sample) -> Array | None:
@@ -107,20 +122,21 @@ def _matrix(sample: Sample) -> Array | None:
     return W if np.allclose(np.sum((z @ W) * z, 1) / size, sample.cost / size) else None
 
 
-def _explanation(name: str, s: Array, z0: Array, state: Mask) -> str:
+def _explanation(name: str, s: Array, z0: Array, state: Mask) -> tuple[str, str]:
+    """Return what is the matter, and a cure where there is one other than that."""
     scale, shift = _listed(s[state]), _listed(z0[state])
     u = f"the input {_listed(s[~state])} * action + {_listed(z0[~state])}"
     if name == "rescaled action":
         return (
             f"the cost is that of {u}: a RescaleAction, or an R of another size. Build the "
             "LinearMPC for the inputs that the env takes, with their weight in its reward."
-        )
+        ), ""
     if name == "other weights":
         return (
             f"the reward weighs the entries of theta by {_listed(s[state] ** 2)} and of u by "
             f"{_listed(s[~state] ** 2)} times as much as Q and R of the problem: other weights, or "
             "other units (the square roots of these numbers)."
-        )
+        ), ""
     if name == "shifted observation":
         what = f"theta = obs + {shift}: observations are absolute, or deviations from another point"
         undo = f"deviation({_listed(-z0[state])})"
@@ -129,7 +145,7 @@ def _explanation(name: str, s: Array, z0: Array, state: Mask) -> str:
         what += "observations are normalized"
         undo = f"normalized(mean={shift}, std={scale})"
     undo = f'policy_kwargs={{"observation": AffineObservation.{undo}}}'
-    return f"the cost is that of {what}. Pass {undo}."
+    return f"the cost is that of {what}.", f" Pass {undo}."
 
 
 def _listed(values: Array) -> str:

@@ -13,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
+from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import actor
@@ -73,6 +74,7 @@ class Plant:
         self.yann = require_yann_policy(model.policy, "Commissioning")
         self.problem = self.yann.problem
         normalization_of(model)  # or raise, before anything acts on the plant
+        require_state_shown(env, self.yann.told)
         for name in ("observation_space", "action_space"):
             own, its = getattr(model, name), getattr(env, name)
             if own.shape != its.shape or (

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, as_kind, as_whole
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
+from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.plant_units import InputUnits
 
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
@@ -145,6 +146,7 @@ def evaluate(
     env = env.source if isinstance(env, EnvPool) else as_source(env)
     if isinstance(env, gym.Env):
         _require_same_inputs(policy, env.action_space)
+        _require_state_shown(policy, env)
         episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
     elif isinstance(env, str) and (vector_env := _vector_env(env, len(seeds))) is not None:
         with closing(vector_env):
@@ -155,6 +157,7 @@ def evaluate(
         with closing(own), (pool or own).lend(len(seeds)) as envs:
             for each in envs[:1]:
                 _require_same_inputs(policy, each.action_space)
+                _require_state_shown(policy, each)
             if len({id(each.unwrapped) for each in envs}) < len(envs):
                 raise ValueError(
                     "The function that makes envs returned the same one twice. Make a new one each "
@@ -248,6 +251,14 @@ def _as_batch_function(policy: Predictor | Callable[[Any], Any]) -> Callable[[An
     if callable(policy):
         return lambda observations: [policy(observation) for observation in observations]
     raise TypeError(f"policy = {policy!r} must have a predict method or be callable.")
+
+
+def _require_state_shown(policy: Any, env: gym.Env[Any, Any]) -> None:
+    """Raise if an env does not show a law the state; other policies may take anything."""
+    acts = getattr(policy, "policy", policy)  # a model's
+    owner = getattr(acts, "__self__", acts)  # of a method, such as law.plant_input
+    if isinstance(owner, PiecewiseAffine | OnlineLaw) or hasattr(owner, "told"):
+        require_state_shown(env, getattr(owner, "told", False))
 
 
 def _require_same_inputs(policy: Any, space: Any) -> None:

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_flag, as_options, as_whole
+from sb3_yann.audit.callback import CostAudit
 from sb3_yann.evaluation.episodes import LONG, Source, as_source
 from sb3_yann.evaluation.plots.decisions import plot_decisions
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
@@ -49,8 +50,9 @@ class ImprovementGuard(BaseCallback):
     Candidates, accepted policy and MPC play the same seeded starts in a simulator. Where there is
     none, use :class:`Commissioning`. `docs/guard.md` says when a candidate is refused. A refusal
     restores actor, target actor and the actor's optimizer bit for bit, at once or when ``patience``
-    is over. No random numbers are drawn. The state travels with the model, as
-    ``model.guard_state``: a guard with the same settings goes on there.
+    is over. No random numbers are drawn. The rewards of the first hundred steps are compared with
+    the MPC's stage cost, as by a :class:`CostAudit`, unless one is passed as well. The state
+    travels with the model, as ``model.guard_state``: a guard with the same settings goes on there.
 
     Parameters
     ----------
@@ -110,6 +112,7 @@ class ImprovementGuard(BaseCallback):
     twin: PlantTwin | None = None
     _handler: Handler | None = None
     _has_begun = False
+    _audit: CostAudit | None = None
     _steps: Any = 0  # of each env's present episode, in this learn
 
     def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
@@ -225,6 +228,7 @@ class ImprovementGuard(BaseCallback):
         self._has_begun = True
         self._folder = self._folder_of_accepted()
         self._save_accepted()
+        self._audit_rewards()
         if self.log_path is not None:
             self.session.log_lacks_rows = not begin_record(self.log_path, self.decisions)
 
@@ -242,7 +246,23 @@ class ImprovementGuard(BaseCallback):
             self.model.guard_state = known  # type: ignore[attr-defined]
             raise
 
+    def _audit_rewards(self) -> None:
+        """Begin to compare the first rewards with the stage cost, unless somebody does or did."""
+        passed = all_callbacks(self.locals.get("callback"))
+        if self._audit is None and not any(isinstance(each, CostAudit) for each in passed):
+            self._audit = CostAudit()
+            self._audit.reward_alone = True
+            self._audit.init_callback(self.model)
+            self._audit.on_training_start(self.locals, self.globals)
+
+    def update_child_locals(self, locals_: dict[str, Any]) -> None:
+        """Pass on what SB3 knows at this step."""
+        if self._audit is not None:
+            self._audit.update_locals(locals_)
+
     def _on_step(self) -> bool:
+        if self._audit is not None and self._audit.finding is None:
+            self._audit.on_step()
         dones = self.locals["dones"]
         self.state.episodes += int(np.sum(dones))
         self._warn_of_an_endless_episode(dones)
@@ -294,6 +314,8 @@ class ImprovementGuard(BaseCallback):
         if not self._has_begun:
             return
         self.session.interrupted = False
+        if self._audit is not None and self._audit.finding is None:
+            self._audit.on_training_end()
         try:
             self.acceptance.end(self.session)
         finally:

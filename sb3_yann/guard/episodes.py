@@ -188,6 +188,11 @@ class Unplayable(Exception):
 class _FinitePolicy:
     session: GuardSession
 
+    @property
+    def told(self) -> bool:
+        """Whether the user said what an env shows."""
+        return self.session.policy.told
+
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
         seen = self.session.seen(observation)
         actions, state = self.session.policy.predict(seen, deterministic=deterministic)

@@ -44,6 +44,20 @@ def require_plain_td3(algorithm: BaseAlgorithm | None) -> None:
         )
 
 
+def as_gamma(gamma: float | None, algorithm: BaseAlgorithm | None) -> float:
+    """Return the discount that is given, else the algorithm's."""
+    if gamma is not None:
+        return gamma
+    if isinstance(algorithm, TD3):
+        return algorithm.gamma
+    raise ValueError(
+        "YannPolicy does not find the DDPG or TD3 that builds it, and so neither its discount nor "
+        "a VecNormalize. Let the algorithm build it, in the same thread: DDPG(YannPolicy, env). "
+        "For a policy that stands alone, or else, pass the discount: policy_kwargs={'gamma': ...}; "
+        "its observations must then not be normalized."
+    )
+
+
 def require_sb3_kwargs(given: dict[str, Any], own: list[str]) -> None:
     """Raise unless all keywords that are not the policy's ``own`` are SB3's, and make sense."""
     if unknown := [name for name in given if name not in SB3_KWARGS]:
@@ -131,7 +145,7 @@ def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> 
 
 
 def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) -> None:
-    """Raise unless the space is a Box, with one dimension where nothing flattens it."""
+    """Raise unless the space is a Box of floats of one dimension, where no map makes theta."""
     if not isinstance(space, spaces.Box):
         raise TypeError(
             f"{name} is a {type(space).__name__}, YannPolicy needs a Box. "
@@ -142,6 +156,12 @@ def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) ->
             f"{name} has shape {space.shape}, YannPolicy needs one dimension, (n,). "
             "Wrap the env in gymnasium.wrappers.FlattenObservation, observe the plant's state, or "
             "pass policy_kwargs={'observation': AffineObservation(matrix, offset)}."
+        )
+    if name == "observation_space" and not (flattened or np.issubdtype(space.dtype, np.floating)):
+        raise TypeError(
+            f"{name} has dtype {space.dtype}: rounded to whole numbers, it is not the state. Use "
+            "numpy.float32, or say what the numbers mean: policy_kwargs={'observation': "
+            "AffineObservation(matrix, offset)}."
         )
 
 

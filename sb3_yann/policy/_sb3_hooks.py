@@ -9,17 +9,26 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 
-def algorithm_under_construction() -> BaseAlgorithm | None:
-    """Return the algorithm whose `_setup_model` is building a policy, None where nobody is.
+def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
+    """Return the algorithm that is building a policy, None where nobody is.
 
     SB3 hands a policy its spaces and its learning rate, but not the discount, which the critic
-    needs to be exact; so the caller's frame is asked. Called from a policy's `__init__` only.
+    needs to be exact; so the whole call stack is asked, whatever decorators and factories are on
+    the way. The algorithm is the one whose `_setup_model` is running, or that holds the learning
+    rate. Called from a policy's `__init__` only.
     """
     frame = sys._getframe(1)
-    while frame.f_code.co_name == "__init__" and frame.f_back is not None:
-        frame = frame.f_back
-    caller = frame.f_locals.get("self")
-    return caller if isinstance(caller, BaseAlgorithm) else None
+    while frame is not None:
+        held = frame.f_locals
+        caller = held.get("self")
+        if frame.f_code.co_name == "_setup_model" and isinstance(caller, BaseAlgorithm):
+            return caller
+        for each in held.values():
+            if isinstance(each, BaseAlgorithm):
+                if getattr(each, "lr_schedule", None) is lr_schedule:
+                    return each
+        frame = frame.f_back  # type: ignore[assignment]
+    return None
 
 
 def own_policy_kwargs(algorithm: BaseAlgorithm | None) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.policy._features import SeesTheta, keeps_entries, without_entries
 from sb3_yann.policy._finite import what_is_not_finite
 from sb3_yann.policy._own_parameters import require_own_problem
+from sb3_yann.policy._precision import KeepsPrecision
 from sb3_yann.policy.critic_options import CriticOptions
 
 LONGEST = 100
@@ -31,7 +32,7 @@ LONGEST = 100
 NETWORKS = ("per_region", "shared")
 
 
-class YannActor(SeesTheta, Actor):
+class YannActor(KeepsPrecision, SeesTheta, Actor):
     """SB3's actor with a law and its networks in place of the multi-layer perceptron.
 
     Parameters
@@ -133,7 +134,7 @@ class YannActor(SeesTheta, Actor):
         return {**super()._get_constructor_parameters(), **self.options}
 
 
-class YannCritic(SeesTheta, ContinuousCritic):
+class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
     """SB3's critic with networks that start as the value of the law on the linear plant.
 
     Parameters

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import weakref
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -11,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 from stable_baselines3 import TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
@@ -19,6 +21,7 @@ from torch import nn
 
 from sb3_yann._validation import Array, as_between, as_choice, as_discount, as_flag, as_whole
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.choice import LAWS
 from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
@@ -26,6 +29,7 @@ from sb3_yann.policy import _checks, _sb3_hooks
 from sb3_yann.policy._features import AffineFeatures
 from sb3_yann.policy._finite import finite_gradient, warn_of_refused_step, watch_buffer
 from sb3_yann.policy._own_parameters import require_own_problem
+from sb3_yann.policy._precision import KeepsPrecision, single_precision
 from sb3_yann.policy.actor_critic import YannActor, YannCritic, layer_for
 from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
 from sb3_yann.policy.observations import AffineObservation, Shown, as_observation
@@ -33,7 +37,7 @@ from sb3_yann.policy.problem_registry import resolve_problem
 from sb3_yann.policy.value_scale import EPS, follow_scale
 
 
-class YannPolicy(TD3Policy):
+class YannPolicy(KeepsPrecision, TD3Policy):
     """A TD3 or DDPG policy that starts as a linear MPC, exactly, with the critic that goes with it.
 
     The actor is the law of the MPC plus networks that are zero at first. The critic is
@@ -55,7 +59,7 @@ class YannPolicy(TD3Policy):
         The MPC, the name of a registered one, or ``"module:attribute"``. The default is the
         ``problem`` of the observation space, as our environments have it.
     gamma : float, optional
-        Discount of the critic. The default is the algorithm's, 0.99 without an algorithm.
+        Discount of the critic. The default is that of the algorithm that builds the policy.
     net_arch : dict or list, optional
         Widths of one or two hidden layers, for each network of the actor and for each critic:
         ``{"pi": [16, 16], "qf": [64, 64]}`` by default, with [64, 64] for a shared network.
@@ -130,7 +134,7 @@ class YannPolicy(TD3Policy):
         networks: str | None = None,
         **sb3_kwargs: Any,
     ) -> None:
-        algorithm = _sb3_hooks.algorithm_under_construction()
+        algorithm = _sb3_hooks.algorithm_under_construction(lr_schedule)
         _checks.require_plain_td3(algorithm)
         names = [*inspect.signature(YannPolicy).parameters]
         _checks.require_sb3_kwargs(sb3_kwargs, own=names[names.index("problem") : -1])
@@ -141,18 +145,18 @@ class YannPolicy(TD3Policy):
         if isinstance(problem, str):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             self.saved_kwargs["problem"] = self.problem
-        told = observation is not None
+        # Whether the user said what the env shows.
+        self.told = told = observation is not None
         self.input_units = _checks.as_input_units(self.problem, action_space, told)
         self.observation = as_observation(observation, self.problem, self.input_units)
         _checks.require_theta(self.problem, observation_space, self.observation)
         _checks.warn_of_absolute_inputs(self.problem, algorithm, self.input_units)
-        undone = isinstance(observation, AffineObservation | Mapping)
-        given = self.observation if undone else None
-        _checks.require_undone_normalization(self.problem, algorithm, given)
+        self.undone = isinstance(observation, AffineObservation | Mapping)
+        self._meets(algorithm)
         if told or self.observation is not None:
             self.saved_kwargs["observation"] = self.observation or "deviation"
         self.looked = False  # at the first observation
-        self.gamma = as_discount(getattr(algorithm, "gamma", 0.99) if gamma is None else gamma)
+        self.gamma = as_discount(_checks.as_gamma(gamma, algorithm))
         self.lr_mult = {
             "actor": as_between("actor_lr_mult", actor_lr_mult, 0, np.inf, "[)"),
             "critic": as_between("critic_lr_mult", critic_lr_mult, 0, np.inf, "[)"),
@@ -176,11 +180,31 @@ class YannPolicy(TD3Policy):
             activation_fn=_checks.as_activation(activation_fn),
             **_checks.with_fused_adam(sb3_kwargs),
         )
+        self._algorithm = _as_reference(algorithm)
+        self._met = _as_reference(None if algorithm is None else algorithm.get_env())
         if algorithm is not None:
             watch_buffer(algorithm)
 
+    def _meets(self, algorithm: BaseAlgorithm | None) -> None:
+        """Raise unless the observations of an algorithm's env are what the policy takes."""
+        given = self.observation if self.undone else None
+        _checks.require_undone_normalization(self.problem, algorithm, given)
+        if algorithm is not None and algorithm.get_env() is not None:
+            require_state_shown(algorithm.get_env(), self.told)
+
+    def _meets_another_env(self) -> None:
+        """Do the same where `set_env` has given the algorithm another env since."""
+        algorithm = None if self._algorithm is None else self._algorithm()
+        if algorithm is None or algorithm.policy is not self:
+            return
+        env = algorithm.get_env()
+        if env is not None and (self._met is None or self._met() is not env):
+            self._meets(algorithm)
+            self._met = weakref.ref(env)
+
     def _build(self, lr_schedule: Schedule) -> None:
-        super()._build(lr_schedule)
+        with single_precision():
+            super()._build(lr_schedule)
         chosen = {name: each for name, each in self.optimizer_kwargs.items() if name != "fused"}
         adam = self.optimizer_class is th.optim.Adam and chosen.keys() <= {"betas", "eps"}
         if adam and (mu := self.actor.mu).n_networks > FEW:
@@ -237,6 +261,10 @@ class YannPolicy(TD3Policy):
         state_dict.setdefault(f"{prefix}mean_stage_cost", th.zeros_like(self.mean_stage_cost))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle holds: it is no longer the policy of the algorithm."""
+        return {**self.__dict__, "_algorithm": None, "_met": None}
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or a pickle; torch drops the hooks of optimizers on the way."""
         super().__setstate__(state)  # type: ignore[no-untyped-call]
@@ -256,6 +284,7 @@ class YannPolicy(TD3Policy):
         self, observation: Any, *args: Any, **kwargs: Any
     ) -> tuple[Any, tuple[Any, ...] | None]:
         """Return SB3's prediction; name an absolute observation that is taken for a deviation."""
+        self._meets_another_env()
         predicted = super().predict(observation, *args, **kwargs)
         if not self.looked:
             self.looked = True
@@ -282,13 +311,16 @@ class YannPolicy(TD3Policy):
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         kwargs |= {"max_correction": self.max_correction, "pin_equilibrium": self.pin_equilibrium}
         kwargs |= {"law": self.law, "networks": self.networks}
-        return YannActor(self.problem, **kwargs).to(self.device)
+        with single_precision():
+            return YannActor(self.problem, **kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannCritic:
         """Return a critic that is the law's value on the linear model, with networks of zero."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         options, pinned = self.critic_options, self.pin_equilibrium
-        return YannCritic(self.problem, self.gamma, options, pinned, **kwargs).to(self.device)
+        with single_precision():
+            critic = YannCritic(self.problem, self.gamma, options, pinned, **kwargs)
+        return critic.to(self.device)
 
     def limit_correction(self, max_correction: float | None) -> None:
         """Bound what the actor's networks may add to the law, as a fraction of the input range.
@@ -332,10 +364,14 @@ class YannPolicy(TD3Policy):
             "critic_warmup": self.critic_warmup,
             "max_correction": self.max_correction,
             "pin_equilibrium": self.pin_equilibrium,
-            "observation": self.observation or "deviation",
+            "observation": self.observation or ("deviation" if self.told else None),
             "law": self.law,
             "networks": self.networks,
         }
+
+
+def _as_reference(value: Any) -> weakref.ref[Any] | None:
+    return None if value is None else weakref.ref(value)
 
 
 def _as_correction(value: float | None) -> float | None:

@@ -12,8 +12,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import Array
 from sb3_yann.audit import Headroom
 from sb3_yann.control import LinearMPC, PiecewiseAffine
+from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.choice import Law
-from sb3_yann.evaluation.episodes import Episodes, Predictor, Source, evaluate
+from sb3_yann.evaluation.episodes import Episodes, Predictor, Source, evaluate, one_env
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.simulator_acceptance import name_of
 from sb3_yann.guard.state import GuardState
@@ -150,6 +151,8 @@ class Subject:
         if self.env is None:
             return None
         both: dict[str, Predictor] = {MPC: _Mpc(self), POLICY: _Policy(self)}
+        with one_env(self.env) as env:
+            require_state_shown(env, self.policy.told)
         return {
             name: self._in_deviations(evaluate(act, self.env, self.seeds))
             for name, act in both.items()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import warnings
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
 
 from guard_samples import (
@@ -25,6 +27,7 @@ from guard_samples import (
     train,
     verdicts,
 )
+from sb3_yann import CostAudit, CostMismatchWarning, ImprovementGuard, NoActionNoise
 from weights import last_layer
 
 
@@ -180,3 +183,26 @@ def test_with_other_settings_the_accepted_policy_the_hard_starts_and_the_count_a
     new = {seed for seed in seen if seed is not None} - set(second.state.evidence.seeds)
     assert new
     assert min(new) >= used
+
+
+def _halved(env: gym.Env) -> gym.Env:
+    return gym.wrappers.TransformReward(env, lambda reward: reward / 2)
+
+
+def test_a_guard_names_a_reward_that_is_not_the_cost_once_and_a_passed_audit_alone() -> None:
+    model = DDPG("YannPolicy", _halved(gym.make("CSTR-v0")), seed=0, device="cpu", batch_size=2)
+    guard = ImprovementGuard(lambda: _halved(gym.make("CSTR-v0")), n_starts=2, n_new_starts=0)
+    for callbacks, count in (([guard], 1), ([guard], 0), ([guard, CostAudit()], 1)):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            model.learn(110, callback=[NoActionNoise(), *callbacks])
+        found = [str(each.message) for each in told if each.category is CostMismatchWarning]
+        assert len(found) == count
+        assert all("0.5 times minus the cost" in each for each in found)
+
+
+def test_a_guard_says_nothing_of_a_reward_that_is_the_cost() -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", seed=1, device="cpu", batch_size=2)
+    guard = ImprovementGuard("CSTR-v0", n_starts=2, n_new_starts=0)
+    model.learn(110, callback=[NoActionNoise(), guard])  # a warning would be an error
+    assert guard._audit is not None and guard._audit.finding.matches

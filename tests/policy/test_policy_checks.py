@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import functools
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_yann
 import sb3_yann.wrappers
@@ -23,7 +25,7 @@ from policy_samples import (
     unbounded,
 )
 from sample_plants import LinearPlant
-from sb3_yann import CriticOptions, LinearModel, LinearMPC, YannPolicy
+from sb3_yann import AffineObservation, CriticOptions, LinearModel, LinearMPC, YannPolicy
 
 
 @pytest.mark.parametrize(
@@ -206,3 +208,69 @@ def test_a_normalizing_env_is_refused(normalized) -> None:
     env = VecNormalize(make_vec_env("sb3_yann:CSTR-v0"), **switches)
     with pytest.raises(ValueError, match="VecNormalize"):
         DDPG(YannPolicy, env)
+
+
+def test_a_factory_and_a_decorator_hide_neither_discount_nor_normalization() -> None:
+    class Logged(YannPolicy):
+        pass
+
+    plain = Logged.__init__
+
+    @functools.wraps(plain)
+    def logged(self, *args, **kwargs):
+        return plain(self, *args, **kwargs)
+
+    Logged.__init__ = logged
+    for policy in (Logged, lambda *args, **kwargs: YannPolicy(*args, **kwargs)):
+        assert DDPG(policy, "CSTR-v0", gamma=0.93, device="cpu").policy.gamma == 0.93
+        venv = VecNormalize(DummyVecEnv([lambda: gym.make("CSTR-v0")]), norm_reward=False)
+        with pytest.raises(ValueError, match="VecNormalize still moves its statistics"):
+            DDPG(policy, venv, device="cpu")
+
+
+def test_a_policy_that_an_algorithm_builds_in_its_own_way_has_its_discount() -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", gamma=0.95, device="cpu")
+    again = YannPolicy(model.observation_space, model.action_space, model.lr_schedule)
+    assert again.gamma == 0.95
+
+
+def test_a_policy_that_finds_no_algorithm_says_so_and_takes_a_discount() -> None:
+    env = gym.make("CSTR-v0")
+    spaces_of = env.observation_space, env.action_space, lambda _: 1e-3
+    with pytest.raises(ValueError, match=r"does not find the DDPG or TD3.*policy_kwargs"):
+        YannPolicy(*spaces_of)
+    assert YannPolicy(*spaces_of, gamma=0.97).gamma == 0.97
+
+    def in_a_thread(*args, **kwargs):
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(YannPolicy, *args, **kwargs).result()
+
+    with pytest.raises(ValueError, match="in the same thread"):
+        DDPG(in_a_thread, "CSTR-v0", gamma=0.9, device="cpu")
+
+
+def test_numbers_of_another_type_are_refused_and_the_default_type_does_not_matter() -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", device="cpu", learning_starts=0, batch_size=4)
+    for module in (model.policy, model.actor, model.critic):
+        for change in ("double", "float", "half"):
+            with pytest.raises(TypeError, match=r"cannot become torch\.float"):
+                getattr(module, change)()
+    model.policy.to("cpu")
+    th.set_default_dtype(th.float64)
+    try:
+        wide = DDPG("YannPolicy", "CSTR-v0", device="cpu", learning_starts=0, batch_size=4)
+        wide.learn(10)
+    finally:
+        th.set_default_dtype(th.float32)
+    for ours, theirs in zip(wide.actor.parameters(), model.actor.parameters(), strict=True):
+        assert ours.dtype == theirs.dtype
+
+
+def test_whole_numbers_are_no_state_unless_the_user_says_what_they_mean() -> None:
+    box = spaces.Box(-9, 9, (4,), np.int32)
+    act = gym.make("CSTR-v0").action_space
+    with pytest.raises(TypeError, match="observation_space has dtype int32"):
+        make_policy(box, act, problem="CSTR-v0")
+    seen = AffineObservation(0.01 * np.eye(4))
+    policy = make_policy(box, act, problem="CSTR-v0", observation=seen)
+    np.testing.assert_allclose(policy.theta([[3, -1, 2, 5]]), [[0.03, -0.01, 0.02, 0.05]])

@@ -64,4 +64,5 @@ def actions(low: float = -1, high: float = 1, size: int = 1) -> spaces.Box:
 
 
 def make_policy(observation_space, action_space, **kwargs) -> YannPolicy:
-    return YannPolicy(observation_space, action_space, lambda _: 1e-3, **kwargs)
+    alone = {"gamma": 0.99, **kwargs}
+    return YannPolicy(observation_space, action_space, lambda _: 1e-3, **alone)

@@ -16,6 +16,7 @@ from sb3_yann.control.explicit.budget import SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import require_sane_sizes, solve_explicit
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability, simulation
@@ -137,6 +138,13 @@ class LinearMPC(MPCProblem):
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
+        if idle := np.flatnonzero(~np.any(model.B != 0, axis=0)).tolist():
+            names = labels_of(model)[1]
+            raise ValueError(
+                f"Column {idle} of B is zero: input {', '.join(names[i] for i in idle)} does "
+                "nothing in the model, and so there is nothing to control by it. Look for the "
+                "input's effect in the model's units and sampling time, or leave the input out."
+            )
         sides = (x_min, x_max), (u_min, u_max), (theta_min, theta_max)
         given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute)
         tracking, disturbances, outputs = given.tracking, given.disturbances, given.outputs

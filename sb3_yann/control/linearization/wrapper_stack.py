@@ -1,0 +1,183 @@
+"""What an env's wrappers make of its state: the one walk through them, for all who meet an env."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+LIBRARIES = {"gymnasium", "stable_baselines3"}
+LEAVE_OUT = (
+    "Leave it out. For observations that are scaled by fixed numbers, pass "
+    "policy_kwargs={'observation': AffineObservation.normalized(mean, std)}."
+)
+
+
+def layers_of(env: Any) -> Iterator[Any]:
+    """Yield an env and all that it wraps, outermost first; of a vector env each of its envs."""
+    waiting = [env]
+    while waiting:
+        layer = waiting.pop(0)
+        yield layer
+        held = getattr(layer, "__dict__", {})
+        waiting += [held[name] for name in ("venv", "env") if held.get(name) is not None]
+        waiting += [*(held.get("envs") or [])]
+
+
+def require_state_shown(env: Any, told: bool) -> None:
+    """Raise unless an observation means the same state at any time.
+
+    Unknown wrappers pass. Where states are late or inputs are not applied, it warns.
+
+    Parameters
+    ----------
+    env : gymnasium.Env, VecEnv or gymnasium.vector.VectorEnv
+        Also one whose wrappers are in other processes. A `VecNormalize` is not looked at.
+    told : bool
+        Whether the user said what is shown. Else it must be the parameter of the law.
+
+    Raises
+    ------
+    ValueError
+        If a wrapper scales observations or actions by statistics of its own, or, unless ``told``,
+        rescales or stacks observations.
+    """
+    for layer in layers_of(env):
+        name = type(layer).__name__
+        if _keeps_statistics(layer):
+            raise ValueError(
+                f"{name} scales observations or actions by statistics of its own, which move: the "
+                f"same number means another state at each step, and the law takes the state. "
+                f"{LEAVE_OUT}"
+            )
+        if not told and (undo := _other_observation(layer)):
+            raise ValueError(
+                f"{name} shows other numbers than the state that the law takes. Say what they "
+                f"mean: policy_kwargs={{'observation': {undo}}}, or 'deviation' where the model is "
+                "one of what is shown. A law without a policy takes the env without the wrapper."
+            )
+        if not told and (late := _library_names(layer) & {"DelayObservation", "StickyAction"}):
+            what = "shows past states" if "DelayObservation" in late else "repeats past inputs"
+            warnings.warn(
+                f"{name} {what}, and the law is one of the present state and input. Leave it out, "
+                "or put the inputs that are under way into the model's state.",
+                stacklevel=3,
+            )
+        is_wrapped = getattr(layer, "env_is_wrapped", None)
+        if is_wrapped is not None and "envs" not in vars(layer) and "venv" not in vars(layer):
+            for kind in (KeepsStatistics,) if told else (KeepsStatistics, ShowsOtherNumbers):
+                if any(is_wrapped(kind)):
+                    raise ValueError(
+                        f"A wrapper in the processes of {name} {kind.__doc__} The law takes the "
+                        f"state. {LEAVE_OUT}"
+                    )
+
+
+class _Judged(type):
+    """Classes whose instances are told by what they hold, so that a worker process can ask too."""
+
+    def __instancecheck__(cls, layer: Any) -> bool:
+        return bool(cls.judge(layer))  # type: ignore[attr-defined]
+
+
+class KeepsStatistics(metaclass=_Judged):
+    """scales observations or actions by statistics of its own."""
+
+    @staticmethod
+    def judge(layer: Any) -> bool:
+        """Tell whether a wrapper is one."""
+        return _keeps_statistics(layer)
+
+
+class ShowsOtherNumbers(metaclass=_Judged):
+    """rescales or stacks observations."""
+
+    @staticmethod
+    def judge(layer: Any) -> str:
+        """Return how to undo it, empty for other wrappers."""
+        return _other_observation(layer)
+
+
+def _library_names(layer: Any) -> set[str]:
+    """Return the names of a layer's classes that are a library's."""
+    return {each.__name__ for each in type(layer).__mro__ if _library(each) in LIBRARIES}
+
+
+def _library(kind: type) -> str:
+    return kind.__module__.split(".")[0]
+
+
+def _keeps_statistics(layer: Any) -> bool:
+    """Tell whether a layer holds means and spreads of what it passes on, and moves them.
+
+    Those of rewards, which have no entry for each observation, do not count.
+    """
+    if "VecNormalize" in _library_names(layer):
+        return False  # what it says can be undone, once it is frozen
+    if getattr(layer, "update_running_mean", None) is False:
+        return False  # gymnasium's NormalizeObservation, frozen: fixed numbers
+    held = {name.lower(): value for name, value in getattr(layer, "__dict__", {}).items()}
+    shapes = _shapes(layer)
+    of_entries = {name for name, value in held.items() if _shape(value) in shapes}
+    for name, value in held.items():
+        parts = getattr(value, "mean", None), getattr(value, "var", None)
+        moves = hasattr(value, "update") or hasattr(value, "count")
+        if moves and all(each is not None and not callable(each) for each in parts):
+            if _shape(parts[0]) in shapes or any(part in name for part in ("obs", "act", "state")):
+                return True
+    if any(part in name for name in of_entries for part in ("running", "moving", "ema_")):
+        return True
+    means = any("mean" in name for name in of_entries)
+    spreads = any(part in name for name in of_entries for part in ("var", "std", "m2", "sigma"))
+    counts = {name.strip("_") for name in held} & {"count", "n", "num", "n_samples", "n_seen"}
+    return means and spreads and bool(counts)
+
+
+def _shapes(layer: Any) -> set[tuple[int, ...]]:
+    """Return the shapes of a layer's observations and actions, on both sides of it."""
+    kinds = ("observation_space", "action_space", "single_observation_space", "single_action_space")
+    sides = [layer, *(vars(layer).get(name) for name in ("env", "venv") if hasattr(layer, name))]
+    spaces = [getattr(side, kind, None) for side in sides for kind in kinds]
+    shapes = {getattr(space, "shape", None) for space in spaces}
+    return {shape for shape in shapes if shape}
+
+
+def _space(layer: Any) -> Any:
+    """Return the space of one observation."""
+    return getattr(layer, "single_observation_space", layer.observation_space)
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """Return the shape of numbers, None of anything else."""
+    if not isinstance(value, list | tuple) and not hasattr(value, "shape"):
+        return None
+    try:
+        return np.shape(value)
+    except ValueError:  # a list of unequal ones
+        return None
+
+
+def _other_observation(layer: Any) -> str:
+    """Return the map that undoes a library's wrapper, empty where there is nothing to undo."""
+    names = _library_names(layer)
+    if "NormalizeObservation" in names:  # a frozen one: the others have been refused
+        spread = np.sqrt(layer.obs_rms.var + layer.epsilon)
+        mean = np.ravel(layer.obs_rms.mean).tolist()
+        return f"AffineObservation.normalized({mean}, {np.ravel(spread).tolist()})"
+    if "RescaleObservation" in names:
+        shown, meant = _space(layer), _space(layer.env)
+        if np.array_equal([shown.low, shown.high], [meant.low, meant.high]):
+            return ""
+        low, high = (np.asarray(each, np.float64) for each in (meant.low, meant.high))
+        scale = (high - low) / (np.asarray(shown.high, np.float64) - shown.low)
+        mean = np.ravel(low - scale * shown.low).tolist()
+        return f"AffineObservation.normalized({mean}, {np.ravel(scale).tolist()})"
+    if names & {"VecFrameStack", "FrameStackObservation"}:
+        held = vars(layer)
+        frames = held.get("n_stack") or held.get("stack_size") or held["stacked_obs"].n_stack
+        inner = held.get("venv") or held.get("env")
+        size = int(np.prod(inner.observation_space.shape))
+        return f"AffineObservation.newest_frame({size}, {frames})" if frames > 1 else ""
+    return ""
