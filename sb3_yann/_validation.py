@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
 
@@ -110,6 +110,16 @@ def as_output_rows(
             f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
         )
     return entries.astype(int)
+
+
+def as_indices(name: str, value: Sequence[int], size: int) -> tuple[int, ...]:
+    """Return different whole numbers below ``size``, in order."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise TypeError(f"{name} = {_short(value)} must be a list of indices, e.g. [0].")
+    found = sorted(as_whole(name, each, 0) for each in value)
+    if len({*found}) < len(found) or (found and found[-1] >= size):
+        raise ValueError(f"{name} = {found} must be different indices below {size}.")
+    return tuple(found)
 
 
 def as_number(name: str, value: Any, hint: str = "") -> float:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -246,7 +245,8 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         model = LinearModel.from_dynamics(self.rate, x, u, self.dt, scale=scale)
         if offset_free:
             E = np.diag(DISTURBED * scale[: len(x)])
-            model = replace(model, E=E, d_ss=np.zeros(len(x)))
+            own = {"E": E, "d_ss": np.zeros(len(x)), "estimated": range(len(x))}
+            model = LinearModel(**{**vars(model), **own})
         return model.named(self.state_names, self.input_names, self.units)
 
     def _box(self) -> tuple[Array, Array]:

@@ -77,6 +77,7 @@ def export(options: Namespace) -> None:
         precision="float" if options.float else "double",
         absolute=options.absolute,
         checks=checks_of(options.checks),
+        observer=options.observer,
     )
     print(f"Written: {written}")
 

@@ -108,6 +108,12 @@ def _add_plant(commands: Any) -> None:
     one.add_argument(
         "--checks", metavar="FILE.json", help="limits of readings, and how to fall back"
     )
+    one.add_argument(
+        "--observer",
+        choices=("none", "caller"),
+        default="none",
+        help="who estimates what an observer does: an export holds none",
+    )
     one.set_defaults(run=actions.export)
 
     one = commands.add_parser("commission", help="improve a model on its plant, batch by batch")

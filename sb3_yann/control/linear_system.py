@@ -28,6 +28,8 @@ class LinearSystem(ReadOnlyArrays):
         Remarks, and the measured motion in one sample at the operating point.
     state_names, input_names, units : tuple of str, of n, m and n + m entries
         Empty where there are none.
+    estimated : tuple of int
+        Which disturbances an observer estimates.
     """
 
     A: Array
@@ -42,6 +44,7 @@ class LinearSystem(ReadOnlyArrays):
     state_names: tuple[str, ...] = ()
     input_names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
+    estimated: tuple[int, ...] = ()
 
     @property
     def n_states(self) -> int:
@@ -55,8 +58,13 @@ class LinearSystem(ReadOnlyArrays):
 
     @property
     def n_disturbances(self) -> int:
-        """Number of measured disturbances d."""
+        """Number of disturbances d, measured and estimated."""
         return int(self.E.shape[1])
+
+    @property
+    def measured(self) -> tuple[int, ...]:
+        """Which disturbances are not said to be estimated."""
+        return tuple(i for i in range(self.n_disturbances) if i not in self.estimated)
 
 
 def names(sizes: Sequence[int]) -> list[str]:

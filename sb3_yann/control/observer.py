@@ -20,10 +20,13 @@ class DisturbanceObserver:
     """A steady-state Kalman filter for the state and a constant disturbance: offset-free MPC.
 
     The model is augmented to ``x+ = A x + B u + E d``, ``d+ = d``, ``y = C x``. In the theta of a
-    :class:`LinearMPC` with the same model, ``d_hat`` replaces a measured disturbance. Measured
-    tracked outputs then settle without offset (Pannocchia & Rawlings, Disturbance models for
-    offset-free model-predictive control, AIChE J. 49, 2003). With fewer disturbances than measured
-    outputs, E must describe the disturbance.
+    :class:`LinearMPC` with the same model, ``d_hat`` stands for the disturbance that nothing
+    measures. Measured tracked outputs then settle without offset (Pannocchia & Rawlings,
+    Disturbance models for offset-free model-predictive control, AIChE J. 49, 2003). With fewer
+    disturbances than measured outputs, E must describe the disturbance.
+
+    Where the model says which of its disturbances are ``estimated``, the others are measured, and
+    :meth:`update` is told them. Else it estimates all of them.
 
     Parameters
     ----------
@@ -66,13 +69,16 @@ class DisturbanceObserver:
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
-        n, d = model.n_states, model.n_disturbances
+        known = [*model.measured] if model.estimated else []
+        n, d = model.n_states, model.n_disturbances - len(known)
         self.model = model
         self.C = as_outputs("measured", np.eye(n) if measured is None else measured, n)
-        _require_observable(model, self.C)
+        E = np.delete(model.E, known, axis=1)
+        _require_observable(model, E, self.C)
         q = len(self.C)
-        self.A = np.block([[model.A, model.E], [np.zeros((d, n)), np.eye(d)]])
+        self.A = np.block([[model.A, E], [np.zeros((d, n)), np.eye(d)]])
         self.B = np.vstack([model.B, np.zeros((d, model.n_inputs))])
+        self.E = np.vstack([model.E[:, known], np.zeros((d, len(known)))])
         self.seen = np.hstack([self.C, np.zeros((q, d))])
         moves = as_positive_vector("state_noise", state_noise, n, STANDARD)
         drifts = as_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD)
@@ -95,6 +101,16 @@ class DisturbanceObserver:
         return len(self.C)
 
     @property
+    def n_estimated(self) -> int:
+        """Number of estimated disturbances."""
+        return len(self.A) - self.model.n_states
+
+    @property
+    def n_told(self) -> int:
+        """Number of measured disturbances, which :meth:`update` is told."""
+        return int(self.E.shape[1])
+
+    @property
     def x_hat(self) -> Array:
         """The estimated state (n,)."""
         return self.estimate[: self.model.n_states].copy()
@@ -107,29 +123,36 @@ class DisturbanceObserver:
     def reset(self, y: ArrayLike) -> tuple[Array, Array]:
         """Restart with d_hat = 0 and the smallest x_hat that gives y (q,); return both."""
         start = self._smallest @ as_array("y", y, (self.n_measured,))
-        self.estimate = np.concatenate([start, np.zeros(self.model.n_disturbances)])
+        self.estimate = np.concatenate([start, np.zeros(self.n_estimated)])
         return self.x_hat, self.d_hat
 
-    def update(self, y: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        """Return x_hat (n,) and d_hat (d,) from y (q,) now and the last input u (m,)."""
+    def update(self, y: ArrayLike, u: ArrayLike, d: ArrayLike | None = None) -> tuple[Array, Array]:
+        """Return x_hat (n,) and d_hat, from y (q,) now, and the last input u (m,).
+
+        Measured disturbances d are those that acted together with u.
+        """
         now = as_array("y", y, (self.n_measured,))
-        predicted = self._after(u)
+        predicted = self._after(u, d)
         self.estimate = predicted + self.gain @ (now - self.seen @ predicted)
         return self.x_hat, self.d_hat
 
-    def expected(self, u: ArrayLike) -> Array:
-        """Return the outputs y (q,) that the estimate makes expect after the input u (m,)."""
-        return np.asarray(self.seen @ self._after(u))
+    def expected(self, u: ArrayLike, d: ArrayLike | None = None) -> Array:
+        """Return the outputs y (q,) that the estimate makes expect after u (m,) and measured d."""
+        return np.asarray(self.seen @ self._after(u, d))
 
     @cached_property
     def _smallest(self) -> Array:
         """The matrix (n, q) from outputs to the smallest state that gives them."""
         return np.asarray(np.linalg.pinv(self.C))
 
-    def _after(self, u: ArrayLike) -> Array:
-        return np.asarray(
-            self.A @ self.estimate + self.B @ as_array("u", u, (self.model.n_inputs,))
-        )
+    def _after(self, u: ArrayLike, d: ArrayLike | None) -> Array:
+        if (d is None) != (self.n_told == 0):
+            raise ValueError(
+                f"d = {d!r}, but the observer is told {self.n_told} measured disturbances: those "
+                "of its model that are not `estimated`. Pass what acted together with u."
+            )
+        moved = self.A @ self.estimate + self.B @ as_array("u", u, (self.model.n_inputs,))
+        return np.asarray(moved if d is None else moved + self.E @ as_array("d", d, (self.n_told,)))
 
     def _kalman_gain(self, moves: Array, drifts: Array, errors: Array) -> Array:
         """Return the steady-state gain of the filter from the standard deviations."""
@@ -154,9 +177,9 @@ class DisturbanceObserver:
         return lqr.spectral_radius((np.eye(len(self.A)) - gain @ self.seen) @ self.A)
 
 
-def _require_observable(model: LinearModel, C: Array) -> None:
+def _require_observable(model: LinearModel, E: Array, C: Array) -> None:
     """Raise unless the augmented model is detectable (Pannocchia & Rawlings 2003, Lemma 1)."""
-    n, d, q = model.n_states, model.n_disturbances, len(C)
+    n, d, q = model.n_states, E.shape[1], len(C)
     if d == 0:
         hint = "pass its matrix E, e.g. E = B for a load at the input."
         raise ValueError(f"The model has no disturbance to estimate: {hint}")
@@ -167,12 +190,13 @@ def _require_observable(model: LinearModel, C: Array) -> None:
                 f"The measurements do not see an unstable mode: eigenvalue {pole:.6g} of A is not "
                 "observable through C. Measure another output."
             )
-    rank = _rank(np.block([[model.A - np.eye(n), model.E], [C, np.zeros((q, d))]]))
+    rank = _rank(np.block([[model.A - np.eye(n), E], [C, np.zeros((q, d))]]))
     if rank < n + d:
         raise ValueError(
             f"The {q} measured outputs do not determine the {d} disturbances at steady state: "
             f"[[A - I, E], [C, 0]] has rank {rank}, needed is {n + d}. Have at most as many "
-            "disturbances as measured outputs, and none that the outputs cannot tell apart."
+            "disturbances as measured outputs, and none that the outputs cannot tell apart. Where "
+            "a sensor measures some of them, name the others: LinearModel(..., estimated=[...])."
         )
 
 

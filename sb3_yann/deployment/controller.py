@@ -147,6 +147,8 @@ class Controller:
     name : str
     obs_names, action_names : tuple of str
         What the entries are called.
+    note : str
+        What it lacks, such as an observer that the caller runs; empty where nothing.
 
     Examples
     --------
@@ -188,8 +190,15 @@ class Controller:
             )
         _check(self.data)
         self.name, self.activation = str(self.data["name"]), str(self.data["activation"])
+        self.note = str(self.data.get("note", ""))
         self.obs_names = tuple(map(str, self.data["obs_names"]))
         self.action_names = tuple(map(str, self.data["action_names"]))
+
+    def __repr__(self) -> str:
+        """Name the entries, who acted last, and what it lacks."""
+        said = f"{self.name!r}, obs={[*self.obs_names]}, action={[*self.action_names]}"
+        lacks = f", NOTE: {self.note}" if self.note else ""
+        return f"Controller({said}, mode={self.mode!r}{lacks})"
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Controller:

@@ -8,9 +8,9 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from sb3_yann._validation import Array
-from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine
-from sb3_yann.control.model.labels import labels_of
+from sb3_yann._validation import Array, as_choice
+from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
+from sb3_yann.control.model.labels import labels_of, missing_observer
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.controller import FORMAT
@@ -21,13 +21,17 @@ from sb3_yann.policy._features import AffineFeatures, keeps_entries
 from sb3_yann.policy.policies import YannPolicy
 
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.ELU: "elu"}
+NO_ONE, CALLER = "none", "caller"
+"""Who runs an observer of disturbances."""
 Arrays = dict[str, Any]
 Exportable = BaseAlgorithm | YannPolicy | LinearMPC | PiecewiseAffine | OnlineLaw
 Units = tuple[Array, Array, Array, Array]
 """theta = matrix @ obs + offset, and action = scale * (what lies in [-1, 1]) + shift."""
 
 
-def describe(given: Exportable, name: str, checks: Checks, absolute: bool = False) -> Arrays:
+def describe(
+    given: Exportable, name: str, checks: Checks, absolute: bool = False, observer: str = NO_ONE
+) -> Arrays:
     """Return the arrays of a controller.
 
     Parameters
@@ -42,6 +46,8 @@ def describe(given: Exportable, name: str, checks: Checks, absolute: bool = Fals
     absolute : bool, default False
         Whether it takes theta and puts out inputs as the plant has them, not as the env or the
         law does.
+    observer : {"none", "caller"}, default "none"
+        Who runs the observer of estimated disturbances.
 
     Raises
     ------
@@ -49,16 +55,19 @@ def describe(given: Exportable, name: str, checks: Checks, absolute: bool = Fals
         If there is no export of it: the message says why.
     """
     policy = given.policy if isinstance(given, BaseAlgorithm) else given
-    if isinstance(policy, YannPolicy):
-        return _of_policy(policy, name, checks, absolute)
-    if not isinstance(policy, LinearMPC | PiecewiseAffine | OnlineLaw):
+    if not isinstance(policy, YannPolicy | LinearMPC | PiecewiseAffine | OnlineLaw):
         raise TypeError(
             f"{type(given).__name__} cannot be exported: pass a model with a YannPolicy, a "
             "LinearMPC, or a law from LinearMPC.explicit()."
         )
+    note = _note(policy.problem.model if isinstance(policy, YannPolicy) else policy.model, observer)
+    if isinstance(policy, YannPolicy):
+        return _of_policy(policy, name, checks, absolute) | {"note": note}
     law = _explicit(policy.law() if isinstance(policy, LinearMPC) else policy)
     states, inputs = _names(law)
     shown = [*states, *(f"theta[{i}]" for i in range(len(states), law.n_theta))]
+    if isinstance(policy, LinearMPC):
+        shown = _labels(policy)
     arrays = {
         **law_arrays(law),
         **_no_networks(law),
@@ -67,7 +76,32 @@ def describe(given: Exportable, name: str, checks: Checks, absolute: bool = Fals
         "watched": np.arange(law.n_theta) < len(states),
     }
     units = _plant_units(law) if absolute else _own_units(law)
-    return arrays | _with_units(name, law, units, shown, inputs)
+    return arrays | _with_units(name, law, units, shown, inputs) | {"note": note}
+
+
+def _note(model: LinearModel | None, observer: str) -> str:
+    """Return what the export lacks; raise where nobody has said that he knows."""
+    lacks = "" if model is None else missing_observer(model)
+    if as_choice("observer", observer, (NO_ONE, CALLER)) == NO_ONE and lacks:
+        raise ValueError(
+            f"{lacks} An export does not hold it, and does not reach its set-points without it. If "
+            "your code runs the observer and passes what it estimates: export(..., "
+            'observer="caller").'
+        )
+    return lacks
+
+
+def _labels(problem: LinearMPC) -> list[str]:
+    """Return what the entries of theta are called, and whence disturbances come."""
+    labels, first = [*problem.labels()], problem.layout.disturbance.start
+    for i in range(problem.model.n_disturbances):
+        estimated = i in problem.model.estimated
+        labels[first + i] += (
+            " (estimated by the caller's observer)"
+            if estimated
+            else " (from the caller's sensor or observer)"
+        )
+    return labels
 
 
 def _of_policy(policy: YannPolicy, name: str, checks: Checks, absolute: bool) -> Arrays:
@@ -84,7 +118,7 @@ def _of_policy(policy: YannPolicy, name: str, checks: Checks, absolute: bool) ->
     units: Units = matrix, offset, scale_within(half, middle, low, high), middle
     if absolute:
         units = _plant_units(law)
-    names = list(problem.labels()) if kept else [f"obs[{i}]" for i in range(matrix.shape[1])]
+    names = _labels(problem) if kept else [f"obs[{i}]" for i in range(matrix.shape[1])]
     states = np.zeros(law.n_theta, bool)
     states[problem.layout.state] = True
     arrays = {

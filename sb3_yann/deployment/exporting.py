@@ -15,7 +15,7 @@ from sb3_yann._validation import as_choice, as_flag, as_options
 from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.cost import Cost, cost_of
-from sb3_yann.deployment.describe import Arrays, Exportable, describe
+from sb3_yann.deployment.describe import NO_ONE, Arrays, Exportable, describe
 from sb3_yann.deployment.fmu import fmu_file
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.rounding import PRECISIONS
@@ -38,6 +38,8 @@ class Exported:
         Tables, and the operations of a step at worst.
     digest : str
         Of the arrays: two exports of the same controller have the same.
+    note : str
+        What the controller lacks; empty where nothing.
 
     Examples
     --------
@@ -50,12 +52,14 @@ class Exported:
     sizes: tuple[int, ...]
     cost: Cost
     digest: str
+    note: str = ""
 
     def __str__(self) -> str:
         """Say it in words."""
         pairs = zip(self.paths, self.sizes, strict=True)
         written = ", ".join(f"{path} ({size / 1000:.1f} kB)" for path, size in pairs)
-        return f"{written}; {self.cost}; digest {self.digest}"
+        lacks = f". NOTE: {self.note}" if self.note else ""
+        return f"{written}; {self.cost}; digest {self.digest}{lacks}"
 
 
 def export(
@@ -67,6 +71,7 @@ def export(
     precision: str = "double",
     absolute: bool = False,
     checks: Checks | None = None,
+    observer: str = NO_ONE,
 ) -> Exported:
     """Write a controller that runs without this package, as a file or as code.
 
@@ -96,6 +101,9 @@ def export(
     checks : Checks, optional
         Limits of the readings and how to fall back. By default only what is not finite is a fault,
         and late steps where the time is told.
+    observer : {"none", "caller"}, default "none"
+        Who runs the observer of estimated disturbances, as of :func:`offset_free`: an export holds
+        none, and is refused for such a problem unless the caller does. Every file says so then.
 
     Returns
     -------
@@ -128,10 +136,10 @@ def export(
     if kind in ("st", "xml") and called.upper() in RESERVED:
         raise ValueError(f"name = {called!r} is a word of Structured Text. Pass another name.")
     own = as_options("checks", checks or Checks(), Checks)
-    data = describe(given, called, own, as_flag("absolute", absolute))
+    data = describe(given, called, own, as_flag("absolute", absolute), observer)
     paths = FORMATS[kind](data, target, precision)
     sizes = tuple(each.stat().st_size for each in paths)
-    return Exported(tuple(paths), sizes, cost_of(data), digest_of(data))
+    return Exported(tuple(paths), sizes, cost_of(data), digest_of(data), str(data["note"]))
 
 
 def digest_of(data: Arrays) -> str:
@@ -171,10 +179,11 @@ def _write_fmu(data: Arrays, path: Path, precision: str) -> list[Path]:
 
 
 def _about(data: Arrays) -> str:
-    return (
+    said = (
         f"{data['name']}, a controller, written by sb3-yann {version('sb3-yann')}; "
         f"digest {digest_of(data)}."
     )
+    return f"{said}\nNOTE: {data['note']}" if data["note"] else said
 
 
 def write_texts(texts: Mapping[Path, str | bytes]) -> list[Path]:

@@ -61,7 +61,9 @@ def onnx_model(data: Arrays, precision: str, digest: str) -> bytes:
     model = onnx.helper.make_model(whole, producer_name="sb3-yann", opset_imports=opset)
     model.ir_version = 8  # what runtimes of that opset read
     names = {key: ", ".join(map(str, data[key])) for key in ("obs_names", "action_names")}
-    onnx.helper.set_model_props(model, {"digest": digest, **names})
+    note = {"note": str(data["note"])} if data["note"] else {}
+    onnx.helper.set_model_props(model, {"digest": digest, **names, **note})
+    model.doc_string = str(data["note"])
     onnx.checker.check_model(model)
     found: bytes = model.SerializeToString()
     return found

@@ -12,7 +12,7 @@ import torch as th
 from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
-from sb3_yann.control.model.labels import labels_of, with_units
+from sb3_yann.control.model.labels import labels_of, missing_observer, with_units
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.evaluation.episodes import Episodes
 from sb3_yann.evaluation.plots import regions_figure
@@ -34,7 +34,9 @@ def plant_part(subject: Subject) -> Part:
     point += [
         [name, "input", number(value)] for name, value in zip(inputs, model.u_ss, strict=True)
     ]
-    point += [[f"d[{i}]", "disturbance", number(value)] for i, value in enumerate(model.d_ss)]
+    kinds = ["estimated disturbance" if i in model.estimated else "disturbance"
+             for i in range(model.n_disturbances)]  # fmt: skip
+    point += [[f"d[{i}]", kinds[i], number(value)] for i, value in enumerate(model.d_ss)]
     labels, shift = problem.labels(units=True), problem.theta_ss
     box = [
         [name, number(low), number(high)]
@@ -51,6 +53,7 @@ def plant_part(subject: Subject) -> Part:
         ["where the MPC has no solution", problem.infeasible.replace("_", " ")],
         ["penalty of a unit of a broken soft bound", number(soft) if soft else "no soft bounds"],
     ]
+    found = (Finding("note", missing_observer(model)),) if model.estimated else ()
     return Part(
         "Plant and problem",
         join(
@@ -66,6 +69,7 @@ def plant_part(subject: Subject) -> Part:
                 lines(model.report()),
             ]
         ),
+        found,
     )
 
 

@@ -38,9 +38,9 @@ def reidentified(
     if problem.layout.has_constants:  # else the residual has no constant term
         x, u = _rest(problem, A, B, residual.predict(middle)[0])
     note = f"Re-identified from {len(log)} episodes: {choices[chosen].name}."
-    point = model.x_ss + x, model.u_ss + u, E, model.d_ss
-    names = {"state_names": model.state_names, "input_names": model.input_names}
-    found = LinearModel(A, B, model.dt, *point, notes=[note], units=model.units, **names)
+    own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}
+    own |= {"notes": [*model.notes, note], "drift": None}
+    found = LinearModel(**{**vars(model), **own})
     return _with(problem, found, x, u)
 
 

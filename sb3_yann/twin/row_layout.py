@@ -58,6 +58,12 @@ class RowLayout:
                 f"observer has {its} states, inputs and disturbances, the problem {own}. Give the "
                 "observer of this problem's disturbances, all of them."
             )
+        if observer.n_told:
+            raise ValueError(
+                f"The observer is told {observer.n_told} measured disturbances. A twin or a "
+                "simulator of an observer with both kinds of disturbances is not there yet: "
+                "train and compare in the env itself, as ImprovementGuard does."
+            )
         n = model.n_states
         for name, matrix in (("C", observer.C), ("gain of the states", observer.gain[:n])):
             if matrix.shape != (n, n) or not np.linalg.cond(matrix) < SINGULAR:

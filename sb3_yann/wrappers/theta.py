@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +19,7 @@ from sb3_yann.wrappers.appending import Appending, joined
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 from sb3_yann.wrappers.units import Deviations
 
+AWrapper = TypeVar("AWrapper", bound="gym.Wrapper[Any, Any, Any, Any]")
 Schedule = Callable[[int], ArrayLike]
 """The reference after so many steps of an episode."""
 
@@ -195,7 +196,7 @@ class MeasuredDisturbance(Appending):
     Over :class:`Deviations` it counts from the operating point as well: ``d_ss`` is taken off.
 
     An entry that is no finite number is named, and the last one that was holds: at first 0, the
-    operating point, or the nearest bound to it.
+    operating point, or the nearest bound to it. :class:`ObserveDisturbance` comes after it.
 
     Parameters
     ----------
@@ -218,6 +219,11 @@ class MeasuredDisturbance(Appending):
 
     def __init__(self, env: Env, low: ArrayLike, high: ArrayLike, key: str = "disturbance") -> None:
         super().__init__(env, low, high)
+        if _below(env, ObserveDisturbance) is not None:
+            raise ValueError(
+                "The env is in ObserveDisturbance already, whose observer would take the measured "
+                "disturbance for an unknown one. Wrap it in MeasuredDisturbance first."
+            )
         self.d_ss: Array = _operating_disturbance(env, self.low)
         if not isinstance(key, str):
             raise TypeError(f"key = {key!r} must be a str, the entry of info that holds d.")
@@ -247,14 +253,38 @@ class MeasuredDisturbance(Appending):
         return joined(observation, self.held)
 
 
+def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
+    """Return the outermost wrapper of a kind in an env, None where there is none."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, kind):
+            return env
+        env = env.env
+    return None
+
+
 def _operating_disturbance(env: Env, low: Array) -> Array:
     """Return what measured disturbances (d,) count from: d_ss of a `Deviations` below."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
-        if isinstance(inner, Deviations) and inner.d_ss.shape == low.shape:
-            return inner.d_ss
-        inner = inner.env
-    return np.zeros_like(low)
+    units = _below(env, Deviations)
+    return units.d_ss if units is not None and units.d_ss.shape == low.shape else np.zeros_like(low)
+
+
+def _require_told(observer: DisturbanceObserver, measured: MeasuredDisturbance | None) -> None:
+    """Raise unless an observer knows which disturbances the env measures, and comes after them."""
+    shown = 0 if measured is None else len(measured.low)
+    model, told = observer.model, observer.n_told
+    if shown != told:
+        raise ValueError(
+            f"The env measures {shown} disturbances (MeasuredDisturbance), but the observer is "
+            f"told {told}: what it is not told it takes for unknown, and it would count twice. "
+            "Wrap the plant in MeasuredDisturbance first, and give the observer the MPC's model "
+            "with E of all disturbances, the measured ones first: LinearModel(A, B, dt, E=E, "
+            "estimated=[...])."
+        )
+    if told and model.estimated[0] < told:
+        raise ValueError(
+            f"estimated = {[*model.estimated]}: theta holds the measured disturbances before the "
+            "estimated ones. Sort the columns of E so."
+        )
 
 
 def _require_deviations(env: Env, u_ss: Array) -> None:
@@ -275,7 +305,8 @@ class ObserveDisturbance(Appending):
     """Puts the estimated state in place of the measurement, and appends the disturbance d (d,).
 
     The first entries of the env's observation are the measured outputs y (q,) of the observer; what
-    other wrappers have appended to them, such as a reference, stays where it is.
+    other wrappers have appended to them, such as a reference, stays where it is. Measured
+    disturbances come from a :class:`MeasuredDisturbance` below, and the observer is told them.
 
     Parameters
     ----------
@@ -283,7 +314,8 @@ class ObserveDisturbance(Appending):
     observer : DisturbanceObserver
         Copied, so that each env has an estimate of its own.
     low, high : array_like, shape (d,)
-        ``d_min`` and ``d_max`` of the problem, to which the shown estimate is clipped.
+        ``d_min`` and ``d_max`` of the problem, to which the shown estimate is clipped. Those of its
+        measured disturbances may be left out.
 
     Examples
     --------
@@ -301,13 +333,18 @@ class ObserveDisturbance(Appending):
         if not isinstance(observer, DisturbanceObserver):
             raise TypeError(f"observer = {observer!r} must be a DisturbanceObserver.")
         _require_deviations(env, observer.model.u_ss)
+        self.measured: Any = _below(env, MeasuredDisturbance)
+        _require_told(observer, self.measured)
+        if np.size(low) == np.size(high) == observer.model.n_disturbances:
+            low, high = (np.ravel(side)[-observer.n_estimated :] for side in (low, high))
         super().__init__(env, low, high, observer.n_measured, observer.model.n_states)
-        if len(self.low) != observer.model.n_disturbances:
+        if len(self.low) != observer.n_estimated:
             raise ValueError(
                 f"low has shape {self.low.shape}, but the observer estimates "
-                f"{observer.model.n_disturbances} disturbances."
+                f"{observer.n_estimated} disturbances."
             )
         self.observer = copy.deepcopy(observer)
+        self.load: Array | None = None
         self.failing: NDArray[np.bool_] = np.zeros(observer.n_measured, dtype=bool)
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
@@ -319,7 +356,12 @@ class ObserveDisturbance(Appending):
             warnings.warn(at, NonFiniteWarning, stacklevel=4)
         self.failing = failing
         if failing.any():
-            expected = np.zeros(len(failing)) if u is None else observer.expected(u)
+            expected = np.zeros(len(failing)) if u is None else observer.expected(u, self.load)
             measured[failing] = expected[failing]
-        x_hat, d_hat = observer.reset(measured) if u is None else observer.update(measured, u)
+        if u is None:
+            x_hat, d_hat = observer.reset(measured)
+        else:
+            x_hat, d_hat = observer.update(measured, u, self.load)
+        if self.measured is not None:  # acts until the next sample
+            self.load = self.measured.held
         return joined(x_hat, rest, np.clip(d_hat, self.low, self.high))

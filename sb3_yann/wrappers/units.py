@@ -59,7 +59,7 @@ class Deviations(gym.Wrapper[Vector, Vector, Vector, Vector]):
         if tracked.size and seen.shape[0] > n:
             self.x_ss[n : n + len(tracked)] = tracked @ model.x_ss
         self.u_ss: Array = model.u_ss
-        self.d_ss: Array = model.d_ss
+        self.d_ss: Array = model.d_ss[[*model.measured]]
         self.taken = taken
         self.observation_space = _shifted(seen, self.x_ss)
         self.action_space = _shifted(taken, self.u_ss)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -133,3 +135,23 @@ def test_units_of_measurement_and_state_do_not_decide_what_is_determined(unit: f
         stuck = LinearModel([[1.0, 0.0], [0.0, 0.8]], [[1.0], [1.0]], 1, E=[[0.0], [1.0]])
         with pytest.raises(ValueError, match="do not see an unstable mode: eigenvalue 1 of A"):
             DisturbanceObserver(stuck, blind)
+
+
+def test_a_measured_disturbance_is_told_and_no_part_of_the_estimate() -> None:
+    E = np.array([[0.3, 0.1], [-0.2, 1.0]])
+    model = LinearModel([[0.7, 0.2], [0.0, 0.9]], [[0.1], [0.4]], 1, E=E, estimated=[1])
+    observer, rng, x = (
+        DisturbanceObserver(model, measured=[1]),
+        np.random.default_rng(3),
+        np.zeros(2),
+    )
+    for _ in range(200):  # the load moves at random, the unknown stays
+        u, load = rng.normal(size=1), rng.normal(size=1)
+        x = model.step(x, u, [load[0], 0.6])
+        x_hat, d_hat = observer.update(x[1:], u, load)
+    np.testing.assert_allclose([*x_hat, *d_hat], [*x, 0.6], atol=1e-9)
+    for wrong in (None, [1.0, 2.0]):
+        with pytest.raises(ValueError, match="d "):
+            observer.update([0.0], [0.0], wrong)
+    with pytest.raises(ValueError, match="is told 0 measured disturbances"):
+        DisturbanceObserver(dataclasses.replace(model, estimated=())).update(x, u, load)

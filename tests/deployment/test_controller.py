@@ -5,18 +5,33 @@ from __future__ import annotations
 import copy
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG
 
 import general_problems
 import sb3_yann._archive
 import sb3_yann.deployment.controller
 from deployed import CASES, box, disturbed, observations, policy_of
 from sample_laws import solved
-from sb3_yann import AffineObservation, Checks, Controller, export
+from sb3_yann import (
+    AffineObservation,
+    Checks,
+    Controller,
+    DisturbanceBounds,
+    LinearModel,
+    LinearMPC,
+    Tracking,
+    export,
+    offset_free,
+)
 from sb3_yann._archive import write_arrays
 from sb3_yann.deployment.controller import Status
 from sb3_yann.deployment.selftest import steady
@@ -409,3 +424,74 @@ def test_the_cost_is_said(tmp_path):
     assert "kB float" in str(learnt) and learnt.digest in str(learnt)
     again = export(policy_of("reactor"), tmp_path / "again.npz", name="plant")
     assert again.digest == learnt.digest != written.digest
+
+
+def heated() -> LinearMPC:
+    """Return an offset-free MPC of a tank in its own units."""
+    model = LinearModel([[0.85]], [[0.1]], dt=30, x_ss=[60], u_ss=[12], state_names=["temperature"])
+    mpc = LinearMPC(
+        model, Q=[[1]], R=[[0.05]], horizon=3, u_min=0, u_max=30, theta_min=40, theta_max=80,
+        tracking=Tracking([0], 50, 70), absolute=True,
+    )  # fmt: skip
+    return offset_free(mpc)[0]
+
+
+def texts(folder: Path) -> str:
+    """Return all that files say, those in archives too."""
+    found = []
+    for path in folder.iterdir():
+        if path.suffix in (".fmu", ".npz"):
+            with zipfile.ZipFile(path) as archive:
+                found += [
+                    archive.read(each) for each in archive.namelist() if "binaries" not in each
+                ]
+        else:
+            found.append(path.read_bytes())
+    return b"\n".join(found).replace(b"\x00", b"").decode("latin-1")
+
+
+@pytest.mark.parametrize("suffix", ["npz", "c", "onnx", "st", "xml", "fmu"])
+@pytest.mark.filterwarnings("ignore:The model.s operating point")
+@pytest.mark.parametrize("kind", ["problem", "law", "model"])
+def test_an_export_without_its_observer_is_refused_or_says_so(suffix, kind, tmp_path) -> None:
+    if suffix == "onnx":
+        pytest.importorskip("onnx")
+    given: Any = heated()
+    if kind == "law":
+        given = given.explicit()
+    if kind == "model":
+        space = spaces.Box(-100, 100, (3,)), spaces.Box(-12, 18, (1,))
+        policy = {"policy_kwargs": {"problem": given}}
+        given = DDPG("YannPolicy", Silent(*space), **policy, device="cpu")
+    with pytest.raises(ValueError, match='observer="caller"'):
+        export(given, tmp_path / f"tank.{suffix}")
+    assert not [*tmp_path.iterdir()]
+    written = export(given, tmp_path / f"tank.{suffix}", observer="caller")
+    assert "runs the observer" in str(written) and "runs the observer" in texts(tmp_path)
+    assert "measured" not in str(written)
+    if suffix == "npz":
+        read = Controller.load(written.paths[0])
+        assert "runs the observer" in repr(read) and "runs the observer" in read.note
+        if kind != "law":
+            assert read.obs_names[2] == "d[0] (estimated by the caller's observer)"
+
+
+class Silent(gym.Env):
+    """Spaces, and nothing else."""
+
+    def __init__(self, observation_space: Any, action_space: Any) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
+
+
+def test_a_disturbance_that_may_be_measured_or_not_comes_from_the_caller(tmp_path) -> None:
+    model = LinearModel([[0.9]], [[1]], dt=1, E=[[0.5]])
+    mpc = LinearMPC(
+        model, Q=[[1]], R=[[1]], horizon=2, x_min=-3, x_max=3, u_min=-1, u_max=1,
+        disturbances=DisturbanceBounds(-0.1, 0.1),
+    )  # fmt: skip
+    written = export(mpc, tmp_path / "law.npz")
+    read = Controller.load(tmp_path / "law.npz")
+    assert read.obs_names[1] == "d[0] (from the caller's sensor or observer)"
+    assert (read.note, written.note) == ("", "") and "NOTE" not in repr(read) + str(written)
+    with pytest.raises(ValueError, match="observer = 'me' must be one of"):
+        export(mpc, tmp_path / "law.npz", observer="me")

@@ -10,12 +10,14 @@ from gymnasium.utils.env_checker import check_env
 from general_problems import servo
 from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import (
+    DisturbanceBounds,
     DisturbanceObserver,
     LinearModel,
     LinearMPC,
     NonFiniteWarning,
     RateLimits,
     Tracking,
+    offset_free,
 )
 from sb3_yann.wrappers import (
     MeasuredDisturbance,
@@ -286,3 +288,72 @@ def test_what_lies_on_a_bound_stays_inside_when_it_is_rounded(sign) -> None:
     for shown in (env.reset()[0], env.step(np.zeros(1))[0]):
         assert 0.299999 < sign * float(shown[2]) <= 0.3
         assert sign * law([0, 0, shown[2]])[0] > 0.01
+
+
+class Loaded(gym.Env):
+    """A tank with a gain that its model does not know, a load that it reports, and a leak."""
+
+    observation_space = gym.spaces.Box(-50, 50, (1,), np.float64)
+    action_space = gym.spaces.Box(-30, 30, (1,), np.float64)
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.k = np.zeros(1), 0
+        return self.x.copy(), {"disturbance": np.array([2.0])}
+
+    def step(self, u):
+        load = 2.0 if self.k < 60 else -3.0
+        self.k += 1
+        self.x = 0.8 * self.x + 0.25 * u + 0.1 * load - 0.7
+        told = 2.0 if self.k < 60 else -3.0
+        return self.x.copy(), 0.0, False, False, {"disturbance": np.array([told])}
+
+
+def loaded(E, **given) -> LinearMPC:
+    model = LinearModel([[0.8]], [[0.2]], 1, E=E, **given)
+    bound = [5.0, 3.0][: model.n_disturbances]
+    return LinearMPC(
+        model, Q=[[1]], R=[[0.02]], horizon=5, x_min=-50, x_max=50, u_min=-30, u_max=30,
+        tracking=Tracking([0], -4, 4), disturbances=DisturbanceBounds(-np.array(bound), bound),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("how", ["offset_free", "by hand"])
+@pytest.mark.parametrize("between", [False, True])
+def test_with_a_measured_load_and_an_observer_the_plant_rests_at_its_set_point(how, between):
+    if how == "offset_free":
+        mpc, observer = offset_free(loaded([[0.07]]), [3.0])
+    else:
+        mpc = loaded([[0.07, 1.0]], estimated=[1])
+        observer = DisturbanceObserver(mpc.model)
+    env = MeasuredDisturbance(SetPoint(Loaded(), [1.5], [1.5001]), [-5], [5])
+    env = gym.wrappers.TimeLimit(env, 500) if between else env
+    env = ObserveDisturbance(env, observer, mpc.disturbances.d_min, mpc.disturbances.d_max)
+    law, (theta, _) = mpc.law(), env.reset(seed=1)
+    seen = []
+    for _ in range(160):
+        theta, *_ = env.step(law(theta))
+        seen.append(theta[0])
+    np.testing.assert_allclose([seen[58], seen[-1]], theta[1], atol=1e-4)
+    # The load alone moves it little: the observer knows what it does, but for the model's error.
+    assert np.abs(np.array(seen[60:]) - theta[1]).max() < 0.3
+
+
+def test_an_observer_that_is_not_told_a_measured_load_is_refused_in_any_order() -> None:
+    mpc = loaded([[0.07, 1.0]], estimated=[1])
+    told, untold = (
+        DisturbanceObserver(mpc.model),
+        DisturbanceObserver(LinearModel([[0.8]], [[0.2]], 1, E=[[1.0]])),
+    )
+    plain = SetPoint(Loaded(), [-1], [1])
+    measured = MeasuredDisturbance(plain, [-5], [5])
+    for env in (measured, PreviousInput(measured), PastInputs(measured, [1])):
+        with pytest.raises(ValueError, match=r"measures 1 disturbances .* told 0"):
+            ObserveDisturbance(env, untold, [-3], [3])
+    with pytest.raises(ValueError, match=r"measures 0 disturbances .* told 1"):
+        ObserveDisturbance(plain, told, [-3], [3])
+    with pytest.raises(ValueError, match="in ObserveDisturbance already"):
+        MeasuredDisturbance(ObserveDisturbance(plain, untold, [-3], [3]), [-5], [5])
+    swapped = DisturbanceObserver(LinearModel([[0.8]], [[0.2]], 1, E=[[1, 0.07]], estimated=[0]))
+    with pytest.raises(ValueError, match="before the estimated ones"):
+        ObserveDisturbance(measured, swapped, [-3], [3])

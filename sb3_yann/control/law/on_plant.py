@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Law = TypeVar("Law", bound="OnPlant")
 MODEL = "model_"
-TEXT = ("notes", "state_names", "input_names", "units")
+LISTS = ("notes", "state_names", "input_names", "units", "estimated")
 
 
 class OnPlant(ReadOnlyArrays):
@@ -127,10 +127,9 @@ def with_plant(law: Law, data: dict[str, Any]) -> Law:
     """
     if not any(name == "theta_ss" or name.startswith(MODEL) for name in data):
         return law
-    given = {
-        each.name: data[MODEL + each.name] for each in fields(LinearModel)
-    }  # none has a default
-    given |= {name: given[name].tolist() for name in TEXT}
+    data = {MODEL + "estimated": np.empty(0), **data}  # files of before it
+    given = {each.name: data[MODEL + each.name] for each in fields(LinearModel)}
+    given |= {name: given[name].tolist() for name in LISTS}
     model, m = LinearModel(**{**given, "dt": float(given["dt"])}), law.n_inputs
     if model.n_inputs != m or model.n_states > law.n_theta:
         raise ValueError(f"its model has {model.n_states} states and {model.n_inputs} inputs")

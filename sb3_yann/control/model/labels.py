@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+from unicodedata import category
 
 from sb3_yann.control.linear_system import LinearSystem, names
 
@@ -19,7 +20,19 @@ def as_names(what: str, given: Sequence[str], size: int) -> tuple[str, ...]:
         raise ValueError(
             f"{what} = {list(found)} must be {size} different names, or none: leave it out."
         )
+    _require_text(what, found)
     return found
+
+
+def _require_text(what: str, given: Sequence[str]) -> None:
+    """Raise where a name holds what files in XML, HTML and UTF-8 cannot."""
+    for each in given:
+        # Control characters, halves of surrogate pairs, line ends, and the two noncharacters.
+        if any(category(c) in ("Cc", "Cs", "Zl", "Zp") or c in "\ufffe\uffff" for c in each):
+            raise ValueError(
+                f"{what}: {each!r} holds a character that is no text. Leave out line ends, escape "
+                "sequences and other control characters."
+            )
 
 
 def require_different(labels: Sequence[str]) -> None:
@@ -52,6 +65,7 @@ def as_units(given: Units, labels: Sequence[str]) -> tuple[str, ...]:
     found = tuple(given)
     if found and len(found) != len(labels):
         raise ValueError(f"units = {list(found)} must have one entry for each of {list(labels)}.")
+    _require_text("units", found)
     return found if any(found) else ()
 
 
@@ -103,10 +117,31 @@ def name_of(model: LinearSystem, kind: str, index: int) -> str:
     return given[index] if given else f"{kind} {index}"
 
 
+def missing_observer(model: LinearSystem) -> str:
+    """Return what a law or a policy of this model lacks; empty where nothing is estimated.
+
+    Examples
+    --------
+    >>> from sb3_yann.control import LinearModel
+    >>> missing_observer(LinearModel([[1]], [[1]], dt=1, E=[[1]], estimated=[0])).partition(":")[0]
+    'd[0] is estimated'
+    """
+    if not model.estimated:
+        return ""
+    which = [f"d[{i}]" for i in model.estimated]
+    verb = "is" if len(which) == 1 else "are"
+    return (
+        f"{', '.join(which)} {verb} estimated: the DisturbanceObserver is no part of the law or "
+        "the policy. Whoever calls it runs the observer, and passes its x_hat and d_hat."
+    )
+
+
 def short_repr(model: Any) -> str:
     """Return the sizes, names and operating point of a model, for one line."""
     states, inputs = with_units(model)
     sizes = f"states={states}, inputs={inputs}, disturbances={model.n_disturbances}"
+    if model.estimated:
+        sizes += f", estimated={[*model.estimated]}"
     point = f"x_ss={model.x_ss.tolist()}, u_ss={model.u_ss.tolist()}"
     return f"{type(model).__name__}({sizes}, dt={model.dt:g}, {point})"
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_positive, as_vector, to_float
+from sb3_yann._validation import Array, as_array, as_indices, as_positive, as_vector, to_float
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.linear_system import names, zero_order_hold
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class LinearModel(Plant):
     """The plant near an operating point: ``x[k+1] = A x[k] + B u[k] + E d[k]``, every ``dt``.
 
-    ``x``, ``u`` and the measured disturbances ``d`` are deviations from the operating point
+    ``x``, ``u`` and the disturbances ``d`` are deviations from the operating point
     ``(x_ss, u_ss, d_ss)``. Arrays are stored as read-only float64.
 
     Parameters
@@ -47,6 +47,9 @@ class LinearModel(Plant):
         Names for reports, n and m of them. Equality ignores them.
     units : mapping from name to str, or sequence of n + m str, optional
         Units of states and inputs, for reports.
+    estimated : sequence of int, optional
+        Disturbances, by their index, that no sensor measures: a :class:`DisturbanceObserver`
+        estimates them. Equality ignores it, `dataclasses.replace` keeps it.
 
     Examples
     --------
@@ -61,6 +64,7 @@ class LinearModel(Plant):
     state_names: tuple[str, ...] = field(default=(), compare=False)
     input_names: tuple[str, ...] = field(default=(), compare=False)
     units: tuple[str, ...] = field(default=(), compare=False)
+    estimated: tuple[int, ...] = field(default=(), compare=False)
 
     def __init__(  # noqa: PLR0913 (the matrices of a plant and its operating point)
         self,
@@ -77,6 +81,7 @@ class LinearModel(Plant):
         state_names: Sequence[str] = (),
         input_names: Sequence[str] = (),
         units: Units = (),
+        estimated: Sequence[int] = (),
     ) -> None:
         A = as_array("A", A, ("n", "n"))
         n = A.shape[0]
@@ -97,7 +102,8 @@ class LinearModel(Plant):
         labels = [*(named[0] or names((n,))), *(named[1] or names((0, u.size)))]
         require_different(labels)
         step, kept = as_positive("dt", dt), as_units(units, labels)
-        super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept)
+        seen = as_indices("estimated", estimated, E.shape[1])
+        super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept, seen)
 
     @classmethod
     def from_continuous(

@@ -30,8 +30,11 @@ def describe(model: LinearSystem) -> str:
 
 def _head(model: LinearSystem) -> list[str]:
     counts = (model.n_states, model.n_inputs, model.n_disturbances)
-    words = zip(counts, ("state", "input", "measured disturbance"), strict=True)
+    words = zip(counts, ("state", "input", "disturbance"), strict=True)
     sizes = ", ".join(f"{count} {word}{'s' * (count != 1)}" for count, word in words)
+    if model.estimated:
+        which = ", ".join(f"d[{i}]" for i in model.estimated)
+        sizes += f" (an observer estimates {which})"
     point = f"x_ss = {_vector(model.x_ss)}, u_ss = {_vector(model.u_ss)}"
     if model.n_disturbances:
         point += f", d_ss = {_vector(model.d_ss)}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -25,10 +27,12 @@ def offset_free(
     Rawlings, AIChE J. 49, 2003). All states must be measured. The observer takes disturbances and
     errors of measurements for equally large, in half-widths of the box of states.
 
+    Measured disturbances of the MPC stay, before the estimated ones: the observer is told them.
+
     Parameters
     ----------
     mpc : LinearMPC
-        Without disturbances of its own.
+        Without estimated disturbances of its own.
     d_max : array_like, shape (n,), optional
         Largest disturbance, in units of the states per sample. The default is 5 % of the
         half-widths of the box of states.
@@ -36,7 +40,7 @@ def offset_free(
     Raises
     ------
     TypeError, ValueError
-        If the MPC knows disturbances already: give an observer of yours its model.
+        If the MPC has estimated disturbances already.
 
     Examples
     --------
@@ -51,22 +55,30 @@ def offset_free(
     """
     as_kind("mpc", mpc, LinearMPC, "a LinearMPC")
     old, n = mpc.model, mpc.model.n_states
-    if old.n_disturbances:
+    if old.estimated:
         raise ValueError(
-            f"The MPC has {old.n_disturbances} disturbances already. Give their observer the "
-            "model: DisturbanceObserver(mpc.model)."
+            f"The MPC has {len(old.estimated)} estimated disturbances already: their observer is "
+            "DisturbanceObserver(mpc.model)."
         )
     unit = mpc.theta_half[mpc.layout.state]
     largest = SHARE * unit if d_max is None else d_max
     bound = as_positive_vector("d_max", largest, n, "In units of the states.")
-    names = {"state_names": old.state_names, "input_names": old.input_names, "units": old.units}
-    model = LinearModel(old.A, old.B, old.dt, old.x_ss, old.u_ss, np.eye(n), **names)
-    terminal = Terminal(set="invariant" if len(mpc.terminal.set[1]) else None)
+    known, of_both = mpc.disturbances, old.n_disturbances + n
+    own: dict[str, Any] = {
+        "E": np.hstack([old.E, np.eye(n)]),
+        "d_ss": np.concatenate([old.d_ss, np.zeros(n)]),
+        "estimated": range(old.n_disturbances, of_both),
+        "drift": None,  # the disturbance makes up for it
+    }
+    model = LinearModel(**{**vars(old), **own})
+    terminal = Terminal(mpc.terminal.cost, set="invariant" if len(mpc.terminal.set[1]) else None)
     states = mpc.layout.state
     found = derived(
         mpc,
         model=model,
-        disturbances=DisturbanceBounds(-bound, bound),
+        disturbances=DisturbanceBounds(
+            np.concatenate([known.d_min, -bound]), np.concatenate([known.d_max, bound])
+        ),
         terminal=terminal,
         theta_min=mpc.theta_min[states],
         theta_max=mpc.theta_max[states],

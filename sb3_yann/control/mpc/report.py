@@ -58,6 +58,8 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
     for i, (label, name) in enumerate(zip(labels, names, strict=True)):
         kind, index = name[:-1].split("[")
         meaning = f"{shown[i]:<{room}}{meanings[kind]} {index}"
+        if kind == "d" and int(index) in problem.model.estimated:
+            meaning += ", which an observer estimates"
         yield f"  {label:<{width}} {low[i]:>10.4g} to {high[i]:<10.4g} {meaning}"
 
 

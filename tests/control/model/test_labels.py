@@ -85,3 +85,13 @@ def test_deviations_in_the_report_say_that_they_are() -> None:
     """A gain is no state: one unit more than u_ss moves the state from x_ss."""
     model = LinearModel(A, B, dt=1.0, x_ss=[12, 350], u_ss=[3], **NAMES)
     assert "Held at u_ss + 1, pump moves the state to x_ss + (12.5, 2.5)." in model.report()
+
+
+@pytest.mark.parametrize(
+    "name", ["T\x1b[31m", "T\n", "a\tb", "\x00", "\x7f", "\ud800", "a\u2028b", "\uffff"]
+)
+def test_what_is_no_text_is_refused_in_names_and_units(name: str) -> None:
+    for given in ({"state_names": [name, "b"]}, {"input_names": [name]}, {"units": [name, "", ""]}):
+        with pytest.raises(ValueError, match="holds a character that is no text"):
+            LinearModel(A, B, dt=1.0, **given)
+    LinearModel(A, B, dt=1.0, state_names=["\N{SNOWMAN}", "T\N{NO-BREAK SPACE}1"])

@@ -124,7 +124,7 @@ def test_sampling_is_compared_with_the_plant(model: LinearModel, word: str) -> N
 def test_operating_point_and_disturbances_are_told() -> None:
     model = LinearModel([[0.5]], [[1]], 0.25, [3], [4], [[1, 2]], [5, 6])
     assert model.report().splitlines()[:2] == [
-        "Linear model: 1 state, 1 input, 2 measured disturbances, sampled every 0.25.",
+        "Linear model: 1 state, 1 input, 2 disturbances, sampled every 0.25.",
         "Operating point: x_ss = (3), u_ss = (4), d_ss = (5, 6).",
     ]
 

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
 
 from general_problems import servo, solved
-from sb3_yann import DisturbanceObserver, LinearModel, LinearMPC, offset_free
+from sb3_yann import (
+    DisturbanceObserver,
+    LinearModel,
+    LinearMPC,
+    PiecewiseAffine,
+    Terminal,
+    offset_free,
+)
 
 MPC = servo(x_min=[-5, -2], x_max=[5, 2])
 
@@ -55,9 +64,61 @@ def test_bounds_that_were_given_as_the_plant_shows_them_are_shown_so() -> None:
     assert "absolute=True" in repr(mpc) and "absolute" not in repr(offset_free(MPC)[0])
 
 
-def test_what_knows_disturbances_already_or_is_no_mpc_is_named() -> None:
-    with pytest.raises(ValueError, match="has 1 disturbances already"):
-        offset_free(solved("servo with a disturbance"))
+def test_the_notes_of_the_model_stay_and_its_drift_is_made_up_for() -> None:
+    noted = LinearModel(
+        [[0.8]], [[0.3]], 2.0, notes=["fitted to a log"], drift=[0.4], state_names=["T"]
+    )
+    with pytest.warns(UserWarning, match="no steady state"):
+        mpc = LinearMPC(noted, Q=[[1]], R=[[1]], horizon=2, x_min=-3, x_max=3, u_min=-1, u_max=1)
+    model = offset_free(mpc)[0].model
+    assert (model.notes, model.drift.tolist(), model.dt) == (("fitted to a log",), [0.0], 2.0)
+    assert "Note: fitted to a log" in model.report()
+
+
+def test_a_terminal_cost_that_was_given_stays() -> None:
+    mpc = dataclasses.replace(MPC, terminal=Terminal(cost=7 * np.eye(2)))
+    np.testing.assert_array_equal(offset_free(mpc)[0].terminal.cost, 7 * np.eye(2))
+
+
+def test_that_disturbances_are_estimated_survives_copies_pickles_files_and_replace(tmp_path):
+    mpc, _ = offset_free(MPC)
+    mpc.explicit().save(tmp_path / "law.npz")
+    copies = [
+        copy.deepcopy(mpc).model,
+        pickle.loads(pickle.dumps(mpc)).model,
+        dataclasses.replace(mpc, horizon=3).model,
+        dataclasses.replace(mpc.model, dt=0.5),
+        mpc.model.named(["a", "b"]),
+        PiecewiseAffine.load(tmp_path / "law.npz").model,
+    ]
+    assert [each.estimated for each in copies] == 6 * [(0, 1)]
+    assert MPC.model.estimated == ()
+
+
+def test_nothing_calls_an_estimated_disturbance_measured() -> None:
+    mpc, _ = offset_free(MPC)
+    for text in (mpc.model.report(), mpc.report(samples=20), repr(mpc.model)):
+        assert "measured" not in text and "estimate" in text
+
+
+def test_measured_disturbances_stay_before_the_estimated_ones() -> None:
+    mpc, observer = offset_free(solved("servo with a disturbance"), [0.3, 0.4])
+    assert (mpc.model.estimated, mpc.model.measured) == ((1, 2), (0,))
+    assert (observer.n_estimated, observer.n_told) == (2, 1)
+    given = solved("servo with a disturbance")
+    np.testing.assert_array_equal(mpc.model.E, np.hstack([given.model.E, np.eye(2)]))
+    assert mpc.disturbances.d_max.tolist() == [*given.disturbances.d_max, 0.3, 0.4]
+
+
+@pytest.mark.parametrize("estimated", [[1], [-1], [0, 0], [0.5], 0, "0"])
+def test_an_index_of_no_disturbance_is_named(estimated) -> None:
+    with pytest.raises((TypeError, ValueError), match="estimated"):
+        LinearModel([[0.5]], [[1]], 1, E=[[1]], estimated=estimated)
+
+
+def test_what_estimates_disturbances_already_or_is_no_mpc_is_named() -> None:
+    with pytest.raises(ValueError, match="has 2 estimated disturbances already"):
+        offset_free(offset_free(MPC)[0])
     with pytest.raises(TypeError, match=r"mpc = LinearModel.* must be a LinearMPC"):
         offset_free(MPC.model)
     for wrong in ([0.1, 0.0], [0.1, -1.0], [0.1]):
