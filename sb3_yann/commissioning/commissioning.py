@@ -15,7 +15,13 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_between, as_flag, as_whole
-from sb3_yann.commissioning.comparison import Costs, compare, is_confirmed, why_taken_back
+from sb3_yann.commissioning.comparison import (
+    Costs,
+    compare,
+    is_confirmed,
+    is_kept,
+    why_taken_back,
+)
 from sb3_yann.commissioning.improve import improve
 from sb3_yann.commissioning.incumbent import Incumbent
 from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
@@ -32,10 +38,15 @@ class Commissioning:
     """Puts a better policy to work on a plant as plants are commissioned: in growing batches.
 
     The first batch is the MPC's. After each one the twin is fitted to all that the plant has shown,
-    the policy is improved in it (:func:`improve`), and acts in the next batch if it was accepted:
-    at first within a small ``max_correction``, which doubles when the plant confirms at least half
-    of the gain that the twin promised. Where it costs more than the twin predicts for the MPC, the
-    MPC is back. Nothing else ever acts.
+    and the policy is improved in it (:func:`improve`). One that was accepted there is on trial in
+    the next batch: the MPC and the policy take turns, in an order that is drawn for each pair. Only
+    the plant decides. It is kept where it surely cost less than the MPC in these turns, and the MPC
+    is back where it surely cost more, by t tests of the pairs. A policy acts at first within a
+    small ``max_correction``, which doubles when the plant confirms at least half of the gain that
+    the twin promised. Nothing else ever acts.
+
+    What counts is the stage cost, or the plant's own reward where that is another one. The twin's
+    searches know the stage cost alone.
 
     A watchdog looks on. At an alarm the MPC has the plant within the same sample, for the rest of
     the episode and until it has played a quiet one; it has no state of its own that could bump. Two
@@ -43,7 +54,8 @@ class Commissioning:
 
     Each episode and each decision is on the disk before the next begins. After a kill at any moment
     the same script goes on: with the same settings and record, :meth:`run` repeats nothing but the
-    episode that was cut off. The model holds the accepted policy at all times.
+    episode that was cut off. When :meth:`run` returns, the model holds the policy that the plant
+    has confirmed last, or the MPC; what is still on trial it does not.
 
     Parameters
     ----------
@@ -149,13 +161,17 @@ class Commissioning:
             If an episode does not end in a million steps.
         """
         as_whole("batches", batches)
-        if len(self.batches) < batches:
-            with one_env(self.plant_env) as env:
-                plant = Plant(env, self.model)
+        if len(self.batches) >= batches:
+            return self.batches
+        with one_env(self.plant_env) as env:
+            plant = Plant(env, self.model)
+            try:
                 while len(self.batches) < batches:
                     while not self._batch_is_over():
                         self._play(plant)
                     self._decide(plant)
+            finally:
+                self.incumbent.show()
         return self.batches
 
     def report(self) -> str:
@@ -166,9 +182,13 @@ class Commissioning:
         journal = self.journal
         unsafe = any(each.violations for each, by_policy in journal.batch if by_policy)
         doubted = unsafe or journal.doubted or journal.cut_off >= 2
-        acts = journal.accepted and not (self.shadow or doubted)
+        trial = journal.accepted and not self.shadow
+        number = len(journal.batch)
+        turn = np.random.default_rng([self.seed, len(journal.batches), number // 2]).integers(2)
+        acts = trial and not doubted and turn == number % 2
         self.incumbent.restore()
-        first = plant.begin(self.seed + len(journal.episodes))
+        # A simulator gives both of a pair the same start.
+        first = plant.begin(self.seed + len(journal.episodes) - (number % 2 if trial else 0))
         journal.begin(acts)
         try:
             act = plant.policy if acts else plant.mpc
@@ -211,7 +231,16 @@ class Commissioning:
                 policy = f"batch {number}"
                 outlook = replace(outlook, policy=policy, model=saved, model_digest=digest)
             elif verdict != "stays":
-                outlook = replace(outlook, policy="MPC", model=None, model_digest=None)
+                self.incumbent.keep(False)
+                outlook = replace(
+                    outlook,
+                    policy="MPC",
+                    model=None,
+                    model_digest=None,
+                    kept=None,
+                    kept_digest=None,
+                    kept_bound=None,
+                )
             self.incumbent.limit(outlook.max_correction)
             shown = costs.actual, costs.predicted, costs.mpc
             sizes = number, len(journal.batch), alarms
@@ -228,6 +257,11 @@ class Commissioning:
         if why := why_taken_back(self.journal, costs):
             self.incumbent.give_back()
             outlook = replace(outlook, max_correction=self._first_bound)
+        elif is_kept(costs):
+            self.incumbent.keep(True)
+            file, digest, bound = outlook.model, outlook.model_digest, outlook.max_correction
+            outlook = replace(outlook, kept=file, kept_digest=digest, kept_bound=bound)
+        if why:
             said = f"The policy was taken back: {why}. "
         elif is_confirmed(self.journal, costs):
             wider = min(2 * outlook.max_correction, self.largest)
@@ -315,6 +349,14 @@ class Commissioning:
         if outlook.tried:
             self.incumbent.candidate = None
         self.incumbent.hold()
+        if outlook.kept is not None:
+            whole = self.policy.max_correction
+            self.journal.record.load(outlook.kept, outlook.kept_digest, self.model)
+            self.incumbent.limit(outlook.kept_bound)
+            self.incumbent.keep(True)
+            self.incumbent.limit(whole)
+            self.journal.record.load(outlook.model, outlook.model_digest, self.model)
+        self.incumbent.show()
         if outlook.twin is not None:
             self.twin = self._fit(outlook.twin, outlook.twin_seed)
             self.watchdog = Watchdog.of(self.twin)

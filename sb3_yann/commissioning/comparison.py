@@ -1,4 +1,4 @@
-"""The plant against its twin: what a batch cost, was predicted to, and would with the MPC."""
+"""What a batch cost on the plant, with the policy and with the MPC in turns, and was predicted to."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.journal import Journal
@@ -15,9 +16,11 @@ from sb3_yann.twin.plant_twin import PlantTwin
 
 ENOUGH = 0.5
 """Of the gain that the twin promised, so much lets the bound of the correction grow."""
-SURELY, MOST = 1.645, 0.05
-"""Standard errors by which a policy's cost must be above the MPC's to be taken back, a one-sided
-test of five per cent; what it may not exceed in any case, as a fraction of the MPC's cost."""
+SURELY, MOST = 0.95, 0.05
+"""One-sided level of the t test by which a policy is kept or taken back; what it may cost more than
+the MPC in any case, as a fraction of the MPC's cost."""
+OWN = 0.95
+"""Share of the episodes' rewards that the stage cost explains where they are the same."""
 ALARMS = 0.25
 """Share of a policy's episodes with an alarm from which on it is taken back, two at least."""
 
@@ -32,10 +35,16 @@ class Costs(NamedTuple):
     predicted, promised : float
         What the twin had predicted, and how much less than for the MPC.
     mpc : float
-        The MPC's from the same starts: what the twin that has learnt from them predicts, and what
-        the MPC's own episodes cost beyond that. With sensor noise a plant costs more than any twin.
+        What the plant showed of the MPC, which took turns with the policy: its episodes' cost, less
+        what the twin says that their starts differ by.
     error : float, default 0
-        Standard error of ``actual - mpc``.
+        Standard error of ``actual - mpc``, over pairs of episodes, widened where those that follow
+        each other are correlated.
+    pairs : int, default 0
+        Episodes of the policy that have one of the MPC beside them.
+    own_reward : bool, default False
+        Whether the costs are minus the rewards, which are not the stage cost: a twin, whose costs
+        are stage costs, promises nothing then.
     """
 
     actual: float
@@ -43,6 +52,15 @@ class Costs(NamedTuple):
     promised: float
     mpc: float
     error: float = 0.0
+    pairs: int = 0
+    own_reward: bool = False
+
+    @property
+    def room(self) -> float:
+        """How far from the MPC's cost a mean cost may be by chance; inf for a single pair."""
+        if self.pairs < 2:
+            return np.inf
+        return float(stdtrit(self.pairs - 1, SURELY) * self.error)
 
 
 def compare(
@@ -60,22 +78,43 @@ def compare(
         The twin that was in force, and the one that has learnt from the batch.
     """
     by_policy = any(each for _, each in journal.batch)
-    own = [e for e, each in journal.batch if each == by_policy and (by_policy or not e.alarm)]
+    of_mpc = [each for each, policys in journal.batch if not policys and each.alarm is None]
+    own = [each for each, policys in journal.batch if policys] if by_policy else of_mpc
     if not own:
         return Costs(np.nan, np.nan, np.nan, np.nan)
-    problem, act = plant.problem, plant.policy if by_policy else plant.mpc
-    predicted = promised = mpc = np.nan
-    error, actual = 0.0, _costs(problem, own)
-    if before is not None:
-        predicted = predicted_costs(before, own, act).mean()
-        promised = predicted_costs(before, own, plant.mpc).mean() - predicted
-    if now is not None:
-        length = np.mean([len(each.actions) for each in own])
-        as_mpc = predicted_costs(now, own, plant.mpc)
-        beyond, unsure = _beyond(journal, plant, now)
-        mpc = as_mpc.mean() + length * beyond
-        error = np.hypot(_standard_error(actual - as_mpc), length * unsure)
-    return Costs(*map(float, (actual.mean(), predicted, promised, mpc, error)))
+    pays_own, problem = pays_its_own(plant.problem, journal.episodes), plant.problem
+    actual, predicted, promised = _costs(problem, own, pays_own), np.nan, np.nan
+    if before is not None and not pays_own:
+        as_mpc = predicted_costs(before, own, plant.mpc)
+        told = predicted_costs(before, own, plant.policy) if by_policy else as_mpc
+        predicted, promised = float(told.mean()), float(as_mpc.mean() - told.mean())
+    mean, pairs = float(actual.mean()), min(len(own), len(of_mpc))
+    if not by_policy:
+        return Costs(mean, predicted, promised, mean, own_reward=pays_own)
+    if not pairs:
+        return Costs(mean, predicted, promised, np.nan, own_reward=pays_own)
+    more = actual[:pairs] - _costs(problem, of_mpc[:pairs], pays_own)
+    if now is not None and not pays_own:
+        starts = [predicted_costs(now, each[:pairs], plant.mpc) for each in (own, of_mpc)]
+        more = more - (starts[0] - starts[1])
+    mpc = mean - float(more.mean())
+    return Costs(mean, predicted, promised, mpc, _standard_error(more), pairs, pays_own)
+
+
+def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
+    """Return whether the episodes' rewards are something else than minus their stage costs.
+
+    They may differ by a constant and a factor. Rewards that are all zero are none.
+    """
+    rewards = np.array([each.reward for each in episodes])
+    if not np.all(np.isfinite(rewards)) or not np.any(rewards):
+        return False
+    costs = _costs(problem, episodes, False)
+    spread = float(np.std(rewards) * np.std(costs))
+    if not spread > 1e-9 * np.abs(rewards).max() * np.abs(costs).max():
+        return False
+    correlation = -float(np.mean((rewards - rewards.mean()) * (costs - costs.mean()))) / spread
+    return not (correlation > 0 and correlation**2 >= OWN)
 
 
 def why_taken_back(journal: Journal, costs: Costs) -> str:
@@ -90,10 +129,16 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     alarms = sum(each.alarm is not None for each in played)
     if alarms >= max(2.0, ALARMS * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
-    room = min(SURELY * costs.error, MOST * abs(costs.mpc))
+    room = min(costs.room, MOST * abs(costs.mpc))
     if not costs.actual <= costs.mpc + room < np.inf:  # nor does NaN pass
-        return f"it cost {costs.actual:.5g}, the MPC would have {costs.mpc:.5g}"
+        by = "by the plant's reward, " if costs.own_reward else ""
+        return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
     return ""
+
+
+def is_kept(costs: Costs) -> bool:
+    """Return whether the plant has shown that the policy surely costs less than the MPC."""
+    return costs.pairs >= 2 and costs.actual + costs.room < costs.mpc
 
 
 def is_confirmed(journal: Journal, costs: Costs) -> bool:
@@ -103,22 +148,20 @@ def is_confirmed(journal: Journal, costs: Costs) -> bool:
     return quiet and 0 < ENOUGH * costs.promised <= gained < np.inf
 
 
-def _beyond(journal: Journal, plant: Plant, twin: PlantTwin) -> tuple[float, float]:
-    """Return how much more than in the twin a step of the MPC has cost, and the standard error."""
-    own = [journal.episodes[i] for i in journal.log if not journal.by_policy[i]]
-    own = [each for each in own if each.alarm is None]
-    if not own:
-        return 0.0, 0.0
-    more = _costs(plant.problem, own) - predicted_costs(twin, own, plant.mpc)
-    steps = sum(len(each.actions) for each in own)
-    return float(more.sum() / steps), len(own) * _standard_error(more) / steps
-
-
 def _standard_error(values: Array) -> float:
-    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
+    """Return that of the mean of values in their order, of which neighbors may be correlated."""
+    if len(values) < 2:
+        return 0.0
+    left = values - values.mean()
+    size = float(left @ left)
+    lag = float(np.clip(left[1:] @ left[:-1] / size, 0.0, 0.95)) if size > 0 else 0.0
+    widened = np.sqrt((1 + lag) / (1 - lag))  # an autoregression's variance of the mean
+    return float(widened * values.std(ddof=1) / np.sqrt(len(values)))
 
 
-def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> Array:
+def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode], own_reward: bool) -> Array:
+    if own_reward:
+        return np.array([-each.reward for each in episodes])
     cost = problem.stage_cost
     return np.array([np.sum(cost(each.thetas[:-1], each.actions)) for each in episodes])
 

@@ -6,10 +6,11 @@ import copy
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard.actor_checkpoint import ActorCheckpoint, Tensors
 from sb3_yann.guard.rng import preserve_rng
 from sb3_yann.policy.policies import YannPolicy, require_yann_policy
 
@@ -36,6 +37,8 @@ class Incumbent:
         for actor in ("actor", "actor_target"):
             self._first |= {f"{actor}.{name}": each for name, each in mpc.items()}
         self.candidate: ActorCheckpoint | None = None
+        self._kept: tuple[ActorCheckpoint, float | None] | None = None
+        self._shown: tuple[ActorCheckpoint, Any] | None = None
         if self.has_learnt:
             self.candidate = ActorCheckpoint.of(self.policy)
             self.give_back()
@@ -62,13 +65,39 @@ class Incumbent:
             self.candidate.restore(self.policy)
             self.candidate = None
 
+    def keep(self, kept: bool) -> None:
+        """Take it for the one that the plant has confirmed; or forget which one that was."""
+        self._kept = (ActorCheckpoint.of(self.policy), self.policy.max_correction) if kept else None
+
+    def show(self) -> None:
+        """Make it the one that the plant has confirmed, else the MPC, while no episode is played.
+
+        What is on trial goes on from :meth:`restore`.
+        """
+        if self._shown is not None:
+            return
+        whole = _whole(self.policy), self.policy.max_correction
+        if self._kept is None:
+            self.give_back()
+        else:
+            self._kept[0].restore(self.policy)
+            self.limit(self._kept[1])
+        self._shown = ActorCheckpoint.of(self.policy), whole
+
     def hold(self) -> None:
         """Take it for the accepted one from here on."""
+        self._shown = None
         self._held = ActorCheckpoint.of(self.policy), self.policy.max_correction
 
     def restore(self) -> None:
         """Make it the accepted one again, with a warning where something has changed it."""
         held, bound = self._held
+        if self._shown is not None:
+            shown, (whole, its_bound) = self._shown
+            self._shown = None
+            if shown.is_actor_of(self.policy):
+                _restore_whole(self.policy, whole)
+                self.limit(its_bound)
         if held.is_actor_of(self.policy) and bound == self.policy.max_correction:
             return
         held.restore(self.policy)
@@ -96,13 +125,24 @@ class Incumbent:
 @contextmanager
 def all_or_nothing(policy: YannPolicy) -> Iterator[None]:
     """Undo what happens to a policy's weights and optimizers, if an error or Ctrl-C cuts it off."""
-    weights = {name: each.clone() for name, each in policy.state_dict().items()}
-    optimizers = policy.actor.optimizer, policy.critic.optimizer
-    states = [copy.deepcopy(each.state_dict()) for each in optimizers]
+    whole = _whole(policy)
     try:
         yield
     except BaseException:
-        policy.load_state_dict(weights)
-        for optimizer, state in zip(optimizers, states, strict=True):
-            optimizer.load_state_dict(state)
+        _restore_whole(policy, whole)
         raise
+
+
+def _whole(policy: YannPolicy) -> tuple[Tensors, list[Any]]:
+    """Return a copy of a policy's weights, and of its optimizers' states."""
+    optimizers = policy.actor.optimizer, policy.critic.optimizer
+    weights = {name: each.clone() for name, each in policy.state_dict().items()}
+    return weights, [copy.deepcopy(each.state_dict()) for each in optimizers]
+
+
+def _restore_whole(policy: YannPolicy, whole: tuple[Tensors, list[Any]]) -> None:
+    weights, states = whole
+    policy.load_state_dict(weights)
+    optimizers = policy.actor.optimizer, policy.critic.optimizer
+    for optimizer, state in zip(optimizers, states, strict=True):
+        optimizer.load_state_dict(copy.deepcopy(state))

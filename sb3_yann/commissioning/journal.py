@@ -30,9 +30,9 @@ class Batch:
         How far it could leave the MPC, in input ranges.
     cost, predicted, mpc : float
         Mean stage cost of the quiet episodes of the one that acted; what the twin had predicted
-        for it from these starts; and what the MPC would have cost, by the twin that has learnt
-        from them and by what the MPC's own episodes cost beyond that twin, with sensor noise for
-        one. NaN where there was no twin.
+        for it from these starts; and what the MPC cost, which took turns with it on the plant. NaN
+        where it did not, or where there was no twin. Minus the plant's rewards where these are not
+        the stage cost.
     verdict : str
         "accepted" (a new policy), "stays" (the one that acted), "the MPC acts" or "begins anew".
     reason : str
@@ -77,6 +77,8 @@ class Outlook:
         And its seed.
     model, model_digest : str or None
         The file of the accepted policy, and its digest.
+    kept, kept_digest, kept_bound : str, str and float, or None
+        The file of the policy that the plant has confirmed, its digest, and its bound.
     tried : bool
         Whether what the model had learnt before has been tried.
     """
@@ -89,6 +91,9 @@ class Outlook:
     twin_seed: int = 0
     model: str | None = None
     model_digest: str | None = None
+    kept: str | None = None
+    kept_digest: str | None = None
+    kept_bound: float | None = None
     tried: bool = False
 
 

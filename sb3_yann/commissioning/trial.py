@@ -13,7 +13,8 @@ from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
 from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
-from sb3_yann.twin.dynamics import law_of
+from sb3_yann.twin.dynamics import Dynamics, law_of
+from sb3_yann.twin.hidden_dynamics import HiddenDynamics
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.starts import RARE
 
@@ -139,11 +140,19 @@ class Trial:
         return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
 
     def second_objection(self, act: Inputs) -> str:
-        """Return what the twin's second opinion says against a policy; empty where nothing.
+        """Return what the twin's other models say against a policy; empty where nothing.
 
-        From the starts that begin as the log does it must gain, and none may cost much more.
+        From the starts that begin as the log does it must gain in each, and none may cost much
+        more: in one without a form, and in one with a memory where the log shows hidden dynamics.
         """
-        opinion, starts = self.twin.second_opinion, self.starts[:1, : self.n_known]
+        said = self._objection(self.twin.second_opinion, act, "a second model")
+        if said or self.twin.hidden_dynamics is None:
+            return said
+        return self._objection(self.twin.hidden_dynamics, act, "a model with hidden dynamics")
+
+    def _objection(self, opinion: Dynamics | HiddenDynamics, act: Inputs, name: str) -> str:
+        """Return what one model says against a policy."""
+        starts = self.starts[:1, : self.n_known]
         given, stage_cost = self.given[:, : self.n_known], self.twin.problem.stage_cost
         with np.errstate(all="ignore"):
             runs = (opinion.roll_out(each, starts, self.steps, given) for each in (self._law, act))
@@ -152,9 +161,9 @@ class Trial:
             )
             change, mean = costs - mpc, np.abs(mpc).mean()
             if not change.mean() < 0:
-                return f"by a second model it costs {100 * change.mean() / mean:+.2g} %"
+                return f"by {name} it costs {100 * change.mean() / mean:+.2g} %"
             if not change.max() <= OTHERWISE * mean:
-                return f"by a second model a start costs {change.max():.4g} more"
+                return f"by {name} a start costs {change.max():.4g} more"
         return ""
 
     def _run(self, act: Inputs) -> tuple[Array, Array]:

@@ -15,6 +15,7 @@ from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.env import TwinEnv
 from sb3_yann.twin.gaussian_process import GaussianProcess
+from sb3_yann.twin.hidden_dynamics import HiddenDynamics
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from sb3_yann.twin.observers import observer_of, warn_of_estimates
@@ -263,6 +264,11 @@ class PlantTwin:
         process = GaussianProcess(problem.layout.has_constants, shortest=SHORT)
         residual = fitted(problem, coordinates, self.episodes, [process])
         return Dynamics(problem, coordinates, tuple(residual))
+
+    @cached_property
+    def hidden_dynamics(self) -> HiddenDynamics | None:
+        """The twin with a memory of earlier inputs and errors; None where the log shows none."""
+        return HiddenDynamics.of(self.dynamics, self.episodes)
 
     @cached_property
     def starts(self) -> Starts:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.curvature import features, without
+from sb3_yann.control.identification.hidden_states import leftover
 from sb3_yann.control.identification.logs import Episode
 
 LONGEST = 10  # longest dead time, in samples, that is looked for
@@ -64,7 +65,8 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
             trials = [[*best[:j], lag, *best[j + 1 :]] for lag in range(LONGEST + 1)]
             left = np.array([_left(gram, trial, n) + floor for trial in trials])
             best = trials[_chosen(left, steps, n)]
-    return best
+    # A hidden state makes earlier inputs count too, but earlier states with them.
+    return [0] * n_inputs if any(best) and leftover(longer, best).is_hidden else best
 
 
 def _left(gram: Array, delays: list[int], n: int) -> Array:

@@ -8,6 +8,7 @@ from scipy.special import fdtrc
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.curvature import bent, features
 from sb3_yann.control.identification.dead_time import GAIN, found_delays
+from sb3_yann.control.identification.hidden_states import leftover
 from sb3_yann.control.identification.least_squares import Regression
 from sb3_yann.control.identification.logs import Episode
 from sb3_yann.control.linear_system import names
@@ -15,6 +16,7 @@ from sb3_yann.control.linear_system import names
 LONGEST = 10  # longest input delay, in samples, that is looked for
 ENOUGH = 5000  # steps in which a delay is looked for
 CHANCE = 0.01  # significance level of an input's effect
+HIDDEN = "earlier states explain more than dead time does, so there is one that is not measured."
 FOLLOWS = 0.25  # least correlation of residuals with an earlier input: sensor noise leaves some
 
 
@@ -39,6 +41,8 @@ def input_notes(
     """
     n, m, _ = sizes
     delays, notes = _delays(found, episodes, sizes), []
+    automatic = found_delays(log or episodes, m) if any(lag for lag, _ in delays[:m]) else [0] * m
+    hidden = not any(automatic) and leftover(log or episodes, automatic).is_hidden
     driven = zip(names(sizes)[n:], delays, strict=True)
     for column, (name, (lag, correlation)) in enumerate(driven, n):
         idle = _chance(found, n, column) > CHANCE
@@ -46,6 +50,8 @@ def input_notes(
             f"he residuals follow {name} of {lag} steps before (correlation {correlation:.2f}): "
             f"it acts {lag} samples late."
         )
+        if hidden:
+            late = late.replace(f"it acts {lag} samples late.", HIDDEN)
         if lag:
             start = f"{name} has no effect that can be told from 0, and t" if idle else "T"
             cure = f" Move its measurements {lag} samples down, in the log and on the plant."
@@ -56,7 +62,7 @@ def input_notes(
                 "more than the log shows, too small beside the noise, or not what the plant got?"
             )
     lags = [lag for lag, _ in delays[:m]]
-    return [*notes, _advice(lags, found_delays(log or episodes, m))] if any(lags) else notes
+    return [*notes, _advice(lags, automatic)] if any(lags) and not hidden else notes
 
 
 def _advice(lags: list[int], automatic: list[int]) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.curvature import bent
+from sb3_yann.control.identification.hidden_states import NOISE, leftover
 from sb3_yann.control.identification.least_squares import Regression, neighbors
 from sb3_yann.control.identification.logs import Episode
 from sb3_yann.control.identification.pole_errors import pole_note
@@ -57,17 +58,36 @@ def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[st
     share, rest = bent(found, fitted)
     share, own = share[:n], found.autocorrelation[:n]
     colored = np.abs(own) > 3 / np.sqrt(found.steps)
-    notes = []
+    left, notes = leftover(fitted), list[str]()
+    known = bool(np.any(left.linear > 0))
+    # What chance squares to is not there on rows that were held out.
+    share = np.where(left.may_bend[:n] | (not known), share, 0.0)
+    explained = 100 * (1 - left.lags[:n] / np.where(left.linear[:n] > 0, left.linear[:n], np.inf))
     if np.any(share > 0):
-        notes.append(
+        curved = (
             f"Curvature: squares and products of states and inputs explain {listed(100 * share)} % "
-            "of the residuals' variance. The plant is not linear over this log: record closer to "
-            "the operating point, or learn what is missing (PlantTwin)."
+            "of the residuals' variance. "
+        )
+        sure = not known or bool(np.any(left.bends[:n] & (share > 0)))
+        cure = "record closer to the operating point, or learn what is missing (PlantTwin)."
+        notes.append(
+            f"{curved}The plant is not linear over this log: {cure}"
+            if sure
+            else f"{curved}Earlier states and inputs explain {listed(explained)} %: the plant is "
+            f"not linear over this log, or it has a state that is not measured. If the former, "
+            f"{cure}"
         )
         # What curvature explains is no noise.
         colored &= np.abs(neighbors(rest, fitted)[:n]) > 3 / np.sqrt(found.steps)
         # Where it explains much, what it leaves is curvature of higher order.
         colored &= share < MUCH
+    elif np.any(explained > 100 * (1 - NOISE)):
+        return [
+            f"Earlier states and inputs explain {listed(explained)} % of the residuals' variance, "
+            "more than sensor noise lets them: there is a state that is not measured, or dead "
+            "time. Append earlier readings and inputs to the states, or measure what is missing. "
+            "The standard errors do not tell that."
+        ]
     if np.any(colored):
         notes.append(
             f"The residuals of neighboring steps are correlated ({listed(own)}): "
