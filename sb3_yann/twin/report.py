@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from decimal import ROUND_CEILING, Context
-from itertools import pairwise
 
 import numpy as np
 
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import labels_of
-from sb3_yann.twin.log import Episode
+from sb3_yann.twin.log import Episode, records
 from sb3_yann.twin.trust import ALONE, Trust
 
 
@@ -36,27 +35,16 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
 def _data(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Iterator[str]:
     steps = sum(map(len, episodes))
     yield f"The log: {len(episodes)} episodes, {steps} steps."
-    for first, last in _records(episodes):
+    for pieces in filter(lambda each: len(each) > 1, records(episodes)):
         yield (
-            f"Episodes {first} to {last} are consecutive pieces of one record: each is tested as "
-            "one of its own. Independent are those that do not follow each other."
+            f"Episodes {pieces[0]} to {pieces[-1]} are consecutive pieces of one record. Every "
+            f"other one is independent: {len(pieces[::2])} of {len(pieces)}."
         )
     constant = problem.layout.constant
     seen = np.concatenate([each.thetas[:, constant] for each in episodes])
     names = np.array(problem.layout.names)[constant]
     if still := [*names[np.ptp(seen, axis=0) == 0]]:
         yield f"The log shows one value alone of {', '.join(still)}: elsewhere the MPC will act."
-
-
-def _records(episodes: tuple[Episode, ...]) -> Iterator[tuple[int, int]]:
-    """Yield the first and the last number of episodes of which each begins as one before ended."""
-    follows = [np.array_equal(a.thetas[-1], b.thetas[0]) for a, b in pairwise(episodes)]
-    first = 0
-    for number, goes_on in enumerate([*follows, False]):
-        if not goes_on:
-            if number > first:
-                yield first, number
-            first = number + 1
 
 
 def _errors(kind: str, trust: Trust) -> Iterator[str]:

@@ -16,7 +16,7 @@ from sb3_yann.control.identification.frozen import frozen_rows, words_for
 from sb3_yann.control.model.labels import labels_of, name_of
 from sb3_yann.twin.alignment import objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
-from sb3_yann.twin.log import Episode
+from sb3_yann.twin.log import Episode, records
 from sb3_yann.twin.selection import Candidate, FreeRuns, fitted
 
 COST_ERROR = 0.25
@@ -228,7 +228,7 @@ def judge(
     inputs : pair of ndarray, shape (m,)
         How much of each input is its own, and how much it moves.
     n_episodes : int
-        In the log.
+        In the log, independent of each other.
     beyond : pair of float and str
         The largest share of logged rows beyond the box of theta, and of which entry.
     names : sequence of str, optional
@@ -239,7 +239,8 @@ def judge(
     if n_episodes < 2:
         problems.append("There is one episode: nothing is left to test the twin on.")
         advice.append(
-            "Log at least one episode more; five are a good number. Cut a long record into pieces."
+            "Log at least one episode more; five are a good number. A long "
+            "record may be cut into three consecutive pieces or more."
         )
     still: NDArray[np.bool_] = moves < STILL
     for k in np.flatnonzero(still):
@@ -307,7 +308,8 @@ def evidence(
     shares = beyond_the_box(problem, log)
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
-    problems, advice = judge(runs, standing, costs, inputs, len(log), beyond, names)
+    independent = sum(len(each[::2]) for each in records(log))
+    problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names)
     problems += foreign_previous(problem, log)
     problems += objections(problem, coordinates, log)
     problems += _frozen(dynamics, log)

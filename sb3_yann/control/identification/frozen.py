@@ -145,4 +145,3 @@ def _runs(columns: Sequence[Array], state: int) -> Iterator[Frozen]:
 
 def _length(run: Frozen) -> int:
     return run.last - run.first + 1
-
