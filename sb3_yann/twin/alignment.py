@@ -247,11 +247,11 @@ def _against_model(
     fit = fits[0]
     if fit is None:
         return
-    # Inputs that follow the state of their own row tell it in the row after: that is no cause.
-    closed = min(fit.follows) < FOLLOWS
-    for shift in (-1, 1)[: 1 if closed else 2]:
+    for shift in (-1, 1):
         other = fits[shift]
-        ratio = other.left / fit.left if other is not None else np.ones(1)
+        if other is None or (shift == 1 and not _causes(other, fit, problem.model.B, coordinates)):
+            continue
+        ratio = other.left / fit.left
         if ratio.min() < CLEARLY and ratio.max() < 1 / FOLLOWS:
             yield (
                 f"The next states follow the inputs of {WHERE[shift]} (they leave "
@@ -272,10 +272,9 @@ def _against_model(
     if np.any(columns != np.arange(len(columns))):
         return
     for j in own:
-        weights = B[:, j] / unit**2
+        weights = _weights(B[:, j], unit)
         if not np.any(weights):
             continue
-        weights = weights / (weights @ B[:, j])
         gain = float(weights @ fit.B[:, j])
         error = float(np.sqrt(max(weights @ fit.covariance @ weights, 0.0)) * fit.factors[j])
         if gain + SURE * error < 0 and gain < -LITTLE:
@@ -288,6 +287,22 @@ def _against_model(
                 f"The logged {names[j]} moves the plant {gain:.3g} ± {error:.2g} times as much as "
                 "the model says: is it in other units, or a row off?"
             )
+
+
+def _weights(b: Array, units: Array) -> Array:
+    """Return weights (n,) that make 1 of a column of B, and of another one its relative gain."""
+    size = float(np.sum((b / units) ** 2))
+    return b / units**2 / size if size else np.zeros(len(b))
+
+
+def _causes(after: _Gains, fit: _Gains, B: Array, coordinates: Coordinates) -> bool:
+    """Return whether the inputs of the row after may be what moved the plant.
+
+    Inputs that follow the state of their own row tell it, with the other sign: that is no cause.
+    """
+    columns = zip(B.T, after.B.T, strict=True)
+    gains = [_weights(b, coordinates.units) @ found for b, found in columns]
+    return min(fit.follows) > FOLLOWS or min(gains) > GAINS[0]
 
 
 def _resting(
@@ -376,15 +391,9 @@ class _Gains:
 
 
 def _exchanged(fit: _Gains, B: Array, units: Array) -> Array:
-    """Return whose direction of B each input has (m,): its own, unless others clearly fit better.
+    """Return whose direction of the model's B each input has (m,), in units of the states.
 
-    Parameters
-    ----------
-    fit : _Gains
-    B : ndarray, shape (n, m)
-        The model's.
-    units : ndarray, shape (n,)
-        Those of the states.
+    Its own, unless others clearly fit better.
     """
     own = np.arange(B.shape[1])
     sizes = np.linalg.norm(fit.B / np.sqrt(np.diag(fit.covariance))[:, None], axis=0)

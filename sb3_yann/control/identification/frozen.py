@@ -30,8 +30,7 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
 
     A sensor that counts in steps repeats itself often: runs count from ten times its usual length
     on. A plant at rest repeats itself while nothing else moves. A state that rests by itself is
-    told to rest by a linear model of the other rows. A clipped one comes back to where it is
-    clipped. None of these is frozen.
+    told to rest by a linear model of the other rows. A clipped one rests at an end of its range. None of these is frozen.
 
     Parameters
     ----------
@@ -112,7 +111,8 @@ class _Column:
         comes_back = any(
             each != run and _length(each) > 2 and self._value(each) == value for each in self.runs
         )
-        if comes_back and (value in self.ends or predicted < 1):
+        clipped = value in self.ends and (comes_back or run.first > 0)
+        if clipped or (comes_back and predicted < 1):
             return False
         alive = all(each > 0.2 * self.typical for each in self._beside(run))
         return bool(predicted > 1e-3 and (predicted > 1 or alive))

@@ -16,7 +16,6 @@ from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc._arguments import Bounds
 from sb3_yann.control.mpc.problem import MPCProblem
 
-
 GROWTH = 1e3
 """How many times as large the fastest mode may become over the horizon, uncontrolled.
 

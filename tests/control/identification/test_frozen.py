@@ -47,12 +47,8 @@ def test_a_sensor_that_counts_in_steps_is_not_frozen(levels) -> None:
 
 def test_a_plant_at_rest_a_state_at_rest_and_a_clipped_one_are_not_frozen() -> None:
     x, u = log()
-    assert (
-        frozen_rows(
-            [np.vstack([x, np.tile(x[-1], (80, 1))])], [np.vstack([u, u[-1] * np.ones((80, 1))])]
-        )
-        == []
-    )  # noqa: E501
+    rests = np.vstack([x, np.tile(x[-1], (80, 1))]), np.vstack([u, np.tile(u[-1], (80, 1))])
+    assert frozen_rows([rests[0]], [rests[1]]) == []
     beside = np.hstack([x, np.concatenate([0.5 ** np.arange(101), np.zeros(100)])[:, None]])
     beside[60:, 2] = 0.0  # it decays to nothing, and stays there
     assert frozen_rows([beside], [u]) == []
