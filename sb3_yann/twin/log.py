@@ -132,6 +132,16 @@ def pieces(episodes: tuple[Episode, ...], least: int) -> tuple[Episode, ...]:
     return tuple(found)
 
 
+def records(episodes: tuple[Episode, ...]) -> list[range]:
+    """Return the numbers of the episodes of each record: one begins where the one before ends.
+
+    Two neighbors share a row and what the plant remembers. Every other one is independent.
+    """
+    follows = [np.array_equal(a.thetas[-1], b.thetas[0]) for a, b in pairwise(episodes)]
+    edges = [0, *(np.flatnonzero(~np.array(follows, dtype=bool)) + 1), len(episodes)]
+    return [range(int(first), int(stop)) for first, stop in pairwise(edges)]
+
+
 def _lacking(problem: LinearMPC, states: Array) -> str:
     """Return a hint where states (T + 1, k) lack the inputs on their way, empty elsewhere."""
     model, past = problem.model, list[int]()

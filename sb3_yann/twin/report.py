@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import labels_of
-from sb3_yann.twin.log import Episode
+from sb3_yann.twin.log import Episode, records
 from sb3_yann.twin.trust import ALONE, Trust
 
 
@@ -35,6 +35,11 @@ def report(problem: LinearMPC, episodes: tuple[Episode, ...], kind: str, trust: 
 def _data(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Iterator[str]:
     steps = sum(map(len, episodes))
     yield f"The log: {len(episodes)} episodes, {steps} steps."
+    for pieces in filter(lambda each: len(each) > 1, records(episodes)):
+        yield (
+            f"Episodes {pieces[0]} to {pieces[-1]} are consecutive pieces of one record. Every "
+            f"other one is independent: {len(pieces[::2])} of {len(pieces)}."
+        )
     constant = problem.layout.constant
     seen = np.concatenate([each.thetas[:, constant] for each in episodes])
     names = np.array(problem.layout.names)[constant]

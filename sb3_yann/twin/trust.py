@@ -12,9 +12,11 @@ from scipy.optimize import nnls
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.model.labels import name_of
+from sb3_yann.control.identification.frozen import frozen_rows, words_for
+from sb3_yann.control.model.labels import labels_of, name_of
+from sb3_yann.twin.alignment import objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
-from sb3_yann.twin.log import Episode
+from sb3_yann.twin.log import Episode, records
 from sb3_yann.twin.selection import Candidate, FreeRuns, fitted
 
 COST_ERROR = 0.25
@@ -169,12 +171,6 @@ def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
     return np.asarray(np.mean((theta < low) | (theta > high), axis=0))
 
 
-def count_apart(episodes: tuple[Episode, ...]) -> int:
-    """Return how many episodes there are, where one that begins as another ends goes on with it."""
-    ends = np.array([each.thetas[-1] for each in episodes])
-    return sum(not np.any(np.all(each.thetas[0] == ends, axis=1)) for each in episodes)
-
-
 def spikes(problem: LinearMPC, episodes: tuple[Episode, ...], left: list[Array]) -> list[str]:
     """Return which reading stands alone, by what one step leaves of the states, (T, n) each."""
     together = np.abs(np.concatenate(left))
@@ -201,6 +197,15 @@ def foreign_previous(problem: LinearMPC, episodes: tuple[Episode, ...]) -> list[
     return [f"In {100 * share:.3g} % of the rows theta does not hold the input before it."]
 
 
+def _frozen(dynamics: Dynamics, episodes: tuple[Episode, ...]) -> list[str]:
+    """Return which sensor stands still though the plant moves."""
+    row, model = dynamics.row, dynamics.problem.model
+    driven = [row.features(e.thetas[:-1], e.actions)[:, model.n_states :] for e in episodes]
+    states = [each.thetas[:, row.state] for each in episodes]
+    found = frozen_rows(states, driven)
+    return words_for(found, labels_of(model)[0], [x + model.x_ss for x in states])
+
+
 def judge(
     runs: FreeRuns,
     standing: Array,
@@ -223,7 +228,7 @@ def judge(
     inputs : pair of ndarray, shape (m,)
         How much of each input is its own, and how much it moves.
     n_episodes : int
-        In the log.
+        In the log, independent of each other.
     beyond : pair of float and str
         The largest share of logged rows beyond the box of theta, and of which entry.
     names : sequence of str, optional
@@ -233,7 +238,10 @@ def judge(
     share, moves = inputs
     if n_episodes < 2:
         problems.append("There is one episode: nothing is left to test the twin on.")
-        advice.append("Log at least one episode more; five are a good number.")
+        advice.append(
+            "Log at least one episode more; five are a good number. A long "
+            "record may be cut into three consecutive pieces or more."
+        )
     still: NDArray[np.bool_] = moves < STILL
     for k in np.flatnonzero(still):
         which, what = (names[k] if names else f"{each} {k}" for each in ("Input", "input"))
@@ -300,8 +308,11 @@ def evidence(
     shares = beyond_the_box(problem, log)
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
-    problems, advice = judge(runs, standing, costs, inputs, count_apart(log), beyond, names)
+    independent = sum(len(each[::2]) for each in records(log))
+    problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names)
     problems += foreign_previous(problem, log)
+    problems += objections(problem, coordinates, log)
+    problems += _frozen(dynamics, log)
     first = Dynamics(problem, coordinates, dynamics.members[:1])
     parts = [e.thetas[1:] - first.step(e.thetas[None, :-1], e.actions[None])[0] for e in log]
     parts = [each[:, row.state] for each in parts]

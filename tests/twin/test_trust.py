@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.optimize import check_grad
 from general_problems import solved
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits
 from sb3_yann.twin import trust as trusts
-from sb3_yann.twin.log import Episode, as_episodes, pieces
+from sb3_yann.twin.log import Episode, as_episodes, records
 from sb3_yann.twin.network import UNITS, Network
 from sb3_yann.twin.plots import draw_twin
 from sb3_yann.twin.report import report
@@ -224,17 +225,17 @@ def test_the_actual_cost_of_an_episode_is_that_of_its_steps() -> None:
     assert trusts.costs_of(problem(), each) == pytest.approx(expected)
 
 
-def test_an_episode_that_goes_on_where_another_ends_is_none_of_its_own() -> None:
-    one, two = (random_episode(problem(), 20, seed) for seed in range(2))
-    parts = pieces((one, two), 2), (one, two), (*pieces((one, two), 4), two)
-    assert [trusts.count_apart(each) for each in parts] == [2, 2, 3]
-    halves = [
-        Episode(one.thetas[:11], one.actions[:10]),
-        Episode(one.thetas[10:], one.actions[10:]),
-    ]
-    assert trusts.count_apart((*halves,)) == 1
-    almost = Episode(halves[1].thetas + np.array([0.0, 1e-9]), halves[1].actions)
-    assert trusts.count_apart((halves[0], almost)) == 2
+def test_every_other_piece_of_a_record_is_independent() -> None:
+    one, two = (random_episode(problem(), 40, seed) for seed in range(2))
+    edges = (0, 10, 20, 30, 40)
+    parts = [Episode(one.thetas[a : b + 1], one.actions[a:b]) for a, b in pairwise(edges)]
+    assert records((one, two)) == [range(1), range(1, 2)]
+    assert records((two, *parts)) == [range(1), range(1, 5)]
+    almost = Episode(parts[1].thetas + np.array([0.0, 1e-9]), parts[1].actions)
+    assert len(records((parts[0], almost))) == 2
+    said = report(problem(), (two, *parts), "", twin().trust).splitlines()[1]
+    assert said.startswith("Episodes 1 to 4 are consecutive pieces of one record.")
+    assert said.endswith("2 of 4.")
 
 
 def test_a_reading_a_thousand_times_as_far_off_as_most_is_named_with_its_value() -> None:

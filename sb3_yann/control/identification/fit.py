@@ -18,6 +18,7 @@ from sb3_yann.control.identification.dead_time import (
     with_memory,
     with_memory_point,
 )
+from sb3_yann.control.identification.frozen import frozen_rows, words_for
 from sb3_yann.control.identification.input_delays import input_notes
 from sb3_yann.control.identification.least_squares import Regression, regress
 from sb3_yann.control.identification.logs import Episode, Log, as_episodes, split, without_gaps
@@ -74,6 +75,7 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
     dt, lost = as_positive("dt", dt), 0
     if time is not None:
         episodes, lost = without_gaps(episodes, time, dt)
+    _require_moving(episodes, sizes)
     episodes, sizes, delays = _delayed(episodes, sizes, delay)
     x_ss = with_memory_point(x_ss, u_ss, delays)
     n, m, d = sizes
@@ -101,6 +103,14 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
     if lost:
         notes.append(f"{lost} steps that took another time than dt were left out.")
     return LogFit(replace(system, notes=tuple(notes)), found, fits, tuple(delays))
+
+
+def _require_moving(episodes: list[Episode], sizes: tuple[int, int, int]) -> None:
+    """Raise where a sensor stands still though the plant moves."""
+    states = [each.states for each in episodes]
+    found = frozen_rows(states, [each.driven for each in episodes])
+    if found:
+        raise ValueError(" ".join(words_for(found, names(sizes), states)))
 
 
 def _system(

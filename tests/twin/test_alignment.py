@@ -1,0 +1,114 @@
+"""Logs whose inputs are not those that acted: rows, columns, signs, units; and frozen sensors."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel, LinearMPC, PlantTwin
+
+GAINS = np.array([1.5, 0.7])
+SELECT = ["none", "linear"]
+
+
+@cache
+def mpc() -> LinearMPC:
+    """Two coupled lags."""
+    model = LinearModel([[0.9, 0.15], [0.0, 0.7]], [[0.1, 0.0], [0.05, 0.3]], 1.0)
+    return LinearMPC(
+        model, Q=np.diag([2.0, 1.0]), R=0.2 * np.eye(2), horizon=3, u_min=-1, u_max=1,
+        x_min=-4, x_max=4,
+    )  # fmt: skip
+
+
+def logged(kind: str, seed: int = 0, noise: float = 0.01) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return episodes of a plant of other gains: of the MPC, another controller, or open loop."""
+    rng, law, found = np.random.default_rng(seed), mpc().explicit(), []
+    for _ in range(6):
+        x, held = rng.uniform(-1.5, 1.5, 2), np.zeros(2)
+        states, inputs = [x + noise * rng.normal(size=2)], []
+        for k in range(40):
+            held = rng.uniform(-0.4, 0.4, 2) if k % 5 == 0 else held
+            u = held
+            if kind == "the MPC":
+                u = law(states[-1])
+            elif kind == "another controller":
+                gentle = np.array([[0.8, 0.1], [0.0, 0.7]]) @ states[-1]
+                u = np.clip(0.08 * rng.normal(size=2) - gentle, -1, 1)
+            x = mpc().model.A @ x + mpc().model.B @ (GAINS * u)
+            states.append(x + noise * rng.normal(size=2))
+            inputs.append(u)
+        found.append((np.array(states), np.array(inputs)))
+    return found
+
+
+def stuck(x: np.ndarray, state: int) -> np.ndarray:
+    """Return states of which one reads the same for a quarter of the rows."""
+    x = x.copy()
+    x[8:18, state] = x[8, state]
+    return x
+
+
+FAULTS = {
+    "a row early": lambda x, u: (x[:-1], u[1:]),
+    "a row late": lambda x, u: (x[1:], u[:-1]),
+    "inputs exchanged": lambda x, u: (x, u[:, ::-1]),
+    "states exchanged": lambda x, u: (x[:, ::-1], u),
+    "a sign": lambda x, u: (x, u * [1, -1]),
+    "both signs": lambda x, u: (x, -u),
+    "a hundredth": lambda x, u: (x, 0.01 * u),
+    "a tenth": lambda x, u: (x, 0.1 * u),
+    "a fraction of the range": lambda x, u: (x, 0.5 + 0.5 * u),
+    "a frozen sensor": lambda x, u: (stuck(x, 0), u),
+    "the other one frozen": lambda x, u: (stuck(x, 1), u),
+}
+KINDS = ("the MPC", "another controller", "open loop")
+
+
+def fitted(episodes: list) -> PlantTwin:
+    return PlantTwin.fit(mpc(), episodes, residuals=SELECT, n_members=1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_log_whose_columns_are_not_what_acted_is_not_trusted(kind, fault) -> None:
+    assert not fitted([FAULTS[fault](x, u) for x, u in logged(kind)]).trusted
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
+def test_a_sound_log_has_nothing_against_its_columns(kind, noise) -> None:
+    for seed in range(2):
+        twin = fitted(logged(kind, seed, noise))
+        assert twin.trusted, twin.report()
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("a row early", "u[0] is what the MPC gives u[0] in the row after"),
+        ("a row late", "u[0] is what the MPC gives u[0] in the row before"),
+        ("inputs exchanged", "u[0] is what the MPC gives u[1] in the same row"),
+        ("a sign", "u[1] is minus what the MPC gives u[1] in the same row"),
+        ("a tenth", "u[0] is 0.1 times what the MPC gives"),
+        ("a fraction of the range", "u[1] is 0.5 times what the MPC gives, +0.5"),
+        ("states exchanged", "where x[0] and x[1] are exchanged"),
+        ("a frozen sensor", "x[0] reads exactly"),
+    ],
+)
+def test_the_report_says_what_is_wrong_with_a_log_of_the_mpc(fault, said) -> None:
+    assert said in fitted([FAULTS[fault](x, u) for x, u in logged("the MPC")]).report()
+
+
+def test_consecutive_pieces_of_a_record_are_tested_as_episodes() -> None:
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.uniform(-0.8, 0.8, (60, 2)), 10, axis=0)
+    x = [np.zeros(2)]
+    for each in u:
+        x.append(mpc().model.A @ x[-1] + mpc().model.B @ (GAINS * each) + 0.02 * x[-1] ** 2)
+    states = np.array(x)
+    twin = fitted([(states[i : i + 61], u[i : i + 60]) for i in range(0, 600, 60)])
+    assert twin.trusted
+    assert "Every other one is independent: 5 of 10." in twin.report()
