@@ -8,6 +8,7 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
+from scipy.spatial import QhullError
 
 from sb3_yann._validation import Array, as_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
@@ -60,26 +61,40 @@ def solve_explicit(
     as_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
     require_sane_sizes(program, u_min, u_max)
-    units = ProgramUnits(program, u_min, u_max)
-    _require_feasible(units.scaled)
     # Before the clock starts: on a new machine this compiles, for longer than many a time limit.
     for kernels in KERNELS:
         import_module(kernels)
     with BudgetTimer(budget) as timer:
-        regions = _critical_regions(units.scaled, solver, timer)
         try:
-            regions = Certificate(
-                units.scaled, regions, len(u_min), units.center, units.half, timer
-            ).check()
+            return _solved(ProgramUnits(program, u_min, u_max), infeasible, solver, timer)
         except ExplicitSolutionError as error:
             if solver == "walk":
                 raise
             raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
-        law = units.law(regions, infeasible)
-        if not law.walks:
-            timer.stage("Search tree", "and checked", law.n_regions)
-            law.grow_tree(timer.advance)
-        return law
+        except (np.linalg.LinAlgError, QhullError, FloatingPointError) as error:
+            fault = str(error).partition("\n")[0].rstrip(".")
+            raise ExplicitSolutionError(
+                f"No explicit law was found: the equations of a region have no solution in float64 "
+                f"({fault}). Bring states, inputs and weights to similar magnitudes, shorten the "
+                "horizon, or use online(), which needs no regions."
+            ) from None
+
+
+def _solved(
+    units: ProgramUnits, infeasible: str, solver: str, timer: BudgetTimer
+) -> PiecewiseAffine:
+    """Return the law of a program in its units, checked, with its search tree."""
+    _require_feasible(units.scaled)
+    regions = _critical_regions(units.scaled, solver, timer)
+    n_inputs = len(units.input_range[0])
+    regions = Certificate(
+        units.scaled, regions, n_inputs, units.center, units.half, timer
+    ).check()
+    law = units.law(regions, infeasible)
+    if not law.walks:
+        timer.stage("Search tree", "and checked", law.n_regions)
+        law.grow_tree(timer.advance)
+    return law
 
 
 def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> list[Region]:

@@ -68,7 +68,8 @@ class LinearMPC(MPCProblem):
     Q : array_like, shape (n, n)
         Weight of the state, symmetric positive semi-definite.
     R : array_like, shape (m, m)
-        Weight of the input, symmetric positive definite.
+        Weight of the input, symmetric positive semi-definite. An input without one needs a weight
+        of its rate, or must move a state that has a terminal cost.
     horizon : int
         Number N of predicted steps, at least 1.
     x_min, x_max : array_like, shape (n,), or float, optional
@@ -143,7 +144,7 @@ class LinearMPC(MPCProblem):
         n, m = model.n_states, model.n_inputs
         horizon, gamma = arguments.as_horizon(horizon), check.as_discount(gamma)
         infeasible = check.as_choice("infeasible", infeasible, INFEASIBLE)
-        Q, R = as_symmetric("Q", Q, n), as_symmetric("R", R, m, definite=True)
+        Q, R = as_symmetric("Q", Q, n), as_symmetric("R", R, m)
         x, u = as_bounds("x", *given.x, n), as_bounds("u", *given.u, m)
         tracking = _as_group("tracking", tracking, Tracking).sized(n)
         d = _as_group("disturbances", disturbances, DisturbanceBounds).sized(model.n_disturbances)
@@ -334,9 +335,15 @@ def _completed(problem: MPCProblem) -> Terminal:
     cost: Any = problem.terminal.cost
     half_spaces: Any = problem.terminal.set
     if cost is None:
-        cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
+        try:
+            cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
+        except ValueError:
+            _require_weighted_inputs(problem)
+            raise
     elif len(cost) != len(errors.Q):
         as_array("Terminal.cost", cost, errors.Q.shape)  # which names the size that is wanted
+    if np.shape(cost) == np.shape(errors.Q):
+        _require_weighted_inputs(problem, cost)
     if isinstance(half_spaces, str):
         half_spaces = invariant_set(problem, cost)
     n, size = problem.model.n_states, problem.n_theta
@@ -344,3 +351,20 @@ def _completed(problem: MPCProblem) -> Terminal:
     if F.shape[1] != size:
         F = np.pad(as_array("Terminal.set F", F, ("rows", n)), ((0, 0), (0, size - n)))
     return Terminal(cost, (F, g))
+
+
+def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> None:
+    """Raise where an input costs nothing: not itself, not by its rate, not by what it moves."""
+    errors = problem.error_system
+    B = errors.model.B
+    weight = errors.R if cost is None else errors.R + problem.gamma * B.T @ cost @ B
+    unit = np.outer(problem.u_half, problem.u_half)
+    sizes = np.linalg.eigvalsh(weight * unit)
+    if sizes[0] > 1e-13 * max(sizes[-1], np.finfo(float).tiny):
+        return
+    raise ValueError(
+        "R must be positive definite, its smallest eigenvalue is "
+        f"{np.linalg.eigvalsh(problem.R)[0]:g}, where an input costs nothing else: neither its rate "
+        "nor a state that it moves has a weight. Give every input a positive weight, in R or in "
+        "RateLimits(R_du=...)."
+    )
