@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
+import numpy as np
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from sb3_yann._validation import as_positive, as_whole
@@ -107,6 +108,11 @@ class BudgetTimer:
         most = self.budget.time_limit
         if most is not None and time.monotonic() - self._start > most:
             self._stop(f"The law was not solved in time_limit = {most:g} s")
+
+    def left(self) -> float:
+        """Return for how many seconds the search may go on, infinite without a limit."""
+        most = self.budget.time_limit
+        return np.inf if most is None else max(0.0, self._start + most - time.monotonic())
 
     def _new_bar(self, name: str, total: int | None) -> Any:
         hidden = not self.budget.progress

@@ -65,8 +65,8 @@ class Certificate:
     ----------
     program, regions : ParametricQP, list of Region
         The scaled program, and what was found.
-    n_inputs : int
-        The first entries of U that are the law.
+    to_inputs : ndarray, shape (m, v)
+        What of U is the law.
     center, half : ndarray, shape (n,)
         Take theta to the units of the problem.
     timer : BudgetTimer, optional
@@ -77,14 +77,14 @@ class Certificate:
         self,
         program: ParametricQP,
         regions: list[Region],
-        n_inputs: int,
+        to_inputs: Array,
         center: Array,
         half: Array,
         timer: BudgetTimer | None = None,
     ) -> None:
         self.program = program
         self.regions = regions
-        self.n_inputs = n_inputs
+        self.to_inputs = to_inputs
         self.center = center
         self.half = half
         self.timer = timer or BudgetTimer(SolveBudget())
@@ -132,8 +132,8 @@ class Certificate:
         self.by_set = {as_bits(region.active_set): i for i, region in enumerate(regions)}
         self.A = np.concatenate([region.A for region in regions])
         self.b = np.concatenate([region.b for region in regions])
-        self.gains = np.array([region.gain[: self.n_inputs] for region in regions])
-        self.offsets = np.array([region.offset[: self.n_inputs] for region in regions])
+        self.gains = np.array([self.to_inputs @ region.gain for region in regions])
+        self.offsets = np.array([self.to_inputs @ region.offset for region in regions])
         self.starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
 
     @contextmanager
@@ -159,9 +159,9 @@ class Certificate:
     def _checked(self, i: int, ball: Ball, kkt: Optimality) -> Region:
         """Return region i, trimmed, with the exact law where that is steep; raise if wrong."""
         region = self.regions[i]
-        exact, offset = kkt.law[: self.n_inputs, :-1], kkt.law[: self.n_inputs, -1]
-        off = max(np.abs(exact - self.gains[i]).max(), np.abs(offset - self.offsets[i]).max())
-        if off > LAW * (1 + np.abs(kkt.law[: self.n_inputs]).max()):
+        exact = self.to_inputs @ kkt.law
+        off = np.abs(exact - np.column_stack([self.gains[i], self.offsets[i]])).max()
+        if off > LAW * (1 + np.abs(exact).max()):
             self._fail(f"the law of region {i} is not optimal inside it", ball[0])
         own = np.column_stack([region.A, region.b])
         known = np.concatenate([self.outer, kkt.rows])
@@ -273,7 +273,7 @@ class Certificate:
         Constraints that hold to 1e-11 move its answer by so much times the slope of the law.
         """
         gains, offsets = self.gains[regions], self.offsets[regions]
-        first = inputs[:, : self.n_inputs]
+        first = inputs @ self.to_inputs.T
         off = np.abs(np.einsum("kvn,kn->kv", gains, points) + offsets - first).max(axis=1)
         return np.asarray(off - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1))
 
