@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
+from sb3_yann.control.explicit.budget import (
+    BudgetTimer,
+    SolveBudget,
+    effort_of_conditions,
+    effort_of_lp,
+    effort_of_qp,
+)
 from sb3_yann.control.explicit.kkt import Optimality, optimality
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
 from sb3_yann.control.polyhedra import Region, farthest_points, largest_ball
@@ -89,6 +95,7 @@ class Certificate:
         self.half = half
         self.timer = timer or BudgetTimer(SolveBudget())
         self.outer = np.column_stack(program.theta_rows())
+        self.effort = effort_of_qp(*program.G.shape)
 
     def check(self) -> list[Region]:
         """Return the regions, with the laws of steep ones more exact, and trimmed by 1e-8 at most.
@@ -153,6 +160,7 @@ class Certificate:
 
     def _is_right(self, i: int, point: Array) -> bool:
         """Tell whether a QP at a point has the law of region i for an answer."""
+        self.timer.tick(self.effort)
         U = self.program.solve(point)
         return U is not None and self._off(np.array([i]), point[None], U[None])[0] <= LAW
 
@@ -178,7 +186,11 @@ class Certificate:
         """Yield the KKT conditions of each region that is left."""
         left = [i for i in range(len(self.regions)) if i not in dropped]
         sets = [self.regions[i].active_set for i in left]
-        for _, members in batches(map(len, sets)):
+        (v, n), rows = self.program.F.shape, len(self.program.w)
+        numbers = lambda size: (v + size) * (v + size + rows + n + 1)
+        for size, members in batches(map(len, sets), numbers):
+            effort = effort_of_conditions(rows + n, v + size, v + size)
+            self.timer.tick(len(members) * effort)
             try:
                 found = optimality(self.program, [sets[k] for k in members])
             except np.linalg.LinAlgError:
@@ -213,6 +225,7 @@ class Certificate:
         if not len(others):
             return others
         rows = kkt.rows[others]
+        self.timer.tick(len(rows) * effort_of_lp(*region.A.shape) / 2)
         points = farthest_points(region.A, region.b, inside, rows[:, :n])
         beyond = np.sum(rows[:, :n] * points, axis=1) - rows[:, n]
         for k in np.flatnonzero(beyond > INSIDE):
@@ -247,6 +260,7 @@ class Certificate:
 
     def _look_across(self, region: Region, row: int) -> None:
         """Raise if no region touches a facet from the other side where that is feasible."""
+        self.timer.tick(effort_of_lp(*region.A.shape) + self.effort)
         middle, distance = largest_ball(region.A, region.b, row)
         for step in (1e-5, 1e-6, 1e-7):
             point = middle + step * region.A[row]
@@ -284,8 +298,12 @@ class Certificate:
         """Raise unless QPs at random points of the box agree with the regions."""
         n, random = self.program.F.shape[1], np.random.default_rng(1)
         drawn = random.uniform(-1, 1, (50 * n, n))
-        solved = [(point, *self.program.solve_with_multipliers(point)) for point in drawn]
-        feasible = [each for each in solved if each[1] is not None]
+        feasible = []
+        for point in drawn:
+            self.timer.tick(self.effort)
+            U, found = self.program.solve_with_multipliers(point)
+            if U is not None:
+                feasible.append((point, U, found))
         if not feasible:
             return
         points, inputs, multipliers = (np.array(each) for each in zip(*feasible, strict=True))
@@ -321,6 +339,7 @@ class Certificate:
         for i, j in zip(order[near], order[near + 1], strict=True):
             one, two = self.regions[i], self.regions[j]
             A, b = np.concatenate([one.A, two.A]), np.concatenate([one.b, two.b])
+            self.timer.tick(effort_of_lp(*A.shape))
             middle, radius = largest_ball(A, b)
             if radius > 0.99 * min(balls[i][1], balls[j][1]):
                 self._fail(f"region {min(i, j)} and region {max(i, j)} are the same", middle)

@@ -12,7 +12,7 @@ from scipy import optimize
 from scipy.spatial import QhullError
 
 from sb3_yann._validation import Array, as_choice, half_widths
-from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
+from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget, effort_of_lp
 from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
 from sb3_yann.control.explicit.equalities import Equalities
 from sb3_yann.control.explicit.facet_walk import walk
@@ -39,7 +39,7 @@ def solve_explicit(
     u_max: Array,
     infeasible: str,
     solver: str = "walk",
-    budget: SolveBudget = SolveBudget(),  # noqa: B008 (it is frozen)
+    timer: BudgetTimer | None = None,
 ) -> PiecewiseAffine:
     """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
 
@@ -55,31 +55,35 @@ def solve_explicit(
         See :class:`PiecewiseAffine`.
     solver : {"walk", "ppopt"}
         Our walk from facet to facet, or ppopt, tens of times slower.
-    budget : SolveBudget
-        When to give up.
+    timer : BudgetTimer, optional
+        Gives up at a limit.
 
     Its errors are those of :meth:`LinearMPC.explicit`.
     """
     as_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
     require_sane_sizes(program, u_min, u_max)
-    # Before the clock starts: on a new machine this compiles, for longer than many a time limit.
+    timer = timer or BudgetTimer(SolveBudget())
+    timer.tick()
+    try:
+        return _solved(ProgramUnits(program, u_min, u_max, timer), infeasible, solver, timer)
+    except ExplicitSolutionError as error:
+        if solver == "walk":
+            raise
+        raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
+    except (np.linalg.LinAlgError, QhullError, FloatingPointError) as error:
+        fault = str(error).partition("\n")[0].rstrip(".")
+        raise ExplicitSolutionError(
+            f"No explicit law was found: the equations of a region have no solution in float64 "
+            f"({fault}). Bring states, inputs and weights to similar magnitudes, shorten the "
+            "horizon, or use online(), which needs no regions."
+        ) from None
+
+
+def load_kernels() -> None:
+    """Load what is compiled; on a new machine this compiles, for longer than many a time limit."""
     for kernels in KERNELS:
         import_module(kernels)
-    with BudgetTimer(budget) as timer:
-        try:
-            return _solved(ProgramUnits(program, u_min, u_max, timer), infeasible, solver, timer)
-        except ExplicitSolutionError as error:
-            if solver == "walk":
-                raise
-            raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
-        except (np.linalg.LinAlgError, QhullError, FloatingPointError) as error:
-            fault = str(error).partition("\n")[0].rstrip(".")
-            raise ExplicitSolutionError(
-                f"No explicit law was found: the equations of a region have no solution in float64 "
-                f"({fault}). Bring states, inputs and weights to similar magnitudes, shorten the "
-                "horizon, or use online(), which needs no regions."
-            ) from None
 
 
 def _solved(
@@ -95,7 +99,9 @@ def _solved(
     law = units.law(regions, infeasible)
     if not law.walks:
         timer.stage("Search tree", "and checked", law.n_regions)
-        law.grow_tree(timer.advance)
+        # Each region's vertices, and the nodes: by trial.
+        effort = 2e-4 * 2.0 ** max(0, law.n_theta - 4)
+        law.grow_tree(lambda count: timer.advance(count, count * effort))
     return law
 
 
@@ -286,8 +292,11 @@ def _room(
     return None if found.x is None else np.asarray((b - A @ found.x[: v + n])[left])
 
 
-def _linprog(cost: Array, A: Array, b: Array, bounds: Any, timer: BudgetTimer, **options: Any) -> Any:
+def _linprog(
+    cost: Array, A: Array, b: Array, bounds: Any, timer: BudgetTimer, **options: Any
+) -> Any:
     """Return HiGHS's answer to a linear program; raise ExplicitLimitError if time is over."""
+    timer.tick(effort_of_lp(*A.shape))
     options["time_limit"] = timer.left()
     found = optimize.linprog(cost, A_ub=A, b_ub=b, bounds=bounds, options=options)
     timer.tick()

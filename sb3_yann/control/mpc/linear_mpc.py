@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann import _validation as check
 from sb3_yann._validation import Array, as_array, as_bounds, as_symmetric, to_float
 from sb3_yann.control import lqr
-from sb3_yann.control.explicit.budget import SolveBudget
+from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.explicit.solve import require_sane_sizes, solve_explicit
+from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
@@ -257,7 +257,8 @@ class LinearMPC(MPCProblem):
         solver : {"walk", "ppopt"}, default "walk"
             A walk from facet to facet, or ppopt, the many times slower reference.
         time_limit : float, optional
-            Seconds after which to give up. A law that was kept takes none.
+            Seconds after which to give up, by the clock. To load compiled code, once in a process,
+            does not count. A law that was kept takes none.
         region_limit : int, optional
             The most regions that the law may have. ppopt tells them only at its end.
         progress : bool, default False
@@ -272,10 +273,16 @@ class LinearMPC(MPCProblem):
         ExplicitSolutionError
             If the solution fails its check; the message says where.
         """
-        budget = SolveBudget(time_limit, region_limit, progress)
+        return self._solved(SolveBudget(time_limit, region_limit, progress), solver)
+
+    def _solved(self, budget: SolveBudget, solver: str = "walk") -> PiecewiseAffine:
+        """Return the explicit law, solved within a budget unless it is there."""
         if solver not in self._laws:
-            program, limits = self.condensed(), (self.u_min, self.u_max)
-            law = solve_explicit(program, *limits, self.infeasible, solver, budget)
+            load_kernels()
+            limits = self.u_min, self.u_max
+            with BudgetTimer(budget) as timer:
+                program = self.condensed()
+                law = solve_explicit(program, *limits, self.infeasible, solver, timer)
             self._laws[solver] = law.on_plant(self.model, self.theta_ss)
         budget.require(self._laws[solver].n_regions)
         return self._laws[solver]
@@ -290,8 +297,10 @@ class LinearMPC(MPCProblem):
     def law(self, kind: str = "auto") -> Law:
         """Return :meth:`explicit` or :meth:`online`, the same function where it is feasible.
 
-        "auto" is what was solved or chosen before; else the explicit law if 10 s find it, of at
-        most 5,000 regions; else the online law, with an :class:`OnlineLawWarning`.
+        "auto" is what was solved or chosen before; else the explicit law if it is found with the
+        effort of about a second, of at most 5,000 regions; else the online law, with an
+        :class:`OnlineLawWarning`. The effort is counted, not clocked: the choice is the same on
+        every machine, whatever else that does.
         """
         return choose(self, self._laws, check.as_choice("kind", kind, LAWS))
 
