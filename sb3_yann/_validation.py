@@ -43,8 +43,8 @@ def as_vector(name: str, value: ArrayLike | None, size: int) -> Array:
     return as_array(name, np.zeros(size) if value is None else value, (size,))
 
 
-def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = False) -> Array:
-    """Return ``value`` as a symmetric positive (semi-)definite ``(size, size)`` matrix."""
+def as_symmetric(name: str, value: ArrayLike, size: int) -> Array:
+    """Return ``value`` as a symmetric positive semi-definite ``(size, size)`` matrix."""
     matrix = as_array(name, value, (size, size))
     scale = max(float(np.max(np.abs(matrix))), np.finfo(float).tiny)
     if np.max(np.abs(matrix - matrix.T)) > 1e-9 * scale:
@@ -52,10 +52,10 @@ def as_symmetric(name: str, value: ArrayLike, size: int, *, definite: bool = Fal
             f"{name} is not symmetric: {matrix.tolist()}. Pass ({name} + {name}.T) / 2."
         )
     smallest = float(np.linalg.eigvalsh(matrix)[0])
-    if smallest < -1e-9 * scale or (definite and smallest <= 0):
-        kind, hint = ("", " Give every input a positive weight.") if definite else ("semi-", "")
-        fault = f"its smallest eigenvalue is {smallest:g}"
-        raise ValueError(f"{name} must be positive {kind}definite, {fault}.{hint}")
+    if smallest < -1e-9 * scale:
+        raise ValueError(
+            f"{name} must be positive semi-definite, its smallest eigenvalue is {smallest:g}."
+        )
     return _frozen((matrix + matrix.T) / 2)
 
 

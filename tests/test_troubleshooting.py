@@ -111,7 +111,7 @@ RAISED = (ValueError, TypeError, AssertionError, RuntimeError, Warning)
 CASES: dict[str, Callable[[], object]] = {
     # The problem
     "x_min must lie below x_max, but entry 0 has": lambda: linear_plant_with(x_min=1, x_max=-1),
-    "R must be positive definite": lambda: linear_plant_with(R=[[0]]),
+    "R must be positive definite": lambda: linear_plant_with(Q=[[0]], R=[[0]]),
     "The law needs a bounded box of theta, not": lambda: linear_plant_with(
         u_min=-1, u_max=1
     ).explicit(),

@@ -58,7 +58,13 @@ def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, f
     return found[:-1], float(found[-1])
 
 
-def farthest_point(A: Array, b: Array, direction: Array, inside: Array | None = None) -> Array:
+def farthest_point(
+    A: Array,
+    b: Array,
+    direction: Array,
+    inside: Array | None = None,
+    seconds: float | None = None,
+) -> Array:
     """Return the point (n,) of a bounded polyhedron that is farthest in one direction.
 
     Parameters
@@ -67,7 +73,11 @@ def farthest_point(A: Array, b: Array, direction: Array, inside: Array | None = 
         The polyhedron, and where to.
     inside : ndarray, shape (n,), optional
         A point of it, with which it is found faster.
+    seconds : float, optional
+        Of a large polyhedron: HiGHS is asked, which gives up after so long, and returns any point.
     """
+    if seconds is not None:
+        return _maximize(np.asarray(direction, dtype=float), A, b, None, seconds)
     cost = np.array(direction, dtype=float)
     start = largest_ball(*_unit_rows(A, b))[0] if inside is None else inside
     if np.all(A @ start <= b):
@@ -149,11 +159,24 @@ def _unit_rows(A: Array, b: Array) -> tuple[Array, Array]:
     return A / length[:, None], b / length
 
 
-def _maximize(cost: Array, A: Array, b: Array, equal: int | None) -> Array:
+def _maximize(
+    cost: Array, A: Array, b: Array, equal: int | None, seconds: float | None = None
+) -> Array:
     """Return the solution of a small linear program from HiGHS, for where our own search fails."""
     tied = np.arange(len(b)) == equal
     free, equal_rows = (A[~tied], b[~tied]), (A[tied], b[tied])
-    found = optimize.linprog(-cost, *free, *equal_rows, bounds=(None, None))
+    options = (
+        {}
+        if seconds is None
+        else {
+            "time_limit": seconds,
+            "primal_feasibility_tolerance": 1e-10,
+            "dual_feasibility_tolerance": 1e-10,
+        }
+    )
+    found = optimize.linprog(-cost, *free, *equal_rows, bounds=(None, None), options=options)
+    if found.x is None and seconds is not None:
+        return np.zeros(len(cost))
     if found.x is None:  # an empty facet
         return np.append(np.zeros(len(cost) - 1), -np.inf)
     return np.asarray(found.x)

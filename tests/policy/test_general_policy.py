@@ -19,6 +19,7 @@ from sb3_yann.wrappers import ObserveDisturbance, PreviousInput, SetPoint, Stage
 NAMES = [
     "servo",
     "servo with a disturbance",
+    "servo with a weight on nothing but the rate",
     "servo with all of it",
     "soft states",
     "invariant with all of it",

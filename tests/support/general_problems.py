@@ -55,6 +55,13 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     "servo with a disturbance": lambda: servo(LOADED, horizon=3),
     "servo with rates": lambda: servo(**RATED),
     "servo with a weight on the rate": lambda: servo(rate=RateLimits(R_du=[[2.0]])),
+    "servo with a weight on nothing but the rate": lambda: servo(
+        R=[[0.0]], gamma=0.97, rate=RateLimits(R_du=[[0.4]])
+    ),
+    "two tanks with a weight on no input": lambda: two_tanks(R=np.zeros((2, 2)), horizon=2),
+    "two tanks with a weight on one input and the other one's rate": lambda: two_tanks(
+        R=np.diag([0.2, 0]), rate=RateLimits(R_du=np.diag([0, 0.3]))
+    ),
     "servo with all of it": lambda: servo(LOADED, rate=RateLimits(**RATES, R_du=[[2.0]])),
     "regulator with a disturbance": lambda: servo(LOADED, tracking=None, horizon=3),
     "regulator with rates": lambda: servo(tracking=None, **RATED),

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
+import numpy as np
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from sb3_yann._validation import as_positive, as_whole
@@ -50,11 +51,14 @@ class SolveBudget:
         The largest number of regions.
     progress : bool, default False
         Show a progress bar that counts regions.
+    effort_limit : float, optional
+        The most effort, by what is counted and not by the clock. See :class:`BudgetTimer`.
     """
 
     time_limit: float | None = None
     region_limit: int | None = None
     progress: bool = False
+    effort_limit: float | None = None
 
     def __post_init__(self) -> None:
         if self.time_limit is not None:
@@ -70,9 +74,14 @@ class SolveBudget:
 
 
 class BudgetTimer:
-    """Counts regions and, from now on, the time of a search and its check; ends them at a limit."""
+    """Counts regions and, from now on, the time of a search and its check; ends them at a limit.
+
+    It also sums up effort: what each linear program, QP and factorization takes by its size, in
+    seconds of a processor of 2024 with nothing else to do. That is the same on every machine.
+    """
 
     def __init__(self, budget: SolveBudget) -> None:
+        self.effort = 0.0
         self.budget, self.found, self._start = budget, 0, time.monotonic()
         self._done = ""
         self._bar = self._new_bar("Critical regions", None)
@@ -97,16 +106,25 @@ class BudgetTimer:
         self._bar.close()
         self._done, self._bar = f" {done}", self._new_bar(name, steps)
 
-    def advance(self, more: int = 1) -> None:
+    def advance(self, more: int = 1, effort: float = 0.0) -> None:
         """Count steps of a stage; raise ExplicitLimitError if the time is over."""
         self._bar.update(more)
-        self.tick()
+        self.tick(effort)
 
-    def tick(self) -> None:
-        """Raise ExplicitLimitError if the time is over."""
+    def tick(self, effort: float = 0.0) -> None:
+        """Count effort that is ahead; raise ExplicitLimitError if it is too much, or time is over."""
+        self.effort += effort
+        limit = self.budget.effort_limit
+        if limit is not None and self.effort > limit:
+            self._stop("The law takes more effort than about a second of a fast processor")
         most = self.budget.time_limit
         if most is not None and time.monotonic() - self._start > most:
             self._stop(f"The law was not solved in time_limit = {most:g} s")
+
+    def left(self) -> float:
+        """Return for how many seconds the search may go on, infinite without a limit."""
+        most = self.budget.time_limit
+        return np.inf if most is None else max(0.0, self._start + most - time.monotonic())
 
     def _new_bar(self, name: str, total: int | None) -> Any:
         hidden = not self.budget.progress
@@ -115,3 +133,22 @@ class BudgetTimer:
     def _stop(self, what: str) -> NoReturn:
         found = f"{self.found} regions were found in {time.monotonic() - self._start:.1f} s"
         raise ExplicitLimitError(f"{what}: {found}{self._done}. {_ADVICE}", self.found)
+
+
+OF_REGION = 6e-4
+"""The effort of a candidate for a region besides its programs: Python."""
+
+
+def effort_of_lp(rows: int, variables: int) -> float:
+    """Return the effort of a linear program with inequality constraints."""
+    return 1e-5 + 2e-9 * rows * variables**2
+
+
+def effort_of_qp(rows: int, variables: int) -> float:
+    """Return the effort of a quadratic program from DAQP."""
+    return 2e-5 + 4e-9 * rows * variables + 4e-9 * variables**2
+
+
+def effort_of_conditions(rows: int, variables: int, active: int) -> float:
+    """Return the effort of the conditions of one active set."""
+    return 2e-6 + 2e-9 * (rows + variables) * (variables + active) * max(1, active)

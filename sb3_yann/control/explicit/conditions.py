@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.explicit.budget import (
+    OF_REGION,
+    BudgetTimer,
+    effort_of_conditions,
+    effort_of_lp,
+    effort_of_qp,
+)
 from sb3_yann.control.explicit.kkt import equations
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches, row_units
 from sb3_yann.control.explicit.steep import SteepQP
 from sb3_yann.control.polyhedra import (
     equal_rows,
     farthest_point,
-    farthest_points,
     largest_ball,
     region,
 )
@@ -27,6 +33,8 @@ Rows = tuple[Array, Array]  # half-spaces A x <= b
 THINNEST = 1e-9
 # Facets with nothing feasible beyond; and facets that several constraints share.
 OUTER, SHARED = -1, -2
+# Linear programs of more effort than this, in seconds, are solved by what can be interrupted.
+LONG = 0.1
 # Constraints whose part across those of an active set is smaller, relative to all, depend on them.
 DEPENDENT = 1e-9
 
@@ -93,15 +101,18 @@ class Conditions:
     ``N z <= w + S theta``: the active rows are then all that a region needs to factor.
     """
 
-    def __init__(self, program: ParametricQP, tick: Callable[[], None]) -> None:
-        self.tick = tick  # raises when the time is over
+    def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
+        tick = timer.tick  # counts effort, and raises when that or the time is over
+        self.tick = tick
         moving, n = np.flatnonzero(np.any(program.G, axis=1)), program.F.shape[1]
         self.outer_A, self.outer_b = program.theta_rows()
         joint = _joint(program, moving, self.outer_A, self.outer_b)
+        tick(effort_of_lp(*joint[0].shape))
         inside, _ = largest_ball(*joint)
         # Points of the feasible set that span it.
-        self.corners, self.middle = _corners(*joint, inside, n), inside[-n:]
-        self.kept = moving[_irredundant(*joint, inside, len(moving), tick)]
+        self.corners, self.middle = _corners(*joint, inside, n, timer), inside[-n:]
+        self.kept = moving[_irredundant(*joint, inside, len(moving), timer)]
+        tick(0.0)
         L = np.linalg.cholesky(program.H)
         self.back = np.linalg.inv(L).T
         self.Y = np.linalg.solve(L, np.column_stack([program.F, program.c]))
@@ -128,6 +139,7 @@ class Conditions:
             return None
         if len(self.kept) == 0:
             return 0
+        self.tick(effort_of_qp(*self.N.shape))
         if self.steep is not None:
             moved = replace(self.steep, w=self.steep.w + apart * self.apart)
             U, found = (moved if apart else self.steep).solve_with_multipliers(theta)
@@ -147,8 +159,12 @@ class Conditions:
 
     def regions(self, wave: list[int]) -> Iterator[Found]:
         """Yield the regions with an interior among those of some active sets."""
-        for size, members in batches(active.bit_count() for active in wave):
-            if size <= self.N.shape[1]:
+        rows, v = self.N.shape
+        width = v + self.outer_A.shape[1] + 1
+        numbers = lambda size: (rows + v) * (size + width)
+        for size, members in batches((active.bit_count() for active in wave), numbers):
+            if size <= v:
+                self.tick(len(members) * effort_of_conditions(rows, v, size))
                 yield from self._regions([wave[i] for i in members], size)
 
     def _regions(self, members: list[int], size: int) -> Iterator[Found]:
@@ -169,8 +185,9 @@ class Conditions:
         ok &= ~ruled_out & ~np.any((b < THINNEST - reach) & ~constant, axis=1)
         needed = (b < reach - 1e-12) & ~constant
         for i in np.flatnonzero(ok):
-            self.tick()
             label = np.flatnonzero(needed[i])
+            bounds = len(label) + len(self.outer_b)
+            self.tick(OF_REGION + bounds * effort_of_lp(bounds, A.shape[2]) / 2)
             one = self._region(actives[i], laws[i], A[i, label], b[i, label], label)
             if one is not None:
                 one.beyond.update(self._exchanges(one, factors, i))
@@ -278,22 +295,29 @@ def _joint(program: ParametricQP, rows: Indices, outer_A: Array, outer_b: Array)
     return A, np.concatenate([program.w[rows], outer_b])
 
 
-def _corners(A: Array, b: Array, inside: Array, n: int) -> Array:
+def _corners(A: Array, b: Array, inside: Array, n: int, timer: BudgetTimer) -> Array:
     """Return the theta of feasible pairs that are farthest along every axis (2 n, n)."""
     axes = np.zeros((2 * n, len(inside)))
     axes[:n, -n:], axes[n:, -n:] = np.eye(n), -np.eye(n)
-    return farthest_points(A, b, inside, axes)[:, -n:]
+    return np.array([_farthest(A, b, axis, inside, timer)[-n:] for axis in axes])
 
 
-def _irredundant(
-    A: Array, b: Array, inside: Array, count: int, tick: Callable[[], None]
-) -> list[int]:
+def _farthest(A: Array, b: Array, direction: Array, inside: Array, timer: BudgetTimer) -> Array:
+    """Return the farthest point in a direction; a large program ends when the time is over."""
+    effort = effort_of_lp(*A.shape)
+    timer.tick(effort)
+    seconds = timer.left() if effort > LONG else None
+    found = farthest_point(A, b, direction, inside, seconds)
+    timer.tick()
+    return found
+
+
+def _irredundant(A: Array, b: Array, inside: Array, count: int, timer: BudgetTimer) -> list[int]:
     """Return which of the first rows bound a polyhedron; of those that say the same, the first."""
     alive = np.ones(len(b), dtype=bool)
     for k in reversed(range(count)):
-        tick()
         relaxed = b.copy()
         relaxed[k] += 1.0
-        farthest = farthest_point(A[alive], relaxed[alive], A[k], inside)
+        farthest = _farthest(A[alive], relaxed[alive], A[k], inside, timer)
         alive[k] = A[k] @ farthest > b[k] + 1e-10
     return [int(k) for k in np.flatnonzero(alive[:count])]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.control.explicit.budget import BudgetTimer
+from sb3_yann.control.explicit.budget import BudgetTimer, effort_of_lp
 from sb3_yann.control.explicit.conditions import (
     OUTER,
     THINNEST,
@@ -43,7 +43,7 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
 class _Walk:
     def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
         self.program, self.timer = program, timer
-        self.conditions = Conditions(program, timer.tick)
+        self.conditions = Conditions(program, timer)
         self.found: dict[int, Found] = {}
         self.seen: set[int] = set()
         self.random = np.random.default_rng(0)
@@ -115,7 +115,7 @@ class _Walk:
 
     def _across(self, one: Found, row: int) -> int | None:
         """Return the active set across a facet, None if none is new or feasible there."""
-        self.timer.tick()
+        self.timer.tick(effort_of_lp(*one.A.shape))
         middle, distance = largest_ball(one.A, one.b, row)
         if distance <= THINNEST:  # the row only touches the region
             return None

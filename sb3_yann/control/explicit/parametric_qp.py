@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -19,19 +19,30 @@ Where such a bound is active, the law is so steep that its own rounding shows.
 """
 
 
+BATCH = 4e6
+"""How many numbers a batch of active sets may hold: 32 MB."""
+
+
 def as_bits(active_set: Iterable[int]) -> int:
     """Return a set of constraints as a whole number, with bit k for constraint k."""
     return sum(1 << int(k) for k in active_set)
 
 
-def batches(sizes: Iterable[int]) -> Iterator[tuple[int, list[int]]]:
-    """Yield each size, ascending, with the indices that have it, at most 256 at a time."""
+def batches(
+    sizes: Iterable[int], numbers: Callable[[int], float] = lambda size: 1.0
+) -> Iterator[tuple[int, list[int]]]:
+    """Yield each size, ascending, with the indices that have it, at most 256 at a time.
+
+    ``numbers`` tells how many numbers one of a size needs: so many that memory and time of a batch
+    stay small.
+    """
     indices: dict[int, list[int]] = {}
     for i, size in enumerate(sizes):
         indices.setdefault(size, []).append(i)
     for size, members in sorted(indices.items()):
-        for start in range(0, len(members), 256):
-            yield size, members[start : start + 256]
+        most = int(np.clip(BATCH / numbers(size), 1, 256))
+        for start in range(0, len(members), most):
+            yield size, members[start : start + most]
 
 
 def row_units(G: Array) -> Array:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
+from scipy.spatial import QhullError
 
 from sb3_yann._validation import Array, as_choice, half_widths
-from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
+from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget, effort_of_lp
 from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
+from sb3_yann.control.explicit.equalities import Equalities
 from sb3_yann.control.explicit.facet_walk import walk
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
@@ -36,7 +39,7 @@ def solve_explicit(
     u_max: Array,
     infeasible: str,
     solver: str = "walk",
-    budget: SolveBudget = SolveBudget(),  # noqa: B008 (it is frozen)
+    timer: BudgetTimer | None = None,
 ) -> PiecewiseAffine:
     """Return the law of the first ``len(u_min)`` entries of U, with a region for each active set.
 
@@ -52,34 +55,54 @@ def solve_explicit(
         See :class:`PiecewiseAffine`.
     solver : {"walk", "ppopt"}
         Our walk from facet to facet, or ppopt, tens of times slower.
-    budget : SolveBudget
-        When to give up.
+    timer : BudgetTimer, optional
+        Gives up at a limit.
 
     Its errors are those of :meth:`LinearMPC.explicit`.
     """
     as_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
     require_sane_sizes(program, u_min, u_max)
-    units = ProgramUnits(program, u_min, u_max)
-    _require_feasible(units.scaled)
-    # Before the clock starts: on a new machine this compiles, for longer than many a time limit.
+    timer = timer or BudgetTimer(SolveBudget())
+    timer.tick()
+    try:
+        return _solved(ProgramUnits(program, u_min, u_max, timer), infeasible, solver, timer)
+    except ExplicitSolutionError as error:
+        if solver == "walk":
+            raise
+        raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
+    except (np.linalg.LinAlgError, QhullError, FloatingPointError) as error:
+        fault = str(error).partition("\n")[0].rstrip(".")
+        raise ExplicitSolutionError(
+            f"No explicit law was found: the equations of a region have no solution in float64 "
+            f"({fault}). Bring states, inputs and weights to similar magnitudes, shorten the "
+            "horizon, or use online(), which needs no regions."
+        ) from None
+
+
+def load_kernels() -> None:
+    """Load what is compiled; on a new machine this compiles, for longer than many a time limit."""
     for kernels in KERNELS:
         import_module(kernels)
-    with BudgetTimer(budget) as timer:
-        regions = _critical_regions(units.scaled, solver, timer)
-        try:
-            regions = Certificate(
-                units.scaled, regions, len(u_min), units.center, units.half, timer
-            ).check()
-        except ExplicitSolutionError as error:
-            if solver == "walk":
-                raise
-            raise ExplicitSolutionError(f"{error} Or it is {solver}'s: try explicit().") from None
-        law = units.law(regions, infeasible)
-        if not law.walks:
-            timer.stage("Search tree", "and checked", law.n_regions)
-            law.grow_tree(timer.advance)
-        return law
+
+
+def _solved(
+    units: ProgramUnits, infeasible: str, solver: str, timer: BudgetTimer
+) -> PiecewiseAffine:
+    """Return the law of a program in its units, checked, with its search tree."""
+    _require_feasible(units.scaled, timer)
+    regions = _critical_regions(units.scaled, solver, timer)
+    certificate = Certificate(
+        units.scaled, regions, units.to_inputs, units.center, units.half, timer
+    )
+    regions = certificate.check()
+    law = units.law(regions, infeasible)
+    if not law.walks:
+        timer.stage("Search tree", "and checked", law.n_regions)
+        # Each region's vertices, and the nodes: by trial.
+        effort = 2e-4 * 2.0 ** max(0, law.n_theta - 4)
+        law.grow_tree(lambda count: timer.advance(count, count * effort))
+    return law
 
 
 def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> list[Region]:
@@ -91,7 +114,14 @@ def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) ->
 class ProgramUnits:
     """A program in units of its box and its input range, where tolerances suit every plant."""
 
-    def __init__(self, program: ParametricQP, u_min: Array, u_max: Array) -> None:
+    def __init__(
+        self,
+        program: ParametricQP,
+        u_min: Array,
+        u_max: Array,
+        timer: BudgetTimer | None = None,
+    ) -> None:
+        timer = timer or BudgetTimer(SolveBudget())
         self.center = (program.theta_max + program.theta_min) / 2
         self.half = half_widths(program.theta_min, program.theta_max)
         steps = (len(program.c) - program.n_slacks) // len(u_min)
@@ -104,11 +134,22 @@ class ProgramUnits:
             most = most + np.abs(program.feedback) @ box / reach[: len(u_min)]
         most = np.concatenate([np.tile(most, steps), np.full(program.n_slacks, np.inf)])
         scaled = program.scaled(self.center, self.half, self.reach)
-        self.scaled = solvable(scaled.without_faint_rows(most))
+        scaled = scaled.without_faint_rows(most)
+        self.equalities = None
+        if not _has_room(scaled):
+            self.equalities = Equalities.of(scaled, lambda *rows: _room(*rows, scaled, timer))
+        if self.equalities is not None:
+            scaled = self.equalities.eliminated(scaled)
+        self.scaled = solvable(scaled)
+        self.to_inputs = np.eye(len(u_min), len(program.c))
+        if self.equalities is not None:
+            self.to_inputs = self.to_inputs @ self.equalities.free
 
     def law(self, regions: list[Region], infeasible: str) -> PiecewiseAffine:
         """Return the law of the first inputs in the units of the problem."""
         m, reach, half = len(self.input_range[0]), self.reach, self.half
+        if self.equalities is not None:
+            regions = [self.equalities.with_all_of_U(region) for region in regions]
         gains = np.stack([reach[:m, None] * region.gain[:m] / half for region in regions])
         offsets = np.stack([reach[:m] * region.offset[:m] for region in regions])
         A = np.concatenate([region.A / half for region in regions])
@@ -205,20 +246,58 @@ def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> Non
         )
 
 
-def _require_feasible(program: ParametricQP) -> None:
+def _with_room(program: ParametricQP) -> ParametricQP:
+    """Return the program with each constraint moved in by a millionth."""
+    rows = np.hstack([program.G, -program.S])
+    return replace(program, w=program.w - 1e-6 * np.linalg.norm(rows, axis=1))
+
+
+def _has_room(program: ParametricQP) -> bool:
+    """Tell whether the middle of the box is feasible with room: mostly, and soon told."""
+    return _with_room(program).solve(np.zeros(program.F.shape[1])) is not None
+
+
+def _require_feasible(program: ParametricQP, timer: BudgetTimer) -> None:
     """Raise unless the feasible pairs (U, theta) have an interior (largest ball, HiGHS)."""
+    if _has_room(program):
+        return
     v, n = program.F.shape
     rows = np.hstack([program.G, -program.S])
     rows = np.hstack([rows, np.linalg.norm(rows, axis=1, keepdims=True)])
-    with_room = replace(program, w=program.w - 1e-6 * rows[:, -1])
-    if with_room.solve(np.zeros(n)) is not None:  # mostly: it takes a hundredth of the time
-        return
     bounds = [(None, None)] * v + [(-1, 1)] * n + [(None, 1)]
     cost = np.zeros(v + n + 1)
     cost[-1] = -1
-    ball = optimize.linprog(cost, A_ub=rows, b_ub=program.w, bounds=bounds)
+    ball = _linprog(cost, rows, program.w, bounds, timer)
     if ball.status != 0 or ball.x[-1] < 1e-9:
         raise ValueError(
             "The MPC problem is infeasible: no theta in its box has inputs that keep every bound "
-            "with room to spare. Widen x_min/x_max, u_min/u_max or the terminal set."
+            "with room to spare. Widen x_min/x_max, u_min/u_max or the terminal set, or lengthen "
+            "the horizon. Where only a line or a plane of theta is feasible, use online()."
         )
+
+
+def _room(
+    A: Array, b: Array, left: NDArray[np.intp], program: ParametricQP, timer: BudgetTimer
+) -> Array | None:
+    """Return how much room some rows have where the sum of these is largest, None if infeasible."""
+    v, n = program.F.shape
+    count = len(left)
+    slack = np.zeros((len(b), count))
+    slack[left, np.arange(count)] = 1.0
+    cost = np.concatenate([np.zeros(v + n), -np.ones(count)])
+    # Of each row a little counts, so that none pays for another one.
+    bounds = [(None, None)] * v + [(-1, 1)] * n + [(0, 1e-3)] * count
+    exact = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    found = _linprog(cost, np.hstack([A, slack]), b, bounds, timer, **exact)
+    return None if found.x is None else np.asarray((b - A @ found.x[: v + n])[left])
+
+
+def _linprog(
+    cost: Array, A: Array, b: Array, bounds: Any, timer: BudgetTimer, **options: Any
+) -> Any:
+    """Return HiGHS's answer to a linear program; raise ExplicitLimitError if time is over."""
+    timer.tick(effort_of_lp(*A.shape))
+    options["time_limit"] = timer.left()
+    found = optimize.linprog(cost, A_ub=A, b_ub=b, bounds=bounds, options=options)
+    timer.tick()
+    return found

@@ -18,6 +18,11 @@ from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
 
 MILD = 1e7
 """Up to so many times the inputs' own cost a slack may cost for a dual method."""
+STEEPEST = 1e15
+"""So many times the inputs' own cost a slack costs at most.
+
+A larger penalty moves the law by less than 1e-15 of it, and KKT equations become singular.
+"""
 HELD = 1e-9
 """So far beyond the conditions of an active set, in half-widths of the box, a point is in them."""
 MOST_STEPS, MOST_KNOWN = 100, 1 << 12
@@ -41,9 +46,15 @@ def steepness(program: ParametricQP) -> tuple[Array, Array]:
 
 def solvable(program: ParametricQP) -> ParametricQP:
     """Return a program in units of its input range and its box as a SteepQP, if it is one."""
-    if np.all(steepness(program)[0] <= MILD):
+    ratio, _ = steepness(program)
+    if np.all(ratio <= MILD):
         return program
-    return SteepQP(**{each.name: getattr(program, each.name) for each in fields(ParametricQP)})
+    parts = {each.name: getattr(program, each.name) for each in fields(ParametricQP)}
+    less = np.ones(len(program.c))
+    less[len(less) - program.n_slacks :] = np.minimum(1.0, STEEPEST / ratio)
+    parts["H"] = program.H * np.sqrt(np.outer(less, less))
+    parts["c"] = program.c * less
+    return SteepQP(**parts)
 
 
 class SteepQP(ParametricQP):

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Protocol
 
-from sb3_yann.control.explicit.budget import ExplicitLimitError
+from sb3_yann.control.explicit.budget import ExplicitLimitError, SolveBudget
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
@@ -14,8 +14,10 @@ from sb3_yann.control.online.online_law import OnlineLaw
 
 Law = PiecewiseAffine | OnlineLaw
 LAWS = ("auto", "explicit", "online")
-SECONDS, REGIONS = 10.0, 5000
-"""What "auto" spends on the search for an explicit law."""
+EFFORT = 1.0
+"""What "auto" spends on an explicit law, in what about a second does, by what it counts."""
+REGIONS = 5000
+"""The most regions of a law that "auto" takes."""
 LARGE = 50_000
 """Constraints times parameters beyond which a single region takes long, and none is looked for."""
 CHOSEN = "_online_chosen"
@@ -38,6 +40,9 @@ class Solvable(Protocol):
         self, solver: str = ..., *, time_limit: float | None = ..., region_limit: int | None = ...
     ) -> PiecewiseAffine:
         """Return the explicit law."""
+
+    def _solved(self, budget: SolveBudget) -> PiecewiseAffine:
+        """Return the explicit law within a budget."""
 
     def condensed(self) -> ParametricQP:
         """Return the program in U."""
@@ -75,7 +80,7 @@ def _searched(problem: Solvable) -> PiecewiseAffine | str:
     if rows * n > LARGE:
         return f"It has {rows} constraints on {n} parameters, too many to look for regions."
     try:
-        return problem.explicit(time_limit=SECONDS, region_limit=REGIONS)
+        return problem._solved(SolveBudget(region_limit=REGIONS, effort_limit=EFFORT))
     except ExplicitLimitError as error:
         return f"{error} Or call problem.explicit() before, which has no limit by default."
     except ExplicitSolutionError as error:

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann import _validation as check
 from sb3_yann._validation import Array, as_array, as_bounds, as_symmetric, to_float
 from sb3_yann.control import lqr
-from sb3_yann.control.explicit.budget import SolveBudget
+from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.explicit.solve import require_sane_sizes, solve_explicit
+from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.model.linear_model import LinearModel
@@ -69,7 +69,8 @@ class LinearMPC(MPCProblem):
     Q : array_like, shape (n, n)
         Weight of the state, symmetric positive semi-definite.
     R : array_like, shape (m, m)
-        Weight of the input, symmetric positive definite.
+        Weight of the input, symmetric positive semi-definite. An input without one needs a weight
+        of its rate, or must move a state that has a terminal cost.
     horizon : int
         Number N of predicted steps, at least 1.
     x_min, x_max : array_like, shape (n,), or float, optional
@@ -151,7 +152,7 @@ class LinearMPC(MPCProblem):
         n, m = model.n_states, model.n_inputs
         horizon, gamma = arguments.as_horizon(horizon), check.as_discount(gamma)
         infeasible = check.as_choice("infeasible", infeasible, INFEASIBLE)
-        Q, R = as_symmetric("Q", Q, n), as_symmetric("R", R, m, definite=True)
+        Q, R = as_symmetric("Q", Q, n), as_symmetric("R", R, m)
         x, u = as_bounds("x", *given.x, n), as_bounds("u", *given.u, m)
         tracking = _as_group("tracking", tracking, Tracking).sized(n)
         d = _as_group("disturbances", disturbances, DisturbanceBounds).sized(model.n_disturbances)
@@ -264,7 +265,8 @@ class LinearMPC(MPCProblem):
         solver : {"walk", "ppopt"}, default "walk"
             A walk from facet to facet, or ppopt, the many times slower reference.
         time_limit : float, optional
-            Seconds after which to give up. A law that was kept takes none.
+            Seconds after which to give up, by the clock. To load compiled code, once in a process,
+            does not count. A law that was kept takes none.
         region_limit : int, optional
             The most regions that the law may have. ppopt tells them only at its end.
         progress : bool, default False
@@ -279,10 +281,16 @@ class LinearMPC(MPCProblem):
         ExplicitSolutionError
             If the solution fails its check; the message says where.
         """
-        budget = SolveBudget(time_limit, region_limit, progress)
+        return self._solved(SolveBudget(time_limit, region_limit, progress), solver)
+
+    def _solved(self, budget: SolveBudget, solver: str = "walk") -> PiecewiseAffine:
+        """Return the explicit law, solved within a budget unless it is there."""
         if solver not in self._laws:
-            program, limits = self.condensed(), (self.u_min, self.u_max)
-            law = solve_explicit(program, *limits, self.infeasible, solver, budget)
+            load_kernels()
+            limits = self.u_min, self.u_max
+            with BudgetTimer(budget) as timer:
+                program = self.condensed()
+                law = solve_explicit(program, *limits, self.infeasible, solver, timer)
             self._laws[solver] = law.on_plant(self.model, self.theta_ss)
         budget.require(self._laws[solver].n_regions)
         return self._laws[solver]
@@ -297,8 +305,10 @@ class LinearMPC(MPCProblem):
     def law(self, kind: str = "auto") -> Law:
         """Return :meth:`explicit` or :meth:`online`, the same function where it is feasible.
 
-        "auto" is what was solved or chosen before; else the explicit law if 10 s find it, of at
-        most 5,000 regions; else the online law, with an :class:`OnlineLawWarning`.
+        "auto" is what was solved or chosen before; else the explicit law if it is found with the
+        effort of about a second, of at most 5,000 regions; else the online law, with an
+        :class:`OnlineLawWarning`. The effort is counted, not clocked: the choice is the same on
+        every machine, whatever else that does.
         """
         return choose(self, self._laws, check.as_choice("kind", kind, LAWS))
 
@@ -342,9 +352,15 @@ def _completed(problem: MPCProblem) -> Terminal:
     cost: Any = problem.terminal.cost
     half_spaces: Any = problem.terminal.set
     if cost is None:
-        cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
+        try:
+            cost = lqr.riccati(errors.model, errors.Q, errors.R, problem.gamma, errors.cross)
+        except ValueError:
+            _require_weighted_inputs(problem)
+            raise
     elif len(cost) != len(errors.Q):
         as_array("Terminal.cost", cost, errors.Q.shape)  # which names the size that is wanted
+    if np.shape(cost) == np.shape(errors.Q):
+        _require_weighted_inputs(problem, cost)
     if isinstance(half_spaces, str):
         half_spaces = invariant_set(problem, cost)
     n, size = problem.model.n_states, problem.n_theta
@@ -352,3 +368,20 @@ def _completed(problem: MPCProblem) -> Terminal:
     if F.shape[1] != size:
         F = np.pad(as_array("Terminal.set F", F, ("rows", n)), ((0, 0), (0, size - n)))
     return Terminal(cost, (F, g))
+
+
+def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> None:
+    """Raise where an input costs nothing: not itself, not by its rate, not by what it moves."""
+    errors = problem.error_system
+    B = errors.model.B
+    weight = errors.R if cost is None else errors.R + problem.gamma * B.T @ cost @ B
+    unit = np.outer(problem.u_half, problem.u_half)
+    sizes = np.linalg.eigvalsh(weight * unit)
+    if sizes[0] > 1e-13 * max(sizes[-1], np.finfo(float).tiny):
+        return
+    raise ValueError(
+        "R must be positive definite, its smallest eigenvalue is "
+        f"{np.linalg.eigvalsh(problem.R)[0]:g}, where an input costs nothing else: neither its rate "
+        "nor a state that it moves has a weight. Give every input a positive weight, in R or in "
+        "RateLimits(R_du=...)."
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 
 from fresh_process import run_python
 from sample_problems import PROBLEMS, benchmark, box_points, solved
-from sb3_yann.control import ExplicitLimitError
-from sb3_yann.control.explicit import budget, certificate, conditions
+from sb3_yann.control import ExplicitLimitError, LinearModel, LinearMPC
+from sb3_yann.control.explicit import budget, certificate, conditions, solve
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
+from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.law import search_tree
 
 
@@ -149,14 +151,13 @@ def test_a_law_that_was_solved_builds_nothing_when_it_is_called(monkeypatch) -> 
 
 
 def test_nothing_is_compiled_while_the_clock_runs() -> None:
-    # A new machine compiles what is imported first, for longer than ten seconds: a policy would
-    # then have an online law for want of time.
+    # A new machine compiles what is imported first, for longer than many a limit.
     found = run_python(
         """
 import sys
-from sb3_yann.control.explicit import solve
+from sb3_yann.control.mpc import linear_mpc
 
-class Timer(solve.BudgetTimer):
+class Timer(linear_mpc.BudgetTimer):
     def __enter__(self):
         self.before = set(sys.modules)
         return super().__enter__()
@@ -166,7 +167,7 @@ class Timer(solve.BudgetTimer):
         print("compiled meanwhile:", compiled)
         return super().__exit__(*error)
 
-solve.BudgetTimer = Timer
+linear_mpc.BudgetTimer = Timer
 from sb3_yann_envs import problems
 problems.cstr().law()
 """
@@ -210,3 +211,56 @@ def test_the_bar_counts_regions_and_steps_of_a_stage(monkeypatch: pytest.MonkeyP
     assert (timer._bar.n, timer._bar.desc, timer._bar.total) == (5, "Checked", 9)
     timer.__exit__()
     assert BudgetTimer(SolveBudget())._bar.disable
+
+
+def large_plant() -> LinearMPC:
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(8, 8))
+    A *= 0.9 / np.max(np.abs(np.linalg.eigvals(A)))
+    model = LinearModel(A, rng.normal(size=(8, 4)), 1.0)
+    return LinearMPC(
+        model, Q=np.eye(8), R=0.1 * np.eye(4), horizon=70, x_min=-4, x_max=4, u_min=-1, u_max=1
+    )
+
+
+def test_the_limit_of_time_holds_where_a_single_linear_program_takes_seconds() -> None:
+    mpc = large_plant()
+    benchmark().explicit()  # loads what is compiled
+    start = time.monotonic()
+    with pytest.raises(ExplicitLimitError, match="0 regions were found in (0|1)"):
+        mpc.explicit(time_limit=0.7)
+    assert time.monotonic() - start < 1.9  # 0.8 s alone
+
+
+@pytest.mark.parametrize("slow", ["solve_with_multipliers", "walk", "optimality"])
+def test_the_limit_of_time_is_looked_at_between_any_two_steps(slow, monkeypatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr("sb3_yann.control.explicit.budget.time.monotonic", lambda: clock[0])
+    owner = {"solve_with_multipliers": ParametricQP, "walk": solve, "optimality": certificate}[slow]
+    original = getattr(owner, slow)
+
+    def passing(*args: Any, **options: Any) -> Any:
+        clock[0] += 0.5
+        return original(*args, **options)
+
+    monkeypatch.setattr(owner, slow, passing)
+    with pytest.raises(ExplicitLimitError, match="time_limit = 0.4 s: "):
+        benchmark().explicit(time_limit=0.4)
+    assert clock[0] <= 1.0
+
+
+def test_effort_is_the_same_whatever_the_clock_says(monkeypatch) -> None:
+    found = []
+    for speed in (0.0, 1.0):
+        clock = itertools.count()
+        monkeypatch.setattr(budget.time, "monotonic", lambda: next(clock) * speed)  # noqa: B023
+        with BudgetTimer(SolveBudget()) as timer:
+            mpc = benchmark()
+            solve.solve_explicit(mpc.condensed(), mpc.u_min, mpc.u_max, mpc.infeasible, timer=timer)
+        found.append(timer.effort)
+    assert found[0] == found[1] > 0
+
+
+def test_a_law_of_too_much_effort_is_given_up_before_it_is_found() -> None:
+    with pytest.raises(ExplicitLimitError, match="more effort .* regions were found .* horizon"):
+        large_plant()._solved(SolveBudget(effort_limit=0.2))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 import warnings
 
 import numpy as np
 import pytest
+from scipy.spatial import QhullError
 
 from benchmarks.online_problems import wide_plant
-from general_problems import PROBLEMS, servo, solved
+from general_problems import PROBLEMS, servo, solved, two_tanks
+from sb3_yann import RateLimits
 from sb3_yann.control import LinearMPC, OnlineLaw, OnlineLawWarning, PiecewiseAffine
+from sb3_yann.control.explicit import budget, solve
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.mpc import choice
 
@@ -33,7 +37,7 @@ def test_auto_is_the_online_law_beyond_the_budget_and_says_so_once(monkeypatch) 
 
 
 def test_regions_of_a_very_large_program_are_not_looked_for(monkeypatch) -> None:
-    monkeypatch.setattr(LinearMPC, "explicit", None)
+    monkeypatch.setattr(LinearMPC, "_solved", None)
     with pytest.warns(OnlineLawWarning, match="801 constraints on 165 parameters, too many"):
         assert isinstance(wide_plant().law(), OnlineLaw)
 
@@ -42,7 +46,7 @@ def test_a_law_that_fails_its_check_is_not_taken(monkeypatch) -> None:
     def failing(self, *args, **kwargs):
         raise ExplicitSolutionError("It is wrong: somewhere.")
 
-    monkeypatch.setattr(LinearMPC, "explicit", failing)
+    monkeypatch.setattr(LinearMPC, "_solved", failing)
     with pytest.warns(OnlineLawWarning, match="It is wrong"):
         assert isinstance(servo().law(), OnlineLaw)
 
@@ -59,9 +63,33 @@ def test_what_was_solved_is_taken_whatever_its_size(monkeypatch) -> None:
 def test_what_was_chosen_is_kept(monkeypatch) -> None:
     mpc = servo()
     assert isinstance(mpc.law("online"), OnlineLaw)
-    monkeypatch.setattr(LinearMPC, "explicit", None)
+    monkeypatch.setattr(LinearMPC, "_solved", None)
     assert isinstance(mpc.law(), OnlineLaw)
     mpc.value_matrix(0.99)
+
+
+def test_auto_gives_up_by_what_it_counts_and_not_by_the_clock(monkeypatch) -> None:
+    monkeypatch.setattr(choice, "EFFORT", 0.01)
+    messages = set()
+    for speed in (0.0, 100.0):
+        clock = itertools.count()
+        monkeypatch.setattr(budget.time, "monotonic", lambda: next(clock) * speed)  # noqa: B023
+        with pytest.warns(OnlineLawWarning, match="more effort") as caught:
+            assert isinstance(two_tanks(rate=RateLimits(-0.8, 0.9)).law(), OnlineLaw)
+        messages.add(str(caught[0].message).partition(" regions")[0])
+    assert len(messages) == 1
+
+
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("Singular matrix"), QhullError("QH6154")])
+def test_auto_takes_the_online_law_whatever_fails_in_the_search(error, monkeypatch) -> None:
+    def failing(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(solve, "walk", failing)
+    with pytest.raises(ExplicitSolutionError, match="similar magnitudes"):
+        servo().explicit()
+    with pytest.warns(OnlineLawWarning, match="no solution in float64"):
+        assert isinstance(servo().law(), OnlineLaw)
 
 
 def test_an_unknown_kind_is_named() -> None:

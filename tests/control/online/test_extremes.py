@@ -9,7 +9,7 @@ import daqp
 import numpy as np
 import pytest
 
-from sb3_yann.control import ExplicitSolutionError, LinearModel, LinearMPC, SoftBounds
+from sb3_yann.control import LinearModel, LinearMPC, SoftBounds
 from sb3_yann.control.online._kernels import UNKNOWN
 
 STEEP = SoftBounds(x=True, penalty=1e3)
@@ -88,9 +88,12 @@ def test_a_law_is_the_same_whatever_the_unit_of_the_states(unit: float) -> None:
         np.testing.assert_allclose(solve(other)(unit * points), expected, rtol=0, atol=1e-9)
 
 
-def test_a_law_that_float64_cannot_hold_is_refused_with_advice() -> None:
-    with pytest.raises(ExplicitSolutionError, match="give SoftBounds larger units or a smaller"):
-        cart(1e9).explicit()
+@pytest.mark.parametrize("unit", [1e8, 1e9, 1e15])
+def test_a_penalty_beyond_all_digits_of_float64_gives_the_law_of_one_that_is_within(unit) -> None:
+    points = np.random.default_rng(0).uniform(-1.4, 1.4, (200, 2)) * [1, 0.5]
+    expected = cart(1e6).explicit()(1e6 * points)
+    for solve in (LinearMPC.online, LinearMPC.explicit):
+        np.testing.assert_allclose(solve(cart(unit))(unit * points), expected, rtol=0, atol=1e-11)
 
 
 def solved_in_fractions(program, theta: np.ndarray, active: np.ndarray) -> list[float]:
