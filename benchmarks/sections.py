@@ -14,6 +14,7 @@ from benchmarks import (
     exactness,
     gpu,
     large,
+    long_horizons,
     memory,
     networks,
     offline,
@@ -36,6 +37,7 @@ TITLES = {
     exactness.SECTION: "Exactness",
     suite.SECTION: "Suite of problems",
     large.SECTION: "A large law",
+    long_horizons.SECTION: "Unstable plants over long horizons",
     online.LAW: "The online law in numpy, one point",
     online.PREDICT: "The online law: model.predict of one observation",
     online.TRAIN: "The online law: one training step of DDPG, batch of 256",
@@ -59,6 +61,7 @@ EACH: dict[str, PerProblem] = {
 WHOLE: dict[str, Callable[[Bench], None]] = {
     "suite": suite.suite,
     "large": large.large,
+    "horizons": long_horizons.long_horizons,
     "online": online.online,
     "export": deployment.deployment,
     "env": simulators.simulators,

@@ -193,8 +193,8 @@ def asked_of_inputs(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
     unit = 1 / np.sqrt(np.diag(program.H))
     H, F = unit[:, None] * program.H * unit, unit[:, None] * program.F
     gains = -(unit[:, None] * np.linalg.lstsq(H, F, rcond=None)[0])[:count]
-    if program.feedback is not None:
-        gains[:m] += program.feedback
+    if program.feedback is not None:  # later steps are what is added to it
+        gains = gains[:m] + program.feedback
     gains = np.abs(gains).reshape(-1, m, program.F.shape[1]).max(axis=0)
     width = program.theta_max / 2 - program.theta_min / 2
     box = np.where(np.isfinite(width), width, 0.0)
