@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
+from unicodedata import category
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,6 +111,14 @@ def as_output_rows(
             f"{limit}, or an output matrix as a list of rows, [[...], [...]]."
         )
     return entries.astype(int)
+
+
+def is_text(character: str) -> bool:
+    """Return whether a character may stand in a line of XML, HTML and UTF-8.
+
+    None are control characters, halves of surrogate pairs, line ends and noncharacters.
+    """
+    return category(character) not in ("Cc", "Cs", "Zl", "Zp") and ord(character) & 0xFFFE != 0xFFFE
 
 
 def as_indices(name: str, value: Sequence[int], size: int) -> tuple[int, ...]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +25,7 @@ from sb3_yann.commissioning.simulator_grounds import RULE, SimulatorGrounds
 from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.evaluation.episodes import Source
+from sb3_yann.guard.simulator_acceptance import name_of
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin, require_yann_policy
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -37,13 +40,19 @@ relative to the error of the twin's costs."""
 RACE = 3
 """Of two searches the better one goes on after such a part of the iterations."""
 
+SETTINGS = (
+    "iterations", "batch", "learning_rate", "reidentify", "confine", "n_starts", "check_every",
+    "patience", "seed",
+)  # fmt: skip
+"""Arguments of `improve` that its record names."""
+
 REFINED = 0.2
 """Factor of the learning rate where the re-identified MPC, or what plans taught, is refined."""
 
 
 @dataclass(frozen=True)
 class Improvement:
-    """What :func:`improve` did.
+    """What :func:`improve` did; it travels in the model's zip, in ``model.improvements``.
 
     Attributes
     ----------
@@ -59,6 +68,14 @@ class Improvement:
     before : Check, optional
         Of what the model had learnt before, if it had.
     where : {"the twin", "the simulator"}
+    source : str
+        Which twin or simulator.
+    episodes : int
+        Of the log that the twin was fitted to, or played in the simulator to compare.
+    settings : dict of str to number
+        The arguments.
+    policy : str
+        Fingerprint of the policy's weights when it ended.
 
     Examples
     --------
@@ -71,6 +88,10 @@ class Improvement:
     accepted: bool
     before: Check | None = None
     where: str = "the twin"
+    source: str = ""
+    episodes: int = 0
+    settings: dict[str, float] = field(default_factory=dict)
+    policy: str = ""
 
     @property
     def reason(self) -> str:
@@ -204,6 +225,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
 
     ``improve(model, "CSTR-v0")`` does it in the simulator.
     """
+    given = dict(locals())
     if not isinstance(model, OffPolicyAlgorithm):
         raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
     policy = require_yann_policy(model.policy, "improve")
@@ -229,15 +251,33 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
         layer.confine(*twin.starts.shown) if confine else layer.confine(None, None)
         searches = _in_twin(layer, TwinGrounds(twin, batch, n_starts, seed), pace, reidentify)
         leg, least, where = -(-iterations // RACE), least_gain(twin.trust), "the twin"
-        return _improved(policy, searches, max(check_every, leg), least, where, progress_bar)
-    simulator = SimulatorTwin.of(policy.problem, twin, seed)
-    try:
-        grounds = SimulatorGrounds(simulator, batch, n_starts, seed)
-        searches = _in_simulator(layer, grounds, pace, progress_bar)
-        least = RULE.least_gain
-        return _improved(policy, searches, 0, least, "the simulator", progress_bar)
-    finally:
-        simulator.close()
+        found = _improved(policy, searches, max(check_every, leg), least, where, progress_bar)
+        source, episodes = repr(twin), len(twin.episodes)
+    else:
+        simulator = SimulatorTwin.of(policy.problem, twin, seed)
+        try:
+            grounds = SimulatorGrounds(simulator, batch, n_starts, seed)
+            searches = _in_simulator(layer, grounds, pace, progress_bar)
+            least = RULE.least_gain
+            found = _improved(policy, searches, 0, least, "the simulator", progress_bar)
+        finally:
+            simulator.close()
+        source, episodes = name_of(twin), len(simulator.seeds) + sum(simulator.played)
+    settings = {name: given[name] for name in SETTINGS}
+    prints = fingerprint(policy.actor.state_dict())
+    found = replace(found, source=source, episodes=episodes, settings=settings, policy=prints)
+    record: Any = model
+    record.improvements = (*getattr(model, "improvements", ()), found)
+    return found
+
+
+def fingerprint(state: dict[str, th.Tensor]) -> str:
+    """Return the SHA-256 of tensors, whatever their order and device."""
+    found = hashlib.sha256()
+    for name in sorted(state):
+        found.update(name.encode())
+        found.update(np.ascontiguousarray(state[name].cpu().numpy()).tobytes())
+    return found.hexdigest()
 
 
 def _in_twin(layer: LawLayer, grounds: TwinGrounds, pace: Pace, reidentify: bool) -> list[Search]:

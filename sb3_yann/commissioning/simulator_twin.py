@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -73,6 +73,8 @@ class SimulatorTwin:
         Makes an env that shows theta and takes deviations; one that is closed is used again.
     free : list of gymnasium.Env
         Those that were.
+    played : list of int
+        Episodes of each comparison so far.
     """
 
     problem: LinearMPC
@@ -82,6 +84,7 @@ class SimulatorTwin:
     seeds: range
     make: Callable[[], gym.Env[Any, Any]]
     free: list[gym.Env[Any, Any]]
+    played: list[int] = field(default_factory=list)
 
     @classmethod
     def of(cls, problem: LinearMPC, env: Source, seed: int = 0) -> SimulatorTwin:
@@ -135,6 +138,7 @@ class SimulatorTwin:
 
     def play(self, controller: Controller, seeds: Sequence[int]) -> Loops:
         """Return episodes of the simulator itself."""
+        self.played.append(len(seeds))
         return play(self.problem, self.make, seeds, controller)
 
     def close(self) -> None:

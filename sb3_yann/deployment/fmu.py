@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import os
 import platform
 import shutil
+import signal
 import subprocess
 import tempfile
 import uuid
@@ -101,16 +103,39 @@ def _library(sources: dict[str, str]) -> bytes:
             (Path(folder) / file).write_text(text, encoding="ascii")
         units = [file for file in sources if file.endswith(".c")]
         command = [compiler, *FLAGS, *units, "-lm", "-o", "library"]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-        if done.returncode:
+        code, said = _run(command, folder)
+        if code:
             warnings.warn(
-                f"{compiler} failed, so the FMU holds sources and no library: "
-                f"{done.stderr.strip()[:300]}",
+                f"{compiler} failed, so the FMU holds sources and no library: {said.strip()[:300]}",
                 RuntimeWarning,
                 stacklevel=2,
             )
             return b""
         return (Path(folder) / "library").read_bytes()
+
+
+def _run(command: list[str], folder: str) -> tuple[int, str]:
+    """Run a compiler; return its exit code and what it complains of.
+
+    Its temporary files lie in the folder. Where Ctrl-C or an error cuts it off, all of its
+    processes end before the folder is removed.
+    """
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        env={**os.environ, "TMPDIR": folder},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        said = process.communicate()[1]
+    except BaseException:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        raise
+    return process.returncode, said
 
 
 def _description(data: Arrays, about: str, identity: str, units: list[str]) -> bytes:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from io import StringIO
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sb3_yann.evaluation.episodes import Episodes, as_played
+
+WIDTH = 100  # letters in a line of a table that is printed
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -75,9 +78,19 @@ def _require_pairs(before: Episodes, after: Episodes) -> None:
 
 
 def _table(rows: str, title: str) -> Table:
-    from rich.table import Table  # not before it is used
+    from rich.console import Console  # not before it is used
+    from rich.table import Table
 
-    table = Table(rows, "before", "after", "change", title=title)
+    class PrintedTable(Table):
+        """A table that `print` shows too, without colors."""
+
+        def __str__(self) -> str:
+            console = Console(file=StringIO(), width=WIDTH, color_system=None)
+            with console.capture() as shown:
+                console.print(self)
+            return shown.get()
+
+    table = PrintedTable(rows, "before", "after", "change", title=title)
     for column in table.columns[1:]:
         column.justify = "right"
     return table

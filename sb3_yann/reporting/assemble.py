@@ -15,7 +15,12 @@ from sb3_yann.audit import Headroom
 from sb3_yann.evaluation.episodes import Source, as_seeds
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
-from sb3_yann.reporting.evidence_parts import guard_part, headroom_part, twin_part
+from sb3_yann.reporting.evidence_parts import (
+    guard_part,
+    headroom_part,
+    improve_part,
+    twin_part,
+)
 from sb3_yann.reporting.html import Html, clean, join, page, say, table, tag
 from sb3_yann.reporting.loop_parts import distance_part, loops_part, statistics_part
 from sb3_yann.reporting.problem_parts import constraints_part, law_part, plant_part
@@ -23,9 +28,10 @@ from sb3_yann.reporting.record_parts import again_part, cost_part
 from sb3_yann.reporting.subject import Finding, Part, Subject
 from sb3_yann.twin import PlantTwin
 
+TITLE = "Report on a policy that starts as an MPC"
 PARTS = (
     plant_part, constraints_part, law_part, loops_part, statistics_part, distance_part, guard_part,
-    twin_part, headroom_part, cost_part, again_part,
+    improve_part, twin_part, headroom_part, cost_part, again_part,
 )  # fmt: skip
 
 
@@ -38,14 +44,15 @@ def report(
     twin: PlantTwin | None = None,
     headroom: Headroom | None = None,
     seeds: Iterable[int] = range(20),
-    title: str = "Report on a policy that starts as an MPC",
+    title: str = TITLE,
 ) -> Path:
     """Write a page about a model that an engineer can read, print and sign; return its path.
 
     It is one HTML file without scripts, and loads nothing: pictures are part of it. It tells the
     plant and the problem in plant units, the register of constraints, the law and how it was
     checked, closed loops against the MPC, what they prove, where and how far the policy leaves the
-    MPC, every decision of the guard, the twin, what there is to gain, timing, versions and seeds.
+    MPC, every decision of the guard, what `improve` did, the twin, what there is to gain, timing,
+    versions and seeds.
     What cannot be told from what is given is left out, and said to be.
 
     Parameters
@@ -83,7 +90,10 @@ def report(
     >>> report(model, "cstr.html", env="CSTR-v0", seeds=range(2)).name
     'cstr.html'
     """
+    given = {"path": path, "env": env, "guard": guard, "twin": twin, "headroom": headroom}
+    given |= {"seeds": seeds, "title": None if title == TITLE else title}
     subject = _subject(model, env, guard, twin, headroom, seeds)
+    subject.call = {name: value for name, value in given.items() if value is not None}
     with _Whole(Path(path)) as target:
         parts = [each(subject) for each in PARTS]
         target.write(page(title, [_head(title), *_body(parts), _signatures()]))

@@ -25,6 +25,8 @@ def guard_part(subject: Subject) -> Part:
             "No guard was at work on this model: nothing has confirmed the policy on new starts. "
             "Pass an ImprovementGuard to learn."
         )
+        if subject.improved is not None:
+            said = "No guard was at work on this model. What confirmed the policy is the next part."
         return Part(title, left_out(said), (Finding("note", "No guard was at work."),))
     accepted = state.accepted.is_actor_of(subject.policy)
     text = "The policy is the one that the guard accepted last."
@@ -33,7 +35,10 @@ def guard_part(subject: Subject) -> Part:
             "The policy is NOT the one that the guard accepted last: it is a candidate, or was "
             "changed since. restore_accepted(model) gives the accepted one."
         )
-    finding = Finding("passed" if accepted else "failed", text)
+    since = not accepted and subject.improved is not None
+    if since:
+        text = "The policy is not the guard's: improve has accepted another one since."
+    finding = Finding("passed" if accepted else "note" if since else "failed", text)
     starts = len(state.settings["seeds"])
     caption = (
         "Mean cost of each candidate by the verdict on it, of the accepted policy and of the MPC, "
@@ -97,6 +102,45 @@ def _reason(decision: Decision) -> str:
     if 0 < decision.share < 1:
         parts.append(f"accepted {decision.share:g} of the way")
     return "; ".join(filter(None, parts))
+
+
+def improve_part(subject: Subject) -> Part:
+    """Return what `improve` did, in what, with how many episodes, and whose the policy is."""
+    title, found = "What improve did", subject.improvements
+    if not found:
+        return Part(title, left_out("improve was not at work on this model."))
+    head = ["", "in", "episodes", "checks passed", "what came of it"]
+    rows = [
+        [str(k), f"{each.where}: {each.source}", str(each.episodes),
+         f"{sum(check.accepted for check in each.checks)} of {len(each.checks)}", each.report()]
+        for k, each in enumerate(found, start=1)
+    ]  # fmt: skip
+    of_last = [[name.replace("_", " "), str(value)] for name, value in found[-1].settings.items()]
+    finding = _finding_of_improve(subject)
+    said = (
+        "Episodes are those of the log that the twin was fitted to, or those that were played in "
+        "the simulator to compare. What was confirmed there holds for the plant as far as the "
+        "twin or the simulator is like it."
+    )
+    parts = [say(finding.text), say(said), table(head, rows)]
+    parts += [tag("h3", "Settings of the last improvement"), table(["setting", "value"], of_last)]
+    return Part(title, join(parts), (finding,))
+
+
+def _finding_of_improve(subject: Subject) -> Finding:
+    """Return whether the policy is the one that `improve` accepted last."""
+    now, state = subject.improved, subject.state
+    if now is not None:
+        place = f"{now.where} ({now.episodes} episodes, {100 * now.change:+.2f} %)"
+        return Finding("passed", f"The policy is the one that improve accepted last, in {place}.")
+    if not any(each.accepted for each in subject.improvements):
+        return Finding("note", f"improve was at work. {subject.improvements[-1].reason}")
+    if subject.policy.actor.mu.network.is_zero():
+        return Finding("note", "The policy is the MPC again: what improve accepted is gone.")
+    if state is not None and state.accepted.is_actor_of(subject.policy):
+        return Finding("note", "The guard has accepted another policy after improve.")
+    text = "The policy is NOT the one that improve accepted last: it was changed since."
+    return Finding("failed", text)
 
 
 def twin_part(subject: Subject) -> Part:

@@ -10,6 +10,8 @@ from io import BytesIO
 from string import Template
 from typing import TYPE_CHECKING, Any
 
+from sb3_yann._validation import is_text
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -86,8 +88,14 @@ class Html(str):
 
 
 def clean(value: Any) -> Html:
-    """Return a value as HTML: escaped, unless it is that already."""
-    return value if isinstance(value, Html) else Html(escape(str(value)))
+    """Return a value as HTML: escaped, unless it is that already.
+
+    What is no text, such as control characters, becomes a replacement character.
+    """
+    if isinstance(value, Html):
+        return value
+    text = "".join(c if c in "\n\t" or is_text(c) else "\ufffd" for c in str(value))
+    return Html(escape(text))
 
 
 def tag(name: str, *content: Any, **attributes: str) -> Html:

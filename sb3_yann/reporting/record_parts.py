@@ -7,13 +7,16 @@ import platform
 import sys
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
+from os import PathLike, fspath
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.type_aliases import TrainFreq
 
+from sb3_yann.commissioning.improve import fingerprint
 from sb3_yann.control import PiecewiseAffine
+from sb3_yann.guard.simulator_acceptance import name_of
 from sb3_yann.reporting.html import join, lines, say, table, tag
 from sb3_yann.reporting.subject import Part, Subject
 
@@ -96,14 +99,7 @@ def again_part(subject: Subject) -> Part:
         ["the policy's weights", fingerprint(subject.policy.actor.state_dict())],
         ["the MPC problem", _problem_print(subject)],
     ]
-    seeds = ", ".join(map(str, subject.seeds))
-    env = repr(subject.env) if isinstance(subject.env, str | None) else subject.env_name
-    code = (
-        f"from stable_baselines3 import {type(model).__name__}\n"
-        "from sb3_yann import report\n\n"
-        f'model = {type(model).__name__}.load("the model of these fingerprints")\n'
-        f"report(model, env={env}, seeds=[{seeds}])"
-    )
+    code = _same_report(subject)
     parts = [
         tag("h3", "Versions"), table(["library", "version"], versions),
         tag("h3", f"Settings of the {type(model).__name__}"), table(["setting", "value"], rows),
@@ -113,13 +109,48 @@ def again_part(subject: Subject) -> Part:
     return Part("To do it again", join(parts))
 
 
-def fingerprint(state: dict[str, Any]) -> str:
-    """Return the SHA-256 of tensors, whatever their order and device."""
-    found = hashlib.sha256()
-    for name in sorted(state):
-        found.update(name.encode())
-        found.update(np.ascontiguousarray(state[name].cpu().numpy()).tobytes())
-    return found.hexdigest()
+def _same_report(subject: Subject) -> str:
+    """Return code that writes the report again.
+
+    What cannot be written as code stands there by its name, and a comment says what it is.
+    """
+    model = type(subject.model).__name__
+    imports = ["from sb3_yann import report"]
+    named = [f"model: the {model} of these fingerprints, by {model}.load(...)"]
+    words = ["model"]
+    for name, value in subject.call.items():
+        if name == "seeds":
+            words.append(f"seeds={_seeds(subject.seeds)}")
+            continue
+        text, module, told = _as_code(name, value, subject)
+        words.append(text if name == "path" else f"{name}={text}")
+        imports += [module] if module else []
+        named += [told] if told else []
+    comments = [f"# {_one_line(each)}" for each in named]
+    return "\n".join([*sorted(imports, key=len), "", *comments, f"report({', '.join(words)})"])
+
+
+def _as_code(name: str, value: Any, subject: Subject) -> tuple[str, str, str]:
+    """Return an argument as code, the import that it takes, and what to say where it is none."""
+    if isinstance(value, str | PathLike):
+        return repr(fspath(value)), "", ""
+    if subject.twin is not None and value == subject.twin.env:
+        return "twin.env", "", ""
+    module, own = getattr(value, "__module__", ""), getattr(value, "__qualname__", "")
+    if callable(value) and own.isidentifier() and module != "__main__":
+        if getattr(sys.modules.get(module), own, None) is value:
+            return own, f"from {module} import {own}", ""
+    what = name_of(value) if name == "env" else repr(value)
+    return name, "", f"{name}: {what}, which cannot be written here: make it as you did"
+
+
+def _seeds(seeds: tuple[int, ...]) -> str:
+    whole = range(seeds[0], seeds[0] + len(seeds))
+    return repr(whole if seeds == tuple(whole) else [*seeds])
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
 
 
 def _problem_print(subject: Subject) -> str:

@@ -11,6 +11,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array
 from sb3_yann.audit import Headroom
+from sb3_yann.commissioning.improve import Improvement, fingerprint
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.choice import Law
@@ -95,6 +96,8 @@ class Subject:
     twin : PlantTwin or None
     headroom : Headroom or None
     seeds : tuple of int
+    call : dict
+        Arguments of `report` that were given, by their names, in their order.
     points : int
         Drawn at random from the box of theta.
     """
@@ -106,6 +109,7 @@ class Subject:
     twin: PlantTwin | None
     headroom: Headroom | None
     seeds: tuple[int, ...]
+    call: dict[str, Any] = field(default_factory=dict)
     points: int = field(default=500)
 
     @property
@@ -128,6 +132,19 @@ class Subject:
         """What a guard has left in the model."""
         state = getattr(self.model, "guard_state", None)
         return state if isinstance(state, GuardState) else None
+
+    @property
+    def improvements(self) -> tuple[Improvement, ...]:
+        """What `improve` has left in the model."""
+        found = getattr(self.model, "improvements", ())
+        return tuple(each for each in found if isinstance(each, Improvement))
+
+    @cached_property
+    def improved(self) -> Improvement | None:
+        """What made the policy that it is: the last improvement, if nothing changed it since."""
+        accepted = [each for each in self.improvements if each.accepted]
+        now = fingerprint(self.policy.actor.state_dict())
+        return accepted[-1] if accepted and accepted[-1].policy == now else None
 
     @property
     def env_name(self) -> str:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import platform
 import shutil
+import signal
 import subprocess
+import sys
+import time
 import zipfile
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -244,3 +249,42 @@ def test_a_compiler_that_fails_is_told(tmp_path, monkeypatch):
         export(policy_of("reactor"), tmp_path / "plant.fmu")
     with zipfile.ZipFile(tmp_path / "plant.fmu") as archive:
         assert not any("binaries" in each for each in archive.namelist())
+
+
+SLOW = """#!/bin/sh
+mktemp > /dev/null
+echo $$ > "{0}"
+sh -c 'echo $$ > "{0}.child"; mktemp > /dev/null; sleep 60' &
+wait
+"""
+
+
+def test_an_interrupt_leaves_no_files_of_the_compiler_and_none_of_its_processes(tmp_path):
+    temporary, told = tmp_path / "temporary", tmp_path / "told"
+    temporary.mkdir()
+    (tmp_path / "cc").write_text(SLOW.format(told))
+    (tmp_path / "cc").chmod(0o755)
+    program = "from sb3_yann.deployment import fmu\nfmu._library({'a.c': 'int a;'})"
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    environment = {**os.environ, "TMPDIR": str(temporary), "PATH": path}
+    running = subprocess.Popen(
+        [sys.executable, "-c", program], env=environment, stderr=subprocess.PIPE
+    )
+    child = Path(f"{told}.child")
+    while running.poll() is None and not (child.exists() and child.read_text()):
+        time.sleep(0.02)
+    time.sleep(0.1)
+    running.send_signal(signal.SIGINT)  # as Ctrl-C, but for the process group
+    assert b"KeyboardInterrupt" in running.communicate(timeout=20)[1]
+    assert [*temporary.iterdir()] == []
+    for number in (told, child):
+        assert not _is_running(int(number.read_text()))
+
+
+def _is_running(number: int) -> bool:
+    """Return whether a process is there, and no zombie."""
+    try:
+        said = Path(f"/proc/{number}/stat").read_text()
+    except OSError:
+        return False
+    return said.rpartition(")")[2].split()[0] not in "ZX"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from dataclasses import replace
 from functools import partial
@@ -9,6 +10,7 @@ from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -20,7 +22,18 @@ import guard_samples
 import twin_samples
 import unit_samples
 from guard_samples import Slide, make_guard
-from sb3_yann import Headroom, LinearModel, LinearMPC, NoActionNoise, PlantTwin, report
+from sb3_yann import (
+    Headroom,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    PlantTwin,
+    improve,
+    offset_free,
+    report,
+)
+from sb3_yann.commissioning.improve import Improvement
+from sb3_yann.commissioning.trial import Check
 from sb3_yann.evaluation import evaluate
 from sb3_yann.reporting import (
     assemble,
@@ -126,6 +139,7 @@ def test_every_part_is_there_with_its_pictures(whole) -> None:
         "Plant and problem", "Constraints register", "The law and how it was checked",
         "Closed loops against the MPC", "Statistics in words",
         "Where and how far the policy leaves the MPC", "Decisions of the guard",
+        "What improve did",
         "The twin and its verdict", "What there is to gain", "Timing and memory",
         "To do it again", "Signatures",
     ):  # fmt: skip
@@ -333,6 +347,125 @@ def test_a_wrong_law_fails(tmp_path, monkeypatch) -> None:
     vars(subject)["law"] = replace(law, offsets=law.offsets + 1e-3)
     part = problem_parts.law_part(subject)
     assert [each.verdict for each in part.findings] == ["failed", "failed"]
+
+
+@pytest.fixture(scope="module")
+def improved(tmp_path_factory):
+    """A saved and loaded model that `improve` has made better in a twin, the twin, and its page."""
+    twin, problem = twin_samples.twin(), twin_samples.problem()
+    model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": problem}, device="cpu", seed=0)
+    found = improve(model, twin, iterations=30, n_starts=7)
+    assert found.accepted
+    folder = tmp_path_factory.mktemp("improved")
+    model.save(folder / "model.zip")
+    loaded = DDPG.load(folder / "model.zip")
+    given = {"env": twin.env, "twin": twin, "seeds": range(40, 43)}
+    return loaded, twin, report(loaded, folder / "page.html", **given, title="Of today")
+
+
+def code_of(page: Path) -> str:
+    """Return the code of the same report, as the page shows it."""
+    shown = page.read_text(encoding="utf-8").rpartition("The same report")[2]
+    return unescape(re.search("<pre>(.*?)</pre>", shown, re.DOTALL)[1])
+
+
+def test_what_improve_did_travels_with_the_model_and_is_on_the_page(improved) -> None:
+    model, _, page = improved
+    text, (found,) = read(page)[1], model.improvements
+    for said in (
+        "The policy is the one that improve accepted last, in the twin (5 episodes",
+        found.report(), found.source, "n starts 7", "iterations 30",
+    ):  # fmt: skip
+        assert said in text
+    assert "nothing has confirmed" not in text and found.settings["n_starts"] == 7
+
+
+def test_a_policy_that_was_changed_after_improve_fails(improved) -> None:
+    changed = copy.deepcopy(improved[0])
+    with th.no_grad():
+        for each in changed.policy.actor.mu.network.parameters():
+            each.add_(0.01)
+    (finding,) = evidence_parts.improve_part(subject_of(changed)).findings
+    assert finding.verdict == "failed" and "changed since" in finding.text
+    assert "nothing has confirmed" in evidence_parts.guard_part(subject_of(changed)).content
+    back = copy.deepcopy(improved[0])
+    with th.no_grad():
+        last_layer(back).zero_()
+    (finding,) = evidence_parts.improve_part(subject_of(back)).findings
+    assert finding.verdict == "note" and "MPC again" in finding.text
+
+
+def test_improve_after_a_guard_is_no_failure_and_one_that_found_nothing_is_a_note() -> None:
+    model, guard = guarded()
+    record_parts_of = Improvement((), -0.1, True, policy="of another")
+    model.improvements = (record_parts_of,)
+    (finding,) = evidence_parts.improve_part(subject_of(model)).findings
+    assert finding.verdict == "note" and "guard has accepted another" in finding.text
+    with th.no_grad():
+        unpin(model)
+        last_layer(model)[..., -1] = 0.2
+    now = record_parts.fingerprint(model.policy.actor.state_dict())
+    model.improvements = (Improvement((), -0.1, True, policy=now),)
+    (finding,) = evidence_parts.guard_part(subject_of(model, guard=guard)).findings
+    assert finding.verdict == "note" and "improve has accepted another one" in finding.text
+    check = Check(1, False, "a start costs more", 0.0, 0.0, True)
+    model.improvements = (Improvement((check,), 0.0, False, source="Slide", episodes=9),)
+    part = evidence_parts.improve_part(subject_of(model))
+    assert part.findings[0].verdict == "note" and "a start costs more" in part.content
+
+
+def test_the_same_report_runs_and_is_the_same(improved) -> None:
+    model, twin, page = improved
+    before, code = read(page)[1], code_of(page)
+    for said in ("env=twin.env", "twin=twin", "seeds=range(40, 43)", "title='Of today'"):
+        assert said in code
+    page.unlink()
+    exec(code, {"model": model, "twin": twin})
+    after = read(page)[1]
+    part = slice(before.index("Closed loops against"), before.rindex("Timing and memory"))
+    assert after[part] == before[part]
+
+
+@pytest.mark.parametrize("how", ["id", "class", "lambda", "instance", "local", "guard", "partial"])
+def test_what_is_no_code_stands_there_by_its_name(how, tmp_path) -> None:
+    model, guard = guarded()
+
+    def local():
+        return Slide()
+
+    envs = {"class": Slide, "lambda": lambda: Slide(), "instance": Slide(), "local": local}
+    envs |= {"id": None, "guard": None, "partial": partial(Slide)}
+    given = {"env": envs[how], "guard": guard if how == "guard" else None}
+    if how == "id":
+        given["env"] = "ClippedPendulum-v0"
+        model = DDPG("YannPolicy", given["env"], device="cpu")
+    seeds = [4, 2] if how == "class" else range(2)
+    page = report(model, tmp_path / "page's.html", **given, seeds=seeds)
+    code = code_of(page)
+    assert "address" not in code and " at 0x" not in code and code.count("report(") == 1
+    if how == "class":
+        assert "from guard_samples import Slide" in code and "seeds=[4, 2]" in code
+    elif how not in ("id", "guard"):
+        assert "# env: " in code and "cannot be written here" in code and "env=env" in code
+    page.unlink()
+    exec(code, {"model": model, "env": given["env"], "guard": guard})
+    assert page.exists()
+
+
+def test_control_characters_of_a_title_are_no_part_of_the_page(tmp_path) -> None:
+    page = report(guard_samples.build(), tmp_path / "p.html", title="a\x1b[31m\x00\ud800b")
+    assert not set(page.read_text(encoding="utf-8")) & set("\x1b\x00")
+
+
+def test_the_page_says_that_an_observer_is_no_part_of_the_policy(tmp_path) -> None:
+    mpc, _ = offset_free(twin_samples.problem())
+    env = gym.Env()
+    env.observation_space = gym.spaces.Box(-9, 9, (mpc.n_theta,), np.float64)
+    env.action_space = gym.spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
+    policy = {"policy_kwargs": {"problem": mpc}, "device": "cpu"}
+    text = read(report(DDPG("YannPolicy", env, **policy), tmp_path / "p.html"))[1]
+    assert "estimated disturbance" in text and "runs the observer" in text
+    assert "measured disturbance" not in text
 
 
 def test_starts_that_the_guard_knows_are_named() -> None:

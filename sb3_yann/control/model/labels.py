@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
-from unicodedata import category
 
+from sb3_yann._validation import is_text
 from sb3_yann.control.linear_system import LinearSystem, names
 
 Units = Mapping[str, str] | Sequence[str]
@@ -27,8 +27,7 @@ def as_names(what: str, given: Sequence[str], size: int) -> tuple[str, ...]:
 def _require_text(what: str, given: Sequence[str]) -> None:
     """Raise where a name holds what files in XML, HTML and UTF-8 cannot."""
     for each in given:
-        # Control characters, halves of surrogate pairs, line ends, and the two noncharacters.
-        if any(category(c) in ("Cc", "Cs", "Zl", "Zp") or c in "\ufffe\uffff" for c in each):
+        if not all(map(is_text, each)):
             raise ValueError(
                 f"{what}: {each!r} holds a character that is no text. Leave out line ends, escape "
                 "sequences and other control characters."
