@@ -36,7 +36,9 @@ def test_the_table_shows_losses_as_well_as_gains() -> None:
     console = Console(record=True, width=100, file=StringIO())
     console.print(comparison_table("costs", fake([10.0, 20.0]), fake([9.0, 27.0])))
     text = console.export_text()
-    assert "-1.00" in text
+    assert "-1.00" in text and text == str(
+        comparison_table("costs", fake([10.0, 20.0]), fake([9.0, 27.0]))
+    )
     assert "+7.00" in text
     assert "+3.00 (+20.0 %)" in text
 

@@ -390,15 +390,15 @@ def test_a_policy_that_was_changed_after_improve_fails(improved) -> None:
     assert "nothing has confirmed" in evidence_parts.guard_part(subject_of(changed)).content
     back = copy.deepcopy(improved[0])
     with th.no_grad():
-        last_layer(back).zero_()
+        for each in back.policy.actor.mu.network.parameters():
+            each.zero_()
     (finding,) = evidence_parts.improve_part(subject_of(back)).findings
     assert finding.verdict == "note" and "MPC again" in finding.text
 
 
 def test_improve_after_a_guard_is_no_failure_and_one_that_found_nothing_is_a_note() -> None:
     model, guard = guarded()
-    record_parts_of = Improvement((), -0.1, True, policy="of another")
-    model.improvements = (record_parts_of,)
+    model.improvements = (Improvement((), -0.1, True, policy="of another"),)
     (finding,) = evidence_parts.improve_part(subject_of(model)).findings
     assert finding.verdict == "note" and "guard has accepted another" in finding.text
     with th.no_grad():
@@ -426,26 +426,19 @@ def test_the_same_report_runs_and_is_the_same(improved) -> None:
     assert after[part] == before[part]
 
 
-@pytest.mark.parametrize("how", ["id", "class", "lambda", "instance", "local", "guard", "partial"])
+@pytest.mark.parametrize("how", ["class", "lambda", "instance", "guard"])
 def test_what_is_no_code_stands_there_by_its_name(how, tmp_path) -> None:
     model, guard = guarded()
 
-    def local():
-        return Slide()
-
-    envs = {"class": Slide, "lambda": lambda: Slide(), "instance": Slide(), "local": local}
-    envs |= {"id": None, "guard": None, "partial": partial(Slide)}
+    envs = {"class": Slide, "lambda": lambda: Slide(), "instance": Slide(), "guard": None}
     given = {"env": envs[how], "guard": guard if how == "guard" else None}
-    if how == "id":
-        given["env"] = "ClippedPendulum-v0"
-        model = DDPG("YannPolicy", given["env"], device="cpu")
     seeds = [4, 2] if how == "class" else range(2)
     page = report(model, tmp_path / "page's.html", **given, seeds=seeds)
     code = code_of(page)
-    assert "address" not in code and " at 0x" not in code and code.count("report(") == 1
+    assert " at 0x" not in code and code.count("report(") == 1
     if how == "class":
         assert "from guard_samples import Slide" in code and "seeds=[4, 2]" in code
-    elif how not in ("id", "guard"):
+    elif how != "guard":
         assert "# env: " in code and "cannot be written here" in code and "env=env" in code
     page.unlink()
     exec(code, {"model": model, "env": given["env"], "guard": guard})
