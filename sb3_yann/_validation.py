@@ -121,7 +121,7 @@ def is_text(character: str) -> bool:
     return category(character) not in ("Cc", "Cs", "Zl", "Zp") and ord(character) & 0xFFFE != 0xFFFE
 
 
-def as_indices(name: str, value: Sequence[int], size: int) -> tuple[int, ...]:
+def as_indices(name: str, value: Iterable[int] | str, size: int) -> tuple[int, ...]:
     """Return different whole numbers below ``size``, in order."""
     if isinstance(value, str) or not isinstance(value, Iterable):
         raise TypeError(f"{name} = {_short(value)} must be a list of indices, e.g. [0].")

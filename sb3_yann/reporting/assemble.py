@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -90,7 +91,13 @@ def report(
     >>> report(model, "cstr.html", env="CSTR-v0", seeds=range(2)).name
     'cstr.html'
     """
-    given = {"path": path, "env": env, "guard": guard, "twin": twin, "headroom": headroom}
+    given: dict[str, Any] = {
+        "path": path,
+        "env": env,
+        "guard": guard,
+        "twin": twin,
+        "headroom": headroom,
+    }
     given |= {"seeds": seeds, "title": None if title == TITLE else title}
     subject = _subject(model, env, guard, twin, headroom, seeds)
     subject.call = {name: value for name, value in given.items() if value is not None}
