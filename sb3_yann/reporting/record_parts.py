@@ -142,7 +142,7 @@ def _as_code(name: str, value: Any, subject: Subject) -> tuple[str, str, str]:
             return own, f"from {module} import {own}", ""
     what = name_of(value) if name == "env" else repr(value)
     if " at 0x" in what:  # an address, which says nothing
-        what = f"the {type(value).__name__} that was given"
+        what = f"the {type(value).__name__} of then"
     return name, "", f"{name}: {what}, which cannot be written here: make it as you did"
 
 
