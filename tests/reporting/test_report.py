@@ -48,6 +48,9 @@ from weights import last_layer, unpin
 
 VOID = {"meta", "img"}
 SEEDS = range(8)
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:The reward is not minus"
+)  # Slide pays something else
 
 
 class Outline(HTMLParser):
