@@ -57,7 +57,6 @@ def test_the_file_holds_what_is_accepted_from_the_first_step_on(tmp_path) -> Non
     assert [each.name for each in folder.iterdir()] == ["accepted_model.zip"]
 
 
-@pytest.mark.filterwarnings("ignore:The reward is not minus the cost")
 def test_saving_changes_no_bit_of_the_training(tmp_path) -> None:
     found = []
     for options in ({}, {"save_path": tmp_path}):
