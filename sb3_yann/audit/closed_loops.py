@@ -22,7 +22,7 @@ from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
-from sb3_yann.evaluation.episodes import Source, watch_length
+from sb3_yann.evaluation.episodes import Source, as_source, watch_length
 from sb3_yann.twin.dynamics import law_of
 
 Controller = Callable[[int, Array, NDArray[np.bool_]], Array]
@@ -83,6 +83,8 @@ class Loops:
 
 def maker(env: Source, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]]:
     """Return a function that makes envs like the one that is given, by this name, or made."""
+    if isinstance(env, str):
+        env = as_source(env)  # "module:function" is a function
     if isinstance(env, str):
         return partial(gym.make, env, disable_env_checker=True)
     if isinstance(env, gym.Env):

@@ -143,17 +143,17 @@ def evaluate(
     resets = [*zip(seeds, options, strict=True)]
     act = _as_batch_function(policy)
     pool = env if isinstance(env, EnvPool) else None
-    env = env.source if isinstance(env, EnvPool) else as_source(env)
-    if isinstance(env, gym.Env):
-        _require_same_inputs(policy, env.action_space)
-        _require_state_shown(policy, env)
-        episodes = [_side_by_side(act, [env], [reset])[0] for reset in resets]
-    elif isinstance(env, str) and (vector_env := _vector_env(env, len(seeds))) is not None:
+    source: Source = env.source if isinstance(env, EnvPool) else as_source(env)
+    if isinstance(source, gym.Env):
+        _require_same_inputs(policy, source.action_space)
+        _require_state_shown(policy, source)
+        episodes = [_side_by_side(act, [source], [reset])[0] for reset in resets]
+    elif isinstance(source, str) and (vector_env := _vector_env(source, len(seeds))) is not None:
         with closing(vector_env):
             _require_same_inputs(policy, vector_env.single_action_space)
             return _as_one(act, vector_env, seeds, starts)
     else:
-        own = EnvPool(env)
+        own = EnvPool(source)
         with closing(own), (pool or own).lend(len(seeds)) as envs:
             for each in envs[:1]:
                 _require_same_inputs(policy, each.action_space)

@@ -10,6 +10,7 @@ from stable_baselines3 import DDPG
 
 import unit_samples as units
 from sb3_yann import YannPolicy
+from sb3_yann.audit.closed_loops import maker
 from sb3_yann.evaluation import Episodes, evaluate
 from sb3_yann.evaluation.episodes import EnvPool
 from sb3_yann.wrappers import Deviations
@@ -316,3 +317,9 @@ class Goal(gym.Wrapper):
 def test_an_end_that_is_a_success_is_no_termination_that_counts() -> None:
     act = lambda _: [0.0]  # noqa: E731
     assert not evaluate(act, lambda: Goal(gym.make("CSTR-v0")), [0]).terminated.any()
+
+
+def test_headroom_and_improve_make_their_envs_by_such_a_name_too() -> None:
+    made = maker(f"{__name__}:short_reactor")()
+    assert isinstance(made, gym.Env) and made.spec.max_episode_steps == 3
+    assert maker("sb3_yann_envs:CSTR-v0")().spec.id == "CSTR-v0"

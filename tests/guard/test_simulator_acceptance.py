@@ -184,7 +184,7 @@ def test_a_training_env_that_never_ends_is_told(n_envs, monkeypatch) -> None:
         UserWarning, match=r"training env has not ended after 20 .*TimeLimit"
     ) as told:
         train(endless, 30 * n_envs, NoActionNoise(), make_guard())
-    assert len(told) == 1
+    assert sum("has not ended" in str(each.message) for each in told) == 1
 
 
 def test_a_guard_counts_the_steps_of_the_present_learn_whatever_its_envs(monkeypatch) -> None:
