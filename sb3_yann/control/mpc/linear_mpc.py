@@ -139,13 +139,6 @@ class LinearMPC(MPCProblem):
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
-        if idle := np.flatnonzero(~np.any(model.B != 0, axis=0)).tolist():
-            names = labels_of(model)[1]
-            raise ValueError(
-                f"Column {idle} of B is zero: input {', '.join(names[i] for i in idle)} does "
-                "nothing in the model, and so there is nothing to control by it. Look for the "
-                "input's effect in the model's units and sampling time, or leave the input out."
-            )
         sides = (x_min, x_max), (u_min, u_max), (theta_min, theta_max)
         given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute)
         tracking, disturbances, outputs = given.tracking, given.disturbances, given.outputs
@@ -180,6 +173,13 @@ class LinearMPC(MPCProblem):
             tracking, d, rate, outputs, soft,
         )  # fmt: skip
         super().__init__(*checked, _completed(MPCProblem(*checked, terminal)))
+        if idle := np.flatnonzero(~np.any(model.B != 0, axis=0)).tolist():
+            names = labels_of(model)[1]
+            raise ValueError(
+                f"Column {idle} of B is zero: input {', '.join(names[i] for i in idle)} does "
+                "nothing in the model, and so there is nothing to control by it. Look for the "
+                "input's effect in the model's units and sampling time, or leave the input out."
+            )
         self._store(absolute=bool(absolute))
 
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
