@@ -292,7 +292,18 @@ class _Search:
         if self.lost is not None and verdict_of(*parts) == "do not bother":
             verdict = UNKNOWN
         rest = self._rest() if offset < LITTLE else ""
-        return dataclasses.replace(whole, verdict=verdict, lost=self.lost, rest=rest)
+        played = {
+            name: self.others[name].costs if name in self.others else None
+            for name in ("observer", "model")
+        }
+        return dataclasses.replace(
+            whole,
+            verdict=verdict,
+            lost=self.lost,
+            rest=rest,
+            observer_played=played["observer"],
+            reidentified_played=played["model"],
+        )
 
     def _rest(self) -> str:
         """Return what is said of an offset that remains though an observer gains nothing."""

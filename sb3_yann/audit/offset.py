@@ -61,8 +61,8 @@ def steady_offset(problem: LinearMPC, sample: Sample) -> str:
     i = found.worst
     return (
         f"Where a reference held, {found.times} times, the tracked output {i} came to rest "
-        f"{found.beside[i]:.3g} beside r[{i}]: the plant is not its model. Without an offset, and "
-        f"before any learning: {CURE}"
+        f"{found.beside[i]:.3g} beside r[{i}]: the plant is not its model. An observer may "
+        f"remove that, or cost more on the way: headroom(mpc, env) plays it. Where it pays: {CURE}"
     )
 
 
