@@ -308,8 +308,10 @@ class _Search:
     def _rest(self) -> str:
         """Return what is said of an offset that remains though an observer gains nothing."""
         runs, observer = [x for x, _ in self.base.episodes()], self.others.get("observer")
-        observed = None if observer is None else [x for x, _ in observer.episodes()]
-        return remaining_offset(self.mpc, runs, observed)
+        if observer is None:
+            return remaining_offset(self.mpc, runs, None)
+        dearer = -gain(self.base.costs, observer.costs)
+        return remaining_offset(self.mpc, runs, [x for x, _ in observer.episodes()], dearer)
 
 
 def _name(mpc: LinearMPC, make: Callable[[], gym.Env[Any, Any]]) -> str:
