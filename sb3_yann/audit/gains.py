@@ -13,6 +13,8 @@ LITTLE = 0.005
 """A gain below this, relative to the MPC's cost, is not worth an observer or a new model."""
 WORTH = 0.02
 """A gain below this is not worth learning, which finds a part of it."""
+ROUNDING = 1e-9
+"""Of an episode's cost: so much more is the same."""
 ADVICE = {
     "do not bother": "there is little to gain over the MPC.",
     "add ObserveDisturbance first": f"that brings most of it: {CURE}",
@@ -56,6 +58,9 @@ class Headroom:
         in which they were made of the env's episodes is so poor.
     rest : str, optional
         How far from its set-points the MPC comes to rest though an observer gains nothing, and why.
+    observer_played, reidentified_played : ndarray, shape (starts,), optional
+        What the MPC with an observer and the re-identified one cost when they were played, losses
+        included; None where they were not.
 
     Examples
     --------
@@ -77,6 +82,8 @@ class Headroom:
     d_max: Array | None = None
     lost: float | None = None
     rest: str = ""
+    observer_played: Array | None = None
+    reidentified_played: Array | None = None
 
     @property
     def total(self) -> float:
@@ -103,15 +110,26 @@ class Headroom:
             f"{self.source}; the best that was found {best:.5g}: {-100 * self.total:+.2f} % +- "
             f"{100 * self.standard_error:.2f} (from {each.min():+.2f} to {each.max():+.2f} % by "
             "start).",
-            *(f"  {name}: {-100 * part:+.2f} %" for name, part in parts),
-            f"An MPC with a re-identified model: "
-            f"{-100 * gain(self.mpc_costs, self.reidentified_costs):+.2f} %.",
+            *(f"  {name}: {0.0 - 100 * part:+.2f} %" for name, part in parts),
+            f"An MPC with a disturbance observer{self._as_played(self.observer_played)}",
+            f"An MPC with a re-identified model{self._as_played(self.reidentified_played)}",
             f"Verdict: {self.verdict}; {self._advice()}",
             *([self._with_d_max(self.rest)] if self.rest else []),
         ]
         return "\n".join(lines)
 
     __str__ = report
+
+    def _as_played(self, costs: Array | None) -> str:
+        """Return what came of another MPC, losses included."""
+        if costs is None:
+            return " was not played."
+        each = (costs - self.mpc_costs) / np.maximum(np.abs(self.mpc_costs), 1e-300)
+        dearer = np.count_nonzero(each > ROUNDING)
+        return (
+            f", as it was played: {0.0 - 100 * gain(self.mpc_costs, costs):+.2f} %, from the worst "
+            f"start {100 * each.max():+.2f} %; {dearer} of {len(costs)} starts cost more."
+        )
 
     def _advice(self) -> str:
         """Return what the verdict means, and whether more starts might change it."""
@@ -127,6 +145,10 @@ class Headroom:
         if self.verdict == UNKNOWN:
             return f"nothing was found, but {poor}"
         advice = self._with_d_max(ADVICE[self.verdict])
+        played = self.observer_played
+        if self.verdict == "add ObserveDisturbance first" and played is not None:
+            if np.any(played > self.mpc_costs + LITTLE * np.abs(self.mpc_costs)):
+                advice += " Not from every start: look at the worst one before you take it."
         return f"{advice} The rest is not known: {poor}" if poor else advice
 
     def _with_d_max(self, advice: str) -> str:

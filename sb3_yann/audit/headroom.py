@@ -292,13 +292,26 @@ class _Search:
         if self.lost is not None and verdict_of(*parts) == "do not bother":
             verdict = UNKNOWN
         rest = self._rest() if offset < LITTLE else ""
-        return dataclasses.replace(whole, verdict=verdict, lost=self.lost, rest=rest)
+        played = {
+            name: self.others[name].costs if name in self.others else None
+            for name in ("observer", "model")
+        }
+        return dataclasses.replace(
+            whole,
+            verdict=verdict,
+            lost=self.lost,
+            rest=rest,
+            observer_played=played["observer"],
+            reidentified_played=played["model"],
+        )
 
     def _rest(self) -> str:
         """Return what is said of an offset that remains though an observer gains nothing."""
         runs, observer = [x for x, _ in self.base.episodes()], self.others.get("observer")
-        observed = None if observer is None else [x for x, _ in observer.episodes()]
-        return remaining_offset(self.mpc, runs, observed)
+        if observer is None:
+            return remaining_offset(self.mpc, runs, None)
+        dearer = -gain(self.base.costs, observer.costs)
+        return remaining_offset(self.mpc, runs, [x for x, _ in observer.episodes()], dearer)
 
 
 def _name(mpc: LinearMPC, make: Callable[[], gym.Env[Any, Any]]) -> str:

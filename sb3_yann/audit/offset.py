@@ -25,6 +25,8 @@ LEAST = 0.01
 """An offset that counts, in half-widths of the references."""
 AT_REST = 0.2
 """How far outputs may still move in that part, relative to their offset."""
+WORSE = 0.005
+"""Of the MPC's cost: an observer that costs so much more is not advised."""
 SURE = 3.0
 """Standard deviations within that part that an offset exceeds."""
 
@@ -61,8 +63,8 @@ def steady_offset(problem: LinearMPC, sample: Sample) -> str:
     i = found.worst
     return (
         f"Where a reference held, {found.times} times, the tracked output {i} came to rest "
-        f"{found.beside[i]:.3g} beside r[{i}]: the plant is not its model. Without an offset, and "
-        f"before any learning: {CURE}"
+        f"{found.beside[i]:.3g} beside r[{i}]: the plant is not its model. An observer may "
+        f"remove that, or cost more on the way: headroom(mpc, env) plays it. Where it pays: {CURE}"
     )
 
 
@@ -97,7 +99,10 @@ def rests_beside(problem: LinearMPC, theta: Array, begins: NDArray[np.bool_]) ->
 
 
 def remaining_offset(
-    problem: LinearMPC, runs: Sequence[Array], observed: Sequence[Array] | None
+    problem: LinearMPC,
+    runs: Sequence[Array],
+    observed: Sequence[Array] | None,
+    dearer: float = 0.0,
 ) -> str:
     """Return in words the offset that an MPC leaves though an observer gains nothing, and why.
 
@@ -107,6 +112,8 @@ def remaining_offset(
         Whose stage cost says so.
     runs, observed : sequence of ndarray, shapes (T + 1, n_theta)
         Episodes of the MPC, and of the MPC with an observer; None where that was not tried.
+    dearer : float, default 0
+        By how much the latter cost more, relative to the former.
     """
     found = rests_beside(problem, *_joined(runs))
     if found is None:
@@ -128,6 +135,8 @@ def remaining_offset(
             f"{said}An observer leaves {left:.3g}: look whether an input is at its bound, and "
             f"whether the {wanted} can be held, mpc.is_reachable(r)."
         )
+    if dearer > WORSE:
+        return f"{said}An observer removes that, but costs {100 * dearer:.3g} % more: leave it out."
     return (
         f"{said}An observer removes that, and gains next to nothing by the MPC's stage cost: R "
         f"punishes an input away from where the model has it at the {wanted}. If the offset "

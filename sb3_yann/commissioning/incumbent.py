@@ -111,13 +111,16 @@ class Incumbent:
     @contextmanager
     def unless_cut_off(self) -> Iterator[None]:
         """Leave it as it was if an error or Ctrl-C cuts a decision off."""
-        bound, candidate = self.policy.max_correction, self.candidate
+        bound = self.policy.max_correction
+        candidate = self.candidate
+        kept = self._kept
         try:
             with all_or_nothing(self.policy):
                 yield
         except BaseException:
             self.limit(bound)
             self.candidate = candidate
+            self._kept = kept
             raise
         self.hold()
 

@@ -20,7 +20,7 @@ ROWS = 4  # steps of a log for each coefficient, at least
 
 @dataclass(frozen=True)
 class HiddenDynamics:
-    """One member of a twin with a memory, ``x+ = f(x, u) + W [1, x, u, earlier u, earlier errors]``.
+    """A member of a twin with a memory, ``x+ = f(x, u) + W [1, x, u, earlier u, earlier errors]``.
 
     An error is what the member missed a state by. An actuator that lags, backlash and a load that
     lasts show in these terms, an ARMAX model's (Ljung, *System Identification*, section 4.2).

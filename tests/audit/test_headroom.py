@@ -314,3 +314,29 @@ def test_a_plant_without_a_time_limit_may_be_given_one() -> None:
     bounds = {"u_min": -1, "u_max": 1, "theta_min": -3, "theta_max": 3}
     mpc = LinearMPC(LinearModel([[0.9]], [[1.0]], 1.0), Q=[[1]], R=[[1]], horizon=2, **bounds)
     assert headroom(mpc, TimeLimit(LinearPlant(mpc), 30), n_starts=3).verdict == "do not bother"
+
+
+def test_what_an_observer_loses_is_shown_as_a_loss() -> None:
+    costs = np.array([10.0, 20.0, 30.0])
+    dear = np.array([9.0, 20.0, 43.0])
+    found = Headroom(
+        costs, costs, costs, costs, 0.0, 0.0, 0.0, "do not bother", "a simulator",
+        observer_played=dear,
+    )  # fmt: skip
+    text = found.report()
+    assert "-0.00 %" not in text
+    assert "with a disturbance observer, as it was played: +20.00 %, from the worst start" in text
+    assert "+43.33 %; 1 of 3 starts cost more." in text
+    assert "An MPC with a re-identified model was not played." in text
+
+
+def test_an_observer_that_pays_on_average_alone_is_advised_with_its_worst_start() -> None:
+    costs = np.full(4, 10.0)
+    mixed = np.array([4.0, 5.0, 6.0, 12.0])
+    found = Headroom(
+        costs, mixed, costs, mixed, 0.325, 0.0, 0.0, "add ObserveDisturbance first", "a simulator",
+        observer_played=mixed,
+    )  # fmt: skip
+    assert "Not from every start" in found.report() and "worst start +20.00 %" in found.report()
+    gains = dataclasses.replace(found, observer_played=costs - 1)
+    assert "Not from every start" not in gains.report()

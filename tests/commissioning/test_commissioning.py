@@ -17,7 +17,10 @@ from sb3_yann import Commissioning, Improvement, YannPolicy
 from sb3_yann.commissioning import Check, commissioning
 from sb3_yann.commissioning.comparison import (
     Costs,
+    _standard_error,
     is_confirmed,
+    is_kept,
+    pays_its_own,
     predicted_costs,
     why_taken_back,
 )
@@ -33,6 +36,12 @@ def commission(path: Any = None, env: Any = Cart, **options: Any) -> Commissioni
     model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
     options = {"batch": 5, "iterations": 40, "max_correction": 0.2} | options
     return Commissioning(model, env, log_path=path, **options)
+
+
+def policys_turn(run: Commissioning) -> int:
+    """Return the first episode of the second batch in which the policy acts."""
+    first = run.batch
+    return first + int(np.random.default_rng([run.seed, 1, 0]).integers(2))
 
 
 class Faulty(gym.Wrapper[Any, Any, Any, Any]):
@@ -70,7 +79,12 @@ def test_the_first_batch_is_the_mpcs_and_the_next_is_better_and_within_its_bound
     for k, each in enumerate(run.episodes):
         apart = np.abs(each.actions - law(each.thetas[:-1])) / (m.u_max - m.u_min)
         assert apart.max() <= (1e-6 if k < 5 else 0.2 + 1e-6)
-    assert second.cost < second.mpc  # the MPC's, by the twin, from the same starts
+    assert second.cost < second.mpc  # the MPC's own, in turns, from the same starts
+    assert sum(run.journal.by_policy[5:]) == 5
+    for one, other in ((5, 6), (7, 8)):
+        np.testing.assert_array_equal(run.episodes[one].thetas[0], run.episodes[other].thetas[0])
+    pairs = [run.journal.by_policy[k : k + 2] for k in (5, 7, 9, 11, 13)]
+    assert all(sorted(each) == [False, True] for each in pairs) and len({*map(tuple, pairs)}) == 2
     assert second.predicted == pytest.approx(second.cost, rel=0.1)
 
 
@@ -170,32 +184,34 @@ def test_a_decision_that_is_cut_off_leaves_the_accepted_policy(monkeypatch) -> N
 
 
 def test_a_reading_that_is_no_number_gives_the_plant_to_the_mpc_at_once() -> None:
-    env = Faulty(Cart(), 6, "nan", step=1)
-    run = commission(env=env)
+    turn = policys_turn(commission())
+    run = commission(env=Faulty(Cart(), turn, "nan", step=1))
     run.run(2)
-    episode, law = run.episodes[6], problem().explicit()
+    episode, law = run.episodes[turn], problem().explicit()
     assert episode.alarm is not None and episode.alarm.kind == "not a number"
     assert episode.alarm.message == "It reads x[0] = nan, x[1] = nan." and episode.step == 0
     u = np.clip(law(episode.thetas[1:-1]), -1, 1)  # on what the model predicts
     np.testing.assert_allclose(episode.actions[1:], u, atol=1e-5)
     assert np.isfinite(episode.thetas).all()
-    assert run.journal.by_policy[5:8] == [True, True, False]  # the MPC until an episode is quiet
-    assert 6 not in run.journal.log
+    assert run.journal.by_policy[turn : turn + 2] == [True, False]  # the MPC until one is quiet
+    assert turn not in run.journal.log
 
 
 def test_a_violation_takes_the_policy_back() -> None:
-    run = commission(env=Faulty(Cart(), 6, "violation"))
+    turn = policys_turn(commission())
+    run = commission(env=Faulty(Cart(), turn, "violation"))
     run.run(1)
     assert run.journal.accepted
     run.run(2)
-    assert run.journal.by_policy == [False] * 5 + [True] * 2 + [False] * 8
+    assert [k for k, each in enumerate(run.journal.by_policy) if each] == [turn]
     assert "taken back" in run.batches[1].reason
-    assert run.episodes[6].violations == 1
+    assert run.episodes[turn].violations == 1
 
 
 def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> None:
     run = commission(max_correction=1.0)
     run.run(1)
+    run.incumbent.restore()
     with th.no_grad():  # what was accepted turns out to be bad: the plant says so
         for each in run.policy.actor.parameters():
             each.add_(0.5 * th.randn(each.shape, generator=th.Generator().manual_seed(0)))
@@ -210,6 +226,8 @@ def test_a_policy_that_costs_more_than_the_mpc_is_taken_back(monkeypatch) -> Non
 def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatch) -> None:
     run = commission()
     run.run(1)
+    assert is_mpc(run.model)  # until the plant has confirmed it
+    run.incumbent.restore()
     bound = run.policy.max_correction
     before = [each.clone() for each in run.policy.actor.parameters()]
     refused = Check(0, False, "start 3 costs a little more", -0.01, 0.001, True)
@@ -232,6 +250,7 @@ def test_what_the_plant_confirmed_stays_where_nothing_better_is_found(monkeypatc
 def test_weights_that_nobody_accepted_never_act() -> None:
     run = commission()
     run.run(1)
+    run.incumbent.restore()
     accepted = [each.clone() for each in run.policy.actor.parameters()]
     with th.no_grad():
         for each in run.policy.actor.parameters():
@@ -317,10 +336,11 @@ def test_the_bound_grows_only_with_what_was_promised() -> None:
 def test_a_policy_is_taken_back_where_it_surely_costs_more() -> None:
     played = SimpleNamespace(violations=0, alarm=None)
     journal = SimpleNamespace(batch=[(played, True)], cut_off=0)
-    costs = Costs(10.3, 10.0, 0.5, 10.0)
-    assert "it cost 10.3, the MPC would have 10" in why_taken_back(journal, costs)
-    assert why_taken_back(journal, costs._replace(error=0.2)) == ""  # 1.5 standard errors
-    assert why_taken_back(journal, costs._replace(error=0.18)) != ""
+    costs = Costs(10.3, 10.0, 0.5, 10.0, pairs=8)  # Student's t of 7 degrees of freedom: 1.895
+    assert "it cost 10.3, the MPC in turns with it 10" in why_taken_back(journal, costs)
+    assert why_taken_back(journal, costs._replace(error=0.2)) == ""
+    assert why_taken_back(journal, costs._replace(error=0.15)) != ""
+    assert why_taken_back(journal, costs._replace(pairs=1)) == ""  # one pair tells nothing
     dear = costs._replace(actual=10.6, error=1.0)  # more than five per cent in any case
     assert why_taken_back(journal, dear) != ""
     assert why_taken_back(journal, costs._replace(mpc=np.nan)) != ""
@@ -335,7 +355,7 @@ def test_shadow_computes_and_does_not_act() -> None:
         np.testing.assert_allclose(each.actions, law(each.thetas[:-1]), atol=1e-6)
     assert run.episodes[0].apart < 1e-6
     assert run.episodes[7].apart > 1e-3  # what it would have done
-    assert not is_mpc(run.model)
+    assert is_mpc(run.model)  # nothing was confirmed
 
 
 @pytest.mark.parametrize(
@@ -398,3 +418,47 @@ def test_a_plant_that_its_model_describes_keeps_the_mpc(tmp_path) -> None:
 
     found = commission(tmp_path / "record", Described()).run(3)
     assert [each.acted for each in found] == ["MPC"] * 3
+
+
+def test_a_policy_is_kept_where_it_surely_costs_less_in_turns() -> None:
+    costs = Costs(9.7, 10.0, 0.5, 10.0, 0.1, 8)
+    assert is_kept(costs) and not is_kept(costs._replace(error=0.2))
+    assert not is_kept(costs._replace(pairs=1, error=0.0))
+    assert not is_kept(costs._replace(actual=np.nan)) and not is_kept(costs._replace(mpc=np.nan))
+
+
+def test_neighboring_differences_that_are_alike_widen_the_error() -> None:
+    values = np.repeat(np.random.default_rng(0).normal(size=10), 4)
+    plain = values.std(ddof=1) / np.sqrt(len(values))
+    assert _standard_error(values) > 1.8 * plain
+    shuffled = np.random.default_rng(1).permutation(values)
+    assert _standard_error(shuffled) == pytest.approx(plain, rel=0.3)
+
+
+def test_a_reward_of_its_own_decides_what_is_kept() -> None:
+    class Paid(Cart):
+        """Pays for the distance from the MPC's input, which no stage cost knows."""
+
+        def step(self, action):
+            law = float(problem().explicit()(self.x)[0])
+            observation, _, *rest = super().step(action)
+            return observation, -7.0 * abs(float(action[0]) - law), *rest
+
+    run = commission(env=Paid)
+    second = run.run(2)[-1]
+    assert "by the plant's reward" in second.reason and second.verdict == "the MPC acts"
+    assert second.cost > second.mpc and is_mpc(run.model)
+    policys = np.array(run.journal.by_policy)
+    rewards = np.array([each.reward for each in run.episodes])
+    assert second.cost == pytest.approx(-rewards[policys].mean())
+    assert pays_its_own(problem(), run.episodes)
+
+
+def test_a_reward_that_is_the_stage_cost_up_to_a_line_is_no_reward_of_its_own() -> None:
+    run = commission(iterations=1)
+    run.run(1)
+    assert not pays_its_own(problem(), run.episodes)
+    for factor, offset in ((0.01, 0.0), (3.0, -50.0), (0.0, 0.0)):
+        paid = [replace(e, reward=factor * e.reward + offset) for e in run.episodes]
+        assert not pays_its_own(problem(), paid)
+    assert pays_its_own(problem(), [replace(e, reward=-e.reward) for e in run.episodes])

@@ -81,9 +81,9 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
 
 def _offset(problem: MPCProblem) -> Iterator[str]:
     if problem.layout.n_references and not problem.layout.n_disturbances:
-        yield "Where the plant is not its model, it settles beside its set-points. This mends it:"
-        yield "  mpc, observer = offset_free(mpc); d = mpc.disturbances"
-        yield "  env = ObserveDisturbance(env, observer, d.d_min, d.d_max)"
+        yield "There is no integral action: a plant that is not its model may rest beside its set-"
+        yield "points. offset_free(mpc) has it, and may cost less or more on the way there:"
+        yield "  headroom(mpc, env) plays it in a simulator. Add it where that gains."
 
 
 def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> Iterator[str]:

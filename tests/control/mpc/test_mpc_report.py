@@ -150,7 +150,7 @@ def test_where_nothing_is_feasible_there_is_no_share() -> None:
 
 
 def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> None:
-    hint = "mpc, observer = offset_free(mpc); d = mpc.disturbances"
+    hint = "There is no integral action"
     for name, told in (
         ("servo", True),
         ("servo with a disturbance", False),
@@ -159,6 +159,7 @@ def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> Non
     ):
         assert (hint in solved(name).report(samples=5)) == told
     assert hint not in small_mpc().report(samples=5)
+    assert "headroom(mpc, env) plays it" in solved("servo").report(samples=5)
 
 
 def test_an_online_law_is_told_with_its_constraints_and_no_penalty_without_soft_bounds() -> None:
