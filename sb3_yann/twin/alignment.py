@@ -22,6 +22,8 @@ from sb3_yann.twin.residuals import Monomials
 
 CLEARLY = 0.5
 """Another reading of a log is taken where it leaves less than so much of the error."""
+NEARLY = 0.1
+"""What the law leaves of an input, relative to its standard deviation, that it explains."""
 FOLLOWS = 0.7
 """An input follows the law where the law leaves less than so much of its standard deviation."""
 SAME = 0.05
@@ -132,8 +134,11 @@ def _of_law(
 
 
 def _clearly(left: Array, than: Array) -> bool:
-    """Return whether another reading explains some input, and explains it clearly better."""
-    return bool(np.any((left < CLEARLY) & (left < CLEARLY * than - 1e-5)))
+    """Return whether another reading explains nearly all of some input, and clearly better.
+
+    Less would not do: where a plant follows its inputs slowly, so does minus the law.
+    """
+    return bool(np.any((left < NEARLY) & (left < CLEARLY * than - 1e-5)))
 
 
 def _against_law(best: _Law, logged: _Law, names: list[str]) -> Iterator[str]:
