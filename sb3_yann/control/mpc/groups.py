@@ -18,10 +18,24 @@ HalfSpaces = tuple[ArrayLike, ArrayLike]
 
 def _loose(name: str, lower: Given, upper: Given) -> Bounds:
     """Return bounds that fit each other, of a size that is still open."""
-    low = to_float(f"{name}_min", -np.inf if lower is None else lower)
-    high = to_float(f"{name}_max", np.inf if upper is None else upper)
-    as_bounds(name, low, high, max(low.size, high.size))
+    low = _as_side(f"{name}_min", -np.inf if lower is None else lower)
+    high = _as_side(f"{name}_max", np.inf if upper is None else upper)
+    as_bounds(name, low, high, max(low.size, high.size), ordered=_ordered(lower, upper))
     return low, high
+
+
+def _ordered(lower: Given, upper: Given) -> bool:
+    """Tell whether the order of bounds counts here.
+
+    Where one is stored and one is new, `dataclasses.replace` is at work, maybe for an absolute
+    problem: the stored one is then a deviation. The problem looks at them when they are alike.
+    """
+    return lower is None or upper is None or check.is_kept(lower) == check.is_kept(upper)
+
+
+def _as_side(name: str, value: ArrayLike) -> Array:
+    """Return a bound; one that is stored somewhere is the same array."""
+    return np.asarray(value) if check.is_kept(value) else to_float(name, value)
 
 
 def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> Bounds:
@@ -29,7 +43,7 @@ def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> B
     low, high = _loose(name, lower, upper)
     if size == 0 and np.any(np.isfinite(np.append(low, high))):
         raise ValueError(f"{name}_min or {name}_max is given, but there is no {missing}.")
-    return as_bounds(name, low, high, size)
+    return as_bounds(name, low, high, size, ordered=_ordered(lower, upper))
 
 
 def _outputs(name: str, C: Outputs, symbol: str, lower: Given, upper: Given) -> dict[str, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -96,8 +96,8 @@ class LinearMPC(MPCProblem):
     terminal : Terminal, optional
         The terminal cost, by default the Riccati solution, and the terminal set.
     absolute : bool, default False
-        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations, so
-        `dataclasses.replace` takes and returns a problem in deviations.
+        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations.
+        `dataclasses.replace` of such a problem takes absolute values too, and returns another one.
 
     Raises
     ------
@@ -112,6 +112,12 @@ class LinearMPC(MPCProblem):
     >>> mpc.explicit()([-5.0, 0.0])
     array([1.])
     """
+
+    # `dataclasses.replace` hands what is stored to the constructor. By this field that learns that
+    # these are deviations of an absolute problem, and only what was replaced is absolute.
+    _stored: LinearMPC | None = field(  # type: ignore[assignment]
+        default=property(lambda self: self if self.absolute else None), compare=False, repr=False
+    )
 
     def __init__(  # noqa: PLR0913 (the user's arguments)
         self,
@@ -135,11 +141,13 @@ class LinearMPC(MPCProblem):
         soft: SoftBounds | None = None,
         terminal: Terminal | None = None,
         absolute: bool = False,
+        _stored: LinearMPC | None = None,
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         sides = (x_min, x_max), (u_min, u_max), (theta_min, theta_max)
-        given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute)
+        absolute = True if _stored is not None else absolute
+        given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute, _stored)
         tracking, disturbances, outputs = given.tracking, given.disturbances, given.outputs
         n, m = model.n_states, model.n_inputs
         horizon, gamma = arguments.as_horizon(horizon), check.as_discount(gamma)
@@ -328,7 +336,7 @@ class LinearMPC(MPCProblem):
 
 def derived(problem: LinearMPC, **changes: Any) -> LinearMPC:
     """Return a problem with changes, in deviations, which counts as stated in the same values."""
-    found = replace(problem, **changes)
+    found = replace(problem, _stored=None, **changes)
     found._store(absolute=problem.absolute)
     return found
 
