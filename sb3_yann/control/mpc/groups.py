@@ -197,7 +197,9 @@ class SoftBounds(ReadOnlyArrays):
         is for all that have a bound.
     penalty : float, optional
         The cost of one unit of violation. Above the largest sum of multipliers of the hard problem,
-        the soft one breaks no bound without need.
+        the soft one breaks no bound without need. By default the problem chooses 100 times what it
+        costs to come back from the bounds, and stores that number: far above the multipliers, save
+        next to where the hard problem has no solution.
 
     Examples
     --------
@@ -207,7 +209,7 @@ class SoftBounds(ReadOnlyArrays):
 
     x: Array
     y: Array
-    penalty: float
+    penalty: float | None
 
     def __init__(
         self, x: ArrayLike = 0.0, y: ArrayLike = 0.0, penalty: float | None = None
@@ -220,20 +222,17 @@ class SoftBounds(ReadOnlyArrays):
                     "unit, 0 where the bound is hard: no entry may be negative."
                 )
         soft = any(np.any(unit) for unit in units.values())
-        if soft and penalty is None:
-            raise ValueError(
-                "SoftBounds.penalty is missing, the cost of one unit of violation: try 1e3 times "
-                "the stage cost at the bound."
-            )
         if penalty and not soft:
             raise ValueError(f"SoftBounds.penalty = {penalty!r}, but nothing is soft: pass x or y.")
-        cost = check.as_positive("SoftBounds.penalty", penalty) if soft else 0.0
+        cost = 0.0 if not soft else None
+        if soft and penalty is not None:
+            cost = check.as_positive("SoftBounds.penalty", penalty)
         self._store(**units, penalty=cost)
 
     def sized(self, x: Bounds, y: Bounds) -> SoftBounds:
         """Return it with an entry for each bound of the states and of the outputs."""
         units = as_softness("SoftBounds.x", self.x, x), as_softness("SoftBounds.y", self.y, y)
-        return SoftBounds(*units, self.penalty)
+        return SoftBounds(*units, self.penalty or None)
 
 
 @dataclass(frozen=True, eq=False, init=False)

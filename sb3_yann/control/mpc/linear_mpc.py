@@ -179,7 +179,11 @@ class LinearMPC(MPCProblem):
             model, Q, R, horizon, *x, *u, *theta, gamma, infeasible,
             tracking, d, rate, outputs, soft,
         )  # fmt: skip
-        super().__init__(*checked, _completed(MPCProblem(*checked, terminal)))
+        completed = _completed(MPCProblem(*checked, terminal))
+        if soft.penalty is None:
+            penalty = _default_penalty(MPCProblem(*checked, completed))
+            checked = (*checked[:-1], replace(soft, penalty=penalty))
+        super().__init__(*checked, completed)
         self._store(absolute=bool(absolute))
 
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
@@ -385,3 +389,30 @@ def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> 
         "nor a state that it moves has a weight. Give every input a positive weight, in R or in "
         "RateLimits(R_du=...)."
     )
+
+
+def _default_penalty(problem: MPCProblem) -> float:
+    """Return 100 times the cost of coming back from the bounds, at most, with inputs at theirs.
+
+    A unit of violation that is larger than a bound counts as so many times more.
+    """
+    n = problem.model.n_states
+    given = [problem.x_min, problem.x_max, problem.theta_min[:n], problem.theta_max[:n]]
+    sizes = np.abs([np.where(np.isfinite(each), each, 0.0) for each in given])
+    x = np.where(np.any(sizes[:2] > 0, axis=0), sizes[:2].max(axis=0), sizes.max(axis=0))
+    limits = np.abs([problem.u_min, problem.u_max])
+    u = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
+    cost = problem.terminal.cost[:n, :n]
+    total = x @ (np.abs(problem.Q) + np.abs(cost)) @ x + u @ np.abs(problem.R) @ u
+    y = np.abs([problem.outputs.y_min, problem.outputs.y_max])
+    y = np.where(np.isfinite(y), y, 0.0).max(axis=0)
+    units = [(problem.soft.x, x), (problem.soft.y, y)]
+    parts = [unit[size > 0] / size[size > 0] for unit, size in units]
+    wide = max(1.0, *(float(part.max(initial=0.0)) for part in parts))
+    if not total > 0:
+        raise ValueError(
+            "SoftBounds.penalty is missing, and nothing tells how much a violation should cost: "
+            "neither states nor inputs have a bound that costs anything. Pass the cost of one unit "
+            "of violation."
+        )
+    return float(100 * total * wide)
