@@ -73,7 +73,9 @@ class _Shift:
         self.name = name
         self.point = point
         self.before = before
-        self.kept = () if owner is None else (getattr(owner, f"{name}_min"), getattr(owner, f"{name}_max"))
+        self.kept = (
+            () if owner is None else (getattr(owner, f"{name}_min"), getattr(owner, f"{name}_max"))
+        )
 
     def of(self, low: Given, high: Given) -> Sides:
         """Return bounds minus the point, None where there is none."""

@@ -281,8 +281,13 @@ BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [
     (lambda: SoftBounds(-1, penalty=1), ValueError, "SoftBounds.x = .* no entry may be negative"),
     (
         lambda: {
-            "soft": SoftBounds(y=1), "outputs": OutputBounds([0], -0.5, 0.5), "tracking": None,
-            "x_min": None, "x_max": None, "u_min": None, "u_max": None,
+            "soft": SoftBounds(y=1),
+            "outputs": OutputBounds([0], -0.5, 0.5),
+            "tracking": None,
+            "x_min": None,
+            "x_max": None,
+            "u_min": None,
+            "u_max": None,
         },
         ValueError,
         "SoftBounds.penalty is missing, and nothing tells",
