@@ -49,7 +49,7 @@ def main() -> None:
     torch.set_num_threads(1)  # the networks are too small to share among cores
     console = Console(highlight=False)
 
-    plant = LinearModel.from_env(make_env, state=[0, 0], action=[0])
+    plant = LinearModel.from_env(make_env, x_ss=[0, 0], u_ss=[0])
     console.print(plant.report())
     cost = {"Q": np.diag([1.0, 0.1]), "R": [[0.001]]}  # what Gymnasium's documentation says
     limits = {

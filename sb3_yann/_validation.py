@@ -61,15 +61,20 @@ def as_symmetric(name: str, value: ArrayLike, size: int) -> Array:
 
 
 def as_bounds(
-    name: str, lower: ArrayLike | None, upper: ArrayLike | None, size: int
+    name: str,
+    lower: ArrayLike | None,
+    upper: ArrayLike | None,
+    size: int,
+    *,
+    ordered: bool = True,
 ) -> tuple[Array, Array]:
-    """Return bounds of shape ``(size,)``, the lower below the upper.
+    """Return bounds of shape ``(size,)``, where ``ordered`` the lower below the upper.
 
     A scalar is for all entries; None and infinity are no bound. A finite one has at most 1e100.
     """
     low = _bound(f"{name}_min", lower, size, -np.inf)
     high = _bound(f"{name}_max", upper, size, np.inf)
-    if np.any(low >= high):
+    if ordered and np.any(low >= high):
         i = int(np.argmax(low >= high))
         given = f"{name}_min = {low[i]:g} and {name}_max = {high[i]:g}"
         raise ValueError(f"{name}_min must lie below {name}_max, but entry {i} has {given}.")
@@ -297,6 +302,8 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:
+    if is_kept(value) and np.shape(value) == (size,):
+        return np.asarray(value)  # the array itself: dataclasses.replace passes what is stored
     array = to_float(name, missing if value is None else value)
     array = np.full(size, float(array)) if array.ndim == 0 else array
     if array.shape != (size,):
@@ -305,6 +312,12 @@ def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Arr
         raise ValueError(f"{name} holds NaN: {array.tolist()}. Use inf for 'no bound'.")
     _require_moderate(name, array, "Use inf for 'no bound'.")
     return _frozen(array)
+
+
+def is_kept(value: Any) -> bool:
+    """Tell whether a value is an array as these functions return it: checked, and read-only."""
+    kept = type(value) is np.ndarray and value.dtype == np.float64
+    return bool(kept and value.base is None and not value.flags.writeable)
 
 
 def _require_moderate(name: str, array: Array, hint: str) -> None:

@@ -112,7 +112,17 @@ def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) ->
 
 
 class ProgramUnits:
-    """A program in units of its box and its input range, where tolerances suit every plant."""
+    """A program in units of its box and its input range, where tolerances suit every plant.
+
+    Constraints that always hold with equality are eliminated.
+
+    Parameters
+    ----------
+    program, u_min, u_max
+        As in :func:`solve_explicit`.
+    timer : BudgetTimer, optional
+        Ends the search for equalities.
+    """
 
     def __init__(
         self,

@@ -32,8 +32,8 @@ NOISY, LEAST = 10.0, 1e-10  # from where on noise counts: beside rounding, and i
 
 def linearize_env(
     env: Maker,
-    state: ArrayLike | None,
-    action: ArrayLike | None,
+    x_ss: ArrayLike | None,
+    u_ss: ArrayLike | None,
     dt: float | None,
     set_state: Callable[[Any, Array], object] | None,
     get_state: Callable[[Any], ArrayLike] | None,
@@ -45,13 +45,13 @@ def linearize_env(
     ----------
     env, dt, set_state, get_state : Maker, float or None, callable or None
         The simulator, the time of one step, and what sets and returns the state (n,).
-    state, action, scale : array_like, shapes (n,), (m,) and (n,), or None
+    x_ss, u_ss, scale : array_like, shapes (n,), (m,) and (n,), or None
         The operating point, NaN where it is to be solved for, and the range of each state.
     """
     with contextlib.closing(borrow(env)) as borrowed:
         step_time = sample_time(borrowed.env, dt)
         simulator = Simulator(borrowed, set_state, get_state)
-        x, u = _partly_known("state", state), _partly_known("action", action)
+        x, u = _partly_known("x_ss", x_ss), _partly_known("u_ss", u_ss)
         found = _linearize(simulator, x, u, step_time, scale)
         faults = episode_faults(borrowed.env, found.u_ss) if borrowed.private else []
         for fault in faults:
@@ -68,7 +68,7 @@ def _linearize(
         # With a state to hold, the action is what holds it; with none, that at mid range.
         u = middle if x is None else np.full(middle.size, np.nan)
     elif u.shape != middle.shape:
-        raise ValueError(f"action has shape {u.shape}, expected {middle.shape}.")
+        raise ValueError(f"u_ss has shape {u.shape}, expected {middle.shape}.")
     u_start = np.where(np.isnan(u), middle, u)
     x_start, size = connect(simulator, x, u_start, scale)
     scales = np.concatenate([size, width])
@@ -119,7 +119,7 @@ def _differentiate(simulator: Simulator, point: Array, scale: Array) -> tuple[Ja
     if np.any(room <= 1e-6 * scale[n:]):
         i = int(np.argmin(room / scale[n:]))
         raise ValueError(
-            f"action = {point[n:].tolist()}: entry {i} lies on its bound in {space}, where the "
+            f"u_ss = {point[n:].tolist()}: entry {i} lies on its bound in {space}, where the "
             "plant cannot be linearized. Choose an operating point with room to both sides."
         )
 

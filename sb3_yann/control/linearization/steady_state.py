@@ -48,7 +48,7 @@ def steady_state(
         reason = simulator.refusal if np.any(np.isnan(moved)) else f"{(moved * scale[:n]).tolist()}"
         stuck = _at_bounds(simulator, point[n:], scale[n:])
         raise ValueError(
-            f"No steady state was found. The best is state = {point[:n].tolist()}, action = "
+            f"No steady state was found. The best is x_ss = {point[:n].tolist()}, u_ss = "
             f"{point[n:].tolist()}, which moves in one step by {reason}.{stuck} Leave more entries "
             "free (NaN), or start closer to it."
         )
@@ -115,7 +115,7 @@ def require_steady_state(simulator: Simulator, point: Array, jacobian: Array, sc
     left = moved + slopes @ way
     if np.max(np.abs(way)) > AWAY or np.max(np.abs(left)) > MOVED:
         raise ValueError(
-            f"state = {point[:n].tolist()}, action = {point[n:].tolist()} is no steady state: one "
+            f"x_ss = {point[:n].tolist()}, u_ss = {point[n:].tolist()} is no steady state: one "
             f"step moves it by {(moved * scale[:n]).tolist()}. Set entries to NaN to be solved for."
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -181,13 +182,15 @@ class LinearModel(Plant):
     def from_env(
         cls,
         env: gymnasium.Env[Any, Any] | str | Callable[[], gymnasium.Env[Any, Any]],
-        state: ArrayLike | None = None,
-        action: ArrayLike | None = None,
+        x_ss: ArrayLike | None = None,
+        u_ss: ArrayLike | None = None,
         *,
         dt: float | None = None,
         set_state: Callable[[Any, Array], object] | None = None,
         get_state: Callable[[Any], ArrayLike] | None = None,
         scale: ArrayLike | None = None,
+        state: ArrayLike | None = None,
+        action: ArrayLike | None = None,
     ) -> LinearModel:
         """Linearize one step of a simulator and its wrappers by central differences.
 
@@ -199,11 +202,11 @@ class LinearModel(Plant):
         ----------
         env : gymnasium.Env, str or callable
             A single environment with a one-dimensional Box of actions, its id, or its maker.
-        state : array_like, shape (n,), optional
+        x_ss : array_like, shape (n,), optional
             The operating point in the environment's units. NaN entries are solved for; the default
             solves for all of them, starting from a reset.
-        action : array_like, shape (m,), optional
-            Likewise. The default is the middle of the action space if ``state`` is left out too.
+        u_ss : array_like, shape (m,), optional
+            Likewise. The default is the middle of the action space if ``x_ss`` is left out too.
         dt : float, optional
             Time of one step. The default is ``dt``, ``tau`` or ``DT`` of the unwrapped environment,
             or ``DT`` of its module. Pass it if a wrapper repeats actions.
@@ -219,6 +222,8 @@ class LinearModel(Plant):
             Range in which each state moves in use. Steps are at most 1 % of it, 5 % for float32
             states; a given steady state may be 1 % off. The default is half the width of the
             observation space, or the size of the state, at least 1.
+        state, action : array_like, optional
+            What ``x_ss`` and ``u_ss`` were called before 0.2; deprecated.
 
         Raises
         ------
@@ -232,7 +237,17 @@ class LinearModel(Plant):
         >>> pendulum.dt, pendulum.A.shape, pendulum.B.shape
         (0.05, (2, 2), (2, 1))
         """
-        return cls(**vars(linearize_env(env, state, action, dt, set_state, get_state, scale)))
+        if state is not None or action is not None:
+            if x_ss is not None or u_ss is not None:
+                raise TypeError("Pass x_ss and u_ss, not state and action too: they are the same.")
+            warnings.warn(
+                "state= and action= of LinearModel.from_env are called x_ss= and u_ss= now.",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            x_ss = state
+            u_ss = action
+        return cls(**vars(linearize_env(env, x_ss, u_ss, dt, set_state, get_state, scale)))
 
     @classmethod
     def from_data(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sb3_yann._validation import Array, as_bounds, as_flag
+from sb3_yann._validation import Array, as_bounds, as_flag, as_outputs
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc._arguments import Given
 from sb3_yann.control.mpc.groups import DisturbanceBounds, OutputBounds, Tracking
+
+if TYPE_CHECKING:
+    from sb3_yann.control.mpc.problem import MPCProblem
 
 Sides = tuple[Given, Given]
 
@@ -24,33 +27,71 @@ class Boxes(NamedTuple):
     disturbances: DisturbanceBounds | None
     outputs: OutputBounds | None
 
-    def seen_from(self, model: LinearModel, absolute: bool) -> Boxes:
-        """Return them in deviations; absolute ones less the operating point. None stays None."""
+    def seen_from(
+        self, model: LinearModel, absolute: bool, stored: MPCProblem | None = None
+    ) -> Boxes:
+        """Return them in deviations; absolute ones less the operating point. None stays None.
+
+        Parameters
+        ----------
+        model, absolute
+            As in :class:`LinearMPC`.
+        stored : MPCProblem, optional
+            An absolute problem, of which something is replaced: its arrays are deviations already,
+            from the operating point of its model.
+        """
         if not as_flag("absolute", absolute):
             return self
         tracking, d, outputs = self.tracking, self.disturbances, self.outputs
+        old = None if stored is None else stored.model
         if tracking is not None:
-            rows = tracking.sized(model.n_states).C
-            r = _less("r", (tracking.r_min, tracking.r_max), rows @ model.x_ss)
-            tracking = Tracking(rows, *r)
+            rows = as_outputs("Tracking.C", tracking.C, model.n_states)
+            before = None if stored is None or old is None else stored.tracking.C @ old.x_ss
+            r = _Shift("r", rows @ model.x_ss, stored and stored.tracking, before)
+            tracking = Tracking(rows, *r.of(tracking.r_min, tracking.r_max))
         if outputs is not None:
-            rows = outputs.sized(model.n_states).C
-            y = _less("y", (outputs.y_min, outputs.y_max), rows @ model.x_ss)
-            outputs = OutputBounds(rows, *y)
+            rows = as_outputs("OutputBounds.C", outputs.C, model.n_states)
+            before = None if stored is None or old is None else stored.outputs.C @ old.x_ss
+            y = _Shift("y", rows @ model.x_ss, stored and stored.outputs, before)
+            outputs = OutputBounds(rows, *y.of(outputs.y_min, outputs.y_max))
         if d is not None:
-            d = DisturbanceBounds(*_less("d", (d.d_min, d.d_max), model.d_ss))
-        x, theta = (_less(k, getattr(self, k), model.x_ss) for k in ("x", "theta"))
-        return Boxes(x, _less("u", self.u, model.u_ss), theta, tracking, d, outputs)
+            shift = _Shift("d", model.d_ss, stored and stored.disturbances, old and old.d_ss)
+            d = DisturbanceBounds(*shift.of(d.d_min, d.d_max))
+        x = _Shift("x", model.x_ss, stored, old and old.x_ss).of(*self.x)
+        theta = _Shift("theta", model.x_ss, stored, old and old.x_ss).of(*self.theta)
+        u = _Shift("u", model.u_ss, stored, old and old.u_ss).of(*self.u)
+        return Boxes(x, u, theta, tracking, d, outputs)
 
 
-def _less(name: str, sides: Sides, point: Array) -> Sides:
-    """Return bounds minus a point, None where there is none."""
-    if not point.size:
-        return sides
-    low, high = as_bounds(name, *sides, point.size)
-    low, high = low - point, high - point
-    # What is not given has its own default.
-    return (
-        None if sides[0] is None else np.where(low == 0, 0.0, low),
-        None if sides[1] is None else np.where(high == 0, 0.0, high),
-    )
+class _Shift:
+    """From absolute values to deviations, for the two bounds of one quantity.
+
+    ``owner`` holds bounds that are deviations from the point ``before``.
+    """
+
+    def __init__(self, name: str, point: Array, owner: Any, before: Array | None) -> None:
+        self.name = name
+        self.point = point
+        self.before = before
+        self.kept = (
+            () if owner is None else (getattr(owner, f"{name}_min"), getattr(owner, f"{name}_max"))
+        )
+
+    def of(self, low: Given, high: Given) -> Sides:
+        """Return bounds minus the point, None where there is none."""
+        return self._side(f"{self.name}_min", low), self._side(f"{self.name}_max", high)
+
+    def _side(self, name: str, value: Given) -> Given:
+        if value is None or not self.point.size:  # what is not given has its own default
+            return value
+        moved = self.point
+        if self.before is not None and any(value is each for each in self.kept):
+            moved = self.point - self.before
+            if not np.any(moved):
+                return value
+            if np.size(value) > moved.size:  # all of theta: the rest has its own bounds
+                value = np.asarray(value)[: moved.size]
+        side = name.partition("_")[2]
+        bounds = (value, None) if side == "min" else (None, value)
+        found = as_bounds(self.name, *bounds, self.point.size)[side == "max"] - moved
+        return np.where(found == 0, 0.0, found)

@@ -18,10 +18,24 @@ HalfSpaces = tuple[ArrayLike, ArrayLike]
 
 def _loose(name: str, lower: Given, upper: Given) -> Bounds:
     """Return bounds that fit each other, of a size that is still open."""
-    low = to_float(f"{name}_min", -np.inf if lower is None else lower)
-    high = to_float(f"{name}_max", np.inf if upper is None else upper)
-    as_bounds(name, low, high, max(low.size, high.size))
+    low = _as_side(f"{name}_min", -np.inf if lower is None else lower)
+    high = _as_side(f"{name}_max", np.inf if upper is None else upper)
+    as_bounds(name, low, high, max(low.size, high.size), ordered=_ordered(lower, upper))
     return low, high
+
+
+def _ordered(lower: Given, upper: Given) -> bool:
+    """Tell whether the order of bounds counts here.
+
+    Where one is stored and one is new, `dataclasses.replace` is at work, maybe for an absolute
+    problem: the stored one is then a deviation. The problem looks at them when they are alike.
+    """
+    return lower is None or upper is None or check.is_kept(lower) == check.is_kept(upper)
+
+
+def _as_side(name: str, value: ArrayLike) -> Array:
+    """Return a bound; one that is stored somewhere is the same array."""
+    return np.asarray(value) if check.is_kept(value) else to_float(name, value)
 
 
 def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> Bounds:
@@ -29,7 +43,7 @@ def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> B
     low, high = _loose(name, lower, upper)
     if size == 0 and np.any(np.isfinite(np.append(low, high))):
         raise ValueError(f"{name}_min or {name}_max is given, but there is no {missing}.")
-    return as_bounds(name, low, high, size)
+    return as_bounds(name, low, high, size, ordered=_ordered(lower, upper))
 
 
 def _outputs(name: str, C: Outputs, symbol: str, lower: Given, upper: Given) -> dict[str, Array]:
@@ -183,7 +197,9 @@ class SoftBounds(ReadOnlyArrays):
         is for all that have a bound.
     penalty : float, optional
         The cost of one unit of violation. Above the largest sum of multipliers of the hard problem,
-        the soft one breaks no bound without need.
+        the soft one breaks no bound without need. By default the problem chooses 100 times what it
+        costs to come back from the bounds, and stores that number: far above the multipliers, save
+        next to where the hard problem has no solution.
 
     Examples
     --------
@@ -193,7 +209,7 @@ class SoftBounds(ReadOnlyArrays):
 
     x: Array
     y: Array
-    penalty: float
+    penalty: float | None
 
     def __init__(
         self, x: ArrayLike = 0.0, y: ArrayLike = 0.0, penalty: float | None = None
@@ -206,20 +222,17 @@ class SoftBounds(ReadOnlyArrays):
                     "unit, 0 where the bound is hard: no entry may be negative."
                 )
         soft = any(np.any(unit) for unit in units.values())
-        if soft and penalty is None:
-            raise ValueError(
-                "SoftBounds.penalty is missing, the cost of one unit of violation: try 1e3 times "
-                "the stage cost at the bound."
-            )
         if penalty and not soft:
             raise ValueError(f"SoftBounds.penalty = {penalty!r}, but nothing is soft: pass x or y.")
-        cost = check.as_positive("SoftBounds.penalty", penalty) if soft else 0.0
+        cost = 0.0 if not soft else None
+        if soft and penalty is not None:
+            cost = check.as_positive("SoftBounds.penalty", penalty)
         self._store(**units, penalty=cost)
 
     def sized(self, x: Bounds, y: Bounds) -> SoftBounds:
         """Return it with an entry for each bound of the states and of the outputs."""
         units = as_softness("SoftBounds.x", self.x, x), as_softness("SoftBounds.y", self.y, y)
-        return SoftBounds(*units, self.penalty)
+        return SoftBounds(*units, self.penalty or None)
 
 
 @dataclass(frozen=True, eq=False, init=False)

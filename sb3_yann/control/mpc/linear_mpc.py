@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -97,8 +97,8 @@ class LinearMPC(MPCProblem):
     terminal : Terminal, optional
         The terminal cost, by default the Riccati solution, and the terminal set.
     absolute : bool, default False
-        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations, so
-        `dataclasses.replace` takes and returns a problem in deviations.
+        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations.
+        `dataclasses.replace` of such a problem takes absolute values too, and returns another one.
 
     Raises
     ------
@@ -113,6 +113,12 @@ class LinearMPC(MPCProblem):
     >>> mpc.explicit()([-5.0, 0.0])
     array([1.])
     """
+
+    # `dataclasses.replace` hands what is stored to the constructor. By this field that learns that
+    # these are deviations of an absolute problem, and only what was replaced is absolute.
+    _stored: LinearMPC | None = field(  # type: ignore[assignment]
+        default=property(lambda self: self if self.absolute else None), compare=False, repr=False
+    )
 
     def __init__(  # noqa: PLR0913 (the user's arguments)
         self,
@@ -136,11 +142,13 @@ class LinearMPC(MPCProblem):
         soft: SoftBounds | None = None,
         terminal: Terminal | None = None,
         absolute: bool = False,
+        _stored: LinearMPC | None = None,
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         sides = (x_min, x_max), (u_min, u_max), (theta_min, theta_max)
-        given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute)
+        absolute = True if _stored is not None else absolute
+        given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute, _stored)
         tracking, disturbances, outputs = given.tracking, given.disturbances, given.outputs
         n, m = model.n_states, model.n_inputs
         horizon, gamma = arguments.as_horizon(horizon), check.as_discount(gamma)
@@ -172,7 +180,11 @@ class LinearMPC(MPCProblem):
             model, Q, R, horizon, *x, *u, *theta, gamma, infeasible,
             tracking, d, rate, outputs, soft,
         )  # fmt: skip
-        super().__init__(*checked, _completed(MPCProblem(*checked, terminal)))
+        completed = _completed(MPCProblem(*checked, terminal))
+        if soft.penalty is None:
+            penalty = _default_penalty(MPCProblem(*checked, completed))
+            checked = (*checked[:-1], replace(soft, penalty=penalty))
+        super().__init__(*checked, completed)
         if idle := np.flatnonzero(~np.any(model.B != 0, axis=0)).tolist():
             names = labels_of(model)[1]
             raise ValueError(
@@ -336,7 +348,7 @@ class LinearMPC(MPCProblem):
 
 def derived(problem: LinearMPC, **changes: Any) -> LinearMPC:
     """Return a problem with changes, in deviations, which counts as stated in the same values."""
-    found = replace(problem, **changes)
+    found = replace(problem, _stored=None, **changes)
     found._store(absolute=problem.absolute)
     return found
 
@@ -385,3 +397,30 @@ def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> 
         "nor a state that it moves has a weight. Give every input a positive weight, in R or in "
         "RateLimits(R_du=...)."
     )
+
+
+def _default_penalty(problem: MPCProblem) -> float:
+    """Return 100 times the cost of coming back from the bounds, at most, with inputs at theirs.
+
+    A unit of violation that is larger than a bound counts as so many times more.
+    """
+    n = problem.model.n_states
+    given = [problem.x_min, problem.x_max, problem.theta_min[:n], problem.theta_max[:n]]
+    sizes = np.abs([np.where(np.isfinite(each), each, 0.0) for each in given])
+    x = np.where(np.any(sizes[:2] > 0, axis=0), sizes[:2].max(axis=0), sizes.max(axis=0))
+    limits = np.abs([problem.u_min, problem.u_max])
+    u = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
+    cost = problem.terminal.cost[:n, :n]
+    total = x @ (np.abs(problem.Q) + np.abs(cost)) @ x + u @ np.abs(problem.R) @ u
+    y = np.abs([problem.outputs.y_min, problem.outputs.y_max])
+    y = np.where(np.isfinite(y), y, 0.0).max(axis=0)
+    units = [(problem.soft.x, x), (problem.soft.y, y)]
+    parts = [unit[size > 0] / size[size > 0] for unit, size in units]
+    wide = max(1.0, *(float(part.max(initial=0.0)) for part in parts))
+    if not total > 0:
+        raise ValueError(
+            "SoftBounds.penalty is missing, and nothing tells how much a violation should cost: "
+            "neither states nor inputs have a bound that costs anything. Pass the cost of one unit "
+            "of violation."
+        )
+    return float(100 * total * wide)

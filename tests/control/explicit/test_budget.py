@@ -227,7 +227,7 @@ def test_the_limit_of_time_holds_where_a_single_linear_program_takes_seconds() -
     mpc = large_plant()
     benchmark().explicit()  # loads what is compiled
     start = time.monotonic()
-    with pytest.raises(ExplicitLimitError, match="0 regions were found in (0|1)"):
+    with pytest.raises(ExplicitLimitError, match=r"0 regions were found in (0|1)"):
         mpc.explicit(time_limit=0.7)
     assert time.monotonic() - start < 1.9  # 0.8 s alone
 
@@ -244,7 +244,7 @@ def test_the_limit_of_time_is_looked_at_between_any_two_steps(slow, monkeypatch)
         return original(*args, **options)
 
     monkeypatch.setattr(owner, slow, passing)
-    with pytest.raises(ExplicitLimitError, match="time_limit = 0.4 s: "):
+    with pytest.raises(ExplicitLimitError, match=r"time_limit = 0\.4 s: "):
         benchmark().explicit(time_limit=0.4)
     assert clock[0] <= 1.0
 
@@ -262,5 +262,5 @@ def test_effort_is_the_same_whatever_the_clock_says(monkeypatch) -> None:
 
 
 def test_a_law_of_too_much_effort_is_given_up_before_it_is_found() -> None:
-    with pytest.raises(ExplicitLimitError, match="more effort .* regions were found .* horizon"):
+    with pytest.raises(ExplicitLimitError, match=r"more effort .* regions were found .* horizon"):
         large_plant()._solved(SolveBudget(effort_limit=0.2))

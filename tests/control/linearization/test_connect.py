@@ -56,10 +56,10 @@ class Plant(gym.Env[Any, Any]):
 )
 def test_a_fault_of_rounding_is_tolerated_and_a_larger_one_is_named(fault, edge, message) -> None:
     small = Plant(fault, 0.9 * edge)
-    model = LinearModel.from_env(small, state=[0.0], action=[0.0])
+    model = LinearModel.from_env(small, x_ss=[0.0], u_ss=[0.0])
     np.testing.assert_allclose([model.A, model.B], [[[0.5]], [[0.25]]], atol=1e-2)
     with pytest.raises(ValueError, match=message):
-        LinearModel.from_env(Plant(fault, 1.2 * edge), state=[0.0], action=[0.0])
+        LinearModel.from_env(Plant(fault, 1.2 * edge), x_ss=[0.0], u_ss=[0.0])
 
 
 class Clock(Plant):
@@ -84,8 +84,8 @@ def test_a_clock_is_noticed_whichever_of_twenty_samples_it_strikes_at(at: int) -
     with pytest.raises(
         ValueError, match=r"starts anew \(a delay of the input, an actuator, a clock"
     ):
-        LinearModel.from_env(Clock(at), state=[0.0], action=[0.0])
-    LinearModel.from_env(Clock(20), state=[0.0], action=[0.0])
+        LinearModel.from_env(Clock(at), x_ss=[0.0], u_ss=[0.0])
+    LinearModel.from_env(Clock(20), x_ss=[0.0], u_ss=[0.0])
 
 
 class Strict(Plant):
@@ -113,7 +113,7 @@ def test_an_episode_that_is_over_is_begun_anew_before_its_state_is_set(ends: boo
         env.x = np.array(x)
 
     model = LinearModel.from_env(
-        Strict(ends), state=[0.0], action=[0.0], set_state=put, get_state=lambda env: env.x
+        Strict(ends), x_ss=[0.0], u_ss=[0.0], set_state=put, get_state=lambda env: env.x
     )
     np.testing.assert_allclose([model.A, model.B], [[[0.5]], [[0.25]]], atol=1e-9)
     assert any("terminates the episode" in note for note in model.notes) == ends
@@ -146,7 +146,7 @@ def test_an_unbounded_input_is_taken_from_minus_one_to_one() -> None:
 @pytest.mark.parametrize(("room", "refused"), [(0.9e-6, True), (1.1e-6, False)])
 def test_an_input_on_its_bound_has_no_slope_to_both_sides(room: float, refused: bool) -> None:
     env = Plant()
-    point = {"state": [0.5 * (1 - room)], "action": [1 - room]}
+    point = {"x_ss": [0.5 * (1 - room)], "u_ss": [1 - room]}
     if refused:
         with pytest.raises(ValueError, match="entry 0 lies on its bound"):
             LinearModel.from_env(env, **point)
@@ -155,17 +155,17 @@ def test_an_input_on_its_bound_has_no_slope_to_both_sides(room: float, refused: 
 
 
 def test_the_notes_tell_what_was_solved_for_and_what_is_observed() -> None:
-    model = LinearModel.from_env(Plant(), state=[np.nan], action=[0.4])
+    model = LinearModel.from_env(Plant(), x_ss=[np.nan], u_ss=[0.4])
     assert model.x_ss == pytest.approx([0.2])
     assert any(
         "Of the 2 entries of the operating point, 1 were solved for" in n for n in model.notes
     )
     assert not any("observation is not this state" in n or "terminates" in n for n in model.notes)
     shown = LinearModel.from_env(
-        Plant("shows another", 1.0), state=[0.0], action=[0.0], get_state=lambda env: env.x
+        Plant("shows another", 1.0), x_ss=[0.0], u_ss=[0.0], get_state=lambda env: env.x
     )
     assert any("The observation is not this state." in n for n in shown.notes)
-    ends = LinearModel.from_env(Plant("ends"), state=[0.0], action=[0.0])
+    ends = LinearModel.from_env(Plant("ends"), x_ss=[0.0], u_ss=[0.0])
     assert any("terminates the episode at the operating point" in n for n in ends.notes)
     assert model.dt == 0.5 and model.n_disturbances == 0
 
@@ -175,7 +175,7 @@ def test_without_a_state_the_input_in_the_middle_is_held_and_with_one_that_which
     plant.action_space = box([-1], [3])
     model = LinearModel.from_env(plant)
     assert model.u_ss == pytest.approx([1.0]) and model.x_ss == pytest.approx([0.5])
-    held = LinearModel.from_env(plant, state=[0.25])
+    held = LinearModel.from_env(plant, x_ss=[0.25])
     assert held.u_ss == pytest.approx([0.5]) and held.x_ss == pytest.approx([0.25])
 
 

@@ -235,8 +235,8 @@ def test_a_simulator_s_steady_state_lies_a_hundredth_of_a_scale_away_at_most(wid
     for share, accepted in ((0.98, True), (1.02, False)):
         env = Steps(drift=share * edge, wide=wide)
         if accepted:
-            model = LinearModel.from_env(env, state=[0.0], action=[0.0])
+            model = LinearModel.from_env(env, x_ss=[0.0], u_ss=[0.0])
             np.testing.assert_allclose([model.A, model.B], [[[0.5]], [[0.5]]], atol=1e-9)
         else:
             with pytest.raises(ValueError, match="is no steady state: one step moves it by"):
-                LinearModel.from_env(env, state=[0.0], action=[0.0])
+                LinearModel.from_env(env, x_ss=[0.0], u_ss=[0.0])

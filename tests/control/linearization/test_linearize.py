@@ -177,14 +177,14 @@ BAD_PLANTS: list[tuple[Any, dict[str, Any], str]] = [
     (lambda x, u: 0.5 * x + np.floor(x) + u, {}, r"along x\[0\], .* \(a (kink|jump or noise)\)"),
     (random_walk, {}, "two steps from the same state.*the plant is random or has states besides"),
     (lambda x, u: 0.5 * x + u + next(CLOCK), {}, "has states besides these"),
-    (lambda x, u: 0.5 * x + u, {"action": [1.0]}, r"action = \[1\.0\]: entry 0 lies on its bound"),
-    (lambda x, u: 0.5 * x + u + 2, {"state": [0]}, "No steady state was found.*moves in one step"),
-    (lambda x, u: 0.5 * x + u + 2, {"state": [0]}, r"u\[0\] is at its lower bound, -1: the inputs"),
-    (lambda x, u: x + u + 2, {"state": [0], "action": [0]}, "no steady state: one step moves it"),
-    (lambda x, u: 0.999 * x, {"state": [1], "action": [0]}, "no steady state: one step moves it"),
-    (lambda x, u: x, {"state": [[0]]}, "must be a vector of finite numbers, or NaN"),
-    (lambda x, u: x, {"state": [0, 0]}, r"a state of shape \(2,\), like the one given, is nowhere"),
-    (lambda x, u: x, {"action": [0, 0]}, r"action has shape \(2,\), expected \(1,\)"),
+    (lambda x, u: 0.5 * x + u, {"u_ss": [1.0]}, r"u_ss = \[1\.0\]: entry 0 lies on its bound"),
+    (lambda x, u: 0.5 * x + u + 2, {"x_ss": [0]}, "No steady state was found.*moves in one step"),
+    (lambda x, u: 0.5 * x + u + 2, {"x_ss": [0]}, r"u\[0\] is at its lower bound, -1: the inputs"),
+    (lambda x, u: x + u + 2, {"x_ss": [0], "u_ss": [0]}, "no steady state: one step moves it"),
+    (lambda x, u: 0.999 * x, {"x_ss": [1], "u_ss": [0]}, "no steady state: one step moves it"),
+    (lambda x, u: x, {"x_ss": [[0]]}, "must be a vector of finite numbers, or NaN"),
+    (lambda x, u: x, {"x_ss": [0, 0]}, r"a state of shape \(2,\), like the one given, is nowhere"),
+    (lambda x, u: x, {"u_ss": [0, 0]}, r"u_ss has shape \(2,\), expected \(1,\)"),
     (lambda x, u: x, {"scale": [0]}, r"scale = \[0\.0\] must be above 0"),
     (lambda x, u: x, {"dt": -1}, "dt = -1 must be a finite number above 0"),
 ]
@@ -195,14 +195,14 @@ def test_plant_that_cannot_be_linearized_is_refused_with_the_reason(
     step: Any, arguments: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=f"(?s){message}"):
-        LinearModel.from_env(Plant(step), **(arguments or {"state": [0], "action": [0]}))
+        LinearModel.from_env(Plant(step), **(arguments or {"x_ss": [0], "u_ss": [0]}))
 
 
 def test_the_input_with_the_least_room_of_its_own_range_is_named() -> None:
     plant = Plant(lambda x, u: 0.5 * x + u[:1] + u[1:])
     plant.action_space = gym.spaces.Box(np.array([-0.1, -100]), np.array([0.1, 100]), dtype=float)
     with pytest.raises(ValueError, match="entry 1 lies on its bound"):
-        LinearModel.from_env(plant, state=[0], action=[0.09, 100.0])
+        LinearModel.from_env(plant, x_ss=[0], u_ss=[0.09, 100.0])
 
 
 def test_a_reset_that_ignores_the_state_is_noticed() -> None:
@@ -248,7 +248,7 @@ class Delayed(Plant):
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
 @pytest.mark.parametrize("keeps", [True, False])
-@pytest.mark.parametrize("point", [{}, {"state": [0.0]}, {"state": [0.0], "action": [0.0]}])
+@pytest.mark.parametrize("point", [{}, {"x_ss": [0.0]}, {"x_ss": [0.0], "u_ss": [0.0]}])
 def test_inputs_on_their_way_are_noticed(delay: int, keeps: bool, point: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="the plant has states besides these"):
         LinearModel.from_env(Delayed(delay, keeps), **point)
@@ -292,3 +292,12 @@ def test_missing_sampling_time_is_asked_for_and_render_fps_is_none() -> None:
 def test_what_is_no_environment_of_a_plant_is_named(env: Any, message: str) -> None:
     with pytest.raises(TypeError, match=message):
         LinearModel.from_env(env)
+
+
+def test_the_former_names_of_the_operating_point_are_taken_with_a_warning() -> None:
+    plant = Plant(lambda x, u: 0.5 * x + u)
+    with pytest.warns(DeprecationWarning, match="x_ss= and u_ss= now"):
+        former = LinearModel.from_env(plant, state=[0.0], action=[0.0])
+    assert former == LinearModel.from_env(plant, x_ss=[0.0], u_ss=[0.0])
+    with pytest.raises(TypeError, match="they are the same"):
+        LinearModel.from_env(plant, x_ss=[0.0], action=[0.0])

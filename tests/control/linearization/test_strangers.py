@@ -46,7 +46,7 @@ class Adaptive(gym.Env):
 @pytest.mark.parametrize(("rtol", "method"), [(1e-3, "RK45"), (1e-5, "LSODA")])
 def test_an_adaptive_integrator_is_linearized_through_its_noise(rtol: float, method: str) -> None:
     truth = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
-    model = LinearModel.from_env(Adaptive(rtol, method), action=cstr.U_SS)
+    model = LinearModel.from_env(Adaptive(rtol, method), u_ss=cstr.U_SS)
     for found, exact in ((model.A, truth.A), (model.B, truth.B)):
         assert np.abs(found - exact).max() < 0.01 * np.abs(exact).max()
 
@@ -77,7 +77,7 @@ class Rough(gym.Env):
 
 @pytest.mark.parametrize("grid", [1e-7, 1e-5, 1e-4])
 def test_noise_of_a_simulator_is_measured_and_stepped_over(grid: float) -> None:
-    model = LinearModel.from_env(Rough(grid), action=[0.0])
+    model = LinearModel.from_env(Rough(grid), u_ss=[0.0])
     np.testing.assert_allclose(model.A, [[1, 0.1], [-0.05, 0.9]], atol=5 * grid / 0.1 + 1e-6)
     np.testing.assert_allclose(model.B, [[0], [0.1]], atol=5 * grid / 0.1 + 1e-6)
     assert "as adaptive integrators do" in model.report()
@@ -189,7 +189,7 @@ class Root(Forgets):
 
 
 def test_a_plant_without_a_value_there_turns_the_search_for_a_steady_state_back() -> None:
-    model = LinearModel.from_env(Root(), action=[-0.5])
+    model = LinearModel.from_env(Root(), u_ss=[-0.5])
     np.testing.assert_allclose(model.x_ss, [0.25], atol=1e-6)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import pickle
 from typing import Any
 
 import numpy as np
@@ -49,6 +51,61 @@ def test_absolute_bounds_make_the_same_problem() -> None:
 def test_a_changed_copy_of_it_is_not_shifted_again() -> None:
     again = dataclasses.replace(shown(), horizon=3)
     assert again == dataclasses.replace(deviations(), horizon=3)
+
+
+COPIES = [
+    lambda mpc: mpc,
+    copy.copy,
+    copy.deepcopy,
+    lambda mpc: pickle.loads(pickle.dumps(mpc)),
+    lambda mpc: dataclasses.replace(mpc, horizon=mpc.horizon),
+]
+
+
+@pytest.mark.parametrize("copied", COPIES)
+def test_what_is_replaced_in_an_absolute_problem_is_absolute_and_the_rest_stays(copied) -> None:
+    mpc = copied(shown())
+    tracking = dataclasses.replace(mpc.tracking, r_max=352)
+    loads = dataclasses.replace(mpc.disturbances, d_min=3.5)
+    outputs = dataclasses.replace(mpc.outputs, y_max=377)
+    found = dataclasses.replace(
+        mpc, x_max=[365, 4.5], u_min=9, theta_min=[335, 1.5], tracking=tracking, outputs=outputs,
+        disturbances=loads,
+    )  # fmt: skip
+    expected = LinearMPC(
+        MODEL, **WEIGHTS, x_min=[330, 1], x_max=[365, 4.5], u_min=9, u_max=15,
+        theta_min=[335, 1.5], theta_max=shown().theta_max[:2] + X_SS,
+        tracking=Tracking([0], 345, 352), disturbances=DisturbanceBounds(3.5, 7),
+        outputs=OutputBounds([[1, 1]], y_max=377), soft=SOFT, absolute=True,
+    )  # fmt: skip
+    assert found.absolute
+    assert found == expected
+    assert dataclasses.replace(found) == found
+
+
+def test_absolute_bounds_stay_where_they_are_when_the_operating_point_moves() -> None:
+    moved = dataclasses.replace(MODEL, x_ss=[345.0, 2.5], u_ss=[11.0], d_ss=[4.5])
+    found = dataclasses.replace(shown(), model=moved)
+    np.testing.assert_allclose(found.x_min + moved.x_ss, [330, 1])
+    np.testing.assert_allclose(found.u_max + moved.u_ss, [15])
+    np.testing.assert_allclose(found.tracking.r_max + 345, [355])
+    np.testing.assert_allclose(found.disturbances.d_min + moved.d_ss, [4])
+    np.testing.assert_allclose(found.outputs.y_max + 347.5, [382])
+
+
+def test_bounds_that_are_in_the_wrong_order_once_they_are_alike_are_refused() -> None:
+    mpc = shown()
+    with pytest.raises(ValueError, match="r_min must lie below r_max"):
+        dataclasses.replace(mpc, tracking=dataclasses.replace(mpc.tracking, r_max=340))
+    plain = deviations()
+    with pytest.raises(ValueError, match="r_min must lie below r_max"):
+        dataclasses.replace(plain, tracking=dataclasses.replace(plain.tracking, r_max=-7))
+
+
+def test_a_problem_in_deviations_does_not_become_absolute_by_a_flag() -> None:
+    for mpc in (shown(), deviations()):
+        with pytest.raises(ValueError, match="absolute"):
+            dataclasses.replace(mpc, absolute=not mpc.absolute)
 
 
 def test_a_box_of_theta_and_what_is_not_given() -> None:

@@ -87,6 +87,34 @@ def test_a_soft_bound_is_kept_where_the_hard_one_can_be() -> None:
     assert error <= 1e-9  # exact, not nearly: the penalty has a linear part
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e4])
+def test_a_soft_bound_without_a_penalty_is_kept_too_whatever_the_units(seed, unit) -> None:
+    rng = np.random.default_rng(seed)
+    units = np.array([1.0, unit])
+    A = rng.normal(size=(2, 2))
+    A *= rng.uniform(0.7, 1.2) / np.max(np.abs(np.linalg.eigvals(A)))
+    model = LinearModel(units[:, None] * A / units, units[:, None] * rng.normal(size=(2, 1)), 1.0)
+    given: dict[str, Any] = {"Q": np.diag(1 / units**2), "R": [[0.3]], "horizon": 3}
+    given |= {"u_min": -1, "u_max": 1, "x_min": -2 * units, "x_max": 3 * units}
+    hard = LinearMPC(model, **given)
+    soft = LinearMPC(model, **given, soft=SoftBounds(x=0.5 * units))
+    assert soft.soft.penalty == pytest.approx(100 * soft_cost(soft, units))
+    assert dataclasses.replace(soft) == soft
+    points = box_points(hard, 500)
+    inside = points[hard.online().in_domain(points)]
+    off = np.abs(soft.explicit()(inside) - hard.online()(inside)).max(axis=1)
+    assert np.mean(off < 1e-9) > 0.99  # next to where the hard one ends multipliers have no bound
+    expected, _ = online_answers(soft, points)
+    assert relative_error(soft, soft.explicit()(points), expected) < 1e-8
+
+
+def soft_cost(mpc: LinearMPC, units: np.ndarray) -> float:
+    """What x = 3, u = 1 costs at most, and to come back from there."""
+    x = 3 * units
+    return float(x @ np.abs(mpc.Q) @ x + x @ np.abs(mpc.terminal.cost) @ x + 0.3)
+
+
 def test_the_law_reaches_beyond_a_soft_bound_without_being_told() -> None:
     soft = {"x_min": -1.2, "x_max": 1.2, "soft": SoftBounds(1, penalty=300)}
     law = servo(**soft).explicit()
@@ -251,7 +279,19 @@ BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [
     ),
     (lambda: RateLimits(R_du=2), ValueError, r"R_du has shape \(\), expected \(1, 1\)"),
     (lambda: SoftBounds(-1, penalty=1), ValueError, "SoftBounds.x = .* no entry may be negative"),
-    (lambda: SoftBounds(1), ValueError, "SoftBounds.penalty is missing"),
+    (
+        lambda: {
+            "soft": SoftBounds(y=1),
+            "outputs": OutputBounds([0], -0.5, 0.5),
+            "tracking": None,
+            "x_min": None,
+            "x_max": None,
+            "u_min": None,
+            "u_max": None,
+        },
+        ValueError,
+        "SoftBounds.penalty is missing, and nothing tells",
+    ),
     (lambda: SoftBounds(penalty=1), ValueError, "SoftBounds.penalty = 1, but nothing is soft"),
     (
         lambda: SoftBounds(1, penalty=-1),
