@@ -174,7 +174,9 @@ class Evidence(Starts):
     def paired(self) -> PairedEpisodes:
         """The costs that a candidate's are compared with."""
         costs = self.mpc.costs, self.accepted.costs
-        return PairedEpisodes(*costs, self.accepted.unsafe, self.tolerance, self.n_starts)
+        # Neither is exceeded: a tolerance over the accepted policy alone would add up.
+        unsafe = np.minimum(self.accepted.unsafe, self.mpc.unsafe)
+        return PairedEpisodes(*costs, unsafe, self.tolerance, self.n_starts)
 
     @property
     def visits(self) -> NDArray[np.bool_]:
