@@ -48,9 +48,9 @@ def unsafe_columns(
 def less_safe(now: Array, before: Array, room: float = EXCESS_ROOM) -> NDArray[np.bool_]:
     """Tell which episodes are less safe than before, and in what (episodes, 6).
 
-    - The largest excess of an episode may be larger by ``room`` and ``EXCESS_SHARE`` of what it was.
-      The summed one may so as well, and by one step of the largest. It counts where it is larger on
-      average over all episodes, too.
+    - The largest excess of an episode may be larger by ``room`` and by ``EXCESS_SHARE`` of what it
+      was. So may the summed one, and by one step of the largest besides. It counts where it is
+      larger on average over all episodes, too.
     - Where the env reported violations before, and the problem's bounds tell their size, a tenth
       more steps of them, or one, count only where they are larger.
     - Of all else nothing may be more.
