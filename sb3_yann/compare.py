@@ -63,18 +63,19 @@ def less_safe(now: Array, before: Array, room: float = EXCESS_ROOM) -> NDArray[n
         Half-widths of a bound by which an excess may be larger.
     """
     more = now[:, : len(UNSAFE)] > before[:, : len(UNSAFE)]
-    larger = ~(now <= _allowed(before, room))
+    larger = ~(now <= allowed_excess(before, room))
     few = now[:, 0] <= before[:, 0] + np.maximum(1.0, EXCESS_SHARE * before[:, 0])
     known = (before[:, 0] > 0) & (now[:, 6] > 0) & few & ~larger[:, 6]
     more[:, 0] &= ~known
     more[:, 4] = larger[:, 4]
     step = before[:, 4]  # one more of the largest
-    longer = ~(now[:, 5] <= _allowed(before[:, 5], room) + step)
-    mean = _allowed(before[:, 5].mean(), room) if len(now) else 0.0
+    longer = ~(now[:, 5] <= allowed_excess(before[:, 5], room) + step)
+    mean = allowed_excess(before[:, 5].mean(), room) if len(now) else 0.0
     least = mean + step.max(initial=0.0) / max(len(now), 1)
     more[:, 5] = longer & (len(now) > 0 and not now[:, 5].mean() <= least)
     return np.asarray(more)
 
 
-def _allowed(excess: ArrayLike, room: float) -> Array:
+def allowed_excess(excess: ArrayLike, room: float = EXCESS_ROOM) -> Array:
+    """Return the excess that is no larger than another: it rides the same bound."""
     return np.asarray((1 + EXCESS_SHARE) * np.asarray(excess) + room)

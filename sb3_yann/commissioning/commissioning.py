@@ -15,13 +15,20 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import as_between, as_flag, as_whole
-from sb3_yann.commissioning.comparison import Costs, compare, is_confirmed, why_taken_back
+from sb3_yann.commissioning.comparison import (
+    Costs,
+    compare,
+    excess_of_mpc,
+    is_confirmed,
+    why_taken_back,
+)
 from sb3_yann.commissioning.improve import improve
 from sb3_yann.commissioning.incumbent import Incumbent
 from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
 from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
+from sb3_yann.compare import allowed_excess
 from sb3_yann.evaluation.episodes import Source, one_env
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.twin.observers import observer_of
@@ -35,7 +42,8 @@ class Commissioning:
     the policy is improved in it (:func:`improve`), and acts in the next batch if it was accepted:
     at first within a small ``max_correction``, which doubles when the plant confirms at least half
     of the gain that the twin promised. Where it costs more than the twin predicts for the MPC, the
-    MPC is back. Nothing else ever acts.
+    MPC is back. So it is where it exceeds a hard bound of the problem by more than the MPC has on
+    this plant. Nothing else ever acts.
 
     A watchdog looks on. At an alarm the MPC has the plant within the same sample, for the rest of
     the episode and until it has played a quiet one; it has no state of its own that could bump. Two
@@ -172,7 +180,8 @@ class Commissioning:
         journal.begin(acts)
         try:
             act = plant.policy if acts else plant.mpc
-            played = plant.play(first, act, self.watchdog)
+            limit = float(allowed_excess(excess_of_mpc(journal, plant.problem).largest.max()))
+            played = plant.play(first, act, self.watchdog, limit)
         except KeyboardInterrupt:
             journal.interrupt()
             raise

@@ -10,7 +10,9 @@ import numpy as np
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.journal import Journal
 from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
+from sb3_yann.compare import allowed_excess
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess, excess_of_episodes
 from sb3_yann.twin.plant_twin import PlantTwin
 
 ENOUGH = 0.5
@@ -36,6 +38,8 @@ class Costs(NamedTuple):
         the MPC's own episodes cost beyond that. With sensor noise a plant costs more than any twin.
     error : float, default 0
         Standard error of ``actual - mpc``.
+    longer : str, default ""
+        By how much more than the MPC the policy exceeds hard bounds, summed over an episode.
     """
 
     actual: float
@@ -43,6 +47,7 @@ class Costs(NamedTuple):
     promised: float
     mpc: float
     error: float = 0.0
+    longer: str = ""
 
 
 def compare(
@@ -75,7 +80,8 @@ def compare(
         beyond, unsure = _beyond(journal, plant, now)
         mpc = as_mpc.mean() + length * beyond
         error = np.hypot(_standard_error(actual - as_mpc), length * unsure)
-    return Costs(*map(float, (actual.mean(), predicted, promised, mpc, error)))
+    shown = map(float, (actual.mean(), predicted, promised, mpc, error))
+    return Costs(*shown, _longer(journal, problem, own) if by_policy else "")
 
 
 def why_taken_back(journal: Journal, costs: Costs) -> str:
@@ -87,6 +93,8 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
         return ""
     if unsafe := sum(each.violations for each in played):
         return f"it violated a limit in {unsafe} steps"
+    if costs.longer:
+        return costs.longer
     alarms = sum(each.alarm is not None for each in played)
     if alarms >= max(2.0, ALARMS * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
@@ -94,6 +102,26 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     if not costs.actual <= costs.mpc + room < np.inf:  # nor does NaN pass
         return f"it cost {costs.actual:.5g}, the MPC would have {costs.mpc:.5g}"
     return ""
+
+
+def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
+    """Return the excess over the bounds of the MPC's own episodes in the log, one 0 without any."""
+    own = [journal.episodes[i] for i in journal.log if not journal.by_policy[i]]
+    if not own:
+        return BoundExcess(*np.zeros((4, 1)))
+    return excess_of_episodes(problem, ((each.thetas, each.actions) for each in own))
+
+
+def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]) -> str:
+    mpc = excess_of_mpc(journal, problem)
+    ours = excess_of_episodes(problem, ((each.thetas, each.actions) for each in played))
+    summed, before = float(ours.summed.mean()), float(mpc.summed.mean())
+    if summed <= allowed_excess(before) + mpc.largest.max():
+        return ""
+    return (
+        f"it exceeded hard bounds by {summed:.3g} half-widths, summed over an episode, the MPC by "
+        f"{before:.3g}"
+    )
 
 
 def is_confirmed(journal: Journal, costs: Costs) -> bool:
@@ -120,7 +148,9 @@ def _standard_error(values: Array) -> float:
 
 def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> Array:
     cost = problem.stage_cost
-    return np.array([np.sum(cost(each.thetas[:-1], each.actions)) for each in episodes])
+    stage = np.array([np.sum(cost(each.thetas[:-1], each.actions)) for each in episodes])
+    soft = excess_of_episodes(problem, ((each.thetas, each.actions) for each in episodes))
+    return np.asarray(stage + soft.penalty)
 
 
 def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inputs) -> Array:
@@ -139,5 +169,9 @@ def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inpu
             theta[..., row.given] = np.array(now)[:, row.given]
             u = act(row.shown(theta.reshape(-1, shape[-1]))).reshape(*shape[:2], -1)
             costs += np.where(k < lengths, twin.problem.stage_cost(row.shown(theta), u), 0.0)
-            theta = dynamics.step(theta, u)
+            after = dynamics.step(theta, u)
+            reached = np.array([row.shown(theta), row.shown(after)])
+            soft = bound_excess(twin.problem, reached, u[None]).penalty
+            costs += np.where(k < lengths, soft, 0.0)
+            theta = after
     return np.asarray(costs.mean(axis=0))
