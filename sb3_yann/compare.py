@@ -47,11 +47,12 @@ def unsafe_columns(
     return np.column_stack([np.broadcast_to(each, size).astype(np.float64) for each in columns])
 
 
-def less_safe(now: Array, before: Array) -> NDArray[np.bool_]:
+def less_safe(now: Array, before: Array, room: float = EXCESS_ROOM) -> NDArray[np.bool_]:
     """Tell which episodes are less safe than before, and in what (episodes, 6).
 
-    - The largest excess of an episode may be larger by ``EXCESS_ROOM`` and ``EXCESS_SHARE`` of what
-      it was. The summed one is compared on average over all episodes, with the same tolerance.
+    - The largest excess of an episode may be larger by ``room`` and by ``EXCESS_SHARE`` of what it
+      was. So may the summed one, and by one step of the largest besides. It counts where it is
+      larger on average over all episodes, too.
     - Where the env reported violations before, and the problem's bounds tell their size, a tenth
       more steps of them, or one, count only where they are larger.
     - Of all else nothing may be more.
@@ -60,17 +61,23 @@ def less_safe(now: Array, before: Array) -> NDArray[np.bool_]:
     ----------
     now, before : ndarray, shape (episodes, 7)
         As :func:`unsafe_columns` returns them, of the same starts.
+    room : float
+        Half-widths of a bound by which an excess may be larger.
     """
     more = now[:, : len(UNSAFE)] > before[:, : len(UNSAFE)]
-    larger = now > _allowed(before)
+    larger = ~(now <= allowed_excess(before, room))
     few = now[:, 0] <= before[:, 0] + np.maximum(1.0, EXCESS_SHARE * before[:, 0])
     known = (before[:, 0] > 0) & (now[:, 6] > 0) & few & ~larger[:, 6]
     more[:, 0] &= ~known
     more[:, 4] = larger[:, 4]
-    grown = bool(len(now)) and not now[:, 5].mean() <= _allowed(before[:, 5].mean())
-    more[:, 5] = larger[:, 5] & grown
+    step = before[:, 4]  # one more of the largest
+    longer = ~(now[:, 5] <= allowed_excess(before[:, 5], room) + step)
+    mean = allowed_excess(before[:, 5].mean(), room) if len(now) else 0.0
+    least = mean + step.max(initial=0.0) / max(len(now), 1)
+    more[:, 5] = longer & (len(now) > 0 and not now[:, 5].mean() <= least)
     return np.asarray(more)
 
 
-def _allowed(excess: Array) -> Array:
-    return np.asarray((1 + EXCESS_SHARE) * excess + EXCESS_ROOM)
+def allowed_excess(excess: ArrayLike, room: float = EXCESS_ROOM) -> Array:
+    """Return the excess that is no larger than another: it rides the same bound."""
+    return np.asarray((1 + EXCESS_SHARE) * np.asarray(excess) + room)

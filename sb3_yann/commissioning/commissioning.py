@@ -18,6 +18,7 @@ from sb3_yann._validation import as_between, as_flag, as_whole
 from sb3_yann.commissioning.comparison import (
     Costs,
     compare,
+    excess_of_mpc,
     is_confirmed,
     is_kept,
     why_taken_back,
@@ -28,6 +29,7 @@ from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
 from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
+from sb3_yann.compare import allowed_excess
 from sb3_yann.evaluation.episodes import Source, one_env
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.twin.observers import observer_of
@@ -43,7 +45,8 @@ class Commissioning:
     the plant decides. It is kept where it surely cost less than the MPC in these turns, and the MPC
     is back where it surely cost more, by t tests of the pairs. A policy acts at first within a
     small ``max_correction``, which doubles when the plant confirms at least half of the gain that
-    the twin promised. Nothing else ever acts.
+    the twin promised. So it is where it exceeds a hard
+    bound of the problem by more than the MPC has on this plant. Nothing else ever acts.
 
     What counts is the stage cost, or the plant's own reward where that is another one. The twin's
     searches know the stage cost alone.
@@ -192,7 +195,8 @@ class Commissioning:
         journal.begin(acts)
         try:
             act = plant.policy if acts else plant.mpc
-            played = plant.play(first, act, self.watchdog)
+            limit = float(allowed_excess(excess_of_mpc(journal, plant.problem).largest.max()))
+            played = plant.play(first, act, self.watchdog, limit)
         except KeyboardInterrupt:
             journal.interrupt()
             raise

@@ -11,7 +11,9 @@ from scipy.special import stdtrit
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.journal import Journal
 from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
+from sb3_yann.compare import allowed_excess
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess, excess_of_episodes
 from sb3_yann.twin.plant_twin import PlantTwin
 
 ENOUGH = 0.5
@@ -45,6 +47,8 @@ class Costs(NamedTuple):
     own_reward : bool, default False
         Whether the costs are minus the rewards, which are not the stage cost: a twin, whose costs
         are stage costs, promises nothing then.
+    longer : str, default ""
+        By how much more than the MPC the policy exceeds hard bounds, summed over an episode.
     """
 
     actual: float
@@ -54,6 +58,7 @@ class Costs(NamedTuple):
     error: float = 0.0
     pairs: int = 0
     own_reward: bool = False
+    longer: str = ""
 
     @property
     def room(self) -> float:
@@ -91,14 +96,15 @@ def compare(
     mean, pairs = float(actual.mean()), min(len(own), len(of_mpc))
     if not by_policy:
         return Costs(mean, predicted, promised, mean, own_reward=pays_own)
+    longer = _longer(journal, problem, own)
     if not pairs:
-        return Costs(mean, predicted, promised, np.nan, own_reward=pays_own)
+        return Costs(mean, predicted, promised, np.nan, own_reward=pays_own, longer=longer)
     more = actual[:pairs] - _costs(problem, of_mpc[:pairs], pays_own)
     if now is not None and not pays_own:
         starts = [predicted_costs(now, each[:pairs], plant.mpc) for each in (own, of_mpc)]
         more = more - (starts[0] - starts[1])
     mpc = mean - float(more.mean())
-    return Costs(mean, predicted, promised, mpc, _standard_error(more), pairs, pays_own)
+    return Costs(mean, predicted, promised, mpc, _standard_error(more), pairs, pays_own, longer)
 
 
 def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
@@ -126,6 +132,8 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
         return ""
     if unsafe := sum(each.violations for each in played):
         return f"it violated a limit in {unsafe} steps"
+    if costs.longer:
+        return costs.longer
     alarms = sum(each.alarm is not None for each in played)
     if alarms >= max(2.0, ALARMS * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
@@ -139,6 +147,26 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
 def is_kept(costs: Costs) -> bool:
     """Return whether the plant has shown that the policy surely costs less than the MPC."""
     return costs.pairs >= 2 and costs.actual + costs.room < costs.mpc
+
+
+def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
+    """Return the excess over the bounds of the MPC's own episodes in the log, one 0 without any."""
+    own = [journal.episodes[i] for i in journal.log if not journal.by_policy[i]]
+    if not own:
+        return BoundExcess(*np.zeros((4, 1)))
+    return excess_of_episodes(problem, ((each.thetas, each.actions) for each in own))
+
+
+def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]) -> str:
+    mpc = excess_of_mpc(journal, problem)
+    ours = excess_of_episodes(problem, ((each.thetas, each.actions) for each in played))
+    summed, before = float(ours.summed.mean()), float(mpc.summed.mean())
+    if summed <= allowed_excess(before) + mpc.largest.max():
+        return ""
+    return (
+        f"it exceeded hard bounds by {summed:.3g} half-widths, summed over an episode, the MPC by "
+        f"{before:.3g}"
+    )
 
 
 def is_confirmed(journal: Journal, costs: Costs) -> bool:
@@ -163,7 +191,9 @@ def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode], own_reward: boo
     if own_reward:
         return np.array([-each.reward for each in episodes])
     cost = problem.stage_cost
-    return np.array([np.sum(cost(each.thetas[:-1], each.actions)) for each in episodes])
+    stage = np.array([np.sum(cost(each.thetas[:-1], each.actions)) for each in episodes])
+    soft = excess_of_episodes(problem, ((each.thetas, each.actions) for each in episodes))
+    return np.asarray(stage + soft.penalty)
 
 
 def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inputs) -> Array:
@@ -182,5 +212,9 @@ def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inpu
             theta[..., row.given] = np.array(now)[:, row.given]
             u = act(row.shown(theta.reshape(-1, shape[-1]))).reshape(*shape[:2], -1)
             costs += np.where(k < lengths, twin.problem.stage_cost(row.shown(theta), u), 0.0)
-            theta = dynamics.step(theta, u)
+            after = dynamics.step(theta, u)
+            reached = np.array([row.shown(theta), row.shown(after)])
+            soft = bound_excess(twin.problem, reached, u[None]).penalty
+            costs += np.where(k < lengths, soft, 0.0)
+            theta = after
     return np.asarray(costs.mean(axis=0))

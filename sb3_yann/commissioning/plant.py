@@ -13,7 +13,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
+from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
+from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import actor
@@ -35,7 +37,8 @@ class PlantEpisode:
     reward : float
         The plant's own, summed.
     violations : int
-        Steps with ``info["violation"]``, and an end that is no time limit.
+        Steps with ``info["violation"]`` or too large an excess over a hard bound of the problem,
+        and an end that is no time limit.
     alarm : Alarm or None
         Why the MPC took over.
     step : int
@@ -125,7 +128,13 @@ class Plant:
             )
         return known
 
-    def play(self, known: Array, act: Inputs, watchdog: Watchdog | None) -> PlantEpisode:
+    def play(
+        self,
+        known: Array,
+        act: Inputs,
+        watchdog: Watchdog | None,
+        allowed: float = np.inf,
+    ) -> PlantEpisode:
         """Play an episode; after an alarm the MPC acts, from the very sample on.
 
         Parameters
@@ -136,6 +145,9 @@ class Plant:
             The one that acts until then: :meth:`policy` or :meth:`mpc`.
         watchdog : Watchdog, optional
             Without one only violations and readings that are not finite are seen.
+        allowed : float, optional
+            Half-widths by which the policy may exceed a hard bound of the problem. A violation that
+            the plant reports is none where its size is known, and allowed.
         """
         if watchdog is not None:
             watchdog.start(known, act)
@@ -149,14 +161,19 @@ class Plant:
             action = u if self.as_is else self.yann.input_units.action(u).astype(np.float32)
             action = np.clip(action, space.low, space.high).astype(space.dtype)  # to the last bit
             observation, gained, terminated, over, info = self.env.step(action)
-            unsafe = bool(info.get("violation", False)) or terminated
-            reward, violations = reward + float(gained), violations + unsafe
             over, read = over or terminated, self._theta(observation)
+            after = self._known(known, u, read)
+            excess = bound_excess(self.problem, np.array([known, after]), u[None]).largest
+            limit = allowed if act == self.policy else np.inf
+            sized = EXCESS_ROOM < excess <= limit
+            reported = bool(info.get("violation", False)) and not sized
+            unsafe = reported or terminated or bool(excess > limit)
+            reward, violations = reward + float(gained), violations + unsafe
             if alarm is None:
                 found = self._look(watchdog, known, u, read, unsafe)
                 if found is not None:
                     alarm, step, act = found, len(actions), self.mpc
-            known = self._known(known, u, read)
+            known = after
             thetas.append(known)
             actions.append(u.astype(np.float64))
             if len(actions) >= LONGEST:
@@ -182,7 +199,7 @@ class Plant:
         if not np.isfinite(read).all():
             return Alarm("not a number", f"It reads {self._not_finite(read)}.")
         if unsafe:
-            return Alarm("violation", "The plant reports a violation.")
+            return Alarm("violation", "The plant reports a violation, or exceeds a hard bound.")
         if watchdog is None:
             return None
         return watchdog.watch(known, u.astype(np.float64), read)

@@ -157,7 +157,9 @@ class Trial:
         with np.errstate(all="ignore"):
             runs = (opinion.roll_out(each, starts, self.steps, given) for each in (self._law, act))
             mpc, costs = (
-                stage_cost(opinion.row.shown(rows[:-1]), u).sum(axis=0)[0] for rows, u in runs
+                stage_cost(opinion.row.shown(rows[:-1]), u).sum(axis=0)[0]
+                + bound_excess(self.twin.problem, opinion.row.shown(rows), u).penalty[0]
+                for rows, u in runs
             )
             change, mean = costs - mpc, np.abs(mpc).mean()
             if not change.mean() < 0:

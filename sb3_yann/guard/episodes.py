@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.compare import EXCESS_ROOM, less_safe, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.evaluation.episodes import LONGEST, Episodes, evaluate
 from sb3_yann.guard.actor_checkpoint import DIVERGED, ActorCheckpoint
@@ -37,9 +37,9 @@ class Outcome(NamedTuple):
     unsafe: Array
     visits: NDArray[np.bool_]
 
-    def breaks_more_than(self, other: Outcome) -> bool:
+    def breaks_more_than(self, other: Outcome, room: float = EXCESS_ROOM) -> bool:
         """Return whether it is less safe: a large step of an input wears, and breaks nothing."""
-        return bool(np.any(np.delete(less_safe(self.unsafe, other.unsafe), WEARS, axis=1)))
+        return bool(np.any(np.delete(less_safe(self.unsafe, other.unsafe, room), WEARS, axis=1)))
 
     def at(self, index: Any) -> Outcome:
         """Return some of the episodes."""
@@ -94,7 +94,9 @@ class Starts:
 
     def more_unsafe(self, outcome: Outcome) -> NDArray[np.bool_]:
         """Return which break a limit, end early or are not finite, more often than with the MPC."""
-        return np.asarray(less_safe(outcome.unsafe, self.mpc.unsafe).any(1))
+        return np.asarray(
+            less_safe(outcome.unsafe, self.mpc.unsafe, self.tolerance.excess_room).any(1)
+        )
 
     def lost(self, outcome: Outcome) -> NDArray[np.bool_]:
         """Return which a policy loses against the MPC."""
@@ -126,7 +128,10 @@ class Starts:
         """Return why a policy is refused on these starts, empty where it is not."""
         if self.loses(outcome):
             first = self.hardest(outcome)[0]
-            unsafe, breaks = self.more_unsafe(outcome).any(), outcome.breaks_more_than(self.mpc)
+            unsafe, breaks = (
+                self.more_unsafe(outcome).any(),
+                outcome.breaks_more_than(self.mpc, self.tolerance.excess_room),
+            )
             also = f" and {VIOLATES if breaks else 'moves an input too far'}" if unsafe else ""
             more = (outcome.costs - self.mpc.costs)[first]
             return (
@@ -172,7 +177,9 @@ class Evidence(Starts):
     def paired(self) -> PairedEpisodes:
         """The costs that a candidate's are compared with."""
         costs = self.mpc.costs, self.accepted.costs
-        return PairedEpisodes(*costs, self.accepted.unsafe, self.tolerance, self.n_starts)
+        # Neither is exceeded: a tolerance over the accepted policy alone would add up.
+        unsafe = np.minimum(self.accepted.unsafe, self.mpc.unsafe)
+        return PairedEpisodes(*costs, unsafe, self.tolerance, self.n_starts)
 
     @property
     def visits(self) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import special
 
 from sb3_yann._validation import as_between, as_flag
+from sb3_yann.compare import EXCESS_ROOM
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,11 @@ class AcceptanceRule:
     largest_step : float, optional
         How far an input may move from one sample to the next, in multiples of the MPC's largest
         step on the known starts, at least 1. The default is no bound.
+    excess_room : float, default 0.001
+        How much farther than the MPC a policy may exceed a hard bound of the problem, in
+        half-widths of theta's box, besides a tenth of the MPC's own excess. It holds for the
+        largest excess of an episode and for the sum over its steps, which may be larger by one
+        step as well. The costs count what soft bounds cost the MPC.
 
     Examples
     --------
@@ -52,6 +58,7 @@ class AcceptanceRule:
     significance: float = 0.05
     least_gain: float = 0.001
     largest_step: float | None = None
+    excess_room: float = EXCESS_ROOM
 
     def __post_init__(self) -> None:
         as_between("margin", self.margin, 0, np.inf)
@@ -60,6 +67,8 @@ class AcceptanceRule:
         )
         hint = "It is a share of the MPC's mean cost, 0 for any gain."
         as_between("least_gain", self.least_gain, 0, 1, hint=hint)
+        hint = "It is in half-widths of theta's box, 0 for the MPC's own excess and a tenth."
+        as_between("excess_room", self.excess_room, 0, np.inf, hint=hint)
         if self.largest_step is not None:
             hint = "It is a multiple of the MPC's largest step, or None."
             as_between("largest_step", self.largest_step, 1, np.inf, hint=hint)

@@ -92,7 +92,13 @@ def _accept_one_by_one(
             known = starts[~outcome.visits[starts][:, other].any(1)]
             trial = trial.replaced(known, outcome.at(known))
             lost = len(known) and evidence.at(known).loses(outcome.at(known))
-            if lost or np.any(less_safe(trial.unsafe[known], evidence.accepted.unsafe[known])):
+            if lost or np.any(
+                less_safe(
+                    trial.unsafe[known],
+                    evidence.paired.unsafe[known],
+                    evidence.tolerance.excess_room,
+                )
+            ):
                 continue  # whatever the others cost
         others = np.setdiff1d(starts, known)
         try:

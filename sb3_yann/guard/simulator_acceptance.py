@@ -68,7 +68,11 @@ class SimulatorAcceptance:
         """What the evidence depends on."""
         bound = self.rule.largest_step
         steps = {} if bound is None else {"largest_step": bound}
-        tolerance = {"margin": self.rule.margin, "tail": self.rule.tail}
+        tolerance = {
+            "margin": self.rule.margin,
+            "tail": self.rule.tail,
+            "excess_room": self.rule.excess_room,
+        }
         return {"env": self.name, "seeds": self.seeds, **tolerance, **steps}
 
     def start(self, session: GuardSession) -> None:
@@ -109,7 +113,9 @@ class SimulatorAcceptance:
             seeds = (*seeds, *sorted(hard - {*seeds}))
         mpc = first_episodes(session, self.name, seeds, self.rule.largest_step)
         typical = float(np.median(np.abs(mpc.costs[: len(self.seeds)])))
-        tolerance = Tolerance(self.rule.margin * typical, self.rule.tail, typical)
+        tolerance = Tolerance(
+            self.rule.margin * typical, self.rule.tail, typical, self.rule.excess_room
+        )
         state.accept(session.mpc, Evidence(seeds, mpc, tolerance, len(seeds), accepted=mpc))
         leading = session.mpc
         for candidate in candidates:
@@ -182,7 +188,7 @@ class SimulatorAcceptance:
         state, rule = session.state, self.rule
         before: tuple[ActorCheckpoint, Evidence] = state.accepted, state.evidence
         outcome, reason = evaluate_candidate(session, candidate)
-        hopeless = outcome is None or outcome.breaks_more_than(before[1].accepted)
+        hopeless = outcome is None or outcome.breaks_more_than(before[1].accepted, rule.excess_room)
         share = 0.0 if reason else 1.0
         if outcome is not None and not reason:
             accept_visited(session, candidate, outcome)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.compare import SUCCESS, UNSAFE, less_safe
+from sb3_yann.compare import EXCESS_ROOM, SUCCESS, UNSAFE, less_safe
 
 ROUNDING = 1e-6
 """Of a mean cost: what float32 actions and batches of other sizes make of one policy's."""
@@ -29,11 +29,13 @@ class Tolerance:
         With a tail, a start that costs the MPC more than ``typical`` may cost more in proportion,
         and no start may cost more than ``MOST`` times as much as the average may.
     typical : float, the MPC's median cost
+    excess_room : float, half-widths by which an excess over bounds may be larger
     """
 
     margin: float
     tail: float = 0.0
     typical: float = np.inf
+    excess_room: float = EXCESS_ROOM
 
     def excess(self, mpc_costs: Array, costs: Array) -> Array:
         """Return what each start costs more than with the MPC, in units of what it may.
@@ -132,7 +134,9 @@ class PairedEpisodes:
 
         Comparisons are written so that a cost that is not a number is refused.
         """
-        for what, column in zip(UNSAFE, less_safe(unsafe, self.unsafe).T, strict=True):
+        for what, column in zip(
+            UNSAFE, less_safe(unsafe, self.unsafe, self.tolerance.excess_room).T, strict=True
+        ):
             more = np.flatnonzero(column)
             if len(more):
                 told = f"{len(more)} starts with {what}, the first is number {more[0]}"

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, as_whole
+from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import DisturbanceObserver
+from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode
@@ -22,6 +24,9 @@ Single = NDArray[np.float32]
 
 class TwinEnv(gym.Env[Single, Single]):
     """Episodes of a member of a twin: theta is observed, the reward is minus the stage cost.
+
+    ``info["excess"]`` and ``info["penalty"]`` are those of
+    :class:`~sb3_yann.wrappers.StageCost`, and an excess is a violation.
 
     An episode begins in the box of the log's first states, takes the references and disturbances of
     one of its episodes, and lasts as long. ``info["violation"]`` reports a state beyond the
@@ -106,17 +111,16 @@ class TwinEnv(gym.Env[Single, Single]):
         if u.shape != self.action_space.shape or not np.all(np.isfinite(u)):
             wanted = f"{self.action_space.shape} finite numbers"
             raise ValueError(f"action = {action!r} must be {wanted}.")
-        rows, costs, violated, over = step_all([self], self._acting, u[None])
+        rows, told, over = step_all([self], self._acting, u[None])
         thetas = self.dynamics.row.shown(rows)
-        cost, violation = float(costs[0]), bool(violated[0])
-        info = {"cost": cost, "violation": violation, "state": thetas[0]}
-        return thetas[0].astype(np.float32), -cost, False, bool(over[0]), info
+        info = {name: each[0].item() for name, each in told.items()} | {"state": thetas[0]}
+        return thetas[0].astype(np.float32), -info["cost"], False, bool(over[0]), info
 
 
 def step_all(
     envs: Sequence[TwinEnv], dynamics: Dynamics, actions: Array
-) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Step envs of one twin as one array; return rows, costs, violations, and who is over.
+) -> tuple[Array, dict[str, NDArray[Any]], NDArray[np.bool_]]:
+    """Step envs of one twin as one array; return rows, what infos tell, and who is over.
 
     Parameters
     ----------
@@ -138,4 +142,11 @@ def step_all(
             theta[row.given] = each._episode.thetas[each._steps, row.given]
         each._theta = theta.copy()
     over = np.array([each._steps >= len(each._episode) for each in envs])
-    return after, costs, envs[0].limits.violated(after), over
+    excess = bound_excess(problem, np.array([row.shown(before), row.shown(after)]), u[None])
+    told = {
+        "cost": costs,
+        "violation": envs[0].limits.violated(after) | (excess.largest > EXCESS_ROOM),
+        "excess": excess.largest,
+        "penalty": excess.penalty,
+    }
+    return after, told, over

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch as th
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
 from sb3_yann.networks.law_layer import LawLayer
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.row_layout import RowLayout
@@ -24,6 +26,8 @@ from sb3_yann.twin.row_layout import RowLayout
 @dataclass(frozen=True)
 class Objective:
     """What is minimized: stage costs, the value at the end, and a penalty beyond limits.
+
+    Bounds of the problem's outputs are limits as well; soft bounds cost what they cost the MPC.
 
     Attributes
     ----------
@@ -41,6 +45,11 @@ class Objective:
     low: Array
     high: Array
     penalty: float
+
+    @cached_property
+    def bounds(self) -> Bounds:
+        """Those of the problem."""
+        return Bounds.of(self.problem)
 
     def slopes(self, rows: Array, inputs: Array, row: RowLayout) -> tuple[Array, Array]:
         """Return the derivatives of the cost of runs by their rows and by the inputs.
@@ -60,7 +69,21 @@ class Objective:
         by_rows[:-1, ..., :size], by_u = both[..., :size], both[..., size:].copy()
         by_rows[-1, ..., :size] = 2 * thetas[-1] @ self.value
         by_rows[:-1, ..., row.state] += 2 * self.penalty * self._beyond(rows[:-1, ..., row.state])
+        by_rows[1:, ..., row.state] += self._slopes_of_bounds(thetas[1:])
         return by_rows, by_u
+
+    def _slopes_of_bounds(self, thetas: Array) -> Array:
+        """Return the derivatives by the states of what soft bounds and those of outputs cost."""
+        bounds, over = self.bounds, self.bounds.beyond(thetas)
+        soft, is_output = bounds.softness > 0, ~bounds.of_states
+        by_bound = np.where(is_output & ~soft, 2 * self.penalty * over, 0.0) / bounds.half
+        for part in (soft & ~is_output, soft & is_output):  # each shares a slack
+            unit = np.where(part, bounds.softness, np.inf) / bounds.half
+            s = np.abs(over) / unit
+            most = (s == s.max(axis=-1, keepdims=True, initial=0.0)) & (s > 0)
+            slope = self.problem.soft.penalty * (1 + 2 * s) / (unit * bounds.half)
+            by_bound = by_bound + np.where(most, np.sign(over) * slope, 0.0)
+        return np.asarray(by_bound @ bounds.C)
 
     def _beyond(self, x: Array) -> Array:
         half = self.problem.theta_half[self.problem.layout.state]
@@ -68,11 +91,12 @@ class Objective:
         return np.asarray(over / half**2)
 
     def costs(self, rows: Array, inputs: Array) -> Array:
-        """Return the costs of runs, without the penalty."""
+        """Return the costs of runs with those of soft bounds, without the penalty."""
         thetas = rows[..., : self.problem.n_theta]
         end = thetas[-1]
         stage = self.problem.stage_cost(thetas[:-1], inputs).sum(axis=0)
-        return np.asarray(stage + np.sum((end @ self.value) * end, axis=-1))
+        soft = bound_excess(self.problem, thetas, inputs).penalty
+        return np.asarray(stage + soft + np.sum((end @ self.value) * end, axis=-1))
 
 
 def actor(layer: LawLayer, problem: LinearMPC) -> Callable[[Array], Array]:

@@ -28,8 +28,8 @@ class _Copies:
         """Take note that an episode has begun: another member may act in it."""
         self._stack = None
 
-    def step(self, actions: Any) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return thetas, costs, violations, and which episodes are over."""
+    def step(self, actions: Any) -> tuple[Array, dict[str, NDArray[Any]], NDArray[np.bool_]]:
+        """Return thetas, what infos tell, and which episodes are over."""
         first = self.envs[0]
         if any(each._theta is None for each in self.envs):
             raise gym.error.ResetNeeded("Call env.reset() before env.step().")
@@ -39,15 +39,15 @@ class _Copies:
         u, shape = np.asarray(actions, np.float64), (len(self.envs), first.dynamics.m)
         if u.shape != shape or not np.all(np.isfinite(u)):
             raise ValueError(f"actions = {actions!r} must be {shape} finite numbers.")
-        rows, costs, violated, over = step_all(self.envs, self._stack, u)
-        return first.dynamics.row.shown(rows), costs, violated, over
+        rows, told, over = step_all(self.envs, self._stack, u)
+        return first.dynamics.row.shown(rows), told, over
 
 
 class TwinVectorEnv(VectorEnv[Single, Single, NDArray[Any]]):
     """Copies of a :class:`TwinEnv` that step as one array; each has a random generator of its own.
 
     Where an episode is over the next one begins in the same step: ``info["final_obs"]`` holds its
-    last observation. ``info["cost"]`` and ``info["violation"]`` are those of the step.
+    last observation. The rest of ``info`` is that of the step.
 
     :meth:`PlantTwin.vector_env` makes one.
 
@@ -110,18 +110,18 @@ class TwinVectorEnv(VectorEnv[Single, Single, NDArray[Any]]):
         self, actions: Single
     ) -> tuple[Single, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Step every copy; whose episode is over starts the next one."""
-        thetas, costs, violated, over = self._copies.step(actions)
-        infos: dict[str, Any] = {"cost": costs, "violation": violated, "state": thetas}
+        thetas, told, over = self._copies.step(actions)
+        infos: dict[str, Any] = {**told, "state": thetas}
         infos |= {f"_{name}": np.ones(self.num_envs, dtype=bool) for name in infos}
         observations = thetas.astype(np.float32)
         for i in np.flatnonzero(over):
-            final = {"cost": costs[i], "violation": violated[i], "state": thetas[i].copy()}
+            final = {name: each[i] for name, each in told.items()} | {"state": thetas[i].copy()}
             ended = {"final_obs": observations[i].copy(), "final_info": final}
             infos = self._add_info(infos, ended, i)
             observations[i], begun = self.envs[i].reset()
             infos["state"][i] = begun["state"]
             self._copies.reset()
-        return observations, -costs, np.zeros_like(over), over, infos
+        return observations, -told["cost"], np.zeros_like(over), over, infos
 
 
 class TwinVecEnv(DummyVecEnv):
@@ -146,19 +146,19 @@ class TwinVecEnv(DummyVecEnv):
 
     def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:
         """Step every copy; whose episode is over starts the next one."""
-        thetas, costs, violated, over = self._copies.step(self.actions)
+        thetas, told, over = self._copies.step(self.actions)
         observations = thetas.astype(np.float32)
         infos: list[dict[str, Any]] = [
-            {"cost": cost, "violation": bad, "state": theta, "TimeLimit.truncated": ended}
-            for cost, bad, theta, ended in zip(
-                costs.tolist(), violated.tolist(), thetas, over.tolist(), strict=True
+            {**dict(zip(told, values, strict=True)), "state": theta, "TimeLimit.truncated": ended}
+            for *values, theta, ended in zip(
+                *(each.tolist() for each in told.values()), thetas, over.tolist(), strict=True
             )
         ]
         for i in np.flatnonzero(over):
             infos[i]["terminal_observation"] = observations[i].copy()
             observations[i], self.reset_infos[i] = self.envs[i].reset()
             self._copies.reset()
-        return observations, -costs.astype(np.float32), over, infos
+        return observations, -told["cost"].astype(np.float32), over, infos
 
 
 def copies(env: TwinEnv, n_envs: int) -> list[TwinEnv]:

@@ -139,7 +139,7 @@ def test_what_passed_is_kept_once_the_latest_last_and_as_far_as_memory_allows(mo
     for value in (0.1, 0.2, 0.3, 0.4):
         correct(policy, RIGHT, value)
         some.append(ActorCheckpoint.of(policy))
-    nothing = Outcome(np.zeros(1), np.zeros((1, 4), np.int64), np.zeros((1, 3), bool))
+    nothing = Outcome(np.zeros(1), np.zeros((1, 7)), np.zeros((1, 3), bool))
     for each in (*some[:3], some[0]):
         keep_passed(session, each, nothing)
     assert [each for each, _ in kept] == [some[1], some[2], some[0]]

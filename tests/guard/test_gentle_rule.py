@@ -85,7 +85,7 @@ def test_a_fall_back_to_the_mpc_is_called_that() -> None:
 
 def test_a_mean_that_is_not_surely_below_the_mpc_s_does_not_pass_the_final_trial() -> None:
     mpc, tolerance = np.full(200, 20.0), Tolerance(2.0, 0.05, 20.0)
-    nothing = np.zeros((200, 4), np.int64), np.zeros((200, 1), bool)
+    nothing = np.zeros((200, 7)), np.zeros((200, 1), bool)
     sure = AcceptanceRule().standard_errors
     assert sure == pytest.approx(1.645, abs=1e-3) and AcceptanceRule(tail=0).standard_errors == 0
     change = np.random.default_rng(0).standard_normal(200)
@@ -100,7 +100,7 @@ def test_a_mean_that_is_not_surely_below_the_mpc_s_does_not_pass_the_final_trial
 @pytest.mark.parametrize(("gain", "passes"), [(0.0009, False), (0.0011, True)])
 def test_a_gain_that_is_sure_and_little_does_not_pass_the_final_trial(gain, passes) -> None:
     mpc, tolerance = np.full(50, -20.0), Tolerance(2.0, 0.05, 20.0)
-    nothing = np.zeros((50, 4), np.int64), np.zeros((50, 1), bool)
+    nothing = np.zeros((50, 7)), np.zeros((50, 1), bool)
     least, outcome = AcceptanceRule().least_gain, Outcome(mpc - 20 * gain, *nothing)
     starts = Starts((*range(50),), Outcome(mpc, *nothing), tolerance, 50, 1.6, least)
     assert starts.objection(outcome).endswith("" if passes else ": too little a gain")
@@ -129,7 +129,7 @@ def test_a_run_that_ends_within_the_warm_up_says_so() -> None:
 
 def test_starts_are_lost_beyond_what_they_may_cost_and_the_hardest_come_first() -> None:
     mpc, tolerance = np.full(6, 20.0), Tolerance(2.0, 0.5, 20.0)
-    nothing = np.zeros((6, 4), np.int64), np.zeros((6, 1), bool)
+    nothing = np.zeros((6, 7)), np.zeros((6, 1), bool)
     starts = Starts((*range(6),), Outcome(mpc, *nothing), tolerance, 6)
     outcome = Outcome(np.array([21.9, 22.1, 23.9, 15.0, 20.0, 50.0]), *nothing)
     assert starts.lost(outcome).tolist() == [False, True, True, False, False, True]

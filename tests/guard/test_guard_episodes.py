@@ -22,9 +22,10 @@ STRICT = Tolerance(1.0)
 
 def outcome(costs: Any, unsafe: Any = None, visits: Any = None) -> Outcome:
     n = len(costs)
-    unsafe = np.zeros((n, 4)) if unsafe is None else unsafe
+    unsafe = np.zeros((n, 7)) if unsafe is None else np.array(unsafe, float)
+    unsafe = np.pad(unsafe, ((0, 0), (0, 7 - unsafe.shape[1])))
     visits = np.ones((n, 2)) if visits is None else visits
-    return Outcome(np.array(costs, float), np.array(unsafe, np.int64), np.array(visits, bool))
+    return Outcome(np.array(costs, float), unsafe, np.array(visits, bool))
 
 
 def starts(costs: Any, tolerance: Tolerance = STRICT, sure: float = 0.0, **more: Any) -> Starts:
@@ -34,11 +35,11 @@ def starts(costs: Any, tolerance: Tolerance = STRICT, sure: float = 0.0, **more:
 
 def test_a_large_step_of_an_input_breaks_nothing_and_all_else_does() -> None:
     calm = outcome([1.0, 2.0])
-    for column in range(4):
-        unsafe = np.zeros((2, 4))
+    for column in range(6):
+        unsafe = np.zeros((2, 7))
         unsafe[1, column] = 1
         worse = outcome([1.0, 2.0], unsafe)
-        assert worse.breaks_more_than(calm) == (column < 3)
+        assert worse.breaks_more_than(calm) == (column != 3)
         assert not calm.breaks_more_than(worse) and not worse.breaks_more_than(worse)
         assert starts([1.0, 2.0]).more_unsafe(worse).tolist() == [False, True]
         assert starts([1.0, 2.0], unsafe=unsafe).more_unsafe(worse).tolist() == [False, False]
@@ -51,7 +52,7 @@ def test_episodes_are_picked_joined_and_replaced() -> None:
     longer = one.extended_by(outcome([7.0]))
     assert longer.costs.tolist() == [1, 2, 3, 7] and len(longer.unsafe) == len(longer.visits) == 4
     other = one.replaced([1], outcome([9.0], [[1, 2, 3, 4]], [[0, 0]]))
-    assert other.costs.tolist() == [1, 9, 3] and other.unsafe[1].tolist() == [1, 2, 3, 4]
+    assert other.costs.tolist() == [1, 9, 3] and other.unsafe[1, :4].tolist() == [1, 2, 3, 4]
     assert other.visits[1].tolist() == [False, False]
     assert one.costs.tolist() == [1, 2, 3]  # as it was
 
@@ -127,7 +128,8 @@ def test_the_evidence_pairs_the_accepted_policy_with_the_mpc() -> None:
     evidence = Evidence((1, 2), mpc, STRICT, 7, accepted=accepted)
     paired = evidence.paired
     assert paired.mpc_costs is mpc.costs and paired.costs is accepted.costs
-    assert paired.unsafe is accepted.unsafe and (paired.tolerance, paired.n_starts) == (STRICT, 7)
+    assert np.array_equal(paired.unsafe, accepted.unsafe)
+    assert (paired.tolerance, paired.n_starts) == (STRICT, 7)
     assert evidence.visits is accepted.visits
 
 

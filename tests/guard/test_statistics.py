@@ -8,7 +8,7 @@ from scipy import stats
 
 from sb3_yann.guard.statistics import PairedEpisodes, Tolerance, tail_average
 
-NONE = np.zeros((3, 4), dtype=np.int64)
+NONE = np.zeros((3, 7))
 NAN, INF = np.nan, np.inf
 
 
@@ -58,7 +58,7 @@ def test_without_a_margin_no_start_may_cost_more() -> None:
 
 def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_costs() -> None:
     def violations(*steps: int):
-        return np.column_stack([steps, np.zeros((3, 3), np.int64)])
+        return np.column_stack([steps, np.zeros((3, 6))])
 
     message = "1 starts with violations, the first is number 2"
     assert message in objection([1, 1, 1], violations(0, 0, 1))
@@ -70,11 +70,13 @@ def test_any_violation_more_than_the_accepted_policy_s_is_refused_whatever_it_co
 
 
 def test_an_episode_that_is_terminated_is_refused_though_it_has_fewer_violations() -> None:
-    accepted = np.array([[2, 0, 0, 0], [0, 1, 0, 0]])
+    accepted = np.pad([[2, 0], [0, 1]], ((0, 0), (0, 5)))
     paired = PairedEpisodes(np.ones(2), np.ones(2), accepted, Tolerance(1.0))
-    assert "the env ends" in paired.objection(np.zeros(2), np.array([[1, 1, 0, 0], [0, 1, 0, 0]]))
+    assert "the env ends" in paired.objection(
+        np.zeros(2), np.pad([[1, 1], [0, 1]], ((0, 0), (0, 5)))
+    )
     assert paired.objection(np.zeros(2), accepted) == ""
-    assert "violations" in paired.objection(np.zeros(2), np.array([[2, 0, 0, 0], [1, 0, 0, 0]]))
+    assert "violations" in paired.objection(np.zeros(2), np.pad([[2, 0], [1, 0]], ((0, 0), (0, 5))))
 
 
 def test_with_a_tail_the_worst_starts_count_on_average() -> None:
@@ -84,7 +86,7 @@ def test_with_a_tail_the_worst_starts_count_on_average() -> None:
     def reason(worst: list[float], rule: Tolerance = allowed) -> str:
         policy = costs.copy()
         policy[: len(worst)] = mpc[: len(worst)] + worst
-        nothing = np.zeros((100, 4), np.int64)
+        nothing = np.zeros((100, 7))
         return PairedEpisodes(mpc, mpc, nothing, rule).objection(policy, nothing)
 
     assert reason([0.9, 0.1]) == ""  # (.9 + .1 - 3 * .5) / 5 is below .2
@@ -173,7 +175,7 @@ def test_what_a_dear_start_may_cost_more_grows_with_its_cost() -> None:
 
 
 def test_the_first_start_of_several_is_named() -> None:
-    now = np.zeros((3, 4), np.int64)
+    now = np.zeros((3, 7))
     now[1:, 3] = 2
     said = PairedEpisodes(np.ones(3), np.ones(3), NONE, Tolerance(1.0)).objection(np.ones(3), now)
     assert said == "2 starts with an input that moves too far in one step, the first is number 1"

@@ -26,9 +26,11 @@ class Bounds:
         Combinations of the states.
     low, high, half : ndarray, shape (k,)
         Their bounds, one of which is finite at least, and half-widths: of theta's box, or of the
-        outputs in it.
+        outputs in it. Where a state's box has an open side, the size of its bound.
     softness : ndarray, shape (k,)
         The violation that counts as one unit where a bound is soft, 0 where it is hard.
+    of_states : ndarray of bool, shape (k,)
+        Which are of single states; the others are of outputs.
     states : slice
         Where theta has the states.
     """
@@ -38,12 +40,18 @@ class Bounds:
     high: Array
     half: Array
     softness: Array
+    of_states: NDArray[np.bool_]
     states: slice
 
     @classmethod
     def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
         """Return those of a problem, and of its states (n,) besides."""
-        outputs, size = problem.outputs, problem.theta_half[problem.layout.state]
+        outputs, n = problem.outputs, problem.model.n_states
+        size = (problem.theta_max - problem.theta_min)[:n] / 2
+        # Without a box the size of a bound is the unit: one that is fixed would be hidden.
+        ends = np.abs([problem.x_min, problem.x_max, problem.theta_min[:n], problem.theta_max[:n]])
+        ends = np.max(np.where(np.isfinite(ends), ends, 0.0), axis=0)
+        size = np.where(np.isfinite(size) & (size > 0), size, np.where(ends > 0, ends, 1.0))
         C = np.vstack([np.eye(len(size)), outputs.C])
         lowest = np.concatenate([np.maximum(problem.x_min, low), outputs.y_min])
         highest = np.concatenate([np.minimum(problem.x_max, high), outputs.y_max])
@@ -56,6 +64,7 @@ class Bounds:
             high=highest[used],
             half=half[used],
             softness=softness[used],
+            of_states=(np.arange(len(used)) < n)[used],
             states=problem.layout.state,
         )
 
@@ -127,7 +136,7 @@ def bound_excess(
         either = _counted(np.concatenate([over, *parts], axis=-1), counted)
         penalty = np.zeros(thetas.shape[1:-1])
         for first in (True, False):  # the states' bounds share a slack, the outputs' another
-            soft = (bounds.softness > 0) & (_of_states(bounds, problem) == first)
+            soft = (bounds.softness > 0) & (bounds.of_states == first)
             if np.any(soft):
                 unit = bounds.half[soft] / bounds.softness[soft]
                 s = np.max(_counted(over[..., soft], counted) * unit, axis=-1)
@@ -144,12 +153,6 @@ def _counted(over: Array, taken: NDArray[np.bool_]) -> Array:
     """Return an excess without rounding, 0 where a step does not count, inf for NaN."""
     over = np.where(np.isnan(over), np.inf, over)
     return np.where(taken & (over > ROUNDING), over, 0.0)
-
-
-def _of_states(bounds: Bounds, problem: MPCProblem) -> NDArray[np.bool_]:
-    """Tell which bounds are of single states, which come first."""
-    states = np.isfinite(problem.x_min) | np.isfinite(problem.x_max)
-    return np.arange(len(bounds.half)) < np.count_nonzero(states)
 
 
 def excess_of_episodes(problem: MPCProblem, episodes: Iterable[tuple[Array, Array]]) -> BoundExcess:

@@ -1,0 +1,114 @@
+"""The guard and `improve` keep the problem's own bounds where the env reports nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3 import DDPG
+
+from sb3_yann import LinearModel, LinearMPC, OutputBounds, SoftBounds
+from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.control.mpc.bound_excess import excess_of_episodes
+from sb3_yann.evaluation import evaluate
+from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
+from sb3_yann.wrappers import StageCost
+
+A = np.array([[1, 0.2], [0, 1]])
+B = np.array([[0.02], [0.2]])
+LIMIT = 0.6
+COMMON: Any = {"Q": np.diag([1, 0]), "R": [[0.05]], "horizon": 6, "u_min": -2, "u_max": 2}
+WIDE: Any = {"theta_min": [-3, -2], "theta_max": [3, 2]}
+BOX: Any = {"x_min": [-9, -LIMIT], "x_max": [9, LIMIT]}
+KINDS: dict[str, Any] = {
+    "hard states": {**BOX, "theta_min": [-3, -LIMIT], "theta_max": [3, LIMIT]},
+    "hard outputs": {**WIDE, "outputs": OutputBounds([[0, 1]], -LIMIT, LIMIT)},
+    "soft states": {**WIDE, **BOX, "soft": SoftBounds(x=[0, LIMIT], penalty=500)},
+}
+
+
+class Carriage(gym.Env[Any, Any]):
+    """A double integrator whose info says nothing."""
+
+    observation_space = gym.spaces.Box(-20, 20, (2,), np.float64)
+    action_space = gym.spaces.Box(-2, 2, (1,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Begin at rest."""
+        super().reset(seed=seed)
+        self.x = np.array([self.np_random.uniform(-2, 2), 0.0])
+        return self.x.copy(), {}
+
+    def step(self, action: Any) -> Any:
+        """Move."""
+        self.x = A @ self.x + B @ np.clip(action, -2, 2)
+        return self.x.copy(), 0.0, False, False, {}
+
+
+def carriage(kind: str) -> tuple[LinearMPC, Any]:
+    mpc = LinearMPC(LinearModel(A, B, dt=0.2), **COMMON, **KINDS[kind])
+    return mpc, lambda: TimeLimit(StageCost(Carriage(), mpc), 25)
+
+
+def hasty(theta: Any) -> Any:
+    """Reach a speed of half as much again as the limit."""
+    wanted = np.clip(-1.2 * theta[0], -1.5 * LIMIT, 1.5 * LIMIT)
+    return np.clip([(wanted - theta[1]) / 0.2], -2, 2)
+
+
+@pytest.mark.parametrize("kind", ["hard states", "hard outputs"])
+def test_a_policy_that_is_cheaper_beyond_a_hard_bound_is_refused(kind: str) -> None:
+    mpc, make = carriage(kind)
+    law = mpc.law()
+    played = [evaluate(each, make, range(4)) for each in (law, hasty)]
+    assert played[1].costs.mean() < played[0].costs.mean()
+    found = [excess_of_episodes(mpc, zip(p.observations, p.actions, strict=True)) for p in played]
+    unsafe = [unsafe_columns(0, 0, 0, each) for each in found]
+    paired = PairedEpisodes(played[0].costs, played[0].costs, unsafe[0], Tolerance(1e9))
+    assert "a larger excess over the problem's bounds" in paired.objection(
+        played[1].costs, unsafe[1]
+    )
+    assert not less_safe(unsafe[0], unsafe[0]).any()
+    assert found[0].largest.max() < 1e-3
+
+
+def test_a_soft_bound_costs_what_the_mpc_says_and_is_no_excess() -> None:
+    mpc, make = carriage("soft states")
+    played = [evaluate(each, make, range(4)) for each in (mpc.law(), hasty)]
+    found = [excess_of_episodes(mpc, zip(p.observations, p.actions, strict=True)) for p in played]
+    assert played[1].costs.mean() < played[0].costs.mean()  # without the penalty
+    totals = [(p.costs + each.penalty).mean() for p, each in zip(played, found, strict=True)]
+    assert totals[1] > totals[0]
+    assert not found[1].largest.any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_guard_never_accepts_a_faster_policy_than_the_bounds_let(kind: str) -> None:
+    from guard_samples import At, correct
+    from sb3_yann import ImprovementGuard, NoActionNoise
+
+    mpc, make = carriage(kind)
+    options = {"problem": mpc, "networks": "shared"}
+    model = DDPG("YannPolicy", make(), policy_kwargs=options, device="cpu", seed=0,
+                 learning_starts=10**6)  # fmt: skip
+    guard = ImprovementGuard(make, n_starts=4, n_new_starts=4, n_final_starts=4, eval_every=1)
+    pushed = At([20], lambda policy: correct(policy, slice(None), 0.5))
+    model.learn(60, callback=[NoActionNoise(), pushed, guard])
+    log = evaluate(model, make, range(20, 30))
+    assert guard.decisions
+    assert max(np.abs(each[:, 1]).max() for each in log.observations) < LIMIT * 1.01
+
+
+def test_stage_cost_tells_the_excess_and_the_penalty() -> None:
+    for kind, hard in (("hard states", True), ("hard outputs", True), ("soft states", False)):
+        _, make = carriage(kind)
+        env = make()
+        env.reset(seed=1)
+        infos = [env.step(np.array([2.0]))[4] for _ in range(4)]
+        assert (infos[-1]["excess"] > 0.1) == hard
+        assert infos[-1].get("violation", False) == hard
+        assert (infos[-1]["penalty"] > 0) != hard
+        assert infos[0]["excess"] == infos[0]["penalty"] == 0
