@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from types import FrameType
 from typing import Any
 
 import torch as th
@@ -17,7 +18,7 @@ def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
     the way. The algorithm is the one whose `_setup_model` is running, or that holds the learning
     rate. Called from a policy's `__init__` only.
     """
-    frame = sys._getframe(1)
+    frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         held = frame.f_locals
         caller = held.get("self")
@@ -27,7 +28,7 @@ def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
             if isinstance(each, BaseAlgorithm):
                 if getattr(each, "lr_schedule", None) is lr_schedule:
                     return each
-        frame = frame.f_back  # type: ignore[assignment]
+        frame = frame.f_back
     return None
 
 

@@ -154,7 +154,7 @@ def _shape(value: Any) -> tuple[int, ...] | None:
     if not isinstance(value, list | tuple) and not hasattr(value, "shape"):
         return None
     try:
-        return np.shape(value)
+        return tuple(np.shape(value))
     except ValueError:  # a list of unequal ones
         return None
 
