@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import gymnasium as gym
@@ -41,7 +42,7 @@ class Lagging(gym.Env[Any, Any]):
 
 
 def twin(plant: Lagging, episodes: int = 6) -> PlantTwin:
-    log = evaluate(MPC.explicit(), lambda: plant, range(100, 100 + episodes))
+    log = evaluate(MPC.explicit(), lambda: copy.copy(plant), range(100, 100 + episodes))
     return PlantTwin.fit(MPC, [*zip(log.observations, log.actions, strict=True)])
 
 
@@ -50,7 +51,10 @@ def test_a_memory_predicts_the_episode_of_a_lagging_actuator_as_the_plant_plays_
     found = twin(plant)
     memory = found.hidden_dynamics
     assert memory is not None
-    law, (episode,) = MPC.explicit(), evaluate(MPC.explicit(), lambda: plant, [900]).observations
+    law, (episode,) = (
+        MPC.explicit(),
+        evaluate(MPC.explicit(), lambda: copy.copy(plant), [900]).observations,
+    )
     starts, given = episode[:1][None], np.zeros((40, 1, 0))
     errors = [
         np.abs(each.roll_out(lambda x: law(x), starts, 40, given)[0][:, 0, 0] - episode).max()
@@ -71,5 +75,5 @@ def test_a_twin_that_knows_no_lag_promises_nothing_that_the_plant_does_not_keep(
     model = DDPG("YannPolicy", fitted.env(), policy_kwargs={"problem": MPC}, device="cpu", seed=1)
     if improve(model, fitted, iterations=60, seed=1).accepted:
         seeds = range(5000, 5100)
-        ours = evaluate(model, lambda: plant, seeds).costs
-        assert ours.mean() < evaluate(MPC.explicit(), lambda: plant, seeds).costs.mean()
+        ours = evaluate(model, lambda: copy.copy(plant), seeds).costs
+        assert ours.mean() < evaluate(MPC.explicit(), lambda: copy.copy(plant), seeds).costs.mean()
