@@ -46,21 +46,20 @@ def twin(plant: Lagging, episodes: int = 6) -> PlantTwin:
     return PlantTwin.fit(MPC, [*zip(log.observations, log.actions, strict=True)])
 
 
-def test_a_memory_predicts_the_episode_of_a_lagging_actuator_as_the_plant_plays_it() -> None:
+def test_a_memory_predicts_episodes_of_a_lagging_actuator_better_than_no_memory() -> None:
     plant = Lagging(0.4, 0.5, noise=0.0)
     found = twin(plant)
     memory = found.hidden_dynamics
     assert memory is not None
-    law, (episode,) = (
-        MPC.explicit(),
-        evaluate(MPC.explicit(), lambda: copy.copy(plant), [900]).observations,
-    )
-    starts, given = episode[:1][None], np.zeros((40, 1, 0))
-    errors = [
-        np.abs(each.roll_out(lambda x: law(x), starts, 40, given)[0][:, 0, 0] - episode).max()
-        for each in (memory, found.second_opinion)
-    ]
-    assert errors[0] < 0.3 * errors[1]
+    law = MPC.explicit()
+    played = np.array(evaluate(law, lambda: copy.copy(plant), range(900, 920)).observations)
+    given = np.zeros((40, len(played), 0))
+    errors = []
+    for each in (memory, found.second_opinion, found.dynamics):
+        starts = np.repeat(played[None, :, 0], len(getattr(each, "members", [0])), axis=0)
+        rows = each.roll_out(lambda x: law(x), starts, 40, given)[0][:, 0, :, 0]
+        errors.append(np.sqrt(np.mean((rows - played[:, :, 0].T) ** 2)))
+    assert errors[0] < 0.7 * min(errors[1:])
 
 
 @pytest.mark.slow
