@@ -107,7 +107,8 @@ class Headroom:
         )
         lines = [
             f"By its own stage cost the MPC costs {mpc:.5g} from {len(self.mpc_costs)} starts of "
-            f"{self.source}; the best that was found {best:.5g}: {-100 * self.total:+.2f} % +- "
+            f"{self.source}; the best that was found {best:.5g}: "
+            f"{0.0 - 100 * self.total:+.2f} % +- "
             f"{100 * self.standard_error:.2f} (from {each.min():+.2f} to {each.max():+.2f} % by "
             "start).",
             *(f"  {name}: {0.0 - 100 * part:+.2f} %" for name, part in parts),

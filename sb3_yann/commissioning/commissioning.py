@@ -190,8 +190,10 @@ class Commissioning:
         turn = np.random.default_rng([self.seed, len(journal.batches), number // 2]).integers(2)
         acts = trial and not doubted and turn == number % 2
         self.incumbent.restore()
-        # A simulator gives both of a pair the same start.
-        first = plant.begin(self.seed + len(journal.episodes) - (number % 2 if trial else 0))
+        # A simulator gives both of a pair the same start, but not after an alarm: an odd start
+        # would look like a changed plant.
+        again = number % 2 if trial and not journal.doubted else 0
+        first = plant.begin(self.seed + len(journal.episodes) - again)
         journal.begin(acts)
         try:
             act = plant.policy if acts else plant.mpc
@@ -353,7 +355,7 @@ class Commissioning:
         if outlook.tried:
             self.incumbent.candidate = None
         self.incumbent.hold()
-        if outlook.kept is not None:
+        if outlook.kept is not None and outlook.model is not None:
             whole = self.policy.max_correction
             self.journal.record.load(outlook.kept, outlook.kept_digest, self.model)
             self.incumbent.limit(outlook.kept_bound)

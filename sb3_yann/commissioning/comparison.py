@@ -1,4 +1,4 @@
-"""What a batch cost on the plant, with the policy and with the MPC in turns, and was predicted to."""
+"""What a batch cost on the plant, with policy and MPC in turns, and what was predicted."""
 
 from __future__ import annotations
 

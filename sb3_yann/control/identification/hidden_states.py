@@ -102,7 +102,7 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     parts = np.array_split(np.arange(steps), FOLDS)
 
     def left(*groups: Array) -> Array:
-        return _held_out(np.column_stack([plain, *groups]), target_left, parts) + floor
+        return np.asarray(_held_out(np.column_stack([plain, *groups]), target_left, parts) + floor)
 
     squares = features(now - center)
     lagged = [
