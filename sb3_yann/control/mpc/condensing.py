@@ -54,11 +54,8 @@ class _Prediction:
     def rate(self, problem: MPCProblem, k: int) -> tuple[Array, Array]:
         """Return rows (m, N m) and (m, n_theta) for ``u_k - u_{k-1} = rows V + rows theta``."""
         inputs, start = self.inputs(k)
-        if k > 0:
-            inputs_before, start_before = self.inputs(k - 1)
-            return inputs - inputs_before, start - start_before
-        start[:, problem.layout.previous] -= np.eye(len(inputs))
-        return inputs, start
+        before = problem.layout.previous
+        return inputs - self.forced[k][before], start - self.powers[k][before]
 
 
 class _Rows:
@@ -121,13 +118,14 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
     if plain is not None and not _error(problem, plain[0]) > _error(problem, found[0]):
         found = plain
     error = _error(problem, found[0])
-    if error > OFF:
+    if error > OFF or (plain is None and np.isnan(error)):
         poles = np.linalg.eigvals(problem.model.A)
         pole = poles[np.argmax(np.abs(poles))]
         raise ValueError(
             f"With horizon = {problem.horizon} and the pole {pole if pole.imag else pole.real:.6g} "
             f"of the model, rounding hides the law: without constraints it is off by {error:.1e} "
-            f"half-widths of the input range, and may be by {OFF:g}. Pass a shorter horizon, leave "
+            f"half-widths of the input range (nan: it is not unique), and may be by {OFF:g}. Give "
+            "states that grow a weight in Q, pass a shorter horizon, leave "
             "the terminal cost to the Riccati equation, or bring states, inputs and weights to "
             "similar magnitudes."
         )
@@ -144,15 +142,23 @@ def _stabilizing_feedback(problem: MPCProblem) -> Array:
     """Return K (m, n_theta) with ``u = K theta`` a law that brings the model to its steady state.
 
     It is the gain of the terminal cost where that stabilizes: then the Hessian is as well
-    conditioned as a single step's. Else it is the one of the problem without a discount.
+    conditioned as a single step's. Else the gain of the problem without a discount, or of unit
+    weights, where Q leaves a mode on the unit circle without one. Where no gain stabilizes, as a
+    mode grows that no input reaches, it is the one whose loop grows least.
     """
-    errors = problem.error_system
-    weights = errors.R, problem.terminal.cost
-    gain = lqr.gain(errors.model, *weights, problem.gamma, errors.cross)
-    if lqr.spectral_radius(errors.model.A - errors.model.B @ gain) >= 1:
-        with suppress(ValueError):  # a mode on the unit circle without weight: it does not grow
-            P = lqr.riccati(errors.model, errors.Q, errors.R, cross=errors.cross)
-            gain = lqr.gain(errors.model, errors.R, P, cross=errors.cross)
+    errors, box = problem.error_system, problem.theta_half[problem.layout.state]
+    model, gamma = errors.model, problem.gamma
+    unit = np.concatenate([box, problem.u_half])[: len(errors.Q)] ** -2.0
+    plain = np.diag(unit), np.diag(problem.u_half**-2.0), None
+    own = errors.Q, errors.R, errors.cross
+    gains = [lqr.gain(model, errors.R, problem.terminal.cost, gamma, errors.cross)]
+    for (Q, R, cross), discount in ((own, 1.0), (plain, 1.0), (plain, gamma)):
+        if lqr.spectral_radius(model.A - model.B @ gains[-1]) < 1:
+            break
+        with suppress(ValueError):  # it has no such gain
+            P = lqr.riccati(model, Q, R, discount, cross)
+            gains.append(lqr.gain(model, R, P, discount, cross))
+    gain = min(reversed(gains), key=lambda K: lqr.spectral_radius(model.A - model.B @ K))
     return np.asarray(errors.to_input - gain @ errors.to_error)
 
 
@@ -164,18 +170,21 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     so.
     """
     errors, gamma = problem.error_system, problem.gamma
-    A, B, P = errors.model.A, errors.model.B, problem.terminal.cost
+    A = errors.model.A
+    B = errors.model.B
+    P = problem.terminal.cost
+    cross = np.zeros(B.shape) if errors.cross is None else errors.cross
+    weight = np.block([[errors.Q, cross], [cross.T, errors.R]])
     count, m = len(program.c) - program.n_slacks, problem.model.n_inputs
     try:
         for _ in range(problem.horizon):
             gain = lqr.gain(errors.model, errors.R, P, gamma, errors.cross)
-            slope = (
-                gamma * A.T @ P @ B if errors.cross is None else gamma * A.T @ P @ B + errors.cross
-            )
-            P = errors.Q + gamma * A.T @ P @ A - slope @ gain
-            P = (P + P.T) / 2
+            # As a sum of squares: of a large terminal cost a difference would leave rounding.
+            law = np.vstack([np.eye(len(A)), -gain])
+            closed = A - B @ gain
+            P = law.T @ weight @ law + gamma * closed.T @ P @ closed
         factor = linalg.cho_factor(program.H[:count, :count])
-    except np.linalg.LinAlgError:
+    except (np.linalg.LinAlgError, ValueError):  # not definite, or numbers that overflow
         return np.nan
     own = -linalg.cho_solve(factor, program.F[:count])[:m]
     if program.feedback is not None:

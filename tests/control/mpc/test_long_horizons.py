@@ -76,3 +76,36 @@ def test_where_digits_are_lost_an_error_names_the_horizon_and_the_pole(kind) -> 
     mpc = LinearMPC(nearly, Q=np.eye(2), R=[[1]], horizon=90, **BOX)
     with pytest.raises(ValueError, match=r"horizon = 90 and the pole 2 of the model"):
         mpc.law(kind)
+
+
+def test_where_the_problems_own_gains_do_not_stabilize_another_one_does() -> None:
+    """A mode on the unit circle without a weight has no Riccati gain; the law needs none."""
+    model = LinearModel([[1.8, 0], [0, 1]], [[1], [0.5]], dt=1)
+    short = Terminal(cost=np.zeros((2, 2)))
+    mpc = LinearMPC(model, Q=np.diag([1, 0]), R=[[1]], horizon=70, terminal=short, **BOX)
+    error, _, compared = errors(mpc, 8, explicit=False)
+    assert compared and error < 1e-8
+
+
+def test_a_mode_that_no_input_reaches_may_grow_beside_one_that_is_steadied() -> None:
+    model = LinearModel([[1.7, 0.2], [0, 1.01]], [[1], [0]], dt=1)
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=70, gamma=0.95, **BOX)
+    error, _, compared = errors(mpc, 8, explicit=False)
+    assert compared and error < 1e-8
+
+
+@pytest.mark.parametrize("cost", [1e7, 1e11])
+def test_a_large_terminal_cost_is_no_loss_of_digits(cost) -> None:
+    model = LinearModel([[2.3, 0.3], [0, 0.5]], [[1], [1]], dt=1)
+    stiff = Terminal(cost=cost * np.eye(2))
+    mpc = LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=50, terminal=stiff, **BOX)
+    error, _, compared = errors(mpc, 8, explicit=False)
+    assert compared and error < 1e-8
+
+
+def test_a_mode_that_grows_and_costs_nothing_is_named_with_the_horizon() -> None:
+    model = LinearModel([[2.1, 0], [0, 0.5]], [[1], [1]], dt=1)
+    blind = Terminal(cost=np.zeros((2, 2)))
+    mpc = LinearMPC(model, Q=np.diag([0, 1]), R=[[1]], horizon=55, terminal=blind, **BOX)
+    with pytest.raises(ValueError, match=r"horizon = 55 and the pole 2\.1 .*a weight in Q"):
+        mpc.online()
