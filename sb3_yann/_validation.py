@@ -302,7 +302,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _bound(name: str, value: ArrayLike | None, size: int, missing: float) -> Array:
-    if is_kept(value) and np.shape(value) == (size,):
+    if is_kept(value) and np.asarray(value).shape == (size,):
         return np.asarray(value)  # the array itself: dataclasses.replace passes what is stored
     array = to_float(name, missing if value is None else value)
     array = np.full(size, float(array)) if array.ndim == 0 else array

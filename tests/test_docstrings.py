@@ -108,7 +108,9 @@ def undocumented(function: Callable[..., Any], text: str) -> list[str]:
     given = [
         each.name
         for each in inspect.signature(function).parameters.values()
-        if each.name not in ("self", "cls") and each.kind not in (each.VAR_KEYWORD,)
+        if each.name not in ("self", "cls")
+        and each.kind not in (each.VAR_KEYWORD,)
+        and not each.name.startswith("_")  # what `dataclasses.replace` passes
     ]
     if len(given) < MANY:
         return []

@@ -66,7 +66,7 @@ class Loops:
             unsafe_columns(each.violations, -each.lengths, ~np.isfinite(each.costs), each.excess)
             for each in (self, others)
         ]
-        return np.asarray(~less_safe(*unsafe).any(axis=1))
+        return np.asarray(~less_safe(unsafe[0], unsafe[1]).any(axis=1))
 
     def steps(self) -> tuple[Array, Array, Array]:
         """Return thetas, inputs and following thetas of all steps, (steps, ...)."""

@@ -100,7 +100,7 @@ class Commissioning:
     ('MPC', 2)
     """
 
-    def __init__(  # noqa: PLR0913 (settings of a user, each by its name)
+    def __init__(
         self,
         model: OffPolicyAlgorithm,
         plant_env: Source,

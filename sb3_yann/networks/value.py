@@ -180,7 +180,7 @@ class AfterstateValue(nn.Module):
     value_scale: th.Tensor
     W: th.Tensor
 
-    def __init__(  # noqa: PLR0913 (a user's options of the critic)
+    def __init__(
         self,
         W: Array,
         P: Array,

@@ -105,7 +105,7 @@ def _constraint_findings(problem: LinearMPC, loops: dict[str, Episodes]) -> tupl
     """Return whether the policy exceeds bounds of the problem by more than the MPC does."""
     mpc, policy = (excess_of_episodes(problem, _pairs(loops[who])) for who in (MPC, POLICY))
     sides = [unsafe_columns(0, 0, 0, each) for each in (policy, mpc)]
-    breach = bool(np.any(less_safe(*sides)))
+    breach = bool(np.any(less_safe(sides[0], sides[1])))
     worst = int(np.argmax(policy.largest - mpc.largest))
     text = (
         "Excess over the hard bounds of the problem, in half-widths: "

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sb3_yann._validation import Array
@@ -236,11 +237,11 @@ def _scaled(
             )
 
 
-def _against_model(
+def _against_model(  # noqa: C901 (one question after the other)
     problem: LinearMPC,
     coordinates: Coordinates,
     episodes: tuple[Episode, ...],
-    own: Array,
+    own: NDArray[np.intp],
     names: list[str],
 ) -> Iterator[str]:
     """Yield where inputs that do not follow the law act otherwise than the model says.
@@ -281,7 +282,7 @@ def _against_model(
         if not np.any(weights):
             continue
         gain = float(weights @ fit.B[:, j])
-        error = float(np.sqrt(max(weights @ fit.covariance @ weights, 0.0)) * fit.factors[j])
+        error = float(np.sqrt(max(float(weights @ fit.covariance @ weights), 0.0)) * fit.factors[j])
         if gain + SURE * error < 0 and gain < -LITTLE:
             yield (
                 f"The logged {names[j]} moves the plant against the sign of the model's B "
@@ -307,7 +308,7 @@ def _causes(after: _Gains, fit: _Gains, B: Array, coordinates: Coordinates) -> b
     """
     columns = zip(B.T, after.B.T, strict=True)
     gains = [_weights(b, coordinates.units) @ found for b, found in columns]
-    return min(fit.follows) > FOLLOWS or min(gains) > GAINS[0]
+    return bool(min(fit.follows) > FOLLOWS or min(gains) > GAINS[0])
 
 
 def _resting(
@@ -395,18 +396,18 @@ class _Gains:
         return cls(*effects, squares, slopes[m], np.sqrt(squares) * factors[m], follows)
 
 
-def _exchanged(fit: _Gains, B: Array, units: Array) -> Array:
+def _exchanged(fit: _Gains, B: Array, units: Array) -> NDArray[np.intp]:
     """Return whose direction of the model's B each input has (m,), in units of the states.
 
     Its own, unless others clearly fit better.
     """
-    own = np.arange(B.shape[1])
+    own: NDArray[np.intp] = np.arange(B.shape[1], dtype=np.intp)
     sizes = np.linalg.norm(fit.B / np.sqrt(np.diag(fit.covariance))[:, None], axis=0)
     if len(own) == 1 or np.any(SURE * np.sqrt(len(B)) * fit.factors > sizes):
         return own  # too little is known
     found, given = (each / units[:, None] for each in (fit.B, B))
     norms = np.outer(np.linalg.norm(found, axis=0), np.linalg.norm(given, axis=0))
     apart = 1 - (found.T @ given / np.maximum(norms, 1e-300)) ** 2
-    columns = np.asarray(linear_sum_assignment(apart)[1])
+    columns = np.asarray(linear_sum_assignment(apart)[1], dtype=np.intp)
     clearly = apart[own, columns].sum() < CLEARLY**2 * apart[own, own].sum()
     return columns if clearly else own

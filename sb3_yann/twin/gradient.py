@@ -81,7 +81,7 @@ class Objective:
             unit = np.where(part, bounds.softness, np.inf) / bounds.half
             s = np.abs(over) / unit
             most = (s == s.max(axis=-1, keepdims=True, initial=0.0)) & (s > 0)
-            slope = self.problem.soft.penalty * (1 + 2 * s) / (unit * bounds.half)
+            slope = (self.problem.soft.penalty or 0.0) * (1 + 2 * s) / (unit * bounds.half)
             by_bound = by_bound + np.where(most, np.sign(over) * slope, 0.0)
         return np.asarray(by_bound @ bounds.C)
 

@@ -112,7 +112,7 @@ class BudgetTimer:
         self.tick(effort)
 
     def tick(self, effort: float = 0.0) -> None:
-        """Count effort that is ahead; raise ExplicitLimitError if it is too much, or time is over."""
+        """Count effort ahead; raise ExplicitLimitError if it is too much, or time is over."""
         self.effort += effort
         limit = self.budget.effort_limit
         if limit is not None and self.effort > limit:

@@ -187,7 +187,10 @@ class Certificate:
         left = [i for i in range(len(self.regions)) if i not in dropped]
         sets = [self.regions[i].active_set for i in left]
         (v, n), rows = self.program.F.shape, len(self.program.w)
-        numbers = lambda size: (v + size) * (v + size + rows + n + 1)
+
+        def numbers(size: int) -> float:
+            return (v + size) * (v + size + rows + n + 1)
+
         for size, members in batches(map(len, sets), numbers):
             effort = effort_of_conditions(rows + n, v + size, v + size)
             self.timer.tick(len(members) * effort)
@@ -216,7 +219,8 @@ class Certificate:
         """Return which conditions the half-spaces of region i just do not imply.
 
         They are left out where they seem to touch the region alone. Raise if it lies farther
-        beyond one, and a QP there disagrees; ``known`` tells which of the conditions are among the half-spaces.
+        beyond one, and a QP there disagrees; ``known`` tells which of the conditions are among the
+        half-spaces.
         """
         region, n, (inside, radius) = self.regions[i], len(ball[0]), ball
         if radius <= 0 or np.any(kkt.rows[:, n] + IMPLIED < kkt.rows[:, :n] @ inside):

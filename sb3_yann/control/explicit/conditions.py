@@ -161,7 +161,10 @@ class Conditions:
         """Yield the regions with an interior among those of some active sets."""
         rows, v = self.N.shape
         width = v + self.outer_A.shape[1] + 1
-        numbers = lambda size: (rows + v) * (size + width)
+
+        def numbers(size: int) -> float:
+            return (rows + v) * (size + width)
+
         for size, members in batches((active.bit_count() for active in wave), numbers):
             if size <= v:
                 self.tick(len(members) * effort_of_conditions(rows, v, size))

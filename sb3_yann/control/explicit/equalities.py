@@ -46,16 +46,16 @@ class Equalities:
         these is largest, each counted up to a small one; None if there is no point.
         """
         A, b = np.hstack([program.G, -program.S]), program.w
-        left = np.arange(len(b))
+        left: NDArray[np.intp] = np.arange(len(b), dtype=np.intp)
         while len(left):
             room = slacks(A, b, left)
             if room is None:
                 return None
             if np.all(room <= NO_SLACK):
                 break
-            left = left[room <= NO_SLACK]
+            left = np.asarray(left[room <= NO_SLACK])
         own = slice(len(program.c) - program.n_slacks)
-        left = left[np.any(program.G[left, own], axis=1)]
+        left = np.asarray(left[np.any(program.G[left, own], axis=1)])
         if not len(left):
             return None
         G, limit = program.G[left], np.column_stack([program.S, program.w])[left]

@@ -147,7 +147,9 @@ class ProgramUnits:
         scaled = scaled.without_faint_rows(most)
         self.equalities = None
         if not _has_room(scaled):
-            self.equalities = Equalities.of(scaled, lambda *rows: _room(*rows, scaled, timer))
+            self.equalities = Equalities.of(
+                scaled, lambda A, b, left: _room(A, b, left, scaled, timer)
+            )
         if self.equalities is not None:
             scaled = self.equalities.eliminated(scaled)
         self.scaled = solvable(scaled)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -30,11 +31,13 @@ def frozen_rows(states: Sequence[Array], driven: Sequence[Array]) -> list[Frozen
 
     A sensor that counts in steps repeats itself often: runs count from ten times its usual length
     on. A plant at rest repeats itself while nothing else moves. A state that rests by itself is
-    told to rest by a linear model of the other rows. A clipped one rests at an end of its range. None of these is frozen.
+    told to rest by a linear model of the other rows. A clipped one rests at an end of its range.
+    None of these is frozen.
 
     Parameters
     ----------
     states : sequence of ndarray, shapes (T+1, n)
+        The readings.
     driven : sequence of ndarray, shapes (T, k)
         Inputs and disturbances between them.
 
@@ -132,14 +135,15 @@ class _Column:
         for x, u, free in zip(self.states, self.driven, self.free, strict=True):
             columns.append(np.hstack([x[:-1], u, np.ones((len(u), 1))])[free])
             targets.append(np.diff(x[:, self.i])[free])
-        return np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
+        fit = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
+        return np.asarray(fit)
 
 
 def _runs(columns: Sequence[Array], state: int) -> Iterator[Frozen]:
     """Yield all runs of equal readings, those of one reading as well."""
     for episode, x in enumerate(columns):
         edges = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0) + 1, [len(x)]])
-        for first, stop in zip(edges[:-1], edges[1:], strict=True):
+        for first, stop in pairwise(edges):
             yield Frozen(episode, state, int(first), int(stop) - 1)
 
 

@@ -182,7 +182,7 @@ def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Genera
     "void(float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
     "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1], int64[::1])"
 )
-def _hits(  # noqa: PLR0913 (compiled: plain arrays)
+def _hits(
     normals: Array,
     levels: Array,
     children: Integers,

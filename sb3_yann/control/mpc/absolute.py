@@ -55,11 +55,15 @@ class Boxes(NamedTuple):
             y = _Shift("y", rows @ model.x_ss, stored and stored.outputs, before)
             outputs = OutputBounds(rows, *y.of(outputs.y_min, outputs.y_max))
         if d is not None:
-            shift = _Shift("d", model.d_ss, stored and stored.disturbances, old and old.d_ss)
+            shift = _Shift(
+                "d", model.d_ss, stored and stored.disturbances, None if old is None else old.d_ss
+            )
             d = DisturbanceBounds(*shift.of(d.d_min, d.d_max))
-        x = _Shift("x", model.x_ss, stored, old and old.x_ss).of(*self.x)
-        theta = _Shift("theta", model.x_ss, stored, old and old.x_ss).of(*self.theta)
-        u = _Shift("u", model.u_ss, stored, old and old.u_ss).of(*self.u)
+        x = _Shift("x", model.x_ss, stored, None if old is None else old.x_ss).of(*self.x)
+        theta = _Shift("theta", model.x_ss, stored, None if old is None else old.x_ss).of(
+            *self.theta
+        )
+        u = _Shift("u", model.u_ss, stored, None if old is None else old.u_ss).of(*self.u)
         return Boxes(x, u, theta, tracking, d, outputs)
 
 
@@ -92,6 +96,9 @@ class _Shift:
             if np.size(value) > moved.size:  # all of theta: the rest has its own bounds
                 value = np.asarray(value)[: moved.size]
         side = name.partition("_")[2]
-        bounds = (value, None) if side == "min" else (None, value)
-        found = as_bounds(self.name, *bounds, self.point.size)[side == "max"] - moved
+        size = self.point.size
+        if side == "min":
+            found = as_bounds(self.name, value, None, size)[0] - moved
+        else:
+            found = as_bounds(self.name, None, value, size)[1] - moved
         return np.where(found == 0, 0.0, found)

@@ -393,9 +393,9 @@ def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> 
         return
     raise ValueError(
         "R must be positive definite, its smallest eigenvalue is "
-        f"{np.linalg.eigvalsh(problem.R)[0]:g}, where an input costs nothing else: neither its rate "
-        "nor a state that it moves has a weight. Give every input a positive weight, in R or in "
-        "RateLimits(R_du=...)."
+        f"{np.linalg.eigvalsh(problem.R)[0]:g}, where an input costs nothing else: neither its "
+        "rate nor a state that it moves has a weight. Give every input a positive weight, in R or "
+        "in RateLimits(R_du=...)."
     )
 
 
