@@ -18,7 +18,15 @@ LEAST, TIMES = 10, 10.0
 
 @dataclass(frozen=True)
 class Frozen:
-    """Equal readings in a row of one state, from row ``first`` to ``last`` of an episode."""
+    """Equal readings in a row of one state.
+
+    Attributes
+    ----------
+    episode, state : int
+        Where they are.
+    first, last : int
+        The rows of the episode from which and to which they reach.
+    """
 
     episode: int
     state: int

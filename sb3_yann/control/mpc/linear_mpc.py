@@ -385,6 +385,8 @@ def _completed(problem: MPCProblem) -> Terminal:
 def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> None:
     """Raise where an input costs nothing: not itself, not by its rate, not by what it moves."""
     errors = problem.error_system
+    if np.linalg.eigvalsh(problem.R)[0] > 0:
+        return  # where rounding hides it, the laws say so
     B = errors.model.B
     weight = errors.R if cost is None else errors.R + problem.gamma * B.T @ cost @ B
     unit = np.outer(problem.u_half, problem.u_half)
