@@ -50,7 +50,9 @@ def test_it_is_the_policy(name, tmp_path):
     obs = observations(policy, 10_000).astype(np.float32).astype(np.float64)  # as SB3 takes it
     scale = 2 * controller.data["action_scale"]
     # In float64 by torch, which is an evaluation of its own.
-    wide = copy.deepcopy(policy).double()
+    wide = copy.deepcopy(policy)
+    for each in (*wide.parameters(), *wide.buffers()):  # policy.double() is refused
+        each.data = each.data.double() if each.is_floating_point() else each.data
     with th.no_grad():
         wanted = wide.actor(th.as_tensor(obs)).numpy()
     wanted = wanted * controller.data["action_scale"] + controller.data["action_shift"]

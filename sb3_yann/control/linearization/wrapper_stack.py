@@ -155,7 +155,7 @@ def _shape(value: Any) -> tuple[int, ...] | None:
         return None
     try:
         return tuple(np.shape(value))
-    except ValueError:  # a list of unequal ones
+    except (TypeError, ValueError):  # a class, a list of unequal ones
         return None
 
 

@@ -16,7 +16,6 @@ from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
 from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
-from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability, simulation
@@ -185,12 +184,10 @@ class LinearMPC(MPCProblem):
             penalty = _default_penalty(MPCProblem(*checked, completed))
             checked = (*checked[:-1], replace(soft, penalty=penalty))
         super().__init__(*checked, completed)
-        if idle := np.flatnonzero(~np.any(model.B != 0, axis=0)).tolist():
-            names = labels_of(model)[1]
+        if not np.any(model.B):
             raise ValueError(
-                f"Column {idle} of B is zero: input {', '.join(names[i] for i in idle)} does "
-                "nothing in the model, and so there is nothing to control by it. Look for the "
-                "input's effect in the model's units and sampling time, or leave the input out."
+                "B of the model is zero: no input does anything, so there is nothing to control. "
+                "Look for the inputs' effect in the model's units and sampling time."
             )
         self._store(absolute=bool(absolute))
 
