@@ -117,7 +117,13 @@ def test_what_is_given_reaches_the_acceptance_and_what_is_not_has_its_default() 
     ).acceptance  # fmt: skip
     rule = AcceptanceRule(margin=0.5)
     assert some == SimulatorAcceptance("CSTR-v0", range(40, 47), 3, 2, 6, 8, True, rule)
-    assert some.settings == {"env": "CSTR-v0", "seeds": range(40, 47), "margin": 0.5, "tail": 0.05}
+    assert some.settings == {
+        "env": "CSTR-v0",
+        "seeds": range(40, 47),
+        "margin": 0.5,
+        "tail": 0.05,
+        "excess_room": 1e-3,
+    }
     bounded = ImprovementGuard(Slide, n_new_starts=4, rule={"largest_step": 2.0}).acceptance
     assert bounded.n_final_starts == 40 and bounded.settings["largest_step"] == 2.0
 

@@ -231,8 +231,6 @@ def test_a_smaller_discount_stands_in_for_an_input_that_does_not_reach() -> None
     "changes",
     [
         {"terminal": Terminal(set=([[1, 0], [-1, 0]], [-1, -1]))},  # x <= -1 and x >= 1
-        # x = 0: feasible, but without an interior
-        {"terminal": Terminal(set=([[1, 0], [-1, 0]], [0, 0]))},
         {"theta_min": [50, 50], "theta_max": [60, 60]},  # out of the inputs' reach
     ],
 )
