@@ -104,7 +104,7 @@ def test_an_offset_that_the_stage_cost_wants_is_named_with_what_to_do() -> None:
     assert found.offset < 0.005 and found.d_max is not None
     assert "With the MPC, x[0] came to rest 0.619 beside its set-point, 8 times." in found.rest
     assert "leave it out" in found.rest
-    assert f"offset_free(mpc, d_max=[{found.d_max[0]:.3g}])" in str(found).splitlines()[-1]
+    assert "offset_free(" not in str(found)
 
 
 def test_no_offset_is_named_where_the_observer_is_advised_or_the_model_is_the_plant() -> None:
