@@ -228,7 +228,9 @@ def _scaled(
         steps = rest, rest - moved[:, None] * B[:, j]
         sizes = [np.sum((np.std(each, axis=0) / coordinates.units) ** 2) for each in steps]
         # One state times a factor is what any controller makes of it.
-        certain = problem.model.n_states > 1 or not sizes[0] < CLEARLY * sizes[1]
+        moved_zero = abs(offset) > OFFSET * problem.u_half[j] and not problem.layout.has_constants
+        unlikely = moved_zero or not sizes[0] < CLEARLY * sizes[1]
+        certain = problem.model.n_states > 1 or unlikely
         if (left < EXACT and certain) or (left < CLEARLY and sizes[1] < sizes[0]):
             yield (
                 f"The logged {name} is {slope:.4g} times what the MPC gives"
