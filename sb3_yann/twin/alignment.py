@@ -269,7 +269,13 @@ def _against_model(  # noqa: C901 (one question after the other)
             return
     if not problem.layout.has_constants:
         yield from _resting(fit, coordinates, problem.u_half, names)
-    B, unit = problem.model.B, coordinates.units
+    yield from _against_gains(fit, problem.model.B, coordinates.units, own, names)
+
+
+def _against_gains(
+    fit: _Gains, B: Array, unit: Array, own: Array, names: list[str]
+) -> Iterator[str]:
+    """Yield where columns of inputs act as others of B do, against its signs, or far otherwise."""
     columns = _exchanged(fit, B, unit)
     for j in own:
         if columns[j] != j:
