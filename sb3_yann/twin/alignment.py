@@ -228,7 +228,9 @@ def _scaled(
         steps = rest, rest - moved[:, None] * B[:, j]
         sizes = [np.sum((np.std(each, axis=0) / coordinates.units) ** 2) for each in steps]
         # One state times a factor is what any controller makes of it.
-        certain = problem.model.n_states > 1 or not sizes[0] < CLEARLY * sizes[1]
+        moved_zero = abs(offset) > OFFSET * problem.u_half[j] and not problem.layout.has_constants
+        unlikely = moved_zero or not sizes[0] < CLEARLY * sizes[1]
+        certain = problem.model.n_states > 1 or unlikely
         if (left < EXACT and certain) or (left < CLEARLY and sizes[1] < sizes[0]):
             yield (
                 f"The logged {name} is {slope:.4g} times what the MPC gives"
@@ -267,7 +269,13 @@ def _against_model(  # noqa: C901 (one question after the other)
             return
     if not problem.layout.has_constants:
         yield from _resting(fit, coordinates, problem.u_half, names)
-    B, unit = problem.model.B, coordinates.units
+    yield from _against_gains(fit, problem.model.B, coordinates.units, own, names)
+
+
+def _against_gains(
+    fit: _Gains, B: Array, unit: Array, own: Array, names: list[str]
+) -> Iterator[str]:
+    """Yield where columns of inputs act as others of B do, against its signs, or far otherwise."""
     columns = _exchanged(fit, B, unit)
     for j in own:
         if columns[j] != j:
