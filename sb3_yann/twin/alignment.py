@@ -239,7 +239,7 @@ def _scaled(
             )
 
 
-def _against_model(  # noqa: C901 (one question after the other)
+def _against_model(
     problem: LinearMPC,
     coordinates: Coordinates,
     episodes: tuple[Episode, ...],
