@@ -273,7 +273,7 @@ def _against_model(
 
 
 def _against_gains(
-    fit: _Gains, B: Array, unit: Array, own: Array, names: list[str]
+    fit: _Gains, B: Array, unit: Array, own: NDArray[np.intp], names: list[str]
 ) -> Iterator[str]:
     """Yield where columns of inputs act as others of B do, against its signs, or far otherwise."""
     columns = _exchanged(fit, B, unit)
