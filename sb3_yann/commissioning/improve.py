@@ -103,7 +103,13 @@ class Improvement:
         best = min((each.change for each in passed), default=0.0)
         small = f"a gain of {-100 * best:.2g} % in {self.where} is too small, or not sure"
         last = small if best < 0 else self.checks[-1].reason or f"no gain in {self.where}"
-        return f"Nothing better was found: {last}."
+        said = f"Nothing better was found: {last}."
+        if self.where == "the twin":  # plans of a steep plant take minutes, and are the twin's own
+            said += (
+                " In a twin the search makes no plans: headroom(mpc, twin) tells what they would "
+                "gain there, and improve(model, simulator) begins at them."
+            )
+        return said
 
     def report(self) -> str:
         """Return in words what was accepted, or why nothing was, and how many checks it took."""
