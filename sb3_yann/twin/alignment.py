@@ -12,7 +12,6 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sb3_yann._validation import Array
