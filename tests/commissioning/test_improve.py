@@ -69,8 +69,8 @@ def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     )
     assert Improvement((refused,), 0.0, accepted=False).report() == (
         "Nothing better was found: 2 starts with violations. In a twin the search makes no plans: "
-        "headroom(mpc, twin) tells what they would gain there, and improve(model, simulator) begins "
-        "at them. The model is as it was. "
+        "headroom(mpc, twin) tells what they would gain there, and improve(model, simulator) "
+        "begins at them. The model is as it was. "
         "0 of 1 checks passed."
     )
 
