@@ -77,7 +77,7 @@ class SteepQP(ParametricQP):
         H[inputs:, inputs:] *= np.sqrt(np.outer(less, less)) * np.outer(broken, broken)
         c[inputs:] *= less * broken
         G[:, inputs:] *= broken
-        # "No violation" is then far longer than all other rows, which would count as zero beside it.
+        # "No violation" is far longer than all other rows, which count as zero then.
         units = 1 / np.maximum(1.0, np.linalg.norm(G, axis=1))
         plain = {each.name: getattr(self, each.name) for each in fields(ParametricQP)}
         plain |= {"G": G * units[:, None], "S": self.S * units[:, None], "w": self.w * units}
