@@ -69,7 +69,7 @@ class SteepQP(ParametricQP):
     def mild(self) -> ParametricQP:
         """The program with slacks that cost what a dual method can take, in units of the largest.
 
-        Its rows are those of this program.
+        Its rows are those of this program, at most of length one.
         """
         ratio, broken = steepness(self)
         inputs, less = len(self.c) - self.n_slacks, 1 / np.maximum(1.0, ratio / MILD)
@@ -77,8 +77,11 @@ class SteepQP(ParametricQP):
         H[inputs:, inputs:] *= np.sqrt(np.outer(less, less)) * np.outer(broken, broken)
         c[inputs:] *= less * broken
         G[:, inputs:] *= broken
+        # "No violation" is far longer than all other rows, which count as zero then.
+        units = 1 / np.maximum(1.0, np.linalg.norm(G, axis=1))
         plain = {each.name: getattr(self, each.name) for each in fields(ParametricQP)}
-        return ParametricQP(**{**plain, "H": H, "c": c, "G": G})
+        plain |= {"G": G * units[:, None], "S": self.S * units[:, None], "w": self.w * units}
+        return ParametricQP(**{**plain, "H": H, "c": c})
 
     def solve_with_multipliers(self, theta: Array) -> tuple[Array | None, Array]:
         """Return the optimal U (v,), or None, and 1 for each active row (rows,), else 0."""
