@@ -21,6 +21,7 @@ from sb3_yann.audit.finding import (
     judged,
 )
 from sb3_yann.audit.offset import steady_offset
+from sb3_yann.audit.own_reward import may_change_reward
 from sb3_yann.audit.sample import FEWEST, Sample
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import require_frozen
@@ -106,7 +107,7 @@ class CostAudit(BaseCallback):
                     "action": np.array(self.locals["actions"][i], dtype=np.float64),
                     "reward": float(rewards[i]),
                     "step": len(records) + 1,
-                    "violation": bool(info.get("violation", False)),
+                    "violation": may_change_reward(info),
                     "truncated": done and bool(info.get("TimeLimit.truncated", False)),
                     "done": done,
                 }

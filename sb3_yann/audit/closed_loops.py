@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.beginnings import beginnings
-from sb3_yann.audit.own_reward import as_reward
+from sb3_yann.audit.own_reward import as_reward, may_change_reward
 from sb3_yann.audit.plants import Plant
 from sb3_yann.audit.task import Task
 from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
@@ -147,7 +147,7 @@ def play(
                 action = u[i].astype(envs[i].action_space.dtype)
                 now[i], reward, terminated, truncated, info = envs[i].step(action)
                 violated[i] = info.get("violation", False)
-                if not (violated[i] or terminated):
+                if not (may_change_reward(info) or terminated):
                     earned[i] = as_reward(reward)
                 running[i] = not (terminated or truncated)
                 lengths[i] += 1

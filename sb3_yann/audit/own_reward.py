@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -28,6 +29,14 @@ def as_reward(value: Any) -> float:
     except (TypeError, ValueError):
         return np.nan
     return float(number.ravel()[0]) if number.size == 1 else np.nan
+
+
+def may_change_reward(info: Mapping[str, Any]) -> bool:
+    """Tell whether a step reports a violation for which its reward may be another one.
+
+    An env whose every step is one would be compared nowhere: `StageCost` says what it added.
+    """
+    return bool(info.get("violation", False)) and info.get("violation_cost") != 0
 
 
 def below_set_points(env: gym.Env[Any, Any]) -> bool:

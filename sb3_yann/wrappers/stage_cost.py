@@ -22,8 +22,9 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
     The cost is that of the observed theta and of the input played there. A step that takes a state,
     an output or an input beyond a hard bound of the problem, or moves an input too far, reports
-    ``info["violation"]``; by how much is ``info["excess"]``, in half-widths. What soft bounds cost
-    is no part of the reward, since the critic is exact without it: it is ``info["penalty"]``.
+    ``info["violation"]``; by how much is ``info["excess"]``, in half-widths, and what it added to
+    the cost ``info["violation_cost"]``. What soft bounds cost is no part of the reward, since the
+    critic is exact without it: it is ``info["penalty"]``.
 
     Parameters
     ----------
@@ -101,7 +102,8 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         info = {**info, "excess": float(excess.largest), "penalty": float(excess.penalty)}
         if excess.largest > EXCESS_ROOM:
             info["violation"] = True
-        cost += self.violation_cost if info.get("violation") else 0.0
+        info["violation_cost"] = self.violation_cost if info.get("violation") else 0.0
+        cost += info["violation_cost"]
         self.theta = after
         return observation, -cost, terminated, truncated, info
 

@@ -34,6 +34,7 @@ def cart(**changes) -> LinearMPC:
 
 
 def plan(mpc: LinearMPC, starts: np.ndarray):
+    mpc.explicit()  # some take more effort than "auto" spends
     free = np.full(mpc.model.n_states, np.inf)
     task = Task(mpc, -free, free, mpc.value_matrix(1.0), WEIGHT)
     rows = np.arange(len(starts))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import subprocess
 import sys
 import zipfile
@@ -19,7 +18,7 @@ from stable_baselines3 import DDPG
 import general_problems
 import sb3_yann._archive
 import sb3_yann.deployment.controller
-from deployed import CASES, box, disturbed, observations, policy_of
+from deployed import CASES, box, disturbed, in_float64, observations, policy_of
 from sample_laws import solved
 from sb3_yann import (
     AffineObservation,
@@ -50,11 +49,8 @@ def test_it_is_the_policy(name, tmp_path):
     obs = observations(policy, 10_000).astype(np.float32).astype(np.float64)  # as SB3 takes it
     scale = 2 * controller.data["action_scale"]
     # In float64 by torch, which is an evaluation of its own.
-    wide = copy.deepcopy(policy)
-    for each in (*wide.parameters(), *wide.buffers()):  # policy.double() is refused
-        each.data = each.data.double() if each.is_floating_point() else each.data
     with th.no_grad():
-        wanted = wide.actor(th.as_tensor(obs)).numpy()
+        wanted = in_float64(policy).actor(th.as_tensor(obs)).numpy()
     wanted = wanted * controller.data["action_scale"] + controller.data["action_shift"]
     kept = np.isin(obs, steady(controller, obs, "double")).all(1)
     assert kept.mean() > 0.6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deployed import disturbed
+from deployed import disturbed, in_float64
 from partitions import as_range, mixture
 from random_problems import examples, problems
 from sb3_yann import Checks, Controller, LinearMPC, YannPolicy, export
@@ -35,9 +34,8 @@ def exported(given: Any, **options: Any) -> Controller:
 
 def by_torch(policy: YannPolicy, seen: np.ndarray, controller: Controller) -> np.ndarray:
     """The policy in float64, an evaluation of its own."""
-    wide = copy.deepcopy(policy).double()
     with th.no_grad():
-        actions = wide.actor(th.as_tensor(seen)).numpy()
+        actions = in_float64(policy).actor(th.as_tensor(seen)).numpy()
     return np.asarray(actions * controller.data["action_scale"] + controller.data["action_shift"])
 
 

@@ -214,7 +214,7 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place,
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
-    [{"n_starts": 4}, {"seed": 7}, {"rule": {"margin": 0.5}}, {"env": "Slide-v0"}, {"env": None}],
+    [{"n_starts": 4}, {"seed": 7}, {"rule": {"margin": 0.5}}, {"env": "Slide-v0"}],
 )
 def test_with_other_settings_the_guard_starts_afresh(change) -> None:
     first, second = make_guard(), make_guard(**change)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import shutil
 import subprocess
@@ -86,6 +87,14 @@ def confined(policy: YannPolicy) -> YannPolicy:
     low, high = policy.problem.theta_min, policy.problem.theta_max
     policy.confine_correction(0.5 * low, 0.6 * high)
     return policy
+
+
+def in_float64(policy: YannPolicy) -> YannPolicy:
+    """Return a copy that torch computes in float64, which policy.double() refuses to be."""
+    wide = copy.deepcopy(policy)
+    for each in (*wide.parameters(), *wide.buffers()):
+        each.data = each.data.double() if each.is_floating_point() else each.data
+    return wide
 
 
 @cache

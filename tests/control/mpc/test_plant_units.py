@@ -63,9 +63,9 @@ def test_a_problem_knows_whether_it_was_stated_in_absolute_values() -> None:
     bounds = {"u_min": [299, -5], "u_max": [302, 3], "theta_min": -1, "theta_max": 3}
     mpc = LinearMPC(MODEL, Q=np.eye(2), R=np.eye(2), horizon=1, absolute=True, **bounds)
     assert mpc.absolute and not MPC.absolute
-    other = replace(mpc, horizon=2)  # what is stored are deviations
+    other = replace(mpc, horizon=2)  # what is stored are deviations; what is given stays absolute
     assert other.u_min.tolist() == mpc.u_min.tolist() == [-1, -3]
-    assert not other.absolute and replace(other, horizon=1) == mpc
+    assert other.absolute and replace(other, horizon=1) == mpc
 
 
 @pytest.mark.parametrize(
