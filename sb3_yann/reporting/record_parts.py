@@ -159,6 +159,7 @@ def _problem_print(subject: Subject) -> str:
     problem, found = subject.problem, hashlib.sha256()
     program = problem.condensed()
     arrays = [program.H, program.F, program.c, program.G, program.w, program.S]
+    arrays += [] if program.feedback is None else [program.feedback]
     for each in (*arrays, problem.theta_min, problem.theta_max, problem.theta_ss):
         found.update(np.ascontiguousarray(each).tobytes())
     return found.hexdigest()

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import Array, as_kind, as_number
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
 from sb3_yann.control.mpc.plant_units import InputUnits
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
@@ -77,6 +77,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 "pass observation=AffineObservation(matrix, offset)."
             )
         self.problem, self.violation_cost = problem, as_number("violation_cost", violation_cost)
+        self.bounds = Bounds.of(problem)
         self.theta: Array = np.zeros(problem.n_theta)
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
@@ -98,7 +99,8 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         cost = float(self.problem.stage_cost(self.theta, u))
         observation, _, terminated, truncated, info = self.env.step(action)
         after = self.seen(observation)
-        excess = bound_excess(self.problem, np.array([self.theta, after]), u[None])
+        states = np.array([self.theta, after])
+        excess = bound_excess(self.problem, states, u[None], bounds=self.bounds)
         info = {**info, "excess": float(excess.largest), "penalty": float(excess.penalty)}
         if excess.largest > EXCESS_ROOM:
             info["violation"] = True

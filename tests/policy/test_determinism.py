@@ -11,6 +11,7 @@ from fresh_process import run_python
 from guard_samples import STEPS, build, train
 from resumed import envs, guard_in_simulator, model_bits
 
+pytestmark = pytest.mark.filterwarnings("ignore:The reward is not minus")  # of the sample plant
 CODE = "import resumed; resumed.fresh_trainings()"
 
 

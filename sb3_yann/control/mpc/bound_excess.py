@@ -99,7 +99,11 @@ class BoundExcess(NamedTuple):
 
 
 def bound_excess(
-    problem: MPCProblem, thetas: Array, inputs: Array, taken: ArrayLike = True
+    problem: MPCProblem,
+    thetas: Array,
+    inputs: Array,
+    taken: ArrayLike = True,
+    bounds: Bounds | None = None,
 ) -> BoundExcess:
     """Return by how much trajectories exceed the bounds of states, outputs, inputs and rates.
 
@@ -113,6 +117,8 @@ def bound_excess(
         Of trajectories, in deviations.
     taken : ndarray of bool, shape (T, ...), optional
         Which steps count.
+    bounds : Bounds, optional
+        Those of the problem, where they are at hand: a wrapper asks at every step.
 
     Examples
     --------
@@ -122,37 +128,37 @@ def bound_excess(
     >>> float(bound_excess(mpc, np.array([[4.0, 2], [6.0, 2]]), np.zeros((1, 1))).largest)
     0.2
     """
-    bounds = Bounds.of(problem)
+    bounds = Bounds.of(problem) if bounds is None else bounds
     with np.errstate(invalid="ignore", over="ignore"):
-        over = np.abs(bounds.beyond(thetas[1:]))
-        parts = [np.maximum(inputs - problem.u_max, problem.u_min - inputs) / problem.u_half]
-        if problem.has_rate_bounds:
+        parts = [
+            np.abs(bounds.beyond(thetas[1:])),
+            np.maximum(inputs - problem.u_max, problem.u_min - inputs) / problem.u_half,
+        ]
+        if problem.layout.n_previous:
             moved = inputs - thetas[:-1][..., problem.layout.previous]
             rate = problem.rate
             parts.append(np.maximum(moved - rate.du_max, rate.du_min - moved) / problem.u_half)
-        hard = np.concatenate([over[..., bounds.softness <= 0], *parts], axis=-1)
-        counted = np.asarray(taken)[..., None]
-        hard = _counted(hard, counted)
-        either = _counted(np.concatenate([over, *parts], axis=-1), counted)
-        penalty = np.zeros(thetas.shape[1:-1])
-        for first in (True, False):  # the states' bounds share a slack, the outputs' another
-            soft = (bounds.softness > 0) & (bounds.of_states == first)
-            if np.any(soft):
-                unit = bounds.half[soft] / bounds.softness[soft]
-                s = np.max(_counted(over[..., soft], counted) * unit, axis=-1)
-                penalty = penalty + problem.soft.penalty * np.sum(s + s**2, axis=0)
+        over = np.concatenate(parts, axis=-1)
+    counts = ~(over <= ROUNDING) & np.asarray(taken)[..., None]
+    nothing = np.zeros(thetas.shape[1:-1])
+    if not counts.any():  # mostly
+        return BoundExcess(nothing, nothing, nothing, nothing)
+    over = np.where(counts, np.where(np.isnan(over), np.inf, over), 0.0)
+    first = len(bounds.half)
+    hard = np.append(bounds.softness <= 0, np.ones(over.shape[-1] - first, dtype=bool))
+    penalty = nothing
+    for part in (bounds.of_states, ~bounds.of_states):  # each of them shares a slack
+        soft = part & (bounds.softness > 0)
+        if np.any(soft):
+            units = bounds.half[soft] / bounds.softness[soft]
+            s = np.max(over[..., :first][..., soft] * units, axis=-1)
+            penalty = penalty + problem.soft.penalty * np.sum(s + s**2, axis=0)
     return BoundExcess(
-        largest=np.max(hard, axis=(0, -1), initial=0.0),
-        summed=np.sum(hard, axis=(0, -1)),
-        any_bound=np.max(either, axis=(0, -1), initial=0.0),
+        largest=np.max(over[..., hard], axis=(0, -1), initial=0.0),
+        summed=np.sum(over[..., hard], axis=(0, -1)),
+        any_bound=np.max(over, axis=(0, -1), initial=0.0),
         penalty=penalty,
     )
-
-
-def _counted(over: Array, taken: NDArray[np.bool_]) -> Array:
-    """Return an excess without rounding, 0 where a step does not count, inf for NaN."""
-    over = np.where(np.isnan(over), np.inf, over)
-    return np.where(taken & (over > ROUNDING), over, 0.0)
 
 
 def excess_of_episodes(problem: MPCProblem, episodes: Iterable[tuple[Array, Array]]) -> BoundExcess:
