@@ -21,7 +21,7 @@ class NonFiniteWarning(RuntimeWarning):
     """An observation, a reward, an action or a gradient is not a finite number."""
 
 
-def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
+def check_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
     """Return ``value`` as a finite, read-only float64 array of ``shape``; a letter is any size."""
     array = to_float(name, value)
     if array.ndim != len(shape) or any(
@@ -39,14 +39,14 @@ def as_array(name: str, value: ArrayLike, shape: Sequence[int | str]) -> Array:
     return _frozen(array)
 
 
-def as_vector(name: str, value: ArrayLike | None, size: int) -> Array:
+def check_vector(name: str, value: ArrayLike | None, size: int) -> Array:
     """Return ``value`` as a finite array of shape ``(size,)``, zeros for None."""
-    return as_array(name, np.zeros(size) if value is None else value, (size,))
+    return check_array(name, np.zeros(size) if value is None else value, (size,))
 
 
-def as_symmetric(name: str, value: ArrayLike, size: int) -> Array:
+def check_symmetric(name: str, value: ArrayLike, size: int) -> Array:
     """Return ``value`` as a symmetric positive semi-definite ``(size, size)`` matrix."""
-    matrix = as_array(name, value, (size, size))
+    matrix = check_array(name, value, (size, size))
     scale = max(float(np.max(np.abs(matrix))), np.finfo(float).tiny)
     if np.max(np.abs(matrix - matrix.T)) > 1e-9 * scale:
         raise ValueError(
@@ -60,7 +60,7 @@ def as_symmetric(name: str, value: ArrayLike, size: int) -> Array:
     return _frozen((matrix + matrix.T) / 2)
 
 
-def as_bounds(
+def check_bounds(
     name: str,
     lower: ArrayLike | None,
     upper: ArrayLike | None,
@@ -81,10 +81,10 @@ def as_bounds(
     return low, high
 
 
-def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -> Array:
+def check_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -> Array:
     """Return ``value`` as positive numbers of shape ``(size,)``; a scalar is for all entries."""
     array = to_float(name, value)
-    array = as_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
+    array = check_array(name, np.full(size, float(array)) if array.ndim == 0 else array, (size,))
     if np.any(array <= 0):
         raise ValueError(
             f"{name} = {array.tolist()} must be above 0 in each entry. {hint}".rstrip()
@@ -92,13 +92,13 @@ def as_positive_vector(name: str, value: ArrayLike, size: int, hint: str = "") -
     return array
 
 
-def as_outputs(name: str, value: ArrayLike | Sequence[int], n_states: int) -> Array:
+def check_outputs(name: str, value: ArrayLike | Sequence[int], n_states: int) -> Array:
     """Return an output matrix ``(q, n)`` from a matrix or from a list of indices of states."""
-    rows = as_output_rows(name, value, n_states - 1)
-    return as_array(name, np.eye(n_states)[rows] if rows.ndim == 1 else rows, ("q", n_states))
+    rows = check_output_rows(name, value, n_states - 1)
+    return check_array(name, np.eye(n_states)[rows] if rows.ndim == 1 else rows, ("q", n_states))
 
 
-def as_output_rows(
+def check_output_rows(
     name: str, value: ArrayLike | Sequence[int], most: float = np.inf
 ) -> NDArray[Any]:
     """Return indices of states ``(q,)``, at most ``most``, or an output matrix ``(q, n)``."""
@@ -107,7 +107,7 @@ def as_output_rows(
         raise ValueError(f"{name} = {value!r} must be a list of indices of states: [{value!r}].")
     if entries.ndim != 1:
         _require_moderate(name, entries, "Take another unit of the outputs.")
-        return as_array(name, value, ("q", "n"))
+        return check_array(name, value, ("q", "n"))
     whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in value)  # type: ignore[union-attr]
     if not whole or np.any(entries < 0) or np.any(entries > most):
         limit = f"from 0 to {most}" if np.isfinite(most) else "from 0 on"
@@ -126,32 +126,32 @@ def is_text(character: str) -> bool:
     return category(character) not in ("Cc", "Cs", "Zl", "Zp") and ord(character) & 0xFFFE != 0xFFFE
 
 
-def as_indices(name: str, value: Iterable[int] | str, size: int) -> tuple[int, ...]:
+def check_indices(name: str, value: Iterable[int] | str, size: int) -> tuple[int, ...]:
     """Return different whole numbers below ``size``, in order."""
     if isinstance(value, str) or not isinstance(value, Iterable):
         raise TypeError(f"{name} = {_short(value)} must be a list of indices, e.g. [0].")
-    found = sorted(as_whole(name, each, 0) for each in value)
+    found = sorted(check_int(name, each, 0) for each in value)
     if len({*found}) < len(found) or (found and found[-1] >= size):
         raise ValueError(f"{name} = {found} must be different indices below {size}.")
     return tuple(found)
 
 
-def as_number(name: str, value: Any, hint: str = "") -> float:
+def check_number(name: str, value: Any, hint: str = "") -> float:
     """Return ``value`` as a finite float."""
-    return as_between(name, value, -np.inf, np.inf, "()", hint)
+    return check_range(name, value, -np.inf, np.inf, "()", hint)
 
 
-def as_positive(name: str, value: Any, hint: str = "") -> float:
+def check_positive(name: str, value: Any, hint: str = "") -> float:
     """Return ``value`` as a finite float above 0."""
-    return as_between(name, value, 0, np.inf, "()", hint)
+    return check_range(name, value, 0, np.inf, "()", hint)
 
 
-def as_discount(value: Any) -> float:
+def check_discount(value: Any) -> float:
     """Return ``value`` as a discount factor in (0, 1]."""
-    return as_between("gamma", value, 0, 1, "(]")
+    return check_range("gamma", value, 0, 1, "(]")
 
 
-def as_between(
+def check_range(
     name: str, value: Any, low: float, high: float, ends: str = "[]", hint: str = ""
 ) -> float:
     """Return ``value`` as a finite float between ``low`` and ``high``.
@@ -190,7 +190,7 @@ def as_between(
     raise ValueError(f"{name} = {_short(value)} must {wanted}. {hint}".rstrip())
 
 
-def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
+def check_int(name: str, value: Any, least: int = 1, hint: str = "") -> int:
     """Return ``value`` as an int of at least ``least``, else raise ValueError; bools are none."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise ValueError(
@@ -201,28 +201,28 @@ def as_whole(name: str, value: Any, least: int = 1, hint: str = "") -> int:
     return int(value)
 
 
-def as_flag(name: str, value: Any) -> bool:
+def check_bool(name: str, value: Any) -> bool:
     """Return ``value`` as a bool, else raise TypeError: 0 and 1 are none."""
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{name} = {_short(value)} must be True or False.")
     return bool(value)
 
 
-def as_choice(name: str, value: Any, options: Sequence[str]) -> str:
+def check_choice(name: str, value: Any, options: Sequence[str]) -> str:
     """Return ``value`` if it is one of the options, else raise ValueError."""
     if not isinstance(value, str) or value not in options:
         raise ValueError(f"{name} = {_short(value)} must be one of {tuple(options)}.")
     return value
 
 
-def as_kind(name: str, value: Kind, kind: Any, wanted: str) -> Kind:
+def check_type(name: str, value: Kind, kind: Any, wanted: str) -> Kind:
     """Return ``value`` if it is of a class, named by ``wanted``, else raise TypeError."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} = {_short(value)} must be {wanted}.")
     return value
 
 
-def as_options(name: str, value: Any, kind: type[Options]) -> Options:
+def check_options(name: str, value: Any, kind: type[Options]) -> Options:
     """Return a group of options; a mapping, as YAML gives it, holds some of their names.
 
     Raise TypeError for anything else, and for other names.

@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure as LoggedFigure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_kind, as_whole
+from sb3_yann._validation import check_int, check_type
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import require_frozen, require_same_statistics
 from sb3_yann.policy.policies import YannPolicy, require_yann_policy
@@ -178,13 +178,13 @@ class FigureLog(BaseCallback):
     ) -> None:
         super().__init__()
         wanted = "a mapping of names to functions that draw, such as {'guard': guard.plot}"
-        for name, draw in as_kind("figures", figures, Mapping, wanted).items():
+        for name, draw in check_type("figures", figures, Mapping, wanted).items():
             if not callable(draw):
                 raise TypeError(
                     f"figures[{name!r}] = {draw!r} must be a function that draws, such as "
                     "guard.plot, without parentheses."
                 )
-        self.figures, self.every = dict(figures), as_whole("every", every)
+        self.figures, self.every = dict(figures), check_int("every", every)
 
     def _on_training_start(self) -> None:
         self.last = self.num_timesteps

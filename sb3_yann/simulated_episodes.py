@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import Array, as_between, as_whole
+from sb3_yann._validation import Array, check_int, check_range
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.evaluation.episodes import Source, as_source, make_env, watch_length
 from sb3_yann.policy._finite import watch_buffer
@@ -101,11 +101,11 @@ class SimulatedEpisodes(BaseCallback):
         seed: int = 2_000_000,
     ) -> None:
         super().__init__()
-        as_whole("per_episode", per_episode)
-        as_between("step_tests", step_tests, 0, 1)
-        as_whole("longest", longest)
-        as_between("noise", noise, 0, np.inf)
-        as_whole("seed", seed, 0)
+        check_int("per_episode", per_episode)
+        check_range("step_tests", step_tests, 0, 1)
+        check_int("longest", longest)
+        check_range("noise", noise, 0, np.inf)
+        check_int("seed", seed, 0)
         self.env, self.per_episode, self.seed = as_source(env), per_episode, seed
         self.step_tests, self.longest, self.noise = step_tests, longest, noise
         self._envs: list[gym.Env[Any, Any]] = []

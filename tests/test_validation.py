@@ -9,46 +9,51 @@ import pytest
 import torch as th
 
 from sb3_yann._validation import (
-    as_between,
-    as_choice,
-    as_flag,
-    as_number,
-    as_positive,
-    as_positive_vector,
-    as_whole,
+    check_bool,
+    check_choice,
+    check_int,
+    check_number,
+    check_positive,
+    check_positive_vector,
+    check_range,
     to_float,
 )
 
 
 @pytest.mark.parametrize("value", [2, 2.0, np.float32(2), np.int64(2), np.array(2.0)])
 def test_numbers_of_python_and_numpy_become_floats(value: Any) -> None:
-    assert (as_number("x", value), type(as_number("x", value))) == (2.0, float)
+    assert (check_number("x", value), type(check_number("x", value))) == (2.0, float)
 
 
 @pytest.mark.parametrize("value", [True, np.True_, "2", None, 2j, [2.0], np.array([2.0])])
 def test_what_is_no_real_number_is_refused_with_a_hint(value: Any) -> None:
     with pytest.raises(TypeError, match=r"x = .* must be a number\. Give 3\."):
-        as_number("x", value, "Give 3.")
+        check_number("x", value, "Give 3.")
 
 
 BAD: list[tuple[Any, tuple[Any, ...], type[Exception], str]] = [
-    (as_number, (np.nan,), ValueError, "x = nan must be a finite number"),
-    (as_number, (-np.inf,), ValueError, "x = -inf must be a finite number"),
-    (as_positive, (np.inf,), ValueError, "x = inf must be a finite number above 0"),
-    (as_between, (np.inf, 1, np.inf), ValueError, "x = inf must be a finite number of at least 1"),
-    (as_between, (-1, 0, 1), ValueError, "x = -1 must be between 0 and 1"),
-    (as_between, (np.nan, 0, 1), ValueError, "x = nan must be between 0 and 1"),
-    (as_between, (0, 0, 1, "(]"), ValueError, r"x = 0 must lie in \(0, 1\]"),
-    (as_between, (1, 0, 1, "[)"), ValueError, r"x = 1 must lie in \[0, 1\)"),
-    (as_positive_vector, ([1, 0], 2), ValueError, r"\[1\.0, 0\.0\] must be above 0 in each entry"),
-    (as_choice, ("d", ("a", "b")), ValueError, r"x = 'd' must be one of \('a', 'b'\)"),
-    *((as_flag, (x,), TypeError, "x = .* must be True or False") for x in (0, 1, "no", None)),
+    (check_number, (np.nan,), ValueError, "x = nan must be a finite number"),
+    (check_number, (-np.inf,), ValueError, "x = -inf must be a finite number"),
+    (check_positive, (np.inf,), ValueError, "x = inf must be a finite number above 0"),
+    (check_range, (np.inf, 1, np.inf), ValueError, "x = inf must be a finite number of at least 1"),
+    (check_range, (-1, 0, 1), ValueError, "x = -1 must be between 0 and 1"),
+    (check_range, (np.nan, 0, 1), ValueError, "x = nan must be between 0 and 1"),
+    (check_range, (0, 0, 1, "(]"), ValueError, r"x = 0 must lie in \(0, 1\]"),
+    (check_range, (1, 0, 1, "[)"), ValueError, r"x = 1 must lie in \[0, 1\)"),
+    (
+        check_positive_vector,
+        ([1, 0], 2),
+        ValueError,
+        r"\[1\.0, 0\.0\] must be above 0 in each entry",
+    ),
+    (check_choice, ("d", ("a", "b")), ValueError, r"x = 'd' must be one of \('a', 'b'\)"),
+    *((check_bool, (x,), TypeError, "x = .* must be True or False") for x in (0, 1, "no", None)),
     *(
-        (as_whole, (x,), ValueError, "whole number of at least 1")
+        (check_int, (x,), ValueError, "whole number of at least 1")
         for x in (True, 2.0, "2", None, 0)
     ),
-    (as_between, ([[1], [1, 2]], 0, 2), TypeError, r"x = \[\[1\], \[1, 2\]\] must be a number"),
-    (as_between, (10**30, 0, 2), ValueError, "x = 10{30} must be between 0 and 2"),
+    (check_range, ([[1], [1, 2]], 0, 2), TypeError, r"x = \[\[1\], \[1, 2\]\] must be a number"),
+    (check_range, (10**30, 0, 2), ValueError, "x = 10{30} must be between 0 and 2"),
 ]
 
 
@@ -59,11 +64,11 @@ def test_what_is_refused_is_named_with_what_was_expected(check, given, error, me
 
 
 def test_what_is_allowed_comes_back_as_pythons_own() -> None:
-    assert [as_between("x", x, 0, 1) for x in (0, 1)] == [0, 1]
-    assert as_positive_vector("x", 2, 3).tolist() == [2, 2, 2]
-    assert (as_whole("x", np.int64(3)), type(as_whole("x", np.int64(3)))) == (3, int)
-    assert (as_flag("x", True), as_flag("x", np.False_)) == (True, False)
-    assert as_choice("x", "a", ("a", "b")) == "a"
+    assert [check_range("x", x, 0, 1) for x in (0, 1)] == [0, 1]
+    assert check_positive_vector("x", 2, 3).tolist() == [2, 2, 2]
+    assert (check_int("x", np.int64(3)), type(check_int("x", np.int64(3)))) == (3, int)
+    assert (check_bool("x", True), check_bool("x", np.False_)) == (True, False)
+    assert check_choice("x", "a", ("a", "b")) == "a"
 
 
 @pytest.mark.parametrize("as_list", [False, True])
@@ -74,7 +79,7 @@ def test_a_tensor_with_a_gradient_is_refused_with_the_word_detach(as_list: bool)
 
 
 @pytest.mark.parametrize("digits", [400, 5000])  # Python writes out no more than 4300
-@pytest.mark.parametrize("check", [as_number, as_whole, to_float])
+@pytest.mark.parametrize("check", [check_number, check_int, to_float])
 def test_a_whole_number_that_no_float_holds_is_named(check: Any, digits: int) -> None:
     with pytest.raises((TypeError, ValueError), match=r"^x = .* (must be|is not) "):
         check("x", 10**digits)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import Array, as_flag, as_positive, as_whole
+from sb3_yann._validation import Array, check_bool, check_int, check_positive
 from sb3_yann.audit.absolute import absolute_observation
 from sb3_yann.audit.causes import Cause, likely_cause, not_finite
 from sb3_yann.audit.finding import (
@@ -71,9 +71,9 @@ class CostAudit(BaseCallback):
         self, steps: int = 100, tolerance: float = 1e-3, strict: bool = False, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
-        self.steps = as_whole("steps", steps, FEWEST, "Fewer say nothing.")
-        self.tolerance = as_positive("tolerance", tolerance, "Rounding is no mismatch.")
-        self.strict = as_flag("strict", strict)
+        self.steps = check_int("steps", steps, FEWEST, "Fewer say nothing.")
+        self.tolerance = check_positive("tolerance", tolerance, "Rounding is no mismatch.")
+        self.strict = check_bool("strict", strict)
         self.finding: CostFinding | None = None
 
     def _init_callback(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from rich.progress import track
 
-from sb3_yann._validation import Array, as_flag, as_whole
+from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.audit.closed_loops import (
     PAUSE,
     Excited,
@@ -119,9 +119,9 @@ def headroom(
     """
     if not isinstance(mpc, LinearMPC):
         raise TypeError(f"mpc = {mpc!r} must be a LinearMPC.")
-    as_whole("n_starts", n_starts, 2)
-    as_whole("seed", seed, 0)
-    as_flag("progress_bar", progress_bar)
+    check_int("n_starts", n_starts, 2)
+    check_int("seed", seed, 0)
+    check_bool("progress_bar", progress_bar)
     access = set_state, get_state
     for name, given in zip(("set_state", "get_state"), access, strict=True):
         if given is not None and not callable(given):

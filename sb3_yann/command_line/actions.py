@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from sb3_yann._validation import as_whole
+from sb3_yann._validation import check_int
 
 
 def solve(options: Namespace) -> None:
@@ -176,8 +176,8 @@ def law_of(given: str) -> Any:
 
 def _seeds(episodes: int, first: int = 0) -> range:
     """Return the seeds of so many episodes, one at least."""
-    first = as_whole("--seed", first, 0)
-    return range(first, first + as_whole("--episodes", episodes))
+    first = check_int("--seed", first, 0)
+    return range(first, first + check_int("--episodes", episodes))
 
 
 def _require_place(path: Path) -> None:

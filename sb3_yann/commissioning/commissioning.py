@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_between, as_flag, as_whole
+from sb3_yann._validation import check_bool, check_int, check_range
 from sb3_yann.commissioning.comparison import (
     Costs,
     compare,
@@ -122,11 +122,11 @@ class Commissioning:
                 "function that makes one."
             )
         self.model, self.plant_env, self.verbose = model, plant_env, verbose
-        self.batch = as_whole("batch", batch, 2)
-        self.smallest = as_between("max_correction", max_correction, 0, 1, "(]")
-        self.shadow = as_flag("shadow", shadow)
-        self.reidentify = as_flag("reidentify", reidentify)
-        self.iterations, self.seed = as_whole("iterations", iterations), as_whole("seed", seed, 0)
+        self.batch = check_int("batch", batch, 2)
+        self.smallest = check_range("max_correction", max_correction, 0, 1, "(]")
+        self.shadow = check_bool("shadow", shadow)
+        self.reidentify = check_bool("reidentify", reidentify)
+        self.iterations, self.seed = check_int("iterations", iterations), check_int("seed", seed, 0)
         self.twin: PlantTwin | None = None
         self.watchdog: Watchdog | None = None
         self.observer = observer_of(model.get_env()) or observer_of(plant_env)
@@ -163,7 +163,7 @@ class Commissioning:
         RuntimeError
             If an episode does not end in a million steps.
         """
-        as_whole("batches", batches)
+        check_int("batches", batches)
         if len(self.batches) >= batches:
             return self.batches
         with one_env(self.plant_env) as env:

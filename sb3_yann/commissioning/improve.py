@@ -14,7 +14,7 @@ import torch as th
 from rich.progress import track
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_between, as_flag, as_whole
+from sb3_yann._validation import check_bool, check_int, check_range
 from sb3_yann.commissioning.critic import refit_critic
 from sb3_yann.commissioning.distillation import distill
 from sb3_yann.commissioning.grounds import TwinGrounds
@@ -244,12 +244,12 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
         require_problem_of_twin(policy, twin.problem)
     counts = {"iterations": iterations, "batch": batch, "n_starts": n_starts}
     for name, value in (counts | {"check_every": check_every, "patience": patience}).items():
-        as_whole(name, value)
-    as_between("learning_rate", learning_rate, 0, np.inf, "()")
-    as_whole("seed", seed, 0)
+        check_int(name, value)
+    check_range("learning_rate", learning_rate, 0, np.inf, "()")
+    check_int("seed", seed, 0)
     for name, flag in {"reidentify": reidentify, "confine": confine}.items():
-        as_flag(name, flag)
-    as_flag("progress_bar", progress_bar)
+        check_bool(name, flag)
+    check_bool("progress_bar", progress_bar)
     layer = copy.deepcopy(policy.actor.mu).cpu()
     pace = Pace(iterations, learning_rate, check_every, patience)
     if isinstance(twin, PlantTwin):

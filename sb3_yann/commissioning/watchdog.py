@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sb3_yann._validation import Array, as_array
+from sb3_yann._validation import Array, check_array
 from sb3_yann.commissioning.bands import GAINS, Act, Bands, Tracks
 from sb3_yann.control.model.labels import name_of
 from sb3_yann.twin.dynamics import Dynamics
@@ -135,7 +135,7 @@ class Watchdog:
             If theta has another shape, or is not finite.
         """
         problem = self.dynamics.problem
-        first = as_array("theta", theta, (problem.n_theta,))
+        first = check_array("theta", theta, (problem.n_theta,))
         first = self.dynamics.row.begin(first)
         tracks = Tracks(self.dynamics, self.bands.familiarity, first, act)
         self.alarm, self._episode = None, _Episode(tracks, first)

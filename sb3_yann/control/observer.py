@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from sb3_yann._validation import Array, as_array, as_outputs, as_positive_vector
+from sb3_yann._validation import Array, check_array, check_outputs, check_positive_vector
 from sb3_yann.control import lqr
 from sb3_yann.control.model.linear_model import LinearModel
 
@@ -72,7 +72,7 @@ class DisturbanceObserver:
         known = [*model.measured] if model.estimated else []
         n, d = model.n_states, model.n_disturbances - len(known)
         self.model = model
-        self.C = as_outputs("measured", np.eye(n) if measured is None else measured, n)
+        self.C = check_outputs("measured", np.eye(n) if measured is None else measured, n)
         E = np.delete(model.E, known, axis=1)
         _require_observable(model, E, self.C)
         q = len(self.C)
@@ -80,13 +80,13 @@ class DisturbanceObserver:
         self.B = np.vstack([model.B, np.zeros((d, model.n_inputs))])
         self.E = np.vstack([model.E[:, known], np.zeros((d, len(known)))])
         self.seen = np.hstack([self.C, np.zeros((q, d))])
-        moves = as_positive_vector("state_noise", state_noise, n, STANDARD)
-        drifts = as_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD)
-        errors = as_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
+        moves = check_positive_vector("state_noise", state_noise, n, STANDARD)
+        drifts = check_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD)
+        errors = check_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
         if gain is None:
             self.gain = self._kalman_gain(moves, drifts, errors)
         else:
-            self.gain = as_array("gain", gain, (n + d, q))
+            self.gain = check_array("gain", gain, (n + d, q))
         radius = self._radius(self.gain)
         if not radius < 1:
             raise ValueError(
@@ -122,7 +122,7 @@ class DisturbanceObserver:
 
     def reset(self, y: ArrayLike) -> tuple[Array, Array]:
         """Restart with d_hat = 0 and the smallest x_hat that gives y (q,); return both."""
-        start = self._smallest @ as_array("y", y, (self.n_measured,))
+        start = self._smallest @ check_array("y", y, (self.n_measured,))
         self.estimate = np.concatenate([start, np.zeros(self.n_estimated)])
         return self.x_hat, self.d_hat
 
@@ -131,7 +131,7 @@ class DisturbanceObserver:
 
         Measured disturbances d are those that acted together with u.
         """
-        now = as_array("y", y, (self.n_measured,))
+        now = check_array("y", y, (self.n_measured,))
         predicted = self._after(u, d)
         self.estimate = predicted + self.gain @ (now - self.seen @ predicted)
         return self.x_hat, self.d_hat
@@ -151,8 +151,10 @@ class DisturbanceObserver:
                 f"d = {d!r}, but the observer is told {self.n_told} measured disturbances: those "
                 "of its model that are not `estimated`. Pass what acted together with u."
             )
-        moved = self.A @ self.estimate + self.B @ as_array("u", u, (self.model.n_inputs,))
-        return np.asarray(moved if d is None else moved + self.E @ as_array("d", d, (self.n_told,)))
+        moved = self.A @ self.estimate + self.B @ check_array("u", u, (self.model.n_inputs,))
+        return np.asarray(
+            moved if d is None else moved + self.E @ check_array("d", d, (self.n_told,))
+        )
 
     def _kalman_gain(self, moves: Array, drifts: Array, errors: Array) -> Array:
         """Return the steady-state gain of the filter from the standard deviations."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import as_bounds, as_positive, as_whole
+from sb3_yann._validation import check_bounds, check_int, check_positive
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class Checks:
 
     def arrays(self, size: int) -> dict[str, Any]:
         """Return them for ``size`` readings; TypeError or ValueError where one is wrong."""
-        low, high = as_bounds("obs", self.obs_min, self.obs_max, size)
+        low, high = check_bounds("obs", self.obs_min, self.obs_max, size)
         counts = {
-            name: np.int64(as_whole(name, getattr(self, name), 0))
+            name: np.int64(check_int(name, getattr(self, name), 0))
             for name in ("frozen_after", "hold", "recover", "transfer")
         }
         late = np.inf
         if self.late_after is not None:
-            late = as_positive("late_after", self.late_after, "None checks nothing.")
+            late = check_positive("late_after", self.late_after, "None checks nothing.")
         return {"obs_min": low, "obs_max": high, "late_after": np.float64(late), **counts}

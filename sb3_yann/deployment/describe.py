@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from sb3_yann._validation import Array, as_choice
+from sb3_yann._validation import Array, check_choice
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of, missing_observer
 from sb3_yann.control.mpc.choice import Law
@@ -82,7 +82,7 @@ def describe(
 def _note(model: LinearModel | None, observer: str) -> str:
     """Return what the export lacks; raise where nobody has said that he knows."""
     lacks = "" if model is None else missing_observer(model)
-    if as_choice("observer", observer, (NO_ONE, CALLER)) == NO_ONE and lacks:
+    if check_choice("observer", observer, (NO_ONE, CALLER)) == NO_ONE and lacks:
         raise ValueError(
             f"{lacks} An export does not hold it, and does not reach its set-points without it. If "
             "your code runs the observer and passes what it estimates: export(..., "

@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 
 from sb3_yann import _archive
-from sb3_yann._validation import as_choice, as_flag, as_options
+from sb3_yann._validation import check_bool, check_choice, check_options
 from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.cost import Cost, cost_of
@@ -123,8 +123,8 @@ def export(
     ['reactor.c', 'reactor.h', 'reactor_selftest.c']
     """
     target = Path(path)
-    kind = as_choice("format", format or target.suffix.lstrip("."), tuple(FORMATS))
-    as_choice("precision", precision, PRECISIONS)
+    kind = check_choice("format", format or target.suffix.lstrip("."), tuple(FORMATS))
+    check_choice("precision", precision, PRECISIONS)
     called = target.stem if name is None else name
     if not isinstance(called, str) or not WORDS.fullmatch(called):
         raise ValueError(
@@ -135,8 +135,8 @@ def export(
         raise FileNotFoundError(f"There is no folder {target.parent}: make it first.")
     if kind in ("st", "xml") and called.upper() in RESERVED:
         raise ValueError(f"name = {called!r} is a word of Structured Text. Pass another name.")
-    own = as_options("checks", checks or Checks(), Checks)
-    data = describe(given, called, own, as_flag("absolute", absolute), observer)
+    own = check_options("checks", checks or Checks(), Checks)
+    data = describe(given, called, own, check_bool("absolute", absolute), observer)
     paths = FORMATS[kind](data, target, precision)
     sizes = tuple(each.stat().st_size for each in paths)
     return Exported(tuple(paths), sizes, cost_of(data), digest_of(data), str(data["note"]))

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, as_kind, as_whole
+from sb3_yann._validation import Array, check_int, check_type
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.plant_units import InputUnits
@@ -64,7 +64,7 @@ class Episodes:
 
 def as_played(name: str, value: Episodes) -> Episodes:
     """Return ``value`` if it is Episodes, else raise TypeError."""
-    return as_kind(name, value, Episodes, "the Episodes that evaluate returns")
+    return check_type(name, value, Episodes, "the Episodes that evaluate returns")
 
 
 class EnvPool:
@@ -187,7 +187,7 @@ def as_seeds(seeds: Iterable[int]) -> list[int]:
     """Return the seeds of episodes, whole numbers of at least 0."""
     if not isinstance(seeds, Iterable):
         raise TypeError(f"seeds = {seeds!r} must hold a seed for each episode, e.g. range(20).")
-    return [as_whole("seeds", each, 0) for each in seeds]
+    return [check_int("seeds", each, 0) for each in seeds]
 
 
 def as_source(env: Any) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_flag, as_options, as_whole
+from sb3_yann._validation import check_bool, check_int, check_options
 from sb3_yann.audit.callback import CostAudit
 from sb3_yann.evaluation.episodes import LONG, Source, as_source
 from sb3_yann.evaluation.plots.decisions import plot_decisions
@@ -148,16 +148,16 @@ class ImprovementGuard(BaseCallback):
             raise ValueError(f"log_path = {log_path!r} is a folder; name a file in it.")
         if save_path is not None and Path(save_path).is_file():
             raise ValueError(f"save_path = {save_path!r} is a file; name a folder.")
-        as_whole("n_starts", n_starts)
-        as_whole("n_new_starts", n_new_starts, 0)
+        check_int("n_starts", n_starts)
+        check_int("n_new_starts", n_new_starts, 0)
         n_final = 10 * n_new_starts if n_final_starts is None else n_final_starts
-        as_whole("n_final_starts", n_final, 0)
-        as_whole("seed", seed, 0)
-        as_whole("eval_every", eval_every)
-        as_whole("patience", patience)
-        as_flag("keep_if_worse", keep_if_worse)
-        rule = as_options("rule", rule, AcceptanceRule)
-        self.env, self.step_size = env, as_options("step_size", step_size, StepSize)
+        check_int("n_final_starts", n_final, 0)
+        check_int("seed", seed, 0)
+        check_int("eval_every", eval_every)
+        check_int("patience", patience)
+        check_bool("keep_if_worse", keep_if_worse)
+        rule = check_options("rule", rule, AcceptanceRule)
+        self.env, self.step_size = env, check_options("step_size", step_size, StepSize)
         self.log_path = None if log_path is None else Path(log_path)
         self.save_path = None if save_path is None else Path(save_path)
         self.acceptance = SimulatorAcceptance(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from sb3_yann._validation import as_between, as_flag
+from sb3_yann._validation import check_bool, check_range
 from sb3_yann.compare import EXCESS_ROOM
 
 
@@ -61,20 +61,20 @@ class AcceptanceRule:
     excess_room: float = EXCESS_ROOM
 
     def __post_init__(self) -> None:
-        as_between("margin", self.margin, 0, np.inf)
-        as_between(
+        check_range("margin", self.margin, 0, np.inf)
+        check_range(
             "tail", self.tail, 0, 1, hint="It is a share of the starts, 0 for the worst one."
         )
         hint = "It is a share of the MPC's mean cost, 0 for any gain."
-        as_between("least_gain", self.least_gain, 0, 1, hint=hint)
+        check_range("least_gain", self.least_gain, 0, 1, hint=hint)
         hint = "It is in half-widths of theta's box, 0 for the MPC's own excess and a tenth."
-        as_between("excess_room", self.excess_room, 0, np.inf, hint=hint)
+        check_range("excess_room", self.excess_room, 0, np.inf, hint=hint)
         if self.largest_step is not None:
             hint = "It is a multiple of the MPC's largest step, or None."
-            as_between("largest_step", self.largest_step, 1, np.inf, hint=hint)
-        as_flag("by_region", self.by_region)
-        as_flag("retreat", self.retreat)
-        as_between("significance", self.significance, 0, 0.5)
+            check_range("largest_step", self.largest_step, 1, np.inf, hint=hint)
+        check_bool("by_region", self.by_region)
+        check_bool("retreat", self.retreat)
+        check_range("significance", self.significance, 0, 0.5)
 
     @property
     def standard_errors(self) -> float:
@@ -107,6 +107,6 @@ class StepSize:
     smallest: float = 0.1
 
     def __post_init__(self) -> None:
-        as_between("shrink", self.shrink, 0, 1)
-        as_between("grow", self.grow, 1, np.inf)
-        as_between("smallest", self.smallest, 0, 1)
+        check_range("shrink", self.shrink, 0, 1)
+        check_range("grow", self.grow, 1, np.inf)
+        check_range("smallest", self.smallest, 0, 1)

@@ -15,7 +15,7 @@ import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import as_kind
+from sb3_yann._validation import check_type
 from sb3_yann.evaluation.episodes import EnvPool, Source
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.options import StepSize
@@ -202,7 +202,7 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     >>> _ = model.learn(1, callback=[NoActionNoise(), guard])
     >>> restore_accepted(model)
     """
-    as_kind("model", model, BaseAlgorithm, "a DDPG or TD3 model")
+    check_type("model", model, BaseAlgorithm, "a DDPG or TD3 model")
     state, policy = getattr(model, "guard_state", None), model.policy
     if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
         name = type(model).__name__

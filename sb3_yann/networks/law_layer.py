@@ -67,9 +67,9 @@ class LawLayer(nn.Module):
         law, network = self.explicit_law, self.network
         if law is None or not network.compiles:
             return None
-        from sb3_yann.networks._kernels.mlp import as_array  # which loads numba
+        from sb3_yann.networks._kernels.mlp import to_numpy  # which loads numba
 
-        weights = map(as_array, network.weights())
+        weights = map(to_numpy, network.weights())
         return (*law.packed, *self.constants, *weights, network.pinned_array)
 
     def frozen(self) -> Callable[[Array], NDArray[Any]]:

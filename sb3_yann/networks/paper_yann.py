@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_yann._validation import Array, as_between, as_kind, as_whole
+from sb3_yann._validation import Array, check_int, check_range, check_type
 from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
 
 
@@ -39,9 +39,9 @@ class PaperYann(nn.Module):
 
     def __init__(self, law: PiecewiseAffine, width: int, scale: float = 0.01) -> None:
         super().__init__()
-        as_kind("law", law, PiecewiseAffine, "a PiecewiseAffine, such as LinearMPC.explicit()")
-        width = as_whole("width", width, 0, "It counts nodes.")
-        scale = as_between("scale", scale, 0, np.inf, "[)")
+        check_type("law", law, PiecewiseAffine, "a PiecewiseAffine, such as LinearMPC.explicit()")
+        width = check_int("width", width, 0, "It counts nodes.")
+        scale = check_range("scale", scale, 0, np.inf, "[)")
         p, m, n, q = law.n_regions, law.n_inputs, law.n_theta, law.n_halfspaces
         counts = np.diff([*law.starts, q])
         owner = np.repeat(np.eye(p), counts, axis=1)  # (p, q): which region a half-space bounds

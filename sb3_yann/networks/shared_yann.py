@@ -109,9 +109,9 @@ class SharedYannLayer(LawLayer):
 
     def inputs(self, theta: th.Tensor | Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return the law's inputs (batch, m), zeros where theta is not finite, and where it is."""
-        from sb3_yann.networks._kernels.mlp import as_array  # which loads numba
+        from sb3_yann.networks._kernels.mlp import to_numpy  # which loads numba
 
-        points = as_array(th.as_tensor(theta), np.float64)
+        points = to_numpy(th.as_tensor(theta), np.float64)
         finite = np.isfinite(points).all(axis=1)
         if finite.all():
             return self.given(points), finite

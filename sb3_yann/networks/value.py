@@ -11,7 +11,13 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_yann._validation import Array, as_array, as_bounds, as_positive, as_positive_vector
+from sb3_yann._validation import (
+    Array,
+    check_array,
+    check_bounds,
+    check_positive,
+    check_positive_vector,
+)
 from sb3_yann.networks.prediction import (
     LinearPrediction,
     PredictionModel,
@@ -46,10 +52,10 @@ class Ranges:
     u_max: Array
 
     def __post_init__(self) -> None:
-        as_positive_vector("theta_half", self.theta_half, len(self.theta_half))
-        as_bounds("u", self.u_min, self.u_max, len(self.u_min))
+        check_positive_vector("theta_half", self.theta_half, len(self.theta_half))
+        check_bounds("u", self.u_min, self.u_max, len(self.u_min))
         for name in ("u_min", "u_max"):
-            as_array(name, getattr(self, name), ("m",))  # finite
+            check_array(name, getattr(self, name), ("m",))  # finite
 
     @property
     def u_half(self) -> Array:
@@ -193,7 +199,7 @@ class AfterstateValue(nn.Module):
         scale: float | None = None,
     ) -> None:
         super().__init__()
-        known = 0.0 if scale is None else as_positive("scale", scale)  # 0: not known yet
+        known = 0.0 if scale is None else check_positive("scale", scale)  # 0: not known yet
         import_module("sb3_yann.networks._kernels.afterstate_value")  # see YannLayer
         self.model = untrained(model) if isinstance(model, nn.Module) else model
         self.gamma = gamma

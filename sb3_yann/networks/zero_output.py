@@ -16,7 +16,7 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_yann._validation import Array, as_between, as_whole
+from sb3_yann._validation import Array, check_int, check_range
 
 Activation = Callable[[th.Tensor], th.Tensor]
 FEW = 32
@@ -48,7 +48,7 @@ class PairedLinear(nn.Module):
         scale: float = 0.01,
     ) -> None:
         super().__init__()
-        as_whole("n_nodes", n_nodes, 2, "Zero needs a pair of nodes.")
+        check_int("n_nodes", n_nodes, 2, "Zero needs a pair of nodes.")
         n_pairs = n_nodes // 2
         self.parts = [n_pairs, n_pairs, n_nodes % 2]
         first = _drawn((n_stacked, n_pairs), in_features, out_features, scale)
@@ -90,8 +90,8 @@ class StackedLinear(nn.Module):
 
 def _drawn(stack: tuple[int, ...], in_features: int, out_features: int, scale: float) -> th.Tensor:
     """Return random weights and, as the last column, biases: (*stack, out_features, n + 1)."""
-    shape = as_whole("out_features", out_features), as_whole("in_features", in_features) + 1
-    scale = as_between("scale", scale, 0, np.inf, "[)")
+    shape = check_int("out_features", out_features), check_int("in_features", in_features) + 1
+    scale = check_range("scale", scale, 0, np.inf, "[)")
     return th.empty(*stack, *shape).uniform_(-scale, scale)
 
 
@@ -183,7 +183,7 @@ class ZeroOutputNetwork(nn.Module):
         super().__init__()
         if np.ndim(hidden) != 1 or len(hidden) not in (1, 2):
             raise ValueError(f"hidden = {hidden!r} must name one or two widths, such as (16, 16).")
-        hidden = tuple(as_whole("hidden", each) for each in hidden)
+        hidden = tuple(check_int("hidden", each) for each in hidden)
         with th.enable_grad():
             zero = th.zeros((), requires_grad=True)
             at_zero = activation(zero)

@@ -16,7 +16,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
-from sb3_yann._validation import Array, as_whole
+from sb3_yann._validation import Array, check_int
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.plant_units import InputUnits, misread_state
@@ -70,7 +70,7 @@ def require_sb3_kwargs(given: dict[str, Any], own: list[str]) -> None:
         raise ValueError(
             "features_extractor_class must stay FlattenExtractor: the law takes theta."
         )
-    as_whole("n_critics", given.get("n_critics", 1))
+    check_int("n_critics", given.get("n_critics", 1))
     _require_optimizer(given.get("optimizer_class", th.optim.Adam))
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from sb3_yann import networks
-from sb3_yann._validation import NonFiniteWarning, as_choice
+from sb3_yann._validation import NonFiniteWarning, check_choice
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks import AfterstateValue, SharedYannLayer, YannLayer
@@ -267,7 +267,7 @@ def layer_for(law: Law, networks: str | None) -> Any:
     ValueError where a network for each region is asked of a law that has none.
     """
     if networks is not None:
-        as_choice("networks", networks, NETWORKS)
+        check_choice("networks", networks, NETWORKS)
     if isinstance(law, PiecewiseAffine):
         return SharedYannLayer if networks == "shared" else YannLayer
     if networks == "per_region":

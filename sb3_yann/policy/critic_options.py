@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_yann._validation import as_choice, as_number, as_options, as_positive
+from sb3_yann._validation import check_choice, check_number, check_options, check_positive
 from sb3_yann.networks.prediction import PredictionModel
 
 KINDS = ("afterstate", "state_action")
@@ -45,7 +45,7 @@ class CriticOptions:
     reward_offset: float = 0.0
 
     def __post_init__(self) -> None:
-        as_choice("kind", self.kind, KINDS)
+        check_choice("kind", self.kind, KINDS)
         if self.prediction_model is not None and not callable(self.prediction_model):
             raise TypeError(
                 f"prediction_model = {self.prediction_model!r} must be a function of tensors "
@@ -54,9 +54,11 @@ class CriticOptions:
         if self.prediction_model is not None and self.kind == "state_action":
             raise ValueError("prediction_model is for kind='afterstate', not for 'state_action'.")
         if self.value_scale is not None:
-            as_positive("value_scale", self.value_scale, "It multiplies the network, or is None.")
-        as_positive("reward_scale", self.reward_scale, "Give 1 for the cost as it is.")
-        as_number("reward_offset", self.reward_offset)
+            check_positive(
+                "value_scale", self.value_scale, "It multiplies the network, or is None."
+            )
+        check_positive("reward_scale", self.reward_scale, "Give 1 for the cost as it is.")
+        check_number("reward_offset", self.reward_offset)
 
     @property
     def scales_itself(self) -> bool:
@@ -75,5 +77,5 @@ class CriticOptions:
 def as_critic_options(critic: str | CriticOptions | Mapping[str, Any]) -> CriticOptions:
     """Return the options of a critic from its kind, a mapping of some of them, or themselves."""
     if isinstance(critic, CriticOptions | Mapping):
-        return as_options("critic", critic, CriticOptions)
-    return CriticOptions(as_choice("critic", critic, KINDS))
+        return check_options("critic", critic, CriticOptions)
+    return CriticOptions(check_choice("critic", critic, KINDS))

@@ -12,7 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_choice, as_whole
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_choice, check_int
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.plant_units import InputUnits
 
@@ -43,19 +43,19 @@ class AffineObservation(ReadOnlyArrays):
     offset: Array = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        matrix = as_array("matrix", self.matrix, ("n_theta", "n_obs"))
+        matrix = check_array("matrix", self.matrix, ("n_theta", "n_obs"))
         offset = np.zeros(len(matrix)) if self.offset is None else self.offset
-        self._store(matrix=matrix, offset=as_array("offset", offset, (len(matrix),)))
+        self._store(matrix=matrix, offset=check_array("offset", offset, (len(matrix),)))
 
     @classmethod
     def identity(cls, size: int) -> AffineObservation:
         """Return ``theta = obs``."""
-        return cls(np.eye(as_whole("size", size)))
+        return cls(np.eye(check_int("size", size)))
 
     @classmethod
     def deviation(cls, x_ss: ArrayLike) -> AffineObservation:
         """Return ``theta = obs - x_ss``, for absolute observations of deviations from x_ss (n,)."""
-        steady = as_array("x_ss", x_ss, ("n",))
+        steady = check_array("x_ss", x_ss, ("n",))
         return cls(np.eye(len(steady)), -steady)
 
     @classmethod
@@ -67,8 +67,8 @@ class AffineObservation(ReadOnlyArrays):
         mean, std : array_like, shape (n,), in units of theta
             No entry of ``std`` is zero.
         """
-        middle = as_array("mean", mean, ("n",))
-        spread = as_array("std", std, (len(middle),))
+        middle = check_array("mean", mean, ("n",))
+        spread = check_array("std", std, (len(middle),))
         if np.any(spread == 0):
             raise ValueError(f"std = {spread.tolist()} must not be zero: nothing would be seen.")
         return cls(np.diag(spread), middle)
@@ -86,9 +86,9 @@ class AffineObservation(ReadOnlyArrays):
         to : pair of float, default (-1, 1)
             As ``min_obs`` and ``max_obs`` of `gymnasium.wrappers.RescaleObservation`.
         """
-        bottom = as_array("low", low, ("n",))
-        top = as_array("high", high, (len(bottom),))
-        start, end = as_array("to", to, (2,))
+        bottom = check_array("low", low, ("n",))
+        top = check_array("high", high, (len(bottom),))
+        start, end = check_array("to", to, (2,))
         if np.any(top <= bottom) or not end > start:
             raise ValueError(
                 f"low = {bottom.tolist()} must lie below high = {top.tolist()}, and to = {to} rise."
@@ -123,7 +123,7 @@ class AffineObservation(ReadOnlyArrays):
 
         It comes last in SB3's `VecFrameStack` and in gymnasium's `FrameStackObservation`.
         """
-        frames, size = as_whole("frames", frames), as_whole("size", size)
+        frames, size = check_int("frames", frames), check_int("size", size)
         return cls.pick(range((frames - 1) * size, frames * size), frames * size)
 
     @classmethod
@@ -214,14 +214,14 @@ def as_observation(
     if isinstance(given, Mapping):
         if set(given) != {"center", "scale"}:
             raise ValueError(f"observation = {dict(given)} must have a 'center' and a 'scale'.")
-        center = as_array("observation['center']", given["center"], (problem.n_theta,))
+        center = check_array("observation['center']", given["center"], (problem.n_theta,))
         return AffineObservation.normalized(center - problem.theta_ss, given["scale"])
     if not isinstance(given, str):
         raise TypeError(
             f"observation = {given!r} must be an AffineObservation, 'deviation', 'absolute', a "
             "mapping with 'center' and 'scale', or None."
         )
-    absolute = as_choice("observation", given, ("deviation", "absolute")) == "absolute"
+    absolute = check_choice("observation", given, ("deviation", "absolute")) == "absolute"
     shifted = absolute and bool(np.any(problem.theta_ss))
     return AffineObservation.deviation(problem.theta_ss) if shifted else None
 
@@ -285,7 +285,7 @@ def require_outermost(normalize: VecNormalize, seen: tuple[int, ...] | None) -> 
 
 def _rows(name: str, entries: Sequence[int], size: int) -> Array:
     """Return the rows (k, size) of the identity that pick so many entries of an observation."""
-    size, found = as_whole("size", size), [*entries] if isinstance(entries, Iterable) else [None]
+    size, found = check_int("size", size), [*entries] if isinstance(entries, Iterable) else [None]
     whole = all(isinstance(each, int | np.integer) for each in found)
     if not whole or not all(0 <= each < size for each in found):
         given = found if isinstance(entries, Iterable) else entries

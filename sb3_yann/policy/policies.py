@@ -19,7 +19,14 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_yann._validation import Array, as_between, as_choice, as_discount, as_flag, as_whole
+from sb3_yann._validation import (
+    Array,
+    check_bool,
+    check_choice,
+    check_discount,
+    check_int,
+    check_range,
+)
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.choice import LAWS
@@ -156,18 +163,18 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         if told or self.observation is not None:
             self.saved_kwargs["observation"] = self.observation or "deviation"
         self.looked = False  # at the first observation
-        self.gamma = as_discount(_checks.as_gamma(gamma, algorithm))
+        self.gamma = check_discount(_checks.as_gamma(gamma, algorithm))
         self.lr_mult = {
-            "actor": as_between("actor_lr_mult", actor_lr_mult, 0, np.inf, "[)"),
-            "critic": as_between("critic_lr_mult", critic_lr_mult, 0, np.inf, "[)"),
+            "actor": check_range("actor_lr_mult", actor_lr_mult, 0, np.inf, "[)"),
+            "critic": check_range("critic_lr_mult", critic_lr_mult, 0, np.inf, "[)"),
         }
         self.critic_options = as_critic_options(critic)
-        self.critic_warmup = as_whole("critic_warmup", critic_warmup, 0, "It counts updates.")
+        self.critic_warmup = check_int("critic_warmup", critic_warmup, 0, "It counts updates.")
         self.max_correction = _as_correction(max_correction)
         if pin_equilibrium is None:
             pin_equilibrium = not self.problem.layout.has_constants
-        self.pin_equilibrium = as_flag("pin_equilibrium", pin_equilibrium)
-        self.law, self.networks = as_choice("law", law, LAWS), networks
+        self.pin_equilibrium = check_bool("pin_equilibrium", pin_equilibrium)
+        self.law, self.networks = check_choice("law", law, LAWS), networks
         shared = layer_for(self.problem.law(law), networks) is SharedYannLayer
         self.actor_step = 1.0  # another factor of the learning rate, which an ImprovementGuard sets
         self.refused = {"actor": 0, "critic": 0}  # steps whose gradient was not finite
@@ -378,7 +385,7 @@ def _as_correction(value: float | None) -> float | None:
     if value is None:
         return None
     hint = "It is a fraction of the input range, or None."
-    return as_between("max_correction", value, 0, 1, hint=hint)
+    return check_range("max_correction", value, 0, 1, hint=hint)
 
 
 def require_yann_policy(policy: BasePolicy, who: str) -> YannPolicy:

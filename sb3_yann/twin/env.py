@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array, as_whole
+from sb3_yann._validation import Array, check_int
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import DisturbanceObserver
 from sb3_yann.control.mpc.bound_excess import bound_excess
@@ -60,7 +60,7 @@ class TwinEnv(gym.Env[Single, Single]):
         member: int | None = None,
     ) -> None:
         members = len(dynamics.members)
-        if member is not None and as_whole("member", member, 0) >= members:
+        if member is not None and check_int("member", member, 0) >= members:
             raise ValueError(f"member = {member} must be below {members}, how many there are.")
         self.dynamics, self.episodes, self.starts, self.limits = dynamics, episodes, starts, limits
         self.member, self.render_mode, problem = member, None, dynamics.problem

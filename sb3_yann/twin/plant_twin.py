@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import as_flag, as_whole
+from sb3_yann._validation import check_bool, check_int
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.env import TwinEnv
@@ -152,9 +152,9 @@ class PlantTwin:
         """
         if not isinstance(problem, LinearMPC):
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
-        as_whole("n_members", n_members)
-        as_whole("seed", seed, 0)
-        as_flag("absolute", absolute)
+        check_int("n_members", n_members)
+        check_int("seed", seed, 0)
+        check_bool("absolute", absolute)
         row, given = RowLayout(problem, observer), (references, disturbances, previous)
         found = observer is not None
         log = as_episodes(problem, episodes, *given, observed=found, absolute=absolute)

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy import linalg
 
-from sb3_yann._validation import Array, as_whole
+from sb3_yann._validation import Array, check_int
 
 STEP = 1e-4
 """Of a finite difference, in scaled coordinates."""
@@ -137,7 +137,7 @@ class Polynomial:
         offset: bool = False,
         inputs: tuple[int, float] = (0, 1.0),
     ) -> None:
-        self.degree, self.shrinkage = as_whole("degree", degree), shrinkage
+        self.degree, self.shrinkage = check_int("degree", degree), shrinkage
         self.offset, self.inputs = offset, inputs
 
     @classmethod

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_yann._validation import Array, as_whole
+from sb3_yann._validation import Array, check_int
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.env import Single, TwinEnv, step_all
 
@@ -164,4 +164,4 @@ class TwinVecEnv(DummyVecEnv):
 def copies(env: TwinEnv, n_envs: int) -> list[TwinEnv]:
     """Return so many envs like the given one."""
     own = env.dynamics, env.episodes, env.starts, env.limits, env.member
-    return [TwinEnv(*own) for _ in range(as_whole("n_envs", n_envs))]
+    return [TwinEnv(*own) for _ in range(check_int("n_envs", n_envs))]

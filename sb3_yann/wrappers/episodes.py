@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.random.mtrand import get_bit_generator, set_bit_generator
 
-from sb3_yann._validation import as_whole
+from sb3_yann._validation import check_int
 
 Any_Env = gym.Env[Any, Any]
 
@@ -43,7 +43,7 @@ class TimeLimitIsNoTermination(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: Any_Env, steps: int) -> None:
         super().__init__(env)
         hint = "It counts the steps after which the env ends every episode."
-        self.steps, self.taken = as_whole("steps", steps, hint=hint), 0
+        self.steps, self.taken = check_int("steps", steps, hint=hint), 0
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Start an episode."""

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_yann._validation import as_kind
+from sb3_yann._validation import check_type
 
 Vector = NDArray[np.floating[Any]]
 Env = gym.Env[Vector, Vector]
@@ -17,7 +17,7 @@ Env = gym.Env[Vector, Vector]
 
 def require_vector(env: gym.Env[Any, Any], name: str) -> spaces.Box:
     """Return a space of the env, a Box with one dimension."""
-    as_kind("env", env, gym.Env, "a gymnasium.Env: gymnasium.make(id), or one of your own")
+    check_type("env", env, gym.Env, "a gymnasium.Env: gymnasium.make(id), or one of your own")
     space = getattr(env, name)
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise TypeError(

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_kind, as_number
+from sb3_yann._validation import Array, check_number, check_type
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
@@ -56,7 +56,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     ) -> None:
         space = require_vector(env, "observation_space")
         super().__init__(env)
-        as_kind("problem", problem, LinearMPC, "a LinearMPC, such as that of the policy")
+        check_type("problem", problem, LinearMPC, "a LinearMPC, such as that of the policy")
         self.inputs = require_vector(env, "action_space")
         names = problem.layout.names
         units = InputUnits.of(problem, self.inputs.low, self.inputs.high)
@@ -76,7 +76,7 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"{problem.n_theta} entries. Wrap the env so that it shows all, in this order, or "
                 "pass observation=AffineObservation(matrix, offset)."
             )
-        self.problem, self.violation_cost = problem, as_number("violation_cost", violation_cost)
+        self.problem, self.violation_cost = problem, check_number("violation_cost", violation_cost)
         self.bounds = Bounds.of(problem)
         self.theta: Array = np.zeros(problem.n_theta)
 

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, NonFiniteWarning, as_vector, as_whole
+from sb3_yann._validation import Array, NonFiniteWarning, check_int, check_vector
 from sb3_yann.control import DisturbanceObserver
 from sb3_yann.wrappers.appending import Appending, joined
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
@@ -82,7 +82,7 @@ class PastInputs(Appending):
         hint = "It counts past values of an input."
         if not isinstance(delays, Iterable):
             raise TypeError(f"delays = {delays!r} must be a list, one entry for each input. {hint}")
-        self.delays = [as_whole("delays", each, 0, hint) for each in delays]
+        self.delays = [check_int("delays", each, 0, hint) for each in delays]
         if len(self.delays) != bounds.shape[0]:
             raise ValueError(
                 f"delays = {self.delays} must have one entry for each of the {bounds.shape[0]} "
@@ -115,7 +115,7 @@ def _as_initial(initial: ArrayLike | None, bounds: spaces.Box, needed: NDArray[n
             "the default, is hardly the one before an episode. Pass initial, such as u_ss of the "
             "model."
         )
-    return np.clip(as_vector("initial", initial, len(bounds.low)), bounds.low, bounds.high)
+    return np.clip(check_vector("initial", initial, len(bounds.low)), bounds.low, bounds.high)
 
 
 class SetPoint(Appending):
@@ -156,7 +156,7 @@ class SetPoint(Appending):
                 "references are drawn between them."
             )
         if hold is not None:
-            as_whole("hold", hold, hint="It counts steps; None is one reference in each episode.")
+            check_int("hold", hold, hint="It counts steps; None is one reference in each episode.")
         self.hold, self.schedule, self.steps = hold, schedule, 0
         self.reference: Array = np.zeros(len(self.low))
         self._own: np.random.Generator | None = None

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from sb3_yann._validation import as_positive, as_whole
+from sb3_yann._validation import check_int, check_positive
 
 _ADVICE = (
     "Their number grows with the horizon and the bounds: shorten the horizon, leave out bounds "
@@ -62,9 +62,9 @@ class SolveBudget:
 
     def __post_init__(self) -> None:
         if self.time_limit is not None:
-            as_positive("time_limit", self.time_limit, "It is in seconds; None is no limit.")
+            check_positive("time_limit", self.time_limit, "It is in seconds; None is no limit.")
         if self.region_limit is not None:
-            as_whole("region_limit", self.region_limit, hint="None is no limit.")
+            check_int("region_limit", self.region_limit, hint="None is no limit.")
 
     def require(self, n_regions: int) -> None:
         """Raise ExplicitLimitError if a law that is there has too many regions."""

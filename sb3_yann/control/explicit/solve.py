@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 from scipy.spatial import QhullError
 
-from sb3_yann._validation import Array, as_choice, half_widths
+from sb3_yann._validation import Array, check_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget, effort_of_lp
 from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
 from sb3_yann.control.explicit.equalities import Equalities
@@ -60,7 +60,7 @@ def solve_explicit(
 
     Its errors are those of :meth:`LinearMPC.explicit`.
     """
-    as_choice("solver", solver, ("walk", "ppopt"))
+    check_choice("solver", solver, ("walk", "ppopt"))
     _require_box(program)
     require_sane_sizes(program, u_min, u_max)
     timer = timer or BudgetTimer(SolveBudget())

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_between, as_choice, as_positive, as_vector
+from sb3_yann._validation import Array, check_choice, check_positive, check_range, check_vector
 from sb3_yann.control.identification.dead_time import (
     as_delays,
     exact_memory,
@@ -70,9 +70,9 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
     dt, x_ss, u_ss, d_ss, offset, ridge, held_out, delay : float, array_like, bool
         As of `identify`: sampling time, operating point (n,), (m,) and (d,), and options.
     """
-    automatic = isinstance(ridge, str) and as_choice("ridge", ridge, ("auto",)) == "auto"
+    automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
     episodes, sizes = as_episodes(states, actions, disturbances)
-    dt, lost = as_positive("dt", dt), 0
+    dt, lost = check_positive("dt", dt), 0
     if time is not None:
         episodes, lost = without_gaps(episodes, time, dt)
     _require_moving(episodes, sizes)
@@ -83,11 +83,11 @@ def fit_log(  # noqa: PLR0913 (those of `identify`)
         raise ValueError("d_ss is given, but there are no disturbances: pass these as well.")
     point = {"x_ss": (x_ss, n), "u_ss": (u_ss, m), "d_ss": (d_ss, d)}
     given = [
-        None if value is None and offset else as_vector(name, value, size)
+        None if value is None and offset else check_vector(name, value, size)
         for name, (value, size) in point.items()
     ]
-    fitted, tested = split(episodes, as_between("held_out", held_out, 0, 1, "[)"))
-    weight = 0.0 if automatic else as_between("ridge", ridge, 0, np.inf)
+    fitted, tested = split(episodes, check_range("held_out", held_out, 0, 1, "[)"))
+    weight = 0.0 if automatic else check_range("ridge", ridge, 0, np.inf)
     origin = None if offset else np.concatenate([part for part in given if part is not None])
     found, shrunk = regress(fitted, sizes, origin, weight), list[str]()
     if automatic:

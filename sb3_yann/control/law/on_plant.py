@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, to_float
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array, to_float
 from sb3_yann.control.model.linear_model import LinearModel
 
 if TYPE_CHECKING:
@@ -133,4 +133,4 @@ def with_plant(law: Law, data: dict[str, Any]) -> Law:
     model, m = LinearModel(**{**given, "dt": float(given["dt"])}), law.n_inputs
     if model.n_inputs != m or model.n_states > law.n_theta:
         raise ValueError(f"its model has {model.n_states} states and {model.n_inputs} inputs")
-    return law.on_plant(model, as_array("theta_ss", data["theta_ss"], (law.n_theta,)))
+    return law.on_plant(model, check_array("theta_ss", data["theta_ss"], (law.n_theta,)))

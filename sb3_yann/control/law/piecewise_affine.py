@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
 from sb3_yann._archive import write_arrays
-from sb3_yann._validation import Array, as_array
+from sb3_yann._validation import Array, check_array
 from sb3_yann.control.law._files import read_law
 from sb3_yann.control.law.on_plant import OnPlant, plant_arrays, with_plant
 from sb3_yann.control.polyhedra import largest_ball
@@ -101,18 +101,18 @@ class PiecewiseAffine(OnPlant):
 
     def __post_init__(self) -> None:
         """Check the arrays against each other and store them as read-only float64."""
-        gains = as_array("gains", self.gains, ("p", "m", "n"))
+        gains = check_array("gains", self.gains, ("p", "m", "n"))
         p, m, n = gains.shape
-        A = as_array("A", self.A, ("q", n))
-        values = {"gains": gains, "A": A, "b": as_array("b", self.b, (len(A),))}
-        values["offsets"] = as_array("offsets", self.offsets, (p, m))
+        A = check_array("A", self.A, ("q", n))
+        values = {"gains": gains, "A": A, "b": check_array("b", self.b, (len(A),))}
+        values["offsets"] = check_array("offsets", self.offsets, (p, m))
         for name, size in (("u", m), ("theta", n)):
             low, high = f"{name}_min", f"{name}_max"
-            bounds = check.as_bounds(name, getattr(self, low), getattr(self, high), size)
+            bounds = check.check_bounds(name, getattr(self, low), getattr(self, high), size)
             values[low], values[high] = bounds
-        check.as_choice("infeasible", self.infeasible, INFEASIBLE)
-        check.as_flag("disjoint", self.disjoint)
-        rows = as_array("starts", self.starts, (p,))
+        check.check_choice("infeasible", self.infeasible, INFEASIBLE)
+        check.check_bool("disjoint", self.disjoint)
+        rows = check_array("starts", self.starts, (p,))
         if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):
             raise ValueError(
                 f"starts = {rows.tolist()} must be the first row of each region in A, which has "

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._drawing import COLORS, REST, axes_or_new, legend_beside
-from sb3_yann._validation import Array, as_array, half_widths
+from sb3_yann._validation import Array, check_array, half_widths
 from sb3_yann.control.model.labels import labels_of, with_units
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def plot_regions(
         return _draw_line(law, axes, labels)
     across, up = _entries(entries, law)
     zero = np.zeros(law.n_theta) if law.theta_ss is None else law.theta_ss
-    point = zero if at is None else as_array("at", at, (law.n_theta,))
+    point = zero if at is None else check_array("at", at, (law.n_theta,))
     polygons = slices(law, (across, up), point - zero)
     axes = axes_or_new(axes, 7.4, 4.4)
     shift = zero[[across, up]]

@@ -7,7 +7,7 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_positive_vector
+from sb3_yann._validation import Array, check_positive_vector
 from sb3_yann.control.linearization.simulator import Simulator
 
 LONGEST_DELAY = 20  # longest input delay, in samples, that is detected
@@ -63,7 +63,7 @@ def connect(
 def _scale(simulator: Simulator, x: Array, scale: ArrayLike | None) -> Array:
     """Return the scale of each state, shape (n,)."""
     if scale is not None:
-        return as_positive_vector("scale", scale, x.size)
+        return check_positive_vector("scale", scale, x.size)
     size = np.maximum(np.abs(x), 1.0)
     space = simulator.env.observation_space
     if getattr(space, "shape", None) == x.shape and hasattr(space, "low"):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, as_array, as_positive, as_positive_vector, to_float
+from sb3_yann._validation import Array, check_array, check_positive, check_positive_vector, to_float
 from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
 from sb3_yann.control.linearization.differences import curvature, differences, idle_inputs
 from sb3_yann.control.linearization.rate import Rate
@@ -42,8 +42,8 @@ def linearize_dynamics(
         may be None.
     """
     x, u = _partly_known("x_ss", x_ss), _partly_known("u_ss", u_ss)
-    d = as_array("d_ss", [] if d_ss is None else d_ss, ("d",))
-    dt = as_positive("dt", dt)
+    d = check_array("d_ss", [] if d_ss is None else d_ss, ("d",))
+    dt = check_positive("dt", dt)
     labels = ["x", "u"] if d_ss is None else ["x", "u", "d"]
     if not callable(f):
         raise TypeError(f"f = {f!r} must be a function ({', '.join(labels)}) -> dx/dt.")
@@ -54,7 +54,7 @@ def linearize_dynamics(
     point, notes = _solve(rate, given, size, dt) if np.any(free) else (given, [])
     rate.choose(point)
     size = _scale(point, x.size, scale)
-    as_array(f"f({', '.join(f'{name}_ss' for name in labels)})", rate(point), (x.size,))
+    check_array(f"f({', '.join(f'{name}_ss' for name in labels)})", rate(point), (x.size,))
     _require_steady(rate, point, size, dt, scale is not None)
     rounding = np.finfo(float).eps * np.maximum(np.abs(point), size)[: x.size] / dt
     found = differences(rate, point, LONGEST * size, rounding, names(sizes))
@@ -177,5 +177,5 @@ def _scale(point: Array, n: int, scale: ArrayLike | None) -> Array:
         return size
     given = to_float("scale", scale)
     k = point.size if given.shape == point.shape else n
-    size[:k] = as_positive_vector("scale", given, k)
+    size[:k] = check_positive_vector("scale", given, k)
     return size

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_positive, to_float
+from sb3_yann._validation import Array, check_positive, to_float
 
 if TYPE_CHECKING:
     import gymnasium
@@ -89,7 +89,7 @@ def borrow(env: Maker) -> Borrowed:
 def sample_time(env: Any, dt: float | None) -> float:
     """Return the time of one step: ``dt``, or the one that the environment states."""
     if dt is not None:
-        return as_positive("dt", dt)
+        return check_positive("dt", dt)
     plant = env.unwrapped
     module = sys.modules[type(plant).__module__]
     for owner, name in ((plant, "dt"), (plant, "tau"), (plant, "DT"), (module, "DT")):

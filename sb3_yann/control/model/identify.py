@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from sb3_yann._validation import Array, ReadOnlyArrays, as_between, as_choice
+from sb3_yann._validation import Array, ReadOnlyArrays, check_choice, check_range
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.model.linear_model import LinearModel
@@ -69,8 +69,8 @@ class Identified(ReadOnlyArrays):
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Array, Array]:
         """Return each entry's confidence interval (Student's t); ``name`` is "A", "B" or "E"."""
-        name = as_choice("name", name, ("A", "B", "E"))
-        level = as_between("level", level, 0, 1, "()")
+        name = check_choice("name", name, ("A", "B", "E"))
+        level = check_range("level", level, 0, 1, "()")
         value, error = getattr(self.model, name), getattr(self, f"standard_error_{name}")
         width = stdtrit(self.degrees_of_freedom, (1 + level) / 2) * error
         return value - width, value + width

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_indices, as_positive, as_vector, to_float
+from sb3_yann._validation import (
+    Array,
+    check_array,
+    check_indices,
+    check_positive,
+    check_vector,
+    to_float,
+)
 from sb3_yann.control.identification.fit import fit_log
 from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.linear_system import names, zero_order_hold
@@ -84,26 +91,26 @@ class LinearModel(Plant):
         units: Units = (),
         estimated: Sequence[int] = (),
     ) -> None:
-        A = as_array("A", A, ("n", "n"))
+        A = check_array("A", A, ("n", "n"))
         n = A.shape[0]
         if n == 0 or A.shape[1] != n:
             raise ValueError(f"A has shape {A.shape}, expected a square matrix (n, n), n >= 1.")
-        B = as_array("B", B, (n, "m"))
+        B = check_array("B", B, (n, "m"))
         if B.shape[1] == 0:
             raise ValueError(f"B has shape {B.shape}: the model needs at least one input.")
-        E = as_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
+        E = check_array("E", np.zeros((n, 0)) if E is None else E, (n, "d"))
         if d_ss is not None and to_float("d_ss", d_ss).size and not E.size:
             raise ValueError(f"d_ss = {d_ss!r} is given, but there are no disturbances: pass E.")
-        x, u = as_vector("x_ss", x_ss, n), as_vector("u_ss", u_ss, B.shape[1])
-        d, moved = as_vector("d_ss", d_ss, E.shape[1]), as_vector("drift", drift, n)
+        x, u = check_vector("x_ss", x_ss, n), check_vector("u_ss", u_ss, B.shape[1])
+        d, moved = check_vector("d_ss", d_ss, E.shape[1]), check_vector("drift", drift, n)
         named = (
             as_names("state_names", state_names, n),
             as_names("input_names", input_names, u.size),
         )
         labels = [*(named[0] or names((n,))), *(named[1] or names((0, u.size)))]
         require_different(labels)
-        step, kept = as_positive("dt", dt), as_units(units, labels)
-        seen = as_indices("estimated", estimated, E.shape[1])
+        step, kept = check_positive("dt", dt), as_units(units, labels)
+        seen = check_indices("estimated", estimated, E.shape[1])
         super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept, seen)
 
     @classmethod

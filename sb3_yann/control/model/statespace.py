@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_yann._validation import Array, as_array, as_positive
+from sb3_yann._validation import Array, check_array, check_positive
 from sb3_yann.control.linear_system import LinearSystem, names, zero_order_hold
 from sb3_yann.control.model.labels import labels_of
 
@@ -26,7 +26,7 @@ def from_control(
     step, continuous = _sample_time(system.dt, dt)
     chosen = [_input(system, each) for each in disturbances]
     inputs = [i for i in range(system.ninputs) if i not in chosen]
-    A, both = as_array("A", system.A, ("n", "n")), as_array("B", system.B, ("n", "m"))
+    A, both = check_array("A", system.A, ("n", "n")), check_array("B", system.B, ("n", "m"))
     B, E = both[:, inputs], both[:, chosen]
     if continuous:
         A, B, E = zero_order_hold(A, B, E, step)
@@ -66,7 +66,7 @@ def _sample_time(own: float | bool | None, dt: float | None) -> tuple[float, boo
             "system.dt is None: continuous or discrete? Make it with control.ss(A, B, C, D, 0) or "
             "control.ss(A, B, C, D, dt)."
         )
-    given = None if dt is None else as_positive("dt", dt)
+    given = None if dt is None else check_positive("dt", dt)
     if own is not True and own > 0:
         if given is not None and not np.isclose(given, own, rtol=1e-9, atol=0):
             raise ValueError(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_bounds, as_whole, to_float
+from sb3_yann._validation import Array, check_array, check_bounds, check_int, to_float
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
 
@@ -23,7 +23,7 @@ def as_horizon(value: int) -> int:
     """Return the number of predicted steps, a whole number of at least 1."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TypeError(f"horizon = {value!r} must be a whole number of steps.")
-    return as_whole("horizon", value)
+    return check_int("horizon", value)
 
 
 def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
@@ -31,7 +31,7 @@ def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
     size, bounded, units = len(bounds[0]), np.isfinite(bounds).any(axis=0), given
     if given.ndim == 0:
         units = np.where(bounded, given, 0.0) if np.any(bounded) else np.full(size, float(given))
-    units = as_array(name, units, (size,))
+    units = check_array(name, units, (size,))
     if np.any(given > 0) and not np.any(units[bounded] > 0):
         wanted = f"pass {name[-1]}_min or {name[-1]}_max"
         raise ValueError(f"{name} = {given.tolist()}, but there is no bound to soften: {wanted}.")
@@ -63,9 +63,9 @@ def theta_box(
     for value, fallback in zip(given, states, strict=True):
         part = fallback if value is None else to_float("theta", value)
         parts.append(part[:n] if part.shape == (layout.size,) else part)
-    pieces = [as_bounds("theta", parts[0], parts[1], n), *others]
+    pieces = [check_bounds("theta", parts[0], parts[1], n), *others]
     low, high = (np.concatenate(side) for side in zip(*pieces, strict=True))
-    low, high = as_bounds("theta", low, high, layout.size)
+    low, high = check_bounds("theta", low, high, layout.size)
     for name, value, stored in zip(("theta_min", "theta_max"), given, (low, high), strict=True):
         _require_same_rest(name, value, stored, layout)
     return low, high

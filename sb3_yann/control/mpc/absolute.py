@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sb3_yann._validation import Array, as_bounds, as_flag, as_outputs
+from sb3_yann._validation import Array, check_bool, check_bounds, check_outputs
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc._arguments import Given
 from sb3_yann.control.mpc.groups import DisturbanceBounds, OutputBounds, Tracking
@@ -40,17 +40,17 @@ class Boxes(NamedTuple):
             An absolute problem, of which something is replaced: its arrays are deviations already,
             from the operating point of its model.
         """
-        if not as_flag("absolute", absolute):
+        if not check_bool("absolute", absolute):
             return self
         tracking, d, outputs = self.tracking, self.disturbances, self.outputs
         old = None if stored is None else stored.model
         if tracking is not None:
-            rows = as_outputs("Tracking.C", tracking.C, model.n_states)
+            rows = check_outputs("Tracking.C", tracking.C, model.n_states)
             before = None if stored is None or old is None else stored.tracking.C @ old.x_ss
             r = _Shift("r", rows @ model.x_ss, stored and stored.tracking, before)
             tracking = Tracking(rows, *r.of(tracking.r_min, tracking.r_max))
         if outputs is not None:
-            rows = as_outputs("OutputBounds.C", outputs.C, model.n_states)
+            rows = check_outputs("OutputBounds.C", outputs.C, model.n_states)
             before = None if stored is None or old is None else stored.outputs.C @ old.x_ss
             y = _Shift("y", rows @ model.x_ss, stored and stored.outputs, before)
             outputs = OutputBounds(rows, *y.of(outputs.y_min, outputs.y_max))
@@ -98,7 +98,7 @@ class _Shift:
         side = name.partition("_")[2]
         size = self.point.size
         if side == "min":
-            found = as_bounds(self.name, value, None, size)[0] - moved
+            found = check_bounds(self.name, value, None, size)[0] - moved
         else:
-            found = as_bounds(self.name, None, value, size)[1] - moved
+            found = check_bounds(self.name, None, value, size)[1] - moved
         return np.where(found == 0, 0.0, found)

@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, ReadOnlyArrays, as_array, as_bounds, as_symmetric, to_float
+from sb3_yann._validation import (
+    Array,
+    ReadOnlyArrays,
+    check_array,
+    check_bounds,
+    check_symmetric,
+    to_float,
+)
 from sb3_yann.control.mpc._arguments import Bounds, Given, as_softness
 
 Outputs = ArrayLike | Sequence[int]
@@ -20,7 +27,7 @@ def _loose(name: str, lower: Given, upper: Given) -> Bounds:
     """Return bounds that fit each other, of a size that is still open."""
     low = _as_side(f"{name}_min", -np.inf if lower is None else lower)
     high = _as_side(f"{name}_max", np.inf if upper is None else upper)
-    as_bounds(name, low, high, max(low.size, high.size), ordered=_ordered(lower, upper))
+    check_bounds(name, low, high, max(low.size, high.size), ordered=_ordered(lower, upper))
     return low, high
 
 
@@ -43,12 +50,12 @@ def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> B
     low, high = _loose(name, lower, upper)
     if size == 0 and np.any(np.isfinite(np.append(low, high))):
         raise ValueError(f"{name}_min or {name}_max is given, but there is no {missing}.")
-    return as_bounds(name, low, high, size, ordered=_ordered(lower, upper))
+    return check_bounds(name, low, high, size, ordered=_ordered(lower, upper))
 
 
 def _outputs(name: str, C: Outputs, symbol: str, lower: Given, upper: Given) -> dict[str, Array]:
     """Return the fields of a group of outputs ``C x`` with bounds."""
-    rows = check.as_output_rows(name, C)
+    rows = check.check_output_rows(name, C)
     low, high = _bounds(symbol, lower, upper, len(rows), f"output in {name}")
     return {"C": rows, f"{symbol}_min": low, f"{symbol}_max": high}
 
@@ -79,7 +86,7 @@ class Tracking(ReadOnlyArrays):
 
     def sized(self, n_states: int) -> Tracking:
         """Return it with C as a matrix (p, n)."""
-        return Tracking(check.as_outputs("Tracking.C", self.C, n_states), self.r_min, self.r_max)
+        return Tracking(check.check_outputs("Tracking.C", self.C, n_states), self.r_min, self.r_max)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -108,7 +115,7 @@ class OutputBounds(ReadOnlyArrays):
 
     def sized(self, n_states: int) -> OutputBounds:
         """Return it with C as a matrix (q, n)."""
-        C = check.as_outputs("OutputBounds.C", self.C, n_states)
+        C = check.check_outputs("OutputBounds.C", self.C, n_states)
         return OutputBounds(C, self.y_min, self.y_max)
 
 
@@ -179,8 +186,8 @@ class RateLimits(ReadOnlyArrays):
     def sized(self, n_inputs: int) -> RateLimits:
         """Return it with bounds of shape (m,) and a weight of shape (m, m)."""
         weight = self.R_du if self.R_du.size else np.zeros((n_inputs, n_inputs))
-        bounds = as_bounds("du", self.du_min, self.du_max, n_inputs)
-        return RateLimits(*bounds, as_symmetric("R_du", weight, n_inputs))
+        bounds = check_bounds("du", self.du_min, self.du_max, n_inputs)
+        return RateLimits(*bounds, check_symmetric("R_du", weight, n_inputs))
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -226,7 +233,7 @@ class SoftBounds(ReadOnlyArrays):
             raise ValueError(f"SoftBounds.penalty = {penalty!r}, but nothing is soft: pass x or y.")
         cost = 0.0 if not soft else None
         if soft and penalty is not None:
-            cost = check.as_positive("SoftBounds.penalty", penalty)
+            cost = check.check_positive("SoftBounds.penalty", penalty)
         self._store(**units, penalty=cost)
 
     def sized(self, x: Bounds, y: Bounds) -> SoftBounds:
@@ -269,7 +276,7 @@ class Terminal(ReadOnlyArrays):
 def _square(name: str, value: ArrayLike) -> Array:
     """Return a symmetric matrix of any size; one without entries says nothing."""
     matrix = to_float(name, value)
-    return as_symmetric(name, matrix, len(np.atleast_1d(matrix))) if matrix.size else matrix
+    return check_symmetric(name, matrix, len(np.atleast_1d(matrix))) if matrix.size else matrix
 
 
 def _half_spaces(value: HalfSpaces | str) -> tuple[Array, Array]:
@@ -279,5 +286,5 @@ def _half_spaces(value: HalfSpaces | str) -> tuple[Array, Array]:
         got = repr(value) if isinstance(value, str) else type(value).__name__
         wanted = "Terminal.set must be a pair (F, g) of arrays for F x_N <= g, or 'invariant'"
         raise TypeError(f"{wanted}, got {got}.") from None
-    rows = as_array("Terminal.set F", F, ("rows", "columns"))
-    return rows, as_array("Terminal.set g", g, (len(rows),))
+    rows = check_array("Terminal.set F", F, ("rows", "columns"))
+    return rows, check_array("Terminal.set g", g, (len(rows),))

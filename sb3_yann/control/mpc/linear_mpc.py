@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
-from sb3_yann._validation import Array, as_array, as_bounds, as_symmetric, to_float
+from sb3_yann._validation import Array, check_array, check_bounds, check_symmetric, to_float
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
@@ -150,10 +150,10 @@ class LinearMPC(MPCProblem):
         given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute, _stored)
         tracking, disturbances, outputs = given.tracking, given.disturbances, given.outputs
         n, m = model.n_states, model.n_inputs
-        horizon, gamma = arguments.as_horizon(horizon), check.as_discount(gamma)
-        infeasible = check.as_choice("infeasible", infeasible, INFEASIBLE)
-        Q, R = as_symmetric("Q", Q, n), as_symmetric("R", R, m)
-        x, u = as_bounds("x", *given.x, n), as_bounds("u", *given.u, m)
+        horizon, gamma = arguments.as_horizon(horizon), check.check_discount(gamma)
+        infeasible = check.check_choice("infeasible", infeasible, INFEASIBLE)
+        Q, R = check_symmetric("Q", Q, n), check_symmetric("R", R, m)
+        x, u = check_bounds("x", *given.x, n), check_bounds("u", *given.u, m)
         tracking = _as_group("tracking", tracking, Tracking).sized(n)
         d = _as_group("disturbances", disturbances, DisturbanceBounds).sized(model.n_disturbances)
         rate = _as_group("rate", rate, RateLimits).sized(m)
@@ -244,7 +244,7 @@ class LinearMPC(MPCProblem):
         ValueError
             If the law is unstable under this discount, or does not rest at the origin.
         """
-        gamma = check.as_discount(gamma)  # before the law, which may take long
+        gamma = check.check_discount(gamma)  # before the law, which may take long
         return quadratic_value.value_matrix(self, self.law(), gamma)
 
     def state_action_matrix(self, gamma: float) -> Array:
@@ -252,7 +252,7 @@ class LinearMPC(MPCProblem):
 
         The law follows. It holds where :meth:`value_matrix` does, and raises its errors.
         """
-        gamma = check.as_discount(gamma)
+        gamma = check.check_discount(gamma)
         return quadratic_value.state_action_matrix(self, self.law(), gamma)
 
     def explicit(
@@ -319,7 +319,7 @@ class LinearMPC(MPCProblem):
         :class:`OnlineLawWarning`. The effort is counted, not clocked: the choice is the same on
         every machine, whatever else that does.
         """
-        return choose(self, self._laws, check.as_choice("kind", kind, LAWS))
+        return choose(self, self._laws, check.check_choice("kind", kind, LAWS))
 
     @cached_property
     def _online(self) -> OnlineLaw:
@@ -338,8 +338,8 @@ class LinearMPC(MPCProblem):
 
     def report(self, samples: int = 500, seed: int = 0) -> str:
         """Return :func:`~sb3_yann.control.mpc.report.report` of the problem and its law."""
-        check.as_whole("samples", samples)
-        check.as_whole("seed", seed, 0)
+        check.check_int("samples", samples)
+        check.check_int("seed", seed, 0)
         return report(self, self.law(), samples, seed)
 
 
@@ -352,7 +352,7 @@ def derived(problem: LinearMPC, **changes: Any) -> LinearMPC:
 
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:
     """Return a group of arguments; None is one that says nothing."""
-    return check.as_options(name, kind() if value is None else value, kind)
+    return check.check_options(name, kind() if value is None else value, kind)
 
 
 def _completed(problem: MPCProblem) -> Terminal:
@@ -367,7 +367,7 @@ def _completed(problem: MPCProblem) -> Terminal:
             _require_weighted_inputs(problem)
             raise
     elif len(cost) != len(errors.Q):
-        as_array("Terminal.cost", cost, errors.Q.shape)  # which names the size that is wanted
+        check_array("Terminal.cost", cost, errors.Q.shape)  # which names the size that is wanted
     if np.shape(cost) == np.shape(errors.Q):
         _require_weighted_inputs(problem, cost)
     if isinstance(half_spaces, str):
@@ -375,7 +375,7 @@ def _completed(problem: MPCProblem) -> Terminal:
     n, size = problem.model.n_states, problem.n_theta
     F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
     if F.shape[1] != size:
-        F = np.pad(as_array("Terminal.set F", F, ("rows", n)), ((0, 0), (0, size - n)))
+        F = np.pad(check_array("Terminal.set F", F, ("rows", n)), ((0, 0), (0, size - n)))
     return Terminal(cost, (F, g))
 
 

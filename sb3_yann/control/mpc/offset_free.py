@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import as_kind, as_positive_vector
+from sb3_yann._validation import check_positive_vector, check_type
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.groups import DisturbanceBounds, Terminal
 from sb3_yann.control.mpc.linear_mpc import LinearMPC, derived
@@ -53,7 +53,7 @@ def offset_free(
     >>> env.observation_space.shape
     (8,)
     """
-    as_kind("mpc", mpc, LinearMPC, "a LinearMPC")
+    check_type("mpc", mpc, LinearMPC, "a LinearMPC")
     old, n = mpc.model, mpc.model.n_states
     if old.estimated:
         raise ValueError(
@@ -62,7 +62,7 @@ def offset_free(
         )
     unit = mpc.theta_half[mpc.layout.state]
     largest = SHARE * unit if d_max is None else d_max
-    bound = as_positive_vector("d_max", largest, n, "In units of the states.")
+    bound = check_positive_vector("d_max", largest, n, "In units of the states.")
     known, of_both = mpc.disturbances, old.n_disturbances + n
     own: dict[str, Any] = {
         "E": np.hstack([old.E, np.eye(n)]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_yann._validation import Array, as_array, to_float
+from sb3_yann._validation import Array, check_array, to_float
 from sb3_yann.control.mpc._arguments import Given
 from sb3_yann.control.mpc.problem import MPCProblem
 
@@ -65,6 +65,6 @@ def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:
     for name, value, size in (("r", r, p), ("d", d, n_d)):
         array = to_float(name, np.zeros(size) if value is None else value)
         shape: tuple[int | str, ...] = ("batch", size) if array.ndim == 2 else (size,)
-        parts.append(as_array(name, array, shape))
+        parts.append(check_array(name, array, shape))
     rows = np.broadcast_shapes(parts[0].shape[:-1], parts[1].shape[:-1])
     return np.concatenate([np.broadcast_to(a, (*rows, a.shape[-1])) for a in parts], axis=-1)

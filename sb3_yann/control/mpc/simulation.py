@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, as_array, as_whole
+from sb3_yann._validation import Array, check_array, check_int
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.control.mpc.plant_units import misread_state
@@ -22,7 +22,7 @@ def simulate(problem: MPCProblem, law: Law, theta0: ArrayLike, steps: int) -> tu
     theta0, steps : array_like, shape (n_theta,), and int
         The start, and the number of inputs.
     """
-    theta = as_array("theta0", theta0, (problem.n_theta,))
+    theta = check_array("theta0", theta0, (problem.n_theta,))
     i = misread_state(problem, theta[None])
     if i is not None:
         raise ValueError(
@@ -30,7 +30,7 @@ def simulate(problem: MPCProblem, law: Law, theta0: ArrayLike, steps: int) -> tu
             f"it, and theta counts from the operating point, {problem.model.x_ss[i]:g}. Pass "
             "theta0 - mpc.theta_ss."
         )
-    count = as_whole("steps", steps, hint="It counts the inputs that are played.")
+    count = check_int("steps", steps, hint="It counts the inputs that are played.")
     A, B = problem.prediction
     thetas, inputs = np.empty((count + 1, len(theta))), np.empty((count, problem.model.n_inputs))
     thetas[0] = theta

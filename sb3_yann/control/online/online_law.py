@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
 from sb3_yann._archive import write_arrays
-from sb3_yann._validation import Array, as_array, half_widths
+from sb3_yann._validation import Array, check_array, half_widths
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
 from sb3_yann.control.explicit.steep import SteepQP
 from sb3_yann.control.law._files import read_law
@@ -89,25 +89,27 @@ class OnlineLaw(OnPlant):
 
     def __post_init__(self) -> None:
         """Check the arrays against each other and store them as read-only float64."""
-        F, G = as_array("F", self.F, ("v", "n")), as_array("G", self.G, ("rows", len(self.F)))
+        F, G = check_array("F", self.F, ("v", "n")), check_array("G", self.G, ("rows", len(self.F)))
         (v, n), rows = F.shape, len(G)
         shapes: dict[str, tuple[int, ...]] = {"H": (v, v), "c": (v,), "w": (rows,), "S": (rows, n)}
-        values = {name: as_array(name, getattr(self, name), size) for name, size in shapes.items()}
+        values = {
+            name: check_array(name, getattr(self, name), size) for name, size in shapes.items()
+        }
         m = np.size(self.u_min)
         for name, size in (("u", m), ("theta", n)):
             low, high = f"{name}_min", f"{name}_max"
-            bounds = check.as_bounds(name, getattr(self, low), getattr(self, high), size)
+            bounds = check.check_bounds(name, getattr(self, low), getattr(self, high), size)
             values[low], values[high] = bounds
-        check.as_choice("infeasible", self.infeasible, INFEASIBLE)
-        slacks = check.as_whole("n_slacks", self.n_slacks, 0)
-        check.as_whole("n_input_rows", self.n_input_rows, 0)
+        check.check_choice("infeasible", self.infeasible, INFEASIBLE)
+        slacks = check.check_int("n_slacks", self.n_slacks, 0)
+        check.check_int("n_input_rows", self.n_input_rows, 0)
         if m == 0 or (v - slacks) % m or v == slacks:
             raise ValueError(
                 f"The program has {v} variables, {slacks} of them slacks: the others must be the "
                 f"{m} inputs of each step."
             )
         feedback = np.zeros((m, n)) if self.feedback is None else self.feedback
-        values["feedback"] = as_array("feedback", feedback, (m, n))
+        values["feedback"] = check_array("feedback", feedback, (m, n))
         _require_positive_definite(values["H"])
         self._store(F=F, G=G, **values)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._drawing import COLORS, axes_or_new, legend_above, new_figure
-from sb3_yann._validation import Array, as_array, as_whole
+from sb3_yann._validation import Array, check_array, check_int
 from sb3_yann.control import LinearModel
 from sb3_yann.control.model.labels import with_units
 
@@ -59,7 +59,7 @@ def plot_fit(
     ['measured', 'free run, fit 100.0 %', '10 steps ahead, fit 100.0 %']
     """
     x, free, ahead = _predicted(model, states, actions, disturbances)
-    if as_whole("state", state, 0) >= model.n_states:
+    if check_int("state", state, 0) >= model.n_states:
         raise ValueError(f"state = {state} must be below {model.n_states}, the number of states.")
     axes = axes_or_new(axes, 7.0, 3.2)
     time = model.dt * np.arange(len(x))
@@ -122,12 +122,12 @@ def _predicted(
     model: LinearModel, states: ArrayLike, actions: ArrayLike, disturbances: ArrayLike | None
 ) -> tuple[Array, Array, Array]:
     """Return measured states (T + 1, n), the free run, and what is predicted ten steps ahead."""
-    x = as_array("states", states, ("T + 1", model.n_states))
-    u = as_array("actions", actions, (len(x) - 1, model.n_inputs)) - model.u_ss
+    x = check_array("states", states, ("T + 1", model.n_states))
+    u = check_array("actions", actions, (len(x) - 1, model.n_inputs)) - model.u_ss
     shape = len(u), model.n_disturbances
     d = np.zeros(shape) + model.d_ss
     if disturbances is not None:
-        d = as_array("disturbances", disturbances, shape)
+        d = check_array("disturbances", disturbances, shape)
     pushed = u @ model.B.T + (d - model.d_ss) @ model.E.T
     free, ahead = (np.array(x - model.x_ss) for _ in range(2))
     for k in range(len(u)):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._drawing import as_figure
-from sb3_yann._validation import Array, as_choice
+from sb3_yann._validation import Array, check_choice
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.law import plot as law_plot
@@ -54,7 +54,7 @@ def plot_regions(
     >>> axes.get_xlabel()
     'C_B (mol/L)'
     """
-    as_choice("by", by, ("law", "constraint"))
+    check_choice("by", by, ("law", "constraint"))
     chosen = [entry_of(problem, each) for each in entries]
     name = ActiveConstraints(problem) if by == "constraint" else None
     labels = problem.labels(units=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._drawing import axes_or_new, new_figure
-from sb3_yann._validation import Array, as_array
+from sb3_yann._validation import Array, check_array
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.model.labels import with_units
 from sb3_yann.evaluation.plots._sources import Quantity, entry_of, inputs_of
@@ -177,14 +177,14 @@ def _values(
         )
     low, high = problem.theta_min[chosen], problem.theta_max[chosen]
     if frame is not None:
-        low, high = (as_array("frame", each, (2,)) - problem.theta_ss[chosen] for each in frame)
+        low, high = (check_array("frame", each, (2,)) - problem.theta_ss[chosen] for each in frame)
     if not np.all(np.isfinite([low, high])) or np.any(low >= high):
         names = [problem.labels()[i] for i in chosen]
         raise ValueError(
             f"There is no frame to draw {names} in: the box goes from {low.tolist()} to "
             f"{high.tolist()}, about the operating point. Pass frame=(lower left, upper right)."
         )
-    shown = problem.theta_ss if at is None else as_array("at", at, (problem.n_theta,))
+    shown = problem.theta_ss if at is None else check_array("at", at, (problem.n_theta,))
     law = problem.law()
     points = POINTS if isinstance(law, PiecewiseAffine) else FEW
     steps = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]

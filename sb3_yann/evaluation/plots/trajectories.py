@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_yann._drawing import COLORS, new_figure, save_figure
-from sb3_yann._validation import Array, as_flag, as_kind
+from sb3_yann._validation import Array, check_bool, check_type
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import with_units
 from sb3_yann.evaluation.episodes import Episodes, as_played
@@ -122,8 +122,8 @@ def save_plant_trajectories(
     >>> save_plant_trajectories(f"{folder}/run.png", runs, mpc, "h", entries=[3]).name
     'run.png'
     """
-    as_kind("problem", problem, LinearMPC, "a LinearMPC")
-    whole = 0 if as_flag("absolute", absolute) else 1
+    check_type("problem", problem, LinearMPC, "a LinearMPC")
+    whole = 0 if check_bool("absolute", absolute) else 1
     shift = whole * problem.theta_ss, whole * problem.model.u_ss
     shown = [*range(problem.model.n_states)] if entries is None else [*entries]
     names = dict(enumerate(problem.labels(units=True))) | dict(labels or {})
@@ -167,7 +167,7 @@ def shifted(name: str, episodes: Episodes, theta_ss: Array, u_ss: Array) -> Epis
 
 def _as_runs(runs: Mapping[str, Episodes]) -> dict[str, Episodes]:
     """Return runs by their names, else raise TypeError."""
-    as_kind("runs", runs, Mapping, "a mapping of names to episodes: {'MPC': evaluate(...)}")
+    check_type("runs", runs, Mapping, "a mapping of names to episodes: {'MPC': evaluate(...)}")
     return {name: as_played(f"runs[{name!r}]", each) for name, each in runs.items()}
 
 

@@ -10,11 +10,11 @@ import torch as th
 from sb3_yann._numba import Single, compiled
 from sb3_yann._validation import Array
 from sb3_yann.networks._kernels.mlp import (
-    as_array,
     at_zero,
     first_layers,
     hidden_layer,
     tanh,
+    to_numpy,
     transposed,
 )
 
@@ -257,10 +257,10 @@ class _Pass:
         self, constants: Constants, points: th.Tensor, weights: tuple[th.Tensor, ...]
     ) -> None:
         self.weights = weights
-        entries, nodes, second, last = as_array(weights[0], np.float64), *map(as_array, weights[1:])
+        entries, nodes, second, last = to_numpy(weights[0], np.float64), *map(to_numpy, weights[1:])
         W, AB, self.roots, scaling, pinned, self.factor = constants
         self.first: tuple[Any, ...] = (W, AB, entries * self.roots, scaling, nodes, pinned)
-        array = as_array(points, np.float64)
+        array = to_numpy(points, np.float64)
         (batch, size), n, h = array.shape, len(entries), nodes.shape[2]
         total, y, z = np.zeros(batch), np.empty((batch, size)), np.zeros((batch, n))
         x, hidden = np.empty((batch, n), np.float32), np.empty((batch, h), np.float32)
@@ -312,7 +312,7 @@ class _Value(th.autograd.Function):
     @th.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
         _ = ctx.saved_tensors
-        gradient = as_array(gradients[0])
+        gradient = to_numpy(gradients[0])
         _, of_points, *of_weights = ctx.needs_input_grad
         by_points, *by_weights = ctx.done.backward(gradient, of_points, any(of_weights))
         return None, by_points if by_points is None else by_points.to(ctx.dtype), *by_weights

@@ -17,7 +17,7 @@ WEIGHTS = "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1], float3
 """Types of nodes, second, last and pinned, see :func:`network`."""
 
 
-def as_array(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
+def to_numpy(tensor: th.Tensor, dtype: Any = np.float32) -> NDArray[Any]:
     """Return what compiled code takes for a tensor, without its gradient: the same memory if so."""
     try:
         array = tensor.numpy(force=True)

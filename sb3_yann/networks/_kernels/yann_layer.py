@@ -11,7 +11,7 @@ import torch as th
 from sb3_yann._numba import Integers, Single
 from sb3_yann._validation import Array
 from sb3_yann.networks._kernels.layer_loops import backward, forward, forward_shared
-from sb3_yann.networks._kernels.mlp import as_array
+from sb3_yann.networks._kernels.mlp import to_numpy
 
 
 def layer_on_cpu(
@@ -38,7 +38,7 @@ def layer_on_cpu(
         Whether gradients are sparse, with the rows of the regions in use.
     """
     _require_width(theta, int(law[1][0]))
-    known = (*law, as_array(theta, np.float64), *constants)
+    known = (*law, to_numpy(theta, np.float64), *constants)
     return _run(forward, known, weights, pinned, by_row)
 
 
@@ -54,7 +54,7 @@ def shared_layer_on_cpu(
     What else it takes is in :func:`layer_on_cpu`.
     """
     _require_width(theta, (len(constants[0]) - 2 - 2 * u.shape[1]) // 3)
-    known = (u, as_array(theta, np.float64), *constants)
+    known = (u, to_numpy(theta, np.float64), *constants)
     return _run(forward_shared, known, weights, pinned, by_row=False)
 
 
@@ -108,7 +108,7 @@ def _run(
         given = loops, known, pinned, by_row
         actions: th.Tensor = _Layer.apply(*given, *weights)  # type: ignore[no-untyped-call]
         return actions
-    return th.from_numpy(_actions(loops, [*known, *map(as_array, weights), pinned])[0])
+    return th.from_numpy(_actions(loops, [*known, *map(to_numpy, weights), pinned])[0])
 
 
 def _actions(loops: Any, given: list[Any]) -> tuple[Single, list[Any]]:
@@ -136,7 +136,7 @@ class _Layer(th.autograd.Function):
         by_row: bool,
         *weights: th.Tensor,
     ) -> th.Tensor:
-        given = [*known, *map(as_array, weights), pinned]
+        given = [*known, *map(to_numpy, weights), pinned]
         actions, kept = _actions(loops, given)
         # torch notices weights that change before the backward pass
         ctx.save_for_backward(*weights)
@@ -147,7 +147,7 @@ class _Layer(th.autograd.Function):
     @th.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
         weights, (_, used, *_) = ctx.saved_tensors, ctx.kept
-        gradient = as_array(gradients[0])
+        gradient = to_numpy(gradients[0])
         sizes = [
             (len(used), *weight.shape[1:]) if ctx.by_row else weight.shape for weight in weights
         ]

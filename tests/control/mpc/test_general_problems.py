@@ -137,7 +137,7 @@ def test_a_soft_bound_leaves_a_solution_where_the_hard_one_has_none() -> None:
 
 def test_bounded_outputs_are_bounded_states_in_other_words() -> None:
     as_states = servo(x_max=[9.0, 0.3], x_min=[-9.0, -0.3], theta_min=-3, theta_max=3)
-    as_outputs = servo(
+    check_outputs = servo(
         x_min=[-9.0, -np.inf],
         x_max=[9.0, np.inf],
         outputs=OutputBounds([1], -0.3, 0.3),
@@ -145,7 +145,7 @@ def test_bounded_outputs_are_bounded_states_in_other_words() -> None:
         theta_max=3,
     )
     points = box_points(as_states, 1000)
-    one, other = as_states.explicit(), as_outputs.explicit()
+    one, other = as_states.explicit(), check_outputs.explicit()
     np.testing.assert_array_equal(one.in_domain(points), other.in_domain(points))
     inside = points[one.in_domain(points)]
     assert relative_error(as_states, one(inside), other(inside)) <= 1e-9
