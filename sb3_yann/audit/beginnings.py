@@ -43,8 +43,11 @@ def beginnings(plant: Plant, task: Task, starts: Array, steps: int, rows: Rows) 
         Numbers of the starts, as the plant knows them.
     """
     problem, until = task.problem, steps // BURSTS
-    none = partial(_pushed, problem.u_min, 0)
-    pushes = [none, *(partial(_pushed, u, until) for u in (problem.u_min, problem.u_max))]
+    none = partial(_pushed, problem.deviations.u_min, 0)
+    pushes = [
+        none,
+        *(partial(_pushed, u, until) for u in (problem.deviations.u_min, problem.deviations.u_max)),
+    ]
     first = [push(law_of(problem)) for push in pushes]
 
     def played(policy: Policy) -> tuple[Array, Array]:

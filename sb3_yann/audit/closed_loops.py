@@ -203,7 +203,7 @@ def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:
     point[layout.state] = other.model.x_ss - problem.model.x_ss
     point[layout.reference] = problem.tracking.C @ point[layout.state]
     point[layout.previous] = u[: layout.n_previous]
-    limits = problem.u_min, problem.u_max
+    limits = problem.deviations.u_min, problem.deviations.u_max
     return lambda t, theta, running: np.clip(u + law(np.nan_to_num(theta) - point), *limits)
 
 
@@ -226,7 +226,7 @@ class Excited:
         if t % HELD == 0:
             self.moved = DITHER * problem.u_half * self.rng.uniform(-1, 1, shape)
         u = self.law(t, theta, running) + self.moved
-        return np.asarray(np.clip(u, problem.u_min, problem.u_max))
+        return np.asarray(np.clip(u, problem.deviations.u_min, problem.deviations.u_max))
 
 
 class Observing:
@@ -249,7 +249,7 @@ class Observing:
 
     def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
         """Return the inputs (k, m)."""
-        layout, bounds = self.problem.layout, self.other.disturbances
+        layout, bounds = self.problem.layout, self.other.deviations.disturbances
         x = theta[:, layout.state]
         if t == 0:
             self.observers = [copy.copy(self.observer) for _ in x]

@@ -160,7 +160,9 @@ class _Search:
         if isinstance(given, PlantTwin):
             given.require_trust()
             other = given.problem
-            if other.layout != mpc.layout or not np.array_equal(other.u_min, mpc.u_min):
+            if other.layout != mpc.layout or not np.array_equal(
+                other.deviations.u_min, mpc.deviations.u_min
+            ):
                 raise ValueError(
                     "The twin is that of another MPC's plant: fit it with PlantTwin.fit(mpc, "
                     "episodes)."

@@ -158,7 +158,7 @@ class SimulatedPlant:
     def _differences(self, point: Array, unit: Array) -> Array:
         """Return the derivatives (n, n + m) at ``[x, u]``."""
         n = self.problem.model.n_states
-        limit = np.concatenate([np.full(n, np.inf), self.problem.u_max])
+        limit = np.concatenate([np.full(n, np.inf), self.problem.deviations.u_max])
         steps = np.where(point + STEP * unit < limit, STEP, -STEP) * unit
         base = self.after_if_any(point[:n], point[n:])
         J: Array = np.empty((n, len(unit)))

@@ -55,7 +55,7 @@ class Task:
         """Return the bounds (..., m) of the inputs at thetas (..., n_theta)."""
         problem = self.problem
         low, high = (np.broadcast_to(each, (*thetas.shape[:-1], len(each)))
-                     for each in (problem.u_min, problem.u_max))  # fmt: skip
+                     for each in (problem.deviations.u_min, problem.deviations.u_max))  # fmt: skip
         if problem.has_rate_bounds:
             before = thetas[..., problem.layout.previous]
             low = np.maximum(low, before + problem.rate.du_min)

@@ -195,7 +195,9 @@ def _backward(
     limits = task.limits(thetas[:-1])
     low, high = (each - inputs for each in limits)
     # A bound of the rate moves with the previous input.
-    moving = np.stack([limits[0] > problem.u_min, limits[1] < problem.u_max], axis=1)
+    moving = np.stack(
+        [limits[0] > problem.deviations.u_min, limits[1] < problem.deviations.u_max], axis=1
+    )
     v, V = 2 * thetas[-1] @ task.end, np.tile(2 * task.end, (len(rows), 1, 1))
     corrections, gains = np.empty_like(inputs), np.empty_like(plans.gains)
     damped = damping[:, None, None] * W[size:, size:]

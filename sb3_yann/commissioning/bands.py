@@ -81,7 +81,9 @@ class Tracks:
         inputs[:] = u
         if np.isfinite(rows[:, -1]).all():  # else the twin ran away, and its costs are not known
             inputs[:, -1] = self.act(row.shown(rows[:, -1]).copy())
-            np.clip(inputs[:, -1], problem.u_min, problem.u_max, out=inputs[:, -1])
+            np.clip(
+                inputs[:, -1], problem.deviations.u_min, problem.deviations.u_max, out=inputs[:, -1]
+            )
         at = np.vstack([rows[:, -1], theta]), np.vstack([inputs[:, -1], u])
         cost = problem.stage_cost(row.shown(at[0]), at[1])
         self.costs += cost[:-1]

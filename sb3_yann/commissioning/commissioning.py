@@ -329,7 +329,12 @@ class Commissioning:
     @property
     def _settings(self) -> dict[str, Any]:
         problem = self.policy.problem
-        parts = (*problem.prediction, problem.stage_matrix, problem.u_min, problem.u_max)
+        parts = (
+            *problem.prediction,
+            problem.stage_matrix,
+            problem.deviations.u_min,
+            problem.deviations.u_max,
+        )
         numbers = b"".join(np.asarray(each, np.float64).tobytes() for each in parts)
         learner = f"{type(self.model).__name__} {self.policy.actor.net_arch}"
         return {

@@ -28,14 +28,14 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin | SimulatorTwin, seed: int)
     seen = twin.dynamics.row.shown(starts)
     first = actor(layer, problem)(seen)
     first = first + SPREAD * half * rng.standard_normal(first.shape)
-    first = np.clip(first, problem.u_min, problem.u_max)
+    first = np.clip(first, problem.deviations.u_min, problem.deviations.u_max)
     costs = _costs(policy, twin, layer, starts, first)
     options = policy.critic_options
     returns = options.offset_of_return(policy.gamma) - options.reward_scale * costs
     known = np.isfinite(returns)
     if np.count_nonzero(known) < BATCH:  # too few to say anything
         return
-    scaled = (first - problem.u_min) / half - 1
+    scaled = (first - problem.deviations.u_min) / half - 1
     _fit(policy, seen[known], scaled[known], returns[known], rng)
     policy.critic_target.load_state_dict(policy.critic.state_dict())
 

@@ -94,7 +94,9 @@ def fit_layer(
     updates : int
         Steps of Adam.
     """
-    wanted = (inputs - problem.u_min) / (problem.u_max - problem.u_min)
+    wanted = (inputs - problem.deviations.u_min) / (
+        problem.deviations.u_max - problem.deviations.u_min
+    )
     wanted = np.clip(2 * wanted - 1, -1, 1)
     finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
     at, to = th.as_tensor(rows[finite]), th.as_tensor(wanted[finite], dtype=th.float32)

@@ -88,7 +88,7 @@ class Plant:
                     f"plant_env has {name} = {its}, the model {own}: it is another plant."
                 )
         self.law, self.device = law_of(self.problem), self.yann.device
-        self.range = self.problem.u_max - self.problem.u_min
+        self.range = self.problem.deviations.u_max - self.problem.deviations.u_min
         self.as_is = self.yann.input_units.kind == "deviation"
 
     def policy(self, theta: Array) -> Array:
@@ -99,7 +99,9 @@ class Plant:
         else:
             with th.no_grad():
                 actions = layer(th.as_tensor(theta, device=self.device)).double().cpu().numpy()
-            u = (self.problem.u_max + self.problem.u_min) / 2 + self.range / 2 * actions
+            u = (
+                self.problem.deviations.u_max + self.problem.deviations.u_min
+            ) / 2 + self.range / 2 * actions
         finite = np.isfinite(u)
         return u if finite.all() else np.where(finite, u, self.mpc(theta))
 
@@ -110,7 +112,7 @@ class Plant:
             return u
         previous = theta[:, problem.layout.previous]
         low, high = previous + problem.rate.du_min, previous + problem.rate.du_max
-        return np.clip(np.clip(u, low, high), problem.u_min, problem.u_max)
+        return np.clip(np.clip(u, low, high), problem.deviations.u_min, problem.deviations.u_max)
 
     def begin(self, seed: int) -> Array:
         """Reset the plant, and return the first theta (n_theta,).

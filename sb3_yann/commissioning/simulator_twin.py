@@ -156,8 +156,8 @@ class SimulatorTwin:
     def limits(self) -> Limits:
         """The problem's own hard bounds of the states."""
         problem, soft = self.problem, self.problem.soft.x > 0
-        low = np.where(soft, -np.inf, problem.x_min)
-        high = np.where(soft, np.inf, problem.x_max)
+        low = np.where(soft, -np.inf, problem.deviations.x_min)
+        high = np.where(soft, np.inf, problem.deviations.x_max)
         return Limits(problem, low, high, self.dynamics.row)
 
 

@@ -139,7 +139,7 @@ def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> 
     if np.linalg.matrix_rank(matrix) < matrix.shape[1]:  # theta does not tell what was observed
         return np.inf
     back = np.linalg.pinv(matrix)
-    middle = (problem.theta_max + problem.theta_min) / 2 - observation.offset
+    middle = (problem.deviations.theta_max + problem.deviations.theta_min) / 2 - observation.offset
     reach = np.abs(back) @ problem.theta_half
     return float(np.max(np.abs(back @ middle) + reach))
 

@@ -179,7 +179,9 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         self.scales_itself = options.scales_itself
         self.batch: th.Tensor | None = None  # the latest points to learn from
         common: dict[str, Any] = {
-            "ranges": networks.Ranges(problem.theta_half, problem.u_min, problem.u_max),
+            "ranges": networks.Ranges(
+                problem.theta_half, problem.deviations.u_min, problem.deviations.u_max
+            ),
             "hidden": tuple(net_arch),
             "pinned": pin_equilibrium,
         }

@@ -195,7 +195,9 @@ def _bounded(subject: Subject, theta: Array) -> Finding:
     problem = subject.problem
     u = inputs_of(problem, subject.policy, theta)
     room = WITHIN * problem.u_half
-    inside = bool(np.all((u >= problem.u_min - room) & (u <= problem.u_max + room)))
+    inside = bool(
+        np.all((u >= problem.deviations.u_min - room) & (u <= problem.deviations.u_max + room))
+    )
     text = f"Inputs keep their bounds at {len(theta)} random points of the box of parameters."
     if not inside:
         text = "Inputs leave their bounds at random points of the box of parameters."
@@ -249,7 +251,7 @@ def _pictures(subject: Subject) -> list[Html]:
 def _frame(subject: Subject, plane: tuple[int, int]) -> tuple[Array, Array] | None:
     """Return what of a plane the closed loops come through, or the box; None where it is flat."""
     problem, entries = subject.problem, [*plane]
-    low, high = problem.theta_min[entries], problem.theta_max[entries]
+    low, high = problem.deviations.theta_min[entries], problem.deviations.theta_max[entries]
     if subject.loops is not None:
         seen = np.concatenate([x[:, entries] for x in subject.loops[POLICY].observations])
         seen = seen[np.isfinite(seen).all(axis=1)]

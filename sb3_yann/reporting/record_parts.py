@@ -160,7 +160,12 @@ def _problem_print(subject: Subject) -> str:
     program = problem.condensed()
     arrays = [program.H, program.F, program.c, program.G, program.w, program.S]
     arrays += [] if program.feedback is None else [program.feedback]
-    for each in (*arrays, problem.theta_min, problem.theta_max, problem.theta_ss):
+    for each in (
+        *arrays,
+        problem.deviations.theta_min,
+        problem.deviations.theta_max,
+        problem.theta_ss,
+    ):
         found.update(np.ascontiguousarray(each).tobytes())
     return found.hexdigest()
 

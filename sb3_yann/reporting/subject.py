@@ -186,7 +186,7 @@ class Subject:
     def sampled(self) -> Array:
         """Points drawn uniformly from the box of theta (points, n_theta), with a seed of 0."""
         rng, problem = np.random.default_rng(0), self.problem
-        low, high = problem.theta_min, problem.theta_max
+        low, high = problem.deviations.theta_min, problem.deviations.theta_max
         middle, half = (low + high) / 2, (high - low) / 2
         bounded = np.isfinite(half)
         middle, half = np.where(bounded, middle, 0.0), np.where(bounded, half, 1.0)

@@ -226,7 +226,7 @@ class Dynamics:
         state: where the law made the log, it acts on its own predictions.
         """
         parts, law = self.row, law_of(self.problem)
-        u_min, u_max = self.problem.u_min, self.problem.u_max
+        u_min, u_max = self.problem.deviations.u_min, self.problem.deviations.u_max
         logged = law(parts.shown(episode.thetas[:-1]))
         theta = np.repeat(episode.thetas[:1][None], len(self.members), axis=0)
         costs = np.zeros(len(self.members))

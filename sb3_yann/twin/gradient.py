@@ -101,7 +101,7 @@ class Objective:
 
 def actor(layer: LawLayer, problem: LinearMPC) -> Callable[[Array], Array]:
     """Return an actor of now as a function from theta (rows, n_theta) to inputs (rows, m)."""
-    middle, half = (problem.u_max + problem.u_min) / 2, problem.u_half
+    middle, half = (problem.deviations.u_max + problem.deviations.u_min) / 2, problem.u_half
     act = layer.frozen()
     return lambda theta: np.asarray(middle + half * act(theta))
 

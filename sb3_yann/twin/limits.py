@@ -50,8 +50,8 @@ class Limits:
             width = MARGIN * (most - least)
             low, high = np.minimum(low, least - width), np.maximum(high, most + width)
         room = ROUNDING * problem.theta_half[:n]
-        bounded = np.maximum(low, np.where(soft, -np.inf, problem.x_min))
-        limited = np.minimum(high, np.where(soft, np.inf, problem.x_max))
+        bounded = np.maximum(low, np.where(soft, -np.inf, problem.deviations.x_min))
+        limited = np.minimum(high, np.where(soft, np.inf, problem.deviations.x_max))
         return cls(problem, bounded - room, limited + room, coordinates.row)
 
     def violated(self, thetas: Array) -> NDArray[np.bool_]:
@@ -68,5 +68,5 @@ def _planned(problem: LinearMPC, coordinates: Coordinates, starts: Starts) -> tu
     first = starts.draw(PLANNED, np.random.default_rng(0))
     rows = model.roll_out(law_of(problem), first[None], steps)[0]
     x = rows[..., coordinates.row.state].reshape(-1, n)
-    least, most = problem.theta_min[:n], problem.theta_max[:n]
+    least, most = problem.deviations.theta_min[:n], problem.deviations.theta_max[:n]
     return np.clip(x.min(axis=0), least, most), np.clip(x.max(axis=0), least, most)

@@ -46,7 +46,7 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
 
     An observer moves its estimate by a fixed matrix times what the model does not predict.
     """
-    parts, inside = problem.layout, (problem.theta_min, problem.theta_max)
+    parts, inside = problem.layout, (problem.deviations.theta_min, problem.deviations.theta_max)
     if not parts.n_disturbances:
         return
     d_min, d_max = (each[parts.disturbance] for each in inside)

@@ -63,7 +63,9 @@ def episodes_of(model: Any) -> list[tuple[Array, Array]]:
     for env in range(buffer.n_envs):
         now, after = buffer.observations[order, env], buffer.next_observations[order, env]
         scaled = buffer.actions[order, env].astype(np.float64)
-        u = problem.u_min + (scaled + 1) / 2 * (problem.u_max - problem.u_min)
+        u = problem.deviations.u_min + (scaled + 1) / 2 * (
+            problem.deviations.u_max - problem.deviations.u_min
+        )
         ends = buffer.dones[order, env].astype(bool)
         same = np.all(now[1:] == after[:-1], axis=tuple(range(1, now.ndim)))
         ends[:-1] |= ~same

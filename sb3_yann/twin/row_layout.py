@@ -101,7 +101,7 @@ class RowLayout:
     def _d(self) -> tuple[Array, Array]:
         """The bounds (d,) of the disturbance."""
         part = self.problem.layout.disturbance
-        return self.problem.theta_min[part], self.problem.theta_max[part]
+        return self.problem.deviations.theta_min[part], self.problem.deviations.theta_max[part]
 
     @cached_property
     def inputs(self) -> Any:

@@ -56,8 +56,8 @@ class Starts:
         x, k = first[:, :n], len(first)
         middle, half = (x.max(0) + x.min(0)) / 2, (x.max(0) - x.min(0)) / 2
         half = half * _widened(k)
-        low = np.maximum(middle - half, problem.theta_min[:n])
-        high = np.minimum(middle + half, problem.theta_max[:n])
+        low = np.maximum(middle - half, problem.deviations.theta_min[:n])
+        high = np.minimum(middle + half, problem.deviations.theta_max[:n])
         return cls(problem, low, high, first, rows, observer)
 
     @cached_property
@@ -99,7 +99,9 @@ class Starts:
         if not layout.has_constants:
             return drawn
         held, some = self.row.given, drawn[::2].copy()
-        low, high = np.clip(self.shown, self.problem.theta_min, self.problem.theta_max)
+        low, high = np.clip(
+            self.shown, self.problem.deviations.theta_min, self.problem.deviations.theta_max
+        )
         some[:, held] = rng.uniform(low[held], high[held], some[:, held].shape)
         inside = self.problem.law().in_domain(self.row.shown(some))
         drawn[::2][inside] = some[inside]
@@ -123,7 +125,11 @@ class Starts:
         wide = np.maximum(ranges / _widened(k), rng.uniform(1, AROUND, (count, 1)))
         reach = np.minimum(wide, AROUND) * half
         drawn[:, :n] = middle + reach * rng.uniform(-1, 1, (count, n))
-        shown = np.clip(self.row.shown(drawn), self.problem.theta_min, self.problem.theta_max)
+        shown = np.clip(
+            self.row.shown(drawn),
+            self.problem.deviations.theta_min,
+            self.problem.deviations.theta_max,
+        )
         outside, drawn = ~self.problem.law().in_domain(shown), self.row.begin(shown)
         drawn[outside] = self.draw_logged(int(outside.sum()), rng)
         return drawn

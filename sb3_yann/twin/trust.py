@@ -167,7 +167,7 @@ def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
     """Return the share of logged rows (n_theta,) where an entry lies beyond the box of theta."""
     theta = np.concatenate([each.thetas[:, : problem.n_theta] for each in episodes])
     room = ROUNDING * problem.theta_half
-    low, high = problem.theta_min - room, problem.theta_max + room
+    low, high = problem.deviations.theta_min - room, problem.deviations.theta_max + room
     return np.asarray(np.mean((theta < low) | (theta > high), axis=0))
 
 

@@ -60,6 +60,11 @@ class MPCProblem(ReadOnlyArrays):
     absolute: bool = field(default=False, init=False, compare=False)
 
     @property
+    def deviations(self) -> MPCProblem:
+        """The same problem in deviations from its operating point, as laws and networks take it."""
+        return self
+
+    @property
     def has_rate_bounds(self) -> bool:
         """Whether the change of an input is bounded."""
         return self.rate.bounded

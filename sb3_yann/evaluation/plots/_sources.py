@@ -45,4 +45,6 @@ def inputs_of(problem: LinearMPC, policy: Any, theta: Array) -> Array:
     device = next(actor.mu.buffers()).device
     with th.no_grad():
         scaled = actor.mu(th.as_tensor(theta, device=device)).double().cpu().numpy()
-    return np.asarray((problem.u_max + problem.u_min) / 2 + problem.u_half * scaled)
+    return np.asarray(
+        (problem.deviations.u_max + problem.deviations.u_min) / 2 + problem.u_half * scaled
+    )

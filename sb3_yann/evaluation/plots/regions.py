@@ -68,7 +68,7 @@ class ActiveConstraints:
 
     def __init__(self, problem: LinearMPC) -> None:
         program, self.names = condense(problem)
-        self.units = ProgramUnits(program, problem.u_min, problem.u_max)
+        self.units = ProgramUnits(program, problem.deviations.u_min, problem.deviations.u_max)
 
     def at(self, theta: Array) -> list[str] | None:
         """Return the constraints that act at theta (n_theta,), None where no plan is feasible."""

@@ -175,7 +175,7 @@ def _values(
         raise ValueError(
             f"output = {output} must be an input, from 0 to {problem.model.n_inputs - 1}."
         )
-    low, high = problem.theta_min[chosen], problem.theta_max[chosen]
+    low, high = problem.deviations.theta_min[chosen], problem.deviations.theta_max[chosen]
     if frame is not None:
         low, high = (check_array("frame", each, (2,)) - problem.theta_ss[chosen] for each in frame)
     if not np.all(np.isfinite([low, high])) or np.any(low >= high):
