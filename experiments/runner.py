@@ -24,6 +24,8 @@ from joblib import Parallel, delayed, parallel_config
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from sb3_yann._archive import atomic_write
+
 
 @dataclass(frozen=True)
 class Run:
@@ -259,17 +261,10 @@ def path_of(run: Run, folder: Path, fingerprint: str) -> Path:
 def save(outcome: Outcome, run: Run, folder: Path, fingerprint: str) -> None:
     """Write the file of a run, which is either whole or not there."""
     target = path_of(run, folder, fingerprint)
-    unfinished = target.with_name(f"{target.name}.{os.getpid()}.part")
     arrays = {name: getattr(outcome, name) for name in (*_ARRAYS, "seconds")}
     arrays |= {f"extra:{name}": value for name, value in outcome.extra.items()}
-    try:
-        with unfinished.open("wb") as file:
-            np.savez_compressed(file, key=_key(run, fingerprint), **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, target)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with atomic_write(target) as part, part.open("wb") as file:
+        np.savez_compressed(file, key=_key(run, fingerprint), **arrays)
 
 
 def load(run: Run, folder: Path, fingerprint: str) -> Outcome | None:

@@ -11,7 +11,8 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from hashlib import sha256
 from io import BytesIO
 from os import PathLike, fspath
@@ -44,6 +45,24 @@ def digest_of(arrays: Mapping[str, Any]) -> str:
     return found.hexdigest()
 
 
+@contextmanager
+def atomic_write(path: str | PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``, which replaces ``path`` on leaving.
+
+    After an exception ``path`` stays as it was, and nothing is left behind. The data are on the
+    disk before the file is renamed, so a crash leaves the old file or the new one.
+    """
+    target = Path(path)
+    part = target.with_name(f"{target.name}.{os.getpid()}.part")  # others may write the same
+    try:
+        yield part
+        with part.open("r+b") as file:
+            os.fsync(file.fileno())
+        os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
     """Write arrays and their digest as a whole: a reader never sees half of a file.
 
@@ -57,13 +76,8 @@ def write_arrays(path: str | PathLike[str], arrays: Mapping[str, Any]) -> None:
     size = sum(np.asarray(each).nbytes for each in arrays.values())
     if size > 0.99 * MOST:
         raise ValueError(f"{fspath(path)} would hold {size} bytes, more than {MOST} are not read.")
-    part = f"{fspath(path)}.{os.getpid()}.part"  # another process may be writing the same
-    try:
-        with open(part, "wb") as file:
-            np.savez(file, **{**arrays, DIGEST: digest_of(arrays)})
-        os.replace(part, path)
-    finally:
-        Path(part).unlink(missing_ok=True)
+    with atomic_write(path) as part, part.open("wb") as file:
+        np.savez(file, **{**arrays, DIGEST: digest_of(arrays)})
 
 
 def read_arrays(path: str | PathLike[str]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import struct
@@ -174,3 +175,13 @@ def test_a_pipe_is_refused_and_does_not_wait(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "law.npz")
     with pytest.raises(ValueError, match="pipe"):
         read_arrays(tmp_path / "law.npz")
+
+
+def test_a_file_that_fails_to_be_written_leaves_the_old_one_and_nothing_else(tmp_path) -> None:
+    path = tmp_path / "file.txt"
+    for text, error in (("old", None), ("new", RuntimeError)):
+        with contextlib.suppress(RuntimeError), _archive.atomic_write(path) as part:
+            part.write_text(text)
+            if error:
+                raise error
+    assert path.read_text() == "old" and [*tmp_path.iterdir()] == [path]

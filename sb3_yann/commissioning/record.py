@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._archive import atomic_write
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.watchdog import Alarm
 
@@ -101,14 +102,8 @@ class Record:
         if self.path is None:
             return None
         name = f"{self.path.stem}-batch-{batch}.zip"
-        unfinished = self.path.with_name(f"{self.path.stem}-unfinished.zip")
-        try:
-            model.save(unfinished)
-            with unfinished.open("r+b") as file:  # the line that names it is on the disk after it
-                os.fsync(file.fileno())
-            os.replace(unfinished, self.path.with_name(name))
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with atomic_write(self.path.with_name(name)) as part:  # on the disk before its line
+            model.save(part)
         return name
 
     def digest_of(self, name: str | None) -> str | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._archive import atomic_write
 from sb3_yann._validation import check_type
 from sb3_yann.evaluation.episodes import EnvPool, Source
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
@@ -122,15 +122,13 @@ class GuardSession:
         """Save the model with the accepted policy, as a whole; it goes on with its own."""
         own = ActorCheckpoint.of(self.policy)
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(f"{path.name}.unfinished")
         try:
-            self.state.accepted.restore(self.policy)
-            self.model.save(unfinished)
-            os.replace(unfinished, path)
+            with atomic_write(path) as part:
+                self.state.accepted.restore(self.policy)
+                self.model.save(part)
         finally:
             if not self.interrupted:
                 own.restore(self.policy)
-            unfinished.unlink(missing_ok=True)
 
     def has_learned(self, checkpoint: ActorCheckpoint) -> bool:
         """Return whether the networks of a checkpoint correct the MPC anywhere."""

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_yann._archive import atomic_write
 from sb3_yann._validation import Array
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 
@@ -208,13 +209,8 @@ def begin_record(path: Path, decisions: list[Decision]) -> bool:
 def write_csv(path: Path, decisions: list[Decision]) -> None:
     """Write the decisions, all or none of them."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".unfinished")
-    try:
-        with unfinished.open("w", newline="", encoding="utf-8") as file:
-            file.write(_rows(decisions, header=True))
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with atomic_write(path) as part:
+        part.write_text(_rows(decisions, header=True), encoding="utf-8", newline="")
 
 
 def _rows(decisions: list[Decision], header: bool) -> str:
