@@ -13,7 +13,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --quiet
 CODE := sb3_yann envs benchmarks experiments examples tests noxfile.py docs/conf.py docs/messages.py docs/pictures.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper bench test test-fast coverage check docs format clean
+.PHONY: help demo paper bench test test-all test-fast coverage check docs format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -29,15 +29,18 @@ bench: $(STAMP)  ## measure the speed, ten minutes (make bench ARGS="--quick" fo
 	@OMP_NUM_THREADS=1 $(PY) -m benchmarks $(ARGS)
 
 test: $(STAMP)  ## run the tests, side by side (make test ARGS="-n 0 -k name" for pytest alone)
+	@$(PYTEST) -m "not nightly" $(ARGS)
+
+test-all: $(STAMP)  ## run those of the night too: fuzzers, faults, what needs other tools
 	@$(PYTEST) $(ARGS)
 
 test-fast: $(STAMP)  ## run the tests that are not marked slow, in less than two minutes
-	@$(PYTEST) -m "not slow" $(ARGS)
+	@$(PYTEST) -m "not slow and not nightly" $(ARGS)
 
 coverage: $(STAMP)  ## run the tests, and print the lines and branches they leave out
 	@rm -rf out/coverage && mkdir -p out/coverage
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
-		$(PY) -m coverage run -m pytest -n logical --maxprocesses 4 --dist loadfile $(ARGS)
+		$(PY) -m coverage run -m pytest -m "not nightly" -n logical --maxprocesses 4 --dist loadfile $(ARGS)
 	@$(PY) -m coverage combine --quiet && $(PY) -m coverage report
 
 check: $(STAMP)  ## lint, check the formatting and the types

@@ -1,6 +1,6 @@
 """The paper's experiments, with more seeds and more to compare with: ``python -m experiments``."""
 
-import sb3_yann
+import sys
+from pathlib import Path
 
-FINGERPRINT = f"{sb3_yann.__version__}-3"
-"""Results of another version are not taken for those of this one."""
+sys.path.append(str(Path(__file__).parents[1] / "examples"))  # they import each other by name

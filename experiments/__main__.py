@@ -14,10 +14,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments import pcgym, twin
+from experiments import pcgym
+from experiments.markdown import quote
 from experiments.results import in_short, write_report
-from experiments.runner import Outcome, Run, RunsFailed, load_all, run_all
-from experiments.summary import quote
+from experiments.runner import RESULTS, RunsFailed, load_all, run_all
+
+BEGIN = "<!-- results: begin -->\n"
+END = "<!-- results: end -->"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -29,56 +32,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     quick = Path("out/paper-quick")
     runs = catalog.QUICK if options.quick else catalog.RUNS
-    folder = options.results or (quick / "runs" if options.quick else Path("out/paper"))
+    results = options.results or (quick / "results.sqlite" if options.quick else RESULTS)
     report_folder = quick if options.quick else Path("docs")
     failed: RunsFailed | None = None
     if not options.report_only:
+        pattern = re.compile(options.only, re.IGNORECASE)
+        wanted = [run for run in runs if pattern.search(str(run))]
+        where = f"the workers of {options.dask}" if options.dask else "this machine"
+        console.print(f"{len(wanted)} runs on {where}, saved in {results}.")
         try:
-            _run(runs, folder, options, console)
+            run_all(wanted, catalog.execute, results, jobs=options.jobs, dask=options.dask)
         except RunsFailed as error:
             failed = error
         except KeyboardInterrupt:
-            console.print(f"Interrupted. What is finished lies in {folder} and is not run again.")
+            console.print(f"Interrupted. What is finished lies in {results} and is not run again.")
             return 130
-    everything = load_all(runs, folder, catalog.FINGERPRINT)
-    from_logs = {run: each for run, each in everything.items() if run.plant == twin.PLANT}
-    strangers = {run: each for run, each in everything.items() if run.plant in pcgym.PLANTS}
-    apart = from_logs.keys() | strangers.keys()
-    outcomes = {run: each for run, each in everything.items() if run not in apart}
-    if outcomes:
+    outcomes = load_all(runs, results)
+    of_pcgym = {run: each for run, each in outcomes.items() if run.plant in pcgym.PLANTS}
+    of_paper = {run: each for run, each in outcomes.items() if run not in of_pcgym}
+    written = pcgym.write_report(of_pcgym, report_folder)
+    if of_paper:
         command = f'make paper ARGS="{shlex.join(given)}"' if given else "make paper"
-        for path in write_report(outcomes, report_folder, command=command):
-            console.print(f"Written: {path}")
-        if not options.quick and quote(in_short(outcomes), Path("README.md")):
-            console.print("Written: the results in README.md")
-    for path in (
-        *twin.write_report(from_logs, report_folder),
-        *pcgym.write_report(strangers, report_folder),
-    ):
+        written += write_report(of_paper, report_folder, command=command)
+        readme = Path("README.md")
+        if not options.quick and quote(in_short(of_paper), readme, BEGIN, END):
+            written.append(readme)
+    for path in written:
         console.print(f"Written: {path}")
-    console.print(f"{len(everything)} of {len(runs)} runs are in {folder}.")
+    console.print(f"{len(outcomes)} of {len(runs)} runs are in {results}.")
     if failed:
         console.print(str(failed), style="red", markup=False)
-    return 1 if failed or not everything else 0
-
-
-def _run(
-    runs: Sequence[Run], folder: Path, options: argparse.Namespace, console: Console
-) -> dict[Run, Outcome]:
-    from experiments import catalog
-
-    pattern = re.compile(options.only, re.IGNORECASE)
-    wanted = [run for run in runs if pattern.search(str(run))]
-    where = f"the workers of {options.dask}" if options.dask else "this machine"
-    console.print(f"{len(wanted)} runs on {where}, saved in {folder}.")
-    return run_all(
-        wanted,
-        catalog.execute,
-        folder,
-        fingerprint=catalog.FINGERPRINT,
-        jobs=options.jobs,
-        dask=options.dask,
-    )
+    return 1 if failed or not outcomes else 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -86,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="a few short runs, in minutes")
     parser.add_argument("--jobs", type=int, default=-1, help="processes (all cores)")
     parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster")
-    parser.add_argument("--results", type=Path, metavar="DIR", help="of the runs (out/paper)")
+    parser.add_argument("--results", type=Path, metavar="FILE", help="of the runs")
     parser.add_argument(
         "--only",
         metavar="PATTERN",

@@ -21,15 +21,14 @@ from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 
-from experiments import FINGERPRINT as FINGERPRINT
-from experiments import optimum, pcgym, twin, yardsticks
+from experiments import optimum, pcgym, yardsticks
 from experiments.measures import BARE, EXPLORED, MPC, OBSERVER, OPTIMUM, OURS, REIDENTIFIED
+from experiments.plants import printed_pendulum, true_reactor
 from experiments.runner import Outcome, Run
 from experiments.yardsticks import Learner
 from sb3_yann import (
     DisturbanceObserver,
     ImprovementGuard,
-    LinearModel,
     LinearMPC,
     NoActionNoise,
     PlantTwin,
@@ -39,7 +38,7 @@ from sb3_yann import (
 )
 from sb3_yann.evaluation.episodes import Episodes, Source, evaluate
 from sb3_yann.wrappers import ObserveDisturbance, StageCost
-from sb3_yann_envs import cstr, problems
+from sb3_yann_envs import problems
 
 TEST_SEEDS = range(2000, 2100)
 """Test starts; the first ten are those of the paper's tables."""
@@ -92,17 +91,6 @@ def reidentified(plant: Plant) -> LinearMPC:
     problem = plant.problem()
     log = evaluate(problem.explicit(), plant.env, LOG_SEEDS)
     return PlantTwin.fit(problem, [*zip(log.observations, log.actions, strict=True)]).reidentified()
-
-
-def true_reactor() -> LinearMPC:
-    """Return the reactor's MPC with the model that its equations give, not the printed one."""
-    model = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
-    return replace(problems.cstr(), model=model, terminal=None)
-
-
-def printed_pendulum() -> LinearMPC:
-    """Return the pendulum's MPC with the printed weight, Q = I: nine regions instead of seven."""
-    return replace(problems.clipped_pendulum(), Q=np.eye(2), terminal=None)
 
 
 STRICT = {"tail": 0, "retreat": False}
@@ -220,7 +208,6 @@ CHANGES: dict[str, dict[str, Any]] = {
     "two gradient steps": {"gradient_steps": 2},
     "target rate 0.02": {"tau": 0.02},
     "nearest outside": {"infeasible": "nearest_region"},
-    "one network": {"networks": "shared"},
     "no settings": {"defaults": True, "tau": 0.02},
     "a simulator explored": {
         "defaults": True,
@@ -229,9 +216,6 @@ CHANGES: dict[str, dict[str, Any]] = {
         "simulated": True,
         "guard": {"patience": 10, "keep_if_worse": True},
     },
-    "no settings, one network": {"defaults": True, "tau": 0.02, "networks": "shared"},
-    "no settings, from the MPC with observer": {"defaults": True, "tau": 0.02},
-    "input steps bounded": {"guard": {"rule": {"largest_step": 1.5}}},
 }
 """What is changed of YANN-RL, one thing at a time."""
 LEARNERS: dict[str, Callable[..., Learner]] = {
@@ -300,7 +284,7 @@ def _runs() -> list[Run]:
     return runs
 
 
-RUNS = [*_runs(), *twin.runs(), *(pcgym.runs() if find_spec("pcgym") else ())]
+RUNS = [*_runs(), *(pcgym.runs() if find_spec("pcgym") else ())]
 QUICK = [
     *(Run(plant, name, 0, 0) for plant in ("CSTR", "pendulum, Q = I") for name in FIXED),
     Run("CSTR", OURS, 20, 4),
@@ -359,8 +343,6 @@ def execute(run: Run) -> Outcome:
     """Return the outcome of a run."""
     began = time.perf_counter()
     torch.set_num_threads(1)
-    if run.plant == twin.PLANT:
-        return twin.execute(run)
     if run.plant in pcgym.PLANTS:
         return pcgym.execute(run)
     given = PLANTS[run.plant]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,3 +39,14 @@ def spread(values: Sequence[float] | NDArray[np.float64], digits: int = 2, sign:
     figures = np.median(values), np.min(values), np.max(values)
     middle, low, high = (number(float(each), digits, sign) for each in figures)
     return f"{middle} ({low} to {high})"
+
+
+def quote(text: str, page: Path, first: str, last: str) -> bool:
+    """Put the text between the marks of a page; return whether it has them."""
+    old = page.read_text(encoding="utf-8") if page.exists() else ""
+    before, begin, rest = old.partition(first)
+    _, end, after = rest.partition(last)
+    if not (begin and end):
+        return False
+    page.write_text(f"{before}{first}\n{text}\n\n{last}{after}", encoding="utf-8")
+    return True

@@ -20,13 +20,11 @@ from gymnasium.wrappers import RescaleAction, RescaleObservation
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 
-from experiments import FINGERPRINT
-from experiments.markdown import number, table
+from experiments.markdown import number, quote, table
 from experiments.measures import MPC, OURS, REIDENTIFIED
 from experiments.pcgym_nmpc import NonlinearMPC
 from experiments.pcgym_vector import registered
-from experiments.runner import Outcome, Run, load_all, run_all
-from experiments.summary import quote
+from experiments.runner import RESULTS, Outcome, Run, load_all, run_all
 from sb3_yann import (
     DisturbanceBounds,
     DisturbanceObserver,
@@ -312,15 +310,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Do the runs that are missing, print the table and quote it."""
     parser = argparse.ArgumentParser(prog="python -m experiments.pcgym", description=__doc__)
     parser.add_argument("--jobs", type=int, default=-1, help="processes (all cores)")
-    parser.add_argument("--results", type=Path, default=Path("out/paper"), help="of the runs")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="file of the runs")
     parser.add_argument("--report-only", action="store_true", help="of the runs that are done")
     parser.add_argument("--report", type=Path, default=Path("docs"), help="folder of the page")
     options = parser.parse_args(arguments)
     if options.report_only:
-        found = load_all(runs(), options.results, FINGERPRINT)
+        found = load_all(runs(), options.results)
     else:
-        jobs = options.jobs
-        found = run_all(runs(), execute, options.results, fingerprint=FINGERPRINT, jobs=jobs)
+        found = run_all(runs(), execute, options.results, jobs=options.jobs)
     print(table(HEADER, rows(found), texts=2))
     for path in write_report(found, options.report):
         print(f"Written: {path}")

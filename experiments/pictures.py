@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import textwrap
 from collections.abc import Mapping, Sequence
 from functools import reduce
 from pathlib import Path
@@ -53,37 +52,6 @@ def save_in_short(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
             _two_panels(plant, found, fixed).savefig(path, dpi=110)
             return [path]
     return []
-
-
-def save_from_a_log(changes: Mapping[str, Array], optimum: float, folder: Path) -> Path:
-    """Save ``from-a-log.png``: a dot for each log, and the median of each kind of log.
-
-    Parameters
-    ----------
-    changes : mapping of str to ndarray, shape (logs,)
-        Of the mean cost against the MPC's, in %.
-    optimum : float
-        What the optimum has.
-    folder : Path
-        Made as needed.
-    """
-    figure = Figure(figsize=(9, 1.2 + 0.6 * len(changes)), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    for k, (change, color) in enumerate(zip(changes.values(), COLORS, strict=False)):
-        spread = np.linspace(-0.25, 0.25, len(change)) if len(change) > 1 else np.zeros(1)
-        axes.plot(change, k + spread, "o", color=color, alpha=0.7)
-        axes.plot([np.median(change)] * 2, [k - 0.4, k + 0.4], color=color, linewidth=3)
-    for name, level, style in ((MPC, 0.0, "-"), (OPTIMUM, optimum, "--")):
-        axes.axvline(level, label=name, color="black", linestyle=style, linewidth=1, zorder=1)
-    axes.set_yticks(range(len(changes)), [textwrap.fill(name, 30) for name in changes])
-    axes.invert_yaxis()
-    axes.set(xlabel="change of the mean cost on the plant, %", title="improved from a log alone")
-    axes.grid(axis="x", alpha=0.3)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path := folder / "from-a-log.png", dpi=110)
-    return path
 
 
 def _two_panels(

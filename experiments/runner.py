@@ -1,21 +1,19 @@
-"""Many runs side by side: each one is saved when it is done, and never done twice.
+"""Many runs side by side. Each is saved in one file of results as it ends, and never done twice.
 
-A run is one learner with one seed on one plant. Its outcome is one ``.npz`` file, whose name
-holds a hash of the run and of the settings it was made with. Started again after an interruption,
-`run_all` does what is missing.
+A run is one learner with one seed on one plant. The file is an SQLite database: a row for each run,
+whose arrays are a compressed ``.npz``. Started again after an interruption, `run_all` does what is
+missing.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import re
+import io
+import sqlite3
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, nullcontext
+from dataclasses import astuple, dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +22,10 @@ from joblib import Parallel, delayed, parallel_config
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sb3_yann._archive import atomic_write
+RESULTS = Path(__file__).with_name("results.sqlite")
+"""All runs that the tables of the documentation show."""
+FINGERPRINT = "0.1.0-3"
+"""Of the settings that a run depends on; results of others are not taken for those of these."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,8 @@ class RunsFailed(RuntimeError):
     """
 
     def __init__(self, failures: dict[Run, str], outcomes: dict[Run, Outcome]) -> None:
-        self.failures, self.outcomes = failures, outcomes
+        self.failures = failures
+        self.outcomes = outcomes
         texts = (f"{run}\n{text.rstrip()}" for run, text in failures.items())
         super().__init__(f"{len(failures)} run(s) failed.\n\n" + "\n\n".join(texts))
 
@@ -137,14 +139,13 @@ class RunsFailed(RuntimeError):
 def run_all(
     runs: Iterable[Run],
     execute: Callable[[Run], Outcome],
-    folder: str | os.PathLike[str],
+    results: Path = RESULTS,
     *,
-    fingerprint: str = "",
     jobs: int = -1,
     dask: str | None = None,
     progress: bool = True,
 ) -> dict[Run, Outcome]:
-    """Return the outcome of every run, having done those that `folder` does not hold yet.
+    """Return the outcome of every run, having done those that the file does not hold yet.
 
     Parameters
     ----------
@@ -152,14 +153,13 @@ def run_all(
         What is to be done.
     execute : callable
         From a run to its outcome; called in other processes, on one thread each.
-    folder : path-like
-        One file for each run. A file that cannot be read counts as missing.
-    fingerprint : str
-        Stands for whatever else the outcomes depend on; files with another one are left alone.
+    results : Path
+        The file; made where it is missing.
     jobs : int
         Processes on this machine, as joblib counts them: -1 is one for each core.
     dask : str, optional
-        Address of a dask scheduler, whose workers then do the work.
+        Address of a dask scheduler, whose workers then do the work. They need this repository and
+        ``--nthreads 1``, since Stable-Baselines3 seeds the generators of a whole process.
     progress : bool
         Print a line for each run that is done, and a bar with the time left.
 
@@ -168,124 +168,96 @@ def run_all(
     RunsFailed
         At the end, if some runs failed.
     """
-    runs, target = list(dict.fromkeys(runs)), Path(folder)
-    target.mkdir(parents=True, exist_ok=True)
-    outcomes = load_all(runs, target, fingerprint)
+    runs = list(dict.fromkeys(runs))
+    results.parent.mkdir(parents=True, exist_ok=True)
+    outcomes = load_all(runs, results)
     missing = [run for run in runs if run not in outcomes]
     missing.sort(key=lambda run: -run.episodes)  # the longest first
-    if dask is None:
-        stream = _on_this_machine(missing, execute, target, fingerprint, jobs)
-    else:
-        from experiments.cluster import on_cluster
-
-        stream = on_cluster(missing, execute, target, fingerprint, dask)
     failures: dict[Run, str] = {}
-    for run, error in _with_progress(stream, missing, len(runs), progress):
-        outcome = None if error else load(run, target, fingerprint)
-        if outcome is None:
-            failures[run] = error or "The file that was just written cannot be read."
-        else:
-            outcomes[run] = outcome
+    bar = tqdm(
+        total=sum(max(1, run.episodes) for run in missing),
+        unit="episode",
+        smoothing=0,
+        disable=not progress,
+    )
+    with bar:
+        for run, outcome in _played(missing, execute, jobs, dask):
+            if isinstance(outcome, Outcome):
+                save(outcome, run, results)
+                outcomes[run] = outcome
+            else:
+                failures[run] = outcome
+            bar.update(max(1, run.episodes))
+            if progress:
+                bar.write(f"{'FAILED' if run in failures else 'done'}: {run}", file=sys.stdout)
     ordered = {run: outcomes[run] for run in runs if run in outcomes}
     if failures:
         raise RunsFailed(failures, ordered)
     return ordered
 
 
-def play(execute: Callable[[Run], Outcome], run: Run) -> Outcome | str:
-    """Return the outcome of a run, or the traceback of its failure."""
+def _played(
+    runs: list[Run], execute: Callable[[Run], Outcome], jobs: int, dask: str | None
+) -> Iterator[tuple[Run, Outcome | str]]:
+    if not runs:
+        return
+    backend = "loky"
+    client = nullcontext()
+    options = {"inner_max_num_threads": 1}
+    if dask is not None:
+        from distributed import Client
+
+        backend = "dask"
+        client = Client(dask)
+        options = {}
+    with client, parallel_config(backend=backend, **options):
+        parallel = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)
+        yield from parallel(delayed(_play)(execute, run) for run in runs)
+
+
+def _play(execute: Callable[[Run], Outcome], run: Run) -> tuple[Run, Outcome | str]:
+    """Return a run with its outcome, or with the traceback of its failure."""
     torch.set_num_threads(1)  # the networks are too small to share among cores
     try:
-        return execute(run)
+        return run, execute(run)
     except Exception:
-        return traceback.format_exc()
+        return run, traceback.format_exc()
 
 
-def _play_and_save(
-    execute: Callable[[Run], Outcome], run: Run, folder: Path, fingerprint: str
-) -> tuple[Run, str | None]:
-    outcome = play(execute, run)
-    if isinstance(outcome, str):
-        return run, outcome
-    save(outcome, run, folder, fingerprint)
-    return run, None
+def _opened(results: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(results, timeout=60)
+    database.execute(
+        "CREATE TABLE IF NOT EXISTS runs (plant, learner, seed, episodes, fingerprint, arrays, "
+        "PRIMARY KEY (plant, learner, seed, episodes, fingerprint))"
+    )
+    return database
 
 
-def _on_this_machine(
-    runs: Sequence[Run],
-    execute: Callable[[Run], Outcome],
-    folder: Path,
-    fingerprint: str,
-    jobs: int,
-) -> Iterator[tuple[Run, str | None]]:
-    left = dict.fromkeys(runs)
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        parallel = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)
-        calls = (delayed(_play_and_save)(execute, run, folder, fingerprint) for run in runs)
-        results = parallel(calls) if runs else iter(())
-    try:
-        for run, error in results:
-            del left[run]
-            yield run, error
-    except BrokenProcessPool:  # one was killed from outside, or for want of memory
-        reason = f"Not done, since the processes stopped:\n{traceback.format_exc()}"
-        for run in left:
-            yield run, None if load(run, folder, fingerprint) else reason
-
-
-def _with_progress(
-    stream: Iterator[tuple[Run, str | None]], missing: Sequence[Run], total: int, show: bool
-) -> Iterator[tuple[Run, str | None]]:
-    """Pass the results through, with a bar that counts the training episodes."""
-    work = sum(max(1, run.episodes) for run in missing)
-    if show:
-        print(
-            f"{total} runs, {total - len(missing)} done before, {len(missing)} to do.", flush=True
-        )
-    bar = tqdm(total=work, unit="episode", smoothing=0, disable=not show or not missing)
-    with bar:
-        for run, error in stream:
-            bar.update(max(1, run.episodes))
-            if show:
-                bar.write(f"{'FAILED' if error else 'done'}: {run}", file=sys.stdout)
-            yield run, error
-
-
-def path_of(run: Run, folder: Path, fingerprint: str) -> Path:
-    """Return the file of a run: readable, with a hash of all that it depends on."""
-    digest = hashlib.sha256(_key(run, fingerprint).encode()).hexdigest()[:12]
-    words = re.sub(r"[^\w]+", "-", f"{run.plant} {run.learner}").strip("-").lower()
-    return folder / f"{words}-{run.seed}-{run.episodes}-{digest}.npz"
-
-
-def save(outcome: Outcome, run: Run, folder: Path, fingerprint: str) -> None:
-    """Write the file of a run, which is either whole or not there."""
-    target = path_of(run, folder, fingerprint)
+def save(outcome: Outcome, run: Run, results: Path = RESULTS) -> None:
+    """Write the row of a run, whole or not at all."""
     arrays = {name: getattr(outcome, name) for name in (*_ARRAYS, "seconds")}
     arrays |= {f"extra:{name}": value for name, value in outcome.extra.items()}
-    with atomic_write(target) as part, part.open("wb") as file:
-        np.savez_compressed(file, key=_key(run, fingerprint), **arrays)
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    row = (*astuple(run), FINGERPRINT, file.getvalue())
+    with closing(_opened(results)) as database, database:
+        database.execute("INSERT OR REPLACE INTO runs VALUES (?, ?, ?, ?, ?, ?)", row)
 
 
-def load(run: Run, folder: Path, fingerprint: str) -> Outcome | None:
-    """Return the outcome of a run, or None where there is no file or not a whole one."""
-    try:
-        with path_of(run, folder, fingerprint).open("rb") as file:  # np.load would leave it open
-            content = np.load(file, allow_pickle=False)
-            arrays = {name: content[name] for name in content.files}
-        if str(arrays.pop("key")) != _key(run, fingerprint):
-            return None
-        extra = {name[6:]: arrays.pop(name) for name in [*arrays] if name.startswith("extra:")}
-        return Outcome(**arrays, extra=extra)
-    except Exception:  # missing, cut short, or broken in any other way
-        return None
-
-
-def load_all(runs: Iterable[Run], folder: Path, fingerprint: str) -> dict[Run, Outcome]:
-    """Return the outcomes that `folder` holds already."""
-    found = {run: load(run, folder, fingerprint) for run in runs}
-    return {run: outcome for run, outcome in found.items() if outcome is not None}
-
-
-def _key(run: Run, fingerprint: str) -> str:
-    return json.dumps({**asdict(run), "fingerprint": fingerprint}, sort_keys=True)
+def load_all(runs: Iterable[Run], results: Path = RESULTS) -> dict[Run, Outcome]:
+    """Return the outcomes that the file holds already."""
+    if not results.exists():
+        return {}
+    with closing(_opened(results)) as database:
+        rows = database.execute(
+            "SELECT plant, learner, seed, episodes, arrays FROM runs WHERE fingerprint = ?",
+            (FINGERPRINT,),
+        ).fetchall()
+    found: dict[Run, Outcome] = {}
+    wanted = set(runs)
+    for *key, content in rows:
+        if Run(*key) in wanted:
+            arrays = dict(np.load(io.BytesIO(content), allow_pickle=False))
+            extra = {name[6:]: arrays.pop(name) for name in [*arrays] if name.startswith("extra:")}
+            found[Run(*key)] = Outcome(**arrays, extra=extra)
+    return {run: found[run] for run in runs if run in found}

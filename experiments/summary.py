@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 from experiments.markdown import number, table
 from experiments.measures import (
@@ -34,7 +33,6 @@ HEADER = (
     "violations",
     "seeds",
 )
-BEGIN, END = "<!-- results: begin -->\n", "<!-- results: end -->"
 
 
 def summary(outcomes: Mapping[Run, Outcome], episodes: int) -> str:
@@ -43,17 +41,6 @@ def summary(outcomes: Mapping[Run, Outcome], episodes: int) -> str:
     rows = [_cells(at) for at in found if OURS in at.learners]
     starts = max((len(out.test_costs[-1]) for out in outcomes.values()), default=0)
     return f"{table(HEADER, rows)}\n\n{_legend(episodes, starts)}" if rows else ""
-
-
-def quote(text: str, readme: Path, first: str = BEGIN, last: str = END) -> bool:
-    """Put the text between the marks of a README; return whether it has them."""
-    old = readme.read_text(encoding="utf-8") if readme.exists() else ""
-    before, begin, rest = old.partition(first)
-    _, end, after = rest.partition(last)
-    if not (begin and end):
-        return False
-    readme.write_text(f"{before}{first}\n{text}\n\n{last}{after}", encoding="utf-8")
-    return True
 
 
 def _cells(at: Standing) -> list[str]:

@@ -1,0 +1,109 @@
+"""The learning tables hold what their runs do, and every plant shows the theta of its MPC."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments import learning
+from experiments.learning import (
+    FROM_A_LOG,
+    HEADER,
+    IMPROVED,
+    LOGS,
+    PLANNED,
+    SEEDS,
+    execute,
+    log_rows,
+    main,
+    rows,
+    runs,
+)
+from experiments.plants import CASES
+from experiments.runner import Outcome, Run, save
+
+pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
+
+
+def outcome(costs, violations=((0, 0), (0, 0)), accepted=True, seconds=1.0) -> Outcome:
+    none = np.zeros(0)
+    extra = {"accepted": np.array(accepted), "trusted": np.array(accepted)}
+    return Outcome([0, 1], costs, np.array(violations), none, none, none, extra, seconds)
+
+
+BASE = [10.0, 30.0]
+PLANT_RUNS = {
+    Run("pH", PLANNED, 0, 0): outcome([BASE, [10.0, 20.0]]),  # a quarter less
+    Run("pH", IMPROVED, 40, 0): outcome([BASE, [8.0, 24.0]], seconds=3),
+    Run("pH", IMPROVED, 41, 0): outcome([BASE, [14.0, 10.0]], [[0, 0], [2, 1]], seconds=5),
+    Run("pH", IMPROVED, 42, 0): outcome([BASE, BASE], [[1, 0], [1, 0]], False, 9),
+}
+LOG_RUNS = {
+    Run(FROM_A_LOG, PLANNED, 0, 0): outcome([BASE, [9.0, 29.0]]),
+    Run(FROM_A_LOG, "five episodes", 40, 0): outcome([BASE, [8.0, 31.0]], seconds=7),
+    Run(FROM_A_LOG, "two episodes", 40, 0): outcome([BASE, BASE], accepted=False),
+}
+
+
+def test_a_row_holds_medians_ranges_and_what_was_lost() -> None:
+    (row,) = rows(PLANT_RUNS)
+    assert dict(zip(HEADER, row, strict=True)) == {
+        "plant": "pH",
+        "MPC": "20.00",
+        "headroom, %": "-25.00",
+        "`improve`, %": "-20.00 (-40.00 to +0.00)",
+        "of the headroom, %": "80 (0 to 160)",
+        "worst episode, %": "+20.00",
+        "changed": "2 of 3",
+        "violations": "2",
+        "seconds": "5",
+    }
+
+
+def test_a_row_of_a_log_says_how_much_of_the_gap_is_closed() -> None:
+    five, two = log_rows(LOG_RUNS)
+    assert five == [
+        "five episodes", "1 of 1", "-2.50 (-2.50 to -2.50)", "50", "+5.00", "0", "7",
+    ]  # fmt: skip
+    assert two[1:4] == ["0 of 1", "+0.00 (+0.00 to +0.00)", "0"]
+
+
+def test_the_tables_are_quoted_between_their_marks(tmp_path) -> None:
+    results = tmp_path / "results.sqlite"
+    for run, each in (PLANT_RUNS | LOG_RUNS).items():
+        save(each, run, results)
+    page = tmp_path / "improve.md"
+    marks = [f"<!-- {name}: {end} -->\n" for name in ("simulator", "from a log")
+             for end in ("begin", "end")]  # fmt: skip
+    page.write_text("".join(marks), encoding="utf-8")
+    main(["--report-only", "--results", str(results), "--report", str(tmp_path)])
+    text = page.read_text(encoding="utf-8")
+    assert "| pH | 20.00 |" in text and "| five episodes | 1 of 1 |" in text
+
+
+def test_each_plant_is_planned_once_and_improved_with_every_seed() -> None:
+    done = runs(["pH", FROM_A_LOG])
+    assert done[:2] == [Run("pH", PLANNED, 0, 0), Run(FROM_A_LOG, PLANNED, 0, 0)]
+    assert [run.seed for run in done if run.learner == IMPROVED] == [*SEEDS]
+    assert len(done) == 2 + len(SEEDS) * (1 + len(LOGS))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_each_plant_shows_the_theta_of_its_mpc(name, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)  # an example writes a log
+    case = CASES[name]()
+    env = case.make()
+    theta, _ = env.reset(seed=0)
+    assert theta.shape == (case.mpc.n_theta,)
+    assert env.observation_space.contains(env.step(np.float32(case.mpc.online()(theta)))[0])
+
+
+@pytest.mark.slow
+def test_a_run_compares_with_the_mpc_on_the_same_episodes(monkeypatch) -> None:
+    monkeypatch.setattr(learning, "TESTS", range(2000, 2004))
+    plans = execute(Run("pH", PLANNED, 40, 0))
+    law = CASES["pH"]().mpc.explicit()
+    costs, violations = learning.costs_on(CASES["pH"]().mpc, CASES["pH"]().make, law)
+    np.testing.assert_allclose(plans.test_costs[0], costs, rtol=1e-6)
+    assert not violations.any()
+    assert plans.test_costs[1].mean() < 0.8 * costs.mean()

@@ -1,0 +1,324 @@
+"""Readers of damaged files, settings and command lines raise what they document, or read the same.
+
+Each target draws so many mutations; ``FUZZ_COUNT=100000 make test-all ARGS="-k damaged"`` draws
+more. Anything else than a documented error, or exactly what was written, is a finding: another
+exception, another law, more than ten seconds, or numbers that are not finite.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_yann import Checks, Controller, ImprovementGuard, LinearModel, LinearMPC, export
+from sb3_yann._archive import digest_of, read_arrays, write_arrays
+from sb3_yann.command_line import main as command_line
+from sb3_yann.commissioning.journal import Journal, Outlook
+from sb3_yann.commissioning.plant import PlantEpisode
+from sb3_yann.commissioning.record import Record
+from sb3_yann.policy.critic_options import as_critic_options
+
+SECONDS = 10
+"""After which a reader counts as hung."""
+EDGES = (0, 1, -1, 2, 7, 10**9, -(2**31), 2**62, np.nan, np.inf, -np.inf, 1e300, 5e-324, 0.5)
+
+
+class Wrong(Exception):
+    """What was read is not what was written, or of no use."""
+
+
+@dataclass
+class Target:
+    """A reader: ``attempt`` reads one mutation, drawn by ``rng``, or raises."""
+
+    attempt: Callable[[np.random.Generator], str]
+    errors: tuple[type[BaseException], ...] = (ValueError, OSError)
+
+
+@contextlib.contextmanager
+def _limited() -> Iterator[None]:
+    def hung(*_: Any) -> None:
+        raise Wrong(f"it took more than {SECONDS} seconds")
+
+    before = signal.signal(signal.SIGALRM, hung)
+    signal.alarm(SECONDS)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def damaged(content: bytes, rng: np.random.Generator) -> bytes:
+    """Return some bytes with one to four changes: flipped, set, cut, repeated, moved, inserted."""
+    broken = bytearray(content)
+    for _ in range(rng.integers(1, 5)):
+        if not broken:
+            break
+        at, other = (int(each) for each in rng.integers(len(broken), size=2))
+        some = slice(at, at + int(rng.integers(1, 64)))
+        kind = rng.integers(7)
+        if kind == 0:
+            broken[at] ^= 1 << int(rng.integers(8))
+        elif kind == 1:
+            broken[at] = int(rng.integers(256))
+        elif kind == 2:
+            del broken[at:]
+        elif kind == 3:
+            broken[other:other] = broken[some]
+        elif kind == 4:
+            broken[some] = bytes(len(broken[some]))
+        elif kind == 5:
+            broken[at:at] = rng.bytes(int(rng.integers(1, 16)))
+        else:
+            broken[some] = b"\xff" * len(broken[some])
+    return bytes(broken)
+
+
+def _plant() -> LinearMPC:
+    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, state_names=["x", "v"])
+    bounds = {"x_min": -5, "x_max": 5, "u_min": -1, "u_max": 2}
+    return LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=2, **bounds)
+
+
+def _law_file(kind: str, folder: Path) -> tuple[Callable[[Path], Any], Path]:
+    path, mpc = folder / "law.npz", _plant()
+    if kind == "controller":
+        export(mpc.explicit(), path)
+        return Controller.load, path
+    law = mpc.explicit() if kind == "law" else mpc.online()
+    law.save(path)
+    return type(law).load, path
+
+
+def _bytes(kind: str) -> Callable[[Path], Target]:
+    """Return a target of damaged files: they are refused, or hold what they held."""
+
+    def target(folder: Path) -> Target:
+        load, path = _law_file(kind, folder)
+        content, digest, known = path.read_bytes(), digest_of(read_arrays(path)), load(path)
+
+        def attempt(rng: np.random.Generator) -> str:
+            path.write_bytes(damaged(content, rng))
+            read = load(path)
+            same = digest_of(read_arrays(path)) == digest
+            if not same or (kind != "controller" and read != known):
+                raise Wrong("another law was read")
+            return "the same"
+
+        return Target(attempt)
+
+    return target
+
+
+def _arrays(kind: str) -> Callable[[Path], Target]:
+    """Return a target of files with a right digest, and entries that a stranger has changed."""
+
+    def target(folder: Path) -> Target:
+        load, path = _law_file(kind, folder)
+        arrays = read_arrays(path)
+
+        def attempt(rng: np.random.Generator) -> str:
+            changed = dict(arrays)
+            for name in rng.choice([*arrays], size=rng.integers(1, 3)):
+                changed[name] = _changed(np.array(changed.get(name, 0)), rng)
+                if rng.random() < 0.05:
+                    del changed[name]
+            write_arrays(path, changed)
+            act = load(path)
+            n = len(act.obs_names) if kind == "controller" else act.n_theta
+            for theta in rng.uniform(-6, 6, (4, n)):
+                if kind == "controller" and not np.isfinite(act(theta)).all():
+                    raise Wrong("an action is no number")
+                if not np.isfinite(
+                    act.evaluate(theta) if kind == "controller" else act(theta)
+                ).all():
+                    raise Wrong("an input is no number")
+            return "of use"
+
+        return Target(attempt)
+
+    return target
+
+
+def _changed(array: Any, rng: np.random.Generator) -> Any:
+    kind = rng.integers(7)
+    if kind == 0 and array.size and array.dtype.kind in "fi":
+        value = EDGES[rng.integers(len(EDGES))]
+        whole = array.dtype.kind == "i" and np.isfinite(value) and value == int(value)
+        array = array.astype(np.int64 if whole else np.float64)
+        array.flat[rng.integers(array.size)] = value
+        return array
+    if kind == 1:
+        return array[..., :-1] if array.ndim else array.reshape(1)
+    if kind == 2:
+        return np.concatenate([array, array]) if array.ndim else np.zeros(3)
+    if kind == 3:
+        return array.astype(str)
+    if kind == 4:
+        return array.T
+    if kind == 5:
+        return np.zeros((0, *array.shape[1:]), array.dtype)
+    return array.astype(np.float32) * np.float32(-1) if array.dtype.kind in "fi" else array
+
+
+def _record(folder: Path) -> Target:
+    """Return a target of damaged records of a commissioning."""
+    path, settings = folder / "plant.jsonl", {"batch": 2}
+    journal = Journal(Record(path), settings, Outlook(0.1))
+    for _ in range(3):
+        journal.begin(False)
+        rows = np.ones((3, 2)), np.ones((2, 1))
+        journal.add(PlantEpisode(*rows, -1.0, 0, None, 0.1, 0.0), False)
+    content, events = path.read_bytes(), Record(path).events
+
+    def attempt(rng: np.random.Generator) -> str:
+        path.write_bytes(damaged(content, rng))
+        found = Record(path)
+        if found.events != events[: len(found.events)]:
+            raise Wrong("other events were read")
+        Journal(found, settings, Outlook(0.1))
+        return "the same" if len(found.events) == len(events) else "cut off"
+
+    return Target(attempt)
+
+
+SETTINGS = """
+guard: {n_starts: 20, n_new_starts: 5, patience: 3, seed: 1, eval_every: 2, keep_if_worse: true}
+rule: {margin: 0.01, tail: 0.05, by_region: true}
+step_size: {shrink: 0.5, grow: 1.5, smallest: 0.1}
+critic: {kind: afterstate, reward_scale: 1.0}
+checks: {hold: 5, recover: 10, transfer: 5, frozen_after: 30, late_after: 1.5}
+"""
+
+
+def _settings(folder: Path) -> Target:
+    """Return a target of settings in YAML, as RL Zoo reads them."""
+
+    def attempt(rng: np.random.Generator) -> str:
+        try:
+            given = _odd_settings(rng)
+        except (yaml.YAMLError, ValueError):
+            return "no YAML"
+        given = given if isinstance(given, dict) else {"guard": given}
+        part = {name: given.get(name) or {} for name in ("rule", "step_size", "critic", "checks")}
+        guard = given.get("guard")
+        options = guard if isinstance(guard, dict) else {"n_starts": guard}
+        ImprovementGuard("CSTR-v0", rule=part["rule"], step_size=part["step_size"], **options)
+        as_critic_options(part["critic"])
+        checks = part["checks"]
+        Checks(**checks if isinstance(checks, dict) else {"hold": checks}).arrays(2)
+        return "taken"
+
+    return Target(attempt, (TypeError, ValueError))
+
+
+def _odd_settings(rng: np.random.Generator) -> Any:
+    """Return settings from damaged text, or with other values and names here and there."""
+    if rng.random() < 0.3:
+        return yaml.safe_load(damaged(SETTINGS.encode(), rng).decode("utf-8", errors="replace"))
+    given = yaml.safe_load(SETTINGS)
+    odd = [*EDGES, "", "yes", None, True, [], [1, 2], {}, {"a": 1}, 10**400, "\ud800"]
+    for group in rng.choice([*given], size=rng.integers(1, 3)):
+        name = str(rng.choice([*given[group]])) if isinstance(given[group], dict) else ""
+        value = odd[rng.integers(len(odd))]
+        if rng.random() < 0.1 or not name:
+            given[group] = value
+        elif rng.random() < 0.1:
+            given[group][f"{name}s"] = given[group].pop(name)
+        else:
+            given[group][name] = value
+    return given
+
+
+WORDS = (
+    *"solve plot export evaluate report commission --save --name --axes --time-limit".split(),
+    *"--region-limit --float --absolute --episodes --version --help law.npz broken.npz".split(),
+    *"m.zip no:such sb3_yann:nothing Pendulum-v9 0 1 -1 1e9 nan".split(),
+    *"out.c out.npz out.st out.png x.fmu".split(),
+    *("", "--", "\0", "ä b", "../../..", "/", "out.c/out.c"),
+)
+
+
+def _command_line(folder: Path) -> Target:
+    """Return a target of words in any order: the code is 0, 1 or 2, and an error says why."""
+    _, path = _law_file("law", folder)
+    content = path.read_bytes()
+
+    def attempt(rng: np.random.Generator) -> str:
+        path.write_bytes(content)
+        Path("broken.npz").write_bytes(damaged(content, rng))
+        Path("m.zip").write_bytes(damaged(content, rng))
+        words = list(rng.choice(WORDS, size=rng.integers(0, 5)))
+        if rng.random() < 0.7:  # mostly what comes near to a command that reads a file
+            file = str(rng.choice(["law.npz", "broken.npz", "m.zip"]))
+            words = [str(rng.choice(["plot", "export"])), file, *words]
+        said = io.StringIO()
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+            try:
+                code = command_line([str(word) for word in words])
+            except SystemExit as error:
+                code = error.code
+        if code not in (0, 1, 2):
+            raise Wrong(f"{words} ended with {code}")
+        if code == 1 and (not said.getvalue().strip() or "Traceback" in said.getvalue()):
+            raise Wrong(f"{words} said {said.getvalue()!r}")
+        return f"exit {code}"
+
+    return Target(attempt, ())
+
+
+TARGETS: dict[str, Callable[[Path], Target]] = {
+    **{kind: _bytes(kind) for kind in ("law", "online", "controller")},
+    **{f"{kind}, signed": _arrays(kind) for kind in ("law", "online", "controller")},
+    "record": _record,
+    "settings": _settings,
+    "command line": _command_line,
+}
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="no alarm on this system")
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_is_damaged_is_refused_or_read_as_it_was(name, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    target = TARGETS[name](tmp_path)
+    count = int(os.environ.get("FUZZ_COUNT", 60 if name == "command line" else 200))
+    outcomes = set()
+    for k in range(count):
+        rng = np.random.default_rng((7, k))
+        try:
+            with _limited():
+                outcomes.add(target.attempt(rng))
+        except target.errors as error:
+            assert str(error), f"{name}, seed (7, {k}): {error!r} says nothing"
+            outcomes.add(type(error).__name__)
+        except Exception as error:
+            pytest.fail(f"{name}, seed (7, {k}): {error!r}")
+    assert len(outcomes) > 1  # what is refused and what is taken are both met
+
+
+def test_damage_changes_what_is_damaged() -> None:
+    content = bytes(range(200))
+    rng = np.random.default_rng(0)
+    assert sum(damaged(content, rng) == content for _ in range(100)) < 5
+    assert damaged(b"", rng) == b""
+
+
+def test_a_reader_that_hangs_would_be_found(monkeypatch) -> None:
+    monkeypatch.setitem(globals(), "SECONDS", 1)
+    with pytest.raises(Wrong, match="more than 1 seconds"), _limited():
+        while True:
+            pass
