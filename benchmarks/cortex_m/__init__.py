@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_yann import Controller, export
-from sb3_yann.deployment.c_text import table
-from sb3_yann.deployment.selftest import points, steady
+from sb3_yann.deployment.code import insensitive, sample_observations, table
 
 HERE = Path(__file__).parent
 COMPILER, EMULATOR = "arm-none-eabi-gcc", "qemu-system-arm"
@@ -66,8 +65,8 @@ def emulate(given: Any, folder: Path, precision: str = "float") -> Emulated:
     export(given, folder / "plant.c", precision=precision)
     export(given, folder / "plant.npz")
     controller = Controller.load(folder / "plant.npz")
-    drawn = points(controller, 4 * POINTS).astype(np.float32).astype(np.float64)
-    obs = steady(controller, drawn, "float")[:POINTS]
+    drawn = sample_observations(controller, 4 * POINTS).astype(np.float32).astype(np.float64)
+    obs = insensitive(controller, drawn, "float")[:POINTS]
     answers = controller.evaluate(obs)
     room = 1e-5 * 2 * controller.data["action_scale"].min()
     lines = [

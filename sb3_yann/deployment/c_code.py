@@ -3,24 +3,11 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from importlib.resources import files
 
-from sb3_yann.deployment.c_text import comment, literal, table
-from sb3_yann.deployment.controller import Controller
-from sb3_yann.deployment.cost import cost_of
-from sb3_yann.deployment.describe import Arrays, in_words
-from sb3_yann.deployment.rounding import rounding_of
-from sb3_yann.deployment.selftest import vectors
-from sb3_yann.deployment.tables import index_bytes, search_tables, tables_of
-
-ACTIVATION = {
-    ("tanh", "double"): "tanh(x)",
-    ("tanh", "float"): "tanhf(x)",
-    ("relu", "double"): "x > ZERO ? x : ZERO",
-    ("relu", "float"): "x > ZERO ? x : ZERO",
-    ("elu", "double"): "x > ZERO ? x : expm1(x)",
-    ("elu", "float"): "x > ZERO ? x : expm1f(x)",
-}
+from sb3_yann.deployment import code
+from sb3_yann.deployment.code import Arrays, literal, table
 
 
 def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, str]:
@@ -33,87 +20,89 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
     precision : {"double", "float"}
         Of all numbers.
     about : str
-        What stands at the top: where it comes from.
+        The comment at the top: where it comes from.
     file : str
         What the files are called, without a suffix.
     """
-    name = str(data["name"])
-    shown = [f"  {line}" for line in in_words(data, "action")]
+    lines = [f"  {line}" for line in code.signal_lines(data, "action")]
+    n_obs, m = data["obs_matrix"].shape[1], len(data["action_scale"])
     entries = {
-        "ABOUT": comment([*about.splitlines(), "", *shown, "", f"{cost_of(data)}."]),
-        "SIZES": _sizes(data),
+        "ABOUT": comment([*about.splitlines(), "", *lines, "", f"{code.Cost.of(data)}."]),
+        "SIZES": f"#define YANN_N_OBS {n_obs}\n#define YANN_N_INPUTS {m}",
         "REAL": precision,
-        "TABLES": _tables(data, precision),
+        "TABLES": _definitions(data, precision),
+        **code.known_answers(data, precision),
     }
     suffixes = {"controller.c": ".c", "controller.h": ".h", "selftest.c": "_selftest.c"}
-    found = {}
-    for source, suffix in suffixes.items():
-        text = (files("sb3_yann.deployment") / "c" / source).read_text(encoding="ascii")
-        own = vectors(Controller(data), precision) if source == "selftest.c" else {}
-        for key, entry in {**entries, **own}.items():
-            text = text.replace(f"@{key}@", entry)
-        text = text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
-        found[file + suffix] = text
-    export = f"{zlib.crc32(''.join(found.values()).encode('ascii')):#010x}"
+    texts = {file + suffix: fill(each, entries, data) for each, suffix in suffixes.items()}
+    export = f"{zlib.crc32(''.join(texts.values()).encode('ascii')):#010x}"
     return {
-        name: text.replace("@FILE@", file).replace("@EXPORT@", export)
-        for name, text in found.items()
+        path: text.replace("@FILE@", file).replace("@EXPORT@", export)
+        for path, text in texts.items()
     }
 
 
-def _sizes(data: Arrays) -> str:
-    n_obs, m = data["obs_matrix"].shape[1], len(data["action_scale"])
-    return f"#define YANN_N_OBS {n_obs}\n#define YANN_N_INPUTS {m}"
+def fill(template: str, entries: Mapping[str, str], data: Arrays) -> str:
+    """Return a template of C with its entries, ``@KEY@``, and with the controller's prefix."""
+    text = (files("sb3_yann.deployment") / "c" / template).read_text(encoding="ascii")
+    for key, entry in entries.items():
+        text = text.replace(f"@{key}@", entry)
+    name = str(data["name"])
+    return text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
 
 
-def _tables(data: Arrays, precision: str) -> str:
+def comment(lines: list[str]) -> str:
+    """Return lines of a comment in ASCII, which nothing in them can end."""
+    safe = code.ascii_text(lines).replace("*/", "* /").replace("/*", "/ *")
+    safe = safe.replace("??", "? ?").replace("??", "? ?")  # trigraphs
+    return "\n".join(f" * {line}".rstrip().rstrip("\\") for line in safe.splitlines())
+
+
+def _definitions(data: Arrays, precision: str) -> str:
     """Return sizes, options and tables."""
-    p, _, n = data["gains"].shape
-    walks, trees = data["neighbors"].size > 0, "tree_levels" in data
-    n_networks = len(data["pinned"])
-    rounding = rounding_of(data, precision)._asdict()
+    numbers, indices = code.controller_tables(data, precision)
+    search_numbers, search_indices = code.search_tables(data)
+    numbers, indices = {**numbers, **search_numbers}, {**indices, **search_indices}
+    walks, n_networks = data["neighbors"].size > 0, len(data["pinned"])
+    suffix = "f" if precision == "float" else ""
     flags: dict[str, object] = {
-        "N_THETA": n,
-        "N_REGIONS": p,
-        "FABS(x)": "fabsf(x)" if precision == "float" else "fabs(x)",
+        "N_THETA": data["gains"].shape[2],
+        "N_REGIONS": len(data["gains"]),
+        "FABS(x)": f"fabs{suffix}(x)",
         "SEARCH_BY_WALK": int(walks),
-        "SEARCH_BY_TREE": int(trees),
+        "SEARCH_BY_TREE": int("tree_levels" in data),
         "DISJOINT": int(data["disjoint"]),
         "ZERO_INPUT": int(data["zero_input"]),
         "RATE": int(len(data["change"]) > 0),
         "N_NETWORKS": n_networks,
-        "FROZEN_AFTER": int(data["frozen_after"]),
-        "HOLD": int(data["hold"]),
-        "RECOVER": int(data["recover"]),
-        "TRANSFER": int(data["transfer"]),
-        "LATE_AFTER": literal(data["late_after"], precision),
-        **{name.upper(): literal(value, precision) for name, value in rounding.items()},
     }
-    numbers, whole = tables_of(data, precision)
-    of_search, indices_of_search = search_tables(data)
-    numbers, whole = {**numbers, **of_search}, {**whole, **indices_of_search}
+    flags |= {
+        key.upper(): int(data[key]) for key in ("frozen_after", "hold", "recover", "transfer")
+    }
+    tolerances = {"late_after": data["late_after"], **code.search_tolerances(data, precision)}
+    flags |= {key.upper(): literal(value, precision) for key, value in tolerances.items()}
     if walks:
         flags["WALK_FROM"] = int(data["walk_from"])
     if n_networks:
-        flags |= _network_flags(data, precision)
-    index = f"int{8 * index_bytes(whole)}_t"
-    defined = [f"#define {name} {value}" for name, value in flags.items()]
-    tables = [table("real", name, each, precision) for name, each in numbers.items()]
-    indices = [table(index, name, each, precision) for name, each in whole.items()]
-    return "\n".join([*defined, "", *tables, *indices])
-
-
-def _network_flags(data: Arrays, precision: str) -> dict[str, object]:
-    """Return the sizes of the networks."""
-    last = int(data["n_layers"]) - 1
-    widths = [data[f"layer{i}"].shape[1] for i in range(last)]
-    full, none = data["fades"]
-    return {
-        "N_LAYERS": last + 1,
-        **{f"WIDTH_{i + 1}": width for i, width in enumerate(widths)},
-        "WIDTH_LAST": widths[-1],
-        "ACTIVATION": ACTIVATION[str(data["activation"]), precision],
-        "REACH": f"((real){literal(data['reach'], precision)})",
-        "FADES_FROM": literal(full, precision),
-        "FADES_TO": literal(none, precision),
-    }
+        n_layers = int(data["n_layers"])
+        widths = [data[f"layer{i}"].shape[1] for i in range(n_layers - 1)]
+        activation = {
+            "tanh": f"tanh{suffix}(x)",
+            "relu": "x > ZERO ? x : ZERO",
+            "elu": f"x > ZERO ? x : expm1{suffix}(x)",
+        }[str(data["activation"])]
+        fade_start, fade_end = data["fades"]
+        flags |= {
+            "N_LAYERS": n_layers,
+            **{f"WIDTH_{i + 1}": width for i, width in enumerate(widths)},
+            "WIDTH_LAST": widths[-1],
+            "ACTIVATION": activation,
+            "REACH": f"((real){literal(data['reach'], precision)})",
+            "FADES_FROM": literal(fade_start, precision),
+            "FADES_TO": literal(fade_end, precision),
+        }
+    index = f"int{8 * code.index_bytes(indices)}_t"
+    lines = [f"#define {key} {value}" for key, value in flags.items()]
+    lines += ["", *(table("real", key, each, precision) for key, each in numbers.items())]
+    lines += [table(index, key, each, precision) for key, each in indices.items()]
+    return "\n".join(lines)

@@ -1,7 +1,7 @@
-"""A policy or a law in production: it needs numpy and `_archive.py`, a file that needs numpy alone.
+"""A policy or a law in production. It needs numpy and `_archive.py`, which needs numpy alone.
 
-Copy both into one folder, and they run without this package. A policy is evaluated in float64, and
-every step watches the readings. The C code of an export does the same.
+Copy both files into one folder, and they run without this package. A policy is evaluated in
+float64, and every step checks the readings. The C code of an export does the same.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-FORMAT = 1
-POLICY, MPC, MANUAL = "policy", "mpc", "manual"
-MODES = POLICY, MPC, MANUAL
-ENTRIES = 4_000_000  # of slacks at a time
-FAR = 1e12  # times the box of theta: what is farther off counts as there
+FORMAT = 1  # of the arrays; a reader takes its own only
+POLICY, MPC, MANUAL = MODES = ("policy", "mpc", "manual")
+MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
+FAR = 1e12  # theta is clipped to so many times its box: beyond, slacks would overflow
 
 
 class Status(IntFlag):
@@ -38,73 +37,66 @@ class Status(IntFlag):
     FROZEN = 4  # a reading stays the same to the bit while others move
     LATE = 8  # more time has passed since the last step than it may
     OUTSIDE = 16  # the MPC has no solution there; the law acts by its `infeasible` option
-    NETWORK = 32  # a network put out what is no number; the law acted
+    NETWORK = 32  # a network's output is not finite; the law acted
 
 
-NAMES = {each: str(each.name).lower() for each in Status}
 SENSOR = Status.NOT_FINITE | Status.OUT_OF_RANGE | Status.FROZEN
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0),
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+}
 
 
-def _elu(x: Array) -> Array:
-    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
-
-
-def _relu(x: Array) -> Array:
-    return np.maximum(x, 0)
-
-
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": np.tanh, "relu": _relu, "elu": _elu}
-
-
-MAY_BE_INFINITE = "bounds change obs_min obs_max late_after reach confines".split()
-WHOLE = "hold recover transfer frozen_after n_layers"
-
-
-def _check(data: Mapping[str, Any]) -> None:
-    """Raise ValueError where arrays do not fit together, or are none that a step can use."""
+def _check_arrays(data: Mapping[str, Any]) -> None:
+    """Raise ValueError where arrays do not fit together, or a step cannot use them."""
     (p, m, n), (q,), n_obs = data["gains"].shape, data["b"].shape, data["obs_matrix"].shape[-1]
+    counts = "hold recover transfer frozen_after n_layers"
     shapes: list[tuple[tuple[int, ...], str]] = [
-        ((p, m, n), "gains"), ((q,), "b"), ((p, m), "offsets"), ((q, n), "A"),
-        ((p,), "starts network_of"), ((2, n), "confines box"), ((2,), "tolerances fades"),
-        ((n, n_obs), "obs_matrix"), ((2, m), "bounds"), ((n,), "obs_offset per_theta"),
+        ((p, m, n), "gains"),
+        ((p, m), "offsets"),
+        ((q, n), "A"),
+        ((q,), "b"),
+        ((p,), "starts network_of"),
+        ((2, n), "confines box"),
+        ((2,), "tolerances fades"),
+        ((n, n_obs), "obs_matrix"),
+        ((n,), "obs_offset per_theta"),
         ((n_obs,), "obs_rest obs_min obs_max watched obs_names"),
+        ((2, m), "bounds"),
+        ((2 if len(data["change"]) else 0, m), "change"),
         ((m,), "action_scale action_shift resting per_input middle action_names"),
-        ((), f"{WHOLE} late_after reach zero_input"),
-    ]  # fmt: skip
+        ((), f"{counts} late_after reach zero_input"),
+    ]
     wanted = [(name, shape) for shape, names in shapes for name in names.split()]
-    wanted.append(("change", (2, m) if len(data["change"]) else (0, m)))
-    size, k = n, len(data["pinned"])
-    for i in range(int(data["n_layers"])):
-        width = m if i == int(data["n_layers"]) - 1 else data[f"layer{i}"].shape[1]
+    size, k, n_layers = n, len(data["pinned"]), int(data["n_layers"])
+    for i in range(n_layers):
+        width = m if i == n_layers - 1 else data[f"layer{i}"].shape[1]
         wanted.append((f"layer{i}", (k, width, size + 1)))
         size = width
+    may_be_infinite = "bounds change obs_min obs_max late_after reach confines".split()
     for name, shape in wanted:
         if data[name].shape != shape:
             raise ValueError(f"{name} has shape {data[name].shape}, expected {shape}")
         if name.startswith("layer") or name.endswith("names"):
-            continue
+            continue  # a network that overflows is met by a step
         if np.isnan(data[name]).any():
             raise ValueError(f"{name} holds NaN")
-        if name not in MAY_BE_INFINITE and np.isinf(data[name]).any():
+        if name not in may_be_infinite and np.isinf(data[name]).any():
             raise ValueError(f"{name} holds infinite entries")
-    _check_indices(data, p, q, k)
+    starts, used = data["starts"], data["network_of"]
+    whole = all(data[name].dtype.kind == "i" for name in ("starts", "network_of", *counts.split()))
+    if not whole or any(int(data[name]) < 0 for name in counts.split()):
+        raise ValueError("a count or an index is no whole number")
+    if p == 0 or starts[0] != 0 or (np.diff([*starts, q]) < 1).any():
+        raise ValueError(f"starts are not the first rows of {p} regions in {q} half-spaces")
+    if (used < -1).any() or (used >= k).any() or (k > 0) != (n_layers > 0):
+        raise ValueError(f"network_of does not fit {k} networks")
     low, high = data["bounds"]
     if (low > high).any() or (data["action_scale"] <= 0).any():
         raise ValueError("its bounds are crossed, or its scale is not above 0")
     if str(data["activation"]) not in ACTIVATIONS:
         raise ValueError(f"the activation is {data['activation']}")
-
-
-def _check_indices(data: Mapping[str, Any], p: int, q: int, k: int) -> None:
-    """Raise ValueError where a count or an index is none; regions p, rows q, networks k."""
-    starts, used = data["starts"], data["network_of"]
-    whole = all(data[name].dtype.kind == "i" for name in ("starts", "network_of", *WHOLE.split()))
-    if not whole or any(int(data[name]) < 0 for name in WHOLE.split()):
-        raise ValueError("a count or an index is no whole number")
-    if p == 0 or starts[0] != 0 or (np.diff([*starts, q]) < 1).any():
-        raise ValueError(f"starts are not the first rows of {p} regions in {q} half-spaces")
-    if (used < -1).any() or (used >= k).any() or (k > 0) != (int(data["n_layers"]) > 0):
-        raise ValueError(f"network_of does not fit {k} networks")
 
 
 def _as_readings(name: str, value: Any) -> Array:
@@ -173,26 +165,22 @@ class Controller:
             )
         self.data = {name: np.asarray(each) for name, each in data.items()}
         try:
-            self._read()
+            version = int(self.data["format"])
+            if version != FORMAT:
+                raise ValueError(
+                    f"The controller has format {version}, this reader takes {FORMAT}. Export the "
+                    "model again, or take the reader of the version that wrote it."
+                )
+            _check_arrays(self.data)
+            self.name, self.activation = str(self.data["name"]), str(self.data["activation"])
+            self.note = str(self.data.get("note", ""))
+            self.obs_names = tuple(map(str, self.data["obs_names"]))
+            self.action_names = tuple(map(str, self.data["action_names"]))
         except KeyError as error:
             raise ValueError(
                 f"data has no {error}: take all arrays that export wrote, by Controller.load(path)."
             ) from None
         self.reset()
-
-    def _read(self) -> None:
-        """Check the arrays, and take the names from them."""
-        version = int(self.data["format"])
-        if version != FORMAT:
-            raise ValueError(
-                f"The controller has format {version}, this reader takes {FORMAT}. Export the "
-                "model again, or take the reader of the version that wrote it."
-            )
-        _check(self.data)
-        self.name, self.activation = str(self.data["name"]), str(self.data["activation"])
-        self.note = str(self.data.get("note", ""))
-        self.obs_names = tuple(map(str, self.data["obs_names"]))
-        self.action_names = tuple(map(str, self.data["action_names"]))
 
     def __repr__(self) -> str:
         """Name the entries, who acted last, and what it lacks."""
@@ -222,8 +210,8 @@ class Controller:
         n_obs, m = len(self.data["obs_rest"]), len(self.data["action_scale"])
         self.request = self.mode = POLICY
         self.status = Status(0)
-        self.counters = dict.fromkeys(["steps", *MODES, *NAMES.values()], 0)
-        self.counters["changes"] = 0
+        found = [str(each.name).lower() for each in Status]
+        self.counters = dict.fromkeys(["steps", *MODES, *found, "changes"], 0)
         self._good: Array = self.data["obs_rest"].astype(np.float64)  # the last good readings
         self._last: Array = np.full(n_obs, np.nan)
         self._same: NDArray[np.int64] = np.zeros(n_obs, np.int64)
@@ -280,34 +268,41 @@ class Controller:
                 f"obs has shape {rows.shape}, request is {self.request!r}; a step takes "
                 f"({self._good.size},) and one of {MODES}. Use evaluate(obs) for a batch."
             )
-        used, status = self._readings(rows[0])
-        late = float(self.data["late_after"])
-        if elapsed is not None and elapsed > late:
+        reading, data, m = rows[0], self.data, len(self._output)
+        used, status = self._readings(reading)
+        if elapsed is not None and elapsed > float(data["late_after"]):
             status |= Status.LATE
         mode = self._mode(status)
         action, low, high, inside, sound = self._act(used[None], mode == POLICY)
         status |= Status(0) if inside[0] else Status.OUTSIDE
         status |= Status(0) if sound[0] else Status.NETWORK
-        scale, shift = self.data["action_scale"], self.data["action_shift"]
+        scale, shift = data["action_scale"], data["action_shift"]
         target = action[0] * scale + shift
         if mode == MANUAL:
-            held = manual is None or self.request != MANUAL
-            target = self._output if held else self._as_manual(manual)
+            target = self._output
+            if manual is not None and self.request == MANUAL:
+                given = _as_readings("manual", manual)
+                if given.shape != (m,):
+                    raise ValueError(f"manual has shape {given.shape}, expected ({m},).")
+                target = np.where(np.isfinite(given), given, self._output)
         if mode != self.mode:
             self.counters["changes"] += 1
-            self._left = int(self.data["transfer"])
+            self._left = int(data["transfer"])
             self._bump = self._output - target
         if mode == MANUAL:
             self._left = 0  # the operator's output is taken as it is
         if self._left > 0:
-            target = target + self._bump * (self._left / int(self.data["transfer"]))
+            target = target + self._bump * (self._left / int(data["transfer"]))
             self._left -= 1
-        if self._previous_is_lost(rows[0], used):
-            last = (self._output - shift) / scale
-            low, high = np.clip(last + self.data["change"], *self.data["bounds"])[:, None]
+        if len(data["change"]):
+            shows_previous = (data["obs_matrix"][-m:] != 0).any(0)
+            if (shows_previous & (used != reading)).any():  # rates count from the own output then
+                last = (self._output - shift) / scale
+                low, high = np.clip(last + data["change"], *data["bounds"])[:, None]
         self._output = np.clip(target, low[0] * scale + shift, high[0] * scale + shift)
         self.mode, self.status = mode, status
-        for name in ("steps", mode, *(name for each, name in NAMES.items() if each in status)):
+        found = [str(each.name).lower() for each in Status if each in status]
+        for name in ("steps", mode, *found):
             self.counters[name] += 1
         return self._output.copy()
 
@@ -330,13 +325,6 @@ class Controller:
         self._good = np.where(~finite | beyond | frozen, self._good, obs)
         return self._good, status
 
-    def _previous_is_lost(self, obs: Array, used: Array) -> bool:
-        """Return whether rates have to count from the own output: its reading is faulty."""
-        if not len(self.data["change"]):
-            return False
-        says = (self.data["obs_matrix"][-len(self._output) :] != 0).any(0)
-        return bool((says & (used != obs)).any())
-
     def _mode(self, status: Status) -> str:
         """Return who acts now."""
         self._faults = self._faults + 1 if status & SENSOR else 0
@@ -345,12 +333,6 @@ class Controller:
         if self.request == MANUAL or self._faults > int(self.data["hold"]):
             return MANUAL
         return MPC if self.request == MPC or self._sound < recover else POLICY
-
-    def _as_manual(self, manual: ArrayLike | None) -> Array:
-        given = _as_readings("manual", manual)
-        if given.shape != self._output.shape:
-            raise ValueError(f"manual has shape {given.shape}, expected {self._output.shape}.")
-        return np.where(np.isfinite(given), given, self._output)
 
     def _rows(self, obs: ArrayLike) -> tuple[Array, bool]:
         given, n_obs = _as_readings("obs", obs), len(self.data["obs_rest"])
@@ -384,7 +366,10 @@ class Controller:
         law, sound = np.clip(law, low, high), np.ones(len(law), bool)
         action = law
         if networks:
-            part = np.where(lost.any(1), 0.0, self._part(theta))[:, None]
+            middle, per_half, (full, none) = *data["confines"], data["fades"]
+            beyond = (np.abs(theta - middle) * per_half).max(1)
+            part = np.clip((none - beyond) / (none - full), 0, 1)  # of a correction that counts
+            part = np.where(lost.any(1), 0.0, part)[:, None]
             added = self._networks(theta * data["per_theta"], data["network_of"][region])
             sound = np.isfinite(added).all(1) | (part[:, 0] == 0)
             added = np.where(sound[:, None], added, 0.0)
@@ -392,16 +377,9 @@ class Controller:
             action = np.clip(law + np.where(part > 0, added * part, 0.0), low, high)
         return action, low, high, inside, sound
 
-    def _part(self, theta: Array) -> Array:
-        """Return the part (batch,), from 1 to 0, of a network's output that counts."""
-        middle, per_half, (full, none) = *self.data["confines"], self.data["fades"]
-        beyond = (np.abs(theta - middle) * per_half).max(1)
-        part: Array = np.clip((none - beyond) / (none - full), 0, 1)
-        return part
-
     def _locate(self, theta: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the first region that theta violates least, and whether it holds theta."""
-        data, rows = self.data, max(1, ENTRIES // len(self.data["b"]))
+        data, rows = self.data, max(1, MAX_SLACKS // len(self.data["b"]))
         tolerance, tie = data["tolerances"]
         region, inside = np.empty(len(theta), np.int64), np.empty(len(theta), bool)
         for i in range(0, len(theta), rows):

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 
-from sb3_yann import _archive
+from sb3_yann._archive import atomic_write, digest_of, write_arrays
 from sb3_yann._validation import check_bool, check_choice, check_options
 from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
-from sb3_yann.deployment.cost import Cost, cost_of
-from sb3_yann.deployment.describe import NO_ONE, Arrays, Exportable, describe
+from sb3_yann.deployment.code import Cost
+from sb3_yann.deployment.describe import Exportable, describe
 from sb3_yann.deployment.fmu import fmu_file
 from sb3_yann.deployment.onnx_graph import onnx_model
-from sb3_yann.deployment.rounding import PRECISIONS
 from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
-
-C_HEADERS = ("math", "stddef", "stdint", "stdio")  # which the code includes
-WORDS = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True)
@@ -71,7 +66,7 @@ def export(
     precision: str = "double",
     absolute: bool = False,
     checks: Checks | None = None,
-    observer: str = NO_ONE,
+    observer: str = "none",
 ) -> Exported:
     """Write a controller that runs without this package, as a file or as code.
 
@@ -123,89 +118,45 @@ def export(
     ['reactor.c', 'reactor.h', 'reactor_selftest.c']
     """
     target = Path(path)
-    kind = check_choice("format", format or target.suffix.lstrip("."), tuple(FORMATS))
-    check_choice("precision", precision, PRECISIONS)
-    called = target.stem if name is None else name
-    if not isinstance(called, str) or not WORDS.fullmatch(called):
+    kind = format or target.suffix.lstrip(".")
+    check_choice("format", kind, ("npz", "c", "onnx", "st", "xml", "fmu"))
+    check_choice("precision", precision, ("double", "float"))
+    prefix = target.stem if name is None else name
+    if not isinstance(prefix, str) or not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", prefix):
         raise ValueError(
-            f"name = {called!r} must be a word of letters, digits and underscores that begins with "
+            f"name = {prefix!r} must be a word of letters, digits and underscores that begins with "
             "a letter: it goes into the names of the code. Pass another name."
         )
     if not target.parent.is_dir():
         raise FileNotFoundError(f"There is no folder {target.parent}: make it first.")
-    if kind in ("st", "xml") and called.upper() in RESERVED:
-        raise ValueError(f"name = {called!r} is a word of Structured Text. Pass another name.")
-    own = check_options("checks", checks or Checks(), Checks)
-    data = describe(given, called, own, check_bool("absolute", absolute), observer)
-    paths = FORMATS[kind](data, target, precision)
-    sizes = tuple(each.stat().st_size for each in paths)
-    return Exported(tuple(paths), sizes, cost_of(data), digest_of(data), str(data["note"]))
-
-
-def digest_of(data: Arrays) -> str:
-    """Return twelve characters that tell one controller from another: its file's begin so."""
-    return _archive.digest_of(data)[:12]
-
-
-def _write_npz(data: Arrays, path: Path, precision: str) -> list[Path]:
-    _archive.write_arrays(path, data)
-    return [path]
-
-
-def _write_c(data: Arrays, path: Path, precision: str) -> list[Path]:
-    if path.stem.lower() in C_HEADERS:
+    if kind in ("st", "xml") and prefix.upper() in RESERVED:
+        raise ValueError(f"name = {prefix!r} is a word of Structured Text. Pass another name.")
+    if kind == "c" and target.stem.lower() in ("math", "stddef", "stdint", "stdio"):
         raise ValueError(
-            f"{path.stem}.h would stand in for C's own header: call the file something else."
+            f"{target.stem}.h would stand in for C's own header: call the file something else."
         )
-    texts = c_files(data, precision, _about(data), path.stem)
-    parts = {path.parent / file: text for file, text in texts.items()}
-    return write_texts(parts)
-
-
-def _write_onnx(data: Arrays, path: Path, precision: str) -> list[Path]:
-    return write_texts({path: onnx_model(data, precision, digest_of(data))})
-
-
-def _write_st(data: Arrays, path: Path, precision: str) -> list[Path]:
-    return write_texts({path: st_text(data, precision, _about(data))})
-
-
-def _write_plcopen(data: Arrays, path: Path, precision: str) -> list[Path]:
-    return write_texts({path: plcopen_xml(data, precision, _about(data))})
-
-
-def _write_fmu(data: Arrays, path: Path, precision: str) -> list[Path]:
-    return write_texts({path: fmu_file(data, precision, _about(data))})
-
-
-def _about(data: Arrays) -> str:
-    said = (
-        f"{data['name']}, a controller, written by sb3-yann {version('sb3-yann')}; "
-        f"digest {digest_of(data)}."
+    limits = check_options("checks", checks or Checks(), Checks)
+    data = describe(given, prefix, limits, check_bool("absolute", absolute), observer)
+    digest, note = digest_of(data)[:12], str(data["note"])
+    about = (
+        f"{prefix}, a controller, written by sb3-yann {version('sb3-yann')}; digest {digest}."
+        + f"\nNOTE: {note}" * bool(note)
     )
-    return f"{said}\nNOTE: {data['note']}" if data["note"] else said
-
-
-def write_texts(texts: Mapping[Path, str | bytes]) -> list[Path]:
-    """Write all files, or none; return their paths."""
-    parts = {path: path.with_name(f"{path.name}.{os.getpid()}.part") for path in texts}
-    try:
-        for path, text in texts.items():
-            content = text if isinstance(text, bytes) else text.encode("ascii")
-            parts[path].write_bytes(content)
-        for path, part in parts.items():
-            os.replace(part, path)
-    finally:
-        for part in parts.values():
-            part.unlink(missing_ok=True)
-    return list(texts)
-
-
-FORMATS: dict[str, Callable[[Arrays, Path, str], list[Path]]] = {
-    "npz": _write_npz,
-    "c": _write_c,
-    "onnx": _write_onnx,
-    "st": _write_st,
-    "xml": _write_plcopen,
-    "fmu": _write_fmu,
-}
+    files: dict[Path, str | bytes] = {}
+    if kind == "npz":
+        write_arrays(target, data)
+    elif kind == "c":
+        texts = c_files(data, precision, about, target.stem)
+        files = {target.parent / file: text for file, text in texts.items()}
+    elif kind == "onnx":
+        files = {target: onnx_model(data, precision, digest)}
+    else:
+        write = {"st": st_text, "xml": plcopen_xml, "fmu": fmu_file}[kind]
+        files = {target: write(data, precision, about)}
+    with ExitStack() as stack:  # all of them, or none
+        parts = [stack.enter_context(atomic_write(each)) for each in files]
+        for part, content in zip(parts, files.values(), strict=True):
+            part.write_bytes(content if isinstance(content, bytes) else content.encode("ascii"))
+    paths = tuple(files or [target])
+    sizes = tuple(each.stat().st_size for each in paths)
+    return Exported(paths, sizes, Cost.of(data), digest, note)

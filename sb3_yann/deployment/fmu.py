@@ -12,15 +12,11 @@ import tempfile
 import uuid
 import warnings
 import zipfile
-from importlib.resources import files
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-import numpy as np
-
-from sb3_yann.deployment.c_code import c_files
-from sb3_yann.deployment.c_text import comment, literal
-from sb3_yann.deployment.describe import Arrays
+from sb3_yann.deployment.c_code import c_files, comment, fill
+from sb3_yann.deployment.code import Arrays, literal
 
 LIBRARIES = {
     ("Linux", "x86_64"): ("linux64", ".so"),
@@ -29,7 +25,6 @@ LIBRARIES = {
 }
 COMPILERS = "cc", "gcc", "clang"
 FLAGS = "-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"
-WRITTEN = 1980, 1, 1, 0, 0, 0  # of every part, so that the same export is the same file
 
 
 def fmu_file(data: Arrays, precision: str, about: str) -> bytes:
@@ -45,7 +40,7 @@ def fmu_file(data: Arrays, precision: str, about: str) -> bytes:
     precision : {"double", "float"}
         Of the calculation; the variables are in double.
     about : str
-        Where it comes from.
+        The comment at the top: where it comes from.
     """
     name = str(data["name"])
     identity = "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, f"{precision} {about}")) + "}"
@@ -54,7 +49,16 @@ def fmu_file(data: Arrays, precision: str, about: str) -> bytes:
         for file, text in c_files(data, precision, about, name).items()
         if not file.endswith("_selftest.c")
     }
-    sources |= _interface(data, about, identity)
+    rest = ", ".join(literal(each, "double") for each in data["obs_rest"])
+    entries = {
+        "ABOUT": comment(about.splitlines()),
+        "FILE": name,
+        "GUID": identity,
+        "DT": literal(float(data["dt"]), "double"),
+        "REST": f"{{{rest}}}",
+    }
+    for suffix in (".c", ".h"):
+        sources[f"{name}_fmi2{suffix}"] = fill(f"fmi2{suffix}", entries, data)
     units = [file for file in sources if file.endswith(".c")]
     parts: dict[str, bytes] = {
         "modelDescription.xml": _description(data, about, identity, units),
@@ -67,30 +71,10 @@ def fmu_file(data: Arrays, precision: str, about: str) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for path, content in parts.items():
-            entry = zipfile.ZipInfo(path, WRITTEN)
+            entry = zipfile.ZipInfo(path)  # with the same date each time: the same file
             entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
             archive.writestr(entry, content)
     return file.getvalue()
-
-
-def _interface(data: Arrays, about: str, identity: str) -> dict[str, str]:
-    """Return the texts of the functions of FMI 2.0, and of their types."""
-    name = str(data["name"])
-    entries = {
-        "ABOUT": comment(about.splitlines()),
-        "FILE": name,
-        "GUID": identity,
-        "DT": literal(float(data["dt"]), "double"),
-        "REST": "{" + ", ".join(literal(each, "double") for each in data["obs_rest"]) + "}",
-    }
-    found = {}
-    for suffix in (".c", ".h"):
-        text = (files("sb3_yann.deployment") / "c" / f"fmi2{suffix}").read_text(encoding="ascii")
-        for key, entry in entries.items():
-            text = text.replace(f"@{key}@", entry)
-        text = text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
-        found[f"{name}_fmi2{suffix}"] = text
-    return found
 
 
 def _library(sources: dict[str, str]) -> bytes:
@@ -103,39 +87,31 @@ def _library(sources: dict[str, str]) -> bytes:
             (Path(folder) / file).write_text(text, encoding="ascii")
         units = [file for file in sources if file.endswith(".c")]
         command = [compiler, *FLAGS, *units, "-lm", "-o", "library"]
-        code, said = _run(command, folder)
-        if code:
-            warnings.warn(
-                f"{compiler} failed, so the FMU holds sources and no library: {said.strip()[:300]}",
-                RuntimeWarning,
-                stacklevel=2,
-            )
-            return b""
-        return (Path(folder) / "library").read_bytes()
-
-
-def _run(command: list[str], folder: str) -> tuple[int, str]:
-    """Run a compiler; return its exit code and what it complains of.
-
-    Its temporary files lie in the folder. Where Ctrl-C or an error cuts it off, all of its
-    processes end before the folder is removed.
-    """
-    process = subprocess.Popen(
-        command,
-        cwd=folder,
-        env={**os.environ, "TMPDIR": folder},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
+        # Its temporary files lie in the folder. An interrupt ends all processes of the compiler
+        # before the folder is removed.
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env={**os.environ, "TMPDIR": folder},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            errors = process.communicate()[1]
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            raise
+        if process.returncode == 0:
+            return (Path(folder) / "library").read_bytes()
+    warnings.warn(
+        f"{compiler} failed, so the FMU holds sources and no library: {errors.strip()[:300]}",
+        RuntimeWarning,
+        stacklevel=2,
     )
-    try:
-        said = process.communicate()[1]
-    except BaseException:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        raise
-    return process.returncode, said
+    return b""
 
 
 def _description(data: Arrays, about: str, identity: str, units: list[str]) -> bytes:
@@ -172,39 +148,34 @@ def _description(data: Arrays, about: str, identity: str, units: list[str]) -> b
 
 def _add_variables(within: ET.Element, data: Arrays) -> None:
     """Add all variables, in the order of their value references."""
-    n_obs, inputs = len(data["obs_rest"]), [*map(str, data["action_names"])]
-    rest = [*map(float, data["obs_rest"])]
-    shown = "time since the last step in units of dt; 0 where it is not known"
+    inputs = [*map(str, data["action_names"])]
     who = "0 the policy, 1 the MPC, 2 manual"
-    reals = [(f"obs[{i}]", str(data["obs_names"][i]), rest[i]) for i in range(n_obs)]
-    reals += [("elapsed", shown, 0.0)]
-    reals += [(f"manual[{i}]", f"{each}, of the operator", 0.0) for i, each in enumerate(inputs)]
-    taken: list[tuple[str, str, list[tuple[str, str, float | None]]]] = [
-        ("Real", "input", [*reals]),
-        ("Real", "output", [(f"command[{i}]", each, None) for i, each in enumerate(inputs)]),
-        ("Integer", "input", [("request", who, 0.0)]),
-        ("Integer", "output", [("status", "0, or the sum of what was found", None)]),
-        ("Integer", "output", [("mode", f"who acted: {who}", None)]),
-        ("Boolean", "input", [("has_manual", "false holds the output while manual", 0.0)]),
+    taken: list[tuple[str, str, str, str, str | None]] = []
+    for i, (name, rest) in enumerate(zip(data["obs_names"], data["obs_rest"], strict=True)):
+        start = repr(float(rest))
+        taken.append(("Real", "input", f"obs[{i}]", str(name), start))
+    elapsed = "time since the last step in units of dt; 0 where it is not known"
+    taken.append(("Real", "input", "elapsed", elapsed, "0.0"))
+    for i, name in enumerate(inputs):
+        taken.append(("Real", "input", f"manual[{i}]", f"{name}, of the operator", "0.0"))
+    for i, name in enumerate(inputs):
+        taken.append(("Real", "output", f"command[{i}]", name, None))
+    taken += [
+        ("Integer", "input", "request", who, "0"),
+        ("Integer", "output", "status", "0, or the sum of what was found", None),
+        ("Integer", "output", "mode", f"who acted: {who}", None),
+        ("Boolean", "input", "has_manual", "false holds the output while manual", "false"),
     ]
     counts = dict.fromkeys(("Real", "Integer", "Boolean"), 0)
-    for kind, causality, entries in taken:
-        for name, description, start in entries:
-            variable = ET.SubElement(
-                within,
-                "ScalarVariable",
-                name=name,
-                valueReference=str(counts[kind]),
-                description=description,
-                causality=causality,
-                variability="discrete",
-            )
-            counts[kind] += 1
-            first = {} if start is None else {"start": _start(kind, start)}
-            ET.SubElement(variable, kind, first)
-
-
-def _start(kind: str, value: float) -> str:
-    if kind == "Boolean":
-        return "true" if value else "false"
-    return str(int(value)) if kind == "Integer" else repr(float(np.float64(value)))
+    for kind, causality, name, description, start_value in taken:
+        variable = ET.SubElement(
+            within,
+            "ScalarVariable",
+            name=name,
+            valueReference=str(counts[kind]),
+            description=description,
+            causality=causality,
+            variability="discrete",
+        )
+        counts[kind] += 1
+        ET.SubElement(variable, kind, {} if start_value is None else {"start": start_value})

@@ -7,12 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_yann.deployment.code import Arrays, action_scale, search_tolerances
 from sb3_yann.deployment.controller import ACTIVATIONS
-from sb3_yann.deployment.describe import Arrays
-from sb3_yann.deployment.output_range import scale_in
-from sb3_yann.deployment.rounding import rounding_of
-
-OPSET = 17
 
 
 def onnx_model(data: Arrays, precision: str, digest: str) -> bytes:
@@ -42,22 +38,21 @@ def onnx_model(data: Arrays, precision: str, digest: str) -> bytes:
         raise ImportError("An ONNX file needs onnx: pip install onnx.") from None
     graph = _Graph(precision)
     action, outside = _policy(graph, data, precision)
-    kind = onnx.TensorProto.DOUBLE if precision == "double" else onnx.TensorProto.FLOAT
     value = onnx.helper.make_tensor_value_info
     n_obs, m = data["obs_matrix"].shape[1], len(data["action_scale"])
-    graph.op("Identity", action, to="action")
-    graph.op("Identity", outside, to="outside")
+    graph.op("Identity", action, name="action")
+    graph.op("Identity", outside, name="outside")
     whole = onnx.helper.make_graph(
         graph.nodes,
         str(data["name"]),
-        [value("obs", kind, ["batch", n_obs])],
+        [value("obs", graph.kind, ["batch", n_obs])],
         [
-            value("action", kind, ["batch", m]),
+            value("action", graph.kind, ["batch", m]),
             value("outside", onnx.TensorProto.BOOL, ["batch"]),
         ],
         graph.constants,
     )
-    opset = [onnx.helper.make_opsetid("", OPSET)]
+    opset = [onnx.helper.make_opsetid("", 17)]
     model = onnx.helper.make_model(whole, producer_name="sb3-yann", opset_imports=opset)
     model.ir_version = 8  # what runtimes of that opset read
     names = {key: ", ".join(map(str, data[key])) for key in ("obs_names", "action_names")}
@@ -73,41 +68,33 @@ class _Graph:
     """Nodes and constants, each with a name of its own."""
 
     def __init__(self, precision: str) -> None:
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-        self.real = np.float64 if precision == "double" else np.float32
-
-    def new(self) -> str:
-        """Return a name that is not taken."""
-        return f"v{len(self.nodes)}"
-
-    def op(self, kind: str, *inputs: str, to: str = "", **attributes: Any) -> str:
-        """Add a node; return the name of what it puts out."""
         import onnx
 
-        name = to or self.new()
-        self.nodes.append(onnx.helper.make_node(kind, list(inputs), [name], **attributes))
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+        wide, self.helper = precision == "double", onnx.helper
+        self.real = np.float64 if wide else np.float32
+        self.kind = onnx.TensorProto.DOUBLE if wide else onnx.TensorProto.FLOAT
+        self.from_array = onnx.numpy_helper.from_array
+
+    def op(self, operator: str, *inputs: str, name: str = "", **attributes: Any) -> str:
+        """Add a node; return the name of its output."""
+        name = name or f"v{len(self.nodes)}"
+        self.nodes.append(self.helper.make_node(operator, list(inputs), [name], **attributes))
         return name
 
     def constant(self, values: Any) -> str:
         """Add a constant: whole numbers and bools as they are, others in the precision."""
-        import onnx
-
         array: NDArray[Any] = np.asarray(values)
         if array.dtype.kind == "f":
             array = array.astype(self.real)
         name = f"c{len(self.constants)}"
-        self.constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        self.constants.append(self.from_array(np.ascontiguousarray(array), name))
         return name
 
     def number(self, given: str) -> str:
         """Return a bool as a number, 0 or 1."""
-        import onnx
-
-        wide = self.real is np.float64
-        kind = onnx.TensorProto.DOUBLE if wide else onnx.TensorProto.FLOAT
-        self.nodes.append(onnx.helper.make_node("Cast", [given], [name := self.new()], to=kind))
-        return name
+        return self.op("Cast", given, to=self.kind)
 
     def not_finite(self, given: str) -> str:
         """Return where a number is NaN or infinite."""
@@ -141,7 +128,7 @@ def _policy(graph: _Graph, data: Arrays, precision: str) -> tuple[str, str]:
     shown = constant((data["obs_matrix"] != 0).astype(float).T)
     depends = op("Greater", op("MatMul", graph.number(lost), shown), zero)
     theta = op("Where", op("Or", depends, graph.not_finite(theta)), zero, theta)
-    region, inside = _locate(graph, data, theta, rounding_of(data, precision))
+    region, inside = _locate(graph, data, theta, search_tolerances(data, precision))
     law = graph.times(op("Gather", constant(data["gains"]), region), theta)
     law = op("Add", law, op("Gather", constant(data["offsets"]), region))
     law = op("Where", graph.not_finite(law), zero, law)
@@ -162,12 +149,14 @@ def _policy(graph: _Graph, data: Arrays, precision: str) -> tuple[str, str]:
         added = _correction(graph, data, theta, region)
         added = op("Where", graph.any(lost), zero, added)
         law = graph.between(op("Add", law, added), low, high)
-    action = op("Mul", law, constant(scale_in(data, precision)[None]))
+    action = op("Mul", law, constant(action_scale(data, precision)[None]))
     action = op("Add", action, constant(data["action_shift"][None]))
     return action, op("Squeeze", op("Not", inside), constant(np.array([1])))
 
 
-def _locate(graph: _Graph, data: Arrays, theta: str, rounding: Any) -> tuple[str, str]:
+def _locate(
+    graph: _Graph, data: Arrays, theta: str, tolerances: dict[str, float]
+) -> tuple[str, str]:
     """Return the region (batch,) that theta violates least, and whether it holds it (batch, 1)."""
     op, constant = graph.op, graph.constant
     starts, rows = data["starts"], len(data["b"])
@@ -182,10 +171,10 @@ def _locate(graph: _Graph, data: Arrays, theta: str, rounding: Any) -> tuple[str
     slack = op("ReduceMin", slack, axes=[2], keepdims=0)
     largest = op("ReduceMax", slack, axes=[1], keepdims=1)
     room = op("Add", op("Abs", largest), constant(1.0))
-    nearly = op("Sub", largest, op("Mul", room, constant(rounding.tie)))
+    nearly = op("Sub", largest, op("Mul", room, constant(tolerances["tie"])))
     ties = graph.number(op("Not", op("Less", slack, nearly)))
     region = op("ArgMax", ties, axis=1, keepdims=0)
-    return region, op("Not", op("Less", largest, constant(-rounding.tolerance)))
+    return region, op("Not", op("Less", largest, constant(-tolerances["tolerance"])))
 
 
 def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
@@ -221,19 +210,13 @@ def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
     x = op("Where", counts, x, constant(0.0))
     if np.isfinite(data["reach"]):
         x = graph.between(x, constant(-data["reach"]), constant(data["reach"]))
-    return op("Mul", x, _part(graph, data, theta))
-
-
-def _part(graph: _Graph, data: Arrays, theta: str) -> str:
-    """Return the part (batch, 1), from 1 to 0, of a correction that counts."""
-    op, constant = graph.op, graph.constant
     middle, per_half = data["confines"]
     full, none = data["fades"]
     beyond = op("Abs", op("Sub", theta, constant(middle[None])))
     beyond = op("Mul", beyond, constant(per_half[None]))
     beyond = op("ReduceMax", beyond, axes=[1], keepdims=1)
     part = op("Div", op("Sub", constant(none), beyond), constant(none - full))
-    return graph.between(part, constant(0.0), constant(1.0))
+    return op("Mul", x, graph.between(part, constant(0.0), constant(1.0)))
 
 
 def _activate(graph: _Graph, x: str, data: Arrays) -> str:

@@ -22,9 +22,8 @@ from deployed import (
 )
 from sample_laws import solved
 from sb3_yann import Checks, Controller, LinearModel, LinearMPC, export
+from sb3_yann.deployment.code import index_bytes, insensitive
 from sb3_yann.deployment.controller import MODES, Status
-from sb3_yann.deployment.selftest import steady
-from sb3_yann.deployment.tables import index_bytes
 
 pytestmark = needs_compiler
 WITHOUT_MEMORY = Status.OUTSIDE | Status.NETWORK | Status.NOT_FINITE
@@ -41,7 +40,7 @@ def test_double_is_the_controller(name, compiler, tmp_path):
     compiled = Compiled(policy, tmp_path, compiler=compiler)
     obs, controller = observations(policy, 10_000), compiled.controller
     # On a facet of a law whose networks jump there, rounding chooses.
-    kept = steady(controller, obs, "double")
+    kept = insensitive(controller, obs, "double")
     assert len(kept) > 0.6 * len(obs)
     actions, found = compiled.at(kept)
     assert error(actions, controller.evaluate(kept), controller) < 1e-12
@@ -56,7 +55,7 @@ def test_float_is_the_controller_where_it_is_steady(name, tmp_path):
     policy = policy_of(name)
     compiled = Compiled(policy, tmp_path, "float")
     obs = observations(policy, 10_000).astype(np.float32).astype(np.float64)
-    kept = steady(compiled.controller, obs, "float")
+    kept = insensitive(compiled.controller, obs, "float")
     assert len(kept) > 0.4 * len(obs)
     actions, _ = compiled.at(kept)
     assert error(actions, compiled.controller.evaluate(kept), compiled.controller) < 1e-5

@@ -16,7 +16,7 @@ from deployed import disturbed, in_float64
 from partitions import as_range, mixture
 from random_problems import examples, problems
 from sb3_yann import Checks, Controller, LinearMPC, YannPolicy, export
-from sb3_yann.deployment.selftest import steady
+from sb3_yann.deployment.code import insensitive
 
 SEEDS = st.integers(0, 2**32 - 1)
 OPTIONS = st.sampled_from([
@@ -46,11 +46,11 @@ def test_controller_is_the_policy_and_the_law(mpc: LinearMPC, seed: int, options
     seen, law = mixture(mpc, seed).astype(np.float32).astype(np.float64), mpc.explicit()
     policy = disturbed(mpc, seed=seed % 2**31, **options)
     controller = exported(policy)
-    kept = np.isin(seen, steady(controller, seen, "double")).all(1)
+    kept = np.isin(seen, insensitive(controller, seen, "double")).all(1)
     off = as_range(law, controller.evaluate(seen) - by_torch(policy, seen, controller))
     assert np.all(off[kept] <= 1e-12)
     alone = exported(law)
-    kept = np.isin(seen, steady(alone, seen, "double")).all(1)
+    kept = np.isin(seen, insensitive(alone, seen, "double")).all(1)
     assert np.all(as_range(law, alone.evaluate(seen) - law(seen))[kept] <= 1e-12)
 
 

@@ -20,8 +20,8 @@ import pytest
 from deployed import COMPILERS, STRICT, needs_compiler, observations, policy_of, with_faults
 from sb3_yann import Controller, export
 from sb3_yann.deployment import fmu
+from sb3_yann.deployment.code import ROOM
 from sb3_yann.deployment.controller import MODES, Status
-from sb3_yann.deployment.rounding import ROOM
 
 OWN = fmu.LIBRARIES.get((platform.system(), platform.machine()))
 needs_library = pytest.mark.skipif(OWN is None or not COMPILERS, reason="no library is made here")

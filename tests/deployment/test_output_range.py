@@ -9,7 +9,7 @@ from gymnasium import spaces
 from deployed import Compiled, box, needs_compiler
 from policy_samples import make_policy
 from sb3_yann import Controller, LinearModel, LinearMPC, YannPolicy, export
-from sb3_yann.deployment.output_range import scale_within
+from sb3_yann.deployment.code import scale_within
 
 # Of these 2 * half-width, or the middle, is no number of float64, or of float32.
 BOUNDS = [(-1e-7, 1e7 + 0.3), (-0.1, 1 / 3), (-1e-3, 1e4 + 0.7), (-7.7e5, 0.3)]

@@ -10,8 +10,8 @@ import pytest
 
 from deployed import CASES, observations, policy_of, with_faults
 from sb3_yann import Checks, Controller, export
+from sb3_yann.deployment.code import insensitive
 from sb3_yann.deployment.controller import MODES, Status
-from sb3_yann.deployment.selftest import steady
 from structured_text import FunctionBlock
 
 
@@ -28,7 +28,7 @@ def error(found, wanted, controller) -> float:
 @pytest.mark.parametrize("name", CASES)
 def test_a_block_is_the_policy(name, tmp_path):
     controller, block = both(name, tmp_path)
-    obs = steady(controller, observations(policy_of(name), 160), "double")
+    obs = insensitive(controller, observations(policy_of(name), 160), "double")
     assert len(obs) > 60
     for row in obs:
         command, status, mode = block.step(obs=list(row), request=0)
@@ -101,7 +101,7 @@ def test_single_precision_is_real(tmp_path):
     block = FunctionBlock(text)  # in Python's doubles, with tables of floats
     export(policy_of("reactor"), tmp_path / "plant.npz")
     controller = Controller.load(tmp_path / "plant.npz")
-    for row in steady(controller, observations(policy_of("reactor"), 50), "float"):
+    for row in insensitive(controller, observations(policy_of("reactor"), 50), "float"):
         command, _, _ = block.step(obs=list(row), request=0)
         assert error(command, controller.evaluate(row), controller) < 1e-5
 

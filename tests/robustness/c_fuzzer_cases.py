@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_yann import Checks, Controller, LinearModel, LinearMPC, export
-from sb3_yann.deployment.c_text import literal, table
+from sb3_yann.deployment.code import literal, table
 
 HERE = Path(__file__).parent
 ROOM = {"double": 1e-9, "float": 2e-5}

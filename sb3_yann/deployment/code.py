@@ -1,0 +1,311 @@
+"""What all code of a controller has in common: precision, tables, their cost, known answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.deployment.controller import FAR, MODES, Controller
+
+Arrays = Mapping[str, Any]
+Tables = dict[str, NDArray[Any]]
+ROOM = {"double": 1e-12, "float": 1e-5}
+"""How far exported code may be off, in parts of an input's range, by its precision."""
+
+
+def scale_within(
+    scale: Array, shift: Array, low: Array, high: Array, real: Any = np.float64
+) -> NDArray[Any]:
+    """Return the scale (m,), up to 7 roundings smaller so that outputs keep their bounds.
+
+    Outputs are ``scale * y + shift``, computed as ``real``, for y in [-1, 1]; their bounds are
+    ``low`` and ``high``. Where these have no room for that, in float32 beside a huge operating
+    point, the scale stays.
+    """
+    found, middle = scale.astype(real), shift.astype(real)
+    step = np.spacing(np.maximum(found, np.abs(middle)))
+    tried = found - np.arange(8)[:, None].astype(real) * step
+    inside = (middle - tried >= low) & (middle + tried <= high) & (tried > 0)
+    best = np.take_along_axis(tried, inside.argmax(0)[None], 0)[0]
+    return np.where(inside.any(0), best, found)
+
+
+def action_scale(data: Arrays, precision: str) -> NDArray[Any]:
+    """Return the scale of a controller's outputs for code of that precision."""
+    scale, shift = data["action_scale"], data["action_shift"]
+    if precision == "double":
+        return np.asarray(scale)
+    return scale_within(scale, shift, shift - scale, shift + scale, np.float32)
+
+
+def search_tolerances(data: Arrays, precision: str) -> dict[str, float]:
+    """Return the tolerances of a search for a region, in half-widths of the box of theta.
+
+    ``tolerance``: so far outside, a point counts as inside. ``tie``: slacks that differ by less,
+    relative to 1 + their size, tie. The others are those of the law's own compiled search. In float
+    they are coarser: a slack is known to some 1e-6.
+    """
+    if precision == "float":
+        found = (1e-5, 2e-6, 1e-5, 1e-4, 1e-5)
+    else:
+        found = (*map(float, data["tolerances"]), 1e-9, 1e-6, 1e-9)
+    return dict(zip(("tolerance", "tie", "surely_inside", "clear", "back"), found, strict=True))
+
+
+# ---- Tables ----
+
+
+def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
+    """Return the tables of numbers and those of indices, by their names in code."""
+    same = "A b gains offsets obs_matrix obs_offset obs_rest obs_min obs_max action_shift"
+    numbers: Tables = {name: data[name] for name in same.split()}
+    numbers["action_scale"] = action_scale(data, precision)
+    numbers["input_min"], numbers["input_max"] = data["bounds"]
+    numbers["far"] = FAR * np.abs(data["box"]).max(0)
+    starts = np.array([*data["starts"], len(data["b"])])
+    indices: Tables = {"starts": starts, "watched": data["watched"].astype(np.int64)}
+    if data["zero_input"]:
+        numbers["resting"] = data["resting"]
+    if len(data["change"]):
+        numbers["change_min"], numbers["change_max"] = data["change"]
+        numbers |= {"per_input": data["per_input"], "middle": data["middle"]}
+    if len(data["pinned"]):
+        last = int(data["n_layers"]) - 1
+        numbers |= {f"layer{i}": data[f"layer{i}"] for i in range(last)}
+        numbers |= {"last_layer": data[f"layer{last}"], "per_theta": data["per_theta"]}
+        numbers["confine_middle"], numbers["confine_per_half"] = data["confines"]
+        indices |= {"network_of": data["network_of"], "pinned": data["pinned"].astype(np.int64)}
+    return numbers, indices
+
+
+def search_tables(data: Arrays) -> tuple[Tables, Tables]:
+    """Return the tables of a walk or of a search tree; none where all regions are asked."""
+    if data["neighbors"].size:
+        return {"walk_slack": data["walk_slack"]}, {"neighbors": data["neighbors"]}
+    if "tree_levels" not in data:
+        return {}, {}
+    numbers = {f"tree_{key}": data[f"tree_{key}"] for key in ("normals", "levels")}
+    keys = "children", "leaf_starts", "leaf_regions"
+    return numbers, {f"tree_{key}": data[f"tree_{key}"] for key in keys}
+
+
+def index_bytes(indices: Tables) -> int:
+    """Return the bytes that indices need: 2 or 4."""
+    return 2 if max(int(np.abs(each).max()) for each in indices.values()) < 2**15 else 4
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a controller needs at worst.
+
+    Attributes
+    ----------
+    numbers, indices : int
+        Entries of its tables.
+    index_bytes : int
+        Bytes of each index.
+    multiplications : int
+        Multiplications, each with an addition, of one step: a search that must ask every region
+        twice.
+    activations : int
+        Calls of the networks' activation in a step.
+    locals : int
+        Numbers that a step keeps on the stack.
+    """
+
+    numbers: int
+    indices: int
+    index_bytes: int
+    multiplications: int
+    activations: int
+    locals: int
+
+    @classmethod
+    def of(cls, data: Arrays) -> Cost:
+        """Return the cost of a controller's arrays."""
+        numbers, indices = controller_tables(data, "double")
+        search_numbers, search_indices = search_tables(data)
+        (_, m, n), q, n_obs = data["gains"].shape, len(data["b"]), data["obs_matrix"].shape[1]
+        widths = [data[f"layer{i}"].shape[1] for i in range(int(data["n_layers"]))]
+        tree = len(data["tree_levels"]) if "tree_levels" in data else 0
+        search = 2 * q * n + (q * n if data["neighbors"].size else 0) + tree * n
+        products = sum(a * b for a, b in zip([n, *widths], widths, strict=False))
+        hidden = sum(widths[:-1])
+        return cls(
+            numbers=sum(each.size for each in [*numbers.values(), *search_numbers.values()]),
+            indices=sum(each.size for each in [*indices.values(), *search_indices.values()]),
+            index_bytes=index_bytes(indices | search_indices),
+            multiplications=n * n_obs + search + m * (n + 2) + (products + 2 * n) * bool(widths),
+            activations=2 * hidden,
+            locals=2 * n + 7 * m + hidden + 8,
+        )
+
+    def __str__(self) -> str:
+        double, single = (
+            (self.numbers * size + self.indices * self.index_bytes) / 1000 for size in (8, 4)
+        )
+        return (
+            f"tables: {self.numbers} numbers and {self.indices} indices ({double:.1f} kB double, "
+            f"{single:.1f} kB float); a step at worst: {self.multiplications} multiplications "
+            f"with additions, {self.activations} activations, some {self.locals} numbers on the "
+            "stack"
+        )
+
+
+# ---- Text ----
+
+
+def signal_lines(data: Arrays, output: str) -> list[str]:
+    """Return a line for each entry of an observation and of the output: name and values.
+
+    The values tell deviations from the plant's own units.
+    """
+    lines = [
+        f"obs[{i}]  {name}, {rest:.6g} at rest"
+        for i, (name, rest) in enumerate(zip(data["obs_names"], data["obs_rest"], strict=True))
+    ]
+    ends = data["bounds"] * data["action_scale"] + data["action_shift"]
+    for i, (name, low, high) in enumerate(zip(data["action_names"], *ends, strict=True)):
+        lines.append(f"{output}[{i}]  {name}, {low:.6g} to {high:.6g}")
+    return lines
+
+
+def decimal(value: float, precision: str) -> str:
+    """Return the shortest decimal number that is exact in the precision, with a point."""
+    text = str(np.float32(value)) if precision == "float" else repr(float(value))
+    head, exponent, tail = text.partition("e")
+    return f"{head if '.' in head else f'{head}.0'}{exponent}{tail}"
+
+
+def literal(value: float, precision: str) -> str:
+    """Return a number as C has it, exact in its precision."""
+    if np.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return f"{decimal(value, precision)}{'f' if precision == 'float' else ''}"
+
+
+def wrap(entries: Iterable[str], width: int) -> list[str]:
+    """Return lines of entries with commas between them, a line of at least one entry each."""
+    lines, line = [], ""
+    for entry in entries:
+        if line and len(line) + len(entry) > width:
+            lines.append(line)
+            line = ""
+        line += f"{', ' if line else ''}{entry}"
+    return [*lines, line]
+
+
+def table(kind: str, name: str, values: NDArray[np.generic], precision: str) -> str:
+    """Return the declaration of a constant array in C, of a type, of any shape but an empty one."""
+    sizes = "".join(f"[{each}]" for each in values.shape)
+    return f"static const {kind} {name}{sizes} = {_nested(values, precision, 0)};"
+
+
+def _nested(values: NDArray[np.generic], precision: str, depth: int) -> str:
+    indent, outer = "    " * (depth + 1), "    " * depth
+    if values.ndim > 1:
+        rows = f",\n{indent}".join(_nested(each, precision, depth + 1) for each in values)
+        return f"{{\n{indent}{rows},\n{outer}}}"
+    whole = values.dtype.kind in "ib"
+    texts = [str(int(each)) if whole else literal(float(each), precision) for each in values]
+    lines = wrap(texts, 90 - len(indent))
+    body = f",\n{indent}".join(lines)
+    return f"{{{body}}}" if len(lines) == 1 else f"{{\n{indent}{body},\n{outer}}}"
+
+
+def ascii_text(lines: Iterable[str]) -> str:
+    """Return lines as one text in ASCII."""
+    return "\n".join(lines).encode("ascii", "backslashreplace").decode()
+
+
+# ---- Known answers ----
+
+
+def sample_observations(controller: Controller, count: int, seed: int = 0) -> Array:
+    """Return observations (count, n_obs): the operating point, then some in and around the box."""
+    data, generator = controller.data, np.random.default_rng(seed)
+    low, high = data["box"]
+    theta = (low + high) / 2 + generator.uniform(-0.65, 0.65, (count, len(low))) * (high - low)
+    theta[0] = 0.0
+    return np.asarray((theta - data["obs_offset"]) @ np.linalg.pinv(data["obs_matrix"]).T)
+
+
+def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
+    """Return the rows of obs whose answer a rounding of the observation does not change.
+
+    A policy with a network for each region jumps from one to the next.
+    """
+    size = 1e-6 if precision == "float" else 1e-13
+    scale = np.abs(obs).max(0)
+    actions, kept = controller.evaluate(obs), np.ones(len(obs), bool)
+    half = _input_ranges(controller, actions) / 2
+    for sign in (-1, 1):
+        for j in range(obs.shape[1]):
+            moved = obs.copy()
+            moved[:, j] += sign * 2 * size * scale[j]
+            change = np.abs(controller.evaluate(moved) - actions) / half
+            kept &= (change < ROOM[precision]).all(1)
+            kept &= controller.in_domain(moved) == controller.in_domain(obs)
+    return np.asarray(obs[kept])
+
+
+def _input_ranges(controller: Controller, actions: Array) -> Array:
+    """Return the ranges of the inputs (m,), of those without bounds what the actions span."""
+    scale, bounds = controller.data["action_scale"], controller.data["bounds"]
+    largest = np.abs(actions - controller.data["action_shift"]).max(0)
+    return 2 * np.where(np.isfinite(bounds).all(0), scale, np.maximum(scale, largest))
+
+
+def known_answers(data: Arrays, precision: str) -> dict[str, str]:
+    """Return what the self-test in C is filled with: points and steps, and what they must give.
+
+    ValueError if a rounding changes all answers.
+    """
+    controller, n_points, n_steps = Controller(data), 48, 60
+    drawn = sample_observations(controller, 4 * n_points)
+    if precision == "float":
+        drawn = drawn.astype(np.float32).astype(np.float64)
+    obs = insensitive(controller, drawn, precision)[:n_points]
+    if not len(obs):
+        raise ValueError(
+            f"In {precision} a rounding of a reading moves the output by more than "
+            f"{ROOM[precision]:g} of its range, at all points tried: readings are large beside "
+            "what they move by. Pass precision='double', or export without absolute=True."
+        )
+    steps = np.arange(n_steps)
+    readings = obs[steps // 4 % len(obs)]
+    lost = ((steps >= 10) & (steps < 13)) | ((steps >= 30) & (steps < 40))
+    elapsed = np.where(steps == 20, 3.0, 1.0)
+    requests = np.select([(steps >= 50) & (steps < 53), steps >= 56], [1, 2], 0)
+    actions, status, modes = [], [], []
+    for k in steps:
+        reading = readings[k].copy()
+        if lost[k]:
+            reading[0] = np.nan
+        controller.request = MODES[requests[k]]
+        actions.append(controller(reading, elapsed=elapsed[k]))
+        status.append(int(controller.status))
+        modes.append(MODES.index(controller.mode))
+    numbers = {
+        "points": obs,
+        "policy": controller.evaluate(obs),
+        "law": controller.evaluate(obs, networks=False),
+        "readings": np.where(lost[:, None] & (np.arange(obs.shape[1]) == 0), 0.0, readings),
+        "elapsed": elapsed,
+        "actions": np.array(actions),
+        "range_of": _input_ranges(controller, controller.evaluate(drawn)),
+    }
+    whole = {"lost": lost, "requests": requests, "status": status, "modes": modes}
+    texts = [table("yann_real", name, each, precision) for name, each in numbers.items()]
+    texts += [table("int", name, np.array(each), precision) for name, each in whole.items()]
+    return {
+        "VECTORS": "\n".join(texts),
+        "POINTS": str(len(obs)),
+        "STEPS": str(n_steps),
+        "ROOM": f"{ROOM[precision]:g}",
+    }
