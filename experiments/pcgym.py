@@ -1,8 +1,8 @@
 """Plants of PC-Gym: `python -m experiments.pcgym`, some hours of one core; needs the extra `pcgym`.
 
 The linear MPCs, an NMPC, YANN-RL from the offset-free MPC, with a simulator and from a log alone,
-and four learners of Stable-Baselines3. Writes the table into docs/pcgym.md; `make paper` does the
-runs too, where PC-Gym is installed. Nothing was tuned on these seeds, nor on these episodes.
+and four learners of Stable-Baselines3. Writes the table into docs/environments.md; `make paper`
+does the runs too, where PC-Gym is installed. Nothing was tuned on these seeds and episodes.
 """
 
 from __future__ import annotations
@@ -59,10 +59,19 @@ SEEDS = {
     **dict.fromkeys(("DDPG", "TD3", "SAC"), range(40, 41)),
     **{f"{name}{LONG}": range(40, 41) for name in RIVALS},
 }
-HEADER = ("plant", "controller", "training steps", "PC-Gym's cost", "against offset-free, %",
-          "worst episode, %", "stage cost", "against offset-free, %", "ms a step",
-          "seeds")  # fmt: skip
-BEGIN, END = "<!-- plants: begin -->\n", "<!-- plants: end -->"
+HEADER = (
+    "plant",
+    "controller",
+    "training steps",
+    "PC-Gym's cost",
+    "against offset-free, %",
+    "worst episode, %",
+    "stage cost against offset-free, %",
+    "ms a step",
+    "seeds",
+)
+BEGIN = "<!-- plants: begin -->\n"
+END = "<!-- plants: end -->"
 
 
 class Case:
@@ -275,7 +284,9 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[tuple[str, ...]]:
                 if run.plant == plant and run.learner.removesuffix(LONG) == name:
                     for k, steps in enumerate(each.checkpoints):
                         at.setdefault(int(steps), {})[run.seed] = each, k
-            found += [_row(plant, name, k, [*at[k].values()], base) for k in sorted(at)]
+            if at:
+                longest = max(at)
+                found.append(_row(plant, name, longest, [*at[longest].values()], base))
     return found
 
 
@@ -297,12 +308,12 @@ def _row(
     ms = np.median([each.extra["ms"][k] for each, k in tests])
     first, second = cells
     shown = f"{steps:,}" if steps else ""
-    return plant, name, shown, *first, *second[:2], number(ms, 2), f"{len(tests)}"
+    return plant, name, shown, *first, second[1], number(ms, 2), f"{len(tests)}"
 
 
 def write_report(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:
-    """Quote the table in ``pcgym.md`` if it is there; return the paths that were written."""
-    found, page = rows(outcomes), folder / "pcgym.md"
+    """Quote the table in ``environments.md`` if it is there; return the paths that were written."""
+    found, page = rows(outcomes), folder / "environments.md"
     return [page] if found and quote(table(HEADER, found, texts=2), page, BEGIN, END) else []
 
 

@@ -13,12 +13,11 @@ from matplotlib.figure import Figure
 import experiments
 from experiments.__main__ import BEGIN, END, main
 from experiments.markdown import number, quote, spread, table
-from experiments.measures import OURS, interval_of, standing
+from experiments.measures import OURS, rows_of
 from experiments.pictures import _cut_above, save_in_short
 from experiments.published import paper_table
-from experiments.results import write_report
+from experiments.results import in_short, write_report
 from experiments.runner import Outcome, Run
-from experiments.summary import summary
 
 pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
 
@@ -62,54 +61,6 @@ def pendulum(final=(1.0, 30.0), mpc=(1.0, 200.0), optimum=(0.9, 29.1)) -> dict[R
     return outcomes
 
 
-def test_a_row_by_hand() -> None:
-    runs = {
-        Run("CSTR", "YANN-RL", 0, 50): learned([96.0, 296.0], excess=-10.0),  # mean 196
-        Run("CSTR", "YANN-RL", 1, 50): learned([92.0, 292.0], excess=30.0, unsafe=2),  # 192
-        Run("CSTR", "YANN-RL", 2, 50): learned([106.0, 298.0], excess=5.0, unsafe=1),  # 202
-        Run("CSTR", "YANN-RL", 3, 50): learned([94.0, 294.0], excess=7.0),  # 194
-    }
-    row = standing({**reactor(seeds=0), **runs}, "CSTR", 50).row("YANN-RL")
-    assert (row.seeds, row.median, row.low, row.high) == (4, 195, 192, 202)
-    assert row.iqm == 195  # of 194 and 196
-    assert row.change == pytest.approx(-2.5)
-    assert row.closed == pytest.approx(50)
-    assert (row.below, row.above) == (3, 1)
-    assert (row.worst, row.worst_share) == (6, 3)
-    assert row.distance == 5
-    assert row.excess == pytest.approx((6, -10, 30))
-    assert (row.unsafe_training, row.unsafe_tests) == (3, 0)
-    assert row.near == 4  # all below 209
-    assert row.held is None  # no pendulum
-
-
-def test_the_held_starts_are_those_that_the_mpc_holds() -> None:
-    row = standing(pendulum((1.02, 500.0)), "pendulum, Q = I", 50).row("YANN-RL")
-    assert row.held == pytest.approx(0.02)
-    assert row.worst == pytest.approx(300)
-    assert row.near == 0
-
-
-def test_a_long_run_is_read_at_its_checkpoint() -> None:
-    run = Run("CSTR", "YANN-RL", 0, 200)
-    outcomes = {**reactor(seeds=0), run: learned(OPTIMUM, episodes=200, excess=400.0)}
-    short = standing(outcomes, "CSTR", 50).row("YANN-RL")
-    assert short.median == 190
-    assert short.excess == pytest.approx((100, 100, 100))
-    long = standing(outcomes, "CSTR", 200).row("YANN-RL")
-    assert long.median == 200
-    assert long.excess == pytest.approx((400, 400, 400))
-    assert "YANN-RL" not in standing(outcomes, "CSTR", 75).learners
-
-
-def test_the_interval_over_seeds() -> None:
-    assert interval_of([3.0]) is None
-    assert interval_of([3.0, 3.0, 3.0]) == (3, 3)
-    low, high = interval_of([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0])
-    assert 1 < low < 4.5 < high < 8
-    assert interval_of([1.0, 2.0, 9.0]) == interval_of([1.0, 2.0, 9.0])
-
-
 def test_the_papers_table_takes_the_best_and_the_worst_beginning() -> None:
     text = paper_table(reactor(), "CSTR", 50)
     assert "DDPG-G: seed 0, DDPG-P: seed 9, YANN-RL: seed 0" in text
@@ -146,7 +97,6 @@ def test_the_report_is_whole(tmp_path) -> None:
         "How this was made",
         "The paper's tables",
         "After 50 training episodes",
-        "Variants of YANN-RL, after 50 training episodes",
         "After 200 training episodes",
         "Learning curves",
         "What was tried",
@@ -154,17 +104,6 @@ def test_the_report_is_whole(tmp_path) -> None:
         assert f"\n## {heading}\n" in text
     assert text.endswith("This | and *that*.\n")
     assert "![CSTR](results-cstr.png)" in text
-
-
-def test_every_learner_that_is_run_for_longer_has_a_row_of_its_own_after_that_time() -> None:
-    from experiments.catalog import RUNS
-
-    long = [run for run in RUNS if run.episodes == 200]
-    assert len(long) > 4
-    outcomes = {run: learned(OPTIMUM, episodes=200) for run in long}
-    rows, _ = standing({**reactor(seeds=0), **outcomes}, "CSTR", 200).tables()
-    assert {row.learner for row in rows} - {"MPC", "optimum"} == {run.learner for run in long}
-    assert any(run.learner.startswith("YANN-RL") for run in long)
 
 
 @pytest.mark.slow
@@ -219,30 +158,6 @@ def test_the_command_reports_what_failed(catalog, tmp_path, capsys) -> None:
     assert main(["--report-only", "--results", "elsewhere.sqlite"]) == 0
 
 
-def test_the_short_table_has_a_row_for_each_plant() -> None:
-    bare = {Run("CSTR", "YANN-RL, no settings", 0, 50): learned([92.0, 292.0])}
-    bare[Run("CSTR", "YANN-RL, a simulator explored", 0, 50)] = learned([91.0, 290.0])
-    outcomes = {**reactor(), **bare, **pendulum()}
-    header, _, *rows, empty, legend = summary(outcomes, 50).splitlines()
-    names = (
-        "plant | optimum | MPC | **YANN-RL** | no simulator explored | settings of its own | "
-        "worst start"
-    )
-    assert header.startswith(f"| {names} |")
-    assert rows == [
-        "| CSTR | 190.00 | 200.00 | **190.50** | 192.00 | 191.00 (191.00 to 191.00) | "
-        "-9.00 | +0 | 300.00 (300.00 to 300.00) | +4,000 | 0 / 30 | 1 / 10 |",
-        "| pendulum, Q = I | 15.00 | 100.50 |  |  | 15.50 (15.50 to 15.50) | "
-        "+0.00 | +0 |  |  | 0 | 10 |",
-    ]
-    assert empty == "" and "after 50 training episodes, over 2 starts" in legend
-
-
-def test_a_plant_without_our_learner_has_no_row_in_short() -> None:
-    left = {run: out for run, out in reactor().items() if run.learner != "YANN-RL"}
-    assert summary(left, 50) == ""
-
-
 def test_the_picture_of_the_readme_needs_a_rival(tmp_path) -> None:
     (path,) = save_in_short(reactor(), tmp_path / "new")
     assert path.name == "in-short.png" and path.stat().st_size > 10_000
@@ -267,3 +182,51 @@ def test_the_readme_gets_the_short_table_between_its_marks(tmp_path) -> None:
     assert not quote("| new |", readme, BEGIN, END)
     assert readme.read_text(encoding="utf-8") == "nothing to replace"
     assert not quote("| new |", tmp_path / "missing.md", BEGIN, END)
+
+
+def row_of(outcomes, plant: str, episodes: int, learner: str):
+    return next(row for row in rows_of(outcomes, plant, episodes) if row.learner == learner)
+
+
+def test_a_row_by_hand() -> None:
+    runs = {
+        Run("CSTR", "YANN-RL", 0, 50): learned([96.0, 296.0], excess=-10.0),  # mean 196
+        Run("CSTR", "YANN-RL", 1, 50): learned([92.0, 292.0], excess=30.0, unsafe=2),  # 192
+        Run("CSTR", "YANN-RL", 2, 50): learned([106.0, 298.0], excess=5.0, unsafe=1),  # 202
+        Run("CSTR", "YANN-RL", 3, 50): learned([94.0, 294.0], excess=7.0),  # 194
+    }
+    row = row_of({**reactor(seeds=0), **runs}, "CSTR", 50, "YANN-RL")
+    assert (row.seeds, row.median, row.low, row.high) == (4, 195, 192, 202)
+    assert row.change == pytest.approx(-2.5)
+    assert row.closed == pytest.approx(50)
+    assert (row.below, row.above) == (3, 1)
+    assert (row.worst, row.worst_share) == (6, 3)
+    assert row.excess == pytest.approx(6)
+    assert (row.unsafe_training, row.unsafe_tests) == (3, 0)
+
+
+def test_a_long_run_is_read_at_its_checkpoint() -> None:
+    run = Run("CSTR", "YANN-RL", 0, 200)
+    outcomes = {**reactor(seeds=0), run: learned(OPTIMUM, episodes=200, excess=400.0)}
+    short = row_of(outcomes, "CSTR", 50, "YANN-RL")
+    assert short.median == 190 and short.excess == pytest.approx(100)
+    long = row_of(outcomes, "CSTR", 200, "YANN-RL")
+    assert long.median == 200 and long.excess == pytest.approx(400)
+    assert "YANN-RL" not in {row.learner for row in rows_of(outcomes, "CSTR", 75)}
+
+
+def test_the_short_table_has_a_row_for_each_plant_that_was_learnt() -> None:
+    more = {
+        Run("CSTR", "YANN-RL, no settings", 0, 50): learned([92.0, 292.0]),
+        Run("CSTR", "YANN-RL, a simulator explored", 0, 50): learned([91.0, 290.0]),
+    }
+    _, _, *rows, empty, legend = in_short({**reactor(), **more, **pendulum()}).splitlines()
+    assert rows == [
+        "| CSTR | 190.00 | 200.00 | **190.50** | 192.00 | -9.00 | +0 | "
+        "300.00 (300.00 to 300.00) | +4,000 | 0 / 30 | 1 / 10 |",
+        "| pendulum, Q = I | 15.00 | 100.50 | **15.50 (15.50 to 15.50)** |  | +0.00 | +0 |  |  | "
+        "0 | 10 |",
+    ]
+    assert empty == "" and "after 50 training episodes, over 2 starts" in legend
+    left = {run: out for run, out in reactor().items() if run.learner != "YANN-RL"}
+    assert in_short(left) == ""
