@@ -17,7 +17,8 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_name] = "1"
 
-BEGIN, END = "<!-- speed: begin -->\n", "<!-- speed: end -->"
+BEGIN = "<!-- speed: begin -->\n"
+END = "<!-- speed: end -->"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,10 +29,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from rich.console import Console
 
     from benchmarks.records import Bench, Figures
-    from benchmarks.report import in_short, print_criteria, write_report
+    from benchmarks.report import in_short, write_report
     from benchmarks.sections import NAMES, run
     from benchmarks.timing import Stopwatch
-    from experiments.summary import quote
+    from experiments.markdown import quote
 
     th.set_num_threads(1)
     unknown = sorted(set(options.only) - set(NAMES))
@@ -47,14 +48,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bench = Bench(watch, Figures(), console, options.quick, options.slow)
     began = time.perf_counter()
     run(bench, options.only or NAMES)
-    print_criteria(bench)
     report = options.report
     if report is None and not options.only:
         report = Path("out/bench-quick" if options.quick else "docs") / "performance.md"
     if report is not None:
         command = f'make bench ARGS="{shlex.join(given)}"' if given else "make bench"
-        for path in write_report(bench, report, command):
-            console.print(f"Written: {path}")
+        write_report(bench, report, command)
+        console.print(f"Written: {report}")
     whole = not (options.quick or options.only or options.cpu)
     if whole and quote(in_short(bench.figures), Path("README.md"), BEGIN, END):
         console.print("Written: the speed in README.md")
@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="seven regions only, in a minute")
     parser.add_argument(
         "--only", metavar="SECTION", nargs="+", default=[],
-        help="law, actor, train, solve, exact, memory, online, export, env, gpu; writes no report "
+        help="law, actor, train, solve, exact, memory, online, export, env; writes no report "
         "unless --report",
     )  # fmt: skip
     parser.add_argument("--report", type=Path, metavar="FILE", help="docs/performance.md")

@@ -57,10 +57,7 @@ class Figure:
         own = _spread(self.samples)
         if base is None or base.kind != "time" or not base.name.startswith(OURS):
             return own
-        low, middle, high = quartiles(ratios(self.samples, base.samples))
-        if len(self.samples) == 1:
-            return f"{own}: {times(middle)}"
-        return f"{own}: {times(middle)} ({times(low)} to {times(high)})"
+        return f"{seconds(self.middle)}: {times(quartiles(ratios(self.samples, base.samples))[1])}"
 
 
 class Figures:

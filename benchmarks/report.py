@@ -1,4 +1,4 @@
-"""The report: ``performance.md``, with a picture, and the lines that the README quotes."""
+"""The report: ``performance.md``, and the lines that the README quotes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Table
 
 import sb3_yann
 from benchmarks import evaluation, exactness, networks, offline, online, peers, simulators
-from benchmarks.criteria import Criterion, criteria
-from benchmarks.picture import save_picture
 from benchmarks.problems import PROBLEMS, SMALLEST
 from benchmarks.records import Bench, Figure, Figures, heading, times
 from benchmarks.sections import TITLES
@@ -40,26 +36,22 @@ NOTES = {
     f"network has {evaluation.LITERAL_WIDTH} nodes a region, ours 16 and 16 in training.",
 }
 LEGEND = (
-    "Medians, in brackets the first and the third quartile of the repeats; after the colon how "
-    "many times the first row's time that is, turn by turn."
+    "Medians of the repeats, of the first row with its quartiles; after the colon how many times "
+    "the first row's time that is, turn by turn."
 )
 
 
-def write_report(bench: Bench, path: Path, command: str) -> list[Path]:
-    """Write the report and its picture, and return their paths."""
-    figures = bench.figures
-    picture = save_picture(figures, path.parent)
+def write_report(bench: Bench, path: Path, command: str) -> None:
+    """Write the report."""
+    short = in_short(bench.figures)
     parts = [
         "# Performance",
-        f"## In short\n\n{in_short(figures)}" if in_short(figures) else "",
+        f"## In short\n\n{short}" if short else "",
         how_it_was_made(bench, command),
-        what_was_reached(criteria(figures)),
-        f"## Cost against regions\n\n![cost against regions]({picture.name})" if picture else "",
-        *_sections(figures),
+        *_sections(bench.figures),
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
-    return [path, picture] if picture else [path]
 
 
 def in_short(figures: Figures) -> str:
@@ -134,16 +126,6 @@ def versions() -> str:
     return ", ".join(found)
 
 
-def what_was_reached(found: list[Criterion]) -> str:
-    """Return the table of requirements."""
-    if not found:
-        return ""
-    rows = [(line.what, line.required, line.found, line.reached) for line in found]
-    return "## What was required, and what was reached\n\n" + table(
-        ("what", "required", "found", "reached"), rows, texts=4
-    )
-
-
 def _sections(figures: Figures) -> Iterator[str]:
     for section in figures.sections():
         note = NOTES.get(section, "")
@@ -153,18 +135,3 @@ def _sections(figures: Figures) -> Iterator[str]:
         header = ["", *map(heading, figures.columns(section))]
         text = "\n\n".join(part for part in (note, legend, table(header, rows)) if part)
         yield f"## {TITLES[section]}\n\n{text}"
-
-
-def print_criteria(bench: Bench) -> None:
-    """Print what was required, found and reached."""
-    found = criteria(bench.figures)
-    if not found:
-        return
-    shown = Table(title="What was required", title_justify="left")
-    for name in ("what", "required", "found", "reached"):
-        shown.add_column(name)
-    for line in found:
-        style = None if line.holds else "bold red"
-        reached = "yes" if line.holds else "no"
-        shown.add_row(*map(escape, (line.what, line.required, line.found, reached)), style=style)
-    bench.console.print(shown)

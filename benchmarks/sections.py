@@ -5,14 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-import numpy as np
-import torch as th
-
 from benchmarks import (
     deployment,
     evaluation,
     exactness,
-    gpu,
     large,
     long_horizons,
     memory,
@@ -23,8 +19,7 @@ from benchmarks import (
     suite,
 )
 from benchmarks.problems import PROBLEMS, SMALLEST, Problem
-from benchmarks.records import Bench, Figure, show, timed
-from benchmarks.timing import Array
+from benchmarks.records import Bench, show
 
 TITLES = {
     evaluation.ONE: "The law in numpy, one point",
@@ -47,7 +42,6 @@ TITLES = {
     deployment.SMALL: "An exported controller of the reactor on an emulated microcontroller",
     simulators.SECTION: "Environments",
     memory.SECTION: "Memory",
-    gpu.SECTION: "Processor and CUDA device",
 }
 PerProblem = Callable[[Bench, Problem], None]
 EACH: dict[str, PerProblem] = {
@@ -66,8 +60,7 @@ WHOLE: dict[str, Callable[[Bench], None]] = {
     "export": deployment.deployment,
     "env": simulators.simulators,
 }
-GPU = "gpu"
-NAMES = (*EACH, *WHOLE, GPU)
+NAMES = (*EACH, *WHOLE)
 
 
 def run(bench: Bench, names: Sequence[str]) -> None:
@@ -77,8 +70,6 @@ def run(bench: Bench, names: Sequence[str]) -> None:
         before, began = set(bench.figures.sections()), time.perf_counter()
         if name in WHOLE:
             WHOLE[name](bench)
-        elif name == GPU:
-            _devices(bench, problems)
         else:
             for problem in problems:
                 EACH[name](bench, problem)
@@ -86,22 +77,3 @@ def run(bench: Bench, names: Sequence[str]) -> None:
             if section not in before:
                 show(bench.figures, section, TITLES[section], bench.console)
         bench.console.print(f"{name}: {time.perf_counter() - began:.0f} s\n")
-
-
-def _devices(bench: Bench, problems: Sequence[Problem]) -> None:
-    """Measure on a CUDA device too, where there is one."""
-    if not th.cuda.is_available():
-        bench.console.print("No CUDA device: the section gpu is skipped.")
-        return
-    for problem in (problems[0], problems[-1]):
-        found: dict[tuple[str, int], Array] = {}
-        for what, device, batch, seconds in gpu.measure(problem.law, bench.watch):
-            row = f"{problem.regions:,} regions, {what}, {device}"
-            bench.figures.add(timed(gpu.SECTION, f"batch of {batch:,}", {row: seconds}))
-            if what == gpu.BACKWARD:
-                found[device, batch] = seconds
-        first = gpu.pays_from(found)
-        text = "never" if first is None else f"from a batch of {first:,}"
-        row = f"{problem.regions:,} regions: where cuda is faster"
-        column = f"batch of {gpu.BATCHES[0]:,}"
-        bench.figures.add([Figure(gpu.SECTION, row, column, np.zeros(1), "text", text)])
