@@ -17,7 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import check_bool, check_int, check_options
 from sb3_yann.audit.callback import CostAudit
 from sb3_yann.evaluation.episodes import LONG, Source, as_source
-from sb3_yann.evaluation.plots.decisions import plot_decisions
+from sb3_yann.evaluation.plots import plot_decisions
 from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
 from sb3_yann.guard.interrupt import Handler, install
 from sb3_yann.guard.options import AcceptanceRule, StepSize

@@ -10,8 +10,8 @@ from scipy import stats
 from sb3_yann._validation import Array
 from sb3_yann.control.model.labels import with_units
 from sb3_yann.evaluation.episodes import Episodes
-from sb3_yann.evaluation.plots import loops_figure, surfaces_figure, use_figure
-from sb3_yann.evaluation.plots._sources import inputs_of
+from sb3_yann.evaluation.law_plots import inputs_of, surfaces_figure, use_figure
+from sb3_yann.evaluation.plots import loops_figure
 from sb3_yann.reporting.html import Html, join, left_out, picture, say, table, tag
 from sb3_yann.reporting.problem_parts import number, steepest
 from sb3_yann.reporting.subject import MPC, POLICY, Finding, Part, Subject

@@ -15,8 +15,7 @@ from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of, missing_observer, with_units
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.evaluation.episodes import Episodes
-from sb3_yann.evaluation.plots import regions_figure
-from sb3_yann.evaluation.plots.regions import ActiveConstraints
+from sb3_yann.evaluation.law_plots import ActiveConstraints, regions_figure
 from sb3_yann.reporting.html import Html, join, left_out, lines, picture, say, table, tag
 from sb3_yann.reporting.subject import MPC, POLICY, Finding, Part, Subject
 

@@ -219,9 +219,13 @@ class PlantTwin:
 
     def plot(self, axes: tuple[Axes, Axes] | None = None) -> tuple[Axes, Axes]:
         """Draw costs of held-out episodes, and errors of free runs; return both axes."""
-        from sb3_yann.twin.plots import draw_twin
+        from sb3_yann.evaluation import plots
 
-        return draw_twin(self.trust, axes)
+        costs, runs = plots.twin_figure(self.trust).axes if axes is None else axes
+        if axes is not None:
+            plots.plot_costs(self.trust, costs)
+            plots.plot_free_runs(self.trust, runs)
+        return costs, runs
 
     def reidentified(self) -> LinearMPC:
         """Return the MPC of the same costs, bounds and horizon with a model of the log.

@@ -1,0 +1,763 @@
+"""Pictures of closed loops, decisions, fits, headroom and twins; those of laws are imported.
+
+Each takes matplotlib's Axes, or makes a new figure, and returns the Axes; a ``..._figure`` returns
+the figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._drawing import (
+    COLORS,
+    LIMIT,
+    SET_POINT,
+    as_figure,
+    axes_or_new,
+    legend_above,
+    legend_beside,
+    new_figure,
+    save_figure,
+)
+from sb3_yann._validation import Array, check_array, check_bool, check_int, check_type, to_float
+from sb3_yann.control import LinearModel, LinearMPC
+from sb3_yann.control.model.labels import with_units
+from sb3_yann.evaluation.episodes import Episodes, as_played
+from sb3_yann.evaluation.law_plots import (
+    Quantity,
+    RegionUse,
+    entry_of,
+    plot_changes,
+    plot_regions,
+    plot_surface,
+    plot_visits,
+    regions_figure,
+    surfaces_figure,
+    use_figure,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "RegionUse",
+    "decisions_figure",
+    "fit_figure",
+    "headroom_figure",
+    "loops_figure",
+    "plot_changes",
+    "plot_costs",
+    "plot_decisions",
+    "plot_fit",
+    "plot_free_runs",
+    "plot_headroom",
+    "plot_loop",
+    "plot_regions",
+    "plot_surface",
+    "plot_visits",
+    "regions_figure",
+    "save_plant_trajectories",
+    "save_trajectories",
+    "surfaces_figure",
+    "twin_figure",
+    "use_figure",
+]
+Runs = Mapping[str, Episodes]
+MAX_LINES = 6  # so many episodes are drawn one by one; of more, the median and bands
+
+
+# ---- Every episode, saved as a picture ----
+
+
+def save_trajectories(
+    path: str | PathLike[str],
+    runs: Runs,
+    states: Mapping[int, str],
+    inputs: Sequence[str],
+    dt: float,
+    time_unit: str,
+    limits: Mapping[int, tuple[float, str]] | None = None,
+    references: Mapping[int, int] | None = None,
+) -> Path:
+    """Save a picture of states and all inputs over time, a color for each run; return its path.
+
+    Parameters
+    ----------
+    path : path-like
+        Folders are made as needed. Without a suffix it gets ``.png``.
+    runs : mapping of str to Episodes
+        Every episode of every run is drawn.
+    states : mapping of int to str
+        The entries of the observation to draw, with their labels.
+    inputs : sequence of str
+        Labels of the inputs.
+    dt : float
+        Sampling time, in ``time_unit``.
+    time_unit : str
+        For the label of the axis.
+    limits : mapping of int to (float, str), optional
+        A limit of an entry of the observation, and its label.
+    references : mapping of int to int, optional
+        The entry of the observation that is the set-point of another, drawn as a dashed line.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from sb3_yann.evaluation import evaluate
+    >>> runs = {"no input": evaluate(lambda _: [0.0], "CSTR-v0", [0])}
+    >>> folder = tempfile.mkdtemp()
+    >>> save_trajectories(f"{folder}/run.png", runs, {0: "level"}, ["flow"], 1.0, "s").name
+    'run.png'
+    """
+    figure, references = new_figure(8, 2.4 * (len(states) + len(inputs))), references or {}
+    panels = figure.subplots(len(states) + len(inputs), 1, sharex=True, squeeze=False)[:, 0]
+    for number, (name, episodes) in enumerate(_check_runs(runs).items()):
+        style = {"color": COLORS[number % len(COLORS)], "alpha": 0.7, "linewidth": 1.2}
+        for k, (x, u) in enumerate(zip(episodes.observations, episodes.actions, strict=True)):
+            style["label"] = name if k == 0 else "_nolegend_"
+            time = dt * np.arange(len(x))
+            for panel, i in zip(panels, states, strict=False):
+                panel.plot(time, x[:, i], **style)
+                if i in references and number == 0:  # the same in every run
+                    r = x[:, references[i]].copy()
+                    r[-1] = r[-2:][0]  # the last one belongs to a step that is not taken
+                    panel.step(time, r, "k--", where="post", linewidth=1.0)
+            for panel, series in zip(panels[len(states) :], u.T, strict=True):
+                panel.step(time[:-1], series, where="post", **style)
+    for panel, i in zip(panels, states, strict=False):
+        if limits and i in limits:
+            panel.axhline(limits[i][0], color="black", linestyle="--", label=limits[i][1])
+            panel.legend(loc="best")
+    for panel, label in zip(panels, [*states.values(), *inputs], strict=True):
+        panel.set_ylabel(label)
+        panel.grid(alpha=0.3)
+    panels[0].legend(loc="best")
+    panels[-1].set_xlabel(f"time ({time_unit})")
+    return save_figure(figure, path, dpi=120)
+
+
+def save_plant_trajectories(
+    path: str | PathLike[str],
+    runs: Runs,
+    problem: LinearMPC,
+    time_unit: str,
+    entries: Sequence[int] | None = None,
+    labels: Mapping[int, str] | None = None,
+    limits: Mapping[int, tuple[float, str]] | None = None,
+    absolute: bool = False,
+) -> Path:
+    """Save a picture in the plant's own units, with the model's names; return its path.
+
+    A state with a set-point shows it as a dashed line.
+
+    Parameters
+    ----------
+    path : path-like
+        Folders are made as needed. Without a suffix it gets ``.png``.
+    runs : mapping of str to Episodes
+        Their observations are theta.
+    problem : LinearMPC
+        Its model has the operating point, the sampling time, names and units.
+    time_unit : str
+        For the label of the axis.
+    entries : sequence of int, optional
+        The entries of theta to draw; all states by default.
+    labels : mapping of int to str, optional
+        Labels of entries that the model has no name for.
+    limits : mapping of int to (float, str), optional
+        A limit of an entry, in plant units, and its label.
+    absolute : bool, default False
+        Whether the episodes are in the plant's units already.
+
+    Raises
+    ------
+    ValueError
+        If observations or actions have another size than theta and the inputs.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import gymnasium
+    >>> from sb3_yann.evaluation import evaluate
+    >>> runs = {"no input": evaluate(lambda _: [0.0], "CSTR-v0", [0])}
+    >>> mpc = gymnasium.make("CSTR-v0").observation_space.problem
+    >>> folder = tempfile.mkdtemp()
+    >>> save_plant_trajectories(f"{folder}/run.png", runs, mpc, "h", entries=[3]).name
+    'run.png'
+    """
+    check_type("problem", problem, LinearMPC, "a LinearMPC")
+    shown = [*range(problem.model.n_states)] if entries is None else [*entries]
+    names = dict(enumerate(problem.labels(units=True))) | dict(labels or {})
+    references = {i: r for i, r in problem.set_points.items() if i in shown}
+    return save_trajectories(
+        path,
+        _in_plant_units(problem, _check_runs(runs), check_bool("absolute", absolute)),
+        {i: names[i] for i in shown},
+        with_units(problem.model)[1],
+        problem.model.dt,
+        time_unit,
+        limits,
+        references,
+    )
+
+
+def _check_runs(runs: Runs) -> dict[str, Episodes]:
+    """Return runs by their names, else raise TypeError."""
+    check_type("runs", runs, Mapping, "a mapping of names to episodes: {'MPC': evaluate(...)}")
+    return {name: as_played(f"runs[{name!r}]", each) for name, each in runs.items()}
+
+
+def _in_plant_units(problem: LinearMPC, runs: Runs, absolute: bool) -> dict[str, Episodes]:
+    """Return episodes with the operating point added; ValueError where they are not of theta."""
+    theta_ss, u_ss = problem.theta_ss, problem.model.u_ss
+    if absolute:
+        theta_ss, u_ss = 0 * theta_ss, 0 * u_ss
+    found = {}
+    for name, episodes in runs.items():
+        for x, u in zip(episodes.observations, episodes.actions, strict=True):
+            if x.shape[1:] != theta_ss.shape or u.shape[1:] != u_ss.shape:
+                raise ValueError(
+                    f"An episode of {name!r} has observations {x.shape} and actions {u.shape}, but "
+                    f"theta has {theta_ss.size} entries and there are {u_ss.size} inputs. Draw "
+                    "what the env shows by save_trajectories."
+                )
+        found[name] = replace(
+            episodes,
+            observations=tuple(x + theta_ss for x in episodes.observations),
+            actions=tuple(u + u_ss for u in episodes.actions),
+        )
+    return found
+
+
+# ---- Closed loops ----
+
+
+def plot_loop(
+    problem: LinearMPC,
+    runs: Runs,
+    quantity: Quantity,
+    axes: Axes | None = None,
+    *,
+    time_unit: str = "",
+    absolute: bool = False,
+) -> Axes:
+    """Draw one quantity over time, in plant units, with its limits and its set-point.
+
+    Up to six episodes are lines. Of more, a line is their median, a dark band holds 80 % of them,
+    and a light one all; of several controllers dashed lines are the edges of the dark one. Where
+    some episodes have ended, the others count.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        With the operating point, limits, names and units.
+    runs : mapping of str to Episodes
+        By controller; their observations are theta, their actions inputs.
+    quantity : int or str
+        An entry of ``[theta, u]``: its index, or a name as in ``problem.labels()``, or an input's.
+    axes : matplotlib Axes, optional
+        Where to draw; a new figure's by default.
+    time_unit : str, optional
+        Of ``model.dt``, for the label.
+    absolute : bool, default False
+        Whether the episodes are in the plant's units already.
+
+    Raises
+    ------
+    ValueError
+        If there are no episodes, or these are not of the problem's theta and inputs.
+
+    Examples
+    --------
+    >>> from sb3_yann.evaluation import evaluate
+    >>> from sb3_yann_envs import problems
+    >>> mpc = problems.cstr()
+    >>> axes = plot_loop(mpc, {"MPC": evaluate(mpc.explicit(), "CSTR-v0", range(2))}, "U")
+    >>> axes.get_ylabel()
+    'U (kJ/(h m² K))'
+    """
+    entry = entry_of(problem, quantity, inputs=True)
+    runs = _to_draw(problem, runs, absolute)
+    axes = axes_or_new(axes, 6.4, 3.0)
+    _draw_loops([axes], problem, [runs], entry, time_unit)
+    legend_above(axes, columns=1 if len(runs) > 2 else 2)
+    return axes
+
+
+def loops_figure(
+    problem: LinearMPC,
+    runs: Runs,
+    *,
+    quantities: Sequence[Quantity] | None = None,
+    time_unit: str = "",
+    absolute: bool = False,
+) -> Figure:
+    """Return a figure of several quantities.
+
+    Controllers share a panel; of more than six episodes each has its own, one below the other.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        With the operating point, limits, names and units.
+    runs : mapping of str to Episodes
+        By controller, the first one uppermost; their observations are theta.
+    quantities : sequence of int or str, optional
+        As of :func:`plot_loop`; all states and inputs by default.
+    time_unit : str, optional
+        Of ``model.dt``, for the label.
+    absolute : bool, default False
+        Whether the episodes are in the plant's units already.
+
+    Examples
+    --------
+    >>> from sb3_yann.evaluation import evaluate
+    >>> from sb3_yann_envs import problems
+    >>> mpc = problems.clipped_pendulum()
+    >>> runs = {"MPC": evaluate(mpc.explicit(), "ClippedPendulum-v0", range(8))}
+    >>> len(loops_figure(mpc, runs, time_unit="s").axes)
+    3
+    """
+    runs = _to_draw(problem, runs, absolute)
+    if quantities is None:
+        n = problem.n_theta
+        quantities = [*range(problem.model.n_states), *range(n, n + problem.model.n_inputs)]
+    entries = [entry_of(problem, each, inputs=True) for each in quantities]
+    many = max(len(each.costs) for each in runs.values()) > MAX_LINES
+    groups: list[Runs] = [{name: runs[name]} for name in runs] if many else [runs]
+    columns = min(3, len(entries))
+    rows = -(-len(entries) // columns) * len(groups)
+    figure = new_figure(3.2 * columns + 0.4, 1.9 * rows + 0.6)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for k in range(rows // len(groups) * columns):
+        block, column = divmod(k, columns)
+        own = panels[block * len(groups) : (block + 1) * len(groups), column]
+        if k >= len(entries):
+            for panel in own:
+                panel.set_axis_off()
+            continue
+        _draw_loops(own, problem, groups, entries[k], time_unit)
+        for panel, group in zip(own, groups, strict=True):
+            if column == 0 and many and len(groups) > 1:
+                panel.set_title(next(iter(group)), loc="left", fontsize="medium")
+    found: dict[str, Any] = {}
+    for panel in panels.ravel():
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    last = ("limit", "soft limit", "bound of the input", "set-point")
+    found = dict(sorted(found.items(), key=lambda each: each[0] in last))
+    columns = min(4, len(found)) if max(map(len, found)) < 24 else 2
+    figure.legend(
+        [*found.values()], [*found], loc="outside upper left", ncols=columns, frameon=False
+    )
+    return figure
+
+
+def _to_draw(problem: LinearMPC, runs: Runs, absolute: bool) -> dict[str, Episodes]:
+    if not runs or not all(len(each.costs) for each in runs.values()):
+        raise ValueError("There are no episodes to draw: pass {name: evaluate(...)} of some seeds.")
+    return _in_plant_units(problem, runs, absolute)
+
+
+def _draw_loops(
+    panels: Sequence[Axes], problem: LinearMPC, groups: Sequence[Runs], entry: int, time_unit: str
+) -> None:
+    """Draw one quantity, of each group of controllers in a panel: they share their range."""
+    n, number = problem.n_theta, 0
+    reference = problem.set_points.get(entry, entry)
+    every = [
+        rows[np.isfinite(rows)]
+        for group in groups
+        for each in group.values()
+        for rows in (_rows(each, entry, n), _rows(each, reference, n)[:, :-1])
+    ]
+    data = np.concatenate(every) if sum(map(len, every)) else np.array([0.0, 1.0])
+    label = [*problem.labels(units=True), *with_units(problem.model)[1]][entry]
+    for panel, group in zip(panels, groups, strict=True):
+        for name, episodes in group.items():
+            style: dict[str, Any] = {
+                "color": COLORS[number % len(COLORS)],
+                "drawstyle": "steps-post" if entry >= n else "default",
+            }
+            rows = _rows(episodes, entry, n)
+            _draw_rows(panel, rows, problem.model.dt, style, name, len(group) == 1)
+            number += 1
+        if reference != entry:  # the last set-point belongs to a step that is not taken
+            rows = np.unique(_rows(next(iter(group.values())), reference, n)[:, :-1], axis=0)
+            style = dict(SET_POINT)
+            if len(rows) > 1:
+                style |= {"alpha": 0.7 if len(rows) <= MAX_LINES else 0.35, "linewidth": 0.8}
+            time = problem.model.dt * np.arange(rows.shape[1])
+            for k, row in enumerate(rows):
+                style["label"] = "set-point" if k == 0 else "_nolegend_"
+                panel.plot(time, row, drawstyle="steps-post", **style)
+        _draw_limits(panel, problem, entry, float(data.min()), float(data.max()))
+        panel.set_ylabel(label)
+        panel.grid(alpha=0.3)
+    panels[-1].set_xlabel(f"time ({time_unit})" if time_unit else "time")
+
+
+def _rows(episodes: Episodes, entry: int, n_theta: int) -> Array:
+    """Return an entry of [theta, u] in each episode (episodes, steps), NaN after its end."""
+    k = entry - n_theta
+    parts, column = (episodes.actions, k) if k >= 0 else (episodes.observations, entry)
+    series = [each[:, column] for each in parts]
+    found = np.full((len(series), max(map(len, series))), np.nan)
+    for row, each in zip(found, series, strict=True):
+        row[: len(each)] = each
+    return found
+
+
+def _draw_rows(
+    axes: Axes, rows: Array, dt: float, style: dict[str, Any], name: str, alone: bool
+) -> None:
+    """Draw lines of a few episodes; of many the median, and bands, or their edges beside others."""
+    time = dt * np.arange(rows.shape[1])
+    if len(rows) <= MAX_LINES:
+        for k, row in enumerate(rows):
+            label = name if k == 0 else "_nolegend_"
+            axes.plot(time, row, linewidth=1.1, alpha=0.85, label=label, **style)
+        return
+    low, dark, middle, light, high = np.nanpercentile(rows, [0, 10, 50, 90, 100], axis=0)
+    if alone:
+        step = "post" if style["drawstyle"] == "steps-post" else None
+        band: dict[str, Any] = {"color": style["color"], "linewidth": 0, "step": step}
+        axes.fill_between(time, low, high, alpha=0.18, **band)
+        axes.fill_between(time, dark, light, alpha=0.35, **band)
+    else:
+        for edge in (dark, light):
+            axes.plot(time, edge, linewidth=0.9, linestyle="--", **style)
+    what = "dark: 80 %, light: all" if alone else "dashed: 80 %"
+    axes.plot(time, middle, linewidth=1.7, label=f"{name}, median of {len(rows)} ({what})", **style)
+
+
+def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, low: float, high: float) -> None:
+    """Draw limits near the data, name those far away, and set the range of the axis."""
+    k, model, bounds = entry - problem.n_theta, problem.model, problem.deviations
+    kind = ""
+    sides = -np.inf, np.inf
+    if k >= 0:
+        sides = bounds.u_min[k] + model.u_ss[k], bounds.u_max[k] + model.u_ss[k]
+        kind = "bound of the input"
+    elif entry < model.n_states:
+        x_ss = model.x_ss[entry]
+        sides = bounds.x_min[entry] + x_ss, bounds.x_max[entry] + x_ss
+        kind = "soft limit" if problem.soft.penalty and problem.soft.x[entry] > 0 else "limit"
+    width = max(high - low, 1e-9 * max(abs(low), abs(high), 1.0))
+    bottom, top = low, high
+    for value, corner in zip(sides, ("bottom", "top"), strict=True):
+        if not np.isfinite(value):
+            continue
+        if low - width <= value <= high + width:
+            axes.axhline(value, label=kind, **LIMIT)  # type: ignore[arg-type]
+            bottom, top = min(bottom, value), max(top, value)
+        else:
+            y, text = 0.04 if corner == "bottom" else 0.96, f"{kind}: {value:.4g}"
+            place: dict[str, Any] = {"ha": "right", "va": corner, "transform": axes.transAxes}
+            axes.text(0.98, y, text, fontsize=7, **place)
+    room = 0.06 * max(top - bottom, width)
+    axes.set_ylim(bottom - room, top + room)
+
+
+# ---- Decisions of a guard ----
+
+
+def plot_decisions(
+    decisions: Sequence[Any], axes: Axes | None = None, *, training_costs: ArrayLike | None = None
+) -> Axes:
+    """Draw each candidate's mean cost by the verdict on it, the accepted policy's and the MPC's.
+
+    A candidate far beyond the accepted policies, or without a cost, is drawn at the edge.
+
+    Parameters
+    ----------
+    decisions : sequence of Decision
+        As in ``guard.decisions``; of none a note says so.
+    axes : matplotlib Axes, optional
+        Where to draw; a new figure's by default.
+    training_costs : array_like, shape (episodes,), optional
+        Costs of the training episodes themselves, drawn behind.
+
+    Examples
+    --------
+    >>> from sb3_yann import Decision
+    >>> first = Decision(9, 1, "accepted", "", False, 3.0, 3.0, 4.0, -0.5, (), 1.0)
+    >>> plot_decisions([first]).get_xlabel()
+    'training episodes'
+    """
+    axes = axes_or_new(axes, 8.0, 3.8)
+    axes.set(xlabel="training episodes", ylabel="mean cost")
+    if not decisions:
+        axes.text(0.5, 0.5, "no candidate was tried", ha="center", transform=axes.transAxes)
+        return axes
+    episodes = np.array([each.episode for each in decisions])
+    costs, accepted, mpc = (
+        np.array([getattr(each, name) for each in decisions], np.float64)
+        for name in ("candidate_cost", "accepted_cost", "mpc_cost")
+    )
+    bottom, top = _range_of_costs(costs, accepted, mpc)
+    if training_costs is not None:
+        played = to_float("training_costs", training_costs)
+        axes.plot(1 + np.arange(len(played)), played, ".", color="0.7", label="training episode")
+    axes.step(episodes, accepted, where="post", color=COLORS[0], label="accepted policy")
+    axes.plot(episodes, mpc, color="black", linestyle="--", linewidth=1.2, label="MPC")
+    kinds = np.array(
+        [
+            each.verdict if each.verdict != "rejected" else f"rejected{each.restored:d}"
+            for each in decisions
+        ]
+    )
+    for kind, label, marker, color in (
+        ("accepted", "accepted", "o", COLORS[2]),
+        ("accepted in part", "accepted in part", "^", COLORS[4]),
+        ("rejected0", "refused, plays on", "x", COLORS[3]),
+        ("rejected1", "refused, policy restored", "X", COLORS[1]),
+    ):
+        own = kinds == kind
+        if own.any():
+            shown = np.clip(np.nan_to_num(costs[own], nan=np.inf), bottom, top)
+            style: dict[str, Any] = {"color": color, "markersize": 6, "clip_on": False}
+            axes.plot(episodes[own], shown, marker, label=label, **style)
+    if beyond := int(np.sum(~((costs >= bottom) & (costs <= top)))):
+        axes.plot([], [], " ", label=f"({beyond} beyond the scale,\ndrawn at its edge)")
+    axes.set_ylim(bottom, top)
+    axes.locator_params(axis="x", integer=True)
+    axes.grid(alpha=0.3)
+    legend_beside(axes)
+    return axes
+
+
+def _range_of_costs(costs: Array, accepted: Array, mpc: Array) -> tuple[float, float]:
+    """Return the range of what was accepted, and of the candidates within two widths of it."""
+    known = np.concatenate([accepted, mpc])
+    known = known[np.isfinite(known)]
+    if not known.size:
+        known = costs[np.isfinite(costs)] if np.isfinite(costs).any() else np.zeros(1)
+    low, high = float(known.min()), float(known.max())
+    width = max(high - low, 0.02 * max(abs(low), abs(high)), 1e-12)
+    near = costs[(costs >= low - 2 * width) & (costs <= high + 2 * width)]
+    low, high = min([low, *near]), max([high, *near])
+    room = 0.08 * max(high - low, width)
+    return low - room, high + room
+
+
+decisions_figure = as_figure(plot_decisions)
+
+
+# ---- An identified model along a log ----
+
+
+def plot_fit(
+    model: LinearModel,
+    states: ArrayLike,
+    actions: ArrayLike,
+    axes: Axes | None = None,
+    *,
+    disturbances: ArrayLike | None = None,
+    state: int = 0,
+    time_unit: str = "",
+) -> Axes:
+    """Draw one measured state, the model's free run from the first row, and ten steps ahead.
+
+    The legend has the fit, ``100 (1 - |x - predicted| / |x - mean|)`` in percent.
+
+    Parameters
+    ----------
+    model : LinearModel
+        As of :func:`identify`: ``found.model``.
+    states : array_like, shape (T + 1, n)
+        An episode in plant units, best one that the fit has not seen.
+    actions : array_like, shape (T, m)
+        In plant units.
+    axes : matplotlib Axes, optional
+        Where to draw; a new figure's by default.
+    disturbances : array_like, shape (T, d), optional
+        As measured.
+    state : int, default 0
+        Which one.
+    time_unit : str, optional
+        Of ``model.dt``, for the label.
+
+    Examples
+    --------
+    >>> model = LinearModel([[0.5]], [[1.0]], dt=1)
+    >>> axes = plot_fit(model, [[0.0], [1.0], [1.5]], [[1.0], [1.0]])
+    >>> axes.get_legend_handles_labels()[1]
+    ['measured', 'free run, fit 100.0 %', '10 steps ahead, fit 100.0 %']
+    """
+    x = check_array("states", states, ("T + 1", model.n_states))
+    u = check_array("actions", actions, (len(x) - 1, model.n_inputs)) - model.u_ss
+    d = np.zeros((len(u), model.n_disturbances)) + model.d_ss
+    if disturbances is not None:
+        d = check_array("disturbances", disturbances, d.shape)
+    if check_int("state", state, 0) >= model.n_states:
+        raise ValueError(f"state = {state} must be below {model.n_states}, the number of states.")
+    pushed = u @ model.B.T + (d - model.d_ss) @ model.E.T
+    axes = axes_or_new(axes, 7.0, 3.2)
+    time, measured = model.dt * np.arange(len(x)), x[:, state]
+    axes.plot(time, measured, color="black", linewidth=1.0, label="measured")
+    span = float(np.ptp(measured)) or 1.0
+    moved = np.linalg.norm(measured[1:] - measured[1:].mean())
+    for ahead, name, color, line in (
+        (len(x), "free run", COLORS[1], "-"),
+        (10, "10 steps ahead", COLORS[0], "--"),
+    ):
+        predicted = measured.copy()
+        z = x - model.x_ss
+        free = z[0]
+        for end in range(1, len(x)):
+            start = max(0, end - ahead)
+            if start:  # a run of its own from each measured state
+                free = z[start]
+                for k in range(start, end - 1):
+                    free = free @ model.A.T + pushed[k]
+            free = free @ model.A.T + pushed[end - 1]
+            predicted[end] = free[state] + model.x_ss[state]
+        missed = np.linalg.norm(measured[1:] - predicted[1:])
+        fit = 100 * (1 - missed / moved) if moved > 0 else np.nan
+        label = f"{name}, fit {fit:.1f} %"
+        axes.plot(time, predicted, line, color=color, linewidth=1.2, label=label)
+        if ahead == len(x):
+            is_near = bool(np.all(np.abs(predicted - measured) <= 0.3 * span))
+    axes.set_ylim(measured.min() - span, measured.max() + span)
+    if is_near:
+        axes.autoscale(axis="y")
+    axes.set(xlabel=f"time ({time_unit})" if time_unit else "time")
+    axes.set_ylabel(with_units(model)[0][state])
+    axes.grid(alpha=0.3)
+    legend_above(axes)
+    return axes
+
+
+def fit_figure(
+    model: LinearModel,
+    states: ArrayLike,
+    actions: ArrayLike,
+    *,
+    disturbances: ArrayLike | None = None,
+    time_unit: str = "",
+) -> Figure:
+    """Return a figure of :func:`plot_fit` for each state, with its arguments.
+
+    Examples
+    --------
+    >>> model = LinearModel([[0.5]], [[1.0]], dt=1)
+    >>> len(fit_figure(model, [[0.0], [1.0], [1.5]], [[1.0], [1.0]]).axes)
+    1
+    """
+    figure = new_figure(7.0, 2.1 * model.n_states + 0.4)
+    panels = figure.subplots(model.n_states, 1, sharex=True, squeeze=False)[:, 0]
+    own: dict[str, Any] = {"disturbances": disturbances, "time_unit": time_unit}
+    for i, panel in enumerate(panels):
+        plot_fit(model, states, actions, panel, state=i, **own)
+        panel.label_outer()
+    return figure
+
+
+# ---- Headroom, and what a twin is worth ----
+
+
+def plot_headroom(found: Any, axes: Axes | None = None) -> Axes:
+    """Draw the parts of a :class:`Headroom` one after the other, and their sum with its error.
+
+    Examples
+    --------
+    >>> from sb3_yann import Headroom
+    >>> import numpy as np
+    >>> costs = np.array([10.0, 20.0])
+    >>> found = Headroom(costs, costs, costs, costs - 0.5, 0.0, 0.0, 1 / 30, "learn", "a simulator")
+    >>> [round(float(bar.get_width()), 2) for bar in plot_headroom(found).patches]
+    [0.0, 0.0, 3.33, 3.33]
+    """
+    parts = {
+        "offset": "offset:\na disturbance observer",
+        "model_error": "model error:\nre-identification",
+        "nonlinearity": "nonlinearity\nand constraints",
+        "total": "all of it",
+    }
+    axes, start = axes_or_new(axes, 6.4, 2.6), 0.0
+    for k, name in enumerate(parts):
+        value, error = 100 * getattr(found, name), None
+        if name == "total":
+            start, error = 0.0, 100 * found.standard_error
+        axes.barh(k, value, left=start, color=COLORS[k], xerr=error, capsize=3, height=0.6)
+        end = max(start, start + value) + (error or 0.0)
+        axes.annotate(f"{value:+.2f} %", (end, k), (4, 0), textcoords="offset points", va="center")
+        start += value
+    axes.set_yticks(range(len(parts)), [*parts.values()])
+    axes.invert_yaxis()
+    axes.axvline(0, color="black", linewidth=0.8)
+    axes.set(xlabel="gain over the MPC (% of its mean cost)", title=f"verdict: {found.verdict}")
+    axes.margins(x=0.25)
+    axes.grid(axis="x", alpha=0.3)
+    axes.set_axisbelow(True)
+    return axes
+
+
+headroom_figure = as_figure(plot_headroom)
+
+
+def plot_costs(trust: Any, axes: Axes | None = None) -> Axes:
+    """Draw the actual cost of each held-out episode over the predicted one.
+
+    ``trust`` is ``twin.trust``. A trusted twin's costs lie between the dashed lines, on root mean
+    square.
+    """
+    axes = axes_or_new(axes, 4.6, 4.2)
+    if len(trust.actual):
+        both = np.concatenate([trust.predicted, trust.actual])
+        both = both[np.abs(both) <= 3 * np.abs(trust.actual).max()]  # a run that diverged is not
+        ends = np.array([both.min(), both.max()])
+        ends = ends + 0.08 * np.array([-1, 1]) * max(float(np.ptp(ends)), 1e-9)
+        error = 0.25 * np.abs(trust.actual).mean()
+        axes.plot(ends, ends, color="black", linewidth=1, label="as predicted")
+        for side, label in ((-1, "25 % of the mean off"), (1, "_nolegend_")):
+            axes.plot(ends, ends + side * error, "k--", linewidth=0.8, label=label)
+        style: dict[str, Any] = {"color": COLORS[0], "alpha": 0.8, "label": "held-out episode"}
+        axes.plot(trust.predicted, trust.actual, "o", **style)
+        axes.set(xlim=ends, ylim=ends)
+    axes.set(xlabel="predicted cost", ylabel="actual cost")
+    axes.grid(alpha=0.3)
+    legend_above(axes, columns=2)
+    return axes
+
+
+def plot_free_runs(trust: Any, axes: Axes | None = None) -> Axes:
+    """Draw the error of free runs over held-out episodes by how many steps they look ahead."""
+    from matplotlib.ticker import LogLocator
+
+    axes, runs = axes_or_new(axes, 5.2, 4.2), trust.runs
+    axes.set(xlabel="steps ahead", ylabel="error (standard deviations of the states)")
+    if len(trust.actual):
+        for name, errors, color, style in (
+            ("twin", runs.errors[trust.chosen], COLORS[0], "o-"),
+            ("linear model", runs.errors[0], COLORS[1], "s--"),
+            ("nothing moves", trust.standing, COLORS[2], "^:"),
+        ):
+            axes.plot(runs.horizons, errors, style, color=color, label=name)
+        axes.set(xscale="log", yscale="log")
+        axes.set_xticks(runs.horizons, [str(each) for each in runs.horizons], minor=False)
+        axes.set_xticks([], minor=True)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")  # no powers of ten
+        axes.yaxis.set_minor_formatter("")
+    axes.grid(alpha=0.3)
+    legend_above(axes)
+    return axes
+
+
+def twin_figure(trust: Any) -> Figure:
+    """Return a figure of :func:`plot_costs` and :func:`plot_free_runs`."""
+    figure = new_figure(9.2, 3.8)
+    costs, runs = figure.subplots(1, 2)
+    plot_costs(trust, costs)
+    plot_free_runs(trust, runs)
+    return figure
