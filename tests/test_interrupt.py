@@ -7,14 +7,13 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from fresh_process import run_python
-from sb3_yann.control.law import _kernels, search_tree
-from sb3_yann.control.online import _kernels as online
-from sb3_yann.control.online import _table_kernels as table
+from sb3_yann.control import search_tree
+from sb3_yann.control._kernels import law, online, polyhedra
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
 from sb3_yann.twin._kernels import costates, step
 from sb3_yann_envs import cstr
 
-LAWS = _kernels, search_tree, online, table
+LAWS = law, online, polyhedra, search_tree
 MODULES = (*LAWS, yann_layer, afterstate_value, step, costates, cstr)
 CALLED = {
     f"{module.__name__}.{name}": function
@@ -36,8 +35,15 @@ def test_no_compiled_function_that_python_calls_returns_an_array(name) -> None:
 
 def test_all_that_is_known_to_be_called_is_looked_at() -> None:
     names = {name.rpartition(".")[2] for name in CALLED}
-    assert names >= {"law_at", "law_of_batch", "locate_batch", "_hits", "_sides", "forward"}
-    assert names >= {"forward_shared", "solve_batch", "inputs_of_batch", "recall", "remember"}
+    assert names >= {"law_at", "law_of_batch", "locate_batch", "_count_hits", "_sides", "forward"}
+    assert names >= {
+        "forward_shared",
+        "solve_batch",
+        "inputs_of_batch",
+        "recall",
+        "remember",
+        "support",
+    }
     assert names >= {"backward", "_forms", "_output", "_output_backward", "_forms_backward"}
     assert names >= {"_rates", "advance", "advance_all", "is_rich", "step", "costates"}
 

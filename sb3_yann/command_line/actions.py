@@ -163,7 +163,7 @@ def checks_of(path: str | None) -> Any:
 def law_of(given: str) -> Any:
     """Return a law from its file, from a model, or from a problem."""
     from sb3_yann import OnlineLaw, PiecewiseAffine
-    from sb3_yann.control.law._files import read_law
+    from sb3_yann.control.law import read_law
 
     if _is_model(given):
         policy = model_of(given).policy

@@ -3,7 +3,7 @@
 from sb3_yann.control.explicit.budget import ExplicitLimitError
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.model.identify import Identified, identify
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.choice import OnlineLawWarning
@@ -19,7 +19,7 @@ from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.control.mpc.offset_free import offset_free
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
 from sb3_yann.control.observer import DisturbanceObserver
-from sb3_yann.control.online.online_law import OnlineLaw
+from sb3_yann.control.online import OnlineLaw
 
 __all__ = [
     "DisturbanceBounds",

@@ -1,4 +1,4 @@
-"""Balls, facets and vertices of polyhedra ``A x <= b`` with rows of unit length."""
+"""Balls, facets and farthest points of polyhedra ``A x <= b`` with rows of unit length."""
 
 from __future__ import annotations
 
@@ -45,44 +45,35 @@ class Region:
 
 def largest_ball(A: Array, b: Array, facet: int | None = None) -> tuple[Array, float]:
     """Return center and radius (negative: none) of a bounded polyhedron or facet's largest ball."""
-    from sb3_yann.control import _kernels
+    from sb3_yann.control._kernels import polyhedra as kernels
 
     found: Array = np.empty(A.shape[1] + 1)
-    which, none = -1 if facet is None else facet, np.empty(0, dtype=np.int64)
-    done = _kernels.region(*_plain(A, b), which, np.inf, found, none)
-    if done != _kernels.OPTIMAL:
-        rows, cost = np.column_stack([A, np.ones(len(b))]), np.append(np.zeros(A.shape[1]), 1.0)
+    which = -1 if facet is None else facet
+    no_facets = np.empty(0, dtype=np.int64)
+    done = kernels.bounded_region(*_contiguous(A, b), which, np.inf, found, no_facets)
+    if done != kernels.OPTIMAL:
+        rows = np.column_stack([A, np.ones(len(b))])
         if facet is not None:
             rows[facet, -1] = 0.0
-        found = _maximize(cost, rows, b, facet)
+        found = _solve_lp(np.append(np.zeros(A.shape[1]), 1.0), rows, b, facet)
     return found[:-1], float(found[-1])
 
 
 def farthest_point(
-    A: Array,
-    b: Array,
-    direction: Array,
-    inside: Array | None = None,
-    seconds: float | None = None,
+    A: Array, b: Array, direction: Array, inside: Array, seconds: float | None = None
 ) -> Array:
     """Return the point (n,) of a bounded polyhedron that is farthest in one direction.
 
     Parameters
     ----------
-    A, b, direction : ndarray, shapes (q, n), (q,) and (n,)
-        The polyhedron, and where to.
-    inside : ndarray, shape (n,), optional
-        A point of it, with which it is found faster.
+    A, b, direction, inside : ndarray, shapes (q, n), (q,), (n,) and (n,)
+        The polyhedron, where to, and a point of it.
     seconds : float, optional
         Of a large polyhedron: HiGHS is asked, which gives up after so long, and returns any point.
     """
-    if seconds is not None:
-        return _maximize(np.asarray(direction, dtype=float), A, b, None, seconds)
-    cost = np.array(direction, dtype=float)
-    start = largest_ball(*_unit_rows(A, b))[0] if inside is None else inside
-    if np.all(A @ start <= b):
-        return np.asarray(farthest_points(A, b, start, cost[None])[0])
-    return _maximize(cost, A, b, None)
+    if seconds is not None or np.any(A @ inside > b):
+        return _solve_lp(direction, A, b, None, seconds)
+    return np.asarray(farthest_points(A, b, inside, direction[None])[0])
 
 
 def farthest_points(A: Array, b: Array, inside: Array, directions: Array) -> Array:
@@ -93,45 +84,40 @@ def farthest_points(A: Array, b: Array, inside: Array, directions: Array) -> Arr
     A, b, inside, directions : ndarray, shapes (q, n), (q,), (n,) and (k, n)
         The polyhedron, a point of it, and where to.
     """
-    from sb3_yann.control import _kernels
+    from sb3_yann.control._kernels import polyhedra as kernels
 
-    found, rows = np.empty_like(directions), _plain(A, b)
-    if _kernels.support(*rows, inside, np.ascontiguousarray(directions), found) != _kernels.OPTIMAL:
-        found = np.array([_maximize(each, A, b, None) for each in directions])
+    found = np.empty_like(directions)
+    directions = np.ascontiguousarray(directions)
+    if kernels.support(*_contiguous(A, b), inside, directions, found) != kernels.OPTIMAL:
+        found = np.array([_solve_lp(each, A, b, None) for each in directions])
     return found
 
 
-def facets(A: Array, b: Array, inside: Array, radius: float) -> NDArray[np.intp]:
-    """Return the rows that bound a polyhedron with a ball of this radius about a point inside.
-
-    Rows that only touch it may be among them, and duplicate rows are all kept.
-
-    Parameters
-    ----------
-    A, b, inside, radius : ndarray, shapes (q, n), (q,) and (n,), and float
-        The polyhedron, bounded, and the center and radius of the ball.
-    """
-    from sb3_yann.control import _kernels
-
-    found, kept = np.empty(A.shape[1] + 1), np.ones(len(b), dtype=np.int64)
-    if _kernels.region(*_plain(A, b), -1, 0.0, found, kept) == _kernels.OPTIMAL:
-        return np.flatnonzero(kept)
-    return _facets_one_by_one(A, b - A @ inside, radius)
-
-
-def region(A: Array, b: Array, thinnest: float) -> tuple[Array, float, NDArray[np.intp], bool]:
+def bounded_region(
+    A: Array, b: Array, thinnest: float
+) -> tuple[Array, float, NDArray[np.intp], bool]:
     """Return a point inside a bounded polyhedron, its largest ball's radius, and its facets.
 
-    Last comes whether some of these are equal. Where the radius is at most ``thinnest`` no facets
-    are looked for.
+    Last comes whether some of these are equal: all of those are kept. Where the radius is at most
+    ``thinnest`` no facets are looked for.
     """
-    from sb3_yann.control import _kernels
+    from sb3_yann.control._kernels import polyhedra as kernels
 
-    found, kept = np.empty(A.shape[1] + 1), np.ones(len(b), dtype=np.int64)
-    if _kernels.region(*_plain(A, b), -1, thinnest, found, kept) == _kernels.OPTIMAL:
+    found = np.empty(A.shape[1] + 1)
+    kept = np.ones(len(b), dtype=np.int64)
+    done = kernels.bounded_region(*_contiguous(A, b), -1, thinnest, found, kept)
+    if done == kernels.OPTIMAL:
         return found[:-1], float(found[-1]), np.flatnonzero(kept), bool(np.max(kept) > 1)
     inside, radius = largest_ball(A, b)
-    return inside, radius, facets(A, b, inside, radius) if radius > thinnest else np.arange(0), True
+    bounding = []
+    slack = b - A @ inside
+    for k in range(len(b)) if radius > thinnest else ():
+        # Without a facet the polyhedron would be larger.
+        relaxed = slack.copy()
+        relaxed[k] += radius
+        if A[k] @ _solve_lp(A[k], A, relaxed, None) > slack[k] + max(1e-6 * radius, 1e-13):
+            bounding.append(k)
+    return inside, radius, np.array(bounding, dtype=np.intp), True
 
 
 def equal_rows(A: Array, slack: Array, radius: float) -> NDArray[np.bool_]:
@@ -139,55 +125,39 @@ def equal_rows(A: Array, slack: Array, radius: float) -> NDArray[np.bool_]:
 
     ``slack`` (q,) is their distance from a point inside.
     """
-    from sb3_yann.control._kernels import NOISE, SAME
+    from sb3_yann.control._kernels.polyhedra import NOISE, SAME
 
     near = np.abs(slack[:, None] - slack) <= SAME * radius + NOISE
-    # Seldom any: most pairs are told apart by their distance.
+    # Most pairs differ in their distance.
     first, second = np.nonzero(near)
     near[first, second] = np.abs(A[first] - A[second]).max(axis=1) <= SAME
     return np.asarray(near)
 
 
-def _plain(A: Array, b: Array) -> tuple[Array, Array]:
-    """Return arrays as the compiled functions take them."""
+def _contiguous(A: Array, b: Array) -> tuple[Array, Array]:
     return np.ascontiguousarray(A, dtype=float), np.ascontiguousarray(b, dtype=float)
 
 
-def _unit_rows(A: Array, b: Array) -> tuple[Array, Array]:
-    length = np.linalg.norm(A, axis=1)
-    length[length == 0] = 1.0
-    return A / length[:, None], b / length
-
-
-def _maximize(
+def _solve_lp(
     cost: Array, A: Array, b: Array, equal: int | None, seconds: float | None = None
 ) -> Array:
-    """Return the solution of a small linear program from HiGHS, for where our own search fails."""
+    """Return the largest ``cost x`` by HiGHS, for large programs and where our own search fails."""
     tied = np.arange(len(b)) == equal
-    free, equal_rows = (A[~tied], b[~tied]), (A[tied], b[tied])
-    options = (
-        {}
-        if seconds is None
-        else {
-            "time_limit": seconds,
-            "primal_feasibility_tolerance": 1e-10,
-            "dual_feasibility_tolerance": 1e-10,
-        }
+    options = {}
+    if seconds is not None:
+        options = {"time_limit": seconds}
+        options |= {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    found = optimize.linprog(
+        -np.asarray(cost),
+        A_ub=A[~tied],
+        b_ub=b[~tied],
+        A_eq=A[tied],
+        b_eq=b[tied],
+        bounds=(None, None),
+        options=options,
     )
-    found = optimize.linprog(-cost, *free, *equal_rows, bounds=(None, None), options=options)
-    if found.x is None and seconds is not None:
+    if found.x is not None:
+        return np.asarray(found.x)
+    if seconds is not None:
         return np.zeros(len(cost))
-    if found.x is None:  # an empty facet
-        return np.append(np.zeros(len(cost) - 1), -np.inf)
-    return np.asarray(found.x)
-
-
-def _facets_one_by_one(A: Array, b: Array, radius: float) -> NDArray[np.intp]:
-    """Return the rows without which the polyhedron would be larger."""
-    bounding = []
-    for k in range(len(b)):
-        relaxed = b.copy()
-        relaxed[k] += radius
-        if A[k] @ _maximize(A[k], A, relaxed, None) > b[k] + max(1e-6 * radius, 1e-13):
-            bounding.append(k)
-    return np.array(bounding, dtype=np.intp)
+    return np.append(np.zeros(len(cost) - 1), -np.inf)  # an empty facet

@@ -13,7 +13,7 @@ from sb3_yann._drawing import COLORS, as_figure, axes_or_new, new_figure
 from sb3_yann._validation import Array, check_array, check_choice
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.explicit.solve import ProgramUnits
-from sb3_yann.control.law import plot as law_plot
+from sb3_yann.control.law_plot import plot_law
 from sb3_yann.control.model.labels import labels_of, with_units
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.evaluation.episodes import Episodes
@@ -115,7 +115,7 @@ def plot_regions(
     chosen = [entry_of(problem, each) for each in entries]
     name = ActiveConstraints(problem) if by == "constraint" else None
     labels = problem.labels(units=True)
-    return law_plot.plot_regions(
+    return plot_law(
         problem.explicit(), axes, entries=chosen, at=at, labels=labels, name=name
     )
 

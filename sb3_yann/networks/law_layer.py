@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_yann._validation import Array, half_widths
-from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.zero_output import ZeroOutputNetwork, register_constants
 

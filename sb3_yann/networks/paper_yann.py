@@ -11,7 +11,7 @@ import torch as th
 from torch import nn
 
 from sb3_yann._validation import Array, check_int, check_range, check_type
-from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.law import PiecewiseAffine
 
 
 class PaperYann(nn.Module):

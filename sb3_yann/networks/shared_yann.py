@@ -11,7 +11,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array, half_widths
-from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants

@@ -20,10 +20,10 @@ from sb3_yann.control.explicit.kkt import equations
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches, row_units
 from sb3_yann.control.explicit.steep import SteepQP
 from sb3_yann.control.polyhedra import (
+    bounded_region,
     equal_rows,
     farthest_point,
     largest_ball,
-    region,
 )
 
 Indices = NDArray[np.intp]
@@ -271,7 +271,7 @@ class Conditions:
         label: Indices,
     ) -> Found | None:
         A, b = np.concatenate([A, self.outer_A]), np.concatenate([b, self.outer_b])
-        inside, radius, rows, equal = region(A, b, THINNEST)
+        inside, radius, rows, equal = bounded_region(A, b, THINNEST)
         if radius <= THINNEST:
             return None
         A, b = A[rows], b[rows]

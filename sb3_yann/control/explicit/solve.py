@@ -19,13 +19,13 @@ from sb3_yann.control.explicit.facet_walk import walk
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
 from sb3_yann.control.explicit.steep import solvable
-from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
+from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
 
 KERNELS = (
-    "sb3_yann.control._kernels",
-    "sb3_yann.control.law._kernels",
-    "sb3_yann.control.law.search_tree",
+    "sb3_yann.control._kernels.polyhedra",
+    "sb3_yann.control._kernels.law",
+    "sb3_yann.control.search_tree",
 )
 """What a search needs that is compiled."""
 ABSURD, LITTLE = 1e8, 1e-9

@@ -9,8 +9,8 @@ from typing import Protocol
 from sb3_yann.control.explicit.budget import ExplicitLimitError, SolveBudget
 from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.law.piecewise_affine import PiecewiseAffine
-from sb3_yann.control.online.online_law import OnlineLaw
+from sb3_yann.control.law import PiecewiseAffine
+from sb3_yann.control.online import OnlineLaw
 
 Law = PiecewiseAffine | OnlineLaw
 LAWS = ("auto", "explicit", "online")

@@ -15,7 +15,7 @@ from sb3_yann.control import lqr
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
-from sb3_yann.control.law.piecewise_affine import INFEASIBLE, PiecewiseAffine
+from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability, simulation
@@ -36,7 +36,7 @@ from sb3_yann.control.mpc.misread_bounds import Range, warn_of_misread_bounds
 from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.terminal_set import invariant_set
-from sb3_yann.control.online.online_law import OnlineLaw
+from sb3_yann.control.online import OnlineLaw
 
 G = TypeVar("G")
 

@@ -14,7 +14,7 @@ from sb3_yann.control.mpc.choice import Law
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.problem import MPCProblem
 from sb3_yann.control.mpc.reachability import is_reachable
-from sb3_yann.control.online.online_law import OnlineLaw
+from sb3_yann.control.online import OnlineLaw
 
 LOOP_STEPS = 50  # of a closed loop on the model
 

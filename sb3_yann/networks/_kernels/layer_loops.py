@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_yann._numba import Integers, Single, compiled
 from sb3_yann._validation import Array
-from sb3_yann.control.law._kernels import input_at
+from sb3_yann.control._kernels.law import input_at
 from sb3_yann.networks._kernels.mlp import WEIGHTS, network, network_backward, prepared
 
 KEPT = "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1]"

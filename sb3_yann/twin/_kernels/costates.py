@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_yann._numba import Integers, Single, compiled
 from sb3_yann._validation import Array
-from sb3_yann.control.law._kernels import slopes_at
+from sb3_yann.control._kernels.law import slopes_at
 from sb3_yann.networks._kernels.layer_loops import KEPT
 from sb3_yann.networks._kernels.mlp import WEIGHTS, prepared
 from sb3_yann.networks._kernels.slopes import add_slopes

@@ -11,11 +11,10 @@ import pytest
 
 from fresh_process import run_python
 from sample_problems import PROBLEMS, benchmark, box_points, solved
-from sb3_yann.control import ExplicitLimitError, LinearModel, LinearMPC
+from sb3_yann.control import ExplicitLimitError, LinearModel, LinearMPC, search_tree
 from sb3_yann.control.explicit import budget, certificate, conditions, solve
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.law import search_tree
 
 
 @pytest.mark.parametrize("name", ["pendulum", "reactor", "benchmark", "one state", "discounted"])

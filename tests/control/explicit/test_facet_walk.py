@@ -17,7 +17,7 @@ from sb3_yann import LinearModel, LinearMPC, RateLimits, Terminal
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.control.explicit import solve as module
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
-from sb3_yann.control.polyhedra import Region, facets, farthest_point, largest_ball
+from sb3_yann.control.polyhedra import Region, bounded_region, farthest_point, largest_ball
 
 # Those that ppopt solves in about a second.
 NAMES = [
@@ -47,7 +47,7 @@ def regions_of(mpc: LinearMPC, solver: str) -> list[Region]:
 
 def reaches_beyond(one: Region, other: Region) -> float:
     """How far the half-spaces of one region let a point get beyond those of another."""
-    beyond = (normal @ farthest_point(one.A, one.b, normal) for normal in other.A)
+    beyond = (normal @ farthest_point(one.A, one.b, normal, one.ball()[0]) for normal in other.A)
     return max(point - bound for point, bound in zip(beyond, other.b, strict=True))
 
 
@@ -165,8 +165,8 @@ def test_facets_of_a_thin_polyhedron_are_those_of_the_same_one_made_round(width:
     A = random.normal(size=(40, 3))
     A /= np.linalg.norm(A, axis=1)[:, None]
     b = random.uniform(0.5, 1.5, 40)
-    round_one = facets(A, b, np.zeros(3), 0.5)
+    round_one = bounded_region(A, b, 0.0)[2]
     thin = A @ np.linalg.inv(np.linalg.qr(random.normal(size=(3, 3)))[0] * [1, 1, width])
     length = np.linalg.norm(thin, axis=1)
-    found = facets(thin / length[:, None], b / length, np.zeros(3), float(np.min(b / length)))
+    found = bounded_region(thin / length[:, None], b / length, 0.0)[2]
     assert found.tolist() == round_one.tolist() and len(found) < 40

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from sb3_yann.control import _kernels
+from sb3_yann.control._kernels import polyhedra as _kernels
 from sb3_yann.control.polyhedra import (
     Region,
+    bounded_region,
     equal_rows,
-    facets,
     farthest_point,
     farthest_points,
     largest_ball,
-    region,
 )
 
 TRIANGLE = np.array([[-1.0, 0.0], [0.0, -1.0], [0.6, 0.8]])
@@ -36,8 +35,8 @@ def test_the_largest_ball_of_a_triangle_of_3_4_and_5() -> None:
 )
 def test_the_farthest_point_is_a_corner(lengths, direction, corner) -> None:
     A, b = lengths[:, None] * TRIANGLE, lengths * ROOM
-    for inside in (None, np.array([0.5, 0.5])):
-        assert farthest_point(A, b, np.array(direction), inside) == pytest.approx(corner)
+    inside = np.array([0.5, 0.5])
+    assert farthest_point(A, b, np.array(direction, float), inside) == pytest.approx(corner)
     both = farthest_points(A, b, np.array([0.5, 0.5]), np.array([direction, direction], float))
     assert both == pytest.approx(np.array([corner, corner]))
 
@@ -45,7 +44,7 @@ def test_the_farthest_point_is_a_corner(lengths, direction, corner) -> None:
 def test_rows_that_do_not_touch_are_no_facets() -> None:
     A = np.vstack([TRIANGLE, [[1.0, 0.0]]])
     for room, expected in ((5.0, [0, 1, 2]), (3.0, [0, 1, 2, 3])):
-        assert facets(A, np.append(ROOM, room), np.ones(2), 1.0).tolist() == expected
+        assert bounded_region(A, np.append(ROOM, room), 0.0)[2].tolist() == expected
 
 
 def polygon(seed: int, rows: int = 9) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +59,7 @@ def polygon(seed: int, rows: int = 9) -> tuple[np.ndarray, np.ndarray]:
 def search(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Search by our own code, and by the one that stands in for it."""
     if request.param:
-        for name in ("region", "support"):
+        for name in ("bounded_region", "support"):
             monkeypatch.setattr(_kernels, name, lambda *_: -1)
 
 
@@ -79,7 +78,7 @@ def test_balls_corners_and_facets_are_those_of_linear_programs(seed: int) -> Non
         top = -optimize.linprog(-direction, A_ub=A, b_ub=b, bounds=(None, None)).fun
         assert direction @ point == pytest.approx(top, rel=1e-6)
         assert np.max(A @ point - b) < 1e-7
-        for inside in (None, middle, middle + 9.0):
+        for inside in (middle, middle + 9.0):
             found = farthest_point(A, b, direction, inside)
             assert direction @ found == pytest.approx(top, rel=1e-6)
     bounding = []
@@ -88,8 +87,7 @@ def test_balls_corners_and_facets_are_those_of_linear_programs(seed: int) -> Non
         free = optimize.linprog(-A[k], A_ub=A[others], b_ub=b[others], bounds=(None, None))
         if free.status != 0 or -free.fun > b[k] + 1e-9:
             bounding.append(k)
-    assert facets(A, b, middle, radius).tolist() == bounding
-    found, size, rows, equal = region(A, b, 1e-9)
+    found, size, rows, equal = bounded_region(A, b, 1e-9)
     assert rows.tolist() == bounding and size == pytest.approx(radius, rel=1e-6)
     assert np.min(b - A @ found) > 0.5 * radius and isinstance(equal, bool)
     for k in bounding[:3]:

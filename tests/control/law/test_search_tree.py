@@ -16,8 +16,8 @@ import pytest
 from sample_problems import facet_points, vertices
 from sb3_yann._archive import read_arrays, write_arrays
 from sb3_yann.control import LinearModel, LinearMPC, PiecewiseAffine
-from sb3_yann.control.law._kernels import locate_batch
-from sb3_yann.control.law.search_tree import SearchTree, build_tree
+from sb3_yann.control._kernels.law import locate_batch
+from sb3_yann.control.search_tree import SearchTree, build_tree
 
 
 @cache
@@ -170,7 +170,7 @@ def test_a_tree_is_saved_with_its_law_and_copied_with_it(tmp_path: Path, monkeyp
     replace(law).save(tmp_path / "law.npz")  # one that has never been called
     copy = pickle.loads(pickle.dumps(replace(law)))
     law(np.zeros(law.n_theta))
-    monkeypatch.setattr("sb3_yann.control.law.search_tree.build_tree", None)  # not built anew
+    monkeypatch.setattr("sb3_yann.control.search_tree.build_tree", None)  # not built anew
     points = in_box(law, 100)
     for other in (PiecewiseAffine.load(tmp_path / "law.npz"), copy):
         assert other == law

@@ -12,7 +12,7 @@ import pytest
 
 from sample_problems import facet_points
 from sb3_yann.control import LinearModel, LinearMPC, PiecewiseAffine
-from sb3_yann.control.law._kernels import _walked
+from sb3_yann.control._kernels.law import walk_to
 
 UNKNOWN = np.empty(0, np.int64)
 
@@ -61,7 +61,7 @@ def test_it_finds_the_region_of_a_scan_on_facets() -> None:
 def test_no_point_is_left_to_a_scan() -> None:
     law = chain()
     points = in_box(law, 2000)
-    found = [_walked(*law.packed, points, i) for i in range(len(points))]
+    found = [walk_to(*law.packed, points, i) for i in range(len(points))]
     assert np.array_equal(found, law.locate(points))
 
 

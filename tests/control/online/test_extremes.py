@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sb3_yann.control import LinearModel, LinearMPC, SoftBounds
-from sb3_yann.control.online._kernels import UNKNOWN
+from sb3_yann.control._kernels.online import UNKNOWN
 
 STEEP = SoftBounds(x=True, penalty=1e3)
 

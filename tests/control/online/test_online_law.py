@@ -14,8 +14,8 @@ from general_problems import PROBLEMS, solved
 from reference_answers import online_answers, relative_error
 from sb3_yann._archive import write_arrays
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, ParametricQP, SoftBounds
-from sb3_yann.control.online import _kernels
-from sb3_yann.control.online.dual_program import DualProgram
+from sb3_yann.control._kernels import online as _kernels
+from sb3_yann.control.online import DualProgram
 
 
 def drawn(mpc: LinearMPC, count: int, stretch: float = 1.0) -> np.ndarray:

@@ -17,13 +17,10 @@ from sb3_yann.control.model.labels import labels_of, with_units
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SMALL = 0.004
-"""A region that covers a smaller part of the picture gets no number."""
-MOST_NUMBERS = 60
 Name = Callable[[int, Array], str]
 
 
-def plot_regions(
+def plot_law(
     law: Any,
     axes: Axes | None = None,
     *,
@@ -66,7 +63,7 @@ def plot_regions(
     Examples
     --------
     >>> from sb3_yann_envs import problems
-    >>> axes = plot_regions(problems.clipped_pendulum().explicit())
+    >>> axes = plot_law(problems.clipped_pendulum().explicit())
     >>> len(axes.patches), axes.get_xlabel()
     (7, 'angle (rad)')
     """
@@ -83,17 +80,18 @@ def plot_regions(
     polygons = slices(law, (across, up), point - zero)
     axes = axes_or_new(axes, 7.4, 4.4)
     shift = zero[[across, up]]
+    name = name or _constant_inputs(law)
     named: dict[str, list[int]] = {}
     for i, polygon in polygons.items():
         theta = np.array(point - zero)
         theta[[across, up]] = polygon.mean(axis=0)
-        named.setdefault((name or _constant_inputs(law))(i, theta), []).append(i)
-    sizes = {i: area(polygon) for i, polygon in polygons.items()}
-    _fill(axes, {i: p + shift for i, p in polygons.items()}, named, sizes)
+        named.setdefault(name(i, theta), []).append(i)
+    _fill(axes, {i: polygon + shift for i, polygon in polygons.items()}, named)
     called = [*labels] if labels else _labels(law)
-    low, high = law.theta_min[[across, up]] + shift, law.theta_max[[across, up]] + shift
+    low = law.theta_min[[across, up]] + shift
+    high = law.theta_max[[across, up]] + shift
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    if sum(sizes.values()) < 0.999 * np.prod(high - low):
+    if sum(map(area, polygons.values())) < 0.999 * np.prod(high - low):
         axes.fill_between([], [], facecolor="white", edgecolor="0.6", label="no solution")
     axes.set(xlabel=called[across], ylabel=called[up])
     legend_beside(axes)
@@ -157,10 +155,13 @@ def _draw_line(law: Any, axes: Axes | None, labels: Sequence[str] | None) -> Axe
             "The law's box is not bounded: there is no frame to draw. Solve the problem for a "
             "bounded theta_min and theta_max."
         )
-    model, m = law.model, law.n_inputs
+    m = law.n_inputs
     zero = 0.0 if law.theta_ss is None else law.theta_ss[0]
-    rest = np.zeros(m) if model is None else model.u_ss
-    inputs = [f"u[{k}]" for k in range(m)] if model is None else with_units(model)[1]
+    rest = np.zeros(m)
+    inputs = [f"u[{k}]" for k in range(m)]
+    if law.model is not None:
+        rest = law.model.u_ss
+        inputs = with_units(law.model)[1]
     ends = np.unique(np.clip(law.b / law.A[:, 0], low, high)[law.A[:, 0] != 0])
     theta = np.unique(np.concatenate([np.linspace(low, high, 401), ends]))
     axes = axes_or_new(axes, 7.4, 4.4)
@@ -178,7 +179,8 @@ def _draw_line(law: Any, axes: Axes | None, labels: Sequence[str] | None) -> Axe
 
 
 def _entries(entries: Sequence[int | str], law: Any) -> tuple[int, int]:
-    n, names = law.n_theta, [] if law.model is None else labels_of(law.model)[0]
+    n = law.n_theta
+    names = [] if law.model is None else labels_of(law.model)[0]
     chosen: list[Any] = [names.index(each) if each in names else each for each in entries]
     whole = all(isinstance(each, int | np.integer) and 0 <= each < n for each in chosen)
     if len(chosen) != 2 or not whole or chosen[0] == chosen[1]:
@@ -196,35 +198,42 @@ def _labels(law: Any) -> list[str]:
 
 def _constant_inputs(law: Any) -> Name:
     """Return what names a region by the inputs that do not move in it."""
-    m, model = law.n_inputs, law.model
-    names = [f"u[{k}]" for k in range(m)] if model is None else labels_of(model)[1]
-    units = model.units[model.n_states :] if model is not None and model.units else [""] * m
-    rest = np.zeros(m) if model is None else model.u_ss
+    m = law.n_inputs
+    names = [f"u[{k}]" for k in range(m)]
+    units = [""] * m
+    rest = np.zeros(m)
+    if law.model is not None:
+        names = labels_of(law.model)[1]
+        units = law.model.units[law.model.n_states :] or units
+        rest = law.model.u_ss
     size = np.abs(law.gains).max(axis=(0, 2)) + 1e-300
     digits = 12 - np.ceil(np.log10(half_widths(law.u_min, law.u_max) + np.abs(rest))).astype(int)
 
     def name(i: int, theta: Array) -> str:
-        still = np.flatnonzero(np.abs(law.gains[i]).max(axis=1) <= 1e-9 * size)
-        values = [round(float(law.offsets[i][k] + rest[k]), digits[k]) + 0.0 for k in still]
-        said = [f"{names[k]} = {v:.4g} {units[k]}" for k, v in zip(still, values, strict=True)]
-        return ", ".join(map(str.strip, said)) or f"the input{'s' * (m > 1)} move{'s' * (m == 1)}"
+        constant = np.flatnonzero(np.abs(law.gains[i]).max(axis=1) <= 1e-9 * size)
+        values = {k: round(float(law.offsets[i][k] + rest[k]), digits[k]) + 0.0 for k in constant}
+        parts = [f"{names[k]} = {value:.4g} {units[k]}".strip() for k, value in values.items()]
+        return ", ".join(parts) or ("the input moves" if m == 1 else "the inputs move")
 
     return name
 
 
-def _fill(
-    axes: Axes, polygons: dict[int, Array], named: dict[str, list[int]], sizes: dict[int, float]
-) -> None:
-    """Fill polygons, those of one name in one color; what covers least has no color of its own."""
+def _fill(axes: Axes, polygons: dict[int, Array], named: dict[str, list[int]]) -> None:
+    """Fill polygons, those of one name in one color; the smallest share a gray.
+
+    Numbers are for up to 60 regions, and not for slivers.
+    """
     from matplotlib.patches import Polygon
 
+    sizes = {i: area(polygon) for i, polygon in polygons.items()}
     ranked = sorted(named, key=lambda each: -sum(sizes[i] for i in named[each]))
-    whole = sum(sizes.values())
+    others = len(ranked) - len(COLORS)
     for rank, each in enumerate(ranked):
-        own = rank < len(COLORS) or len(ranked) == len(COLORS) + 1
         color = COLORS[rank] if rank < len(COLORS) else REST
-        label = textwrap.fill(each, 34) if own else f"{len(ranked) - len(COLORS)} others"
-        if rank > len(COLORS):
+        label = textwrap.fill(each, 34)
+        if rank == len(COLORS) and others > 1:
+            label = f"{others} others"
+        elif rank > len(COLORS):
             label = "_nolegend_"
         for i in named[each]:
             patch = Polygon(
@@ -233,6 +242,5 @@ def _fill(
             patch.set(label=label, gid=str(i))
             axes.add_patch(patch)
             label = "_nolegend_"
-            if sizes[i] > SMALL * whole and len(polygons) <= MOST_NUMBERS:
-                x, y = polygons[i].mean(axis=0)
-                axes.text(x, y, str(i), ha="center", va="center", fontsize=8)
+            if sizes[i] > 0.004 * sum(sizes.values()) and len(polygons) <= 60:
+                axes.text(*polygons[i].mean(axis=0), str(i), ha="center", va="center", fontsize=8)

@@ -19,11 +19,8 @@ from sb3_yann._numba import Integers, compiled
 from sb3_yann._validation import Array
 from sb3_yann.control.polyhedra import largest_ball
 
-LEAF = 4  # a node with this many regions is not split further
-NODES = 2  # hyperplanes for each region, at most: thin regions make trees grow without bound
-DRAWS = 64  # random points for each region that tell which regions of a leaf are met most often
-CANDIDATES = 16  # facets tried at a node, drawn from those of its regions
-OVERLAP = 1e-8  # a region that passes a hyperplane by less is not on its far side
+OVERLAP = 1e-8
+"""A region that passes a hyperplane by less, in half-widths of the box, is not on its far side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,35 +47,37 @@ class SearchTree:
 
     def checked(self, n_theta: int, n_regions: int) -> SearchTree:
         """Return the tree, or raise ValueError if a search of it may leave it or those regions."""
-        nodes, leaves = self.levels.size, self.leaf_starts.size - 1
-        numbers, children = np.arange(nodes)[:, None], self.children
-        whole = (children, self.leaf_starts, self.leaf_regions)
-        sound = (
-            all(each.dtype.kind == "i" for each in whole)
+        nodes = self.levels.size
+        leaves = self.leaf_starts.size - 1
+        children, starts, regions = self.children, self.leaf_starts, self.leaf_regions
+        if not (
+            all(each.dtype.kind == "i" for each in (children, starts, regions))
             and all(each.dtype.kind == "f" for each in (self.normals, self.levels))
-            and np.all(np.isfinite(self.levels))
-            and np.all(np.isfinite(self.normals))
-            and self.leaf_starts.ndim == self.leaf_regions.ndim == 1
+            and nodes > 0
             and leaves > 0
+            and starts.ndim == regions.ndim == 1
             and self.levels.shape == (nodes,)
             and self.normals.shape == (nodes, n_theta)
             and children.shape == (nodes, 2)
-            and nodes > 0
-            and np.all(((children > numbers) & (children < nodes)) | (children < 0))
-            and np.all(children >= -leaves)
-            and self.leaf_starts[0] == 0
-            and np.all(np.diff(self.leaf_starts) >= 0)
-            and self.leaf_starts[-1] == len(self.leaf_regions)
-            and np.all((self.leaf_regions >= 0) & (self.leaf_regions < n_regions))
-        )
-        if not sound:
+            and np.all(np.isfinite(self.levels))
+            and np.all(np.isfinite(self.normals))
+            and np.all((children > np.arange(nodes)[:, None]) | (children < 0))
+            and np.all((children >= -leaves) & (children < nodes))
+            and starts[0] == 0
+            and starts[-1] == len(regions)
+            and np.all(np.diff(starts) >= 0)
+            and np.all((regions >= 0) & (regions < n_regions))
+        ):
             raise ValueError(f"its search tree does not fit {n_regions} regions")
         return self
 
 
 @dataclass(frozen=True)
 class _Polytopes:
-    """Regions by their half-spaces, row after row, and by their vertices, in a box of [-1, 1]."""
+    """Regions by their half-spaces, row after row, and by their vertices, in a box of [-1, 1].
+
+    ``middles`` are the means of the vertices, ``radii`` the largest distances from these.
+    """
 
     A: Array
     b: Array
@@ -109,26 +108,51 @@ def build_tree(
     advance : callable, optional
         Gets 1 for each region and 0 for each node; what it raises ends the work.
     """
-    center, half = (theta_max + theta_min) / 2, (theta_max - theta_min) / 2
-    regions = _polytopes(A * half, b - A @ center, np.append(starts, len(b)), advance)
+    middle = (theta_max + theta_min) / 2
+    half = (theta_max - theta_min) / 2
+    regions = _polytopes(A * half, b - A @ middle, np.append(starts, len(b)), advance)
     random = np.random.default_rng(0)
-    tree = _grow(regions, random, advance)
+    tree = _split_all(regions, random, advance)
     if not len(tree.levels):  # regions that no hyperplane parts
         return tree
-    in_box, leaf_regions = tree.normals / half, _often_first(tree, regions, random)
-    in_all = tree.levels + in_box @ center
-    return replace(tree, normals=in_box, levels=in_all, leaf_regions=leaf_regions)
+    ordered = _most_frequent_first(tree, regions, random)
+    normals = tree.normals / half
+    levels = tree.levels + normals @ middle
+    return replace(tree, normals=normals, levels=levels, leaf_regions=ordered)
 
 
-def _grow(
+def _polytopes(
+    A: Array, b: Array, row_starts: Integers, advance: Callable[[int], None]
+) -> _Polytopes:
+    length = np.linalg.norm(A, axis=1)
+    length[length == 0] = 1.0
+    A = A / length[:, None]
+    b = b / length
+    corners = []
+    for first, last in pairwise(row_starts):
+        corners.append(vertices(A[first:last], b[first:last]))
+        advance(1)
+    counts = np.array([len(each) for each in corners])
+    vertex_starts = np.append(0, np.cumsum(counts, dtype=np.int64))
+    points = np.ascontiguousarray(np.concatenate(corners))
+    middles = np.add.reduceat(points, vertex_starts[:-1]) / counts[:, None]
+    distance = np.linalg.norm(points - np.repeat(middles, counts, axis=0), axis=1)
+    radii = np.maximum.reduceat(distance, vertex_starts[:-1])
+    return _Polytopes(A, b, row_starts, points, vertex_starts, middles, radii)
+
+
+def _split_all(
     regions: _Polytopes, random: np.random.Generator, advance: Callable[[int], None]
 ) -> SearchTree:
-    """Return a tree whose nodes are split until few regions, or too many nodes, are left."""
+    """Return a tree whose nodes are split until four regions, or too many nodes, are left.
+
+    Thin regions make trees grow without bound: two nodes for each region are the most.
+    """
     p, n = regions.middles.shape
     rows: list[int] = []
     children: list[list[int]] = []
     leaves: list[Integers] = []
-    # The fullest node first, and of those the oldest: a number, its parent and side.
+    # The fullest node first, and of those the oldest: a number, its regions, its parent and side.
     waiting: list[tuple[int, int, Integers, int, int]] = [
         (-p, 0, np.arange(p, dtype=np.int64), -1, 0)
     ]
@@ -136,7 +160,7 @@ def _grow(
     while waiting:
         advance(0)
         _, _, inside, parent, side = heappop(waiting)
-        full = len(rows) >= NODES * p or len(inside) <= LEAF
+        full = len(rows) >= 2 * p or len(inside) <= 4
         split = None if full else _best_split(regions, inside, random)
         if parent >= 0:
             children[parent][side] = -1 - len(leaves) if split is None else len(rows)
@@ -158,90 +182,21 @@ def _grow(
     )
 
 
-def _often_first(tree: SearchTree, regions: _Polytopes, random: np.random.Generator) -> Integers:
-    """Return the regions of all leaves, in each of them those first that hold most of its points.
-
-    Points are drawn all over the box, and for small regions in each of them.
-    """
-    p, n = regions.middles.shape
-    everywhere = random.uniform(-1, 1, (DRAWS * p, n))
-    which = np.repeat(np.arange(p), DRAWS // 8)
-    first, last = regions.vertex_starts[which], regions.vertex_starts[which + 1]
-    corners = regions.vertices[random.integers(first, last, (n + 1, len(which)))]
-    within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
-    all_over, in_each = np.zeros((2, len(tree.leaf_regions)), np.int64)
-    half_spaces = regions.A, regions.b, regions.row_starts
-    for points, hits in ((everywhere, all_over), (within, in_each)):
-        _hits(*(*vars(tree).values(), *half_spaces, points, hits))
-    leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
-    order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
-    return np.ascontiguousarray(tree.leaf_regions[order])
-
-
-@compiled(
-    "void(float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
-    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1], int64[::1])"
-)
-def _hits(
-    normals: Array,
-    levels: Array,
-    children: Integers,
-    leaf_starts: Integers,
-    leaf_regions: Integers,
-    A: Array,
-    b: Array,
-    row_starts: Integers,
-    points: Array,
-    hits: Integers,
-) -> None:
-    """Count for each entry of ``leaf_regions`` the points that it is the first one to hold."""
-    for each in range(len(points)):
-        point, node = points[each], 0
-        while node >= 0:
-            above = np.dot(normals[node], point) > levels[node]
-            node = children[node, 1 if above else 0]
-        for k in range(leaf_starts[-1 - node], leaf_starts[-node]):
-            i = leaf_regions[k]
-            inside = True
-            for row in range(row_starts[i], row_starts[i + 1]):
-                inside = np.dot(A[row], point) <= b[row]
-                if not inside:
-                    break
-            if inside:
-                hits[k] += 1
-                break
-
-
-def _polytopes(
-    A: Array, b: Array, row_starts: Integers, advance: Callable[[int], None]
-) -> _Polytopes:
-    length = np.linalg.norm(A, axis=1)
-    length[length == 0] = 1.0
-    A, b = A / length[:, None], b / length
-    corners = []
-    for i, j in pairwise(row_starts):
-        corners.append(vertices(A[i:j], b[i:j]))
-        advance(1)
-    counts = np.array([len(each) for each in corners])
-    vertex_starts = np.append(0, np.cumsum(counts, dtype=np.int64))
-    points = np.ascontiguousarray(np.concatenate(corners))
-    middles = np.add.reduceat(points, vertex_starts[:-1]) / counts[:, None]
-    distance = np.linalg.norm(points - np.repeat(middles, counts, axis=0), axis=1)
-    radii = np.maximum.reduceat(distance, vertex_starts[:-1])
-    return _Polytopes(A, b, row_starts, points, vertex_starts, middles, radii)
-
-
 def _best_split(
     regions: _Polytopes, inside: Integers, random: np.random.Generator
 ) -> tuple[int, Integers, Integers] | None:
-    """Return a row of A and the regions on either side, None where no row parts them."""
-    chosen = random.choice(inside, min(CANDIDATES, len(inside)), replace=False)
-    first, last = regions.row_starts[chosen], regions.row_starts[chosen + 1]
-    rows = random.integers(np.tile(first, 2), np.tile(last, 2))
+    """Return a row of A and the regions on either side, None where no row parts them.
+
+    Of 32 facets drawn from up to 16 regions it is the one that leaves the smaller halves.
+    """
+    chosen = random.choice(inside, min(16, len(inside)), replace=False)
+    first = np.tile(regions.row_starts[chosen], 2)
+    rows = random.integers(first, np.tile(regions.row_starts[chosen + 1], 2))
     sides = np.empty((len(rows), len(inside)), np.uint8)
     shapes = regions.vertices, regions.vertex_starts, regions.middles, regions.radii
     _sides(*shapes, inside, regions.A[rows], regions.b[rows], sides)
-    below, above = (sides & 1).sum(axis=1), (sides >> 1).sum(axis=1)
+    below = (sides & 1).sum(axis=1)
+    above = (sides >> 1).sum(axis=1)
     larger = np.maximum(below, above)
     best = int(np.lexsort((below + above, larger))[0])
     if larger[best] >= len(inside):
@@ -284,6 +239,64 @@ def _sides(
             sides[c, k] = side if side else 3
 
 
+def _most_frequent_first(
+    tree: SearchTree, regions: _Polytopes, random: np.random.Generator
+) -> Integers:
+    """Return the regions of all leaves, in each of them those first that hold most of its points.
+
+    Points are drawn all over the box, 64 for each region, and for small regions 8 in each of them.
+    """
+    p, n = regions.middles.shape
+    everywhere = random.uniform(-1, 1, (64 * p, n))
+    which = np.repeat(np.arange(p), 8)
+    first = regions.vertex_starts[which]
+    last = regions.vertex_starts[which + 1]
+    corners = regions.vertices[random.integers(first, last, (n + 1, len(which)))]
+    within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
+    hits = []
+    for points in (everywhere, within):
+        hits.append(np.zeros(len(tree.leaf_regions), np.int64))
+        half_spaces = regions.A, regions.b, regions.row_starts
+        _count_hits(*vars(tree).values(), *half_spaces, points, hits[-1])
+    all_over, in_each = hits
+    leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
+    order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
+    return np.ascontiguousarray(tree.leaf_regions[order])
+
+
+@compiled(
+    "void(float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
+    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1], int64[::1])"
+)
+def _count_hits(
+    normals: Array,
+    levels: Array,
+    children: Integers,
+    leaf_starts: Integers,
+    leaf_regions: Integers,
+    A: Array,
+    b: Array,
+    row_starts: Integers,
+    points: Array,
+    hits: Integers,
+) -> None:
+    """Count for each entry of ``leaf_regions`` the points that it is the first one to hold."""
+    for point in points:
+        node = 0
+        while node >= 0:
+            node = children[node, 1 if np.dot(normals[node], point) > levels[node] else 0]
+        for k in range(leaf_starts[-1 - node], leaf_starts[-node]):
+            i = leaf_regions[k]
+            inside = True
+            for row in range(row_starts[i], row_starts[i + 1]):
+                inside = np.dot(A[row], point) <= b[row]
+                if not inside:
+                    break
+            if inside:
+                hits[k] += 1
+                break
+
+
 def vertices(A: Array, b: Array) -> Array:
     """Return the vertices (k, n) of ``{A z <= b, -1 <= z <= 1}``, rows of unit length.
 
@@ -293,8 +306,8 @@ def vertices(A: Array, b: Array) -> Array:
     rows = np.vstack([A, np.eye(n), -np.eye(n)])
     bounds = np.concatenate([b, np.ones(2 * n)])
     if n == 1:
-        up, ends = rows[:, 0] > 0, bounds / np.where(rows[:, 0] == 0, np.inf, rows[:, 0])
-        return np.array([[np.max(ends[rows[:, 0] < 0])], [np.min(ends[up])]])
+        ends = bounds / np.where(rows[:, 0] == 0, np.inf, rows[:, 0])
+        return np.array([[np.max(ends[rows[:, 0] < 0])], [np.min(ends[rows[:, 0] > 0])]])
     inner, _ = largest_ball(rows, bounds)
     try:
         found = HalfspaceIntersection(np.column_stack([rows, -bounds]), inner).intersections

@@ -17,11 +17,8 @@ HEADER = 9
 the region that a walk begins in, 0 where there is none."""
 
 ROWS = 2  # floats before the packed arrays: how far outside counts as inside, which slacks tie
-CLEAR = 1e-6  # so far from all hyperplanes on its way, what holds a point is in the leaf
 SURELY_INSIDE = 1e-9
-"""With it, no region that the tree left out, and of disjoint ones no other at all, is as good."""
-STEPS = 10_000  # of a walk at most
-BACK = 1e-9  # a region that a walk enters holds the line from there on, to rounding
+"""With this slack, no region that the tree left out, and of disjoint ones no other, is as good."""
 
 
 def pack(
@@ -48,22 +45,31 @@ def pack(
     leaves = len(numbers[1]) - 1 if numbers else 0
     header = [n, m, p, q, len(levels), leaves, *flags, 0]
     if walk is not None:  # in place of a tree: slacks at the start, and neighbors
-        header[-1], normals = 1 + walk[1], rows[:, -1] - rows[:, :-1] @ walk[2]
-        numbers = [walk[0]]
+        neighbors, first, inside = walk
+        header[-1] = 1 + first
+        normals = rows[:, -1] - rows[:, :-1] @ inside
+        numbers = [neighbors]
     floats = (np.array(tolerances), rows, gains, offsets, bounds, normals, levels)
     whole = (header, starts, [q], *numbers)
-    return np.hstack(list(map(np.ravel, floats))), np.hstack(list(map(np.ravel, whole))).astype(
-        np.int64
-    )
+    packed = np.hstack([np.ravel(each) for each in whole]).astype(np.int64)
+    return np.hstack([np.ravel(each) for each in floats]), packed
 
 
 @compiled()
-def _slack(
-    floats: Array, n: int, first: int, last: int, theta: Array, at: int, low: float
-) -> float:
-    """Return the smallest slack of rows first to last, or anything below ``low`` if it is lower."""
+def _places(whole: Integers) -> tuple[int, int, int, int]:
+    """Return where gains, offsets, bounds and what comes after them begin in the floats."""
+    gains = ROWS + whole[3] * (whole[0] + 1)
+    offsets = gains + whole[2] * whole[1] * whole[0]
+    bounds = offsets + whole[2] * whole[1]
+    return gains, offsets, bounds, bounds + 2 * whole[1]
+
+
+@compiled()
+def _slack(floats: Array, whole: Integers, region: int, theta: Array, at: int, low: float) -> float:
+    """Return the smallest slack of a region, or anything below ``low`` if it is lower."""
+    n = whole[0]
     smallest = np.inf
-    for k in range(first, last):
+    for k in range(whole[HEADER + region], whole[HEADER + region + 1]):
         row = ROWS + k * (n + 1)
         slack = floats[row + n]
         for j in range(n):
@@ -76,15 +82,30 @@ def _slack(
 
 
 @compiled()
-def _scan(floats: Array, whole: Integers, theta: Array, at: int, known: float) -> tuple[int, float]:
+def _best(
+    floats: Array,
+    whole: Integers,
+    theta: Array,
+    at: int,
+    first: int,
+    last: int,
+    listed: bool,
+    known: float,
+) -> tuple[int, float]:
     """Return the first region whose smallest slack ties with the largest, and the largest.
 
-    With the slack of some region that is ``known``, most of the others are soon passed over. Where
-    regions are disjoint, the first one that surely holds theta ends the search.
+    The regions are those from ``first`` to ``last``, or where they are ``listed``, those which
+    stand there in ``whole``. With the slack of some region that is ``known``, most of the others
+    are soon passed over. Of disjoint ones the first that surely holds theta ends the search.
     """
-    n, p, disjoint = whole[0], whole[2], whole[7] == 1
-    best, largest, low, tied = 0, -np.inf, known - floats[1] * (1 + abs(known)), False
-    for i in range(p):
+    n = whole[0]
+    disjoint = whole[7] == 1
+    best = -1 if listed else 0
+    largest = -np.inf
+    low = known - floats[1] * (1 + abs(known))
+    tied = False
+    for each in range(first, last):
+        i = whole[each] if listed else each
         smallest = np.inf
         for k in range(whole[HEADER + i], whole[HEADER + i + 1]):
             row = ROWS + k * (n + 1)
@@ -103,14 +124,15 @@ def _scan(floats: Array, whole: Integers, theta: Array, at: int, known: float) -
         if smallest > largest:
             low = max(low, smallest - floats[1] * (1 + abs(smallest)))
             tied = largest >= low
-            best, largest = i, smallest
+            best = i
+            largest = smallest
     if not tied:
         return best, largest
     nearly = largest - floats[1] * (1 + abs(largest))
-    for i in range(p):
-        first, last = whole[HEADER + i], whole[HEADER + i + 1]
-        if _slack(floats, n, first, last, theta, at, nearly) >= nearly:
-            return i, largest
+    for each in range(first, last):
+        i = whole[each] if listed else each
+        if i < best and _slack(floats, whole, i, theta, at, nearly) >= nearly:
+            best = i
     return best, largest
 
 
@@ -120,11 +142,13 @@ def _leaf(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, i
 
     With them comes the smallest distance from the hyperplanes on the way.
     """
-    n, m, p, q, nodes, leaves = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
-    normals = ROWS + q * (n + 1) + p * m * n + p * m + 2 * m
+    n = whole[0]
+    nodes = whole[4]
+    normals = _places(whole)[3]
     levels = normals + nodes * n
-    children = HEADER + p + 1
-    node, room = 0, np.inf
+    children = HEADER + whole[2] + 1
+    node = 0
+    room = np.inf
     while node >= 0:
         side = -floats[levels + node]
         for j in range(n):
@@ -132,50 +156,21 @@ def _leaf(floats: Array, whole: Integers, theta: Array, at: int) -> tuple[int, i
         room = min(room, abs(side))
         node = whole[children + 2 * node + (1 if side > 0 else 0)]
     starts = children + 2 * nodes
-    regions = starts + leaves + 1
+    regions = starts + whole[5] + 1
     return regions + whole[starts - node - 1], regions + whole[starts - node], room
 
 
 @compiled()
-def _best_of_leaf(
-    floats: Array, whole: Integers, theta: Array, at: int, first: int, last: int
-) -> tuple[int, float]:
-    """Return what `_scan` does, of the regions of a leaf: those met most often come first."""
-    n, disjoint = whole[0], whole[7] == 1
-    best, largest, low, tied = -1, -np.inf, -np.inf, False
-    for k in range(first, last):
-        i = whole[k]
-        slack = _slack(floats, n, whole[HEADER + i], whole[HEADER + i + 1], theta, at, low)
-        if slack < low:
-            continue
-        if disjoint and slack >= SURELY_INSIDE:
-            return i, slack
-        tied = True
-        if slack > largest:
-            low = max(low, slack - floats[1] * (1 + abs(slack)))
-            tied = largest >= low
-            best, largest = i, slack
-    if not tied:
-        return best, largest
-    nearly = largest - floats[1] * (1 + abs(largest))
-    for k in range(first, last):
-        i = whole[k]
-        rows = whole[HEADER + i], whole[HEADER + i + 1]
-        if i < best and _slack(floats, n, rows[0], rows[1], theta, at, nearly) >= nearly:
-            best = i
-    return best, largest
-
-
-@compiled()
-def _walked(floats: Array, whole: Integers, theta: Array, at: int) -> int:
+def walk_to(floats: Array, whole: Integers, theta: Array, at: int) -> int:
     """Return the region where a line from the start of the walk ends, or where it gets lost."""
-    n, m, p, q = whole[0], whole[1], whole[2], whole[3]
-    at_start = ROWS + q * (n + 1) + p * m * n + p * m + 2 * m
-    neighbors = HEADER + p + 1
+    n = whole[0]
+    at_start = _places(whole)[3]
+    neighbors = HEADER + whole[2] + 1
     region: int = whole[8] - 1
     reached = 0.0
-    for _ in range(STEPS):
-        leaves, out = np.inf, -1
+    for _ in range(10_000):
+        leaves = np.inf
+        out = -1
         for k in range(whole[HEADER + region], whole[HEADER + region + 1]):
             row = ROWS + k * (n + 1)
             slack = floats[row + n]
@@ -184,12 +179,13 @@ def _walked(floats: Array, whole: Integers, theta: Array, at: int) -> int:
             if slack < 0 and slack < floats[at_start + k]:
                 there = floats[at_start + k] / (floats[at_start + k] - slack)
                 if there < leaves:
-                    leaves, out = there, k
-        if out < 0:
+                    leaves = there
+                    out = k
+        # A region that the walk enters holds the line from there on, to rounding.
+        if out < 0 or leaves < reached - 1e-9 or whole[neighbors + out] < 0:
             return region
-        if leaves < reached - BACK or whole[neighbors + out] < 0:
-            return region
-        region, reached = whole[neighbors + out], max(reached, leaves)
+        region = whole[neighbors + out]
+        reached = max(reached, leaves)
     return region
 
 
@@ -201,29 +197,26 @@ def _choose(
 
     Region ``near``, if that is not negative, is asked first: of disjoint ones no other is as good.
     """
-    n = whole[0]
-    for j in range(n):
+    for j in range(whole[0]):
         if not np.isfinite(theta[at, j]):
             return -1, np.nan
-    known = -np.inf
     if near >= 0 and whole[7] == 1:
-        first, last = whole[HEADER + near], whole[HEADER + near + 1]
-        known = _slack(floats, n, first, last, theta, at, SURELY_INSIDE)
-        if known >= SURELY_INSIDE:
-            return near, known
-        known = -np.inf
+        inside = _slack(floats, whole, near, theta, at, SURELY_INSIDE)
+        if inside >= SURELY_INSIDE:
+            return near, inside
+    known = -np.inf
     if whole[8] > 0:
-        region = _walked(floats, whole, theta, at)
-        first, last = whole[HEADER + region], whole[HEADER + region + 1]
-        known = _slack(floats, n, first, last, theta, at, -np.inf)
+        region = walk_to(floats, whole, theta, at)
+        known = _slack(floats, whole, region, theta, at, -np.inf)
         if known >= SURELY_INSIDE:
             return region, known
     elif whole[4] > 0:
         first, last, room = _leaf(floats, whole, theta, at)
-        best, known = _best_of_leaf(floats, whole, theta, at, first, last)
-        if known >= SURELY_INSIDE or (known >= -floats[1] and room > CLEAR):
+        best, known = _best(floats, whole, theta, at, first, last, True, -np.inf)
+        # So far from all hyperplanes on its way, what holds a point is in the leaf.
+        if known >= SURELY_INSIDE or (known >= -floats[1] and room > 1e-6):
             return best, known
-    return _scan(floats, whole, theta, at, known)
+    return _best(floats, whole, theta, at, 0, whole[2], False, known)
 
 
 @compiled()
@@ -235,14 +228,13 @@ def input_at(
     Region ``near`` is asked first. Functions take the array and the row: numba counts references to
     a row of its own.
     """
-    n, m, p, q = whole[0], whole[1], whole[2], whole[3]
-    region, largest = _choose(floats, whole, theta, at, near)
+    n = whole[0]
+    m = whole[1]
+    region, inside = _choose(floats, whole, theta, at, near)
     if region < 0:
         return -1
-    gains = ROWS + q * (n + 1)
-    offsets = gains + p * m * n
-    bounds = offsets + p * m
-    zero = whole[6] == 1 and largest < -floats[0]
+    gains, offsets, bounds, _ = _places(whole)
+    zero = whole[6] == 1 and inside < -floats[0]
     for k in range(m):
         u = 0.0
         if not zero:
@@ -262,18 +254,17 @@ def slopes_at(
 
     They are zero where the input is clipped, and where it is zero as the MPC has no solution.
     """
-    n, m, p, q = whole[0], whole[1], whole[2], whole[3]
-    gains = ROWS + q * (n + 1)
-    offsets = gains + p * m * n
-    bounds = offsets + p * m
-    first, last = whole[HEADER + region], whole[HEADER + region + 1]
-    zero = whole[6] == 1 and _slack(floats, n, first, last, theta, at, -np.inf) < -floats[0]
+    n = whole[0]
+    m = whole[1]
+    gains, offsets, bounds, _ = _places(whole)
+    zero = whole[6] == 1 and _slack(floats, whole, region, theta, at, -np.inf) < -floats[0]
     for k in range(m):
         value = floats[offsets + region * m + k]
         for j in range(n):
             value += floats[gains + (region * m + k) * n + j] * theta[at, j]
         value = 0.0 if zero else value
-        low, high = floats[bounds + k], floats[bounds + m + k]
+        low = floats[bounds + k]
+        high = floats[bounds + m + k]
         for j in range(n):
             free = not zero and low < value < high
             slopes[k, j] = floats[gains + (region * m + k) * n + j] if free else 0.0

@@ -1,0 +1,1 @@
+"""Compiled loops: linear programs over regions, the search for a region, the online program."""

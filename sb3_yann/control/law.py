@@ -1,0 +1,445 @@
+"""Piecewise affine laws on polyhedral regions, and what every law knows of its plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from functools import cached_property, partial
+from os import PathLike, fspath
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann._archive import read_arrays, write_arrays
+from sb3_yann._validation import (
+    Array,
+    ReadOnlyArrays,
+    check_array,
+    check_bool,
+    check_bounds,
+    check_choice,
+    to_float,
+)
+from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.polyhedra import largest_ball
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from typing_extensions import Self
+
+    from sb3_yann.control.search_tree import SearchTree
+
+T = TypeVar("T")
+INFEASIBLE = ("nearest_region", "zero_input")
+
+
+class PlantLaw(ReadOnlyArrays):
+    """A law of theta with what it knows of its plant, which is saved with it.
+
+    Equality ignores the plant.
+
+    Attributes
+    ----------
+    model : LinearModel or None
+        With operating point, dt, names and units. None for a law that was built by hand.
+    theta_ss : ndarray, shape (n_theta,), or None
+        Theta at the operating point, as the plant shows it: of a state its x_ss.
+    """
+
+    # The class is no dataclass: these are no fields of a law.
+    model: LinearModel | None = None
+    theta_ss: Array | None = None
+    # What a file should hold, for a message.
+    _kind = "a law"
+
+    if TYPE_CHECKING:
+
+        @property
+        def n_theta(self) -> int:
+            """Number of parameters."""
+
+        @property
+        def n_inputs(self) -> int:
+            """Number of inputs."""
+
+        def __getstate__(self) -> dict[str, Any]:
+            """Return what a copy keeps."""
+
+        def __call__(self, theta: ArrayLike) -> Array:
+            """Return the input, both in deviations."""
+
+    def on_plant(self, model: LinearModel, theta_ss: ArrayLike) -> Self:
+        """Return the same law with its plant; theta_ss is (n_theta,)."""
+        law = object.__new__(type(self))
+        own = {"model": model, "theta_ss": np.array(theta_ss, np.float64)}
+        law.__setstate__({**self.__getstate__(), **own})
+        return law
+
+    def plant_input(self, shown: ArrayLike) -> Array:
+        """Return the input as the plant takes it, for theta as the plant shows it.
+
+        Parameters
+        ----------
+        shown : array_like, shape (n_theta,) or (batch, n_theta)
+            References, disturbances and the previous input count from the plant's zero too.
+
+        Raises
+        ------
+        ValueError
+            If the law knows no plant.
+
+        Examples
+        --------
+        >>> from sb3_yann.control import LinearMPC
+        >>> tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
+        >>> weights = {"Q": [[1]], "R": [[1]], "horizon": 3}
+        >>> limits = {"x_min": 0, "x_max": 20, "u_min": 0, "u_max": 10, "absolute": True}
+        >>> law = LinearMPC(tank, **weights, **limits).explicit()
+        >>> law.plant_input([12.0])
+        array([3.])
+        """
+        if self.model is None or self.theta_ss is None:
+            raise ValueError(
+                "The law knows no operating point: it was built by hand. Take it from "
+                "LinearMPC.explicit() or online(), or use u_ss + law(shown - theta_ss)."
+            )
+        values = to_float("shown", shown)
+        if values.shape[-1:] != self.theta_ss.shape:
+            size = len(self.theta_ss)
+            raise ValueError(
+                f"shown has shape {values.shape}, expected ({size},) or (batch, {size})."
+            )
+        return np.asarray(self(values - self.theta_ss) + self.model.u_ss)
+
+    def plot(self, axes: Axes | None = None, **options: Any) -> Axes:
+        """Draw the regions by :func:`~sb3_yann.control.law_plot.plot_law`; return the axes.
+
+        Options are those of that function: ``entries``, ``at``, ``labels``, ``name``. A law that is
+        solved online has no regions, and is a ValueError.
+        """
+        from sb3_yann.control.law_plot import plot_law
+
+        return plot_law(self, axes, **options)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the law to ``path`` as an ``.npz`` file of plain arrays.
+
+        Its plant goes along, and a search tree if there is one.
+        """
+        write_arrays(path, self._arrays())
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read a law that :meth:`save` wrote, to the bit; nothing of the file is executed.
+
+        OSError if the file cannot be read; ValueError if it holds no law, or was changed since it
+        was written.
+        """
+        return read_law(cls._kind, path, cls._from_arrays)
+
+    def _arrays(self) -> dict[str, Any]:
+        """Return the law and its plant as arrays by name."""
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
+        if self.model is not None:
+            arrays["theta_ss"] = self.theta_ss
+            arrays |= {f"model_{name}": value for name, value in vars(self.model).items()}
+        return arrays
+
+    @classmethod
+    def _from_arrays(cls, data: dict[str, Any]) -> Self:
+        """Return the law of such arrays; what is missing or damaged raises some error."""
+        own = {each.name: data[each.name] for each in fields(cls)}  # type: ignore[arg-type]
+        law = cls(**{name: each if each.ndim else each.item() for name, each in own.items()})
+        law._restore(data)
+        if not any(name == "theta_ss" or name.startswith("model_") for name in data):
+            return law
+        given = {each.name: data[f"model_{each.name}"] for each in fields(LinearModel)}
+        for name in ("notes", "state_names", "input_names", "units", "estimated"):
+            given[name] = given[name].tolist()
+        model = LinearModel(**{**given, "dt": float(given["dt"])})
+        if model.n_inputs != law.n_inputs or model.n_states > law.n_theta:
+            raise ValueError(f"its model has {model.n_states} states and {model.n_inputs} inputs")
+        return law.on_plant(model, check_array("theta_ss", data["theta_ss"], (law.n_theta,)))
+
+    def _restore(self, data: dict[str, Any]) -> None:
+        """Take over what a file holds besides."""
+
+    def __deepcopy__(self, memo: object = None) -> Self:
+        """Return the law itself: nothing of it can change."""
+        return self
+
+    __copy__ = __deepcopy__
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewiseAffine(PlantLaw):
+    """The law ``u = gains[i] theta + offsets[i]`` for theta in region i, total and bounded.
+
+    The region at theta is the one whose smallest slack ``b - A theta`` is largest, the first of
+    them on a tie: a region that holds theta, or the one that theta violates least. Where the MPC
+    has no solution, ``infeasible`` decides:
+
+    - ``"nearest_region"``: the affine law of that region, clipped to the input bounds.
+    - ``"zero_input"``: no deviation of the input, clipped to the bounds, as in Braniff & Tian. It
+      jumps at the border of the feasible set.
+
+    Attributes
+    ----------
+    gains : ndarray, shape (p, m, n)
+    offsets : ndarray, shape (p, m)
+    A : ndarray, shape (q, n)
+        Half-spaces ``A theta <= b``, region after region. Slacks are in half-widths of the box.
+    b : ndarray, shape (q,)
+    starts : ndarray of int, shape (p,)
+        The first row of each region in ``A``.
+    u_min, u_max : ndarray, shape (m,)
+        Bounds of the input, infinite where there is none.
+    theta_min, theta_max : ndarray, shape (n,)
+        The box for which the law was solved; a network scales its inputs by it.
+    infeasible : {"nearest_region", "zero_input"}
+    disjoint : bool, default False
+        That no two regions share an interior, which is not checked. The search then ends at the
+        first region that holds theta.
+    neighbors : ndarray of int, shape (q,), optional
+        The region beyond each half-space, -1 where none is known. Disjoint regions that are many
+        are then found by a walk along a line, without a tree. Empty where there is no region known.
+
+    Examples
+    --------
+    >>> law = PiecewiseAffine(
+    ...     gains=[[[-2.0]]], offsets=[[0.0]], A=[[1.0], [-1.0]], b=[1.0, 1.0], starts=[0],
+    ...     u_min=[-1.0], u_max=[1.0], theta_min=[-1.0], theta_max=[1.0],
+    ... )
+    >>> law([0.25]), law([3.0])
+    (array([-0.5]), array([-1.]))
+    """
+
+    gains: Array
+    offsets: Array
+    A: Array
+    b: Array
+    starts: NDArray[np.int64]
+    u_min: Array
+    u_max: Array
+    theta_min: Array
+    theta_max: Array
+    infeasible: str = "nearest_region"
+    disjoint: bool = False
+    neighbors: NDArray[np.int64] = field(
+        default_factory=lambda: np.empty(0, np.int64), compare=False
+    )
+
+    # So far outside a point still counts as inside: facets of neighbors agree to rounding only.
+    tolerance = 1e-8
+    # Slacks that differ by less, relative to 1 + their size, tie. Outside the feasible set whole
+    # areas violate two neighbors alike: rounding must not choose.
+    tie_tolerance = 1e-12
+    _kind = "a PiecewiseAffine"
+
+    def __post_init__(self) -> None:
+        """Check the arrays against each other and store them as read-only float64."""
+        gains = check_array("gains", self.gains, ("p", "m", "n"))
+        p, m, n = gains.shape
+        A = check_array("A", self.A, ("q", n))
+        values = {"gains": gains, "A": A, "b": check_array("b", self.b, (len(A),))}
+        values["offsets"] = check_array("offsets", self.offsets, (p, m))
+        values |= bounds_of(self, m, n)
+        check_choice("infeasible", self.infeasible, INFEASIBLE)
+        check_bool("disjoint", self.disjoint)
+        rows = check_array("starts", self.starts, (p,))
+        if p == 0 or rows[0] != 0 or np.any(np.diff([*rows, len(A)]) < 1) or np.any(rows % 1):
+            raise ValueError(
+                f"starts = {rows.tolist()} must be the first row of each region in A, which has "
+                f"{len(A)} rows: whole numbers that increase from 0 on."
+            )
+        beyond = np.asarray(self.neighbors)
+        known = beyond.shape == (len(A),) and beyond.dtype.kind == "i"
+        if beyond.size and not (known and np.all((beyond >= -1) & (beyond < p))):
+            raise ValueError(
+                f"neighbors must be {len(A)} whole numbers, one for each row of A, from -1 to "
+                f"{p - 1}, or none at all."
+            )
+        self._store(**values, starts=rows.astype(np.int64), neighbors=beyond.astype(np.int64))
+
+    @property
+    def n_regions(self) -> int:
+        """Number of regions p."""
+        return len(self.starts)
+
+    @property
+    def n_halfspaces(self) -> int:
+        """Number of half-spaces q of all regions together."""
+        return len(self.b)
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters n."""
+        return int(self.gains.shape[2])
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs m."""
+        return int(self.gains.shape[1])
+
+    def __call__(self, theta: ArrayLike) -> Array:
+        """Return the input: (m,) for theta of shape (n,), (batch, m) for (batch, n)."""
+        # The short way: real numbers, none masked, in one row as compiled code takes them.
+        if type(theta) is np.ndarray and theta.ndim == 1:
+            if theta.dtype.kind in "fiu" and theta.flags.carray:
+                u = np.empty(len(self.u_min))
+                if self._at(theta.astype(np.float64, copy=False), u):
+                    return u
+        from sb3_yann.control._kernels.law import law_of_batch
+
+        points, rows = as_points(theta, self.n_theta)
+        inputs = np.empty((len(rows), self.n_inputs))
+        law_of_batch(*self.packed, rows, inputs)
+        return inputs if points.ndim == 2 else inputs[0]
+
+    def locate(self, theta: ArrayLike) -> NDArray[np.int64]:
+        """Return the index of the region in use at theta, one for each row of a batch."""
+        return self._located(theta)[0]
+
+    def gain(self, theta: ArrayLike) -> Array:
+        """Return the gain in use, (m, n) at theta (n,) or (batch, m, n), before bounds clip it."""
+        return np.asarray(self.gains[self.locate(theta)])
+
+    def in_domain(self, theta: ArrayLike) -> NDArray[np.bool_]:
+        """Tell whether the MPC has a solution at theta, for each row of a batch."""
+        return np.asarray(self._located(theta)[1] >= -self.tolerance)
+
+    def _located(self, theta: ArrayLike) -> tuple[NDArray[np.int64], Array]:
+        """Return the region in use and how far inside it each point lies, negative outside."""
+        from sb3_yann.control._kernels.law import locate_batch
+
+        points, rows = as_points(theta, self.n_theta)
+        region, inside = np.empty(len(rows), np.int64), np.empty(len(rows))
+        locate_batch(*self.packed, rows, region, inside)
+        return region.reshape(points.shape[:-1]), inside.reshape(points.shape[:-1])
+
+    @cached_property
+    def tree(self) -> SearchTree | None:
+        """The tree that finds a region; None for so few that a scan is as fast, or for a walk."""
+        return self.grow_tree()
+
+    def grow_tree(self, advance: Callable[[int], None] = lambda count: None) -> SearchTree | None:
+        """Build the tree now, so that no call does, and return it.
+
+        ``advance`` gets 1 for each region and 0 for each node; what it raises ends the work.
+        """
+        bounded = np.all(np.isfinite([self.theta_min, self.theta_max]))
+        tree = None
+        # With more than ten parameters regions have too many vertices.
+        if self.n_regions > 4 and self.n_theta <= 10 and bounded and not self.walks:
+            from sb3_yann.control.search_tree import build_tree
+
+            box = self.theta_min, self.theta_max
+            tree = build_tree(self.A, self.b, self.starts, *box, advance)
+            if not len(tree.levels):  # no hyperplane parts these regions
+                tree = None
+        vars(self)["tree"] = tree
+        return tree
+
+    @property
+    def walks(self) -> bool:
+        """Whether a region is found by a walk from region to region.
+
+        With more than three parameters a tree takes longer to build than the law to solve.
+        """
+        return self.n_regions > 4 and self.n_theta > 3 and self.disjoint and self.neighbors.size > 0
+
+    @cached_property
+    def packed(self) -> tuple[Array, NDArray[np.int64]]:
+        """The law as two arrays for compiled code, see `_kernels.law.pack`."""
+        from sb3_yann.control._kernels.law import pack
+
+        return pack(
+            self.gains,
+            self.offsets,
+            np.column_stack([self.A, self.b]),
+            self.starts,
+            np.stack([self.u_min, self.u_max]),
+            (self.tolerance, self.tie_tolerance),
+            (self.infeasible == "zero_input", self.disjoint),
+            tuple(vars(self.tree).values()) if self.tree else (),
+            (self.neighbors, *self.start_of_walk()) if self.walks else None,
+        )
+
+    def start_of_walk(self) -> tuple[int, Array]:
+        """Return the region at the middle of the box, and a point inside it."""
+        middle = (self.theta_max + self.theta_min) / 2
+        half = (self.theta_max - self.theta_min) / 2
+        first = int(np.argmax(np.minimum.reduceat(self.b - self.A @ middle, self.starts)))
+        rows = slice(self.starts[first], [*self.starts, len(self.b)][first + 1])
+        inside, _ = largest_ball(self.A[rows] * half, self.b[rows] - self.A[rows] @ middle)
+        return first, middle + half * inside
+
+    @cached_property
+    def _at(self) -> Callable[[Any, Array], bool]:
+        from sb3_yann.control._kernels.law import law_at
+
+        return partial(law_at, *self.packed)
+
+    def _arrays(self) -> dict[str, Any]:
+        tree = {} if self.tree is None else vars(self.tree)
+        return {**super()._arrays(), **{f"tree_{name}": each for name, each in tree.items()}}
+
+    def _restore(self, data: dict[str, Any]) -> None:
+        tree = {name[5:]: each for name, each in data.items() if name.startswith("tree_")}
+        if tree:
+            from sb3_yann.control.search_tree import SearchTree
+
+            vars(self)["tree"] = SearchTree(**tree).checked(self.n_theta, self.n_regions)
+
+    def __hash__(self) -> int:
+        """Return a hash that equal laws share."""
+        return hash((self.gains.tobytes(), self.b.tobytes(), self.infeasible))
+
+    def __repr__(self) -> str:
+        """Name the sizes."""
+        law = f"regions={self.n_regions}, halfspaces={self.n_halfspaces}, theta={self.n_theta}"
+        return f"PiecewiseAffine({law}, inputs={self.n_inputs}, infeasible={self.infeasible!r})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was compiled for this process; the tree goes along, as in :meth:`save`."""
+        _ = self.tree
+        return {name: each for name, each in vars(self).items() if name not in ("packed", "_at")}
+
+
+def read_law(kind: str, path: str | PathLike[str], build: Callable[[dict[str, Any]], T]) -> T:
+    """Return what ``build`` makes of the arrays of a law's file, which should hold a ``kind``.
+
+    OSError if it cannot be read; ValueError if nothing can be built from it, whatever is wrong.
+    """
+    try:
+        return build(read_arrays(path))
+    except OSError:
+        raise
+    except Exception as error:  # a stranger's arrays raise nearly anything
+        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(
+            f"{fspath(path)} does not hold {kind} ({what or type(error).__name__}). Write it with "
+            "law.save(path)."
+        ) from None
+
+
+def as_points(theta: ArrayLike, n: int) -> tuple[Array, Array]:
+    """Return theta as checked numbers (n,) or (batch, n), and as contiguous rows of a batch."""
+    points = to_float("theta", theta)
+    if points.ndim not in (1, 2) or points.shape[-1] != n:
+        raise ValueError(f"theta has shape {points.shape}, expected ({n},) or (batch, {n}).")
+    rows = np.ascontiguousarray(np.atleast_2d(points))
+    if not np.all(np.isfinite(rows)):
+        bad = rows[~np.all(np.isfinite(rows), axis=1)][0]
+        raise ValueError(
+            f"theta holds NaN or infinite entries, {bad.tolist()}; the law is defined for numbers."
+        )
+    return points, rows
+
+
+def bounds_of(law: Any, m: int, n: int) -> dict[str, Array]:
+    """Return the checked bounds of a law's inputs (m,) and its box (n,) by name."""
+    u_min, u_max = check_bounds("u", law.u_min, law.u_max, m)
+    theta_min, theta_max = check_bounds("theta", law.theta_min, law.theta_max, n)
+    return {"u_min": u_min, "u_max": u_max, "theta_min": theta_min, "theta_max": theta_max}

@@ -1,1 +1,0 @@
-"""Piecewise affine laws and the search for a region."""
