@@ -101,6 +101,14 @@ def spectral_radius(matrix: Array) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(matrix))))
 
 
+def long_horizon(A: Array, horizon: int) -> str:
+    """Return in words what loses digits: a horizon and the fastest pole."""
+    poles = np.linalg.eigvals(A)
+    pole = poles[np.argmax(np.abs(poles))]
+    shown = pole if pole.imag else pole.real
+    return f"With horizon = {horizon} and the pole {shown:.6g} of the model"
+
+
 def unreached(A: Array, B: Array) -> complex | None:
     """Return a pole that does not decay and that no input reaches (Hautus' test), None for none."""
     for pole in np.linalg.eigvals(A):

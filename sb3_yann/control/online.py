@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from sb3_yann._validation import Array, check_array, check_choice, check_int, half_widths
+from sb3_yann.control import lqr
 from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
 from sb3_yann.control.explicit.steep import SteepQP, solvable
 from sb3_yann.control.law import INFEASIBLE, PlantLaw, as_points, bounds_of
@@ -186,7 +188,29 @@ class OnlineLaw(PlantLaw):
     @cached_property
     def known(self) -> KnownPoints:
         """The law as a function of contiguous rows (batch, n), with what it remembers."""
-        return KnownPoints(lambda rows: self._answers(rows)[0], self.n_inputs)
+        return KnownPoints(self._inputs, self.n_inputs)
+
+    def _inputs(self, rows: Array) -> Array:
+        """Return the inputs (batch, m) at rows of theta, and warn where rounding hides the law."""
+        u, feasible, _, _ = self._answers(rows)
+        if self.n_slacks and not feasible.all() and np.any(self.feedback):
+            self._warn_beyond_reach(rows[~feasible])
+        return u
+
+    def _warn_beyond_reach(self, rows: Array) -> None:
+        """Warn of rows in the box at which soft bounds give way, but no answer is certain."""
+        inside = np.all((rows >= self.theta_min) & (rows <= self.theta_max), axis=1)
+        if self.model is None or not inside.any():
+            return
+        steps = (len(self.c) - self.n_slacks) // self.n_inputs
+        warnings.warn(
+            f"{lqr.long_horizon(self.model.A, steps)}, no solution was found at theta = "
+            f"{rows[inside][0].tolist()}: no input brings the model back from there, or a hard "
+            "bound cannot be kept. Predictions run away, and rounding hides the law. The input is "
+            "bounded, but not the MPC's; law.in_domain is False. Give theta_min and theta_max the "
+            "states from which inputs bring it back, or pass a shorter horizon.",
+            stacklevel=4,
+        )
 
     def _answers(self, rows: Array) -> tuple[Array, NDArray[np.bool_], Answers, Answers | None]:
         """Return inputs, what is feasible, the answers, and those of infeasible rows softened."""
@@ -237,7 +261,19 @@ class OnlineLaw(PlantLaw):
         found.sizes[at] = len(members)
         found.active[at, : len(members)] = members
         u[:] = self.program.first_input(reach * U, theta, len(u))
+        # Where an unstable model runs away U is huge, and the sum has few digits left.
+        for bound, first in zip((self.u_max, self.u_min), self._first_rows, strict=True):
+            np.copyto(u, bound, where=np.isin(first, self.dual.rows[members]))
         return True
+
+    @cached_property
+    def _first_rows(self) -> Integers:
+        """Rows (2, m) of the upper and lower bounds of the first inputs; -1 where there is none."""
+        finite = np.isfinite([self.u_max, self.u_min])
+        steps = (len(self.c) - self.n_slacks) // self.n_inputs
+        before = steps * np.array([[0], [finite[0].sum()]])
+        known = finite & (self.n_input_rows == steps * finite.sum())
+        return np.where(known, before + np.cumsum(finite, axis=1) - 1, -1)
 
     def _gain(self, active: Integers) -> Array:
         """Return the gain (m, n) of an active set; of a steep program from its KKT equations."""
@@ -261,7 +297,7 @@ class OnlineLaw(PlantLaw):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what follows from the rest, and what is remembered."""
-        derived = ("dual", "known", "program", "scaled", "half")
+        derived = ("dual", "known", "program", "scaled", "half", "_first_rows")
         return {name: each for name, each in vars(self).items() if name not in derived}
 
 
@@ -333,7 +369,8 @@ class DualProgram:
         by_one = linalg.cho_solve(factor, scaled.c[:, None])
         by_row = linalg.cho_solve(factor, G.T)
         size = np.sqrt(np.maximum(np.sum(G * by_row.T, axis=1), 0.0))
-        moved = size > 1e-12 * max(1.0, size.max(initial=0.0))
+        # Not by size: with a discount of 0.5 that of step 80 is 1e12 times as large as the first's.
+        moved = (np.linalg.norm(G, axis=1) > 1e-12) & (size > 0)
         own = size[moved, None]
         gram = (G @ by_row)[np.ix_(moved, moved)] / (own * own.T)
         np.fill_diagonal(gram, 1.0)

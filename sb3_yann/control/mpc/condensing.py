@@ -119,12 +119,10 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
         found = plain
     error = _error(problem, found[0])
     if error > OFF or (plain is None and np.isnan(error)):
-        poles = np.linalg.eigvals(problem.model.A)
-        pole = poles[np.argmax(np.abs(poles))]
         raise ValueError(
-            f"With horizon = {problem.horizon} and the pole {pole if pole.imag else pole.real:.6g} "
-            f"of the model, rounding hides the law: without constraints it is off by {error:.1e} "
-            f"half-widths of the input range (nan: it is not unique), and may be by {OFF:g}. Give "
+            f"{lqr.long_horizon(problem.model.A, problem.horizon)}, rounding hides the law: "
+            f"without constraints it is off by {error:.1e} half-widths of the input range (nan: "
+            f"it is not unique), and may be by {OFF:g}. Give "
             "states that grow a weight in Q, pass a shorter horizon, leave "
             "the terminal cost to the Riccati equation, or bring states, inputs and weights to "
             "similar magnitudes."

@@ -9,7 +9,7 @@ import pytest
 from scipy import linalg
 
 from benchmarks.long_horizons import KINDS, errors, problem
-from sb3_yann import LinearModel, LinearMPC, Terminal
+from sb3_yann import LinearModel, LinearMPC, SoftBounds, Terminal
 from sb3_yann.control import OnlineLaw
 
 BOX = {"x_min": -8, "x_max": 8, "u_min": -1.5, "u_max": 1.5}
@@ -109,3 +109,49 @@ def test_a_mode_that_grows_and_costs_nothing_is_named_with_the_horizon() -> None
     mpc = LinearMPC(model, Q=np.diag([0, 1]), R=[[1]], horizon=55, terminal=blind, **BOX)
     with pytest.raises(ValueError, match=r"horizon = 55 and the pole 2\.1 .*a weight in Q"):
         mpc.online()
+
+
+def soft_problem(pole: float, horizon: int, far: float, penalty: float = 30.0) -> LinearMPC:
+    """Return a problem of two inputs, both of which act on the unstable mode, with a soft bound."""
+    model = LinearModel([[pole, 0.2], [0, 0.6]], [[0.8, 0.05], [0.3, 1]], dt=1)
+    return LinearMPC(
+        model, Q=np.eye(2), R=np.eye(2), horizon=horizon, x_min=[-4, -30], x_max=[4, 30],
+        u_min=-1.5, u_max=1.5, theta_min=[-far, -30], theta_max=[far, 30],
+        soft=SoftBounds(x=[1, 0], penalty=penalty),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("pole", "horizon"), [(1.3, 40), (1.5, 24), (1.6, 18)])
+def test_beyond_reach_of_a_soft_bound_the_online_law_saturates_exactly(pole, horizon) -> None:
+    mpc = soft_problem(pole, horizon, 6)
+    q = np.array([1.0, 0.2 / (pole - 0.6)])  # q A = pole q
+    reach = 1.5 * np.abs(q @ mpc.model.B).sum() / (pole - 1)
+    law = mpc.online()
+    points = np.array([[far * reach - q[1] * x, x] for x in (-3.0, 2.0) for far in (1.1, 1.5)])
+    assert law.in_domain(points).any()
+    for theta in points[law.in_domain(points)]:  # all that moves the mode must fight its growth
+        np.testing.assert_array_equal(law(theta), [-1.5, -1.5])
+
+
+def test_beyond_what_float64_can_solve_a_warning_names_horizon_and_pole() -> None:
+    law = soft_problem(2.0, 40, 15).online()
+    with pytest.warns(UserWarning, match=r"horizon = 40 and the pole 2 of the model, no solution"):
+        u = law([12.0, -3.0])
+    assert np.all(np.abs(u) <= 1.5)
+    law([0.3, 0.1])  # the inputs hold it, and nothing warns
+
+
+@pytest.mark.parametrize("pole", [1.05, 1.3, 1.8])
+def test_a_strong_discount_over_a_long_horizon_makes_nothing_infeasible(pole) -> None:
+    A, B = np.array([[pole, 0.3], [0, 0.9]]), np.array([[0.2], [1.0]])
+    own = {"x_min": -5, "x_max": 5, "u_min": -2, "u_max": 2}
+    mpc = LinearMPC(LinearModel(A, B, 1.0), Q=np.eye(2), R=[[1]], horizon=80, gamma=0.5, **own)
+    law = mpc.online()
+    P = linalg.solve_discrete_are(A, B, np.eye(2), np.eye(1))
+    K = np.linalg.solve(1 + B.T @ P @ B, B.T @ P @ A)
+    for theta in np.random.default_rng(0).uniform(-5, 5, (60, 2)):
+        x, kept = theta, True
+        for _ in range(80):
+            x = A @ x + B @ np.clip(-K @ x, -2, 2)
+            kept = kept and bool(np.all(np.abs(x) <= 5))
+        assert law.in_domain(theta) or not kept
