@@ -46,6 +46,8 @@ class Loops:
         violation; steps.
     excess : BoundExcess
         By how much each exceeds the bounds of the problem.
+    succeeded : ndarray of bool, shape (k,)
+        Whether the last info had ``is_success``.
     thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
         After its end an episode stays where it is.
     rewards : ndarray, shape (T, k)
@@ -59,11 +61,19 @@ class Loops:
     inputs: Array
     rewards: Array
     excess: BoundExcess
+    succeeded: NDArray[np.bool_]
+
+    def sooner(self, longest: int) -> NDArray[np.int64]:
+        """Return by how many steps each is shorter (k,); 0 where its end is a success."""
+        return np.where(self.succeeded, 0, np.maximum(longest - self.lengths, 0))
 
     def no_worse(self, others: Loops) -> NDArray[np.bool_]:
         """Tell which episodes are as long as others, and break no bound by more."""
+        longest = int(others.lengths.max(initial=0))
         unsafe = [
-            unsafe_columns(each.violations, -each.lengths, ~np.isfinite(each.costs), each.excess)
+            unsafe_columns(
+                each.violations, each.sooner(longest), ~np.isfinite(each.costs), each.excess
+            )
             for each in (self, others)
         ]
         return np.asarray(~less_safe(unsafe[0], unsafe[1]).any(axis=1))
@@ -139,6 +149,7 @@ def play(
         rewards: list[Array] = []
         told: list[NDArray[np.bool_]] = []
         lengths = np.zeros(len(envs), dtype=np.int64)
+        succeeded = np.zeros(len(envs), dtype=bool)
         while running.any():
             u = controller(len(inputs), now, running)
             now, violated = now.copy(), np.zeros(len(envs), dtype=bool)
@@ -151,6 +162,7 @@ def play(
                     earned[i] = as_reward(reward)
                 running[i] = not (terminated or truncated)
                 lengths[i] += 1
+                succeeded[i] = bool(info.get("is_success", False)) and not running[i]
             thetas.append(now)
             inputs.append(u)
             rewards.append(earned)
@@ -161,7 +173,8 @@ def play(
     excess = bound_excess(problem, states, played, taken)
     costs = np.sum(problem.stage_cost(states[:-1], played), axis=0, where=taken) + excess.penalty
     violations = np.sum(np.array(told), axis=0, where=taken)
-    return Loops(costs, violations, lengths, states, played, np.array(rewards), excess)
+    paid = np.array(rewards)
+    return Loops(costs, violations, lengths, states, played, paid, excess, succeeded)
 
 
 def require_repeated(

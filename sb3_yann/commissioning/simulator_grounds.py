@@ -101,7 +101,7 @@ class SimulatedTrial(Comparison):
         return self._outcome(self.last)
 
     def _outcome(self, loops: Loops) -> Outcome:
-        short = self.base.lengths.max() - loops.lengths
+        short = loops.sooner(int(self.base.lengths.max()))
         lost = ~np.isfinite(loops.costs)
         return loops.costs, unsafe_columns(loops.violations, short, lost, loops.excess)
 
