@@ -34,6 +34,7 @@ _NAMES = {
     "sb3_yann.deployment.checks": "Checks",
     "sb3_yann.deployment.controller": "Controller",
     "sb3_yann.deployment.exporting": "Exported export",
+    "sb3_yann.log": "Log",
     "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "
     "YannPolicy register_problem",

@@ -38,6 +38,7 @@ from sb3_yann.guard import Decision as Decision
 from sb3_yann.guard import ImprovementGuard as ImprovementGuard
 from sb3_yann.guard import StepSize as StepSize
 from sb3_yann.guard import restore_accepted as restore_accepted
+from sb3_yann.log import Log as Log
 from sb3_yann.policy import AffineObservation as AffineObservation
 from sb3_yann.policy import CriticOptions as CriticOptions
 from sb3_yann.policy import NonFiniteWarning as NonFiniteWarning

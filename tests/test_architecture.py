@@ -17,6 +17,7 @@ PACKAGES = {"sb3_yann": ROOT, "sb3_yann_envs": ROOT / "envs"}
 
 FLOORS = [
     {"sb3_yann._archive", "sb3_yann._validation", "sb3_yann._numba", "sb3_yann._drawing"},
+    {"sb3_yann.log"},
     {"sb3_yann.control"},
     {"sb3_yann.compare"},
     {"sb3_yann_envs"},

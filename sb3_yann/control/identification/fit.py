@@ -9,23 +9,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import Array, check_choice, check_positive, check_range, check_vector
+from sb3_yann._validation import Array, check_choice, check_range, check_vector
 from sb3_yann.control.identification.dead_time import (
     as_delays,
     exact_memory,
     found_delays,
+    input_notes,
     memory_labels,
     with_memory,
     with_memory_point,
 )
 from sb3_yann.control.identification.frozen import frozen_rows, words_for
-from sb3_yann.control.identification.input_delays import input_notes
-from sb3_yann.control.identification.least_squares import Regression, regress
-from sb3_yann.control.identification.logs import Episode, Log, as_episodes, split, without_gaps
-from sb3_yann.control.identification.operating_point import FAR, operating_point
-from sb3_yann.control.identification.quality import AHEAD, listed, quality_notes
-from sb3_yann.control.identification.shrinkage import regularized
+from sb3_yann.control.identification.least_squares import (
+    FAR,
+    Regression,
+    operating_point,
+    regress,
+    regularized,
+)
+from sb3_yann.control.identification.residuals import AHEAD, listed, quality_notes
 from sb3_yann.control.linear_system import LinearSystem, names
+from sb3_yann.log import Episode, Log, split_episodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,61 +51,56 @@ class LogFit:
     delays: tuple[int, ...]
 
 
-def fit_log(  # noqa: PLR0913 (those of `identify`)
-    states: Log,
-    actions: Log,
-    dt: float,
-    disturbances: Log | None = None,
+def fit_log(
+    log: Log,
+    *,
     x_ss: ArrayLike | None = None,
     u_ss: ArrayLike | None = None,
     d_ss: ArrayLike | None = None,
     offset: bool = True,
     ridge: float | str = "auto",
     held_out: float = 0.2,
-    time: Log | None = None,
     delay: int | str | Sequence[int] = 0,
 ) -> LogFit:
-    """Return the least-squares fit to measured episodes.
+    """Return the least-squares fit to a log; options as of `identify`.
 
     Parameters
     ----------
-    states, actions, disturbances, time : array_like, or sequence of such
-        Episodes, of shapes (T+1, n), (T, m), (T, d) and (T+1,).
-    dt, x_ss, u_ss, d_ss, offset, ridge, held_out, delay : float, array_like, bool
-        As of `identify`: sampling time, operating point (n,), (m,) and (d,), and options.
+    log : Log
+        The measured episodes.
+    x_ss, u_ss, d_ss, offset, ridge, held_out, delay
+        As of `identify`.
     """
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
-    episodes, sizes = as_episodes(states, actions, disturbances)
-    dt, lost = check_positive("dt", dt), 0
-    if time is not None:
-        episodes, lost = without_gaps(episodes, time, dt)
+    episodes, sizes = list(log.episodes), log.sizes
+    measured = sizes[2] > 0
     _require_moving(episodes, sizes)
     episodes, sizes, delays = _delayed(episodes, sizes, delay)
     x_ss = with_memory_point(x_ss, u_ss, delays)
     n, m, d = sizes
-    if d_ss is not None and disturbances is None:
+    if d_ss is not None and not measured:
         raise ValueError("d_ss is given, but there are no disturbances: pass these as well.")
     point = {"x_ss": (x_ss, n), "u_ss": (u_ss, m), "d_ss": (d_ss, d)}
     given = [
         None if value is None and offset else check_vector(name, value, size)
         for name, (value, size) in point.items()
     ]
-    fitted, tested = split(episodes, check_range("held_out", held_out, 0, 1, "[)"))
+    fitted, tested = split_episodes(episodes, check_range("held_out", held_out, 0, 1, "[)"))
     weight = 0.0 if automatic else check_range("ridge", ridge, 0, np.inf)
     origin = None if offset else np.concatenate([part for part in given if part is not None])
     found, shrunk = regress(fitted, sizes, origin, weight), list[str]()
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
-    system = _system(found, sizes, given, dt, delays)
+    system = _system(found, sizes, given, log.dt, delays)
     system = _with_exact_memory(system, delays, sizes[0])
     late = [] if any(delays) else input_notes(found, fitted, sizes, episodes)
     if late:
         warnings.warn(" ".join(late), stacklevel=3)
-    told = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
-    notes = [*system.notes, *_memory_notes(delays, sizes, system.u_ss), *told, *shrunk, *late]
-    if lost:
-        notes.append(f"{lost} steps that took another time than dt were left out.")
+    quality = quality_notes(found, fitted, tested, fits, 0.0 if shrunk else weight, sum(delays))
+    notes = [*system.notes, *_memory_notes(delays, sizes, system.u_ss), *quality, *shrunk, *late]
+    if log.lost_steps:
+        notes.append(f"{log.lost_steps} steps that took another time than dt were left out.")
     return LogFit(replace(system, notes=tuple(notes)), found, fits, tuple(delays))
 
 

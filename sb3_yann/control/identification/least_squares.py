@@ -1,14 +1,17 @@
-"""Least squares on measured steps: coefficients, their standard errors, and the excitation."""
+"""The least-squares fit of one step: its ridge, its poles, its steady state."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
 
 from sb3_yann._validation import Array
-from sb3_yann.control.identification.logs import Episode
 from sb3_yann.control.linear_system import combination, names
+from sb3_yann.log import Episode, split_episodes
 
 WEAKEST = 1e-6  # least excitation, below which float32 rounding alone may be what moves
 
@@ -134,3 +137,183 @@ def neighbors(residuals: Array, episodes: list[Episode]) -> Array:
     pairs = sum(np.sum(part[1:] * part[:-1], axis=0) for part in np.split(residuals, borders))
     power = np.sum(residuals**2, axis=0)
     return np.asarray(pairs / np.where(power > 0, power, 1.0))
+
+
+WEAK = 0.01  # excitation below which a log is weak
+RIDGES = 10.0 ** np.arange(-9, 0)
+"""Ridges that are tried, relative to the number of steps."""
+BLIND = 1.0  # error of free runs, in spreads of the states, from which the mean says as much
+FREE_RUN = 50  # steps of a free run
+
+
+def regularized(
+    found: Regression,
+    fitted: list[Episode],
+    tested: list[Episode],
+    sizes: tuple[int, int, int],
+    origin: Array | None,
+) -> tuple[Regression, float, list[str]]:
+    """Return the fit, its ridge and notes; a log that is not weak has none.
+
+    What a weak log says along the direction that moved least is noise or curvature, and one-step
+    predictions do not show it. Free runs do.
+
+    Parameters
+    ----------
+    found, fitted, tested : Regression and lists of Episode
+        The fit without ridge, what it was fitted to, and what was held out.
+    sizes, origin : tuple of int, and ndarray (n+m+d,) or None
+        As of `regress`.
+
+    Raises
+    ------
+    ValueError
+        If a weak log leaves free runs as blind as the mean, with any ridge.
+    """
+    if found.excitation >= WEAK:
+        return found, 0.0, []
+    inner, outer = (fitted, tested) if tested else split_episodes(fitted, 0.2)
+    ridges = np.array([0.0, *RIDGES]) * found.steps
+    errors = np.array([_free_run(regress(inner, sizes, origin, r), outer) for r in ridges])
+    if np.min(errors) >= BLIND:
+        raise ValueError(
+            f"The log is too weakly excited: {found.weakest} moved {found.excitation:.1e} times as "
+            "much as the most excited combination, and with any ridge free runs over the data held "
+            f"out miss by {np.min(errors):.2g} spreads of the states. Add a test signal to each "
+            "input and record longer, or pass ridge=0 (or another number) to take such a fit."
+        )
+    # What rounding leaves of a perfect log counts as nothing.
+    best = int(np.argmax(errors <= np.min(errors) + 1e-9))
+    if best == 0:
+        return found, 0.0, []
+    note = (
+        f"A ridge of {ridges[best]:.2g} was chosen by free runs over data held out: they miss by "
+        f"{errors[best]:.2g} spreads of the states, without it by {errors[0]:.2g}. It biases "
+        "weakly excited entries towards zero, which their standard errors leave out."
+    )
+    return regress(fitted, sizes, origin, float(ridges[best])), float(ridges[best]), [note]
+
+
+def _free_run(found: Regression, episodes: list[Episode]) -> float:
+    """Return the error of free runs, root mean square in spreads of the states."""
+    n, total, count = found.reached.size, 0.0, 0
+    unit = np.where(found.spread[:n] > 0, found.spread[:n], 1.0)
+    for episode in episodes:
+        for start in range(0, len(episode), FREE_RUN):
+            x = episode.states[start]
+            for k in range(start, min(start + FREE_RUN, len(episode))):
+                x = found.predict(np.concatenate([x, episode.driven[k]])[None])[0]
+                # One that runs away is as bad as can be, and its size tells nothing.
+                error = np.minimum(np.abs(x - episode.states[k + 1]) / unit, 1e3)
+                x = np.clip(x, -1e150, 1e150)
+                total, count = total + float(np.mean(error**2)), count + 1
+    return float(np.sqrt(total / max(count, 1)))
+
+
+WIDE = 0.5  # half-width from which an interval says only that the pole is not known
+NORMAL = 1.96  # standard deviations on either side that hold 95 %
+
+
+def pole_errors(found: Regression, n: int) -> tuple[Array, Array]:
+    """Return the poles (n,), largest first, and their standard errors, inf of repeated poles.
+
+    To first order a pole moves by ``y' dA x / y'x`` with its left and right eigenvectors. States
+    after the first n are inputs on their way: they move none of these poles.
+    """
+    values, left, right = linalg.eig(found.coefficients[:n, :n], left=True, right=True)
+    rows = np.real(np.sum(left.conj() * (found.covariance[:n, :n] @ left), axis=0))
+    columns = np.real(np.sum(right.conj() * (found.correlation[:n, :n] @ right), axis=0))
+    overlap = np.abs(np.sum(left.conj() * right, axis=0))
+    size = np.sqrt(np.maximum(rows * columns, 0.0))
+    errors = np.where(overlap > 1e-9, size / np.maximum(overlap, 1e-9), np.inf)
+    order = np.argsort(-np.abs(values), kind="stable")
+    return values[order], errors[order]
+
+
+def pole_note(found: Regression, n: int) -> str:
+    """Return the 95 % intervals of the poles in words, one of each complex pair."""
+    values, errors = pole_errors(found, n)
+    words, open_ends = [], 0
+    for value, error in zip(values, errors, strict=True):
+        if value.imag < 0:
+            continue
+        width = NORMAL * error
+        imaginary = f" ± {value.imag:.4g}i" if value.imag else ""
+        known = f"{value.real:.4g}{imaginary} within {width:.2g}"
+        words.append(known if width < WIDE else f"{value.real:.4g}{imaginary}, hardly known")
+        open_ends += bool(abs(value) < 1 <= abs(value) + width)
+    text = f"Poles with 95 % confidence, under process noise: {'; '.join(words)}."
+    if open_ends:
+        text += (
+            f" {open_ends} that decay in the model may be unstable in the plant, as far as the log "
+            "tells."
+        )
+    return text
+
+
+FAR = 5.0  # spreads from the mean of the data beyond which a model is extrapolated
+SURE = 5.0
+"""Standard errors above which a direction does not integrate: those of an integrator are not normal
+(Dickey & Fuller, 1979, J. Am. Stat. Assoc. 74)."""
+
+
+def operating_point(
+    found: Regression,
+    sizes: tuple[int, int, int],
+    given: Sequence[Array | None],
+    delays: Sequence[int] = (),
+) -> Array:
+    """Return the steady state, inputs and disturbances (n+m+d,) of the fitted plant.
+
+    Parameters
+    ----------
+    found, sizes : Regression, and (n, m, d)
+        The fit.
+    given : sequence of ndarray, shapes (n,), (m,) and (d,)
+        What is known of the point, None where nothing is.
+    delays : sequence of int, length m
+        So many of the last states are each input on its way: at rest these are the inputs, however
+        far from the data.
+    """
+    n, m, _ = sizes
+    means = zip(given, np.split(found.center, [n, n + m]), strict=True)
+    start = np.concatenate([mean if value is None else value for value, mean in means])
+    # The state gives way, or the inputs where the state is given; nothing where both are.
+    if given[0] is not None and given[1] is not None:
+        return start
+    scale = np.where(found.spread > 0, found.spread, 1.0)
+    moves = (found.coefficients - np.eye(n, scale.size)) * scale / scale[:n, None]
+    doubt = found.standard_errors * scale / scale[:n, None]
+    drift = (found.predict(start[None])[0] - start[:n]) / scale[:n]
+    states, inputs = slice(0, n), slice(n, n + m)
+    if given[0] is not None:
+        start[inputs] += scale[inputs] * _way(moves[:, inputs], drift, doubt[:, inputs])
+        return start
+    if given[1] is None:  # only the inputs can hold an integrator
+        left, _, _, known = _directions(moves[:, states], doubt[:, states])
+        free = left[:, ~known].T
+        errors = np.sqrt(free**2 @ doubt[:, inputs] ** 2)
+        way = _way(free @ moves[:, inputs], free @ drift, errors)
+        start[inputs] += scale[inputs] * way
+        drift = drift + moves[:, inputs] @ way
+    if any(delays):
+        states = slice(0, n - sum(delays))
+        start[states.stop : n] = np.repeat(start[inputs], delays)
+        drift = ((found.predict(start[None])[0] - start[:n]) / scale[:n])[states]
+        moves, doubt = moves[states], doubt[states]
+    start[states] += scale[states] * _way(moves[:, states], drift, doubt[:, states])
+    return start
+
+
+def _directions(moves: Array, doubt: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return the singular value decomposition, and which directions differ from an integrator."""
+    left, sizes, right = np.linalg.svd(moves, full_matrices=False)
+    errors = np.sqrt(np.sum((left.T**2 @ doubt**2) * right**2, axis=1))
+    return left, sizes, right, (sizes > SURE * errors) & (sizes > 1e-9)
+
+
+def _way(moves: Array, drift: Array, doubt: Array) -> Array:
+    """Return the step to the steady state along the directions that the data determine."""
+    left, sizes, right, known = _directions(moves, doubt)
+    steps = -(left.T @ drift) / np.where(known, sizes, 1.0)
+    return np.asarray(right.T @ np.where(known & (np.abs(steps) <= FAR), steps, 0.0))

@@ -1,14 +1,139 @@
-"""Jacobians with the coordinate named where there is none, and remarks on what they showed."""
+"""Jacobians by extrapolated central differences, with what they showed."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control.linearization.finite_differences import Jacobian, NotSmoothError, jacobian
+
+LEVELS, RATIO = 6, 4.0
+"""Number of steps that approach a point, and how much shorter each is than the one before."""
+FAINT = 100.0
+"""Effects below so many times the noise are none. Hundreds of operations of an integrator round
+ten times as much as one does, and a plant that forgets a state within a sample shows only that."""
+
+
+@dataclass(frozen=True, eq=False)
+class Jacobian:
+    """A Jacobian, and what its differences showed.
+
+    Attributes
+    ----------
+    value, dropped : ndarray, shape (r, c), and float
+        Exactly zero where not above its own error, and the largest derivative set to zero.
+    steps, change : ndarray, shape (c,)
+        The longest steps, and their errors relative to the column, NaN without a value.
+    doubt : float
+        The largest error left, relative to the column: how far two step sizes agree.
+    """
+
+    value: Array
+    dropped: float
+    steps: Array
+    change: Array
+    doubt: float
+
+
+class NotSmoothError(ValueError):
+    """The function has a kink, a jump or no value next to the point, in coordinate `column`."""
+
+    def __init__(self, column: int, reason: str, no_value: bool = False) -> None:
+        super().__init__(reason)
+        self.column, self.no_value = column, no_value
+
+
+def jacobian(
+    f: Callable[[Array], Array],
+    point: Array,
+    steps: Array,
+    noise: Array,
+    actual: Callable[[Array], Array] = lambda z: z,
+) -> Jacobian:
+    """Return the derivatives of f at a point by Richardson extrapolation.
+
+    Each entry takes the extrapolation that agrees best with its neighbor over shorter steps:
+    Ridders (1982), *Advances in Engineering Software* 4, 75-76.
+
+    Parameters
+    ----------
+    f : callable
+        Takes an array of shape (c,), returns one of shape (r,), NaN where it has no value.
+    point, steps : ndarray, shape (c,)
+        The point, and the longest step in each coordinate.
+    noise : ndarray, shape (r,)
+        The error of each value of f (rounding).
+    actual : callable, optional
+        The point at which f is evaluated for a given one, e.g. its float32 rounding.
+
+    Raises
+    ------
+    NotSmoothError
+        If f has a kink or a jump at the point, or no value next to it.
+    """
+    begin = actual(point)
+    center = f(begin)
+    columns = [_column(f, center, begin, i, steps[i], noise, actual) for i in range(point.size)]
+    value, error, change = (np.array(part) for part in zip(*columns, strict=True))
+    lost = np.abs(value) <= error
+    dropped = float(np.max(np.abs(value[lost]), initial=0.0))
+    largest = np.max(np.abs(value), axis=1)
+    doubt = np.max(np.max(error, axis=1) / np.where(largest > 0, largest, np.inf), initial=0.0)
+    return Jacobian(np.where(lost, 0.0, value).T, dropped, steps, change, float(doubt))
+
+
+def _column(
+    f: Callable[[Array], Array],
+    center: Array,
+    point: Array,
+    i: int,
+    longest: float,
+    noise: Array,
+    actual: Callable[[Array], Array],
+) -> tuple[Array, Array, float]:
+    """Return the derivatives with respect to coordinate i, their errors, and the change."""
+    ahead, behind, spans = [], [], []
+    for level in range(LEVELS):
+        offset = np.zeros(point.size)
+        offset[i] = longest / RATIO**level
+        above, below = actual(point + offset), actual(point - offset)
+        if above[i] <= point[i] or below[i] >= point[i]:
+            break  # the step is lost in the rounding of the point
+        ahead.append((f(above) - center) / (above[i] - point[i]))
+        behind.append((center - f(below)) / (point[i] - below[i]))
+        spans.append(above[i] - below[i])
+    one, other, span = np.array(ahead), np.array(behind), np.array(spans)[:, None]
+    valid = np.all(np.isfinite(one) & np.isfinite(other), axis=1) if spans else np.zeros(0, bool)
+    if np.count_nonzero(valid) < 3:
+        raise NotSmoothError(i, "it has no finite value on one of its sides", True)
+    far = bool(valid[0])
+    one, other, span = one[valid], other[valid], span[valid]
+    slope = (one + other) / 2
+    # Unequal sides (a point that is rounded) would leave a first-order error in the mean.
+    value, error = _extrapolated(slope, RATIO**2, 2 * noise / span)
+    kink, doubt = _extrapolated(one - other, RATIO, 4 * noise / span)
+    steepest = np.max(np.abs(value) + np.abs(kink) / 2)
+    floor = np.max(2 * noise / span[0])
+    if np.any((np.abs(kink) > 5 * doubt) & (np.abs(kink) > 0.01 * steepest)):
+        raise NotSmoothError(i, "its slopes to the two sides differ (a kink)")
+    if np.max(error) > max(0.2 * np.max(np.abs(value)), FAINT * floor):
+        raise NotSmoothError(i, "its slope has no limit for short steps (a jump or noise)")
+    scale = np.max(np.abs(value))
+    change = np.max(np.abs(slope[0] - value)) / scale if scale > 0 else 0.0
+    return value, error, float(change) if far else np.nan
+
+
+def _extrapolated(levels: Array, power: float, rounding: Array) -> tuple[Array, Array]:
+    """Return the limits of the levels (k, r), whose errors fall by `power`, and their errors."""
+    limits = (power * levels[1:] - levels[:-1]) / (power - 1)
+    errors = np.abs(np.diff(limits, axis=0)) + 2 * rounding[1:-1]
+    best = np.argmin(errors, axis=0)
+    rows = np.arange(levels.shape[1])
+    return limits[best, rows], errors[best, rows]
+
 
 SHORTER = 64.0  # factor by which steps shrink where a function has no value next to the point
 

@@ -11,8 +11,8 @@ from scipy.special import stdtrit
 
 from sb3_yann._validation import Array, ReadOnlyArrays, check_choice, check_range
 from sb3_yann.control.identification.fit import fit_log
-from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.log import Arrays, Log
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +77,18 @@ class Identified(ReadOnlyArrays):
 
 
 def identify(  # noqa: PLR0913 (what a log may bring along)
-    states: Log,
-    actions: Log,
+    states: Log | Arrays,
+    actions: Arrays | None = None,
     *,
-    dt: float,
-    disturbances: Log | None = None,
+    dt: float | None = None,
+    disturbances: Arrays | None = None,
     x_ss: ArrayLike | None = None,
     u_ss: ArrayLike | None = None,
     d_ss: ArrayLike | None = None,
     offset: bool = True,
     ridge: float | str = "auto",
     held_out: float = 0.2,
-    time: Log | None = None,
+    time: Arrays | None = None,
     delay: int | str | Sequence[int] = 0,
 ) -> Identified:
     """Fit ``x[k+1] = A x[k] + B u[k] + E d[k] + c`` to measured episodes by least squares.
@@ -98,8 +98,9 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
 
     Parameters
     ----------
-    states : array_like, shape (T+1, n), or a sequence of such
-        One episode or several, each with the state before every action and after the last.
+    states : Log, or array_like, shape (T+1, n), or a sequence of such
+        A log; or one episode or several, each with the state before every action and after the
+        last. With a log, ``actions``, ``dt``, ``disturbances`` and ``time`` are its own.
     actions : array_like, shape (T, m), or a sequence of such
         The inputs as they were executed (clipped, if the plant clips).
     dt : float
@@ -140,11 +141,29 @@ def identify(  # noqa: PLR0913 (what a log may bring along)
     >>> found.model.A.round(6).tolist(), found.ten_step_fit.round(3).tolist()
     ([[0.8]], [100.0])
     """
+    if isinstance(states, Log):
+        own = {"actions": actions, "dt": dt, "disturbances": disturbances, "time": time}
+        if beside := [name for name, value in own.items() if value is not None]:
+            raise TypeError(f"{beside} is given, but the log has its own: leave it out.")
+        log = states
+    elif actions is None or dt is None:
+        raise TypeError("identify takes a Log, or states and actions with dt=.")
+    else:
+        log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
     found = fit_log(
-        states, actions, dt, disturbances=disturbances, x_ss=x_ss, u_ss=u_ss, d_ss=d_ss,
-        offset=offset, ridge=ridge, held_out=held_out, time=time, delay=delay,
-    )  # fmt: skip
-    model, step = LinearModel(**vars(found.system)), found.regression
+        log,
+        x_ss=x_ss,
+        u_ss=u_ss,
+        d_ss=d_ss,
+        offset=offset,
+        ridge=ridge,
+        held_out=held_out,
+        delay=delay,
+    )
+    model = LinearModel(**vars(found.system))
+    if log.state_names:
+        model = model.named(log.state_names, log.input_names)
+    step = found.regression
     n = model.n_states
     A, B, E = np.split(step.standard_errors, [n, n + model.n_inputs], axis=1)
     residuals = (step.covariance, step.degrees_of_freedom, step.autocorrelation)

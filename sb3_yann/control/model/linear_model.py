@@ -19,13 +19,13 @@ from sb3_yann._validation import (
     to_float,
 )
 from sb3_yann.control.identification.fit import fit_log
-from sb3_yann.control.identification.logs import Log
 from sb3_yann.control.linear_system import names, zero_order_hold
 from sb3_yann.control.linearization.dynamics import linearize_dynamics
 from sb3_yann.control.linearization.linearize import linearize_env
 from sb3_yann.control.model.labels import Units, as_names, as_units, require_different
 from sb3_yann.control.model.plant import Plant
 from sb3_yann.control.model.statespace import from_control
+from sb3_yann.log import Arrays, Log
 
 if TYPE_CHECKING:
     import gymnasium
@@ -259,10 +259,12 @@ class LinearModel(Plant):
     @classmethod
     def from_data(
         cls,
-        states: Log,
-        actions: Log,
+        states: Arrays,
+        actions: Arrays,
         *,
         dt: float,
+        disturbances: Arrays | None = None,
+        time: Arrays | None = None,
         **options: Any,
     ) -> LinearModel:
         """Return the least-squares model of measured episodes; :meth:`report` states the fit.
@@ -273,8 +275,10 @@ class LinearModel(Plant):
             States before every action and after the last, and the inputs as they were executed.
         dt : float
             Sampling time.
+        disturbances, time : array_like, optional
+            As of :meth:`sb3_yann.Log.from_arrays`.
         **options
-            As of :func:`sb3_yann.control.identify`, which also returns standard errors.
+            As of :func:`sb3_yann.identify`, which also returns standard errors.
 
         Examples
         --------
@@ -284,7 +288,8 @@ class LinearModel(Plant):
         >>> LinearModel.from_data(x, u, dt=1).B.round(6).tolist()
         [[0.5]]
         """
-        return cls(**vars(fit_log(states, actions, dt=dt, **options).system))
+        log = Log.from_arrays(states, actions, dt, disturbances=disturbances, time=time)
+        return cls(**vars(fit_log(log, **options).system))
 
     @classmethod
     def from_statespace(

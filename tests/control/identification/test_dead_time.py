@@ -9,7 +9,7 @@ import pytest
 
 from sb3_yann import LinearModel, LinearMPC, identify
 from sb3_yann.control.identification.dead_time import with_memory
-from sb3_yann.control.identification.logs import Episode
+from sb3_yann.log import Episode
 
 A = np.array([[0.9, 0.2], [0.0, 0.7]])
 B = np.array([[0.0, 0.5], [1.0, 0.0]])

@@ -7,23 +7,21 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sb3_yann.control import LinearModel
 from sb3_yann.control.identification.dead_time import (
-    _chosen,
-    _left,
-    exact_memory,
-    found_delays,
-    with_memory_point,
-)
-from sb3_yann.control.identification.fit import fit_log
-from sb3_yann.control.identification.input_delays import (
     ENOUGH,
+    _chosen,
     _correlations,
     _delays,
     _first,
+    _left,
+    exact_memory,
+    found_delays,
     input_notes,
+    with_memory_point,
 )
 from sb3_yann.control.identification.least_squares import Regression, regress
-from sb3_yann.control.identification.logs import Episode
+from sb3_yann.log import Episode
 
 SIZES = (1, 2, 0)
 
@@ -126,7 +124,7 @@ def test_a_late_input_that_auto_leaves_out_gets_other_advice_than_auto() -> None
     assert advice.startswith("Pass delay=[0, 2], and keep it where the fit of held-out data")
     assert "delay='auto' takes none" in advice and "or delay='auto'." not in advice
     with pytest.warns(UserWarning, match="delay='auto' takes none: .* less than 30 %"):
-        fit_log(episode.states, episode.driven, 1.0, delay="auto")
+        LinearModel.from_data(episode.states, episode.driven, dt=1.0, delay="auto")
 
 
 def test_a_late_disturbance_gets_no_delay_of_the_inputs() -> None:
@@ -193,9 +191,9 @@ def test_a_measured_disturbance_does_not_move_the_memory() -> None:
     u, d, x = rng.standard_normal((200, 1)), rng.standard_normal((200, 1)), np.zeros((201, 1))
     for k in range(200):
         x[k + 1] = 0.5 * x[k] + (u[k - 1] if k else 0) + 0.3 * d[k] + 0.01 * rng.standard_normal()
-    system = fit_log(x, u, 1.0, disturbances=d, delay=1).system
+    system = LinearModel.from_data(x, u, dt=1.0, disturbances=d, delay=1)
     assert system.E[1, 0] == 0.0 and system.E[0, 0] == pytest.approx(0.3, abs=0.01)
     np.testing.assert_allclose(system.A, [[0.5, 1.0], [0.0, 0.0]], atol=0.01)
     assert system.state_names == ("x[0]", "u[0](k-1)")
     with pytest.raises(ValueError, match="delay = 200, but no episode has more than 200 steps"):
-        fit_log(x, u, 1.0, disturbances=d, delay=200)
+        LinearModel.from_data(x, u, dt=1.0, disturbances=d, delay=200)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_yann.control.identification.fit import _system
-from sb3_yann.control.identification.least_squares import Regression
-from sb3_yann.control.identification.operating_point import operating_point
+from sb3_yann.control.identification.least_squares import Regression, operating_point
 
 A = np.array([[0.8, 0.1], [0.0, 0.6]])
 B = np.array([[0.2, 0.0], [0.1, 0.4]])

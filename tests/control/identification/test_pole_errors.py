@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sb3_yann.control.identification.input_delays import _chance
-from sb3_yann.control.identification.least_squares import Regression, regress
-from sb3_yann.control.identification.logs import Episode
-from sb3_yann.control.identification.pole_errors import pole_errors, pole_note
+from sb3_yann.control.identification.dead_time import _chance
+from sb3_yann.control.identification.least_squares import (
+    Regression,
+    pole_errors,
+    pole_note,
+    regress,
+)
+from sb3_yann.log import Episode
 
 REAL = np.array([[0.9, 0.2], [0.0, 0.7]])
 TURNING = np.array([[0.8, 0.3], [-0.3, 0.7]])

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sb3_yann.control.identification.curvature import bent, features, without
 from sb3_yann.control.identification.least_squares import Regression, neighbors, regress
-from sb3_yann.control.identification.logs import Episode
-from sb3_yann.control.identification.quality import listed, quality_notes
+from sb3_yann.control.identification.residuals import bent, features, listed, quality_notes, without
+from sb3_yann.log import Episode
 
 
 def log(steps: int = 300, curved: float = 0.0, noise: float = 0.1, seed: int = 0) -> Episode:

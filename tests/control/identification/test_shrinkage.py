@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sb3_yann.control.identification.least_squares import regress
-from sb3_yann.control.identification.logs import Episode, split
-from sb3_yann.control.identification.shrinkage import RIDGES, _free_run, regularized
+from sb3_yann.control.identification.least_squares import RIDGES, _free_run, regress, regularized
+from sb3_yann.log import Episode
+from sb3_yann.log import split_episodes as split
 
 SIZES = (2, 1, 0)
 

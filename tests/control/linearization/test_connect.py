@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann.control.linearization.connect import _room, _scale
-from sb3_yann.control.linearization.episodes import episode_faults
-from sb3_yann.control.linearization.linearize import _actions
-from sb3_yann.control.linearization.simulator import sample_time, to_vector
+from sb3_yann.control.linearization.linearize import _actions, episode_faults
+from sb3_yann.control.linearization.simulator import _room, _scale, sample_time, to_vector
 
 
 def box(low: Any, high: Any) -> gym.spaces.Box:

@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann.control.linearization.differences import curvature, differences
-from sb3_yann.control.linearization.finite_differences import Jacobian, NotSmoothError, jacobian
-from sb3_yann.control.linearization.noise import noise_of
+from sb3_yann.control.linearization.differences import (
+    Jacobian,
+    NotSmoothError,
+    curvature,
+    differences,
+    jacobian,
+)
+from sb3_yann.control.linearization.simulator import noise_of
 
 EPS = np.finfo(float).eps
 ONE = np.ones(1)

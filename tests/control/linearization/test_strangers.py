@@ -11,8 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann.control.linearization.noise import noise_of
-from sb3_yann.control.linearization.simulator import to_vector
+from sb3_yann.control.linearization.simulator import noise_of, to_vector
 from sb3_yann.wrappers import SeededGlobals, TimeLimitIsNoTermination
 from sb3_yann_envs import cstr
 

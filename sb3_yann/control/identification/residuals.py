@@ -1,0 +1,294 @@
+"""What the residuals of a linear fit hold: curvature, hidden states, noise; and notes on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtrc
+
+from sb3_yann._validation import Array
+from sb3_yann.control.identification.least_squares import WEAK, Regression, neighbors, pole_note
+from sb3_yann.log import Episode
+
+ROWS = 4  # steps for each feature, at least: with fewer the features fit anything
+MOST = 12  # main components, at most: a long log with many states must not take minutes
+SHARE, CHANCE = 0.1, 1e-3
+"""Least share of the residuals' variance, and its significance, from which curvature is named."""
+
+
+def features(regressors: Array) -> Array:
+    """Return squares, products and cubes (k, q) of the main components of regressors (k, p).
+
+    There are as many components as the number of rows allows. The regressors are centered.
+    """
+    k, p = regressors.shape
+    spread = np.sqrt(np.mean(regressors**2, axis=0))
+    z = regressors / np.where(spread > 0, spread, 1.0)
+    room, kept = k // ROWS - p - 1, 0
+    while kept < min(p, MOST) and (kept + 1) * (kept + 4) / 2 <= room:
+        kept += 1
+    if not kept:
+        return np.zeros((k, 0))
+    left, sizes, _ = np.linalg.svd(z, full_matrices=False)
+    main = left[:, :kept][:, sizes[:kept] > 1e-6 * sizes[0]] * np.sqrt(k)
+    first, second = np.triu_indices(main.shape[1])
+    return np.hstack([main[:, first] * main[:, second], main**3])
+
+
+def bent(found: Regression, episodes: list[Episode]) -> tuple[Array, Array]:
+    """Return the share (n,) of each residual's variance that curvature explains, and what is left.
+
+    The shares are corrected for the number of features, and zero where chance explains them. What
+    is left has the shape (steps, n).
+    """
+    now = np.concatenate([episode.regressors for episode in episodes]) - found.center
+    reached = np.concatenate([episode.states[1:] for episode in episodes])
+    residuals = reached - found.predict(now + found.center)
+    known, added = np.column_stack([np.ones(len(now)), now]), features(now)
+    before = without(known, residuals)
+    after = without(np.column_stack([known, added]), residuals)
+    q, free = added.shape[1], len(now) - known.shape[1] - added.shape[1]
+    size, rest = np.sum(before**2, axis=0), np.sum(after**2, axis=0)
+    real = size > 1e-20 * np.sum(reached**2, axis=0)
+    if not q or free < 1 or not np.any(real):
+        return np.zeros(len(size)), residuals
+    size, rest = np.where(real, size, 1.0), np.where(real, rest, 1.0)
+    share = 1 - (rest / free) / (size / (free + q))
+    ratio = ((size - rest) / q) / np.maximum(rest / free, np.finfo(float).tiny)
+    sure = real & (np.asarray(fdtrc(q, free, ratio)) < CHANCE)
+    return np.asarray(np.where(sure & (share > SHARE), share, 0.0)), after
+
+
+def without(basis: Array, values: Array) -> Array:
+    """Return what a least-squares fit by the basis leaves of the values."""
+    scale = np.linalg.norm(basis, axis=0)
+    left, sizes, _ = np.linalg.svd(basis / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    left = left[:, sizes > 1e-10 * sizes[0]]
+    return np.asarray(values - left @ (left.T @ values))
+
+
+NOISE = 0.4  # share of the errors that is left of them at least where they are sensor noise
+ENOUGH = 2000  # steps in which hidden states are looked for
+FOLDS = 5  # parts of the log, each of which is held out once
+ORDERS = (1, 2, 4, 6)
+"""Numbers of earlier samples, each tried with one more hidden state in mind than the one before."""
+
+
+class Leftover(NamedTuple):
+    """Mean squares (n,) of what each set of regressors leaves of held-out rows.
+
+    All of them hold the present states and inputs. A log that is too short has zeros throughout:
+    nothing can be told then.
+
+    Attributes
+    ----------
+    linear, squares, lags, both : ndarray, shape (n,)
+        With nothing else; with squares and products; with earlier states and inputs; with both.
+    late : ndarray, shape (n,)
+        With squares, products and the inputs of the dead time, but no earlier states.
+    """
+
+    linear: Array
+    squares: Array
+    lags: Array
+    both: Array
+    late: Array
+
+    @property
+    def remembers(self) -> NDArray[np.bool_]:
+        """Whether earlier states and inputs explain a part of the residuals."""
+        return np.asarray(self.lags < (1 - SHARE) * self.linear)
+
+    @property
+    def bends(self) -> NDArray[np.bool_]:
+        """Whether squares and products explain what earlier states and inputs do not."""
+        return np.asarray(self.both < (1 - SHARE) * self.lags)
+
+    @property
+    def may_bend(self) -> NDArray[np.bool_]:
+        """Whether squares and products explain it, or about as much as earlier samples do."""
+        some = self.squares < (1 - SHARE) * self.linear
+        return np.asarray(self.bends | (some & (self.lags >= NOISE * self.squares)))
+
+    @property
+    def is_hidden(self) -> bool:
+        """Whether earlier samples explain far more than squares, products and dead time do.
+
+        A filter of the readings takes up to a half off the noise that a sensor adds to the errors
+        of one step, and more is a state that is not measured. Where squares and products show
+        curvature, earlier samples extrapolate what is left of it, and nothing can be told.
+        """
+        far_less = np.minimum(self.both, self.lags) < NOISE * self.late
+        return bool(np.any(far_less & ~self.bends))
+
+
+def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
+    """Return what is left of rows that a fit has not seen, part after part of the log.
+
+    The rows of a log depend on their neighbors, which an F test does not know: by chance, slow
+    inputs square to what a hidden state adds. A part of the log that was held out tells them apart.
+
+    Parameters
+    ----------
+    episodes : list of Episode
+        The first `ENOUGH` steps count.
+    delays : sequence of int, optional
+        Dead time of each input.
+    """
+    n, lags = episodes[0].states.shape[1], max(ORDERS[-1], *delays, 0)
+    longer = [episode for episode in episodes if len(episode) > lags]
+    steps, none = sum(len(episode) - lags for episode in longer), np.zeros(n)
+    width = episodes[0].regressors.shape[1]
+    if steps <= 4 * (2 * width + sum(delays) + 1):
+        return Leftover(none, none, none, none, none)
+    now = np.concatenate([each.regressors[lags:] for each in longer])[:ENOUGH]
+    target = np.concatenate([each.states[lags + 1 :] for each in longer])[:ENOUGH]
+    past = [
+        np.concatenate([each.regressors[lags - lag : len(each) - lag] for each in longer])[:ENOUGH]
+        for lag in range(1, lags + 1)
+    ]
+    steps = len(now)
+    center = now.mean(axis=0)
+    plain = np.column_stack([np.ones(steps), now - center])
+    target_left = without(plain, target)
+    # Below it, all is rounding.
+    floor = 1e-9 * np.mean(target_left**2, axis=0) + 1e-20 * np.mean(target**2, axis=0)
+    floor += np.finfo(float).tiny
+    parts = np.array_split(np.arange(steps), FOLDS)
+
+    def left(*groups: Array) -> Array:
+        return np.asarray(_held_out(np.column_stack([plain, *groups]), target_left, parts) + floor)
+
+    squares = features(now - center)
+    lagged = [
+        np.column_stack([each - center for each in past[:order]])
+        for order in ORDERS
+        if steps > 4 * width * (order + 1)
+    ]
+    each_order = [left(each) for each in lagged]
+    best = int(np.argmin([np.sum(np.log(each)) for each in each_order]))
+    on_their_way = [past[lag][:, n + j] for j, delay in enumerate(delays) for lag in range(delay)]
+    late = left(squares, *on_their_way)
+    both = left(squares, lagged[best])
+    return Leftover(left(), left(squares), each_order[best], both, late)
+
+
+def _held_out(basis: Array, values: Array, parts: list[NDArray[np.int64]]) -> Array:
+    """Return mean squared errors (n,) of a least-squares fit, each part left out once."""
+    scale = np.linalg.norm(basis, axis=0)
+    basis, squares = basis / np.where(scale > 0, scale, 1.0), np.zeros(values.shape[1])
+    for part in parts:
+        fitted = np.delete(basis, part, axis=0), np.delete(values, part, axis=0)
+        coefficients = np.linalg.lstsq(*fitted, rcond=1e-11)[0]
+        squares += np.sum((values[part] - basis[part] @ coefficients) ** 2, axis=0)
+    return np.asarray(squares / len(values))
+
+
+AHEAD = 10  # steps of the longer prediction whose fit is stated
+MUCH = 0.5  # share of the residuals from which on curvature explains their colour too
+POOR = 50.0  # percent of the longer prediction's fit below which a model is called poor
+
+
+def quality_notes(
+    found: Regression,
+    fitted: list[Episode],
+    tested: list[Episode],
+    fits: tuple[Array, Array],
+    ridge: float,
+    memory: int = 0,
+) -> list[str]:
+    """Return notes on residuals, fit, excitation, bias and poles.
+
+    Parameters
+    ----------
+    found, fitted, tested : Regression and lists of Episode
+        The fit, what it was fitted to, and what was held out.
+    fits, ridge, memory : pair of ndarray (n,), float and int
+        The fits one and more steps ahead in percent, the penalty, and how many of the last states
+        are inputs on their way, of which nothing is in doubt.
+    """
+    n = found.reached.size - memory
+    fits = fits[0][:n], fits[1][:n]
+    notes = [
+        f"Fitted to {found.steps} steps; one step differs from the prediction by "
+        f"{listed(np.sqrt(np.diag(found.covariance))[:n])} (standard deviation of each state)."
+    ]
+    if tested:
+        notes.append(_words_for(fits, sum(map(len, tested))))
+    if found.excitation < WEAK:
+        notes.append(
+            f"Weakly excited: {found.weakest} moved {found.excitation:.1e} times as much as the "
+            "most excited combination. Entries along it are uncertain."
+        )
+    if ridge > 0:
+        notes.append(f"A ridge of {ridge:g} biases the entries towards zero.")
+    return [*notes, *_residual_notes(found, fitted, n), pole_note(found, n)]
+
+
+def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[str]:
+    """Return notes on what the residuals hold beside white noise: curvature, or colour."""
+    share, rest = bent(found, fitted)
+    share, own = share[:n], found.autocorrelation[:n]
+    colored = np.abs(own) > 3 / np.sqrt(found.steps)
+    left, notes = leftover(fitted), list[str]()
+    known = bool(np.any(left.linear > 0))
+    # What chance squares to is not there on rows that were held out.
+    share = np.where(left.may_bend[:n] | (not known), share, 0.0)
+    explained = 100 * (1 - left.lags[:n] / np.where(left.linear[:n] > 0, left.linear[:n], np.inf))
+    if np.any(share > 0):
+        curved = (
+            f"Curvature: squares and products of states and inputs explain {listed(100 * share)} % "
+            "of the residuals' variance. "
+        )
+        sure = not known or bool(np.any(left.bends[:n] & (share > 0)))
+        cure = "record closer to the operating point, or learn what is missing (PlantTwin)."
+        notes.append(
+            f"{curved}The plant is not linear over this log: {cure}"
+            if sure
+            else f"{curved}Earlier states and inputs explain {listed(explained)} %: the plant is "
+            f"not linear over this log, or it has a state that is not measured. If the former, "
+            f"{cure}"
+        )
+        # What curvature explains is no noise.
+        colored &= np.abs(neighbors(rest, fitted)[:n]) > 3 / np.sqrt(found.steps)
+        # Where it explains much, what it leaves is curvature of higher order.
+        colored &= share < MUCH
+    elif np.any(explained > 100 * (1 - NOISE)):
+        return [
+            f"Earlier states and inputs explain {listed(explained)} % of the residuals' variance, "
+            "more than sensor noise lets them: there is a state that is not measured, or dead "
+            "time. Append earlier readings and inputs to the states, or measure what is missing. "
+            "The standard errors do not tell that."
+        ]
+    if np.any(colored):
+        notes.append(
+            f"The residuals of neighboring steps are correlated ({listed(own)}): "
+            "there is sensor noise, which biases A towards zero, or an unmodeled state. The "
+            "standard errors do not tell that."
+        )
+    return notes
+
+
+def _words_for(fits: tuple[Array, Array], steps: int) -> str:
+    """Return a note on the fits to held-out data."""
+    words = [
+        f"{listed(fit)} % {ahead} ahead"
+        for fit, ahead in zip(fits, ("one step", f"{AHEAD} steps"), strict=True)
+        if not np.all(np.isnan(fit))
+    ]
+    if not words:
+        return f"The {steps} steps held out tell no fit: they are too few, or nothing moves."
+    text = f"Fit over {steps} steps held out, 100 % is perfect: {', '.join(words)}."
+    if len(words) < len(fits):
+        text += f" No episode of them is {AHEAD} steps long."
+    if np.any(fits[1] < POOR):
+        text += f" Poor: {AHEAD} steps ahead the model says little of the plant."
+    return text
+
+
+def listed(values: Array) -> str:
+    """Return numbers with three digits, separated by commas."""
+    return ", ".join(f"{value:.3g}" for value in values)

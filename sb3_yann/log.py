@@ -1,0 +1,334 @@
+"""A plant's log: episodes of states, inputs and measured disturbances, checked and cut at gaps."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import Array, check_positive, to_float
+
+Arrays = ArrayLike | Sequence[ArrayLike]
+"""One array for each episode, or that of a single one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode without gaps.
+
+    Attributes
+    ----------
+    states : ndarray, shape (T + 1, n)
+        Before every input, and after the last one.
+    inputs : ndarray, shape (T, m)
+        As they were executed.
+    disturbances : ndarray, shape (T, d)
+        Measured with the inputs; without entries where nothing was.
+    """
+
+    states: Array
+    inputs: Array
+    disturbances: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __len__(self) -> int:
+        """Return the number of steps T."""
+        return len(self.inputs)
+
+    @property
+    def driven(self) -> Array:
+        """Inputs and disturbances of each step, shape (T, m + d)."""
+        return (
+            np.hstack([self.inputs, self.disturbances]) if self.disturbances.size else self.inputs
+        )
+
+    @property
+    def regressors(self) -> Array:
+        """State, inputs and disturbances of each step, shape (T, n + m + d)."""
+        return np.hstack([self.states[:-1], self.driven])
+
+    def part(self, start: int, stop: int) -> Episode:
+        """Return the steps from start to before stop."""
+        return Episode(
+            self.states[start : stop + 1], self.inputs[start:stop], self.disturbances[start:stop]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Episodes of one plant, with the names of what was logged.
+
+    Attributes
+    ----------
+    episodes : tuple of Episode
+        At least two steps in all.
+    dt : float
+        Sampling time.
+    state_names, input_names, disturbance_names : tuple of str
+        Empty where nobody named them.
+    lost_steps : int
+        Steps left out, since they took another time than ``dt``.
+
+    Examples
+    --------
+    >>> log = Log.from_arrays([[0.0], [1.0], [1.5]], [[1.0], [1.0]], dt=0.5)
+    >>> len(log), log.episodes[0].states.shape
+    (1, (3, 1))
+    """
+
+    episodes: tuple[Episode, ...]
+    dt: float
+    state_names: tuple[str, ...] = ()
+    input_names: tuple[str, ...] = ()
+    disturbance_names: tuple[str, ...] = ()
+    lost_steps: int = 0
+
+    def __len__(self) -> int:
+        """Return the number of episodes."""
+        return len(self.episodes)
+
+    def __iter__(self) -> Iterator[tuple[Array, Array]]:
+        """Yield states (T + 1, n) and inputs (T, m) of each episode."""
+        for each in self.episodes:
+            yield each.states, each.inputs
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """The numbers n, m and d of states, inputs and disturbances."""
+        first = self.episodes[0]
+        return first.states.shape[1], first.inputs.shape[1], first.disturbances.shape[1]
+
+    @classmethod
+    def from_arrays(
+        cls,
+        states: Arrays,
+        inputs: Arrays,
+        dt: float,
+        *,
+        disturbances: Arrays | None = None,
+        time: Arrays | None = None,
+    ) -> Log:
+        """Return the log of arrays, one for each episode, or of a single one.
+
+        Parameters
+        ----------
+        states : array_like, shape (T + 1, n), or a sequence of such
+            Before every input, and after the last one.
+        inputs, disturbances : array_like, shapes (T, m) and (T, d), or sequences of such
+            The inputs as they were executed, and what was measured with them.
+        dt : float
+            Sampling time.
+        time : array_like, shape (T + 1,), or a sequence of such, optional
+            When each row of the states was measured. Steps that differ from ``dt`` by more than
+            10 % are left out, and the episode is cut there.
+
+        Raises
+        ------
+        ValueError
+            For shapes that do not fit, or numbers that are not finite.
+        """
+        x = _matrices("states", states)
+        u = _matrices("actions", inputs)
+        d = [np.zeros((len(each), 0)) for each in u]
+        if disturbances is not None:
+            d = _matrices("disturbances", disturbances)
+        for name, parts in (("actions", u), ("disturbances", d)):
+            _require_one_state_more(name, parts, x)
+        if sum(map(len, u)) < 2:
+            raise ValueError(
+                f"states has shape {x[0].shape} and actions {u[0].shape}: one step tells nothing. "
+                "Rows are samples and columns states or inputs; transpose a log that has them "
+                "otherwise."
+            )
+        dt = check_positive("dt", dt)
+        episodes = [Episode(*parts) for parts in zip(x, u, d, strict=True)]
+        lost = 0
+        if time is not None:
+            episodes, lost = _without_gaps(episodes, time, dt)
+        return cls(tuple(episodes), dt, lost_steps=lost)
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: str | os.PathLike[str],
+        states: Sequence[str],
+        inputs: Sequence[str],
+        dt: float,
+        *,
+        disturbances: Sequence[str] = (),
+        episode: str | None = None,
+        time: str | None = None,
+        delimiter: str = ",",
+    ) -> Log:
+        """Return the log of a CSV file with a header, as a historian writes it.
+
+        A row holds the state at a sample and the inputs that act from there on. The inputs of an
+        episode's last row do not count.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        states, inputs, disturbances : sequence of str
+            Names of columns.
+        dt : float
+            Sampling time.
+        episode : str, optional
+            A column that changes from one episode to the next.
+        time : str, optional
+            A column of times in the unit of ``dt``; an episode ends where a step takes another.
+        delimiter : str, default ","
+            Between two columns.
+
+        Raises
+        ------
+        ValueError
+            For a column that is not there, or a row that holds no number where it should. Rows
+            without any reading end an episode.
+        """
+        for name, given in (("states", states), ("inputs", inputs)):
+            if isinstance(given, str) or not given:
+                raise ValueError(f"{name} = {given!r} must be a list of column names.")
+        wanted = [*states, *inputs, *disturbances]
+        with Path(path).open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file, delimiter=delimiter)
+            header = rows.fieldnames or []
+            named = [*wanted, *(each for each in (episode, time) if each is not None)]
+            if missing := [name for name in named if name not in header]:
+                raise ValueError(f"{path} has no column {missing[0]!r}; it has {list(header)}.")
+            content = list(rows)
+        table = np.array(
+            [[_number(path, k, row, name) for name in wanted] for k, row in enumerate(content)]
+        )
+        if not len(table):
+            raise ValueError(f"{path} has no rows below its header.")
+        n, m = len(states), len(inputs)
+        ends = np.zeros(len(table) + 1, dtype=bool)
+        ends[[0, -1]] = True
+        if episode is not None:
+            labels = np.array([row[episode] for row in content])
+            ends[1:-1] |= labels[1:] != labels[:-1]
+        no_state = ~np.isfinite(table[:, :n]).all(axis=1)
+        no_input = ~np.isfinite(table[:, n:]).all(axis=1)
+        ends[:-1] |= no_state
+        ends[1:] |= no_state | no_input
+        times = None
+        if time is not None:
+            times = np.array([_number(path, k, row, time) for k, row in enumerate(content)])
+        edges = pairwise(np.flatnonzero(ends))
+        parts = [slice(first, stop) for first, stop in edges if stop - first > 1]
+        if not parts:
+            raise ValueError(f"{path} holds no two rows in a row with all of {wanted}.")
+        log = cls.from_arrays(
+            [table[part, :n] for part in parts],
+            [table[part, n : n + m][:-1] for part in parts],
+            dt,
+            disturbances=[table[part, n + m :][:-1] for part in parts] if disturbances else None,
+            time=None if times is None else [times[part] for part in parts],
+        )
+        return cls(
+            log.episodes, dt, tuple(states), tuple(inputs), tuple(disturbances), log.lost_steps
+        )
+
+
+def split_episodes(
+    episodes: Sequence[Episode], held_out: float
+) -> tuple[list[Episode], list[Episode]]:
+    """Return what to fit and what to test: the last of all steps, cutting an episode if need be."""
+    total = sum(map(len, episodes))
+    left = total - max(1, round(held_out * total)) if held_out else total
+    fitted: list[Episode] = []
+    tested: list[Episode] = []
+    for episode in episodes:
+        border = min(left, len(episode))
+        left -= border
+        fitted += [episode.part(0, border)] if border else []
+        tested += [episode.part(border, len(episode))] if border < len(episode) else []
+    return fitted, tested
+
+
+def _number(path: object, row: int, content: dict[str, str], name: str) -> float:
+    text = (content[name] or "").strip()
+    try:
+        return float(text) if text else np.nan
+    except ValueError:
+        raise ValueError(f"{path}, row {row + 2}: {name} is {text!r}, expected a number.") from None
+
+
+def _require_one_state_more(name: str, parts: list[Array], states: list[Array]) -> None:
+    if len(parts) != len(states):
+        raise ValueError(f"{name} has {len(parts)} episodes, states has {len(states)}.")
+    for i, (part, state) in enumerate(zip(parts, states, strict=True)):
+        if len(part) + 1 != len(state) or not len(part):
+            raise ValueError(
+                f"{name} of episode {i} has {len(part)} rows, states has {len(state)}. "
+                "Expected T >= 1 and T + 1: the states before each action and after the last."
+            )
+
+
+def _without_gaps(episodes: list[Episode], time: Arrays, dt: float) -> tuple[list[Episode], int]:
+    """Return the episodes cut at steps that do not take dt, and the number of these steps."""
+    if isinstance(time, (list, tuple)) and len(time) > 0 and np.ndim(time[0]) == 1:
+        times = [to_float(f"time of episode {i}", part) for i, part in enumerate(time)]
+    else:
+        array = to_float("time", time)
+        times = list(array) if array.ndim == 2 else [array]
+    if len(times) != len(episodes):
+        raise ValueError(f"time has {len(times)} episodes, states has {len(episodes)}.")
+    parts: list[Episode] = []
+    lost = 0
+    for i, (episode, instants) in enumerate(zip(episodes, times, strict=True)):
+        if instants.shape != (len(episode) + 1,):
+            wanted = f"({len(episode) + 1},): one for each row of states"
+            raise ValueError(f"time of episode {i} has shape {instants.shape}, expected {wanted}.")
+        span = np.diff(instants)
+        if not np.all(span > 0):
+            raise ValueError(
+                f"time of episode {i} does not increase after row {int(np.argmax(~(span > 0)))}. "
+                "Sort the log, and leave out rows that stand there twice."
+            )
+        gaps = np.flatnonzero(np.abs(span - dt) > 0.1 * dt)
+        edges = zip([-1, *gaps], [*gaps, len(episode)], strict=True)
+        parts += [episode.part(a + 1, b) for a, b in edges if b > a + 1]
+        lost += gaps.size
+    if 2 * lost > sum(map(len, episodes)):
+        median = np.median(np.concatenate([np.diff(each) for each in times]))
+        raise ValueError(
+            f"dt = {dt:g}, but a step of the log takes {median:g} (the median). Give time and dt "
+            "in the same unit."
+        )
+    return parts, lost
+
+
+def _matrices(name: str, value: Arrays) -> list[Array]:
+    """Return one float64 matrix for each episode, all with the same columns."""
+    given = list(value) if isinstance(value, (list, tuple)) else []
+    flat = [i for i, part in enumerate(given) if np.shape(part) != () and np.ndim(part) == 1]
+    if flat and len({np.size(part) for part in given}) > 1:
+        raise ValueError(
+            f"{name} of episode {flat[0]} has shape {np.shape(given[flat[0]])}, expected "
+            "(rows, columns). Of a single column write values.reshape(-1, 1)."
+        )
+    several = len(given) > 0 and np.ndim(given[0]) == 2
+    if several or (array := to_float(name, value)).ndim == 3:
+        parts = [to_float(f"{name} of episode {i}", part) for i, part in enumerate(value)]  # type: ignore[arg-type]
+    else:
+        parts = [array]
+    for i, part in enumerate(parts):
+        if part.ndim != 2 or not part.shape[1] or part.shape[1] != parts[0].shape[1]:
+            raise ValueError(
+                f"{name} of episode {i} has shape {part.shape}, expected (rows, columns) with the "
+                "same columns in each episode. Of a single one write values.reshape(-1, 1)."
+            )
+        bad = np.flatnonzero(~np.all(np.isfinite(part), axis=1))
+        if bad.size:
+            raise ValueError(
+                f"{name} of episode {i} holds NaN or infinite entries in {bad.size} rows, first in "
+                f"row {bad[0]}. Leave them out by splitting the episode there into two."
+            )
+    return parts

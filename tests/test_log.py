@@ -1,0 +1,156 @@
+"""Logs are cut where time is missing, and nothing else is lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sb3_yann import identify
+from sb3_yann.log import Episode, Log
+from sb3_yann.log import _without_gaps as without_gaps
+from sb3_yann.log import split_episodes as split
+
+
+def numbered(steps: int) -> Episode:
+    return Episode(np.arange(steps + 1.0)[:, None], np.arange(steps) + np.zeros((1, steps)).T)
+
+
+def test_every_step_but_those_of_another_length_is_kept() -> None:
+    time = np.array([0, 1, 2, 5, 6, 7, 9, 10], float)  # steps 2 and 5 are gaps
+    parts, lost = without_gaps([numbered(7)], [time], 1.0)
+    assert lost == 2
+    assert [each.states[:, 0].tolist() for each in parts] == [[0, 1, 2], [3, 4, 5], [6, 7]]
+    assert all(len(each) == len(each.states) - 1 for each in parts)
+
+
+def test_gaps_at_both_ends_leave_what_is_between() -> None:
+    (part,), lost = without_gaps([numbered(4)], [np.array([0, 3, 4, 5, 9], float)], 1.0)
+    assert lost == 2 and part.states[:, 0].tolist() == [1, 2, 3]
+
+
+def test_the_last_steps_of_all_are_held_out_and_none_is_in_both_parts() -> None:
+    fitted, tested = split([numbered(6), numbered(4)], 0.5)
+    assert [len(each) for each in fitted] == [5] and [len(each) for each in tested] == [1, 4]
+    assert fitted[0].states[-1] == tested[0].states[0] == 5
+
+
+@pytest.mark.parametrize(("longer", "lost"), [(0.099, 0), (-0.099, 0), (0.101, 1), (-0.101, 1)])
+def test_a_step_a_tenth_of_dt_too_long_or_too_short_is_none(longer: float, lost: int) -> None:
+    time = 2.0 * np.arange(10)
+    time[4:] += 2.0 * longer
+    parts, gone = without_gaps([numbered(9)], [time], 2.0)
+    assert gone == lost and sum(map(len, parts)) == 9 - lost
+
+
+def test_where_more_than_half_of_the_steps_are_none_the_unit_is_another() -> None:
+    def times(gaps: int) -> np.ndarray:
+        return np.cumsum([0.0, *[3.0] * gaps, *[1.0] * (8 - gaps)])
+
+    parts, lost = without_gaps([numbered(8)], [times(4)], 1.0)
+    assert lost == 4 and [len(each) for each in parts] == [4]
+    with pytest.raises(ValueError, match=r"dt = 1, but a step of the log takes 3 \(the median\)"):
+        without_gaps([numbered(8)], [times(5)], 1.0)
+    with pytest.raises(ValueError, match="time has 2 episodes, states has 1"):
+        without_gaps([numbered(8)], [times(0), times(0)], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("share", "fitted", "tested"),
+    [(0.0, [6, 4], []), (0.01, [6, 3], [1]), (0.14, [6, 3], [1]), (0.16, [6, 2], [2]),
+     (0.4, [6], [4]), (0.45, [6], [4]), (0.9, [1], [5, 4])],
+)  # fmt: skip
+def test_what_is_held_out_is_rounded_and_one_step_at_least(share, fitted, tested) -> None:
+    parts = split([numbered(6), numbered(4)], share)
+    assert [[len(each) for each in part] for part in parts] == [fitted, tested]
+
+
+def test_disturbances_are_columns_behind_the_inputs_and_one_step_is_no_log() -> None:
+    x = np.zeros((4, 2))
+    u = np.ones((3, 1))
+    log = Log.from_arrays(x, u, 1.0, disturbances=np.full((3, 2), 5.0))
+    (episode,) = log.episodes
+    assert log.sizes == (2, 1, 2)
+    np.testing.assert_array_equal(episode.regressors, np.tile([0, 0, 1, 5, 5], (3, 1)))
+    part = episode.part(1, 3)
+    assert len(part) == 2 and part.states.shape == (3, 2)
+    several = Log.from_arrays(np.zeros((2, 4, 2)), np.ones((2, 3, 1)), 1.0)
+    assert several.sizes == (2, 1, 0) and [len(each) for each in several.episodes] == [3, 3]
+    assert [each[1].shape for each in several] == [(3, 1), (3, 1)]
+    with pytest.raises(ValueError, match="one step tells nothing"):
+        Log.from_arrays(x[:2], u[:1], 1.0)
+
+
+CSV = """run,t,level,T,valve,load
+1,0,1.0,20,0.5,7
+1,10,1.1,21,0.6,7
+1,20,1.2,22,,
+2,0,2.0,23,0.5,8
+2,10,2.1,24,0.6,8
+2,30,2.2,25,0.7,8
+2,40,2.3,26,0.8,8
+2,50,,,0.8,8
+2,60,2.5,27,0.8,8
+2,70,2.6,28,0.9,8
+"""
+
+
+def test_a_csv_file_is_cut_where_an_episode_or_a_reading_ends(tmp_path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(CSV)
+    log = Log.from_csv(
+        path,
+        states=["level", "T"],
+        inputs=["valve"],
+        dt=10,
+        disturbances=["load"],
+        episode="run",
+        time="t",
+    )
+    assert [each.states[:, 0].tolist() for each in log.episodes] == [
+        [1.0, 1.1, 1.2],
+        [2.0, 2.1],
+        [2.2, 2.3],
+        [2.5, 2.6],
+    ]
+    assert [each.inputs[:, 0].tolist() for each in log.episodes] == [
+        [0.5, 0.6],
+        [0.5],
+        [0.7],
+        [0.8],
+    ]
+    assert log.lost_steps == 1 and log.state_names == ("level", "T")
+    assert log.episodes[0].disturbances.tolist() == [[7], [7]]
+
+
+def test_a_csv_file_that_does_not_fit_is_named(tmp_path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(CSV)
+    with pytest.raises(ValueError, match="no column 'h'; it has"):
+        Log.from_csv(path, states=["h"], inputs=["valve"], dt=10)
+    with pytest.raises(ValueError, match="list of column names"):
+        Log.from_csv(path, states="level", inputs=["valve"], dt=10)
+    path.write_text(CSV.replace("1.1", "high"))
+    with pytest.raises(ValueError, match=r"row 3: level is 'high', expected a number"):
+        Log.from_csv(path, states=["level"], inputs=["valve"], dt=10)
+    path.write_text("level,valve\n")
+    with pytest.raises(ValueError, match="no rows below its header"):
+        Log.from_csv(path, states=["level"], inputs=["valve"], dt=10)
+
+
+def test_identify_takes_a_log_with_its_names(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=80)
+    x = np.zeros(81)
+    for k in range(80):
+        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
+    path = tmp_path / "log.csv"
+    rows = [f"{a:.12g};{b:.12g}" for a, b in zip(x, [*u, 0.0], strict=True)]
+    path.write_text("\n".join(["level;valve", *rows]))
+    log = Log.from_csv(path, states=["level"], inputs=["valve"], dt=2, delimiter=";")
+    model = identify(log).model
+    assert model.state_names == ("level",) and model.input_names == ("valve",) and model.dt == 2
+    np.testing.assert_allclose([model.A[0, 0], model.B[0, 0]], [0.8, 0.5], atol=1e-9)
+    with pytest.raises(TypeError, match="'dt'"):
+        identify(log, dt=2)
+    with pytest.raises(TypeError, match="takes a Log, or states and actions"):
+        identify(x)
