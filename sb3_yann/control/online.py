@@ -16,8 +16,7 @@ from scipy import linalg
 
 from sb3_yann._validation import Array, check_array, check_choice, check_int, half_widths
 from sb3_yann.control import lqr
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits
-from sb3_yann.control.explicit.steep import SteepQP, solvable
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, SteepQP, as_bits, solvable
 from sb3_yann.control.law import INFEASIBLE, PlantLaw, as_points, bounds_of
 
 if TYPE_CHECKING:

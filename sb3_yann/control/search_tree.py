@@ -281,7 +281,8 @@ def _count_hits(
     hits: Integers,
 ) -> None:
     """Count for each entry of ``leaf_regions`` the points that it is the first one to hold."""
-    for point in points:
+    for each in range(len(points)):  # numba holds a row of its own for one with gaps
+        point = points[each]
         node = 0
         while node >= 0:
             node = children[node, 1 if np.dot(normals[node], point) > levels[node] else 0]

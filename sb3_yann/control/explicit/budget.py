@@ -69,8 +69,11 @@ class SolveBudget:
     def require(self, n_regions: int) -> None:
         """Raise ExplicitLimitError if a law that is there has too many regions."""
         if self.region_limit is not None and n_regions > self.region_limit:
-            more = f"{n_regions} regions, more than region_limit = {self.region_limit}"
-            raise ExplicitLimitError(f"The law has {more}. {_ADVICE}", n_regions)
+            raise ExplicitLimitError(
+                f"The law has {n_regions} regions, more than region_limit = {self.region_limit}. "
+                f"{_ADVICE}",
+                n_regions,
+            )
 
 
 class BudgetTimer:
@@ -81,8 +84,10 @@ class BudgetTimer:
     """
 
     def __init__(self, budget: SolveBudget) -> None:
+        self.budget = budget
         self.effort = 0.0
-        self.budget, self.found, self._start = budget, 0, time.monotonic()
+        self.found = 0
+        self._start = time.monotonic()
         self._done = ""
         self._bar = self._new_bar("Critical regions", None)
 

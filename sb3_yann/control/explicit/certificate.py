@@ -13,25 +13,28 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.budget import (
     BudgetTimer,
-    SolveBudget,
     effort_of_conditions,
     effort_of_lp,
     effort_of_qp,
 )
-from sb3_yann.control.explicit.kkt import Optimality, optimality
-from sb3_yann.control.explicit.parametric_qp import ParametricQP, as_bits, batches
+from sb3_yann.control.explicit.parametric_qp import (
+    Optimality,
+    ParametricQP,
+    as_bits,
+    batches,
+    optimality,
+)
 from sb3_yann.control.polyhedra import Region, farthest_points, largest_ball
 
-# How far a law may be off, and a point from a region that holds it, in half-widths of the ranges.
-LAW, INSIDE = 1e-6, 1e-8
-# Half-spaces that differ by less are equal; how far a region may reach beyond another's conditions.
-EQUAL, IMPLIED = 1e-9, 1e-9
-# With a larger gain the law is that of the check: the QR factors of the walk leave it off by 1e-13.
-STEEP = 1e3
-# A region that holds no ball of this radius, in half-widths of the box, may be left to its
-# neighbors where its conditions are rounding: such regions crowd at the border of a feasible set.
+LAW_TOL = 1e-6
+"""How far a law may be off, in half-widths of the input range."""
+INSIDE_TOL = 1e-8
+"""How far a point may lie from a region that holds it, in half-widths of the box."""
+IMPLIED_TOL = 1e-9
+"""How far a region may reach beyond its conditions, and equal half-spaces differ; likewise."""
 NEEDLE = 1e-7
-Ball = tuple[Array, float]
+"""A region that holds no ball of this radius, in half-widths of the box, may be left to its
+neighbors where its conditions are rounding: such regions crowd at the border of a feasible set."""
 
 
 class ExplicitSolutionError(RuntimeError):
@@ -42,12 +45,6 @@ class ExplicitSolutionError(RuntimeError):
     >>> issubclass(ExplicitSolutionError, RuntimeError)
     True
     """
-
-
-def _sets(multipliers: Array) -> list[int]:
-    """Return the sets of constraints with multipliers, one for each row, as whole numbers."""
-    bits = np.packbits(multipliers > 1e-11, axis=1, bitorder="little")
-    return [int.from_bytes(row.tobytes(), "little") for row in bits]
 
 
 class Certificate:
@@ -75,7 +72,7 @@ class Certificate:
         What of U is the law.
     center, half : ndarray, shape (n,)
         Take theta to the units of the problem.
-    timer : BudgetTimer, optional
+    timer : BudgetTimer
         Shows how far the check is, and ends it.
     """
 
@@ -86,16 +83,17 @@ class Certificate:
         to_inputs: Array,
         center: Array,
         half: Array,
-        timer: BudgetTimer | None = None,
+        timer: BudgetTimer,
     ) -> None:
         self.program = program
         self.regions = regions
         self.to_inputs = to_inputs
         self.center = center
         self.half = half
-        self.timer = timer or BudgetTimer(SolveBudget())
+        self.timer = timer
         self.outer = np.column_stack(program.theta_rows())
-        self.effort = effort_of_qp(*program.G.shape)
+        self.qp_effort = effort_of_qp(*program.G.shape)
+        self.dropped: set[int] = set()
 
     def check(self) -> list[Region]:
         """Return the regions, with the laws of steep ones more exact, and trimmed by 1e-8 at most.
@@ -104,33 +102,32 @@ class Certificate:
         """
         if not self.regions:
             self._fail("no region was found", self.center * 0)
-        refined = list(self.regions)
         self._collect()
-        balls = [region.ball() for region in self.regions]
+        self.balls = [region.ball() for region in self.regions]
         # Two looks at each region.
-        self.timer.stage("Checked", "and not all were checked", 2 * len(balls))
-        needles = {i for i, (_, radius) in enumerate(balls) if radius < NEEDLE}
-        dropped: set[int] = set()
-        for i, (middle, _) in enumerate(balls):
-            with self._forgiving(i, needles, dropped):
-                self._require_optimal(i, middle)
+        self.timer.stage("Checked", "and not all were checked", 2 * len(self.balls))
+        for i, (middle, _) in enumerate(self.balls):
+            with self._needles_may_fail(i):
+                if not self._is_right(i, middle):
+                    self._fail(f"the law of region {i} is not optimal inside it", middle)
             self.timer.advance()
-        for i, each in self._conditions(needles, dropped):
-            with self._forgiving(i, needles, dropped):
-                refined[i] = self._checked(i, balls[i], each)
+        refined = list(self.regions)
+        for i, conditions in self._conditions():
+            with self._needles_may_fail(i):
+                refined[i] = self._checked(i, conditions)
             self.timer.advance()
-        if dropped:
-            kept = [i for i in range(len(balls)) if i not in dropped]
+        if self.dropped:
+            kept = [i for i in range(len(self.balls)) if i not in self.dropped]
             self.regions = [self.regions[i] for i in kept]
             self._collect()
-            for i in sorted(dropped):
-                U = self.program.solve(balls[i][0])
+            for i in sorted(self.dropped):
+                U = self.program.solve(self.balls[i][0])
                 if U is not None:
-                    self._require_held(balls[i][0], U, 2 * NEEDLE)
+                    self._require_held(self.balls[i][0], U, 2 * NEEDLE)
             refined = [refined[i] for i in kept]
-            balls = [balls[i] for i in kept]
+            self.balls = [self.balls[i] for i in kept]
         self._require_agreement()
-        self._require_no_doubles(balls)
+        self._require_no_doubles()
         return refined
 
     def _collect(self) -> None:
@@ -144,49 +141,39 @@ class Certificate:
         self.starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
 
     @contextmanager
-    def _forgiving(self, i: int, needles: set[int], dropped: set[int]) -> Iterator[None]:
-        """Leave a needle out that fails a check."""
+    def _needles_may_fail(self, i: int) -> Iterator[None]:
+        """Leave region i out if it is a needle that fails a check."""
         try:
             yield
         except ExplicitSolutionError:
-            if i not in needles:
+            if self.balls[i][1] >= NEEDLE:
                 raise
-            dropped.add(i)
-
-    def _require_optimal(self, i: int, middle: Array) -> None:
-        """Raise unless a QP in the middle of region i has its law for an answer."""
-        if not self._is_right(i, middle):
-            self._fail(f"the law of region {i} is not optimal inside it", middle)
+            self.dropped.add(i)
 
     def _is_right(self, i: int, point: Array) -> bool:
         """Tell whether a QP at a point has the law of region i for an answer."""
-        self.timer.tick(self.effort)
+        self.timer.tick(self.qp_effort)
         U = self.program.solve(point)
-        return U is not None and self._off(np.array([i]), point[None], U[None])[0] <= LAW
+        return U is not None and self._error(np.array([i]), point[None], U[None])[0] <= LAW_TOL
 
-    def _checked(self, i: int, ball: Ball, kkt: Optimality) -> Region:
-        """Return region i, trimmed, with the exact law where that is steep; raise if wrong."""
-        region = self.regions[i]
-        exact = self.to_inputs @ kkt.law
-        off = np.abs(exact - np.column_stack([self.gains[i], self.offsets[i]])).max()
-        if off > LAW * (1 + np.abs(exact).max()):
-            self._fail(f"the law of region {i} is not optimal inside it", ball[0])
-        own = np.column_stack([region.A, region.b])
-        known = np.concatenate([self.outer, kkt.rows])
-        same = np.abs(own[:, None] - known[None]).max(axis=2) < EQUAL
-        missing = self._missing(i, np.any(same[:, len(self.outer) :], axis=0), ball, kkt)
-        self._require_neighbors(i, same, kkt)
-        if len(missing):
-            region = self._trimmed(region, kkt, missing)
-        if np.abs(kkt.law[:, :-1]).max() > STEEP:
-            region = replace(region, gain=kkt.law[:, :-1], offset=kkt.law[:, -1])
-        return region
+    def _error(self, regions: NDArray[np.intp], points: Array, inputs: Array) -> Array:
+        """Return how far laws are from the answers of a QP at points, beyond what the QP is.
 
-    def _conditions(self, needles: set[int], dropped: set[int]) -> Iterator[tuple[int, Optimality]]:
+        Constraints that hold to 1e-11 move its answer by so much times the slope of the law.
+        """
+        gains = self.gains[regions]
+        first = inputs @ self.to_inputs.T
+        law = np.einsum("kvn,kn->kv", gains, points) + self.offsets[regions]
+        return np.asarray(
+            np.abs(law - first).max(axis=1) - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1)
+        )
+
+    def _conditions(self) -> Iterator[tuple[int, Optimality]]:
         """Yield the KKT conditions of each region that is left."""
-        left = [i for i in range(len(self.regions)) if i not in dropped]
+        left = [i for i in range(len(self.regions)) if i not in self.dropped]
         sets = [self.regions[i].active_set for i in left]
-        (v, n), rows = self.program.F.shape, len(self.program.w)
+        v, n = self.program.F.shape
+        rows = len(self.program.w)
 
         def numbers(size: int) -> float:
             return (v + size) * (v + size + rows + n + 1)
@@ -196,34 +183,53 @@ class Certificate:
             self.timer.tick(len(members) * effort)
             try:
                 found = optimality(self.program, [sets[k] for k in members])
-            except np.linalg.LinAlgError:
-                yield from self._one_by_one([left[k] for k in members], needles, dropped)
-                continue
-            yield from zip([left[k] for k in members], found, strict=True)
+                yield from zip([left[k] for k in members], found, strict=True)
+            except np.linalg.LinAlgError:  # one of them at least has dependent constraints
+                for k in members:
+                    with self._needles_may_fail(left[k]):
+                        yield left[k], self._conditions_of(left[k])
 
-    def _one_by_one(
-        self, members: list[int], needles: set[int], dropped: set[int]
-    ) -> Iterator[tuple[int, Optimality]]:
-        """Yield the conditions of regions of which one at least has dependent constraints."""
-        for i in members:
-            try:
-                yield i, optimality(self.program, [self.regions[i].active_set])[0]
-            except np.linalg.LinAlgError:
-                what = "the active constraints of a region depend on each other"
-                with self._forgiving(i, needles, dropped):
-                    self._fail(what, self.regions[i].ball()[0])
+    def _conditions_of(self, i: int) -> Optimality:
+        try:
+            return optimality(self.program, [self.regions[i].active_set])[0]
+        except np.linalg.LinAlgError:
+            what = "the active constraints of a region depend on each other"
+            self._fail(what, self.balls[i][0])
 
-    def _missing(
-        self, i: int, known: NDArray[np.bool_], ball: Ball, kkt: Optimality
-    ) -> NDArray[np.intp]:
+    def _checked(self, i: int, kkt: Optimality) -> Region:
+        """Return region i, trimmed, with the exact law where that is steep; raise if wrong."""
+        region = self.regions[i]
+        exact = self.to_inputs @ kkt.law
+        error = np.abs(exact - np.column_stack([self.gains[i], self.offsets[i]])).max()
+        if error > LAW_TOL * (1 + np.abs(exact).max()):
+            self._fail(f"the law of region {i} is not optimal inside it", self.balls[i][0])
+        own = np.column_stack([region.A, region.b])
+        known = np.concatenate([self.outer, kkt.rows])
+        same = np.abs(own[:, None] - known[None]).max(axis=2) < IMPLIED_TOL
+        missing = self._missing(i, np.any(same[:, len(self.outer) :], axis=0), kkt)
+        self._require_neighbors(i, same, kkt)
+        if len(missing):
+            across = region.across
+            if across:
+                across += tuple(self._beyond(kkt.across(row)) for row in missing)
+            A = np.concatenate([region.A, kkt.rows[missing, :-1]])
+            b = np.append(region.b, kkt.rows[missing, -1])
+            region = replace(region, A=A, b=b, across=across)
+        if np.abs(kkt.law[:, :-1]).max() > 1e3:  # the walk's QR factors leave it off by 1e-13
+            region = replace(region, gain=kkt.law[:, :-1], offset=kkt.law[:, -1])
+        return region
+
+    def _missing(self, i: int, known: NDArray[np.bool_], kkt: Optimality) -> NDArray[np.intp]:
         """Return which conditions the half-spaces of region i just do not imply.
 
         They are left out where they seem to touch the region alone. Raise if it lies farther
         beyond one, and a QP there disagrees; ``known`` tells which of the conditions are among the
         half-spaces.
         """
-        region, n, (inside, radius) = self.regions[i], len(ball[0]), ball
-        if radius <= 0 or np.any(kkt.rows[:, n] + IMPLIED < kkt.rows[:, :n] @ inside):
+        region = self.regions[i]
+        inside, radius = self.balls[i]
+        n = len(inside)
+        if radius <= 0 or np.any(kkt.rows[:, n] + IMPLIED_TOL < kkt.rows[:, :n] @ inside):
             self._fail(f"the law of region {i} violates the KKT conditions", inside)
         others = np.flatnonzero(~known)
         if not len(others):
@@ -232,39 +238,32 @@ class Certificate:
         self.timer.tick(len(rows) * effort_of_lp(*region.A.shape) / 2)
         points = farthest_points(region.A, region.b, inside, rows[:, :n])
         beyond = np.sum(rows[:, :n] * points, axis=1) - rows[:, n]
-        for k in np.flatnonzero(beyond > INSIDE):
+        for k in np.flatnonzero(beyond > INSIDE_TOL):
             # The half-spaces of a thin region are rounding: what counts is the law beyond them.
             if beyond[k] > NEEDLE or not self._is_right(i, points[k]):
                 self._fail(f"the law of region {i} violates the KKT conditions", points[k])
-        return np.asarray(others[beyond > IMPLIED])
-
-    def _trimmed(self, region: Region, kkt: Optimality, rows: NDArray[np.intp]) -> Region:
-        """Return a region with some of its conditions besides."""
-        A = np.concatenate([region.A, kkt.rows[rows, :-1]])
-        b = np.append(region.b, kkt.rows[rows, -1])
-        across = region.across
-        if across:
-            across += tuple(self._beyond(kkt.across(row)) for row in rows)
-        return replace(region, A=A, b=b, across=across)
+        return np.asarray(others[beyond > IMPLIED_TOL])
 
     def _beyond(self, candidates: Iterable[int]) -> tuple[int, ...] | None:
         """Return the active set of the first of these that is a region, None if none is."""
         at = next((self.by_set[each] for each in candidates if each in self.by_set), None)
         return None if at is None else self.regions[at].active_set
 
-    def _require_neighbors(self, i: int, same: NDArray[np.bool_], conditions: Optimality) -> None:
+    def _require_neighbors(self, i: int, same: NDArray[np.bool_], kkt: Optimality) -> None:
         """Raise if a facet of region i has no neighbor; ``same`` tells which conditions are it."""
-        outer, open_rows = len(self.outer), set(range(len(same)))
-        for row, each in zip(*(index.tolist() for index in np.nonzero(same)), strict=True):
+        outer = len(self.outer)
+        covered = set()
+        for row, each in np.argwhere(same).tolist():
             # A bound of theta, or a constraint.
-            if each < outer or all(a in self.by_set for a in conditions.across(each - outer)):
-                open_rows.discard(row)
-        for row in sorted(open_rows):
-            self._look_across(self.regions[i], row)
+            if each < outer or all(a in self.by_set for a in kkt.across(each - outer)):
+                covered.add(row)
+        for row in range(len(same)):
+            if row not in covered:
+                self._require_covered_across(self.regions[i], row)
 
-    def _look_across(self, region: Region, row: int) -> None:
+    def _require_covered_across(self, region: Region, row: int) -> None:
         """Raise if no region touches a facet from the other side where that is feasible."""
-        self.timer.tick(effort_of_lp(*region.A.shape) + self.effort)
+        self.timer.tick(effort_of_lp(*region.A.shape) + self.qp_effort)
         middle, distance = largest_ball(region.A, region.b, row)
         for step in (1e-5, 1e-6, 1e-7):
             point = middle + step * region.A[row]
@@ -274,82 +273,72 @@ class Certificate:
             U, multipliers = self.program.solve_with_multipliers(point)
             if U is None:
                 return
-            at = self.by_set.get(_sets(multipliers[None])[0])
-            other = None if at is None else self.regions[at]
-            if other and all(np.min(other.b - other.A @ x) >= -INSIDE for x in (point, middle)):
-                return
+            at = self.by_set.get(_active_sets(multipliers[None])[0])
+            if at is not None:
+                other = self.regions[at]
+                if min(np.min(other.b - other.A @ x) for x in (point, middle)) >= -INSIDE_TOL:
+                    return
             slacks = self._slacks(point)
-            if np.max(slacks) < -INSIDE:
+            if np.max(slacks) < -INSIDE_TOL:
                 self._fail("no region covers a feasible parameter", point)
-            holders = slacks >= -INSIDE
-            if np.any(self._slacks(middle)[holders] >= -INSIDE):
+            if np.any(self._slacks(middle)[slacks >= -INSIDE_TOL] >= -INSIDE_TOL):
                 return
-
-    def _off(self, regions: NDArray[np.intp], points: Array, inputs: Array) -> Array:
-        """Return how far laws are from the answers of a QP at points, beyond what the QP is.
-
-        Constraints that hold to 1e-11 move its answer by so much times the slope of the law.
-        """
-        gains, offsets = self.gains[regions], self.offsets[regions]
-        first = inputs @ self.to_inputs.T
-        off = np.abs(np.einsum("kvn,kn->kv", gains, points) + offsets - first).max(axis=1)
-        return np.asarray(off - 1e-10 * np.abs(gains).sum(axis=2).max(axis=1))
 
     def _slacks(self, point: Array) -> Array:
+        """Return how far inside each region a point lies."""
         return np.asarray(np.minimum.reduceat(self.b - self.A @ point, self.starts))
 
     def _require_agreement(self) -> None:
         """Raise unless QPs at random points of the box agree with the regions."""
-        n, random = self.program.F.shape[1], np.random.default_rng(1)
-        drawn = random.uniform(-1, 1, (50 * n, n))
+        n = self.program.F.shape[1]
         feasible = []
-        for point in drawn:
-            self.timer.tick(self.effort)
+        for point in np.random.default_rng(1).uniform(-1, 1, (50 * n, n)):
+            self.timer.tick(self.qp_effort)
             U, found = self.program.solve_with_multipliers(point)
             if U is not None:
                 feasible.append((point, U, found))
         if not feasible:
             return
         points, inputs, multipliers = (np.array(each) for each in zip(*feasible, strict=True))
-        meant = np.array([self.by_set.get(each, -1) for each in _sets(multipliers)])
+        meant = np.array([self.by_set.get(each, -1) for each in _active_sets(multipliers)])
         held = meant >= 0
         for i in np.unique(meant[held]):
-            region, at = self.regions[i], np.flatnonzero(meant == i)
-            held[at] = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE
-            wrong = at[held[at] & (self._off(np.full(len(at), i), points[at], inputs[at]) > LAW)]
+            region = self.regions[i]
+            at = np.flatnonzero(meant == i)
+            held[at] = (region.b - points[at] @ region.A.T).min(axis=1) >= -INSIDE_TOL
+            error = self._error(np.full(len(at), i), points[at], inputs[at])
+            wrong = at[held[at] & (error > LAW_TOL)]
             if len(wrong):
                 self._fail(f"the law of region {i} violates the KKT conditions", points[wrong[0]])
         for k in np.flatnonzero(~held):
             self._require_held(points[k], inputs[k])
 
-    def _require_held(self, point: Array, U: Array, apart: float = INSIDE) -> None:
-        """Raise unless the region that is nearest to a point has the right law there.
-
-        It is at most so far ``apart``.
-        """
+    def _require_held(self, point: Array, U: Array, distance: float = INSIDE_TOL) -> None:
+        """Raise unless the nearest region, at most so far from a point, has the right law there."""
         slacks = self._slacks(point)
         nearest = int(np.argmax(slacks))
-        if slacks[nearest] < -apart:
+        if slacks[nearest] < -distance:
             self._fail("no region covers a feasible parameter", point)
-        if self._off(np.array([nearest]), point[None], U[None])[0] > LAW:
+        if self._error(np.array([nearest]), point[None], U[None])[0] > LAW_TOL:
             self._fail(f"the law of region {nearest} violates the KKT conditions", point)
 
-    def _require_no_doubles(self, balls: list[tuple[Array, float]]) -> None:
+    def _require_no_doubles(self) -> None:
         """Raise if a region lies in another: both have then the same law, whatever their sets."""
         laws = np.array([np.append(region.gain.ravel(), region.offset) for region in self.regions])
         keys = laws @ np.random.default_rng(0).normal(size=laws.shape[1])
         order = np.argsort(keys)
-        near = np.flatnonzero(np.diff(keys[order]) < LAW * (1 + np.abs(keys[order][:-1])))
+        near = np.flatnonzero(np.diff(keys[order]) < LAW_TOL * (1 + np.abs(keys[order][:-1])))
         for i, j in zip(order[near], order[near + 1], strict=True):
-            one, two = self.regions[i], self.regions[j]
-            A, b = np.concatenate([one.A, two.A]), np.concatenate([one.b, two.b])
+            A = np.concatenate([self.regions[i].A, self.regions[j].A])
+            b = np.concatenate([self.regions[i].b, self.regions[j].b])
             self.timer.tick(effort_of_lp(*A.shape))
             middle, radius = largest_ball(A, b)
-            if radius > 0.99 * min(balls[i][1], balls[j][1]):
+            if radius > 0.99 * min(self.balls[i][1], self.balls[j][1]):
                 self._fail(f"region {min(i, j)} and region {max(i, j)} are the same", middle)
 
     def _fail(self, what: str, theta: Array) -> NoReturn:
-        place, advice = theta * self.half + self.center, "shorten the horizon"
+        place = theta * self.half + self.center
+        advice = "shorten the horizon"
         if self.program.steep:
             advice = "give SoftBounds larger units or a smaller penalty"
         raise ExplicitSolutionError(
@@ -357,3 +346,9 @@ class Certificate:
             f"problem is likely to be badly conditioned: {advice}, or bring states and weights to "
             "similar magnitudes."
         )
+
+
+def _active_sets(multipliers: Array) -> list[int]:
+    """Return the sets of constraints with multipliers, one for each row, as whole numbers."""
+    bits = np.packbits(multipliers > 1e-11, axis=1, bitorder="little")
+    return [int.from_bytes(row.tobytes(), "little") for row in bits]

@@ -1,23 +1,45 @@
-"""A walk over the critical regions of a quadratic program, from facet to facet."""
+"""The critical regions of a quadratic program, found by a walk from facet to facet."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.control.explicit.budget import BudgetTimer, effort_of_lp
-from sb3_yann.control.explicit.conditions import (
-    OUTER,
-    THINNEST,
-    Conditions,
-    Found,
-    members_of,
+from sb3_yann.control.explicit.budget import (
+    OF_REGION,
+    BudgetTimer,
+    effort_of_conditions,
+    effort_of_lp,
+    effort_of_qp,
 )
-from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.polyhedra import Region, largest_ball
+from sb3_yann.control.explicit.parametric_qp import (
+    DEPENDENT,
+    ParametricQP,
+    SteepQP,
+    as_bits,
+    batches,
+    kkt_solution,
+    members_of,
+    row_units,
+)
+from sb3_yann.control.polyhedra import (
+    Region,
+    bounded_region,
+    equal_rows,
+    farthest_point,
+    largest_ball,
+)
+
+THINNEST = 1e-9
+"""Regions that hold no ball of this radius, in half-widths of the box, are left out."""
+OUTER = -1
+"""Stands for the constraint of a facet with nothing feasible beyond."""
+SHARED = -2
+"""Stands for the constraint of a facet that several constraints share."""
 
 
 def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
@@ -27,85 +49,122 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     set with k added, or removed. If k depends on the active constraints, it takes the place of one
     of those that it contains with a positive factor; if there is none, nothing feasible lies there
     (Farkas' lemma). Where these sets have no region, a QP just across the middle of the facet tells
-    what lies there. Last, QPs at random points look for what the walk has not seen. Sets of
+    what lies there. Last, QPs at random points look for what the walk has not met. Sets of
     constraints are whole numbers, with bit k for k.
     """
-    found = _Walk(program, timer)
-    found.explore(found.seeds(20))
+    search = _Walk(program, timer)
+    search.explore(search.seeds(20))
     for _ in range(10):
-        missed = set(found.seeds(20 * program.F.shape[1])) - found.seen
+        missed = set(search.seeds(20 * program.F.shape[1])) - search.visited
         if not missed:
             break
-        found.explore(missed)
-    return found.regions()
+        search.explore(missed)
+    return search.regions()
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateRegion:
+    """A critical region with what lies across its facets.
+
+    Attributes
+    ----------
+    active : int
+        Its active set.
+    law : ndarray, shape (v, n + 1)
+        ``U = law [theta; 1]``.
+    A, b : ndarray, shapes (q, n) and (q,)
+        Its half-spaces.
+    labels : list of int
+        The constraint of each row, or OUTER or SHARED.
+    inside : ndarray, shape (n,)
+        A point well inside.
+    exchanges : dict
+        The active sets across the rows of constraints that depend on the active ones.
+    """
+
+    active: int
+    law: Array
+    A: Array
+    b: Array
+    labels: list[int]
+    inside: Array
+    exchanges: dict[int, tuple[int, ...]]
+
+    def across(self, row: int) -> tuple[int, ...]:
+        """Return the active sets that share a facet if nothing degenerates."""
+        label = self.labels[row]
+        return self.exchanges.get(label, (self.active ^ (1 << label),)) if label >= 0 else ()
 
 
 class _Walk:
+    """The regions that were found, and the active sets that were visited."""
+
     def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
-        self.program, self.timer = program, timer
+        self.timer = timer
         self.conditions = Conditions(program, timer)
-        self.found: dict[int, Found] = {}
-        self.seen: set[int] = set()
+        self.found: dict[int, CandidateRegion] = {}
+        self.visited: set[int] = set()
         self.random = np.random.default_rng(0)
 
     def regions(self) -> list[Region]:
         kept = self.conditions.kept
-        rows = {each: tuple(kept[members_of(each)].tolist()) for each in self.found}
-        across = {
-            each: tuple(
-                next((rows[other] for other in one.across(k) if other in rows), None)
-                for k in range(len(one.labels))
-            )
-            for each, one in self.found.items()
-        }
+        rows = {each: tuple(kept[[*members_of(each)]].tolist()) for each in self.found}
         return [
-            Region(rows[k], one.law[:, :-1], one.law[:, -1], one.A, one.b, one.inside, across[k])
-            for k, one in self.found.items()
+            Region(
+                active_set=rows[active],
+                gain=one.law[:, :-1],
+                offset=one.law[:, -1],
+                A=one.A,
+                b=one.b,
+                inside=one.inside,
+                across=tuple(
+                    next((rows[other] for other in one.across(k) if other in rows), None)
+                    for k in range(len(one.labels))
+                ),
+            )
+            for active, one in self.found.items()
         ]
 
     def seeds(self, count: int) -> Iterator[int]:
         """Yield the active sets where no region is known, at random points of the feasible set."""
-        corners, middle = self.conditions.corners, self.conditions.middle
+        corners = self.conditions.corners
+        middle = self.conditions.middle
         weights = self.random.dirichlet(np.ones(len(corners)), count)
         points = np.vstack([0 * middle, middle, 0.9 * weights @ corners + 0.1 * middle])
-        for point in points[~self._known(points)]:
+        known = np.zeros(len(points), dtype=bool)
+        for one in self.found.values():
+            known |= np.all(points @ one.A.T <= one.b, axis=1)
+        for point in points[~known]:
             active = self._active_at(point)
             if active is not None:
                 yield active
 
-    def _known(self, points: Array) -> NDArray[np.bool_]:
-        """Tell which points a region holds that was found."""
-        known = np.zeros(len(points), dtype=bool)
-        for one in self.found.values():
-            known |= np.all(points @ one.A.T <= one.b, axis=1)
-        return known
-
     def _active_at(self, point: Array) -> int | None:
         """Return the active set at a point, if there are several one that is not ruled out."""
         active = self.conditions.active_at(point)
-        if active in self.seen and active not in self.found:
+        if active in self.visited and active not in self.found:
             return self.conditions.active_at(point, apart=1e-9)
         return active
 
     def explore(self, wave: Iterable[int]) -> None:
         """Add all regions that are connected with those of some active sets."""
-        ahead = sorted(set(wave) - self.seen)
-        facets: list[tuple[Found, int]] = []
+        ahead = sorted(set(wave) - self.visited)
+        facets: list[tuple[CandidateRegion, int]] = []
         while ahead:
-            self.seen.update(ahead)
+            self.visited.update(ahead)
             following: set[int] = set()
             for one in self.conditions.regions(ahead):
                 self.timer.count()
                 self.found[one.active] = one
                 facets += [(one, row) for row in range(len(one.labels))]
                 following.update(*map(one.across, range(len(one.labels))))
-            ahead = sorted(following - self.seen)
-            if not ahead:  # what the flips have left open
-                left = [(pair, self._across(*pair)) for pair in facets if self._open(*pair)]
+            ahead = sorted(following - self.visited)
+            if not ahead:  # the facets across which these sets have no region
+                left = [(pair, self._across(*pair)) for pair in facets if self._is_open(*pair)]
                 ahead = sorted({active for _, active in left if active is not None})
                 facets = [pair for pair, active in left if active is not None]
 
-    def _open(self, one: Found, row: int) -> bool:
+    def _is_open(self, one: CandidateRegion, row: int) -> bool:
         """Tell whether it is not known what lies across a facet."""
         if one.labels[row] == OUTER:
             return False
@@ -113,7 +172,7 @@ class _Walk:
         known = any(active in self.found for active in across)
         return not known or not self.conditions.degenerate.isdisjoint(across)
 
-    def _across(self, one: Found, row: int) -> int | None:
+    def _across(self, one: CandidateRegion, row: int) -> int | None:
         """Return the active set across a facet, None if none is new or feasible there."""
         self.timer.tick(effort_of_lp(*one.A.shape))
         middle, distance = largest_ball(one.A, one.b, row)
@@ -125,10 +184,241 @@ class _Walk:
             active = self._active_at(point)
             if active is None:
                 return None
-            if active not in self.seen:
+            if active not in self.visited:
                 return active
             other = self.found.get(active, one)
-            slacks = (np.min(other.b - other.A @ each) for each in (middle, point))
+            slacks = [np.min(other.b - other.A @ each) for each in (middle, point)]
             if other is not one and min(slacks) >= -1e-9:
                 return None
         return None
+
+
+@dataclass(frozen=True, eq=False)
+class _Factors:
+    """QR factors of some active sets of one size: ``N[index]' = Q R``.
+
+    ``inverse`` and ``right`` are those of R and R', ``NQ`` is N Q, and ``depends`` tells which
+    constraints the active ones make up.
+    """
+
+    index: NDArray[np.intp]
+    Q: Array
+    inverse: Array
+    right: Array
+    NQ: Array
+    depends: NDArray[np.bool_]
+
+
+class Conditions:
+    """The Karush-Kuhn-Tucker conditions of a program as functions of theta, for many active sets.
+
+    With ``H = LL'`` and ``z = L'U`` the program is to find the shortest ``z + Y [theta; 1]`` with
+    ``N z <= w + S theta``: the active rows are then all that a region needs to factor.
+    """
+
+    def __init__(self, program: ParametricQP, timer: BudgetTimer) -> None:
+        self.timer = timer
+        self.outer_A, self.outer_b = program.theta_rows()
+        moving = np.flatnonzero(np.any(program.G, axis=1))
+        self._bound_feasible_set(program, moving)
+        timer.tick()
+        L = np.linalg.cholesky(program.H)
+        self.back = np.linalg.inv(L).T
+        self.Y = np.linalg.solve(L, np.column_stack([program.F, program.c]))
+        self.N = program.G[self.kept] @ self.back
+        self.length = np.linalg.norm(self.N, axis=1)
+        # The slack that each constraint has where none is active.
+        self.D = np.column_stack([program.S, program.w])[self.kept] + self.N @ self.Y
+        # Where constraints that depend on each other are all tight over a region, several active
+        # sets have its law. Those count that are right with each constraint moved out a little.
+        self.apart = np.random.default_rng(0).uniform(0.5, 1.5, len(self.kept))
+        # Active sets that depend on each other, or share their law with another one.
+        self.degenerate: set[int] = set()
+        self.units = row_units(self.N)
+        v = len(self.back)
+        self.least_distance = np.eye(v), np.zeros(v), self.N * self.units[:, None]
+        # What is solved in place of all this where slacks are too costly for it.
+        own = {name: getattr(program, name)[self.kept] for name in "GwS"}
+        self.steep = replace(program, **own) if isinstance(program, SteepQP) else None
+
+    def _bound_feasible_set(self, program: ParametricQP, moving: NDArray[np.intp]) -> None:
+        """Set a point and the corners of the feasible theta, and the constraints that bound it."""
+        v, n = program.F.shape
+        rows = np.vstack([
+            np.hstack([program.G[moving], -program.S[moving]]),
+            np.hstack([np.zeros((len(self.outer_b), v)), self.outer_A]),
+        ])  # fmt: skip
+        b = np.concatenate([program.w[moving], self.outer_b])
+        self.timer.tick(effort_of_lp(*rows.shape))
+        inside, _ = largest_ball(rows, b)
+
+        def farthest(kept: NDArray[np.bool_], limits: Array, direction: Array) -> Array:
+            effort = effort_of_lp(np.count_nonzero(kept), v + n)
+            self.timer.tick(effort)
+            # Only HiGHS can be interrupted where a single program takes long.
+            seconds = self.timer.left() if effort > 0.1 else None
+            found = farthest_point(rows[kept], limits[kept], direction, inside, seconds)
+            self.timer.tick()
+            return found
+
+        self.middle = inside[v:]
+        alive = np.ones(len(b), dtype=bool)
+        axes = np.hstack([np.zeros((2 * n, v)), np.vstack([np.eye(n), -np.eye(n)])])
+        # The theta that are farthest along every axis (2 n, n).
+        self.corners = np.array([farthest(alive, b, axis)[v:] for axis in axes])
+        for k in reversed(range(len(moving))):  # of rows that say the same, the first
+            relaxed = b.copy()
+            relaxed[k] += 1.0
+            alive[k] = rows[k] @ farthest(alive, relaxed, rows[k]) > b[k] + 1e-10
+        self.kept = moving[np.flatnonzero(alive[: len(moving)])]
+
+    def active_at(self, theta: Array, apart: float = 0.0) -> int | None:
+        """Return DAQP's working set at theta with constraints moved apart, None if infeasible."""
+        if np.any(self.outer_A @ theta > self.outer_b + 1e-11):
+            return None
+        rows = len(self.kept)
+        if rows == 0:
+            return 0
+        self.timer.tick(effort_of_qp(*self.N.shape))
+        if self.steep is not None:
+            moved = replace(self.steep, w=self.steep.w + apart * self.apart)
+            U, found = (moved if apart else self.steep).solve_with_multipliers(theta)
+            return None if U is None else as_bits(np.flatnonzero(found > 0))
+        import daqp
+
+        n = len(theta)
+        upper = (self.D[:, :n] @ theta + self.D[:, n] + apart * self.apart) * self.units
+        lower = np.full(rows, -1e30)
+        sense = np.zeros(rows, dtype=np.intc)
+        _, _, status, info = daqp.solve(*self.least_distance, upper, lower, sense, primal_tol=1e-11)
+        if status != 1:
+            return None
+        multipliers = np.asarray(info["lam"])
+        return as_bits(np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max())))
+
+    def regions(self, wave: list[int]) -> Iterator[CandidateRegion]:
+        """Yield the regions with an interior among those of some active sets."""
+        rows, v = self.N.shape
+        width = v + self.outer_A.shape[1] + 1
+
+        def numbers(size: int) -> float:
+            return (rows + v) * (size + width)
+
+        for size, members in batches((active.bit_count() for active in wave), numbers):
+            if size <= v:
+                self.timer.tick(len(members) * effort_of_conditions(rows, v, size))
+                yield from self._regions([wave[i] for i in members], size)
+
+    def _regions(self, members: list[int], size: int) -> Iterator[CandidateRegion]:
+        factors, independent = self._factored(members, size)
+        actives = [members[i] for i in np.flatnonzero(independent)]
+        self.degenerate.update(members[i] for i in np.flatnonzero(~independent))
+        laws, rows, noise = self._rows(factors)
+        index = factors.index
+        each = np.arange(len(index))[:, None]
+        length = np.linalg.norm(rows[:, :, :-1], axis=2)
+        constant = length <= 1e-12 * noise
+        # Something violated everywhere; or a multiplier that is zero everywhere: the region is that
+        # of a smaller active set.
+        ok = ~np.any(constant & (rows[:, :, -1] < -1e-10 * noise), axis=1)
+        weak = constant[each, index] & (rows[each, index, -1] <= 1e-10 * noise[each, index])
+        ok &= ~np.any(weak, axis=1)
+        tight = constant & (np.abs(rows[..., -1]) <= 1e-10 * noise)
+        ruled_out = ok & self._ruled_out(factors, tight)
+        self.degenerate.update(actives[i] for i in np.flatnonzero(ruled_out))
+        length[constant] = 1.0
+        A = -rows[:, :, :-1] / length[:, :, None]
+        b = rows[:, :, -1] / length
+        reach = np.sum(np.abs(A), axis=2)
+        ok &= ~ruled_out & ~np.any((b < THINNEST - reach) & ~constant, axis=1)
+        needed = (b < reach - 1e-12) & ~constant
+        for i in np.flatnonzero(ok):
+            label = np.flatnonzero(needed[i])
+            bounds = len(label) + len(self.outer_b)
+            self.timer.tick(OF_REGION + bounds * effort_of_lp(bounds, A.shape[2]) / 2)
+            one = self._region(actives[i], laws[i], A[i, label], b[i, label], label)
+            if one is not None:
+                one.exchanges.update(self._exchanges(one, factors, i))
+                one.labels[:] = [OUTER if one.exchanges.get(k) == () else k for k in one.labels]
+                yield one
+
+    def _factored(self, members: list[int], size: int) -> tuple[_Factors, NDArray[np.bool_]]:
+        """Return the QR factors of active sets of independent constraints, and which are that."""
+        index = np.array([members_of(active) for active in members], dtype=int)
+        index = index.reshape(len(members), size)
+        Q, R = np.linalg.qr(np.swapaxes(self.N[index], 1, 2))
+        pivots = np.abs(np.diagonal(R, axis1=1, axis2=2))
+        full = np.all(pivots > DEPENDENT * self.length[index], axis=1)
+        Q = Q[full]
+        index = index[full]
+        inverse = np.linalg.inv(R[full])
+        NQ = self.N @ Q
+        left = np.linalg.norm(self.N - NQ @ np.swapaxes(Q, 1, 2), axis=2)
+        depends = left <= DEPENDENT * self.length
+        depends[np.arange(len(index))[:, None], index] = False
+        return _Factors(index, Q, inverse, np.swapaxes(inverse, 1, 2), NQ, depends), full
+
+    def _rows(self, factors: _Factors) -> tuple[Array, Array, Array]:
+        """Return laws; slacks, or multipliers of active rows, as [S w]; the size of their terms."""
+        index = factors.index
+        if self.steep is not None:
+            return kkt_solution(self.steep, index)[:3]
+        W = factors.right @ self.D[index]
+        rows = self.D - factors.NQ @ W
+        width = np.linalg.norm(W, axis=(1, 2))[:, None]
+        noise = np.linalg.norm(self.D, axis=1) + np.linalg.norm(factors.NQ, axis=2) * width
+        each = np.arange(len(index))[:, None]
+        rows[each, index] = -factors.inverse @ W
+        noise[each, index] = np.linalg.norm(factors.inverse, axis=2) * width
+        return self.back @ (factors.Q @ W - self.Y), rows, noise
+
+    def _ruled_out(self, factors: _Factors, tight: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Tell which active sets are wrong with constraints moved apart, where others are tight."""
+        index = factors.index
+        tight[np.arange(len(index))[:, None], index] = False
+        if not np.any(tight):
+            return np.zeros(len(index), dtype=bool)
+        moved = np.squeeze(factors.NQ @ (factors.right @ self.apart[index][:, :, None]), axis=2)
+        return np.asarray(np.any(tight & (self.apart - moved < 0), axis=1))
+
+    def _exchanges(
+        self, one: CandidateRegion, factors: _Factors, i: int
+    ) -> dict[int, tuple[int, ...]]:
+        """Return the active sets across constraints that the active ones make up.
+
+        One of those with a positive factor leaves.
+        """
+        index = factors.index[i]
+        added = [k for k in one.labels if k >= 0 and factors.depends[i, k]]
+        if not added:
+            return {}
+        made_of = factors.NQ[i, added] @ factors.right[i] * self.length[index]
+        leaves = made_of > DEPENDENT * self.length[added, None]
+        return {
+            k: tuple(one.active ^ (1 << k) ^ (1 << int(j)) for j in index[leave])
+            for k, leave in zip(added, leaves, strict=True)
+        }
+
+    def _region(
+        self, active: int, law: Array, A: Array, b: Array, label: NDArray[np.intp]
+    ) -> CandidateRegion | None:
+        """Return a region without what does not bound it, None where it has no interior."""
+        A = np.concatenate([A, self.outer_A])
+        b = np.concatenate([b, self.outer_b])
+        inside, radius, rows, some_equal = bounded_region(A, b, THINNEST)
+        if radius <= THINNEST:
+            return None
+        A = A[rows]
+        b = b[rows]
+        labels = [int(label[k]) if k < len(label) else OUTER for k in rows]
+        if some_equal:
+            same = equal_rows(A, b - A @ inside, radius)
+            keep = np.flatnonzero(np.argmax(same, axis=1) == np.arange(len(rows)))
+            for k in keep:
+                twins = [labels[twin] for twin in np.flatnonzero(same[k])]
+                if len(twins) > 1:
+                    labels[k] = OUTER if OUTER in twins else SHARED
+            A = A[keep]
+            b = b[keep]
+            labels = [labels[k] for k in keep]
+        return CandidateRegion(active, law, A, b, labels, inside, {})

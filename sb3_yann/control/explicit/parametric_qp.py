@@ -1,9 +1,10 @@
-"""The multi-parametric quadratic program that a linear MPC is."""
+"""The multi-parametric quadratic program that a linear MPC is, and its optimality conditions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -12,47 +13,16 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 
-FAINT = 1e-7
+ROW_NORM_TOL = 1e-7
 """Bounds that all inputs together move by less, in half-widths of the box of theta, are its own.
 
 Where such a bound is active, the law is so steep that its own rounding shows.
 """
-
-
-BATCH = 4e6
-"""How many numbers a batch of active sets may hold: 32 MB."""
-
-
-def as_bits(active_set: Iterable[int]) -> int:
-    """Return a set of constraints as a whole number, with bit k for constraint k."""
-    return sum(1 << int(k) for k in active_set)
-
-
-def batches(
-    sizes: Iterable[int], numbers: Callable[[int], float] = lambda size: 1.0
-) -> Iterator[tuple[int, list[int]]]:
-    """Yield each size, ascending, with the indices that have it, at most 256 at a time.
-
-    ``numbers`` tells how many numbers one of a size needs: so many that memory and time of a batch
-    stay small.
-    """
-    indices: dict[int, list[int]] = {}
-    for i, size in enumerate(sizes):
-        indices.setdefault(size, []).append(i)
-    for size, members in sorted(indices.items()):
-        most = int(np.clip(BATCH / numbers(size), 1, 256))
-        for start in range(0, len(members), most):
-            yield size, members[start : start + most]
-
-
-def row_units(G: Array) -> Array:
-    """Return factors (rows,) that give rows a length of about 1, without rounding.
-
-    DAQP takes a row that is shorter than about 1e-6 for one that does not bind.
-    """
-    length = np.linalg.norm(G, axis=1)
-    length[length == 0] = 1.0
-    return np.asarray(2.0 ** -np.round(np.log2(length)))
+DEPENDENT = 1e-9
+"""Constraints whose part across those of an active set is smaller, relative to all, depend on it.
+"""
+MILD = 1e7
+"""Up to so many times the inputs' own cost a slack may cost for a dual method."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +79,7 @@ class ParametricQP:
         """Return the optimal U (v,), or None, and the multipliers of all rows (rows,)."""
         import daqp
 
-        H, G, fixed, lower, sense, units = self._arrays
+        H, G, fixed, lower, sense, units = self._daqp_arrays
         upper = (self.w + self.S @ theta) * units
         if fixed.size:  # bounds of theta alone
             if upper[fixed].min() < -1e-11:
@@ -121,15 +91,13 @@ class ParametricQP:
         return (np.asarray(U) if status == 1 else None), np.asarray(info["lam"]) * units
 
     @cached_property
-    def _arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc], Array]:
-        """What DAQP asks for at every theta: H, G, the rows without U, no bounds, no options.
-
-        Last come the units in which it gets the rows.
-        """
-        units, rows = row_units(self.G), len(self.w)
-        H, G = np.ascontiguousarray(self.H), np.ascontiguousarray(self.G * units[:, None])
+    def _daqp_arrays(self) -> tuple[Array, Array, NDArray[np.intp], Array, NDArray[np.intc], Array]:
+        """Return H, G, the rows without U, no lower bounds, no options, and the units of rows."""
+        units = row_units(self.G)
+        H = np.ascontiguousarray(self.H)
+        G = np.ascontiguousarray(self.G * units[:, None])
         fixed = np.flatnonzero(~np.any(G, axis=1))
-        return H, G, fixed, np.full(rows, -1e30), np.zeros(rows, dtype=np.intc), units
+        return H, G, fixed, np.full(len(G), -1e30), np.zeros(len(G), dtype=np.intc), units
 
     def theta_rows(self) -> tuple[Array, Array]:
         """Return A and b of the bounds of theta alone, for a program whose box is the unit box."""
@@ -138,20 +106,20 @@ class ParametricQP:
         b = np.concatenate([np.ones(2 * len(eye)), self.w[bound]])
         return np.vstack([eye, -eye, -self.S[bound]]), b
 
-    def without_faint_rows(self, most: Array) -> ParametricQP:
+    def without_short_rows(self, u_size: Array) -> ParametricQP:
         """Return a program of unit rows where rows that U hardly moves bound theta alone.
 
-        Those are tightened by what U can do to them, less than FAINT: the law stays exact, and the
-        feasible set is so much smaller. ``most`` (v,) is the largest size of each variable,
-        infinite where it has none.
+        Those are tightened by what U can do to them, less than ROW_NORM_TOL: the law stays exact,
+        and the feasible set is so much smaller. ``u_size`` (v,) is the largest size of each
+        variable, infinite where it has none.
         """
         with np.errstate(invalid="ignore"):  # 0 times inf
-            moved = np.nan_to_num(np.abs(self.G) * most, nan=0.0, posinf=np.inf).sum(axis=1)
-        faint = (moved < FAINT) & np.any(self.G, axis=1) & np.any(self.S, axis=1)
-        if not np.any(faint):
+            moved = np.nan_to_num(np.abs(self.G) * u_size, nan=0.0, posinf=np.inf).sum(axis=1)
+        short = (moved < ROW_NORM_TOL) & np.any(self.G, axis=1) & np.any(self.S, axis=1)
+        if not np.any(short):
             return self
-        w = self.w - np.where(faint, moved, 0.0)
-        return replace(self, G=np.where(faint[:, None], 0.0, self.G), w=w)
+        w = self.w - np.where(short, moved, 0.0)
+        return replace(self, G=np.where(short[:, None], 0.0, self.G), w=w)
 
     def scaled(self, center: Array, half: Array, reach: Array) -> ParametricQP:
         """Return the program in ``U / reach`` and ``(theta - center) / half``, with unit rows.
@@ -159,9 +127,9 @@ class ParametricQP:
         It knows no ``feedback``: that is of the units of the plant.
         """
         size = np.mean(np.diag(self.H) * reach**2)
-        G, S = self.G * reach, self.S * half
-        length = np.linalg.norm(np.hstack([G, S]), axis=1)
-        length[length == 0] = 1.0
+        G = self.G * reach
+        S = self.S * half
+        length = _row_norms(np.hstack([G, S]))
         return replace(
             self,
             H=self.H * np.outer(reach, reach) / size,
@@ -174,3 +142,281 @@ class ParametricQP:
             theta_max=(self.theta_max - center) / half,
             feedback=None,
         )
+
+
+class SteepQP(ParametricQP):
+    """A program whose slacks cost so much more than inputs that a dual method has too few digits.
+
+    In a dual method a slack is what is left when large numbers cancel: its digits are those of
+    float64 less those of the penalty. In the KKT equations as they stand nothing cancels. So DAQP
+    solves a milder program, for an active set to begin with. That set is changed until its KKT
+    conditions hold, and the answer is that of their equations.
+    """
+
+    steep = True
+
+    @cached_property
+    def mild(self) -> ParametricQP:
+        """The program with slacks that cost what a dual method can take, in units of the largest.
+
+        Its rows are those of this program, at most of length one.
+        """
+        ratio, largest = slack_costs(self)
+        inputs = len(self.c) - self.n_slacks
+        less = 1 / np.maximum(1.0, ratio / MILD)
+        H = self.H.copy()
+        c = self.c.copy()
+        G = self.G.copy()
+        H[inputs:, inputs:] *= np.sqrt(np.outer(less, less)) * np.outer(largest, largest)
+        c[inputs:] *= less * largest
+        G[:, inputs:] *= largest
+        # "No violation" is far longer than all other rows, which count as zero then.
+        units = 1 / np.maximum(1.0, np.linalg.norm(G, axis=1))
+        parts = {each.name: getattr(self, each.name) for each in fields(ParametricQP)}
+        parts |= {"H": H, "c": c}
+        parts |= {"G": G * units[:, None], "S": self.S * units[:, None], "w": self.w * units}
+        return ParametricQP(**parts)
+
+    def solve_with_multipliers(self, theta: Array) -> tuple[Array | None, Array]:
+        """Return the optimal U (v,), or None, and 1 for each active row (rows,), else 0."""
+        U, multipliers = self.mild.solve_with_multipliers(theta)
+        if U is None:
+            return None, multipliers
+        start = np.flatnonzero(multipliers > 1e-11 * max(1.0, multipliers.max(initial=0.0)))
+        found = self.conditions_at(theta, as_bits(start))
+        if found is None:
+            return super().solve_with_multipliers(theta)
+        active = np.zeros(len(self.w))
+        active[list(found.active)] = 1.0
+        return found.law @ np.append(theta, 1.0), active
+
+    def conditions_at(self, theta: Array, active: int) -> Optimality | None:
+        """Return the KKT conditions that hold at theta, begun from an active set; None: none do.
+
+        They hold up to 1e-9, in half-widths of the box. At most 100 active sets are tried.
+        """
+        tried: set[int] = set()
+        ahead = [active]
+        while ahead and len(tried) < 100:
+            active = ahead.pop()
+            if active in tried:
+                continue
+            tried.add(active)
+            conditions = self.conditions_of(active)
+            if conditions is None:
+                continue
+            beyond = conditions.rows[:, :-1] @ theta - conditions.rows[:, -1]
+            if np.max(beyond, initial=-np.inf) <= 1e-9:
+                return conditions
+            ahead += reversed(conditions.across(int(np.argmax(beyond))))
+        return None
+
+    def conditions_of(self, active: int) -> Optimality | None:
+        """Return the KKT conditions of an active set, None where its constraints depend."""
+        if active not in self._known:
+            if len(self._known) >= 4096:
+                self._known.clear()
+            self._known[active] = None
+            with suppress(np.linalg.LinAlgError):
+                self._known[active] = optimality(self, [members_of(active)], everywhere=True)[0]
+        return self._known[active]
+
+    @cached_property
+    def _known(self) -> dict[int, Optimality | None]:
+        return {}
+
+
+def solvable(program: ParametricQP) -> ParametricQP:
+    """Return a program in units of its input range and its box as a SteepQP, if it is one.
+
+    A slack costs at most 1e15 times what inputs do: a larger penalty moves the law by less than
+    1e-15 of it, and the KKT equations become singular.
+    """
+    ratio, _ = slack_costs(program)
+    if np.all(ratio <= MILD):
+        return program
+    parts = {each.name: getattr(program, each.name) for each in fields(ParametricQP)}
+    less = np.ones(len(program.c))
+    less[len(less) - program.n_slacks :] = np.minimum(1.0, 1e15 / ratio)
+    parts["H"] = program.H * np.sqrt(np.outer(less, less))
+    parts["c"] = program.c * less
+    return SteepQP(**parts)
+
+
+def slack_costs(program: ParametricQP) -> tuple[Array, Array]:
+    """Return how many times the inputs' own cost each slack may cost, and the largest slacks.
+
+    Both costs are compared where they are largest in theta's box: a slack where its bound is
+    violated by all that it can be. The program comes in units of its input range and its box.
+    """
+    inputs = len(program.c) - program.n_slacks
+    sizes = np.diag(program.H)
+    extent = np.abs(program.S).sum(axis=1) + np.abs(program.G[:, :inputs]).sum(axis=1)
+    own = np.abs(program.G[:, inputs:])
+    violations = np.divide(extent[:, None], own, out=np.zeros_like(own), where=own > 0)
+    largest = np.max(violations, axis=0, initial=0.0)
+    largest[largest == 0] = 1.0
+    return sizes[inputs:] * largest**2 / np.mean(sizes[:inputs]), largest
+
+
+@dataclass(frozen=True, eq=False)
+class Optimality:
+    """What the Karush-Kuhn-Tucker (KKT) conditions say of one active set.
+
+    Attributes
+    ----------
+    active : tuple of int
+    law : ndarray, shape (v, n + 1)
+        ``U = law [theta; 1]``.
+    rows : ndarray, shape (rows, n + 1)
+        ``rows[:, :n] theta <= rows[:, n]``, of unit length, where constraints and multipliers hold.
+        Those without theta are constants.
+    labels : ndarray of int, shape (rows,)
+        The constraint of each row.
+    factors : ndarray, shape (rows, active)
+        Each constraint's part along the active ones, all of unit length in U.
+    depends : ndarray of bool, shape (rows,)
+        Whether a constraint that is not active has no other part.
+    """
+
+    active: tuple[int, ...]
+    law: Array
+    rows: Array
+    labels: NDArray[np.intp]
+    factors: Array
+    depends: NDArray[np.bool_]
+
+    def across(self, row: int) -> tuple[int, ...]:
+        """Return the active sets beyond a row, as whole numbers: an empty tuple is a proof of none.
+
+        A constraint that becomes active and depends on the others takes the place of one that it
+        contains with a positive factor. If there is no such one, it contradicts them (Farkas).
+        """
+        flipped = self._bits ^ (1 << int(self.labels[row]))
+        if not self.depends[row]:
+            return (flipped,)
+        leaves = np.flatnonzero(self.factors[row] > DEPENDENT)
+        return tuple(flipped ^ (1 << self.active[each]) for each in leaves)
+
+    @cached_property
+    def _bits(self) -> int:
+        return as_bits(self.active)
+
+
+def optimality(
+    program: ParametricQP, members: Sequence[tuple[int, ...]], everywhere: bool = False
+) -> list[Optimality]:
+    """Return the KKT conditions of active sets of one size, from LU factors of the KKT matrices.
+
+    Those that hold in all of the unit box are left out, unless ``everywhere``.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the constraints of an active set depend on each other.
+    """
+    n = program.F.shape[1]
+    active = np.array(members, dtype=int).reshape(len(members), len(members[0]))
+    laws, rows, noise, factors, depends = kkt_solution(program, active)
+    # [S w] of 0 <= S theta + w as [A b] of A theta <= b. A gradient is rounding if it is smaller
+    # than 1e-11 of what it is a sum of.
+    length = np.linalg.norm(rows[:, :, :n], axis=2)
+    constant = length <= 1e-11 * noise
+    length[constant] = np.maximum(noise[constant], 1e-300)
+    rows = np.concatenate([-rows[:, :, :n], rows[:, :, n:]], axis=2) / length[:, :, None]
+    rows[constant, :n] = 0.0
+    reach = np.abs(rows[:, :, :n]).sum(axis=2)
+    binding = rows[:, :, n] < (np.where(reach > 0, np.inf, 0.0) if everywhere else reach)
+    return [
+        Optimality(
+            active=members[i],
+            law=laws[i],
+            rows=rows[i, held],
+            labels=np.flatnonzero(held),
+            factors=factors[i, held],
+            depends=depends[i, held],
+        )
+        for i, held in enumerate(binding)
+    ]
+
+
+def kkt_solution(
+    program: ParametricQP, active: NDArray[np.intp]
+) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Return laws, slacks or multipliers as [S w], the size of their terms, factors and depends.
+
+    All are for active sets (count, size), as in :class:`Optimality`.
+    """
+    v, n = program.F.shape
+    count, size = active.shape
+    # In unit length, however little U a constraint holds.
+    length = _row_norms(program.G)
+    G = program.G / length[:, None]
+    limit = np.column_stack([program.S, program.w]) / length[:, None]
+    K = np.zeros((count, v + size, v + size))
+    K[:, :v, :v] = program.H
+    K[:, v:, :v] = G[active]
+    K[:, :v, v:] = np.swapaxes(G[active], 1, 2)
+    right = np.zeros((count, v + size, n + 1 + len(G)))
+    right[:, :v, : n + 1] = -np.column_stack([program.F, program.c])
+    right[:, v:, : n + 1] = limit[active]
+    right[:, :v, n + 1 :] = G.T
+    both = np.linalg.solve(K, right)
+    # One more step: rows that hold little U have multipliers of many magnitudes.
+    both += np.linalg.solve(K, right - K @ both)
+    laws = both[:, :v, : n + 1]
+    multipliers = both[:, v:, : n + 1]
+    factors = np.swapaxes(both[:, v:, n + 1 :], 1, 2)
+    depends = np.linalg.norm(G - factors @ G[active], axis=2) <= DEPENDENT
+    rows = limit - G @ laws
+    noise = np.linalg.norm(limit, axis=1) + np.linalg.norm(laws, axis=(1, 2))[:, None]
+    each = np.arange(count)[:, None]
+    depends[each, active] = False
+    rows[each, active] = multipliers
+    noise[each, active] = np.abs(multipliers).max(axis=(1, 2), initial=0.0)[:, None]
+    if program.steep:  # slacks and their multipliers are far larger than all the rest
+        terms = np.abs(np.linalg.inv(K)) @ np.abs(right[:, :, : n + 1])
+        noise = np.linalg.norm(np.abs(limit) + np.abs(G) @ np.abs(laws), axis=2)
+        noise[each, active] = np.linalg.norm(terms[:, v:], axis=2)
+    return np.asarray(laws), np.asarray(rows), np.asarray(noise), factors, np.asarray(depends)
+
+
+def as_bits(active_set: Iterable[int]) -> int:
+    """Return a set of constraints as a whole number, with bit k for constraint k."""
+    return sum(1 << int(k) for k in active_set)
+
+
+def members_of(active: int) -> tuple[int, ...]:
+    """Return the members of a set of constraints that is a whole number."""
+    return tuple(k for k in range(active.bit_length()) if active >> k & 1)
+
+
+def batches(
+    sizes: Iterable[int], numbers: Callable[[int], float] = lambda size: 1.0
+) -> Iterator[tuple[int, list[int]]]:
+    """Yield each size, ascending, with the indices that have it, at most 256 at a time.
+
+    ``numbers`` tells how many numbers one of a size needs: a batch holds 4 million, or 32 MB.
+    """
+    indices: dict[int, list[int]] = {}
+    for i, size in enumerate(sizes):
+        indices.setdefault(size, []).append(i)
+    for size, members in sorted(indices.items()):
+        most = int(np.clip(4e6 / numbers(size), 1, 256))
+        for start in range(0, len(members), most):
+            yield size, members[start : start + most]
+
+
+def row_units(G: Array) -> Array:
+    """Return factors (rows,) that give rows a length of about 1, without rounding.
+
+    DAQP takes a row that is shorter than about 1e-6 for one that does not bind.
+    """
+    return np.asarray(2.0 ** -np.round(np.log2(_row_norms(G))))
+
+
+def _row_norms(rows: Array) -> Array:
+    """Return the lengths of rows, 1 for zero rows."""
+    length = np.linalg.norm(rows, axis=1)
+    length[length == 0] = 1.0
+    return np.asarray(length)

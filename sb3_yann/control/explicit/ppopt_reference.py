@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.control.explicit.budget import BudgetTimer
@@ -28,7 +27,8 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     """
     if not np.any(program.G):  # nothing binds U, which ppopt does not take
         timer.count()
-        return [_unconstrained(program)]
+        law = -np.linalg.solve(program.H, np.column_stack([program.F, program.c])).astype(float)
+        return [Region((), law[:, :-1], law[:, -1], *program.theta_rows())]
 
     # Rows without U bound theta: with them in the constraints ppopt's active sets degenerate.
     moving = np.any(program.G, axis=1) | ~np.any(program.S, axis=1)
@@ -51,7 +51,11 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
         )
         found = mpqp_combi_graph.solve(problem).critical_regions
     timer.count(len(found))
-    rows = _rows_of(program, problem)
+    # Which row of the program each row is that ppopt has kept.
+    ours = np.column_stack([program.G, -program.S, program.w])
+    theirs = np.column_stack([problem.A, -problem.F, problem.b])
+    distance = np.abs(theirs[:, None] - ours[None]).max(axis=2)
+    rows = np.argmax(distance < 1e-9 + distance.min(axis=1, keepdims=True), axis=1)
     return [
         Region(
             tuple(sorted(int(rows[k]) for k in one.active_set)),
@@ -62,11 +66,6 @@ def ppopt_regions(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
         )
         for one in found
     ]
-
-
-def _unconstrained(program: ParametricQP) -> Region:
-    law: Array = -np.linalg.solve(program.H, np.column_stack([program.F, program.c])).astype(float)
-    return Region((), law[:, :-1], law[:, -1], *program.theta_rows())
 
 
 @contextmanager
@@ -95,23 +94,16 @@ def _solve_lp(c: Array | None, A: Array, b: Array, equal: list[int] | None) -> A
     import daqp
     from ppopt.solver_interface.solver_interface_utils import SolverOutput
 
-    n, rows = A.shape[1], len(b)
-    sense = np.zeros(rows, dtype=np.intc)
+    n = A.shape[1]
+    sense = np.zeros(len(b), dtype=np.intc)
     sense[list(equal or ())] = 5
     cost = np.zeros(n) if c is None else np.ravel(c).astype(float)
     # With a cost, proximal steps solve the linear program.
-    H, settings = (None, {"eps_prox": 1e-2}) if np.any(cost) else (np.eye(n), {})
-    A, b = np.ascontiguousarray(A, dtype=float), np.ravel(b).astype(float)
+    H = None if np.any(cost) else np.eye(n)
+    settings = {"eps_prox": 1e-2} if np.any(cost) else {}
+    A = np.ascontiguousarray(A, dtype=float)
+    b = np.ravel(b).astype(float)
     point, value, status, _ = daqp.solve(
-        H, cost, A, b, np.full(rows, -1e30), sense, primal_tol=1e-9, **settings
+        H, cost, A, b, np.full(len(b), -1e30), sense, primal_tol=1e-9, **settings
     )
     return SolverOutput(value, np.asarray(point), None, None, None) if status == 1 else None
-
-
-def _rows_of(program: ParametricQP, problem: Any) -> NDArray[np.intp]:
-    """Return which row of the program each row is that ppopt has kept."""
-    ours = np.column_stack([program.G, -program.S, program.w])
-    theirs = np.column_stack([problem.A, -problem.F, problem.b])
-    distance = np.abs(theirs[:, None] - ours[None]).max(axis=2)
-    first = np.argmax(distance < 1e-9 + distance.min(axis=1, keepdims=True), axis=1)
-    return np.asarray(first)

@@ -2,35 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
+from scipy import linalg, optimize
 from scipy.spatial import QhullError
 
 from sb3_yann._validation import Array, check_choice, half_widths
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget, effort_of_lp
 from sb3_yann.control.explicit.certificate import Certificate, ExplicitSolutionError
-from sb3_yann.control.explicit.equalities import Equalities
 from sb3_yann.control.explicit.facet_walk import walk
-from sb3_yann.control.explicit.parametric_qp import ParametricQP
+from sb3_yann.control.explicit.parametric_qp import ParametricQP, solvable
 from sb3_yann.control.explicit.ppopt_reference import ppopt_regions
-from sb3_yann.control.explicit.steep import solvable
 from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.polyhedra import Region
-
-KERNELS = (
-    "sb3_yann.control._kernels.polyhedra",
-    "sb3_yann.control._kernels.law",
-    "sb3_yann.control.search_tree",
-)
-"""What a search needs that is compiled."""
-ABSURD, LITTLE = 1e8, 1e-9
-"""Asked for more input ranges in their box, laws are wrong, or feasible sets too thin to be seen;
-asked for less of a range, constraints of states are too faint beside it."""
 
 
 def solve_explicit(
@@ -61,12 +49,22 @@ def solve_explicit(
     Its errors are those of :meth:`LinearMPC.explicit`.
     """
     check_choice("solver", solver, ("walk", "ppopt"))
-    _require_box(program)
+    if not np.all(np.isfinite([program.theta_min, program.theta_max])):
+        raise ValueError(
+            f"The law needs a bounded box of theta, not {program.theta_min.tolist()} to "
+            f"{program.theta_max.tolist()}. Pass finite theta_min and theta_max (or x_min and "
+            "x_max), and where theta holds them, r_min and r_max, d_min and d_max, u_min and u_max."
+        )
     require_sane_sizes(program, u_min, u_max)
     timer = timer or BudgetTimer(SolveBudget())
     timer.tick()
     try:
-        return _solved(ProgramUnits(program, u_min, u_max, timer), infeasible, solver, timer)
+        units = ProgramUnits(program, u_min, u_max, timer)
+        _require_feasible(units.scaled, timer)
+        regions = critical_regions(units.scaled, solver, timer)
+        regions = Certificate(
+            units.scaled, regions, units.to_inputs, units.center, units.half, timer
+        ).check()
     except ExplicitSolutionError as error:
         if solver == "walk":
             raise
@@ -78,24 +76,6 @@ def solve_explicit(
             f"({fault}). Bring states, inputs and weights to similar magnitudes, shorten the "
             "horizon, or use online(), which needs no regions."
         ) from None
-
-
-def load_kernels() -> None:
-    """Load what is compiled; on a new machine this compiles, for longer than many a time limit."""
-    for kernels in KERNELS:
-        import_module(kernels)
-
-
-def _solved(
-    units: ProgramUnits, infeasible: str, solver: str, timer: BudgetTimer
-) -> PiecewiseAffine:
-    """Return the law of a program in its units, checked, with its search tree."""
-    _require_feasible(units.scaled, timer)
-    regions = _critical_regions(units.scaled, solver, timer)
-    certificate = Certificate(
-        units.scaled, regions, units.to_inputs, units.center, units.half, timer
-    )
-    regions = certificate.check()
     law = units.law(regions, infeasible)
     if not law.walks:
         timer.stage("Search tree", "and checked", law.n_regions)
@@ -105,10 +85,16 @@ def _solved(
     return law
 
 
-def _critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> list[Region]:
+def critical_regions(program: ParametricQP, solver: str, timer: BudgetTimer) -> list[Region]:
     """Return the critical regions of a program whose box is the unit box, sorted."""
     found = walk(program, timer) if solver == "walk" else ppopt_regions(program, timer)
     return sorted(found, key=lambda region: (len(region.active_set), region.active_set))
+
+
+def load_kernels() -> None:
+    """Load what is compiled; on a new machine this compiles, for longer than many a time limit."""
+    for kernels in ("_kernels.polyhedra", "_kernels.law", "search_tree"):
+        import_module(f"sb3_yann.control.{kernels}")
 
 
 class ProgramUnits:
@@ -122,6 +108,16 @@ class ProgramUnits:
         As in :func:`solve_explicit`.
     timer : BudgetTimer, optional
         Ends the search for equalities.
+
+    Attributes
+    ----------
+    scaled : ParametricQP
+    center, half : ndarray, shape (n,)
+        Theta is ``center + half`` times that of ``scaled``.
+    reach : ndarray, shape (v,)
+        The units of U.
+    to_inputs : ndarray, shape (m, k)
+        What of the variables of ``scaled`` is the first input, in units of its range.
     """
 
     def __init__(
@@ -131,69 +127,156 @@ class ProgramUnits:
         u_max: Array,
         timer: BudgetTimer | None = None,
     ) -> None:
-        timer = timer or BudgetTimer(SolveBudget())
+        m = len(u_min)
+        self.program = program
+        self.u_min = u_min
+        self.u_max = u_max
         self.center = (program.theta_max + program.theta_min) / 2
         self.half = half_widths(program.theta_min, program.theta_max)
-        steps = (len(program.c) - program.n_slacks) // len(u_min)
+        steps = (len(program.c) - program.n_slacks) // m
         reach = np.tile(half_widths(u_min, u_max), steps)
-        self.reach = np.concatenate([reach, np.ones(program.n_slacks)])
-        self.program, self.input_range = program, (u_min, u_max)
-        most = np.maximum(np.abs(u_min), np.abs(u_max)) / reach[: len(u_min)]
+        self.reach = np.append(reach, np.ones(program.n_slacks))
+        u_size = np.maximum(np.abs(u_min), np.abs(u_max)) / reach[:m]
         if program.feedback is not None:  # v = u - feedback theta
             box = np.maximum(np.abs(program.theta_min), np.abs(program.theta_max))
-            most = most + np.abs(program.feedback) @ box / reach[: len(u_min)]
-        most = np.concatenate([np.tile(most, steps), np.full(program.n_slacks, np.inf)])
-        scaled = program.scaled(self.center, self.half, self.reach)
-        scaled = scaled.without_faint_rows(most)
+            u_size = u_size + np.abs(program.feedback) @ box / reach[:m]
+        u_size = np.append(np.tile(u_size, steps), np.full(program.n_slacks, np.inf))
+        scaled = program.scaled(self.center, self.half, self.reach).without_short_rows(u_size)
+        self.to_inputs = np.eye(m, len(program.c))
         self.equalities = None
-        if not _has_room(scaled):
-            self.equalities = Equalities.of(
-                scaled, lambda A, b, left: _room(A, b, left, scaled, timer)
-            )
+        if not _has_interior_point(scaled):
+            self.equalities = _find_equalities(scaled, timer or BudgetTimer(SolveBudget()))
         if self.equalities is not None:
             scaled = self.equalities.eliminated(scaled)
-        self.scaled = solvable(scaled)
-        self.to_inputs = np.eye(len(u_min), len(program.c))
-        if self.equalities is not None:
             self.to_inputs = self.to_inputs @ self.equalities.free
+        self.scaled = solvable(scaled)
 
     def law(self, regions: list[Region], infeasible: str) -> PiecewiseAffine:
         """Return the law of the first inputs in the units of the problem."""
-        m, reach, half = len(self.input_range[0]), self.reach, self.half
+        m = len(self.u_min)
         if self.equalities is not None:
             regions = [self.equalities.with_all_of_U(region) for region in regions]
-        gains = np.stack([reach[:m, None] * region.gain[:m] / half for region in regions])
-        offsets = np.stack([reach[:m] * region.offset[:m] for region in regions])
-        A = np.concatenate([region.A / half for region in regions])
-        b = np.concatenate([region.b for region in regions]) + A @ self.center
-        starts = np.cumsum([0, *(len(region.b) for region in regions[:-1])])
-        ranges = *self.input_range, self.program.theta_min, self.program.theta_max
+        reach = self.reach[:m]
+        gains = np.stack([reach[:, None] * region.gain[:m] / self.half for region in regions])
+        offsets = np.stack([reach * region.offset[:m] for region in regions])
         offsets = offsets - gains @ self.center
         if self.program.feedback is not None:
             gains = gains + self.program.feedback
-        beyond = _neighbors(regions)
-        return PiecewiseAffine(gains, offsets, A, b, starts, *ranges, infeasible, True, beyond)
-
-
-def _neighbors(regions: list[Region]) -> NDArray[np.int64]:
-    """Return the region beyond each half-space, -1 where none is known; empty for no region."""
-    number = {region.active_set: i for i, region in enumerate(regions)}
-    beyond = [
-        -1 if active is None else number.get(active, -1)
-        for region in regions
-        for active in region.across
-    ]
-    known = len(beyond) == sum(len(region.b) for region in regions)
-    return np.array(beyond if known else [], dtype=np.int64)
-
-
-def _require_box(program: ParametricQP) -> None:
-    if not np.all(np.isfinite([program.theta_min, program.theta_max])):
-        raise ValueError(
-            f"The law needs a bounded box of theta, not {program.theta_min.tolist()} to "
-            f"{program.theta_max.tolist()}. Pass finite theta_min and theta_max (or x_min and "
-            "x_max), and where theta holds them, r_min and r_max, d_min and d_max, u_min and u_max."
+        A = np.concatenate([region.A / self.half for region in regions])
+        # The region beyond each half-space, -1 where none is known; none at all for ppopt's.
+        number = {region.active_set: i for i, region in enumerate(regions)}
+        beyond = [
+            -1 if active is None else number.get(active, -1)
+            for region in regions
+            for active in region.across
+        ]
+        return PiecewiseAffine(
+            gains=gains,
+            offsets=offsets,
+            A=A,
+            b=np.concatenate([region.b for region in regions]) + A @ self.center,
+            starts=np.cumsum([0, *(len(region.b) for region in regions[:-1])]),
+            u_min=self.u_min,
+            u_max=self.u_max,
+            theta_min=self.program.theta_min,
+            theta_max=self.program.theta_max,
+            infeasible=infeasible,
+            disjoint=True,
+            neighbors=np.array(beyond if len(beyond) == len(A) else [], dtype=np.int64),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Equalities:
+    """``U = free y + law [theta; 1]`` for any y: what is left of U by equality constraints.
+
+    Attributes
+    ----------
+    free : ndarray, shape (v, k)
+        Orthonormal.
+    law : ndarray, shape (v, n + 1)
+    rows : ndarray of int
+        The constraints of the program that are these equalities.
+    """
+
+    free: Array
+    law: Array
+    rows: NDArray[np.intp]
+
+    def eliminated(self, program: ParametricQP) -> ParametricQP:
+        """Return the program in y, of unit rows.
+
+        Of equalities that no U can meet, what is left binds theta. What is smaller than 1e-11 of
+        what it is a sum of is zero.
+        """
+        n = program.F.shape[1]
+        law = self.law[:, :n]
+        at = self.law[:, n]
+        size = np.linalg.norm(program.G, axis=1)
+        G = program.G @ self.free
+        G[np.linalg.norm(G, axis=1) <= 1e-11 * size] = 0.0
+        G[self.rows] = 0.0
+        limit = np.column_stack([program.S, program.w]) - program.G @ self.law
+        S = limit[:, :n]
+        w = limit[:, n]
+        noise = 1e-11 * (1 + size * np.linalg.norm(self.law))
+        S[np.linalg.norm(S, axis=1) <= noise] = 0.0
+        w[~np.any(G, axis=1) & ~np.any(S, axis=1) & (np.abs(w) <= noise)] = 0.0
+        length = np.linalg.norm(np.hstack([G, S]), axis=1)
+        length[length == 0] = 1.0
+        return replace(
+            program,
+            H=self.free.T @ program.H @ self.free if np.any(self.free) else np.eye(1),
+            F=self.free.T @ (program.F + program.H @ law),
+            c=self.free.T @ (program.c + program.H @ at),
+            G=G / length[:, None],
+            S=S / length[:, None],
+            w=w / length,
+        )
+
+    def with_all_of_U(self, region: Region) -> Region:
+        """Return a region with the law of U in place of that of y."""
+        return replace(
+            region,
+            gain=self.free @ region.gain + self.law[:, :-1],
+            offset=self.free @ region.offset + self.law[:, -1],
+        )
+
+
+def _find_equalities(program: ParametricQP, timer: BudgetTimer) -> Equalities | None:
+    """Return what holds with equality wherever a program is feasible, None if nothing binds U so.
+
+    A constraint that no feasible point keeps by more than 1e-9, in half-widths of the box, is an
+    equality. Linear programs for the largest sum of slacks find the others.
+    """
+    v, n = program.F.shape
+    inputs = v - program.n_slacks
+    A = np.hstack([program.G, -program.S])
+    left = np.arange(len(A), dtype=np.intp)
+    while len(left):
+        slacks = np.zeros((len(A), len(left)))
+        slacks[left, np.arange(len(left))] = 1.0
+        cost = np.concatenate([np.zeros(v + n), -np.ones(len(left))])
+        # Of each row a little counts, so that none pays for another one.
+        bounds = [(None, None)] * v + [(-1, 1)] * n + [(0, 1e-3)] * len(left)
+        exact = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+        found = _linprog(cost, np.hstack([A, slacks]), program.w, bounds, timer, **exact)
+        if found.x is None:
+            return None
+        room = (program.w - A @ found.x[: v + n])[left]
+        if np.all(room <= 1e-9):
+            break
+        left = left[room <= 1e-9]
+    left = left[np.any(program.G[left, :inputs], axis=1)]
+    if not len(left):
+        return None
+    G = program.G[left]
+    limit = np.column_stack([program.S, program.w])[left]
+    # Slacks stay as they are: how steep a program is shows in their columns.
+    free = linalg.block_diag(linalg.null_space(G[:, :inputs], rcond=1e-9), np.eye(program.n_slacks))
+    if not free.size:
+        free = np.zeros((inputs, 1))  # the equalities leave nothing to choose
+    return Equalities(free, np.asarray(np.linalg.pinv(G, rcond=1e-9) @ limit), left)
 
 
 def asked_of_inputs(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
@@ -201,10 +284,12 @@ def asked_of_inputs(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
 
     That is the largest of all steps where no constraint acts. It is 0 without a box of theta.
     """
-    m, count = len(u_min), len(program.c) - program.n_slacks
+    m = len(u_min)
     unit = 1 / np.sqrt(np.diag(program.H))
-    H, F = unit[:, None] * program.H * unit, unit[:, None] * program.F
-    gains = -(unit[:, None] * np.linalg.lstsq(H, F, rcond=None)[0])[:count]
+    H = unit[:, None] * program.H * unit
+    F = unit[:, None] * program.F
+    gains = -(unit[:, None] * np.linalg.lstsq(H, F, rcond=None)[0])
+    gains = gains[: len(program.c) - program.n_slacks]
     if program.feedback is not None:  # later steps are what is added to it
         gains = gains[:m] + program.feedback
     gains = np.abs(gains).reshape(-1, m, program.F.shape[1]).max(axis=0)
@@ -213,8 +298,17 @@ def asked_of_inputs(program: ParametricQP, u_min: Array, u_max: Array) -> Array:
     return np.asarray(gains * box / half_widths(u_min, u_max)[:, None])
 
 
-def _require_one_minimum(program: ParametricQP) -> None:
-    """Raise where the program has no unique solution but for rounding."""
+def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> None:
+    """Raise where weights, the box of theta or an input's range make rounding hide the rest.
+
+    Asked for more than 1e8 times their range, inputs are wrong, or feasible sets too thin to be
+    found; asked for less than 1e-9 of it, constraints of states are too small beside it.
+
+    Parameters
+    ----------
+    program, u_min, u_max
+        As in :func:`solve_explicit`.
+    """
     unit = 1 / np.sqrt(np.maximum(np.diag(program.H), 1e-300))
     for H in (program.H, unit[:, None] * program.H * unit):  # both are factored
         try:
@@ -226,59 +320,44 @@ def _require_one_minimum(program: ParametricQP) -> None:
                 f"{np.linalg.eigvalsh(H)[0]:.1e} to {np.linalg.eigvalsh(H)[-1]:.1e}, and all must "
                 "be positive. Pass a larger R, a shorter horizon, or states in other units."
             ) from None
-
-
-def require_sane_sizes(program: ParametricQP, u_min: Array, u_max: Array) -> None:
-    """Raise where weights, the box of theta or an input's range make rounding hide the rest.
-
-    Parameters
-    ----------
-    program, u_min, u_max
-        As in :func:`solve_explicit`.
-    """
-    _require_one_minimum(program)
     bounded = np.isfinite(u_min) & np.isfinite(u_max)
     asked = asked_of_inputs(program, u_min, u_max) * bounded[:, None]
-    most, width = asked.max(axis=1, initial=0.0), half_widths(u_min, u_max)
+    most = asked.max(axis=1, initial=0.0)
     # A small part alone may be an input with next to no effect, whose bounds are as they should be.
-    for i in np.flatnonzero((0 < most) & (most < LITTLE) & (width > 1 / LITTLE)):
+    too_large = (0 < most) & (most < 1e-9) & (half_widths(u_min, u_max) > 1e9)
+    for i in np.flatnonzero(too_large):
         raise ValueError(
             f"u_max[{i}] = {u_max[i]:g}, with u_min[{i}] = {u_min[i]:g}, is too large: expected "
-            f"are bounds of which the MPC asks for more than {LITTLE:g}, and it asks for "
+            f"are bounds of which the MPC asks for more than {1e-9:g}, and it asks for "
             f"{most[i]:.0e} of these. Pass what the actuator can do, or inf for no bound."
         )
-    if np.any(asked > ABSURD):
+    if np.any(asked > 1e8):
         i = int(np.argmax(asked.max(axis=0)))
         raise ValueError(
             f"theta_min[{i}] = {program.theta_min[i]:g} and theta_max[{i}] = "
             f"{program.theta_max[i]:g} lie too far apart: in this box the MPC asks for inputs "
-            f"{asked.max():.0e} times their range, expected are at most {ABSURD:.0e}. Pass as "
+            f"{asked.max():.0e} times their range, expected are at most {1e8:g}. Pass as "
             "theta_min and theta_max, or x_min and x_max, what the plant can reach; or inf for no "
             "bound, and use online()."
         )
 
 
-def _with_room(program: ParametricQP) -> ParametricQP:
-    """Return the program with each constraint moved in by a millionth."""
+def _has_interior_point(program: ParametricQP) -> bool:
+    """Tell whether the middle of the box is feasible with room: mostly, and a quick answer."""
     rows = np.hstack([program.G, -program.S])
-    return replace(program, w=program.w - 1e-6 * np.linalg.norm(rows, axis=1))
-
-
-def _has_room(program: ParametricQP) -> bool:
-    """Tell whether the middle of the box is feasible with room: mostly, and soon told."""
-    return _with_room(program).solve(np.zeros(program.F.shape[1])) is not None
+    tighter = replace(program, w=program.w - 1e-6 * np.linalg.norm(rows, axis=1))
+    return tighter.solve(np.zeros(program.F.shape[1])) is not None
 
 
 def _require_feasible(program: ParametricQP, timer: BudgetTimer) -> None:
     """Raise unless the feasible pairs (U, theta) have an interior (largest ball, HiGHS)."""
-    if _has_room(program):
+    if _has_interior_point(program):
         return
     v, n = program.F.shape
     rows = np.hstack([program.G, -program.S])
     rows = np.hstack([rows, np.linalg.norm(rows, axis=1, keepdims=True)])
     bounds = [(None, None)] * v + [(-1, 1)] * n + [(None, 1)]
-    cost = np.zeros(v + n + 1)
-    cost[-1] = -1
+    cost = np.append(np.zeros(v + n), -1.0)
     ball = _linprog(cost, rows, program.w, bounds, timer)
     if ball.status != 0 or ball.x[-1] < 1e-9:
         raise ValueError(
@@ -286,22 +365,6 @@ def _require_feasible(program: ParametricQP, timer: BudgetTimer) -> None:
             "with room to spare. Widen x_min/x_max, u_min/u_max or the terminal set, or lengthen "
             "the horizon. Where only a line or a plane of theta is feasible, use online()."
         )
-
-
-def _room(
-    A: Array, b: Array, left: NDArray[np.intp], program: ParametricQP, timer: BudgetTimer
-) -> Array | None:
-    """Return how much room some rows have where the sum of these is largest, None if infeasible."""
-    v, n = program.F.shape
-    count = len(left)
-    slack = np.zeros((len(b), count))
-    slack[left, np.arange(count)] = 1.0
-    cost = np.concatenate([np.zeros(v + n), -np.ones(count)])
-    # Of each row a little counts, so that none pays for another one.
-    bounds = [(None, None)] * v + [(-1, 1)] * n + [(0, 1e-3)] * count
-    exact = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
-    found = _linprog(cost, np.hstack([A, slack]), b, bounds, timer, **exact)
-    return None if found.x is None else np.asarray((b - A @ found.x[: v + n])[left])
 
 
 def _linprog(

@@ -12,7 +12,7 @@ import pytest
 from fresh_process import run_python
 from sample_problems import PROBLEMS, benchmark, box_points, solved
 from sb3_yann.control import ExplicitLimitError, LinearModel, LinearMPC, search_tree
-from sb3_yann.control.explicit import budget, certificate, conditions, solve
+from sb3_yann.control.explicit import budget, certificate, facet_walk, solve
 from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 
@@ -53,14 +53,14 @@ def test_too_long_a_search_is_an_error_that_says_what_to_change(solver: str) -> 
 
 
 def test_the_time_is_looked_at_before_the_first_region_as_well(monkeypatch) -> None:
-    clock, programs, solve = itertools.count(), itertools.count(), conditions.farthest_point
+    clock, programs, solve = itertools.count(), itertools.count(), facet_walk.farthest_point
     monkeypatch.setattr(budget.time, "monotonic", lambda: float(next(clock)))
 
     def counted(*arguments: Any) -> Any:
         next(programs)
         return solve(*arguments)
 
-    monkeypatch.setattr(conditions, "farthest_point", counted)
+    monkeypatch.setattr(facet_walk, "farthest_point", counted)
     with pytest.raises(ExplicitLimitError) as error:
         benchmark().explicit(time_limit=3)
     assert error.value.n_regions == 0

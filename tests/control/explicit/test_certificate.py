@@ -27,8 +27,8 @@ def error_of(
 ) -> tuple[str, np.ndarray]:
     """Solve with spoilt regions; return the error's message and the theta that it names."""
     with monkeypatch.context() as patch:
-        find = module._critical_regions
-        patch.setattr(module, "_critical_regions", lambda *args: spoil(find(*args)))
+        find = module.critical_regions
+        patch.setattr(module, "critical_regions", lambda *args: spoil(find(*args)))
         with pytest.raises(ExplicitSolutionError, match="failed its check: ") as error:
             PROBLEMS[name]().explicit()
     theta = re.search(r"theta = (\[.*?\])", str(error.value))
@@ -100,14 +100,14 @@ def test_a_region_that_reaches_a_hair_too_far_is_trimmed(
     beyond: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = solved("benchmark").explicit()
-    find = module._critical_regions
+    find = module.critical_regions
 
     def spoil(*args: Any) -> Regions:
         first, *rest = find(*args)
         inner = np.all(np.abs(first.A) < 0.999, axis=1)  # not a bound of theta
         return [dataclasses.replace(first, b=first.b + beyond * inner), *rest]
 
-    monkeypatch.setattr(module, "_critical_regions", spoil)
+    monkeypatch.setattr(module, "critical_regions", spoil)
     law = PROBLEMS["benchmark"]().explicit()
     assert law.n_regions == right.n_regions
     more = len(law.b) - len(right.b)
@@ -157,8 +157,8 @@ def test_one_half_space_that_reaches_a_little_too_far_is_found(
 
 
 def test_the_regions_of_ppopt_are_checked_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    find = module._critical_regions
-    monkeypatch.setattr(module, "_critical_regions", lambda *args: find(*args)[1:])
+    find = module.critical_regions
+    monkeypatch.setattr(module, "critical_regions", lambda *args: find(*args)[1:])
     with pytest.raises(ExplicitSolutionError, match="no region covers a feasible parameter"):
         PROBLEMS["benchmark"]().explicit("ppopt")
 
@@ -171,7 +171,7 @@ def test_finding_no_region_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_failed_check_is_not_kept_as_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
     mpc = PROBLEMS["benchmark"]()
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_critical_regions", lambda *args: [])
+        patch.setattr(module, "critical_regions", lambda *args: [])
         with pytest.raises(ExplicitSolutionError):
             mpc.explicit()
     assert mpc.explicit().n_regions == 9

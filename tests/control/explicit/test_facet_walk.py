@@ -42,7 +42,7 @@ def problem(name: str) -> LinearMPC:
 
 def regions_of(mpc: LinearMPC, solver: str) -> list[Region]:
     units = module.ProgramUnits(mpc.condensed(), mpc.u_min, mpc.u_max)
-    return module._critical_regions(units.scaled, solver, BudgetTimer(SolveBudget()))
+    return module.critical_regions(units.scaled, solver, BudgetTimer(SolveBudget()))
 
 
 def reaches_beyond(one: Region, other: Region) -> float:

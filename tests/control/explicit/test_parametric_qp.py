@@ -7,15 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_yann.control.explicit.kkt import optimality
 from sb3_yann.control.explicit.parametric_qp import (
-    FAINT,
+    MILD,
+    ROW_NORM_TOL,
     ParametricQP,
+    SteepQP,
     as_bits,
     batches,
+    optimality,
     row_units,
+    slack_costs,
+    solvable,
 )
-from sb3_yann.control.explicit.steep import MILD, SteepQP, solvable, steepness
 
 
 def program(seed: int = 0, rows: int = 7, **changes: Any) -> ParametricQP:
@@ -109,20 +112,20 @@ def test_a_program_in_other_units_has_the_same_solution() -> None:
 def test_a_row_that_the_inputs_hardly_move_bounds_theta_alone_by_so_much_less() -> None:
     most = np.array([1.0, 2.0, 1.0, np.inf])
     G = np.zeros((5, 4))
-    G[0, 1] = 0.49 * FAINT  # twice that is moved
-    G[1, 1] = 0.51 * FAINT
+    G[0, 1] = 0.49 * ROW_NORM_TOL  # twice that is moved
+    G[1, 1] = 0.51 * ROW_NORM_TOL
     G[2, 3] = 1e-12  # without a bound anything moves it
-    G[3, 0], G[3, 1] = 0.3 * FAINT, -0.3 * FAINT
-    G[4, 1] = 0.1 * FAINT
+    G[3, 0], G[3, 1] = 0.3 * ROW_NORM_TOL, -0.3 * ROW_NORM_TOL
+    G[4, 1] = 0.1 * ROW_NORM_TOL
     S = np.tile([0.0, 1.0], (5, 1))
     S[4] = 0.0  # says nothing of theta
     given = program(G=G, S=S, w=np.ones(5), rows=5)
-    found = given.without_faint_rows(most)
+    found = given.without_short_rows(most)
     np.testing.assert_array_equal(np.any(found.G, axis=1), [False, True, True, False, True])
-    np.testing.assert_array_equal(found.w, 1 - FAINT * np.array([0.98, 0, 0, 0.9, 0]))
+    np.testing.assert_array_equal(found.w, 1 - ROW_NORM_TOL * np.array([0.98, 0, 0, 0.9, 0]))
     np.testing.assert_array_equal(found.G[[1, 2, 4]], G[[1, 2, 4]])
     strong = program()
-    assert strong.without_faint_rows(np.ones(4)) is strong
+    assert strong.without_short_rows(np.ones(4)) is strong
 
 
 @pytest.mark.parametrize("active", [(), (2,), (1, 4), (0, 3, 6)])
@@ -189,14 +192,14 @@ def steep(cost: float) -> ParametricQP:
 
 
 def test_a_slack_costs_at_most_what_its_largest_violation_does() -> None:
-    ratio, largest = steepness(steep(3.0))
+    ratio, largest = slack_costs(steep(3.0))
     assert largest.tolist() == [4.0]  # both theta and the input move the bound by one, in halves
     assert ratio.tolist() == [6.0 * 16 / 2]
     edge = MILD * 2 / (2 * 16)
     assert not isinstance(solvable(steep(0.99 * edge)), SteepQP)
     assert isinstance(solvable(steep(1.01 * edge)), SteepQP)
     none = program()
-    assert solvable(none) is none and len(steepness(none)[0]) == 0
+    assert solvable(none) is none and len(slack_costs(none)[0]) == 0
 
 
 @pytest.mark.parametrize("times", [0.5, 1e5])

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy import optimize
 
 from sample_problems import small_mpc
-from sb3_yann.control.explicit.parametric_qp import ParametricQP
-from sb3_yann.control.explicit.ppopt_reference import _rows_of, _solve_lp, _unconstrained
+from sb3_yann.control.explicit.ppopt_reference import _solve_lp
 
 BOX = np.vstack([np.eye(2), -np.eye(2)])
 
@@ -48,24 +45,7 @@ def test_where_nothing_is_feasible_there_is_no_answer(cost: np.ndarray | None) -
 
 
 def test_without_a_constraint_the_law_is_the_minimum_in_all_of_the_box() -> None:
-    program = small_mpc(u_min=None, u_max=None, x_min=None, x_max=None, theta_min=-1,
-                        theta_max=1).condensed()  # fmt: skip
-    found = _unconstrained(program)
-    theta = np.array([0.3, -0.7])
-    U = found.gain @ theta + found.offset
-    np.testing.assert_allclose(program.H @ U + program.F @ theta + program.c, 0, atol=1e-12)
-    assert found.active_set == ()
-    np.testing.assert_array_equal(found.A, BOX)
-    np.testing.assert_array_equal(found.b, np.ones(4))
-
-
-def test_the_rows_that_ppopt_keeps_are_told_by_what_they_hold() -> None:
-    rng = np.random.default_rng(0)
-    G, S, w = rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), rng.normal(size=5)
-    G[3], S[3], w[3] = G[1], S[1], w[1]  # of those that say the same, the first
-    program = ParametricQP(
-        np.eye(2), np.zeros((2, 1)), np.zeros(2), G, w, S, -np.ones(1), np.ones(1)
-    )
-    kept = [4, 3, 0]
-    problem = SimpleNamespace(A=G[kept] + 1e-12, F=S[kept], b=w[kept, None])
-    assert _rows_of(program, problem).tolist() == [4, 1, 0]
+    mpc = small_mpc(u_min=None, u_max=None, x_min=None, x_max=None, theta_min=-1, theta_max=1)
+    law, theta = mpc.explicit("ppopt"), np.array([0.3, -0.7])
+    assert law.n_regions == 1 and law.in_domain([[1.0, -1.0], [1.1, 0.0]]).tolist() == [True, False]
+    np.testing.assert_allclose(law(theta), mpc.explicit()(theta), atol=1e-12)

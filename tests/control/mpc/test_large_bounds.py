@@ -7,12 +7,7 @@ import pytest
 
 from general_problems import servo
 from sb3_yann.control import LinearModel, LinearMPC, Terminal
-from sb3_yann.control.explicit.solve import (
-    ABSURD,
-    LITTLE,
-    asked_of_inputs,
-    require_sane_sizes,
-)
+from sb3_yann.control.explicit.solve import asked_of_inputs, require_sane_sizes
 
 MODEL = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
 
@@ -107,9 +102,9 @@ def test_what_an_mpc_asks_of_its_inputs_is_its_gain_times_the_box() -> None:
 def test_sizes_are_absurd_from_these_edges_on(side: float) -> None:
     mpc = servo(tracking=None)
     asked = asked_of_inputs(mpc.condensed(), mpc.u_min, mpc.u_max).max()
-    wide = side * ABSURD / asked
+    wide = side * 1e8 / asked
     large = servo(tracking=None, x_min=None, x_max=None, theta_min=-5 * wide, theta_max=5 * wide)
-    far = asked / (LITTLE / side)
+    far = asked / (1e-9 / side)
     loose = servo(tracking=None, u_min=-1.5 * far, u_max=1.5 * far)
     for each, name, absurd in ((large, "theta_min", side > 1), (loose, r"u_max\[0\]", side > 1)):
         program, limits = each.condensed(), (each.u_min, each.u_max)
