@@ -1,7 +1,11 @@
-"""Whether a log's inputs are those that acted: rows, columns, signs and units.
+"""Whether the inputs and states of a log are those of the plant: rows, columns, signs and units.
 
-A log that was made by the law tells it by the law. In another one, an input that acted shows in the
-next state as the given model says, in direction, sign and size.
+Two regressions tell. Where the MPC made the log, an input regressed on what the law gives has slope
+one and offset zero: then it is proven, whatever the plant's gain. Any other slope of a log that the
+law explains is a fault of the log. Where the law does not explain an input, only the plant can
+speak: the next states, regressed on states and inputs, show in which row, direction and size it
+acts. A plant whose gain is not the model's looks like an input in other units; a gain beyond
+0.6 and 1.7 times the model's must be confirmed by whoever knows the plant.
 """
 
 from __future__ import annotations
@@ -9,10 +13,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import least_squares, linear_sum_assignment
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
@@ -21,33 +26,38 @@ from sb3_yann.twin.dynamics import Coordinates, law_of
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.residuals import Monomials
 
-CLEARLY = 0.5
-"""Another reading of a log is taken where it leaves less than so much of the error."""
-NEARLY = 0.1
-"""What the law leaves of an input, relative to its standard deviation, that it explains."""
-FOLLOWS = 0.7
-"""An input follows the law where the law leaves less than so much of its standard deviation."""
-SAME = 0.05
-"""How far an input may be from the law in scale: less is no other unit."""
-EXACT = 0.02
-"""What is left of an input, relative to its standard deviation, that is the law times a factor."""
-GAINS = 1 / 3, 3.0
-"""An identified gain beyond these times the model's is one in other units."""
-SURE = 4.0
-"""Standard errors by which a gain must be beyond them."""
-LITTLE = 0.1
-"""An effect of so much of the model's is none against its sign."""
-OFFSET = 0.25
-"""Half-widths: where a plant rests with an input so far from zero, that has another zero."""
-FEW = 5
-"""Rows for each coefficient of a regression, at least."""
-WHERE = {-1: "the row before", 0: "the same row", 1: "the row after"}
+STANDARD_ERRORS = 4.0
+"""A coefficient of a regression differs from a value where it is farther away than so many."""
+CLEARLY_BETTER = 0.25
+"""Another reading of a log counts where it leaves less than so much of the squared error."""
+EXACT_SHARE = 4e-4
+"""A regression that leaves less of an input's variance explains all of it: 2 % of its deviation."""
+SLOPE_TOLERANCE = 0.1
+"""How far from one the slope of an input on the law may be: sensors' noise lowers it."""
+LEAST_GAIN = 0.6
+"""A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
+LEAST_ROWS = 20
+"""Rows of a regression on the law, at least."""
+CONFIRM = "If its units were checked, and the plant or its controller is so: units_confirmed=True."
+ROW_NAMES = {-1: "the row before", 0: "the same row", 1: "the row after"}
+
+
+class _Log(NamedTuple):
+    """What is checked: see :func:`objections`."""
+
+    problem: LinearMPC
+    coordinates: Coordinates
+    episodes: tuple[Episode, ...]
+    units_confirmed: bool
 
 
 def objections(
-    problem: LinearMPC, coordinates: Coordinates, episodes: tuple[Episode, ...]
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    episodes: tuple[Episode, ...],
+    units_confirmed: bool = False,
 ) -> list[str]:
-    """Return what speaks against the rows, columns, signs or units of a log's inputs.
+    """Return what speaks against the rows, columns, signs or units of a log.
 
     Parameters
     ----------
@@ -55,289 +65,319 @@ def objections(
         Of the twin.
     episodes : tuple of Episode
         The log.
+    units_confirmed : bool, default False
+        Whether somebody has checked the log's units: then another gain, zero or pace than the
+        model's is the plant's own, and another law is another controller's.
     """
-    compared = [_of_law(problem, coordinates, episodes, shift) for shift in (0, -1, 1)]
-    logged, names = compared[0], labels_of(problem.model)[1]
-    best = min(compared, key=lambda each: float(np.sum(each.assigned() ** 2)))
-    others = np.min([each.left.min(axis=(1, 2)) for each in compared[1:]], axis=0)
-    follows = (logged.straight < FOLLOWS) & (logged.straight <= others)
-    if np.all(follows & (logged.straight < EXACT)):
-        return []  # the law made it
-    law = [*_against_law(best, logged, names)]
-    if law and np.min(best.assigned()) < EXACT:
-        return law
-    states = [*_against_states(problem, coordinates, episodes)]
-    said = states or [*_scaled(problem, coordinates, episodes, logged, names)] or law
-    if said or np.all(follows):
-        return said
-    own = np.flatnonzero(~follows)
-    return [*_against_model(problem, coordinates, episodes, own, names)]
+    log = _Log(problem, coordinates, episodes, units_confirmed)
+    readings = {s: _on_law(log, s) for s in ROW_NAMES}
+    logged = np.diagonal(readings[0].left)
+    proven = np.diagonal(_is_one(readings[0])).copy()
+    for s in (-1, 1):
+        clearly = np.diagonal(readings[s].left) < CLEARLY_BETTER * logged - 1e-9
+        proven &= ~(clearly & np.diagonal(_is_one(readings[s]) & readings[s].alone))
+    if np.all(proven & (logged < EXACT_SHARE)):
+        return []
+    found = [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
+    if not found and not units_confirmed:
+        found += _other_units(log, proven)
+    return found or [*_against_plant(log, proven)]
 
 
 @dataclass(frozen=True)
-class _Law:
-    """Inputs beside what the law says some rows away.
+class _OnLaw:
+    """Each logged input j regressed on each column i of the law, some rows away.
 
     Attributes
     ----------
-    shift : int
-    inputs, law : ndarray, shape (rows, m)
-    left : ndarray, shape (m, m, 2)
-        What column i of the law, with either sign, leaves of input j, in standard deviations of it.
+    slope, offset, error : ndarray, shape (m, m)
+        Of column i for input j at [i, j]; the standard error is the slope's.
+    left : ndarray, shape (m, m)
+        Share of the input's variance that the regression leaves.
+    left_of_rows : ndarray, shape (m, m)
+        Share that theta would leave besides, were all that it adds chance.
+    deviation, offset_room : ndarray, shape (m, m)
+        The input's standard deviation, and four standard errors of the offset.
+    unique : ndarray, shape (m,)
+        Whether the law is more than a multiple of one entry of theta.
     """
 
-    shift: int
-    inputs: Array
-    law: Array
+    slope: Array
+    offset: Array
+    error: Array
     left: Array
+    left_of_rows: Array
+    deviation: Array
+    offset_room: Array
+    unique: NDArray[np.bool_]
 
     @property
-    def straight(self) -> Array:
-        """What each column of the law leaves of its own input, (m,)."""
-        return np.diagonal(self.left[..., 0])
-
-    def columns(self) -> Array:
-        """Return which column of the law each input follows best, each once, (m,)."""
-        return np.asarray(linear_sum_assignment(self.left.min(axis=2) ** 2)[1])
-
-    def assigned(self) -> Array:
-        """Return what the best columns and signs leave of each input, (m,)."""
-        return np.asarray(self.left.min(axis=2)[np.arange(len(self.left)), self.columns()])
+    def alone(self) -> NDArray[np.bool_]:
+        """Where the law explains an input, and theta adds nothing to it, (m, m)."""
+        made = (self.left < self.left_of_rows + EXACT_SHARE) & (self.left < 0.5)
+        return (made & self.unique[:, None]) | (self.left < EXACT_SHARE)
 
 
-def _of_law(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    episodes: tuple[Episode, ...],
-    shift: int,
-    states: Array | None = None,
-) -> _Law:
-    """Return the inputs beside the law, at states (n,) that a matrix (n, n) makes of the logged."""
-    row, layout, law = coordinates.row, problem.layout, law_of(problem)
-    inputs, answers = [], []
-    for each in episodes:
+def _rows(log: _Log, shift: int = 0) -> tuple[Array, Array]:
+    """Return rows of theta (N, n_theta), ``shift`` away from the inputs (N, m) beside them."""
+    layout, thetas, inputs = log.problem.layout, [], []
+    for each in log.episodes:
         k = np.arange(1, len(each) - 1)
-        theta = row.shown(each.thetas)[k + shift].copy()
+        theta = log.coordinates.row.shown(each.thetas)[k + shift].copy()
         theta[:, layout.previous] = each.actions[k - 1][:, : layout.n_previous]
-        if states is not None:
-            theta[:, layout.state] = theta[:, layout.state] @ states.T
+        thetas.append(theta)
         inputs.append(each.actions[k])
-        answers.append(law(theta))
-    u, answer = np.concatenate(inputs), np.concatenate(answers)
-    known = np.isfinite(answer).all(axis=1)
-    u, answer = u[known], answer[known]
-    if not len(u):
-        return _Law(shift, u, answer, np.ones((*problem.R.shape, 2)))
-    unit = np.maximum(np.std(u, axis=0), 1e-6 * problem.u_half)
-    errors = u[:, :, None, None] - answer[:, None, :, None] * np.array([1.0, -1.0])
-    left = np.sqrt(np.mean(errors**2, axis=0)) / unit[:, None, None]
-    return _Law(shift, u, answer, left)
+    return np.concatenate(thetas), np.concatenate(inputs)
 
 
-def _clearly(left: Array, than: Array) -> bool:
-    """Return whether another reading explains nearly all of some input, and clearly better.
+def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) -> _OnLaw:
+    """Return the regressions on the law at the rows ``shift`` away.
 
-    Less would not do: where a plant follows its inputs slowly, so does minus the law.
+    With ``change`` = (M, v) the law sees M x + v in place of the logged states x.
     """
-    return bool(np.any((left < NEARLY) & (left < CLEARLY * than - 1e-5)))
-
-
-def _against_law(best: _Law, logged: _Law, names: list[str]) -> Iterator[str]:
-    """Yield where the inputs are the law's of other rows or columns, or with the other sign."""
-    columns, left = best.columns(), best.assigned()
-    for j in range(len(names)):
-        i, sign = int(columns[j]), int(np.argmin(best.left[j, columns[j]]))
-        same = best.shift == 0 and i == j and sign == 0
-        if same or not _clearly(left[j], logged.straight[j]):
-            continue
-        what = f"{'minus ' if sign else ''}what the MPC gives {names[i]} in {WHERE[best.shift]}"
-        cures = ["move the inputs by a row"] if best.shift else []
-        cures += ["exchange the columns"] if i != j else []
-        cures += ["change the sign"] if sign else []
-        late = " A controller that acts a sample late is dead time: PastInputs."
-        yield (
-            f"The logged {names[j]} is {what} ({100 * left[j]:.3g} % of its standard deviation "
-            f"apart; {100 * logged.straight[j]:.3g} % from its own). In the log, "
-            f"{' and '.join(cures)}.{late if best.shift == -1 else ''}"
+    m = log.problem.model.n_inputs
+    theta, u = _rows(log, shift)
+    if change is not None:
+        state = log.problem.layout.state
+        theta[:, state] = theta[:, state] @ change[0].T + change[1]
+    answer = law_of(log.problem)(theta)
+    known = np.isfinite(answer).all(axis=1)
+    theta, u, answer = theta[known], u[known], answer[known]
+    slope, offset, deviation, room = np.zeros((4, m, m))
+    error, left, left_of_rows = np.ones((3, m, m))
+    unique = np.zeros(m, dtype=bool)
+    for i in range(m):
+        inside = np.minimum(
+            answer[:, i] - log.problem.u_min[i], log.problem.u_max[i] - answer[:, i]
         )
+        inside = inside > 1e-3 * log.problem.u_half[i]
+        y, a, x = u[inside], answer[inside, i], theta[inside]
+        if len(a) < LEAST_ROWS or np.std(a) < 1e-6 * log.problem.u_half[i]:
+            continue
+        x = x[:, np.std(x, axis=0) > 1e-9 * log.problem.theta_half]
+        F = np.column_stack([a - a.mean(), np.ones(len(a))])
+        rows = np.column_stack([F, (x - x.mean(axis=0)) / np.std(x, axis=0)])
+        spread = np.maximum(np.var(y, axis=0), 1e-12 * log.problem.u_half**2)
+        found = np.linalg.lstsq(F, y, rcond=None)[0]
+        slope[i], offset[i] = found[0], found[1] - found[0] * a.mean()
+        left[i] = np.mean((y - F @ found) ** 2, axis=0) / spread
+        rest = y - rows @ np.linalg.lstsq(rows, y, rcond=1e-9)[0]
+        # An F test: p columns that say nothing explain p of N rows.
+        chance = 1 + 3 * x.shape[1] / len(a)
+        left_of_rows[i] = chance * np.mean(rest**2, axis=0) / spread
+        error[i] = np.sqrt(left[i] * spread / np.sum(F[:, 0] ** 2))
+        # Of one entry of theta every linear controller is the law times a factor.
+        share = x - F @ np.linalg.lstsq(F, x, rcond=None)[0]
+        unique[i] = np.any(np.var(share, axis=0) > 0.02 * np.var(x, axis=0))
+        deviation[i] = np.sqrt(spread)
+        room[i] = STANDARD_ERRORS * np.sqrt(left[i] * spread * np.mean(a**2) / np.var(a) / len(a))
+    return _OnLaw(slope, offset, error, left, left_of_rows, deviation, room, unique)
 
 
-def _against_states(
-    problem: LinearMPC, coordinates: Coordinates, episodes: tuple[Episode, ...]
+def _is_one(on: _OnLaw) -> NDArray[np.bool_]:
+    """Return where column i of the law gives input j as it is, [i, j]."""
+    near = np.abs(on.slope - 1) < SLOPE_TOLERANCE
+    # No plausible factor of units is as near to one as the slope may yet be.
+    sure = STANDARD_ERRORS * on.error < 1 - LEAST_GAIN
+    return near & sure & (np.abs(on.offset) < SLOPE_TOLERANCE * on.deviation + on.offset_room)
+
+
+def _against_law(
+    log: _Log, readings: dict[int, _OnLaw], proven: NDArray[np.bool_]
 ) -> Iterator[str]:
+    """Yield where an input is the law's of other rows or columns, or in other units."""
+    logged, names = readings[0], labels_of(log.problem.model)[1]
+    for j in np.flatnonzero(~proven):
+        own = logged.left[j, j]
+        found = [
+            (float(on.left[i, j]), s, i)
+            for s, on in readings.items()
+            for i in range(len(names))
+            if on.alone[i, j]
+            and ((s == 0 and i == j) or on.left[i, j] < CLEARLY_BETTER * own - 1e-9)
+        ]
+        if not found:
+            continue
+        _, s, i = min(found)
+        slope, offset = readings[s].slope[i, j], readings[s].offset[i, j]
+        cures = ["move the inputs by a row"] if s else []
+        cures += ["exchange the columns"] if i != j else []
+        cures += ["change the sign"] if slope < 0 else []
+        error = STANDARD_ERRORS * readings[s].error[i, j]
+        if cures and abs(abs(slope) - 1) < SLOPE_TOLERANCE + error:
+            what = f"{'minus ' if slope < 0 else ''}what the MPC gives {names[i]}"
+            late = " A controller that acts a sample late is dead time: PastInputs."
+            yield (
+                f"The logged {names[j]} is {what} in {ROW_NAMES[s]} (it leaves "
+                f"{100 * np.sqrt(readings[s].left[i, j]):.3g} % of its deviation; its own leaves "
+                f"{100 * np.sqrt(logged.left[j, j]):.3g} %). In the log, "
+                f"{' and '.join(cures)}.{late if s == -1 else ''}"
+            )
+            continue
+        room = SLOPE_TOLERANCE * logged.deviation[i, j] + logged.offset_room[i, j]
+        away = offset if abs(offset) > room else 0.0
+        scaled = abs(slope - 1) > SLOPE_TOLERANCE + error or away
+        if s == 0 and i == j and not log.units_confirmed and scaled and abs(slope) > error:
+            yield (
+                f"The logged {names[j]} is {slope:.4g} times what the MPC gives"
+                f"{f', {away:+.4g}' if away else ''}: is it in other units, or has a state "
+                f"another zero? Log it as the plant got it. {CONFIRM}"
+            )
+
+
+def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where two columns of the states are exchanged, or one has the other sign.
 
     Then the law gives the inputs from the states so changed, or the given model predicts them.
     """
-    names, row, n = labels_of(problem.model)[0], coordinates.row, problem.model.n_states
-    logged = _of_law(problem, coordinates, episodes, 0).straight
-    x = np.concatenate([each.thetas[:-1] for each in episodes])
-    u = np.concatenate([each.actions for each in episodes])
-    after = np.concatenate([each.thetas[1:, row.state] for each in episodes])
-    driven = np.concatenate([x, u], axis=1)
+    row, n = log.coordinates.row, log.problem.model.n_states
+    names = labels_of(log.problem.model)[0]
+    x = np.concatenate([each.thetas[:-1] for each in log.episodes])
+    u = np.concatenate([each.actions for each in log.episodes])
+    after = np.concatenate([each.thetas[1:, row.state] for each in log.episodes])
 
-    def error(change: Array) -> float:
-        rows = driven.copy()
+    def error(change: Array) -> Array:
+        rows = np.concatenate([x, u], axis=1)
         rows[:, row.state] = x[:, row.state] @ change.T
         left = after @ change.T - rows @ row.linear[row.state].T
-        return float(np.sum((np.std(left, axis=0) / np.abs(change @ coordinates.units)) ** 2))
+        return np.asarray(np.var(left / np.abs(change @ log.coordinates.units), axis=0)) + 1e-12
 
     before = error(np.eye(n))
     for i, j in combinations_with_replacement(range(n), 2):
         change = np.eye(n)
         change[[i, j]] = change[[j, i]] if i != j else -change[[i, i]]
-        law = _of_law(problem, coordinates, episodes, 0, change).straight
-        if not _clearly(law, logged) and not error(change) < CLEARLY**2 * before:
-            continue
-        what = f"{names[i]} and {names[j]} are exchanged" if i != j else f"{names[i]} is negated"
-        yield (
-            f"The log fits the MPC, or its model, clearly better where {what}: look at the columns "
-            "and signs of the states."
-        )
-
-
-def _scaled(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    episodes: tuple[Episode, ...],
-    logged: _Law,
-    names: list[str],
-) -> Iterator[str]:
-    """Yield where inputs are the law's in other units.
-
-    Another controller may be the law times a factor as well. Where there is one state that is all
-    of it, the given model decides: in which units do the inputs move the plant as it says?
-    """
-    rows = np.concatenate([each.thetas[:-1] for each in episodes])
-    u = np.concatenate([each.actions for each in episodes])
-    after = np.concatenate([each.thetas[1:] for each in episodes])
-    row = coordinates.row
-    rest = (after - np.concatenate([rows, u], axis=1) @ row.linear.T)[:, row.state]
-    B = row.linear[row.state, row.size :]
-    for j, name in enumerate(names):
-        given, law = logged.inputs[:, j], logged.law[:, j]
-        deviation, spread = np.std(given), np.std(law)
-        if not len(law) or spread < 1e-6 * problem.u_half[j] or not deviation:
-            continue
-        slope, offset = np.polyfit(law, given, 1)
-        left = float(np.std(given - slope * law - offset) / deviation)
-        error = left * deviation / spread / np.sqrt(len(law))
-        if not abs(slope - 1) > SAME + SURE * error or not slope > SURE * error:
-            continue
-        moved = (u[:, j] - offset) / slope - u[:, j]
-        steps = rest, rest - moved[:, None] * B[:, j]
-        sizes = [np.sum((np.std(each, axis=0) / coordinates.units) ** 2) for each in steps]
-        # One state times a factor is what any controller makes of it.
-        moved_zero = abs(offset) > OFFSET * problem.u_half[j] and not problem.layout.has_constants
-        unlikely = moved_zero or not sizes[0] < CLEARLY * sizes[1]
-        certain = problem.model.n_states > 1 or unlikely
-        if (left < EXACT and certain) or (left < CLEARLY and sizes[1] < sizes[0]):
+        ratio = error(change) / (np.abs(change) @ before)
+        fits = ratio.min() < CLEARLY_BETTER and ratio.max() < 1.5
+        if not fits and not np.all(proven):
+            on = _on_law(log, 0, (change, np.zeros(n)))
+            better = np.diagonal(on.left) < CLEARLY_BETTER * logged - 1e-9
+            fits = np.any(np.diagonal(_is_one(on) & on.alone) & better & ~proven)
+        if fits:
+            what = (
+                f"{names[i]} and {names[j]} are exchanged" if i != j else f"{names[i]} is negated"
+            )
             yield (
-                f"The logged {name} is {slope:.4g} times what the MPC gives"
-                f"{f', {offset:+.4g}' if abs(offset) > SAME * deviation else ''}: is it in other "
-                "units? Log it in those of the problem, as the plant got it."
+                f"The log fits the MPC, or its model, clearly better where {what}: look at the "
+                "columns and signs of the states."
             )
 
 
-def _against_model(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    episodes: tuple[Episode, ...],
-    own: NDArray[np.intp],
-    names: list[str],
-) -> Iterator[str]:
-    """Yield where inputs that do not follow the law act otherwise than the model says.
+def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
+    """Yield where the law gives the inputs once one state is taken times a factor, plus a zero."""
+    if np.all(proven):
+        return
+    names = labels_of(log.problem.model)[0]
+    n, unit, law = log.problem.model.n_states, log.coordinates.units, law_of(log.problem)
+    theta, u = _rows(log)
+    some = np.linspace(0, len(u) - 1, min(len(u), 300)).astype(int)  # an online law takes its time
+    theta, u = theta[some], u[some]
+    scale = np.maximum(np.std(u, axis=0), 1e-6 * log.problem.u_half)
 
-    Gains are those of a regression of the next state on state and inputs, with squares of the
-    states where there are rows enough.
-    """
-    fits = {shift: _Gains.of(problem, coordinates, episodes, shift) for shift in (0, -1, 1)}
-    fit = fits[0]
+    for i in range(n):
+
+        def left(p: Array, i: int = i) -> Array:
+            rows = theta.copy()
+            rows[:, i] = p[0] * rows[:, i] + p[1] * unit[i]
+            return np.asarray(np.nan_to_num((u - law(rows)) / scale).ravel())
+
+        before = np.mean(left(np.array([1.0, 0.0])) ** 2)
+        fit = least_squares(left, [1.0, 0.0], diff_step=1e-4, max_nfev=20)
+        factor, zero = fit.x
+        moved = abs(np.log(max(abs(factor), 1e-9))) > 2 * SLOPE_TOLERANCE or abs(zero) > 0.2
+        if not moved or not np.mean(fit.fun**2) < 0.5 * before:
+            continue
+        change, shift = np.eye(n), np.zeros(n)
+        change[i, i], shift[i] = factor, zero * unit[i]
+        on = _on_law(log, 0, (change, shift))
+        if np.any(np.diagonal(_is_one(on) & on.alone) & ~proven):
+            yield (
+                f"The MPC gives the logged inputs where {names[i]} is {factor:.4g} times what is "
+                f"logged, {shift[i]:+.4g}: is it in other units, or has it another zero? {CONFIRM}"
+            )
+
+
+def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
+    """Yield where inputs that the law does not prove act otherwise than the model says."""
+    fit, B, unit = _Effects.of(log, 0), log.problem.model.B, log.coordinates.units
     if fit is None:
         return
-    for shift in (-1, 1):
-        other = fits[shift]
-        if other is None or (shift == 1 and not _causes(other, fit, problem.model.B, coordinates)):
+    sizes = np.maximum(np.sum((B / unit[:, None]) ** 2, axis=0), 1e-300)
+    weights = (B / unit[:, None] ** 2 / sizes).T  # they make 1 of a column of B
+    for s in (-1, 1):
+        other = _Effects.of(log, s)
+        if other is None:
             continue
+        # Inputs that follow the state of their own row tell it, with the other sign: no cause.
+        caused = other.follows.min() > 0.7 or np.min(np.sum(weights * other.B.T, axis=1)) > 1 / 3
         ratio = other.left / fit.left
-        if ratio.min() < CLEARLY and ratio.max() < 1 / FOLLOWS:
+        if (s == -1 or caused) and ratio.min() < 0.5 and ratio.max() < 1.5:
             yield (
-                f"The next states follow the inputs of {WHERE[shift]} (they leave "
+                f"The next states follow the inputs of {ROW_NAMES[s]} (they leave "
                 f"{100 * ratio.min():.3g} % of what the inputs of the same row leave). Move the "
                 "inputs by a row; if the plant acts so late, give the model its dead time."
             )
             return
-    if not problem.layout.has_constants:
-        yield from _resting(fit, coordinates, problem.u_half, names)
-    yield from _against_gains(fit, problem.model.B, coordinates.units, own, names)
+    yield from _against_gains(log, fit, weights, proven)
+    driven = fit.follows.min() > 0.7 and not np.any(proven)  # in closed loop noise moves the zero
+    if driven and not (log.problem.layout.has_constants or log.units_confirmed):
+        yield from _resting(log, fit)
 
 
 def _against_gains(
-    fit: _Gains, B: Array, unit: Array, own: NDArray[np.intp], names: list[str]
+    log: _Log, fit: _Effects, weights: Array, proven: NDArray[np.bool_]
 ) -> Iterator[str]:
-    """Yield where columns of inputs act as others of B do, against its signs, or far otherwise."""
-    columns = _exchanged(fit, B, unit)
-    for j in own:
-        if columns[j] != j:
+    """Yield where inputs act as others of B do, against its signs, or far otherwise."""
+    names, own = labels_of(log.problem.model)[1], np.arange(len(weights))
+    B, unit = log.problem.model.B, log.coordinates.units[:, None]
+    norms = np.outer(np.linalg.norm(fit.B / unit, axis=0), np.linalg.norm(B / unit, axis=0))
+    apart = 1 - ((fit.B / unit).T @ (B / unit) / np.maximum(norms, 1e-300)) ** 2
+    columns = linear_sum_assignment(apart)[1]
+    sizes = np.linalg.norm(fit.B / np.sqrt(np.diag(fit.covariance))[:, None], axis=0)
+    known = np.all(sizes > STANDARD_ERRORS * np.sqrt(len(B)) * fit.factors)
+    if known and apart[own, columns].sum() < CLEARLY_BETTER * apart[own, own].sum():
+        for j in np.flatnonzero((columns != own) & ~proven):
             yield (
                 f"The logged {names[j]} moves the plant as the model's {names[columns[j]]} does: "
                 "exchange the columns of the log."
             )
-    if np.any(columns != np.arange(len(columns))):
         return
-    for j in own:
-        weights = _weights(B[:, j], unit)
-        if not np.any(weights):
-            continue
-        gain = float(weights @ fit.B[:, j])
-        error = float(np.sqrt(max(float(weights @ fit.covariance @ weights), 0.0)) * fit.factors[j])
-        if gain + SURE * error < 0 and gain < -LITTLE:
+    for j in np.flatnonzero(~proven & np.any(B, axis=0)):
+        gain = float(weights[j] @ fit.B[:, j])
+        variance = float(weights[j] @ fit.covariance @ weights[j])
+        error = STANDARD_ERRORS * float(np.sqrt(max(variance, 0.0)) * fit.factors[j])
+        measured = f"{gain:.3g} ± {error:.2g} times"
+        far = not LEAST_GAIN < gain < 1 / LEAST_GAIN and abs(gain - 1) > error
+        if gain + error < 0 and gain < -0.1:
             yield (
                 f"The logged {names[j]} moves the plant against the sign of the model's B "
-                f"({gain:.3g} ± {error:.2g} times its effect). Compare its sign and rows."
+                f"({measured} its effect). Compare its sign and rows."
             )
-        elif not GAINS[0] < gain < GAINS[1] and SURE * error < abs(gain - 1):
+        elif far and not log.units_confirmed:
             yield (
-                f"The logged {names[j]} moves the plant {gain:.3g} ± {error:.2g} times as much as "
-                "the model says: is it in other units, or a row off?"
+                f"The logged {names[j]} moves the plant {measured} as much as the model says: "
+                f"is it in other units, or a row off? {CONFIRM}"
             )
 
 
-def _weights(b: Array, units: Array) -> Array:
-    """Return weights (n,) that make 1 of a column of B, and of another one its relative gain."""
-    size = float(np.sum((b / units) ** 2))
-    return b / units**2 / size if size else np.zeros(len(b))
-
-
-def _causes(after: _Gains, fit: _Gains, B: Array, coordinates: Coordinates) -> bool:
-    """Return whether the inputs of the row after may be what moved the plant.
-
-    Inputs that follow the state of their own row tell it, with the other sign: that is no cause.
-    """
-    columns = zip(B.T, after.B.T, strict=True)
-    gains = [_weights(b, coordinates.units) @ found for b, found in columns]
-    return bool(min(fit.follows) > FOLLOWS or min(gains) > GAINS[0])
-
-
-def _resting(
-    fit: _Gains, coordinates: Coordinates, u_half: Array, names: list[str]
-) -> Iterator[str]:
-    """Yield where the plant rests at zero states with inputs far from zero."""
-    drift, error = fit.drift / coordinates.units, fit.drift_error / coordinates.units
-    B = fit.B / coordinates.units[:, None]
-    rest = -np.linalg.lstsq(B, drift, rcond=None)[0]
-    explained = np.linalg.norm(drift + B @ rest) < CLEARLY * np.linalg.norm(drift)
-    if not explained or not np.any(np.abs(drift) > SURE * error):
+def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
+    """Yield where the plant moves at x = 0 and u = 0, and so rests elsewhere."""
+    if not np.any(np.abs(fit.drift) > STANDARD_ERRORS * fit.drift_error):
         return
-    for j in np.flatnonzero(np.abs(rest) > OFFSET * u_half):
+    A, names = log.problem.model.A, labels_of(log.problem.model)[0]
+    rest = np.linalg.lstsq(np.eye(len(A)) - A, fit.drift, rcond=1e-3)[0]
+    away = np.abs(rest / log.coordinates.units)
+    if np.max(away) > 5:  # beyond the log: a state that hardly returns, or noise
+        return
+    for i in np.flatnonzero(away > 0.5):
         yield (
-            f"At x = 0 the logged plant rests with {names[j]} = {rest[j]:.4g}, the problem's with "
-            "0: compare the input's units and operating point; an absolute log needs absolute=True."
+            f"Without inputs the logged plant rests at {names[i]} = {rest[i]:.4g}, the problem's "
+            "at 0: compare units and operating point of states and inputs; an absolute log needs "
+            f"absolute=True. {CONFIRM}"
         )
 
 
 @dataclass(frozen=True)
-class _Gains:
+class _Effects:
     """A regression of the next states on states and inputs.
 
     Attributes
@@ -352,7 +392,7 @@ class _Gains:
     drift, drift_error : ndarray, shape (n,)
         The next state of x = 0 and u = 0, and its standard error.
     follows : ndarray, shape (m,)
-        What the states leave of the inputs, in standard deviations of these.
+        Deviation of the inputs that the states leave, relative to their own.
     """
 
     B: Array
@@ -364,58 +404,37 @@ class _Gains:
     follows: Array
 
     @classmethod
-    def of(
-        cls,
-        problem: LinearMPC,
-        coordinates: Coordinates,
-        episodes: tuple[Episode, ...],
-        shift: int,
-    ) -> _Gains | None:
-        """Return the regression on the inputs some rows away; None where there are few rows."""
-        row, m = coordinates.row, problem.model.n_inputs
-        steps = [(e, np.arange(1, len(e) - 1)) for e in episodes]
-        z = np.concatenate(
-            [row.features(e.thetas[k], e.actions[k + shift]) / coordinates.scale for e, k in steps]
-        )
+    def of(cls, log: _Log, shift: int) -> _Effects | None:
+        """Return the regression on the inputs some rows away; None where there are few rows.
+
+        Squares of the states count where rows are enough.
+        """
+        row, m = log.coordinates.row, log.problem.model.n_inputs
+        steps = [(e, np.arange(1, len(e) - 1)) for e in log.episodes]
+        z = np.concatenate([row.features(e.thetas[k], e.actions[k + shift]) for e, k in steps])
+        z = z / log.coordinates.scale
         y = np.concatenate([e.thetas[k + 1, row.state] for e, k in steps])
-        states = Monomials(z.shape[1] - m, 2).values(z[:, :-m])
-        many = len(z) > FEW * (states.shape[1] + m + 1)
-        kept = states if many else z[:, :-m]
-        F = np.column_stack([z[:, -m:], np.ones(len(z)), kept])
-        if len(z) <= FEW * F.shape[1]:
+        x, u = z[:, :-m], z[:, -m:]
+        curved = Monomials(x.shape[1], 2).values(x)
+        states = curved if len(z) > 5 * (curved.shape[1] + m + 1) else x
+        F = np.column_stack([u, np.ones(len(z)), states])
+        if len(z) <= 5 * F.shape[1]:
             return None
-        deviation = np.maximum(np.std(F, axis=0), 1e-300)
-        left, singular, right = np.linalg.svd(F / np.where(deviation > 1e-12, deviation, 1), False)
-        kept_ones = singular > 1e-7 * singular[0]
-        inverse = np.where(kept_ones, 1 / np.maximum(singular, 1e-300), 1e7 / singular[0])
-        scale = np.where(deviation > 1e-12, deviation, 1)
-        slopes = (right.T * inverse * kept_ones) @ (left.T @ y) / scale[:, None]
+        scale = np.std(F, axis=0)
+        scale[scale < 1e-12] = 1.0
+        left, singular, right = np.linalg.svd(F / scale, full_matrices=False)
+        kept = singular > 1e-7 * singular[0]
+        inverse = np.where(kept, 1 / np.maximum(singular, 1e-300), 1e7 / singular[0])
+        slopes = (right.T * inverse * kept) @ (left.T @ y) / scale[:, None]
         rest = y - F @ slopes
-        freedom = len(z) - F.shape[1]
-        unit = coordinates.units
-        covariance = rest.T @ rest / freedom + np.diag((1e-5 * unit) ** 2)
+        rounding = np.diag((1e-5 * log.coordinates.units) ** 2)
+        covariance = rest.T @ rest / (len(z) - F.shape[1]) + rounding
         factors = np.linalg.norm(right.T * inverse, axis=1) / scale
-        inputs = coordinates.scale[-m:]
-        u, closed = F[:, :m], F[:, m:]
-        feedback = u - closed @ np.linalg.lstsq(closed, u, rcond=None)[0]
-        follows = np.std(feedback, axis=0) / np.maximum(deviation[:m], 1e-12)
-        effects = slopes[:m].T / inputs, covariance, factors[:m] / inputs
+        own = u - F[:, m:] @ np.linalg.lstsq(F[:, m:], u, rcond=None)[0]
+        follows = np.std(own, axis=0) / np.maximum(np.std(u, axis=0), 1e-12)
         squares = np.diag(covariance).copy()
-        return cls(*effects, squares, slopes[m], np.sqrt(squares) * factors[m], follows)
-
-
-def _exchanged(fit: _Gains, B: Array, units: Array) -> NDArray[np.intp]:
-    """Return whose direction of the model's B each input has (m,), in units of the states.
-
-    Its own, unless others clearly fit better.
-    """
-    own: NDArray[np.intp] = np.arange(B.shape[1], dtype=np.intp)
-    sizes = np.linalg.norm(fit.B / np.sqrt(np.diag(fit.covariance))[:, None], axis=0)
-    if len(own) == 1 or np.any(SURE * np.sqrt(len(B)) * fit.factors > sizes):
-        return own  # too little is known
-    found, given = (each / units[:, None] for each in (fit.B, B))
-    norms = np.outer(np.linalg.norm(found, axis=0), np.linalg.norm(given, axis=0))
-    apart = 1 - (found.T @ given / np.maximum(norms, 1e-300)) ** 2
-    columns = np.asarray(linear_sum_assignment(apart)[1], dtype=np.intp)
-    clearly = apart[own, columns].sum() < CLEARLY**2 * apart[own, own].sum()
-    return columns if clearly else own
+        size = log.coordinates.scale[-m:]
+        return cls(
+            slopes[:m].T / size, covariance, factors[:m] / size, squares, slopes[m],
+            np.sqrt(squares) * factors[m], follows,
+        )  # fmt: skip

@@ -113,6 +113,7 @@ class PlantTwin:
         n_members: int = 5,
         seed: int = 0,
         absolute: bool = False,
+        units_confirmed: bool = False,
     ) -> PlantTwin:
         """Return the twin of a plant that was logged.
 
@@ -144,6 +145,11 @@ class PlantTwin:
         absolute : bool, default False
             Whether the log holds absolute values, as the plant shows them: the operating point is
             taken off states, references and inputs. The twin itself is in deviations.
+        units_confirmed : bool, default False
+            Whether somebody has checked the log's units. A plant whose gain is below 0.6 or above
+            1.7 times the model's looks like an input in other units, and a controller that is a
+            multiple of the law like another zero or scale: such a log is not trusted unless you
+            say so. Where the MPC made the log its inputs are proven, and nothing needs saying.
 
         Raises
         ------
@@ -155,6 +161,7 @@ class PlantTwin:
         check_int("n_members", n_members)
         check_int("seed", seed, 0)
         check_bool("absolute", absolute)
+        check_bool("units_confirmed", units_confirmed)
         row, given = RowLayout(problem, observer), (references, disturbances, previous)
         found = observer is not None
         log = as_episodes(problem, episodes, *given, observed=found, absolute=absolute)
@@ -177,7 +184,7 @@ class PlantTwin:
         drawn = log if len(log) >= FOLDS else pieces(log, BLOCKS)
         members = _members(problem, coordinates, drawn, choice, n_members, seed)
         dynamics = Dynamics(problem, coordinates, members)
-        trust = evidence(dynamics, parts, (choices, chosen, runs))
+        trust = evidence(dynamics, parts, (choices, chosen, runs), units_confirmed)
         return cls(problem, log, choice.name, dynamics, trust, notes)
 
     @classmethod

@@ -288,6 +288,7 @@ def evidence(
     dynamics: Dynamics,
     log: tuple[Episode, ...],
     found: tuple[list[Candidate], int, FreeRuns],
+    units_confirmed: bool = False,
 ) -> Trust:
     """Return the evidence for a twin.
 
@@ -299,6 +300,8 @@ def evidence(
         Each is left out once.
     found : tuple of list, int and FreeRuns
         The candidates, which was chosen, and their free runs.
+    units_confirmed : bool, default False
+        As in :meth:`PlantTwin.fit`.
     """
     (choices, chosen, runs), problem = found, dynamics.problem
     coordinates, row = dynamics.coordinates, dynamics.row
@@ -311,7 +314,7 @@ def evidence(
     independent = sum(len(each[::2]) for each in records(log))
     problems, advice = judge(runs, standing, costs, inputs, independent, beyond, names)
     problems += foreign_previous(problem, log)
-    problems += objections(problem, coordinates, log)
+    problems += objections(problem, coordinates, log, units_confirmed)
     problems += _frozen(dynamics, log)
     first = Dynamics(problem, coordinates, dynamics.members[:1])
     parts = [e.thetas[1:] - first.step(e.thetas[None, :-1], e.actions[None])[0] for e in log]

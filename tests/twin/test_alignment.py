@@ -112,3 +112,59 @@ def test_consecutive_pieces_of_a_record_are_tested_as_episodes() -> None:
     twin = fitted([(states[i : i + 61], u[i : i + 60]) for i in range(0, 600, 60)])
     assert twin.trusted
     assert "Every other one is independent: 5 of 10." in twin.report()
+
+
+@cache
+def room() -> LinearMPC:
+    """Air and walls of a room, and one heater: nothing was tuned on it."""
+    model = LinearModel([[0.8, 0.15], [0.06, 0.93]], [[0.3], [0.01]], 1.0)
+    return LinearMPC(
+        model, Q=np.diag([1.0, 0.2]), R=[[0.3]], horizon=4, u_min=-2, u_max=2, x_min=-6, x_max=6
+    )
+
+
+def heated(gain: float, dither: float, open_loop: bool = False) -> list:
+    """Return episodes of a room whose heater has so many times the model's gain."""
+    rng, law, found = np.random.default_rng(5), room().explicit(), []
+    held = np.zeros(1)
+    for _ in range(6):
+        states, inputs = [rng.uniform(-2, 2, 2)], []
+        for k in range(40):
+            drawn = rng.normal(size=1)
+            held = drawn if k % 4 == 0 else held
+            wanted = 0.5 * held if open_loop else law(states[-1]) + dither * drawn
+            inputs.append(np.clip(wanted, -2, 2))
+            states.append(room().model.A @ states[-1] + gain * room().model.B @ inputs[-1])
+        found.append((np.array(states), np.array(inputs)))
+    return found
+
+
+def heated_twin(episodes: list, **options: bool) -> PlantTwin:
+    return PlantTwin.fit(room(), episodes, residuals=SELECT, n_members=1, **options)
+
+
+@pytest.mark.parametrize("dither", [0.0, 0.2])
+@pytest.mark.parametrize("gain", [0.4, 1.0, 2.2])
+def test_inputs_that_the_mpc_gave_are_proven_whatever_the_gain_of_the_plant(gain, dither) -> None:
+    assert heated_twin(heated(gain, dither)).trusted
+
+
+@pytest.mark.parametrize(("factor", "dither"), [(0.3, 0.2), (0.55, 0.0), (0.55, 0.2), (0.8, 0.0)])
+def test_inputs_times_a_factor_are_not_those_of_the_mpc(factor, dither) -> None:
+    twin = heated_twin([(x, factor * u) for x, u in heated(1.0, dither)])
+    assert "times what the MPC gives" in twin.report()
+    assert not twin.trusted
+
+
+def test_a_state_with_another_zero_and_scale_is_not_the_one_that_the_mpc_saw() -> None:
+    twin = heated_twin([(x * [1.8, 1] + [0.5, 0], u) for x, u in heated(1.0, 0.2)])
+    assert "The MPC gives the logged inputs where x[0] is" in twin.report()
+    assert not twin.trusted
+
+
+def test_a_gain_that_only_an_open_loop_shows_counts_once_the_units_are_confirmed() -> None:
+    log = heated(2.2, 0.0, open_loop=True)
+    assert "units_confirmed=True" in heated_twin(log).report()
+    assert not heated_twin(log).trusted
+    assert heated_twin(log, units_confirmed=True).trusted
+    assert heated_twin(heated(1.4, 0.0, open_loop=True)).trusted
