@@ -18,7 +18,7 @@ import numpy as np
 from stable_baselines3 import DDPG
 
 from examples import quadruple_tank as tank
-from experiments import strangers
+from experiments import plants
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann._validation import Array
 from sb3_yann.wrappers import SetPoint
@@ -112,6 +112,13 @@ def worn_tank() -> tuple[LinearMPC, Any]:
     return mpc, lambda: SetPoint(Plant(mpc, advance, spread), [-2, -2], [2, 2], hold=20)
 
 
+def textbook(make: Callable[[], plants.TextbookPlant]) -> tuple[LinearMPC, Any]:
+    """Return the MPC of a textbook's plant, and what makes the plant."""
+    plant = make()
+    mpc = plant.mpc()
+    return mpc, lambda: plant.env(mpc)
+
+
 PLANTS: dict[str, Callable[[], tuple[LinearMPC, Any]]] = {
     "two lags": two_lags,
     "twice the gain": twice_the_gain,
@@ -119,8 +126,8 @@ PLANTS: dict[str, Callable[[], tuple[LinearMPC, Any]]] = {
     "heater": heater,
     "motor": motor,
     "worn tank": worn_tank,
-    "conical tank": lambda: strangers.case("conical tank"),
-    "van de Vusse": lambda: strangers.case("van de Vusse's reactor"),
+    "conical tank": lambda: textbook(plants.conical_tank),
+    "van de Vusse": lambda: textbook(plants.van_de_vusse),
 }
 
 
