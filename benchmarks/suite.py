@@ -132,7 +132,7 @@ def trials(law: PiecewiseAffine, count: int) -> Array:
 
 def depth(law: PiecewiseAffine, points: Array) -> Array:
     """Return how far inside a region each point lies, in half-widths of the box, or outside."""
-    return np.asarray(law._choose(points)[1])
+    return np.asarray(law._located(points)[1])
 
 
 def table(outcomes: Iterable[Outcome]) -> dict[str, float]:

@@ -243,4 +243,5 @@ def _fill(axes: Axes, polygons: dict[int, Array], named: dict[str, list[int]]) -
             axes.add_patch(patch)
             label = "_nolegend_"
             if sizes[i] > 0.004 * sum(sizes.values()) and len(polygons) <= 60:
-                axes.text(*polygons[i].mean(axis=0), str(i), ha="center", va="center", fontsize=8)
+                x, y = polygons[i].mean(axis=0)
+                axes.text(x, y, str(i), ha="center", va="center", fontsize=8)

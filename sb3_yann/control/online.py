@@ -192,7 +192,7 @@ class OnlineLaw(PlantLaw):
     def _inputs(self, rows: Array) -> Array:
         """Return the inputs (batch, m) at rows of theta, and warn where rounding hides the law."""
         u, feasible, _, _ = self._answers(rows)
-        if self.n_slacks and not feasible.all() and np.any(self.feedback):
+        if self.n_slacks and not feasible.all() and np.any(np.asarray(self.feedback)):
             self._warn_beyond_reach(rows[~feasible])
         return u
 
@@ -243,20 +243,19 @@ class OnlineLaw(PlantLaw):
         """Write the input and active set where the compiled method has no certificate."""
         program, reach = self.scaled
         place = theta / self.half
-        active: Array | None = None
+        conditions = None
         if isinstance(program, SteepQP):
             start = self.dual.rows[found.active[at, : found.sizes[at]]]
             conditions = program.conditions_at(place, as_bits(start))
-            if conditions is not None:
-                U = conditions.law @ np.append(place, 1.0)
-                active = np.isin(self.dual.rows, conditions.active)
-        if active is None:
-            answer, multipliers = program.solve_with_multipliers(place)
-            if answer is None:
-                return False
-            U = answer
-            active = multipliers[self.dual.rows] > 0
-        members = np.flatnonzero(active)[: found.active.shape[1]]
+        if conditions is not None:
+            U: Array | None = conditions.law @ np.append(place, 1.0)
+            members = np.flatnonzero(np.isin(self.dual.rows, conditions.active))
+        else:
+            U, multipliers = program.solve_with_multipliers(place)
+            members = np.flatnonzero(multipliers[self.dual.rows] > 0)
+        if U is None:
+            return False
+        members = members[: found.active.shape[1]]
         found.sizes[at] = len(members)
         found.active[at, : len(members)] = members
         u[:] = self.program.first_input(reach * U, theta, len(u))

@@ -111,14 +111,9 @@ def build_tree(
     middle = (theta_max + theta_min) / 2
     half = (theta_max - theta_min) / 2
     regions = _polytopes(A * half, b - A @ middle, np.append(starts, len(b)), advance)
-    random = np.random.default_rng(0)
-    tree = _split_all(regions, random, advance)
-    if not len(tree.levels):  # regions that no hyperplane parts
-        return tree
-    ordered = _most_frequent_first(tree, regions, random)
+    tree = _split_all(regions, np.random.default_rng(0), advance)
     normals = tree.normals / half
-    levels = tree.levels + normals @ middle
-    return replace(tree, normals=normals, levels=levels, leaf_regions=ordered)
+    return replace(tree, normals=normals, levels=tree.levels + normals @ middle)
 
 
 def _polytopes(
@@ -237,65 +232,6 @@ def _sides(
                 side |= 1 if distance < -OVERLAP else 0
                 side |= 2 if distance > OVERLAP else 0
             sides[c, k] = side if side else 3
-
-
-def _most_frequent_first(
-    tree: SearchTree, regions: _Polytopes, random: np.random.Generator
-) -> Integers:
-    """Return the regions of all leaves, in each of them those first that hold most of its points.
-
-    Points are drawn all over the box, 64 for each region, and for small regions 8 in each of them.
-    """
-    p, n = regions.middles.shape
-    everywhere = random.uniform(-1, 1, (64 * p, n))
-    which = np.repeat(np.arange(p), 8)
-    first = regions.vertex_starts[which]
-    last = regions.vertex_starts[which + 1]
-    corners = regions.vertices[random.integers(first, last, (n + 1, len(which)))]
-    within = np.einsum("ik,kij->ij", random.dirichlet(np.ones(n + 1), len(which)), corners)
-    hits = []
-    for points in (everywhere, within):
-        hits.append(np.zeros(len(tree.leaf_regions), np.int64))
-        half_spaces = regions.A, regions.b, regions.row_starts
-        _count_hits(*vars(tree).values(), *half_spaces, points, hits[-1])
-    all_over, in_each = hits
-    leaf = np.repeat(np.arange(len(tree.leaf_starts) - 1), np.diff(tree.leaf_starts))
-    order = np.lexsort((tree.leaf_regions, -in_each, -all_over, leaf))
-    return np.ascontiguousarray(tree.leaf_regions[order])
-
-
-@compiled(
-    "void(float64[:, ::1], float64[::1], int64[:, ::1], int64[::1], int64[::1], "
-    "float64[:, ::1], float64[::1], int64[::1], float64[:, ::1], int64[::1])"
-)
-def _count_hits(
-    normals: Array,
-    levels: Array,
-    children: Integers,
-    leaf_starts: Integers,
-    leaf_regions: Integers,
-    A: Array,
-    b: Array,
-    row_starts: Integers,
-    points: Array,
-    hits: Integers,
-) -> None:
-    """Count for each entry of ``leaf_regions`` the points that it is the first one to hold."""
-    for each in range(len(points)):  # numba holds a row of its own for one with gaps
-        point = points[each]
-        node = 0
-        while node >= 0:
-            node = children[node, 1 if np.dot(normals[node], point) > levels[node] else 0]
-        for k in range(leaf_starts[-1 - node], leaf_starts[-node]):
-            i = leaf_regions[k]
-            inside = True
-            for row in range(row_starts[i], row_starts[i + 1]):
-                inside = np.dot(A[row], point) <= b[row]
-                if not inside:
-                    break
-            if inside:
-                hits[k] += 1
-                break
 
 
 def vertices(A: Array, b: Array) -> Array:

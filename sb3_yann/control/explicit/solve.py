@@ -252,7 +252,7 @@ def _find_equalities(program: ParametricQP, timer: BudgetTimer) -> Equalities | 
     v, n = program.F.shape
     inputs = v - program.n_slacks
     A = np.hstack([program.G, -program.S])
-    left = np.arange(len(A), dtype=np.intp)
+    left: NDArray[np.intp] = np.arange(len(A))
     while len(left):
         slacks = np.zeros((len(A), len(left)))
         slacks[left, np.arange(len(left))] = 1.0

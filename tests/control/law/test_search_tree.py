@@ -120,21 +120,6 @@ def test_nearly_every_point_is_found_without_a_scan(make) -> None:
     assert missed == 0
 
 
-@LAWS
-def test_the_search_tries_hardly_more_than_the_region_that_holds_a_point(make) -> None:
-    law, tree = make(), make().tree
-    points = in_box(law, 5000)
-    regions, inside = scanned(law, points)
-    tried = []
-    for point, region in zip(points[inside > 1e-6], regions[inside > 1e-6], strict=True):
-        node = 0
-        while node >= 0:
-            node = tree.children[node, int(tree.normals[node] @ point > tree.levels[node])]
-        leaf = tree.leaf_regions[tree.leaf_starts[-1 - node] : tree.leaf_starts[-node]]
-        tried.append(1 + int(np.flatnonzero(leaf == region)[0]))
-    assert np.mean(tried) < 2
-
-
 def test_regions_that_overlap_go_by_the_largest_slack() -> None:
     """Of twenty intervals that reach into their neighbors each holds what it has the middle of."""
     middles = np.linspace(-0.95, 0.95, 20)
