@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from datetime import datetime, timezone
 from os import PathLike
 from pathlib import Path
@@ -12,21 +12,23 @@ from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_yann._archive import atomic_write
 from sb3_yann.audit import Headroom
 from sb3_yann.evaluation.episodes import Source, as_seeds
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.reporting.evidence_parts import (
+    again_part,
+    cost_part,
     guard_part,
     headroom_part,
     improve_part,
     twin_part,
 )
-from sb3_yann.reporting.html import Html, clean, join, page, say, table, tag
+from sb3_yann.reporting.html import Html, clean, page, paragraph, table, tag
 from sb3_yann.reporting.loop_parts import distance_part, loops_part, statistics_part
 from sb3_yann.reporting.problem_parts import constraints_part, law_part, plant_part
-from sb3_yann.reporting.record_parts import again_part, cost_part
-from sb3_yann.reporting.subject import Finding, Part, Subject
+from sb3_yann.reporting.subject import Part, Subject
 from sb3_yann.twin import PlantTwin
 
 TITLE = "Report on a policy that starts as an MPC"
@@ -49,12 +51,11 @@ def report(
 ) -> Path:
     """Write a page about a model that an engineer can read, print and sign; return its path.
 
-    It is one HTML file without scripts, and loads nothing: pictures are part of it. It tells the
+    It is one HTML file without scripts, and loads nothing: pictures are part of it. It has the
     plant and the problem in plant units, the register of constraints, the law and how it was
     checked, closed loops against the MPC, what they prove, where and how far the policy leaves the
-    MPC, every decision of the guard, what `improve` did, the twin, what there is to gain, timing,
-    versions and seeds.
-    What cannot be told from what is given is left out, and said to be.
+    MPC, every decision of the guard, what `improve` did, the twin, the headroom, timing, versions
+    and seeds. A part whose evidence is not given says so in a sentence.
 
     Parameters
     ----------
@@ -91,20 +92,26 @@ def report(
     >>> report(model, "cstr.html", env="CSTR-v0", seeds=range(2)).name
     'cstr.html'
     """
-    given: dict[str, Any] = {
-        "path": path,
-        "env": env,
-        "guard": guard,
-        "twin": twin,
-        "headroom": headroom,
-    }
-    given |= {"seeds": seeds, "title": None if title == TITLE else title}
     subject = _subject(model, env, guard, twin, headroom, seeds)
-    subject.call = {name: value for name, value in given.items() if value is not None}
-    with _Whole(Path(path)) as target:
-        parts = [each(subject) for each in PARTS]
-        target.write(page(title, [_head(title), *_body(parts), _signatures()]))
-    return Path(path)
+    given: dict[str, Any] = {"path": path, "env": env, "guard": guard, "twin": twin}
+    given |= {"headroom": headroom, "seeds": seeds, "title": None if title == TITLE else title}
+    subject.arguments = {name: value for name, value in given.items() if value is not None}
+    target = Path(path)
+    with ExitStack() as stack:
+        try:
+            if target.is_dir():
+                raise IsADirectoryError("it is a folder")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            unfinished = stack.enter_context(atomic_write(target))
+            unfinished.touch()
+        except OSError as error:
+            raise OSError(
+                f"path = {str(target)!r} cannot be written ({error}). Name a file in a folder that "
+                "you may write to."
+            ) from error
+        parts = [make(subject) for make in PARTS]
+        unfinished.write_text(page(title, _body(title, parts)), encoding="utf-8")
+    return target
 
 
 def _subject(
@@ -137,75 +144,31 @@ def _subject(
     return Subject(model, policy, played, guard, twin, headroom, chosen)
 
 
-class _Whole:
-    """A file that is written beside its place, and takes it as a whole; else nothing changes."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
-
-    def __enter__(self) -> _Whole:
-        try:
-            if self.path.is_dir():
-                raise IsADirectoryError("it is a folder")
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self.unfinished.touch()
-        except OSError as error:
-            raise OSError(
-                f"path = {str(self.path)!r} cannot be written ({error}). Name a file in a folder "
-                "that you may write to."
-            ) from error
-        return self
-
-    def write(self, text: str) -> None:
-        """Write the text, and put the file in its place."""
-        self.unfinished.write_text(text, encoding="utf-8")
-        os.replace(self.unfinished, self.path)
-
-    def __exit__(self, *_: object) -> None:
-        self.unfinished.unlink(missing_ok=True)
-
-
-def _head(title: str) -> Html:
+def _body(title: str, parts: Sequence[Part]) -> list[Html]:
+    """Return heading, summary, contents, the parts themselves, and a table for signatures."""
     written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    return join([tag("h1", title), tag("p", f"Written {written}.", class_="said")])
-
-
-def _body(parts: Sequence[Part]) -> list[Html]:
-    """Return summary, contents and the parts themselves."""
-    numbered = [*enumerate(parts, start=1)]
-    links = (tag("li", _link(k, part.title)) for k, part in numbered)
-    rows = [
-        [tag("span", found.verdict, class_=found.verdict), found.text, _link(k, str(k))]
-        for k, part in numbered
-        for found in part.findings
-    ]
-    summary = [tag("h2", "Summary"), _verdict([each for p in parts for each in p.findings])]
-    summary += [table(["", "finding", "part"], rows), tag("nav", tag("ol", *links))]
-    sections = [
-        tag("section", tag("h2", f"{k}. {part.title}", id=f"part-{k}"), part.content)
-        for k, part in numbered
-    ]
-    return [*summary, *sections]
-
-
-def _link(number: int, text: str) -> Html:
-    return tag("a", text, href=f"#part-{number}")
-
-
-def _verdict(findings: Sequence[Finding]) -> Html:
-    counts = Counter(each.verdict for each in findings)
-    said = f"{counts['passed']} checks passed, {counts['failed']} failed."
+    rows, links, sections = [], [], []
+    counts = Counter[str]()
+    for k, part in enumerate(parts, start=1):
+        links.append(tag("li", tag("a", part.title, href=f"#part-{k}")))
+        heading = tag("h2", f"{k}. {part.title}", id=f"part-{k}")
+        sections.append(tag("section", heading, part.content))
+        for found in part.findings:
+            verdict = tag("span", found.verdict, class_=found.verdict)
+            rows.append([verdict, found.text, tag("a", str(k), href=f"#part-{k}")])
+            counts[found.verdict] += 1
+    summary = f"{counts['passed']} checks passed, {counts['failed']} failed."
     if counts["failed"]:
-        said += " Read what failed before you sign."
-    return say(said, "A note is for information: there is nothing to pass.")
-
-
-def _signatures() -> Html:
-    rows = [[clean(role), "", "", ""] for role in ("prepared", "checked", "approved")]
-    return join(
-        [
-            tag("h2", "Signatures"),
-            tag("div", table(["", "name", "date", "signature"], rows), class_="sign"),
-        ]
-    )
+        summary += " Read what failed before you sign."
+    signatures = [[clean(role), "", "", ""] for role in ("prepared", "checked", "approved")]
+    return [
+        tag("h1", title),
+        tag("p", f"Written {written}.", class_="said"),
+        tag("h2", "Summary"),
+        paragraph(summary, "A note is for information: there is nothing to pass."),
+        table(["", "finding", "part"], rows),
+        tag("nav", tag("ol", *links)),
+        *sections,
+        tag("h2", "Signatures"),
+        tag("div", table(["", "name", "date", "signature"], signatures), class_="sign"),
+    ]

@@ -10,14 +10,13 @@ from io import BytesIO
 from string import Template
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sb3_yann._validation import is_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LARGEST_SVG = 120_000
-"""Bytes; a larger picture becomes a PNG."""
-DPI = 110
 STYLE = """
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
@@ -109,14 +108,9 @@ def join(parts: Iterable[Any]) -> Html:
     return Html("\n".join(map(clean, parts)))
 
 
-def say(*sentences: str) -> Html:
+def paragraph(*sentences: str) -> Html:
     """Return a paragraph."""
     return tag("p", " ".join(sentences))
-
-
-def left_out(why: str) -> Html:
-    """Return the sentence that stands for a part that is not there."""
-    return tag("p", why, class_="said")
 
 
 def lines(text: str) -> Html:
@@ -124,47 +118,47 @@ def lines(text: str) -> Html:
     return tag("pre", text)
 
 
+def number(value: float) -> str:
+    """Return a number in four digits; "none" for what is infinite."""
+    return f"{value:.4g}" if np.isfinite(value) else "none"
+
+
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Html:
     """Return a table that scrolls on a narrow screen; columns of numbers are set to the right."""
     body = [[*row] for row in rows]
-    numbers = [bool(body) and all(_is_number(row[k]) for row in body) for k in range(len(head))]
-    kinds = [{"class_": "number"} if each else {} for each in numbers]
-    top = tag("tr", *(tag("th", each, **kind) for each, kind in zip(head, kinds, strict=True)))
-    below = [
-        tag("tr", *(tag("td", each, **kind) for each, kind in zip(row, kinds, strict=True)))
-        for row in body
+    kinds: list[dict[str, str]] = [{} for _ in head]
+    for k, kind in enumerate(kinds):
+        texts = [str(row[k]) for row in body]
+        if texts and all(
+            not text.strip() or text.lstrip("+-−")[:1].isdigit() or text == "none" for text in texts
+        ):
+            kind["class_"] = "number"
+    lines = [
+        tag("tr", *(tag(name, each, **kind) for each, kind in zip(row, kinds, strict=True)))
+        for name, row in [("th", head), *(("td", row) for row in body)]
     ]
-    whole = tag("table", tag("thead", top), tag("tbody", *below))
+    whole = tag("table", tag("thead", lines[0]), tag("tbody", *lines[1:]))
     return tag("div", whole, class_="wide")
-
-
-def _is_number(value: Any) -> bool:
-    return str(value).strip() == "" or str(value).lstrip("+-−")[:1].isdigit() or value == "none"
 
 
 def picture(draw: Callable[[], Figure], caption: str) -> Html:
     """Return a picture with its caption; a name with a dollar sign is no formula.
 
-    Letters that the font lacks become boxes, without a warning.
+    Letters that the font lacks become boxes, without a warning. A large SVG becomes a PNG.
     """
     import matplotlib
 
     options: Any = {"text.parse_math": False, "svg.hashsalt": "sb3-yann"}
     with matplotlib.rc_context(options), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
-        figure, kind = draw(), "svg+xml"
-        content = _saved(figure, format="svg", metadata={"Date": None})
-        if len(content) > LARGEST_SVG:
-            content, kind = _saved(figure, format="png", dpi=DPI), "png"
-    source = f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
+        figure, kind, buffer = draw(), "svg+xml", BytesIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+        if len(buffer.getvalue()) > 120_000:
+            kind, buffer = "png", BytesIO()
+            figure.savefig(buffer, format="png", dpi=110)
+    source = f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
     shown = Html(f'<img alt="{escape(caption)}" src="{source}">')
     return tag("figure", tag("div", shown, class_="wide"), tag("figcaption", caption))
-
-
-def _saved(figure: Figure, **options: Any) -> bytes:
-    buffer = BytesIO()
-    figure.savefig(buffer, **options)
-    return buffer.getvalue()
 
 
 def page(title: str, body: Iterable[Any]) -> str:

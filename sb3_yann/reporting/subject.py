@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -15,12 +16,12 @@ from sb3_yann.commissioning.improve import Improvement, fingerprint
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.choice import Law
-from sb3_yann.evaluation.episodes import Episodes, Predictor, Source, evaluate, one_env
+from sb3_yann.evaluation.episodes import Episodes, Source, evaluate, one_env
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.simulator_acceptance import name_of
 from sb3_yann.guard.state import GuardState
 from sb3_yann.policy.policies import YannPolicy
-from sb3_yann.reporting.html import Html
+from sb3_yann.reporting.html import Html, tag
 from sb3_yann.twin import PlantTwin
 
 POLICY, MPC = "policy", "MPC"
@@ -28,60 +29,40 @@ POLICY, MPC = "policy", "MPC"
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the summary.
-
-    Attributes
-    ----------
-    verdict : str
-        "passed", "failed", or "note" where there is nothing to pass.
-    text : str
-    """
+    """One line of the summary: a verdict, "passed", "failed" or "note", and a text."""
 
     verdict: str
     text: str
 
 
+def make_finding(passed: bool | None, text: str) -> Finding:
+    """Return a finding that passed or failed; None is a note: there is nothing to pass."""
+    return Finding("note" if passed is None else "passed" if passed else "failed", text)
+
+
 @dataclass(frozen=True)
 class Part:
-    """A part of the report.
-
-    Attributes
-    ----------
-    title : str
-    content : Html
-    findings : tuple of Finding
-        What the summary says of it.
-    """
+    """A part of the report: its title, its content, and what the summary says of it."""
 
     title: str
     content: Html
     findings: tuple[Finding, ...] = ()
 
 
-class _Mpc:
-    """The MPC's own law behind the maps of a policy from observations and to actions."""
+def left_out(title: str, why: str, *findings: Finding) -> Part:
+    """Return a part that says in a sentence why it is not there."""
+    return Part(title, tag("p", why, class_="said"), findings)
 
-    def __init__(self, subject: Subject) -> None:
-        self.subject = subject
+
+class _Player:
+    """A policy on observations as the env shows them."""
+
+    def __init__(self, act: Callable[[Any], Any]) -> None:
+        self.act = act
 
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, None]:
-        """Return the actions of the MPC."""
-        subject = self.subject
-        theta = subject.thetas(observation)
-        u = subject.law(np.nan_to_num(theta, nan=0.0, posinf=0.0, neginf=0.0))  # as the policy does
-        return subject.policy.input_units.action(u).astype(subject.policy.action_space.dtype), None
-
-
-class _Policy:
-    """A model's policy on observations as the env shows them."""
-
-    def __init__(self, subject: Subject) -> None:
-        self.subject = subject
-
-    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
-        """Return the actions of the policy."""
-        seen = self.subject.seen(observation)
-        return self.subject.model.predict(seen, deterministic=True)
+        """Return the actions."""
+        return self.act(observation), None
 
 
 @dataclass
@@ -96,10 +77,8 @@ class Subject:
     twin : PlantTwin or None
     headroom : Headroom or None
     seeds : tuple of int
-    call : dict
-        Arguments of `report` that were given, by their names, in their order.
-    points : int
-        Drawn at random from the box of theta.
+    arguments : dict
+        Those of `report` that were given, by their names, in their order.
     """
 
     model: OffPolicyAlgorithm
@@ -109,8 +88,7 @@ class Subject:
     twin: PlantTwin | None
     headroom: Headroom | None
     seeds: tuple[int, ...]
-    call: dict[str, Any] = field(default_factory=dict)
-    points: int = field(default=500)
+    arguments: dict[str, Any] = field(default_factory=dict)
 
     @property
     def problem(self) -> LinearMPC:
@@ -152,42 +130,56 @@ class Subject:
         function = self.env.func if isinstance(self.env, partial) else self.env  # without arguments
         return "" if function is None else name_of(function)
 
-    def seen(self, observations: Any) -> Any:
-        """Return observations of the env, below any VecNormalize, as the policy sees them."""
-        normalize = self.model.get_vec_normalize_env()
-        return observations if normalize is None else normalize.normalize_obs(observations)
-
-    def thetas(self, observations: Any) -> Array:
-        """Return theta (batch, n_theta) for observations of the env."""
-        theta = self.policy.theta(self.seen(np.asarray(observations)))
-        return np.asarray(theta.double().cpu().numpy())
-
     @cached_property
     def loops(self) -> dict[str, Episodes] | None:
         """The closed loops of MPC and policy: theta and inputs in deviations; None without env."""
         if self.env is None:
             return None
-        both: dict[str, Predictor] = {MPC: _Mpc(self), POLICY: _Policy(self)}
         with one_env(self.env) as env:
             require_state_shown(env, self.policy.told)
-        return {
-            name: self._in_deviations(evaluate(act, self.env, self.seeds))
-            for name, act in both.items()
-        }
+        found = {}
+        for name, act in {MPC: self.act_as_mpc, POLICY: self.act_as_policy}.items():
+            played = evaluate(_Player(act), self.env, self.seeds)
+            found[name] = replace(
+                played,
+                observations=tuple(map(self._theta, played.observations)),
+                actions=tuple(map(self.policy.inputs, played.actions)),
+            )
+        return found
 
-    def _in_deviations(self, episodes: Episodes) -> Episodes:
-        return replace(
-            episodes,
-            observations=tuple(self.thetas(each) for each in episodes.observations),
-            actions=tuple(self.policy.inputs(each) for each in episodes.actions),
-        )
+    def act_as_mpc(self, observations: Any) -> Any:
+        """Return the MPC's actions for observations of the env; what is not finite is at rest."""
+        theta = np.nan_to_num(self._theta(observations), nan=0.0, posinf=0.0, neginf=0.0)
+        action = self.policy.input_units.action(self.law(theta))
+        return action.astype(self.policy.action_space.dtype)
+
+    def act_as_policy(self, observations: Any) -> Any:
+        """Return the policy's actions for observations of the env."""
+        return self.model.predict(self._normalized(observations), deterministic=True)[0]
+
+    def _normalized(self, observations: Any) -> Any:
+        """Return observations of the env, which is below any VecNormalize, as the policy does."""
+        normalize = self.model.get_vec_normalize_env()
+        return observations if normalize is None else normalize.normalize_obs(observations)
+
+    def _theta(self, observations: Any) -> Array:
+        theta = self.policy.theta(self._normalized(np.asarray(observations)))
+        return np.asarray(theta.double().cpu().numpy())
 
     @cached_property
-    def sampled(self) -> Array:
-        """Points drawn uniformly from the box of theta (points, n_theta), with a seed of 0."""
-        rng, problem = np.random.default_rng(0), self.problem
-        low, high = problem.deviations.theta_min, problem.deviations.theta_max
-        middle, half = (low + high) / 2, (high - low) / 2
-        bounded = np.isfinite(half)
-        middle, half = np.where(bounded, middle, 0.0), np.where(bounded, half, 1.0)
-        return np.asarray(middle + half * rng.uniform(-1, 1, (self.points, problem.n_theta)))
+    def samples(self) -> Array:
+        """500 points drawn uniformly from the box of theta (500, n_theta), with a seed of 0."""
+        rng, bounds = np.random.default_rng(0), self.problem.deviations
+        middle = (bounds.theta_min + bounds.theta_max) / 2
+        half = (bounds.theta_max - bounds.theta_min) / 2
+        middle, half = np.where(np.isfinite(half), [middle, half], [[0.0], [1.0]])
+        return np.asarray(middle + half * rng.uniform(-1, 1, (500, len(half))))
+
+    @cached_property
+    def steepest_plane(self) -> tuple[int, int]:
+        """The two entries of theta that move the inputs most at the operating point."""
+        problem = self.problem
+        gain = self.law.gain(np.zeros((1, problem.n_theta)))[0]
+        size = np.abs(gain * problem.theta_half / problem.u_half[:, None]).max(axis=0)
+        first, second = np.sort(np.argsort(-size, kind="stable")[:2])
+        return int(first), int(second)
