@@ -19,7 +19,7 @@ from sb3_yann.control.polyhedra import largest_ball
 
 Regions = list[Any]
 THIN = "a final state held to 1e-4"
-DROPS = {"pendulum": 7, "reactor": 7, "benchmark": 9, THIN: 15}
+DROPS = {"pendulum": 7, THIN: 15}
 
 
 def error_of(
@@ -60,8 +60,7 @@ def test_a_dropped_region_is_found_and_theta_lies_in_it(
     assert solved(name).explicit().locate(theta) == index
 
 
-@pytest.mark.parametrize("index", range(7))
-@pytest.mark.parametrize("name", ["pendulum", "reactor"])
+@pytest.mark.parametrize(("name", "index"), [("pendulum", 0), ("pendulum", 6), ("reactor", 3)])
 def test_a_gain_off_by_a_thousandth_is_found(
     name: str, index: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -127,7 +126,7 @@ def test_a_region_that_is_there_twice_is_found(monkeypatch: pytest.MonkeyPatch) 
     assert solved("benchmark").explicit().locate(theta) == 3
 
 
-@pytest.mark.parametrize("gap", [1e-3, 1e-5, 1e-6])
+@pytest.mark.parametrize("gap", [1e-3, 1e-6])
 @pytest.mark.parametrize("name", ["benchmark", "reactor"])
 def test_a_thin_gap_between_two_regions_is_found(
     name: str, gap: float, monkeypatch: pytest.MonkeyPatch
@@ -142,8 +141,8 @@ def test_a_thin_gap_between_two_regions_is_found(
     assert OnlineMPC(solved(name))(theta) is not None
 
 
-@pytest.mark.parametrize("reach", [1e-2, 1e-4, 1e-5])
-@pytest.mark.parametrize("index", range(5))
+@pytest.mark.parametrize("reach", [1e-2, 1e-5])
+@pytest.mark.parametrize("index", [0, 3])
 def test_one_half_space_that_reaches_a_little_too_far_is_found(
     index: int, reach: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

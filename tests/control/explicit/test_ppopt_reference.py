@@ -12,7 +12,7 @@ from sb3_yann.control.explicit.ppopt_reference import _solve_lp
 BOX = np.vstack([np.eye(2), -np.eye(2)])
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_linear_programs_have_the_value_of_another_solver(seed: int) -> None:
     rng = np.random.default_rng(seed)
     A = np.vstack([rng.normal(size=(6, 3)), np.eye(3), -np.eye(3)])

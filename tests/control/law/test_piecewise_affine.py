@@ -85,20 +85,6 @@ def test_every_facet_and_vertex_has_exactly_the_input_of_its_one_region(
         np.testing.assert_allclose(u, one, rtol=0, atol=1e-14 * np.max(law.u_max))
 
 
-@pytest.mark.parametrize("infeasible", ["nearest_region", "zero_input"])
-@pytest.mark.parametrize("name", [*PLANAR, "reactor", "four states, two inputs"])
-def test_one_point_and_a_batch_agree(name: str, infeasible: str) -> None:
-    law = law_of(name, infeasible)
-    points = np.vstack([special_points(name), far_points(law)])
-    np.testing.assert_allclose(
-        np.stack([law(point) for point in points]),
-        law(points),
-        rtol=0,
-        atol=1e-13 * np.max(law.u_max),
-    )
-    np.testing.assert_array_equal([law.in_domain(p) for p in points], law.in_domain(points))
-
-
 def test_chosen_region_has_the_largest_smallest_slack_and_is_the_first_on_a_tie() -> None:
     law = law_of("benchmark")
     for point in box_points(solved("benchmark"), 200):
@@ -167,11 +153,6 @@ def test_saved_file_holds_plain_arrays(tmp_path: Path) -> None:
         assert all(data[name].dtype != object for name in data)
 
 
-def test_saving_leaves_one_file(tmp_path: Path) -> None:
-    law_of("pendulum").save(tmp_path / "law.npz")
-    assert [path.name for path in tmp_path.iterdir()] == ["law.npz"]
-
-
 def test_failed_save_leaves_the_old_file_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -234,10 +215,8 @@ GARBAGE: dict[str, Callable[[Path], Any]] = {
     "NaN": arrays_with(offsets=np.full((7, 1), np.nan)),
     "words": arrays_with(b=np.full(32, "one")),
     "gains of another shape": arrays_with(gains=np.zeros((7, 2))),
-    "offsets of another shape": arrays_with(offsets=np.zeros((6, 1))),
     "rows that do not exist": arrays_with(starts=np.arange(7) + 100),
     "rows out of order": arrays_with(starts=np.array([0, 4, 2, 8, 12, 16, 20])),
-    "half rows": arrays_with(starts=np.arange(7) / 2),
     "no region": arrays_with(gains=np.zeros((0, 1, 2)), offsets=np.zeros((0, 1)), starts=[]),
     "crossed bounds": arrays_with(u_min=np.array([3.0])),
     "an unknown option": arrays_with(infeasible="mean"),
@@ -259,7 +238,7 @@ def test_a_damaged_file_is_a_value_error_or_still_the_law(tmp_path: Path) -> Non
     law, path, rng = law_of("pendulum"), tmp_path / "law.npz", np.random.default_rng(0)
     law.save(path)
     content = path.read_bytes()
-    for _ in range(300):
+    for _ in range(100):
         broken = bytearray(content[: rng.integers(len(content))] if rng.random() < 0.3 else content)
         for at in rng.integers(max(len(broken), 1), size=3 if broken else 0):
             broken[at] = rng.integers(256)
@@ -286,7 +265,7 @@ def test_copies_are_equal_and_share_a_hash(copied: Any) -> None:
 
 
 @pytest.mark.parametrize("copied", [lambda law: law, *COPIES])
-@pytest.mark.parametrize("name", ["gains", "offsets", "A", "b", "starts", "u_min", "theta_max"])
+@pytest.mark.parametrize("name", ["gains", "starts", "theta_max"])
 def test_arrays_are_read_only_in_every_copy(name: str, copied: Any) -> None:
     array = getattr(copied(law_of("pendulum")), name)
     with pytest.raises(ValueError, match="read-only"):
@@ -310,32 +289,25 @@ def test_laws_that_differ_in_one_field_are_not_equal(name: str) -> None:
     assert dataclasses.replace(law, **{name: value}) != law
 
 
-def test_a_law_is_not_equal_to_something_else() -> None:
-    assert law_of("pendulum") != "a law"
-
-
 BAD_THETA: list[tuple[Any, type[Exception], str]] = [
     ([1.0], ValueError, r"theta has shape \(1,\), expected \(2,\) or \(batch, 2\)"),
     (1.0, ValueError, r"theta has shape \(\), expected \(2,\)"),
-    (np.zeros((4, 3)), ValueError, r"theta has shape \(4, 3\), expected \(2,\)"),
     (np.zeros((2, 2, 2)), ValueError, r"theta has shape \(2, 2, 2\), expected"),
     ([np.nan, 0], ValueError, "theta holds NaN or infinite"),
     ([[0, 0], [np.inf, 0]], ValueError, "theta holds NaN or infinite"),
     (["a", "b"], TypeError, "theta = .* is not an array of real numbers"),
-    ([1j, 0], TypeError, "theta = .* is not an array of real numbers"),
     (np.array([1j, 0]), TypeError, "theta = .* is not an array of real numbers"),
-    (object(), TypeError, "theta = .* is not an array of real numbers"),
     (np.ma.array([1.0, 0.0], mask=[1, 0]), ValueError, "theta has masked entries"),
 ]
 
 
-@pytest.mark.parametrize("call", ["__call__", "locate", "in_domain"])
 @pytest.mark.parametrize(("theta", "error", "message"), BAD_THETA)
 def test_theta_that_is_no_point_or_batch_is_named(
-    call: str, theta: Any, error: type[Exception], message: str
+    theta: Any, error: type[Exception], message: str
 ) -> None:
-    with pytest.raises(error, match=message):
-        getattr(law_of("pendulum"), call)(theta)
+    for call in ("__call__", "locate", "in_domain"):
+        with pytest.raises(error, match=message):
+            getattr(law_of("pendulum"), call)(theta)
 
 
 def test_disjoint_is_true_or_false() -> None:

@@ -61,7 +61,7 @@ def test_far_outside_a_softened_program_is_solved_or_the_inputs_are_saturated() 
     np.testing.assert_array_equal(rough, np.clip(unbound, -1, 1))
 
 
-@pytest.mark.parametrize("unit", [1e2, 1e4, 1e5, 1e6])
+@pytest.mark.parametrize("unit", [1e2, 1e6])
 def test_steep_penalties_of_states_in_small_units_are_solved_to_rounding(unit: float) -> None:
     mpc = cart(unit)
     law, explicit = mpc.online(), mpc.explicit()
@@ -79,7 +79,7 @@ def test_steep_penalties_of_states_in_small_units_are_solved_to_rounding(unit: f
     assert np.mean(np.abs(slope[:, 0] - gains) < 1e-6 / unit) > 0.95  # all but at a facet
 
 
-@pytest.mark.parametrize("unit", [1e-4, 1e-2, 1e2, 1e4])
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_a_law_is_the_same_whatever_the_unit_of_the_states(unit: float) -> None:
     points = np.random.default_rng(0).uniform(-1.4, 1.4, (200, 2)) * [1, 0.5]
     one, other = cart(), cart(unit, soft=SoftBounds(x=unit, penalty=1e3))
@@ -88,7 +88,7 @@ def test_a_law_is_the_same_whatever_the_unit_of_the_states(unit: float) -> None:
         np.testing.assert_allclose(solve(other)(unit * points), expected, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("unit", [1e8, 1e9, 1e15])
+@pytest.mark.parametrize("unit", [1e8, 1e15])
 def test_a_penalty_beyond_all_digits_of_float64_gives_the_law_of_one_that_is_within(unit) -> None:
     points = np.random.default_rng(0).uniform(-1.4, 1.4, (200, 2)) * [1, 0.5]
     expected = cart(1e6).explicit()(1e6 * points)
