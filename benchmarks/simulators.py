@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from benchmarks.problems import SMALLEST, Array
 from benchmarks.records import Bench, Figure, timed
 from benchmarks.timing import Task
-from sb3_yann.evaluation.episodes import evaluate
+from sb3_yann.rollout import evaluate
 from sb3_yann_envs import cstr
 from sb3_yann_envs.clipped_pendulum import ClippedPendulumEnv
 from sb3_yann_envs.cstr import CSTREnv

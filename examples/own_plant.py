@@ -61,7 +61,8 @@ def main() -> None:
     settings = {"gamma": mpc.gamma, "gradient_steps": 4, "seed": arguments.seed}
     model = DDPG(YannPolicy, make(), policy_kwargs=policy, **settings)
     before = evaluate(model, make, TEST_SEEDS)
-    guard = ImprovementGuard(make, n_starts=50, n_new_starts=25, log_path="out/own_plant.csv")
+    log_path = "out/own_plant.csv"
+    guard = ImprovementGuard(make, n_eval_episodes=50, n_new_starts=25, log_path=log_path)
     callbacks = [NoActionNoise(), CostAudit(verbose=1), guard]
     model.learn(STEPS * arguments.episodes, callback=callbacks, progress_bar=True)
     after = evaluate(model, make, TEST_SEEDS)

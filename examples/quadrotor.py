@@ -60,7 +60,8 @@ def main() -> None:
     model = DDPG(YannPolicy, make(), policy_kwargs=policy, gamma=mpc.gamma, seed=arguments.seed)
     console.print(f"The policy starts as {mpc.online()}.")
     before = evaluate(model, make, TEST_SEEDS)
-    guard = ImprovementGuard(make, n_starts=30, n_new_starts=15, log_path="out/quadrotor.csv")
+    log_path = "out/quadrotor.csv"
+    guard = ImprovementGuard(make, n_eval_episodes=30, n_new_starts=15, log_path=log_path)
     model.learn(STEPS * arguments.episodes, callback=[NoActionNoise(), guard], progress_bar=True)
     after = evaluate(model, make, TEST_SEEDS)
 

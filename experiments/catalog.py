@@ -36,7 +36,7 @@ from sb3_yann import (
     YannPolicy,
     offset_free,
 )
-from sb3_yann.evaluation.episodes import Episodes, Source, evaluate
+from sb3_yann.rollout import Source, Trajectories, evaluate
 from sb3_yann.wrappers import ObserveDisturbance, StageCost
 from sb3_yann_envs import problems
 
@@ -93,7 +93,7 @@ def reidentified(plant: Plant) -> LinearMPC:
     return PlantTwin.fit(problem, [*zip(log.observations, log.actions, strict=True)]).reidentified()
 
 
-STRICT = {"tail": 0, "retreat": False}
+STRICT = {"cvar_alpha": 0, "backtrack": False}
 """No start may lose: the rule that the published runs had, and their critics a scale of 30."""
 _REACTOR = Plant(
     "CSTR-v0",
@@ -321,10 +321,12 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 class Checkpoints(BaseCallback):
     """Tests the policy after so many training episodes: with a guard, the accepted one."""
 
-    def __init__(self, test: Callable[[Any], Episodes], policy: Any, recorder: Recorder) -> None:
+    def __init__(
+        self, test: Callable[[Any], Trajectories], policy: Any, recorder: Recorder
+    ) -> None:
         super().__init__()
         self.test, self.tested_policy, self.recorder = test, policy, recorder
-        self.tests: dict[int, Episodes] = {}
+        self.tests: dict[int, Trajectories] = {}
 
     def _on_training_start(self) -> None:
         self.tests[0] = self.test(self.tested_policy)
@@ -394,7 +396,7 @@ def _decisions(model: Any) -> dict[str, Any]:
     return {"guard_verdicts": np.array(verdicts), "guard_accepted_costs": np.array(costs)}
 
 
-def _changes_of_input(episodes: Episodes) -> dict[str, Any]:
+def _changes_of_input(episodes: Trajectories) -> dict[str, Any]:
     """Return how far the input moves in each episode: at most in one step, and in all of them."""
     changes = [np.abs(np.diff(each, axis=0)) for each in episodes.actions]
     return {
@@ -409,7 +411,7 @@ def _test_starts(env_id: str) -> Any:
     return np.array([env.reset(seed=seed)[1]["state"] for seed in TEST_SEEDS])
 
 
-def _fixed(name: str, plant: Plant, test: Callable[..., Episodes]) -> Outcome:
+def _fixed(name: str, plant: Plant, test: Callable[..., Trajectories]) -> Outcome:
     """Return the outcome of a controller that does not learn."""
     extra: dict[str, Any] = {}
     if name == OPTIMUM:

@@ -36,7 +36,7 @@ from sb3_yann import (
     YannPolicy,
     improve,
 )
-from sb3_yann.evaluation import Episodes, evaluate
+from sb3_yann.evaluation import Trajectories, evaluate
 from sb3_yann.wrappers import Deviations, ObserveDisturbance, StageCost
 from sb3_yann_envs.pcgym import PCGymEnv
 
@@ -169,7 +169,7 @@ def execute(run: Run) -> Outcome:
     """Return the outcome of a run: PC-Gym's costs as those of its tests."""
     began, name = time.perf_counter(), PLANTS[run.plant]
     case = Case(name, offset_free=run.learner in (OFFSET_FREE, OURS, IN_SIMULATOR, FROM_A_LOG))
-    tested: dict[int, tuple[Episodes, float]] = {}
+    tested: dict[int, tuple[Trajectories, float]] = {}
 
     def test(steps: int, act: Callable[[Any], Any]) -> None:
         played, one = evaluate(Batched(act), case.env, TESTS), Timed(act)
@@ -208,7 +208,9 @@ def execute(run: Run) -> Outcome:
     return outcome(case, tested, time.perf_counter() - began)
 
 
-def outcome(case: Case, tested: Mapping[int, tuple[Episodes, float]], seconds: float) -> Outcome:
+def outcome(
+    case: Case, tested: Mapping[int, tuple[Trajectories, float]], seconds: float
+) -> Outcome:
     """Return tests after so many steps as an outcome: their costs by both metrics."""
     plain, size = Case(case.name).mpc, case.plant.observation_space.shape[0]
     stage = [

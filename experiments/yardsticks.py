@@ -33,7 +33,7 @@ from torch import nn
 
 from sb3_yann import LinearMPC
 from sb3_yann.control import lqr as formulas
-from sb3_yann.evaluation.episodes import evaluate
+from sb3_yann.rollout import evaluate
 from sb3_yann_envs.clipped_pendulum import ClippedPendulumEnv
 
 Array: TypeAlias = NDArray[Any]

@@ -1,11 +1,19 @@
-"""When a policy is less safe than another from the same starts: one rule for whoever compares."""
+"""What "no worse" means: the only place that compares a policy's episodes with another's.
+
+Three questions, in this order: is the policy less safe in any episode, do the worst starts cost too
+much on average (their conditional value at risk), is the mean cost higher?
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, check_bool, check_range
 from sb3_yann.control.mpc.bound_excess import BoundExcess
 
 UNSAFE = (
@@ -17,12 +25,441 @@ UNSAFE = (
     "a larger summed excess over the problem's bounds",
 )
 """What the columns of ``unsafe`` are. A seventh is the excess over hard and soft bounds."""
-SUCCESS = 'where an end is a success, the env says so by info["is_success"]'
-"""What to do about an env that ends an episode because its goal is reached."""
+ENDS_EARLY, INPUT_STEP = 1, 3
+"""Columns: how early the env ends an episode; steps in which an input moves too far."""
+SUCCESS_HINT = 'where an end is a success, the env says so by info["is_success"]'
 EXCESS_ROOM = 1e-3
 """Half-widths of a bound by which an excess may be larger: less is noise."""
 EXCESS_SHARE = 0.1
 """Share of the MPC's own excess by which it may be larger: an MPC that rides a bound is no veto."""
+COST_ROUNDING = 1e-6
+"""Of a mean cost: what float32 actions and batches of other sizes make of one policy's."""
+WORST_START = 10.0
+"""With a CVaR: how many times as much as on average a single start may cost more."""
+HARDEST = 10
+"""New starts that join those of every later candidate at a time."""
+
+
+@dataclass(frozen=True)
+class AcceptanceRule:
+    """When a candidate counts as no worse.
+
+    Parameters
+    ----------
+    margin : float, default 0.01
+        What the worst starts may cost more than with the MPC on average, as a fraction of the
+        MPC's median cost, or of its cost of that start where that is more. No single start may
+        cost ten times as much more.
+    cvar_alpha : float, default 0.05
+        Share of the starts that count as the worst ones. 0 is strict: no single
+        start may cost more than the margin, of the median.
+    by_region : bool, default True
+        Whether single regions are tried where the whole candidate is refused.
+    backtrack : bool, default True
+        Whether half and a quarter of the way are tried where no region is accepted either, and
+        half and a quarter of the correction where a policy loses on new starts.
+    significance : float, default 0.05
+        Probability that the final trial accepts a policy that is no better on average over all
+        starts.
+    least_gain : float, default 0.001
+        What the final trial must gain on average, as a fraction of the MPC's mean cost. What gains
+        less changes nothing. A strict rule, ``cvar_alpha=0``, takes any gain.
+    max_input_step : float, optional
+        How far an input may move from one sample to the next, in multiples of the MPC's largest
+        step on the known starts, at least 1. The default is no bound.
+    excess_room : float, default 0.001
+        How much farther than the MPC a policy may exceed a hard bound of the problem, in
+        half-widths of theta's box, besides a tenth of the MPC's own excess. It holds for the
+        largest excess of an episode and for the sum over its steps, which may be larger by one
+        step as well. The costs count what soft bounds cost the MPC.
+
+    Examples
+    --------
+    >>> from sb3_yann import AcceptanceRule
+    >>> AcceptanceRule(margin=0.02, by_region=False).significance
+    0.05
+    """
+
+    margin: float = 0.01
+    cvar_alpha: float = 0.05
+    by_region: bool = True
+    backtrack: bool = True
+    significance: float = 0.05
+    least_gain: float = 0.001
+    max_input_step: float | None = None
+    excess_room: float = EXCESS_ROOM
+
+    def __post_init__(self) -> None:
+        check_range("margin", self.margin, 0, np.inf)
+        hint = "It is a share of the starts, 0 for the worst one."
+        check_range("cvar_alpha", self.cvar_alpha, 0, 1, hint=hint)
+        hint = "It is a share of the MPC's mean cost, 0 for any gain."
+        check_range("least_gain", self.least_gain, 0, 1, hint=hint)
+        hint = "It is in half-widths of theta's box, 0 for the MPC's own excess and a tenth."
+        check_range("excess_room", self.excess_room, 0, np.inf, hint=hint)
+        if self.max_input_step is not None:
+            hint = "It is a multiple of the MPC's largest step, or None."
+            check_range("max_input_step", self.max_input_step, 1, np.inf, hint=hint)
+        check_bool("by_region", self.by_region)
+        check_bool("backtrack", self.backtrack)
+        check_range("significance", self.significance, 0, 0.5)
+
+    def tolerance(self, mpc_costs: Array) -> Tolerance:
+        """Return what starts may cost more, given what they cost with the MPC."""
+        typical = float(np.median(np.abs(mpc_costs)))
+        return Tolerance(self.margin * typical, self.cvar_alpha, typical, self.excess_room)
+
+    @property
+    def standard_errors(self) -> float:
+        """How many standard errors a mean cost must be below the MPC's in the final trial."""
+        return float(special.ndtri(1 - self.significance)) if self.cvar_alpha else 0.0
+
+
+class Verdict(NamedTuple):
+    """Whether a policy is no worse.
+
+    Attributes
+    ----------
+    reason : str
+        Why it is refused, empty where it is accepted.
+    breaks_limit : bool
+        Whether it breaks a limit that the policy before does not: then there is no patience.
+    above_mpc : bool
+        Whether its mean cost is above the MPC's.
+    """
+
+    reason: str = ""
+    breaks_limit: bool = False
+    above_mpc: bool = False
+
+    @property
+    def accepted(self) -> bool:
+        """Whether nothing speaks against the policy."""
+        return not self.reason
+
+
+class Scores(NamedTuple):
+    """What a policy's episodes cost and break, in the order of their seeds.
+
+    Attributes
+    ----------
+    costs : ndarray, shape (episodes,)
+        With the penalty of soft bounds.
+    unsafe : ndarray, shape (episodes, 7)
+        As :func:`unsafe_columns` returns it.
+    visits : ndarray of bool, shape (episodes, regions)
+        Which regions the episodes come through: other networks have no effect on them.
+    """
+
+    costs: Array
+    unsafe: Array
+    visits: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
+
+    def breaks_more_than(self, other: Scores, room: float = EXCESS_ROOM) -> bool:
+        """Return whether it is less safe: a large step of an input wears, and breaks nothing."""
+        less = less_safe(self.unsafe, other.unsafe, room)
+        return bool(np.any(np.delete(less, INPUT_STEP, axis=1)))
+
+    def at(self, index: Any) -> Scores:
+        """Return some of the episodes."""
+        return Scores._make(each[index] for each in self)
+
+    def extended_by(self, other: Scores) -> Scores:
+        """Return the episodes of both."""
+        return Scores._make(map(np.concatenate, zip(self, other, strict=True)))
+
+    def replaced(self, index: Any, other: Scores) -> Scores:
+        """Return a copy with other episodes in some places."""
+        copy = Scores._make(each.copy() for each in self)
+        for ours, theirs in zip(copy, other, strict=True):
+            ours[index] = theirs
+        return copy
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What starts may cost more than with the MPC.
+
+    Attributes
+    ----------
+    margin : float
+        In units of cost: what a start may cost more; with a CVaR, what the worst of them may on
+        average.
+    cvar_alpha : float, share of all starts that the average is over; 0 is the worst single start
+        With a CVaR, a start that costs the MPC more than ``typical`` may cost more in proportion,
+        and no start may cost more than `WORST_START` times as much as the average may.
+    typical : float, the MPC's median cost
+    excess_room : float, half-widths by which an excess over bounds may be larger
+    """
+
+    margin: float
+    cvar_alpha: float = 0.0
+    typical: float = np.inf
+    excess_room: float = EXCESS_ROOM
+
+    def allowed(self, mpc_costs: Array) -> Array:
+        """Return what each start may cost more, rounding at least."""
+        margin: Any = self.margin
+        if self.cvar_alpha:
+            margin = self.margin * np.maximum(1.0, np.abs(mpc_costs) / self.typical)
+        return np.maximum(margin, COST_ROUNDING * np.abs(mpc_costs))
+
+    def excess(self, mpc_costs: Array, costs: Array) -> Array:
+        """Return what each start costs more than with the MPC, in units of what it may.
+
+        A cost that is not a number is inf.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            more = (costs - mpc_costs) / self.allowed(mpc_costs)
+        more = np.where(costs <= mpc_costs, np.fmin(more, 0.0), more)  # also without any margin
+        return np.asarray(np.nan_to_num(more, nan=np.inf, posinf=np.inf, neginf=-np.inf))
+
+    def objection(
+        self, excess: Array, n_starts: int | None = None, standard_errors: float = 0.0
+    ) -> str:
+        """Return what speaks against such an excess over the MPC, empty where nothing does.
+
+        Parameters
+        ----------
+        excess : ndarray, shape (starts,)
+            As :meth:`excess` returns it.
+        n_starts : int, optional
+            Number of starts of which these are the worst ones. The default is all of them.
+        standard_errors : float, default 0
+            How many standard errors of the tail's average count as well.
+        """
+        worst = int(np.argmax(excess))
+        if not excess[worst] > 1.0:
+            return ""
+        if not self.cvar_alpha or excess[worst] > WORST_START:
+            return f"start {worst}"
+        average, error = tail_average(excess, self.cvar_alpha, n_starts or len(excess))
+        if average + standard_errors * error <= 1.0:
+            return ""
+        share = 100 * self.cvar_alpha
+        return f"the worst {share:g} % of the starts cost too much, start {worst}"
+
+
+def no_worse(
+    policy: Scores,
+    accepted: Scores,
+    mpc: Scores,
+    tolerance: Tolerance,
+    n_starts: int | None = None,
+) -> Verdict:
+    """Compare a policy with the accepted one and the MPC, from the same starts.
+
+    Comparisons are written so that a cost that is not a number is refused.
+
+    Parameters
+    ----------
+    policy, accepted, mpc : Scores
+        Of the three.
+    tolerance : Tolerance
+        What starts may cost more than with the MPC.
+    n_starts : int, optional
+        The number of starts that these are the worst ones of. The default is all of them.
+    """
+    breaks = policy.breaks_more_than(accepted, tolerance.excess_room)
+    above_mpc = is_above(policy.costs, mpc.costs)
+    # Neither is exceeded: a tolerance over the accepted policy alone would add up.
+    allowed = np.minimum(accepted.unsafe, mpc.unsafe)
+    less = less_safe(policy.unsafe, allowed, tolerance.excess_room)
+    excess = tolerance.excess(mpc.costs, policy.costs)
+    reason = ""
+    if less.any():
+        column = int(np.argmax(less.any(axis=0)))
+        which = np.flatnonzero(less[:, column])
+        reason = f"{len(which)} starts with {UNSAFE[column]}, the first is number {which[0]}"
+        if column == ENDS_EARLY:
+            reason = f"{reason}; {SUCCESS_HINT}"
+    elif costly := tolerance.objection(excess, n_starts):
+        worst = np.argmax(excess)
+        more = policy.costs[worst] - mpc.costs[worst]
+        reason = f"{costly} costs {more:.4g} more than with the MPC"
+    elif is_above(policy.costs, accepted.costs):
+        mean, other = format_distinct(policy.costs.mean(), accepted.costs.mean())
+        reason = f"mean cost {mean}, accepted {other}"
+    elif above_mpc:  # by as much as rounding in many acceptances adds up to
+        mean, other = format_distinct(policy.costs.mean(), mpc.costs.mean())
+        reason = f"mean cost {mean}, MPC {other}"
+    return Verdict(reason, breaks, above_mpc)
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Seeded starts, and what came of the MPC there.
+
+    Attributes
+    ----------
+    seeds, mpc : tuple of int and Scores
+    tolerance : Tolerance, what they may cost more than with the MPC
+    n_starts : int, of so many they are those that count
+    standard_errors : float, by how many the mean cost, and the tail's, must be clear of the MPC's
+    least_gain : float, what the mean must gain, as a fraction of the MPC's
+    """
+
+    seeds: tuple[int, ...]
+    mpc: Scores
+    tolerance: Tolerance
+    n_starts: int
+    standard_errors: float = 0.0
+    least_gain: float = 0.0
+
+    def at(self, index: Any) -> Starts:
+        """Return some of them, which stand for as many."""
+        seeds = tuple(np.array(self.seeds)[index].tolist())
+        return replace(self, seeds=seeds, mpc=self.mpc.at(index))
+
+    def joined_with(self, other: Starts) -> Starts:
+        """Return the starts of both."""
+        count = self.n_starts + other.n_starts
+        mpc = self.mpc.extended_by(other.mpc)
+        return Starts((*self.seeds, *other.seeds), mpc, self.tolerance, count)
+
+    def excess(self, policy: Scores) -> Array:
+        """Return what each costs more than with the MPC, in what it may; inf for nan."""
+        return self.tolerance.excess(self.mpc.costs, policy.costs)
+
+    def less_safe(self, policy: Scores) -> NDArray[np.bool_]:
+        """Return in which a policy is less safe than the MPC."""
+        less = less_safe(policy.unsafe, self.mpc.unsafe, self.tolerance.excess_room)
+        return np.asarray(less.any(axis=1))
+
+    def lost(self, policy: Scores) -> NDArray[np.bool_]:
+        """Return which a policy loses against the MPC."""
+        return (self.excess(policy) > 1.0) | self.less_safe(policy)
+
+    def is_lost(self, policy: Scores) -> bool:
+        """Return whether a policy loses too many or too much of them, or is less safe."""
+        excess = self.excess(policy)
+        costly = self.tolerance.objection(excess, self.n_starts, self.standard_errors)
+        return bool(costly) or bool(self.less_safe(policy).any())
+
+    def gains_too_little(self, policy: Scores) -> bool:
+        """Return whether the mean cost is not below the MPC's by the least gain."""
+        gained = self.mpc.costs.mean() - policy.costs.mean()
+        needed = self.least_gain * np.abs(self.mpc.costs).mean()
+        return bool(self.least_gain and not gained >= needed)
+
+    def mean_is_above(self, policy: Scores) -> bool:
+        """Return whether the mean cost is above the MPC's, by more than rounding.
+
+        Where it must be clear of it, its upper confidence limit must be below, and it itself by
+        the least gain.
+        """
+        more = policy.costs - self.mpc.costs
+        error = 0.0
+        if self.standard_errors:
+            error = self.standard_errors * more.std() / np.sqrt(len(more))
+        above = is_above(policy.costs, self.mpc.costs, error)
+        return above or self.gains_too_little(policy)
+
+    def verdict(self, policy: Scores) -> Verdict:
+        """Return whether a policy is no worse than the MPC on these starts, which are new to it."""
+        above_mpc = is_above(policy.costs, self.mpc.costs)
+        if self.is_lost(policy):
+            first = self.hardest(policy)[0]
+            breaks, also = False, ""
+            if self.less_safe(policy).any():
+                breaks = policy.breaks_more_than(self.mpc, self.tolerance.excess_room)
+                also = f" and {'violates a limit' if breaks else 'moves an input too far'}"
+            more = (policy.costs - self.mpc.costs)[first]
+            reason = (
+                f"{self.lost(policy).sum()} of {len(self.seeds)} new starts lose against the MPC, "
+                f"seed {self.seeds[first]} costs {more:.4g} more{also}"
+            )
+            return Verdict(reason, breaks, above_mpc)
+        if not self.mean_is_above(policy):
+            return Verdict()
+        mean, mpc = format_distinct(policy.costs.mean(), self.mpc.costs.mean())
+        reason = f"mean cost {mean} on {len(self.seeds)} new starts, MPC {mpc}"
+        if not above_mpc:
+            little = self.gains_too_little(policy)
+            reason += ": too little a gain" if little else ": not surely below"
+        return Verdict(reason, False, above_mpc)
+
+    def hardest(self, policy: Scores | None) -> NDArray[np.int64]:
+        """Return the hardest that cost more than with the MPC; the first without scores."""
+        if policy is None:
+            return np.zeros(1, dtype=np.int64)
+        excess, less = self.excess(policy), self.less_safe(policy)
+        order = np.argsort(np.where(less, -np.inf, -excess), kind="stable")
+        count = self.lost(policy).sum() or np.count_nonzero(excess > 0)
+        return order[: min(HARDEST, count)]
+
+
+class PairedMean(NamedTuple):
+    """The mean difference of pairs that were played in turns on a plant.
+
+    Attributes
+    ----------
+    mean : float
+    error : float
+        Its standard error, widened where pairs that follow each other are correlated.
+    pairs : int
+    """
+
+    mean: float
+    error: float
+    pairs: int
+
+    @classmethod
+    def of(cls, differences: Array) -> PairedMean:
+        """Return that of differences in the order in which they were played."""
+        if len(differences) < 2:
+            return cls(float(differences.mean()), 0.0, len(differences))
+        left = differences - differences.mean()
+        size = float(left @ left)
+        lag = float(np.clip(left[1:] @ left[:-1] / size, 0.0, 0.95)) if size > 0 else 0.0
+        widened = np.sqrt((1 + lag) / (1 - lag))  # an autoregression's variance of the mean
+        error = float(widened * differences.std(ddof=1) / np.sqrt(len(differences)))
+        return cls(float(differences.mean()), error, len(differences))
+
+    def room(self, level: float = 0.95) -> float:
+        """Return how far from 0 the mean may be by chance, one-sided; inf for a single pair."""
+        if self.pairs < 2:
+            return np.inf
+        return float(special.stdtrit(self.pairs - 1, level) * self.error)
+
+
+def tail_average(values: Array, alpha: float, n_starts: int) -> tuple[float, float]:
+    """Return the average of the worst share of values, and its standard error.
+
+    The conditional value at risk q + E(x - q)+ / alpha at the quantile q, with the deviation of the
+    second part (Rockafellar and Uryasev, *Optimization of conditional value-at-risk*, Journal of
+    Risk 2, 2000). At least one value counts.
+
+    Parameters
+    ----------
+    values : ndarray, shape (values,)
+        The worst ones of ``n_starts``.
+    alpha : float
+        The share.
+    n_starts : int
+        So many values there are.
+    """
+    count = min(max(1.0, alpha * n_starts), float(len(values)))
+    ranked = np.sort(values)[::-1]
+    level = ranked[int(np.ceil(count)) - 1]
+    beyond = np.maximum(ranked - level, 0.0)
+    mean = beyond.sum() / count
+    deviation = np.sqrt(max(0.0, np.sum(beyond**2) / n_starts - (beyond.sum() / n_starts) ** 2))
+    return float(level + mean), float(deviation * np.sqrt(n_starts) / count)
+
+
+def is_above(costs: Array, others: Array, error: float = 0.0) -> bool:
+    """Return whether the mean of costs, and an error, is above that of others beyond rounding.
+
+    A mean that is not a number is.
+    """
+    return not costs.mean() + error - others.mean() <= COST_ROUNDING * np.abs(others).mean()
+
+
+def format_distinct(one: float, other: float) -> tuple[str, str]:
+    """Return two numbers in six digits, or in as many more as tell them apart."""
+    shown = [(f"{one:.{digits}g}", f"{other:.{digits}g}") for digits in range(6, 18)]
+    return next((pair for pair in shown if pair[0] != pair[1]), shown[0])
 
 
 def unsafe_columns(

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import random
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,9 +14,21 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, check_int, check_range
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
-from sb3_yann.evaluation.episodes import Source, as_source, make_env, watch_length
 from sb3_yann.policy._finite import watch_buffer
+from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.rollout import (
+    EnvPool,
+    Rows,
+    Source,
+    Trajectories,
+    as_source,
+    make_env,
+    one_env,
+    preserve_rng,
+    require_like_training,
+    rollout,
+)
 
 
 @dataclass
@@ -33,15 +43,6 @@ class Simulated:
 
     episodes: int = 0
     due: bool = True
-
-
-class _Row(NamedTuple):
-    observation: Any
-    next_observation: Any
-    action: Array
-    reward: float
-    done: bool
-    truncated: bool
 
 
 class SimulatedEpisodes(BaseCallback):
@@ -108,7 +109,9 @@ class SimulatedEpisodes(BaseCallback):
         check_int("seed", seed, 0)
         self.env, self.per_episode, self.seed = as_source(env), per_episode, seed
         self.step_tests, self.longest, self.noise = step_tests, longest, noise
-        self._envs: list[gym.Env[Any, Any]] = []
+        # Single envs, whose steps are the training env's: copies that step as one may round.
+        given = isinstance(self.env, gym.Env)
+        self._pool = EnvPool(self.env if given else lambda: make_env(self.env))
 
     @property
     def state(self) -> Simulated:
@@ -125,28 +128,10 @@ class SimulatedEpisodes(BaseCallback):
         watch_buffer(self.model)
 
     def _on_training_start(self) -> None:
-        training = self.training_env
-        self._envs = [self.env] if isinstance(self.env, gym.Env) else []
-        with _same_random_states():
-            while not isinstance(self.env, gym.Env) and len(self._envs) < self._count:
-                self._envs.append(make_env(self.env))
-        own = [each.unwrapped for each in getattr(training, "envs", [])]
-        if any(env.unwrapped is each for env in self._envs for each in own):
-            raise ValueError(
-                "The simulator is the training env, whose episodes its own would interrupt. Give "
-                "it another one, e.g. its id."
-            )
-        ours, theirs = self._envs[0], training
-        require_state_shown(ours, self.policy.told)
-        if (
-            ours.observation_space.shape != theirs.observation_space.shape
-            or ours.action_space != theirs.action_space
-        ):
-            raise ValueError(
-                f"The simulator has observations of shape {ours.observation_space.shape} and "
-                f"{ours.action_space}, the training env {theirs.observation_space.shape} and "
-                f"{theirs.action_space}. Give it a simulator of this plant."
-            )
+        with preserve_rng():
+            require_like_training(self._pool, self.training_env, "The simulator")
+            with one_env(self._pool) as env:
+                require_state_shown(env, self.policy.told)
 
     def _on_rollout_start(self) -> None:  # what was last seen of the plant is in the buffer now
         if self.state.due:
@@ -159,9 +144,7 @@ class SimulatedEpisodes(BaseCallback):
 
     def _on_training_end(self) -> None:
         if not isinstance(self.env, gym.Env):
-            for each in self._envs:
-                each.close()
-        self._envs = []
+            self._pool.close()
 
     @property
     def _count(self) -> int:
@@ -172,69 +155,57 @@ class SimulatedEpisodes(BaseCallback):
         """Play episodes, and put their steps into the replay buffer."""
         first = self.seed + self.state.episodes
         seeds = range(first, first + self._count)
-        with _same_random_states():
-            if isinstance(self.env, gym.Env):
-                episodes = [self._side_by_side([self.env], [each])[0] for each in seeds]
-            else:
-                episodes = self._side_by_side(self._envs, seeds)
-        self.state.episodes += len(episodes)
-        self._add(episodes)
-
-    def _side_by_side(
-        self, envs: Sequence[gym.Env[Any, Any]], seeds: Sequence[int]
-    ) -> list[list[_Row]]:
-        """Return the rows of one episode in each env."""
         explore = [_Exploration(self, np.random.default_rng([self.seed, k])) for k in seeds]
-        seen = [np.array(env.reset(seed=k)[0]) for env, k in zip(envs, seeds, strict=True)]
-        episodes: list[list[_Row]] = [[] for _ in envs]
-        running = [*range(len(envs))]
-        while running:
-            actions = self._actions(np.stack([seen[i] for i in running]))
-            for i, action in zip([*running], actions, strict=True):
-                scaled = explore[i](action)
-                observation, reward, terminated, truncated, _ = envs[i].step(self._taken(scaled))
-                after, over = np.array(observation), bool(terminated or truncated)
-                cut = bool(truncated and not terminated)
-                episodes[i].append(_Row(seen[i], after, scaled, float(reward), over, cut))
-                seen[i] = after
-                if over:
-                    running.remove(i)
-            if running:
-                watch_length(envs[running[0]], len(episodes[running[0]]))
-        return episodes
-
-    def _actions(self, observations: NDArray[Any]) -> Array:
-        """Return the policy's actions in [-1, 1], shape (batch, m)."""
-        normalize = self.model.get_vec_normalize_env()
-        if normalize is not None:
-            observations = np.asarray(normalize.normalize_obs(observations))
-        actions, _ = self.policy.predict(observations, deterministic=True)
-        return np.asarray(self.policy.scale_action(actions), np.float64)
-
-    def _taken(self, scaled: Array) -> NDArray[Any]:
-        """Return an action of the env, within its bounds to the last bit."""
+        scaled: list[list[Array]] = [[] for _ in seeds]
         space: Any = self.model.action_space
-        taken = self.policy.unscale_action(scaled).astype(space.dtype)
-        return np.clip(taken, space.low, space.high)
 
-    def _add(self, episodes: list[list[_Row]]) -> None:
+        def act(t: int, observations: NDArray[Any], rows: Rows) -> NDArray[Any]:
+            actions, _ = self.policy.predict(
+                normalized(self.model, observations), deterministic=True
+            )
+            own = np.asarray(self.policy.scale_action(actions), np.float64)
+            for i, action in zip(rows, own, strict=True):
+                scaled[i].append(explore[i](action))
+            taken = self.policy.unscale_action(np.array([scaled[i][-1] for i in rows]))
+            return np.clip(taken.astype(space.dtype), space.low, space.high)  # to the last bit
+
+        with preserve_rng():
+            played = rollout(act, self._pool, seeds)
+        self.state.episodes += len(seeds)
+        self._add(played, scaled)
+
+    def _add(self, played: Trajectories, scaled: Sequence[Sequence[Array]]) -> None:
         """Add the episodes to the buffer, one after the other in each of its columns."""
         buffer: Any = self.model.replay_buffer
         if buffer.size():  # what else is under way in the training env goes on behind these rows
             last = buffer.pos - 1
             buffer.timeouts[last] = np.maximum(buffer.timeouts[last], buffer.dones[last] == 0)
         n = buffer.n_envs
-        columns = [[row for rows in episodes[i::n] for row in rows] for i in range(n)]
-        length = min(map(len, columns))
         marks = vars(buffer).setdefault("simulated", np.zeros((buffer.buffer_size, n), dtype=bool))
+        columns = []
+        for i in range(n):
+            own = range(i, len(scaled), n)
+            over = [np.arange(1, length + 1) == length for length in played.lengths[own]]
+            cut = [each & bool(played.truncated[k]) for k, each in zip(own, over, strict=True)]
+            parts = (
+                [played.observations[k][:-1] for k in own],
+                [played.observations[k][1:] for k in own],
+                [np.array(scaled[k]) for k in own],
+                [played.rewards[k].astype(np.float32) for k in own],
+                over,
+                cut,
+            )
+            columns.append([np.concatenate(each) for each in parts])
+        length = min(len(column[0]) for column in columns)
         for k in range(length):
-            rows = [column[k] for column in columns]
-            obs, after, u, reward, done, cut = (np.array(each) for each in zip(*rows, strict=True))
+            obs, after, u, reward, done, cut = (
+                np.array([column[part][k] for column in columns]) for part in range(6)
+            )
             if k == length - 1:  # longer columns end here
                 cut, done = cut | ~done, np.ones(n, dtype=bool)
             at = buffer.pos
             infos = [{"TimeLimit.truncated": bool(each)} for each in cut]
-            buffer.add(obs, after, u, reward.astype(np.float32), done, infos)
+            buffer.add(obs, after, u, reward, done, infos)
             marks[at] = True
 
 
@@ -256,14 +227,3 @@ class _Exploration:
             return self.held
         noise = self.settings.noise * self.rng.standard_normal(action.shape)
         return np.clip(action + noise, -1, 1)
-
-
-@contextmanager
-def _same_random_states() -> Iterator[None]:
-    """Leave the global generators of Python and numpy, from which older envs draw, as they are."""
-    python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002
-    try:
-        yield
-    finally:
-        random.setstate(python)
-        np.random.set_state(legacy)  # noqa: NPY002

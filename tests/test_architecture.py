@@ -20,6 +20,7 @@ FLOORS = [
     {"sb3_yann.log"},
     {"sb3_yann.control"},
     {"sb3_yann.compare"},
+    {"sb3_yann.rollout"},
     {"sb3_yann_envs"},
     {"sb3_yann.evaluation"},
     {"sb3_yann.networks"},

@@ -20,7 +20,7 @@ from sb3_yann_envs import problems
 plot_regions(problems.clipped_pendulum()).figure.savefig("law.png")
 options = {"critic_warmup": 50}
 model = DDPG("YannPolicy", "CSTR-v0", device="cpu", seed=0, policy_kwargs=options)
-guard = ImprovementGuard("CSTR-v0", n_starts=2, n_new_starts=2, n_final_starts=2)
+guard = ImprovementGuard("CSTR-v0", n_eval_episodes=2, n_new_starts=2, n_final_starts=2)
 model.learn(120, callback=[NoActionNoise(), guard])
 print(model.num_timesteps)
 """

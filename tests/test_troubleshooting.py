@@ -145,10 +145,10 @@ CASES: dict[str, Callable[[], object]] = {
     # The guard
     "The guard's env is the training env": lambda: learn(ImprovementGuard(env := Plant()), env),
     "The MPC played two episodes of the guard's env": lambda: learn(
-        ImprovementGuard(lambda: gym.wrappers.TimeLimit(Plant(noise=0.1), 5), n_starts=2)
+        ImprovementGuard(lambda: gym.wrappers.TimeLimit(Plant(noise=0.1), 5), n_eval_episodes=2)
     ),
     "All 3 starts of the guard's env": lambda: learn(
-        ImprovementGuard(lambda: gym.wrappers.TimeLimit(Plant(deaf=True), 5), n_starts=3)
+        ImprovementGuard(lambda: gym.wrappers.TimeLimit(Plant(deaf=True), 5), n_eval_episodes=3)
     ),
     "The guard is within a callback of the class EveryNTimesteps": lambda: learn(
         EveryNTimesteps(2, ImprovementGuard(Plant))

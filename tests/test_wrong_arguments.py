@@ -48,7 +48,7 @@ def drawn(runs, problem=None):
 
 
 ENV = r"env = None must be a gymnasium\.Env: gymnasium\.make\(id\)"
-PLAYED = "must be the Episodes that evaluate returns"
+PLAYED = "must be the Trajectories that evaluate returns"
 WRONG_KINDS = {
     "StageCost without a problem": (lambda: StageCost(plant(), None), "problem = None must be a L"),
     "StageCost without an env": (lambda: StageCost(None, scalar_mpc()), ENV),

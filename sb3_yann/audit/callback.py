@@ -21,11 +21,11 @@ from sb3_yann.audit.finding import (
     judged,
 )
 from sb3_yann.audit.offset import steady_offset
-from sb3_yann.audit.own_reward import may_change_reward
 from sb3_yann.audit.sample import FEWEST, Sample
 from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import require_frozen
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.rollout import may_change_reward
 
 
 class CostAudit(BaseCallback):

@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.beginnings import beginnings
-from sb3_yann.audit.own_reward import as_reward, may_change_reward
 from sb3_yann.audit.plants import Plant
 from sb3_yann.audit.task import Task
 from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
-from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import DisturbanceObserver, LinearMPC
-from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
-from sb3_yann.evaluation.episodes import Source, as_source, watch_length
+from sb3_yann.rollout import Controller, EnvPool, Rows, Source, rollout
 from sb3_yann.twin.dynamics import law_of
 
-Controller = Callable[[int, Array, NDArray[np.bool_]], Array]
-"""From the step, thetas (k, n_theta) and who still runs (k,) to inputs (k, m)."""
 CHANGED = 0.05
 """A reference or disturbance that has moved by so many half-widths is planned for anew."""
 PAUSE = 10
@@ -35,165 +23,21 @@ DITHER, HELD = 0.1, 5
 """Half-widths by which a log for a twin is excited, and for how many steps each time."""
 
 
-@dataclass(frozen=True)
-class Loops:
-    """What came of k episodes that were played side by side.
-
-    Attributes
-    ----------
-    costs, violations, lengths : ndarray, shape (k,)
-        Sums of stage costs, with the penalty of soft bounds; steps in which the env reports a
-        violation; steps.
-    excess : BoundExcess
-        By how much each exceeds the bounds of the problem.
-    succeeded : ndarray of bool, shape (k,)
-        Whether the last info had ``is_success``.
-    thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
-        After its end an episode stays where it is.
-    rewards : ndarray, shape (T, k)
-        The env's own; NaN where it reports a violation or terminates, and after the end.
-    """
-
-    costs: Array
-    violations: NDArray[np.int64]
-    lengths: NDArray[np.int64]
-    thetas: Array
-    inputs: Array
-    rewards: Array
-    excess: BoundExcess
-    succeeded: NDArray[np.bool_]
-
-    def sooner(self, longest: int) -> NDArray[np.int64]:
-        """Return by how many steps each is shorter (k,); 0 where its end is a success."""
-        return np.where(self.succeeded, 0, np.maximum(longest - self.lengths, 0))
-
-    def no_worse(self, others: Loops) -> NDArray[np.bool_]:
-        """Tell which episodes are as long as others, and break no bound by more."""
-        longest = int(others.lengths.max(initial=0))
-        unsafe = [
-            unsafe_columns(
-                each.violations, each.sooner(longest), ~np.isfinite(each.costs), each.excess
-            )
-            for each in (self, others)
-        ]
-        return np.asarray(~less_safe(unsafe[0], unsafe[1]).any(axis=1))
-
-    def steps(self) -> tuple[Array, Array, Array]:
-        """Return thetas, inputs and following thetas of all steps, (steps, ...)."""
-        taken = np.arange(len(self.inputs))[:, None] < self.lengths
-        return self.thetas[:-1][taken], self.inputs[taken], self.thetas[1:][taken]
-
-    def episodes(self) -> list[tuple[Array, Array]]:
-        """Return thetas (T + 1, n_theta) and inputs (T, m) of each episode."""
-        return [
-            (self.thetas[: length + 1, i], self.inputs[:length, i])
-            for i, length in enumerate(self.lengths)
-        ]
-
-
-def maker(env: Source, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]]:
-    """Return a function that makes envs like the one that is given, by this name, or made."""
-    if isinstance(env, str):
-        env = as_source(env)  # "module:function" is a function
-    if isinstance(env, str):
-        return partial(gym.make, env, disable_env_checker=True)
-    if isinstance(env, gym.Env):
-        try:
-            copy.deepcopy(env)
-        except Exception as error:  # whatever a simulator raises that cannot be copied
-            raise TypeError(
-                f"{name} = {env!r} cannot be copied ({error}). Pass a function that makes "
-                "such an env: the starts are played side by side."
-            ) from error
-        return partial(copy.deepcopy, env)
-    if not callable(env):
-        raise TypeError(
-            f"{name} = {env!r} must be a single gymnasium.Env, its id, a function that makes "
-            "one, or a PlantTwin."
-        )
-
-    def made() -> gym.Env[Any, Any]:
-        found = env()
-        if not isinstance(found, gym.Env):
-            raise TypeError(f"{name} = {env!r} made {found!r}. It must return a gymnasium.Env.")
-        return found
-
-    return made
-
-
-def play(
-    problem: LinearMPC,
-    make: Callable[[], gym.Env[Any, Any]],
-    seeds: Sequence[int],
-    controller: Controller,
-) -> Loops:
-    """Return one episode for each seed, side by side.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Whose theta the env shows.
-    make : callable
-        Makes an env.
-    seeds : sequence of int
-        Of the k episodes.
-    controller : callable
-        What acts in all of them.
-    """
-    with ExitStack() as stack:
-        envs = [stack.enter_context(closing(make())) for _ in seeds]
-        begun = [env.reset(seed=s)[0] for env, s in zip(envs, seeds, strict=True)]
-        now: Array = np.array(begun, dtype=np.float64)
-        thetas, running = [now], np.ones(len(envs), dtype=bool)
-        inputs: list[Array] = []
-        rewards: list[Array] = []
-        told: list[NDArray[np.bool_]] = []
-        lengths = np.zeros(len(envs), dtype=np.int64)
-        succeeded = np.zeros(len(envs), dtype=bool)
-        while running.any():
-            u = controller(len(inputs), now, running)
-            now, violated = now.copy(), np.zeros(len(envs), dtype=bool)
-            earned = np.full(len(envs), np.nan)
-            for i in np.flatnonzero(running):
-                action = u[i].astype(envs[i].action_space.dtype)
-                now[i], reward, terminated, truncated, info = envs[i].step(action)
-                violated[i] = info.get("violation", False)
-                if not (may_change_reward(info) or terminated):
-                    earned[i] = as_reward(reward)
-                running[i] = not (terminated or truncated)
-                lengths[i] += 1
-                succeeded[i] = bool(info.get("is_success", False)) and not running[i]
-            thetas.append(now)
-            inputs.append(u)
-            rewards.append(earned)
-            told.append(violated)
-            watch_length(envs[0], len(inputs))
-    states, played = np.array(thetas), np.array(inputs)
-    taken = np.arange(len(inputs))[:, None] < lengths
-    excess = bound_excess(problem, states, played, taken)
-    costs = np.sum(problem.stage_cost(states[:-1], played), axis=0, where=taken) + excess.penalty
-    violations = np.sum(np.array(told), axis=0, where=taken)
-    paid = np.array(rewards)
-    return Loops(costs, violations, lengths, states, played, paid, excess, succeeded)
-
-
-def require_repeated(
-    problem: LinearMPC, make: Callable[[], gym.Env[Any, Any]], seed: int, cost: float
-) -> None:
+def require_repeated(problem: LinearMPC, env: Source | EnvPool, seed: int, cost: float) -> None:
     """Raise unless the MPC's episode from a seed costs the same again.
 
     Parameters
     ----------
     problem : LinearMPC
         Whose theta the env shows.
-    make : callable
-        Makes an env.
+    env : gymnasium.Env, str, callable or EnvPool
+        It plays the episode.
     seed : int
         Of the episode.
     cost : float
         What it cost; what is not finite is not compared.
     """
-    again = play(problem, make, [seed], of_law(problem)).costs[0]
+    again = rollout(of_law(problem), env, [seed], problem=problem).costs[0]
     if np.isfinite(cost) and not np.isclose(again, cost, rtol=1e-6, atol=0):
         raise ValueError(
             f"The MPC's episode from the seed {seed} cost {cost:.6g}, then {again:.6g}: the env "
@@ -205,7 +49,7 @@ def require_repeated(
 def of_law(problem: LinearMPC) -> Controller:
     """Return the MPC itself."""
     law = law_of(problem)
-    return lambda t, theta, running: np.nan_to_num(law(theta))
+    return lambda t, theta, rows: np.nan_to_num(law(theta))
 
 
 def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:
@@ -217,7 +61,7 @@ def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:
     point[layout.reference] = problem.tracking.C @ point[layout.state]
     point[layout.previous] = u[: layout.n_previous]
     limits = problem.deviations.u_min, problem.deviations.u_max
-    return lambda t, theta, running: np.clip(u + law(np.nan_to_num(theta) - point), *limits)
+    return lambda t, theta, rows: np.clip(u + law(np.nan_to_num(theta) - point), *limits)
 
 
 class Excited:
@@ -233,12 +77,14 @@ class Excited:
         self.problem, self.rng, self.law = problem, np.random.default_rng(seed), of_law(problem)
         self.moved: Array = np.zeros((0, 0))
 
-    def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
-        """Return the inputs (k, m)."""
-        problem, shape = self.problem, (len(theta), len(self.problem.R))
-        if t % HELD == 0:
-            self.moved = DITHER * problem.u_half * self.rng.uniform(-1, 1, shape)
-        u = self.law(t, theta, running) + self.moved
+    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
+        """Return the inputs (r, m)."""
+        problem = self.problem
+        if t == 0:
+            self.moved = np.zeros((len(rows), problem.model.n_inputs))
+        if t % HELD == 0:  # one draw for each episode, also for those that are over
+            self.moved = DITHER * problem.u_half * self.rng.uniform(-1, 1, self.moved.shape)
+        u = self.law(t, theta, rows) + self.moved[rows]
         return np.asarray(np.clip(u, problem.deviations.u_min, problem.deviations.u_max))
 
 
@@ -260,21 +106,22 @@ class Observing:
         self.observers: list[DisturbanceObserver] = []
         self.u: Array = np.zeros((0, 0))
 
-    def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
-        """Return the inputs (k, m)."""
+    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
+        """Return the inputs (r, m)."""
         layout, bounds = self.problem.layout, self.other.deviations.disturbances
         x = theta[:, layout.state]
         if t == 0:
             self.observers = [copy.copy(self.observer) for _ in x]
+            self.u = np.zeros((len(x), self.other.model.n_inputs))
             found = [each.reset(y) for each, y in zip(self.observers, x, strict=True)]
         else:
-            rows = zip(self.observers, x, self.u, strict=True)
-            found = [each.update(y, u) for each, y, u in rows]
+            pairs = zip(rows, x, strict=True)
+            found = [self.observers[i].update(y, self.u[i]) for i, y in pairs]
         x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
         d = np.clip(d_hat, bounds.d_min, bounds.d_max)
         parts = x_hat, theta[:, layout.reference], d, theta[:, layout.previous]
-        self.u = np.asarray(self.other.online()(np.concatenate(parts, axis=1)))
-        return self.u
+        self.u[rows] = self.other.online()(np.concatenate(parts, axis=1))
+        return self.u[rows]
 
 
 class Planning:
@@ -294,45 +141,45 @@ class Planning:
 
     Attributes
     ----------
-    plans : dict of int to (int, Plans)
-        The present one of each episode, and the step at which it was made.
+    plans : dict of int to (int, Plans, ndarray)
+        The present one of each episode, the step at which it was made, and the reference and
+        disturbance of then.
     """
 
     def __init__(self, plant: Plant, task: Task, steps: int, pause: int = 0) -> None:
         self.plant, self.task, self.steps, self.pause = plant, task, steps, pause
-        self.plans: dict[int, tuple[int, Plans]] = {}
-        self._constants: Array = np.zeros((0, 0))
+        self.plans: dict[int, tuple[int, Plans, Array]] = {}
 
-    def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
-        """Return the inputs (k, m)."""
+    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
+        """Return the inputs (r, m)."""
         problem, constant = self.task.problem, self.task.problem.layout.constant
-        if not self.plans:
-            self._constants = np.full_like(theta[:, constant], np.nan)
-        known = np.isin(np.arange(len(theta)), [*self.plans])
-        away = np.abs(theta[:, constant] - self._constants) / problem.theta_half[constant]
-        moved, p = (
-            ~(away <= CHANGED),
-            problem.layout.reference.stop - problem.layout.reference.start,
-        )
-        for i, (begun, _) in self.plans.items():
-            moved[i, p:] &= t >= begun + self.pause
-        changed = known & moved.any(axis=1)
-        for rows in (running & ~known, running & changed):
-            if rows.any() and t < self.steps:
-                self._plan(t, theta, np.flatnonzero(rows))
-        u = np.zeros((len(theta), problem.model.n_inputs))
-        for i, (begun, plan) in self.plans.items():
-            at = min(t, self.steps - 1) - begun
-            u[i] = np.nan_to_num(follow(plan, at, theta[i : i + 1])[0])
+        known = np.isin(rows, [*self.plans])
+        changed = np.zeros(len(rows), dtype=bool)
+        for k in np.flatnonzero(known):
+            planned_at, _, constants = self.plans[rows[k]]
+            away = np.abs(theta[k, constant] - constants) / problem.theta_half[constant]
+            moved = ~(away <= CHANGED)
+            if t < planned_at + self.pause:  # an estimated disturbance may still settle
+                moved[problem.layout.reference.stop - problem.layout.reference.start :] = False
+            changed[k] = moved.any()
+        for chosen in (~known, changed):
+            if chosen.any() and t < self.steps:
+                self._plan(t, theta[chosen], rows[chosen])
+        u = np.zeros((len(rows), problem.model.n_inputs))
+        for k, row in enumerate(rows):
+            if row in self.plans:
+                planned_at, plan, _ = self.plans[row]
+                at = min(t, self.steps - 1) - planned_at
+                u[k] = np.nan_to_num(follow(plan, at, theta[k : k + 1])[0])
         return np.clip(u, *self.task.limits(theta))
 
-    def _plan(self, t: int, theta: Array, rows: NDArray[np.intp]) -> None:
-        problem, left, starts = self.task.problem, self.steps - t, theta[rows]
+    def _plan(self, t: int, starts: Array, rows: Rows) -> None:
+        problem, left = self.task.problem, self.steps - t
         law = law_of(problem)
         policies: list[Policy] = [lambda _, at: law(at)]
         if rows[0] not in self.plans:
             policies = beginnings(self.plant, self.task, starts, left, rows)
         found = planned(self.plant, self.task, policies, starts, left, rows)
         for k, row in enumerate(rows):
-            self.plans[row] = t, found.of(np.array([k]))
-        self._constants[rows] = theta[rows, problem.layout.constant]
+            constants = starts[k, problem.layout.constant].copy()
+            self.plans[row] = t, found.of(np.array([k])), constants

@@ -17,13 +17,10 @@ from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.audit.closed_loops import (
     PAUSE,
     Excited,
-    Loops,
     Observing,
     Planning,
-    maker,
     of_law,
     of_model,
-    play,
     require_repeated,
 )
 from sb3_yann.audit.gains import LITTLE, UNKNOWN, WORTH, Headroom, gain, verdict_of
@@ -42,7 +39,7 @@ from sb3_yann.audit.plants import (
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
 from sb3_yann.control.mpc.offset_free import SHARE
-from sb3_yann.evaluation.episodes import Source
+from sb3_yann.rollout import Source, Trajectories, maker, rollout
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import Episode, as_episodes
 from sb3_yann.twin.observers import observer_of
@@ -175,8 +172,8 @@ class _Search:
 
     def play_mpc(self) -> None:
         """Play the MPC, and see that the env repeats an episode."""
-        self.base = base = play(self.mpc, self.make, self.seeds, of_law(self.mpc))
-        self.others: dict[str, Loops] = {}
+        self.base = base = rollout(of_law(self.mpc), self.make, self.seeds, problem=self.mpc)
+        self.others: dict[str, Trajectories] = {}
         if not np.all(np.isfinite(base.costs)):
             i = int(np.flatnonzero(~np.isfinite(base.costs))[0])
             raise ValueError(
@@ -190,7 +187,7 @@ class _Search:
             with closing(self.make()) as env:
                 unaware = below_set_points(env)
             if not unaware:
-                warn_of_own_reward(self.mpc, base.thetas, base.inputs, base.rewards, stacklevel=4)
+                warn_of_own_reward(self.mpc, base, stacklevel=4)
 
     def observe(self) -> None:
         """Play the same MPC with an observer, unless it has one or measures disturbances."""
@@ -207,7 +204,7 @@ class _Search:
             return
         if np.any(largest > SHARE * unit):  # the default would cut off what was found here
             self.d_max = np.maximum(largest, SHARE * unit)
-        self.others["observer"] = play(mpc, self.make, self.seeds, Observing(mpc, *pair))
+        self.others["observer"] = rollout(Observing(mpc, *pair), self.make, self.seeds, problem=mpc)
 
     def reidentify(self) -> None:
         """Play the MPC with a model that its own episodes, or the twin's log, tell."""
@@ -215,13 +212,13 @@ class _Search:
             if self.twin is not None:
                 other = self.twin.reidentified()
             else:
-                log = as_episodes(self.mpc, self.base.episodes())
+                log = as_episodes(self.mpc, self.base.pairs)
                 other = reidentified(self.mpc, Coordinates.of(self.mpc, log), log)
         except ValueError:  # a model without a steady state or a Riccati solution
             return
         if other is not self.mpc:
             controller = of_model(self.mpc, other)
-            self.others["model"] = play(self.mpc, self.make, self.seeds, controller)
+            self.others["model"] = rollout(controller, self.make, self.seeds, problem=self.mpc)
 
     def plan(self) -> None:
         """Play plans."""
@@ -232,7 +229,7 @@ class _Search:
         task = Task(self.mpc, low, high, _value(self.mpc), WEIGHT * unit)
         pause = PAUSE if self._observer() is not None else 0
         controller = Planning(plant, task, int(base.lengths.max()), pause)
-        self.others["plan"] = plans = play(self.mpc, self.make, self.seeds, controller)
+        self.others["plan"] = plans = rollout(controller, self.make, self.seeds, problem=self.mpc)
         lost = -gain(base.costs, plans.costs)
         if (self.doubted or not lost <= WORTH) and self.lacking():
             self.lost = max(float(lost), 0.0)
@@ -255,9 +252,9 @@ class _Search:
         if found is not None:
             return found, -free, free
         self.random = True  # or so it must be taken to be
-        others = play(self.mpc, self.make, self.seeds, Excited(self.mpc, self.seeds[0]))
+        others = rollout(Excited(self.mpc, self.seeds[0]), self.make, self.seeds, problem=self.mpc)
         self.logged = self.base, others
-        log = [*self.base.episodes(), *others.episodes()]
+        log = [*self.base.pairs, *others.pairs]
         twin = PlantTwin.fit(self.mpc, log, observer=self._observer(), n_members=1)
         self.doubted = not twin.trusted
         return TwinPlant(twin.dynamics, [0] * len(self.seeds)), twin.limits.low, twin.limits.high
@@ -268,7 +265,7 @@ class _Search:
         if observer is None:
             return simulated(self.mpc, self.make, *self.base.steps(), self.access)
         row = RowLayout(self.mpc, observer)
-        log = [Episode(*row.recovered(*each)) for each in self.base.episodes()]
+        log = [Episode(*row.recovered(*each)) for each in self.base.pairs]
         found = simulated_dynamics(row, self.make, log, self.access)
         return None if found is None else TwinPlant(found, [0] * len(self.seeds))
 
@@ -309,11 +306,11 @@ class _Search:
 
     def _rest(self) -> str:
         """Return what is said of an offset that remains though an observer gains nothing."""
-        runs, observer = [x for x, _ in self.base.episodes()], self.others.get("observer")
+        runs, observer = [x for x, _ in self.base.pairs], self.others.get("observer")
         if observer is None:
             return remaining_offset(self.mpc, runs, None)
         dearer = -gain(self.base.costs, observer.costs)
-        return remaining_offset(self.mpc, runs, [x for x, _ in observer.episodes()], dearer)
+        return remaining_offset(self.mpc, runs, [x for x, _ in observer.pairs], dearer)
 
 
 def _name(mpc: LinearMPC, make: Callable[[], gym.Env[Any, Any]]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.audit.finding import CostMismatchWarning
 from sb3_yann.control import LinearMPC
+from sb3_yann.rollout import Trajectories
 from sb3_yann.wrappers import SetPoint
 
 Mask = NDArray[np.bool_]
@@ -20,23 +20,6 @@ EXPLAINED = 0.95
 """Share of the rewards' variance from which on they are taken for minus the stage cost."""
 FEWEST = 10
 """Steps that must be seen."""
-
-
-def as_reward(value: Any) -> float:
-    """Return a reward as a number, NaN where it is none."""
-    try:
-        number = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        return np.nan
-    return float(number.ravel()[0]) if number.size == 1 else np.nan
-
-
-def may_change_reward(info: Mapping[str, Any]) -> bool:
-    """Tell whether a step reports a violation for which its reward may be another one.
-
-    An env whose every step is one would be compared nowhere: `StageCost` says what it added.
-    """
-    return bool(info.get("violation", False)) and info.get("violation_cost") != 0
 
 
 def below_set_points(env: gym.Env[Any, Any]) -> bool:
@@ -48,9 +31,7 @@ def below_set_points(env: gym.Env[Any, Any]) -> bool:
     return False
 
 
-def warn_of_own_reward(
-    problem: LinearMPC, thetas: Array, inputs: Array, rewards: Array, stacklevel: int
-) -> None:
+def warn_of_own_reward(problem: LinearMPC, played: Trajectories, stacklevel: int) -> None:
     """Warn where rewards are not minus the stage cost, times a constant and up to one.
 
     The constant may be each episode's own: it ranks no controllers. The cost may be that of the
@@ -60,13 +41,12 @@ def warn_of_own_reward(
     ----------
     problem : LinearMPC
         Whose stage cost counts.
-    thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
-        Of k episodes.
-    rewards : ndarray, shape (T, k)
-        NaN where they do not count, as after the end.
+    played : Trajectories
+        Of thetas, inputs and rewards.
     stacklevel : int
         Of the warning.
     """
+    thetas, inputs, rewards = played.padded()
     costs = [problem.stage_cost(at, inputs) for at in (thetas[:-1], thetas[1:])]
     known: Mask = np.asarray(np.all(np.isfinite([rewards, *costs]), axis=0), dtype=np.bool_)
     if np.count_nonzero(known) < FEWEST or not np.any(rewards[known]):

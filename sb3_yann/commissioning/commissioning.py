@@ -30,8 +30,8 @@ from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import allowed_excess
-from sb3_yann.evaluation.episodes import Source, one_env
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.policy.checkpoint import ActorCheckpoint
+from sb3_yann.rollout import Source, one_env
 from sb3_yann.twin.observers import observer_of
 from sb3_yann.twin.plant_twin import PlantTwin
 

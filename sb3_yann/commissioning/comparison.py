@@ -6,21 +6,19 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.journal import Journal
 from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
-from sb3_yann.compare import allowed_excess
+from sb3_yann.compare import PairedMean, allowed_excess
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess, excess_of_episodes
 from sb3_yann.twin.plant_twin import PlantTwin
 
 ENOUGH = 0.5
 """Of the gain that the twin promised, so much lets the bound of the correction grow."""
-SURELY, MOST = 0.95, 0.05
-"""One-sided level of the t test by which a policy is kept or taken back; what it may cost more than
-the MPC in any case, as a fraction of the MPC's cost."""
+MOST = 0.05
+"""What a policy may cost more than the MPC in any case, as a fraction of the MPC's cost."""
 OWN = 0.95
 """Share of the episodes' rewards that the stage cost explains where they are the same."""
 ALARMS = 0.25
@@ -63,9 +61,7 @@ class Costs(NamedTuple):
     @property
     def room(self) -> float:
         """How far from the MPC's cost a mean cost may be by chance; inf for a single pair."""
-        if self.pairs < 2:
-            return np.inf
-        return float(stdtrit(self.pairs - 1, SURELY) * self.error)
+        return PairedMean(self.actual - self.mpc, self.error, self.pairs).room()
 
 
 def compare(
@@ -103,8 +99,9 @@ def compare(
     if now is not None and not pays_own:
         starts = [predicted_costs(now, each[:pairs], plant.mpc) for each in (own, of_mpc)]
         more = more - (starts[0] - starts[1])
-    mpc = mean - float(more.mean())
-    return Costs(mean, predicted, promised, mpc, _standard_error(more), pairs, pays_own, longer)
+    found = PairedMean.of(more)
+    mpc = mean - found.mean
+    return Costs(mean, predicted, promised, mpc, found.error, pairs, pays_own, longer)
 
 
 def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
@@ -174,17 +171,6 @@ def is_confirmed(journal: Journal, costs: Costs) -> bool:
     quiet = not any(each.alarm for each, by_policy in journal.batch if by_policy)
     gained = costs.mpc - costs.actual
     return quiet and 0 < ENOUGH * costs.promised <= gained < np.inf
-
-
-def _standard_error(values: Array) -> float:
-    """Return that of the mean of values in their order, of which neighbors may be correlated."""
-    if len(values) < 2:
-        return 0.0
-    left = values - values.mean()
-    size = float(left @ left)
-    lag = float(np.clip(left[1:] @ left[:-1] / size, 0.0, 0.95)) if size > 0 else 0.0
-    widened = np.sqrt((1 + lag) / (1 - lag))  # an autoregression's variance of the mean
-    return float(widened * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def _costs(problem: LinearMPC, episodes: Sequence[PlantEpisode], own_reward: bool) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.closed_loops import PAUSE, Controller, Planning
+from sb3_yann.audit.closed_loops import PAUSE, Planning
 from sb3_yann.audit.plants import TwinPlant
 from sb3_yann.audit.task import WEIGHT, Task
 from sb3_yann.audit.trajectory import Plans, follow
@@ -18,6 +18,7 @@ from sb3_yann.commissioning.grounds import value_at_end
 from sb3_yann.commissioning.simulator_grounds import FINAL, RULE, SimulatorGrounds, controller_of
 from sb3_yann.commissioning.trial import Inputs
 from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.rollout import Controller, Rows
 from sb3_yann.twin.gradient import actor
 
 UPDATES = 10_000
@@ -68,11 +69,12 @@ class Teacher:
         better = (shown.costs <= mpc.costs) & shown.no_worse(mpc)
         for i in np.flatnonzero(better):
             for t in range(begins[i], shown.lengths[i]):
-                when, plan = planning.plans[t][i]
-                at, near = min(t, self.steps - 1) - when, self._nearby(shown.thetas[t, i])
+                when, plan, _ = planning.plans[t][i]
+                theta = shown.observations[i][t]
+                at, near = min(t, self.steps - 1) - when, self._nearby(theta)
                 answers = np.concatenate([follow(plan, at, each[None]) for each in near])
-                self.thetas += [shown.thetas[t, i], *near]
-                self.inputs += [shown.inputs[t, i], *np.clip(answers, *self.task.limits(near))]
+                self.thetas += [theta, *near]
+                self.inputs += [shown.actions[i][t], *np.clip(answers, *self.task.limits(near))]
         gained = float(np.sum((mpc.costs - shown.costs)[better]))
         return gained / max(float(np.abs(mpc.costs).sum()), 1e-300)
 
@@ -108,14 +110,15 @@ class _Later:
 
     def __init__(self, controller: Controller, begins: NDArray[np.int64], act: Inputs) -> None:
         self.controller, self.begins, self.act = controller, begins, controller_of(act)
-        self.plans: list[dict[int, tuple[int, Plans]]] = []
+        self.plans: list[dict[int, tuple[int, Plans, Array]]] = []
 
-    def __call__(self, t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
-        """Return the inputs (k, m)."""
-        begun = self.begins <= t
-        u = self.act(t, theta, running)
-        if np.any(running & begun):
-            u = np.where(begun[:, None], self.controller(t, theta, running & begun), u)
+    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
+        """Return the inputs (r, m)."""
+        begun = self.begins[rows] <= t
+        u = self.act(t, theta, rows)
+        if np.any(begun):
+            u = u.copy()
+            u[begun] = self.controller(t, theta[begun], rows[begun])
         self.plans.append({**getattr(self.controller, "plans", {})})
         return u
 

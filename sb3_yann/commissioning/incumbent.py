@@ -10,9 +10,9 @@ from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint, Tensors
-from sb3_yann.guard.rng import preserve_rng
+from sb3_yann.policy.checkpoint import ActorCheckpoint, Tensors
 from sb3_yann.policy.policies import YannPolicy, require_yann_policy
+from sb3_yann.rollout import preserve_rng
 
 
 class Incumbent:

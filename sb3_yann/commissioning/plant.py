@@ -16,6 +16,7 @@ from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.gradient import actor
@@ -184,8 +185,7 @@ class Plant:
         return PlantEpisode(*played, reward, violations, alarm, step, apart)
 
     def _theta(self, observation: Any) -> Array:
-        normalize = self.model.get_vec_normalize_env()
-        seen = observation if normalize is None else normalize.normalize_obs(observation)
+        seen = normalized(self.model, observation)
         return np.asarray(self.yann.theta(np.asarray(seen)[None]).double().cpu().numpy()[0])
 
     def _known(self, before: Array, u: Array, read: Array) -> Array:

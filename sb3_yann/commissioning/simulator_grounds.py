@@ -9,13 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.closed_loops import Controller, Loops, of_law
+from sb3_yann.audit.closed_loops import of_law
 from sb3_yann.commissioning.grounds import Grounds
 from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.trial import NEARLY, Check, Inputs, Outcome
-from sb3_yann.compare import less_safe, unsafe_columns
-from sb3_yann.guard.options import AcceptanceRule
-from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
+from sb3_yann.compare import (
+    AcceptanceRule,
+    Scores,
+    Tolerance,
+    less_safe,
+    no_worse,
+    unsafe_columns,
+)
+from sb3_yann.rollout import Controller, Rows, Trajectories
 
 RULE = AcceptanceRule()
 """When a policy counts as no worse: as a guard has it by default."""
@@ -46,15 +52,14 @@ class Comparison:
     @property
     def tolerance(self) -> Tolerance:
         """What episodes may cost more than with the MPC."""
-        typical = float(np.median(np.abs(self.mpc[0])))
-        return Tolerance(RULE.margin * typical, RULE.tail, typical)
+        return RULE.tolerance(self.mpc[0])
 
     def check(self, iteration: int, played: Outcome, accepted: Outcome) -> Check:
         """Compare a policy with the accepted one and the MPC, by what came of them."""
         costs, unsafe = played
         allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
-        paired = PairedEpisodes(self.mpc[0], accepted[0], allowed, self.tolerance)
-        reason, excess = paired.objection(costs, unsafe), costs - self.mpc[0]
+        scores = Scores(*played), Scores(*accepted), Scores(*self.mpc)
+        reason, excess = no_worse(*scores, self.tolerance).reason, costs - self.mpc[0]
         # Where a few episodes cost a thousand times as much as most, their mean is never sure.
         own = np.maximum(np.abs(self.mpc[0]), self.tolerance.typical)
         each = excess / np.where(own > 0, own, 1.0)
@@ -77,8 +82,8 @@ class SimulatedTrial(Comparison):
 
     twin: SimulatorTwin
     seeds: Sequence[int]
-    base: Loops = field(init=False)
-    last: Loops = field(init=False)
+    base: Trajectories = field(init=False)
+    last: Trajectories = field(init=False)
 
     def __post_init__(self) -> None:
         given, law = self.seeds, of_law(self.twin.problem)
@@ -100,10 +105,11 @@ class SimulatedTrial(Comparison):
         self.last = self.twin.play(controller_of(act), self.seeds)
         return self._outcome(self.last)
 
-    def _outcome(self, loops: Loops) -> Outcome:
-        short = loops.sooner(int(self.base.lengths.max()))
-        lost = ~np.isfinite(loops.costs)
-        return loops.costs, unsafe_columns(loops.violations, short, lost, loops.excess)
+    def _outcome(self, played: Trajectories) -> Outcome:
+        assert played.excess is not None
+        short = played.sooner(int(self.base.lengths.max()))
+        lost = ~np.isfinite(played.costs)
+        return played.costs, unsafe_columns(played.violations, short, lost, played.excess)
 
     def second_objection(self, act: Inputs) -> str:
         """Return nothing: the simulator has spoken."""
@@ -121,8 +127,8 @@ class SimulatedTrial(Comparison):
         row, constant = self.twin.dynamics.row, self.twin.problem.layout.constant
         found: list[Array] = [np.empty((0, row.size))]
         for i in self.lost(played):
-            length = self.last.lengths[i]
-            thetas, inputs = self.last.thetas[: length + 1, i], self.last.inputs[:length, i]
+            thetas, inputs = self.last.pairs[i]
+            length = len(inputs)
             if not np.isfinite(thetas).all():
                 continue
             rows = row.recovered(thetas, inputs)[0][:length]
@@ -160,7 +166,7 @@ def _joined(outcomes: Iterable[Outcome]) -> Outcome:
 def controller_of(act: Inputs) -> Controller:
     """Return a policy as what acts in episodes side by side; on what is not finite, as at rest."""
 
-    def controller(t: int, theta: Array, running: NDArray[np.bool_]) -> Array:
+    def controller(t: int, theta: Array, rows: Rows) -> Array:
         finite = np.isfinite(theta).all(axis=1, keepdims=True)
         return act(np.where(finite, theta, 0.0))
 

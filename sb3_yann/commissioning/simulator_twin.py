@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -12,21 +11,13 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.closed_loops import (
-    Controller,
-    Excited,
-    Loops,
-    maker,
-    of_law,
-    play,
-    require_repeated,
-)
+from sb3_yann.audit.closed_loops import Excited, of_law, require_repeated
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
 from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import simulated_dynamics
 from sb3_yann.control import LinearMPC
-from sb3_yann.evaluation.episodes import Source
+from sb3_yann.rollout import Controller, EnvPool, Source, Trajectories, maker, rollout
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import SHORTEST, Episode
@@ -39,18 +30,6 @@ LOGGED = 40
 """Episodes of the MPC that are played first: they tell where runs of a gradient begin."""
 FIRST, APART = 3_000_000, 1_000_000
 """Seed of the first episode; how far those of two seeds are apart."""
-
-
-class _Kept(gym.Wrapper[Any, Any, Any, Any]):
-    """An env that is used again when it was closed."""
-
-    def __init__(self, env: gym.Env[Any, Any], free: list[gym.Env[Any, Any]]) -> None:
-        super().__init__(env)
-        self.free = free
-
-    def close(self) -> None:
-        """Keep it."""
-        self.free.append(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +48,8 @@ class SimulatorTwin:
         How far the states move in the episodes: standard deviations.
     seeds : range
         Of the episodes.
-    make : callable
-        Makes an env that shows theta and takes deviations; one that is closed is used again.
-    free : list of gymnasium.Env
-        Those that were.
+    envs : EnvPool
+        Of envs that show theta and take deviations.
     played : list of int
         Episodes of each comparison so far.
     """
@@ -82,8 +59,7 @@ class SimulatorTwin:
     dynamics: Dynamics
     units: Array
     seeds: range
-    make: Callable[[], gym.Env[Any, Any]]
-    free: list[gym.Env[Any, Any]]
+    envs: EnvPool
     played: list[int] = field(default_factory=list)
 
     @classmethod
@@ -105,23 +81,19 @@ class SimulatorTwin:
             If it is no such env.
         """
         make = showing_theta(maker(env, "twin"), problem)
-        free: list[gym.Env[Any, Any]] = []
-
-        def kept() -> gym.Env[Any, Any]:
-            return free.pop() if free else _Kept(make(), free)
-
-        with closing(kept()) as one:
+        envs = EnvPool(make)
+        with envs.acquire(1) as (one,):
             row, unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
             require_spaces(problem, one)
         first = FIRST + APART * seed
         seeds = range(first, first + LOGGED)
-        loops = play(problem, kept, seeds, of_law(problem))
-        require_deviations(problem, loops.steps()[0])
-        require_repeated(problem, kept, first, loops.costs[0])
-        warn_of_order(problem, *loops.steps(), stacklevel=4)
+        played = rollout(of_law(problem), envs, seeds, problem=problem)
+        require_deviations(problem, played.steps()[0])
+        require_repeated(problem, envs, first, played.costs[0])
+        warn_of_order(problem, *played.steps(), stacklevel=4)
         if not unaware:
-            warn_of_own_reward(problem, loops.thetas, loops.inputs, loops.rewards, stacklevel=4)
-        logged = _usable(loops)
+            warn_of_own_reward(problem, played, stacklevel=4)
+        logged = _usable(played)
         if not logged:
             raise ValueError(
                 f"None of {LOGGED} episodes of the MPC in the simulator has {SHORTEST} steps that "
@@ -130,22 +102,21 @@ class SimulatorTwin:
         episodes = tuple(Episode(*row.recovered(*each)) for each in logged)
         dynamics = simulated_dynamics(row, make, episodes)
         if dynamics is None:
-            log = [*logged, *_usable(play(problem, kept, seeds, Excited(problem, seed)))]
+            excited = rollout(Excited(problem, seed), envs, seeds, problem=problem)
+            log = [*logged, *_usable(excited)]
             twin = PlantTwin.fit(problem, log, observer=row.observer, n_members=1, seed=seed)
             dynamics = twin.dynamics
         units = Coordinates.of(problem, episodes, row.observer).units
-        return cls(problem, episodes, dynamics, units, seeds, kept, free)
+        return cls(problem, episodes, dynamics, units, seeds, envs)
 
-    def play(self, controller: Controller, seeds: Sequence[int]) -> Loops:
+    def play(self, controller: Controller, seeds: Sequence[int]) -> Trajectories:
         """Return episodes of the simulator itself."""
         self.played.append(len(seeds))
-        return play(self.problem, self.make, seeds, controller)
+        return rollout(controller, self.envs, seeds, problem=self.problem)
 
     def close(self) -> None:
         """Close all envs."""
-        for each in self.free:
-            each.env.close()  # type: ignore[attr-defined]
-        self.free.clear()
+        self.envs.close()
 
     @cached_property
     def starts(self) -> Starts:
@@ -173,10 +144,10 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
         )
 
 
-def _usable(loops: Loops) -> list[tuple[Array, Array]]:
+def _usable(played: Trajectories) -> list[tuple[Array, Array]]:
     """Return the episodes of some steps whose values are all finite."""
     return [
         (thetas, inputs)
-        for thetas, inputs in loops.episodes()
+        for thetas, inputs in played.pairs
         if len(inputs) >= SHORTEST and np.isfinite(thetas).all() and np.isfinite(inputs).all()
     ]

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.compare import Scores, Tolerance, less_safe, no_worse, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
-from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
 from sb3_yann.twin.dynamics import Dynamics, law_of
 from sb3_yann.twin.hidden_dynamics import HiddenDynamics
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -184,13 +183,15 @@ class Trial:
         known, mean, excess = self.known, self.mean, costs - self.mpc[0]
         allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
         safe = not np.any(less_safe(unsafe, allowed))
-        paired = PairedEpisodes(
-            self.mpc[0][known], accepted[0][known], allowed[known], Tolerance(MARGIN * mean)
+        policy, before, mpc = (Scores(c[known], u[known]) for c, u in (played, accepted, self.mpc))
+        reason = no_worse(policy, before, mpc, Tolerance(MARGIN * mean)).reason
+        (logged, error), (of_accepted, _) = map(
+            self._as_logged, (excess, accepted[0] - self.mpc[0])
         )
-        reason = paired.objection(costs[known], unsafe[known])
-        (logged, error), (before, _) = map(self._as_logged, (excess, accepted[0] - self.mpc[0]))
-        if not reason and not logged <= before:
-            reason = f"episodes like the log's cost {100 * (logged - before) / mean:.2g} % more"
+        if not reason and not logged <= of_accepted:
+            reason = (
+                f"episodes like the log's cost {100 * (logged - of_accepted) / mean:.2g} % more"
+            )
         if not reason and not safe:
             reason = "a start outside the log breaks a bound of the problem"
         beyond = (excess - self.room())[~known]

@@ -16,7 +16,7 @@ from sb3_yann.control.explicit.solve import ProgramUnits
 from sb3_yann.control.law_plot import plot_law
 from sb3_yann.control.model.labels import labels_of, with_units
 from sb3_yann.control.mpc.condensing import condense
-from sb3_yann.evaluation.episodes import Episodes
+from sb3_yann.rollout import Trajectories
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,9 +115,7 @@ def plot_regions(
     chosen = [entry_of(problem, each) for each in entries]
     name = ActiveConstraints(problem) if by == "constraint" else None
     labels = problem.labels(units=True)
-    return plot_law(
-        problem.explicit(), axes, entries=chosen, at=at, labels=labels, name=name
-    )
+    return plot_law(problem.explicit(), axes, entries=chosen, at=at, labels=labels, name=name)
 
 
 regions_figure = as_figure(plot_regions)
@@ -321,7 +319,7 @@ class RegionUse:
     largest: Array
 
     @classmethod
-    def of(cls, problem: LinearMPC, policy: Any, episodes: Episodes) -> RegionUse:
+    def of(cls, problem: LinearMPC, policy: Any, episodes: Trajectories) -> RegionUse:
         """Return it of a law, model or policy; the observations of the episodes are theta."""
         law = problem.explicit()
         theta = np.concatenate([each[:-1] for each in episodes.observations])
@@ -370,7 +368,7 @@ def plot_changes(use: RegionUse, axes: Axes | None = None) -> Axes:
     return _with_regions(use, axes)
 
 
-def use_figure(problem: LinearMPC, policy: Any, episodes: Episodes) -> Figure:
+def use_figure(problem: LinearMPC, policy: Any, episodes: Trajectories) -> Figure:
     """Return a figure of :func:`plot_visits` above :func:`plot_changes`.
 
     Examples

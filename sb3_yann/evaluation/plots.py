@@ -29,7 +29,6 @@ from sb3_yann._drawing import (
 from sb3_yann._validation import Array, check_array, check_bool, check_int, check_type, to_float
 from sb3_yann.control import LinearModel, LinearMPC
 from sb3_yann.control.model.labels import with_units
-from sb3_yann.evaluation.episodes import Episodes, as_played
 from sb3_yann.evaluation.law_plots import (
     Quantity,
     RegionUse,
@@ -42,6 +41,7 @@ from sb3_yann.evaluation.law_plots import (
     surfaces_figure,
     use_figure,
 )
+from sb3_yann.rollout import Trajectories, as_played
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,7 +70,7 @@ __all__ = [
     "twin_figure",
     "use_figure",
 ]
-Runs = Mapping[str, Episodes]
+Runs = Mapping[str, Trajectories]
 MAX_LINES = 6  # so many episodes are drawn one by one; of more, the median and bands
 
 
@@ -93,7 +93,7 @@ def save_trajectories(
     ----------
     path : path-like
         Folders are made as needed. Without a suffix it gets ``.png``.
-    runs : mapping of str to Episodes
+    runs : mapping of str to Trajectories
         Every episode of every run is drawn.
     states : mapping of int to str
         The entries of the observation to draw, with their labels.
@@ -162,7 +162,7 @@ def save_plant_trajectories(
     ----------
     path : path-like
         Folders are made as needed. Without a suffix it gets ``.png``.
-    runs : mapping of str to Episodes
+    runs : mapping of str to Trajectories
         Their observations are theta.
     problem : LinearMPC
         Its model has the operating point, the sampling time, names and units.
@@ -209,13 +209,13 @@ def save_plant_trajectories(
     )
 
 
-def _check_runs(runs: Runs) -> dict[str, Episodes]:
+def _check_runs(runs: Runs) -> dict[str, Trajectories]:
     """Return runs by their names, else raise TypeError."""
     check_type("runs", runs, Mapping, "a mapping of names to episodes: {'MPC': evaluate(...)}")
     return {name: as_played(f"runs[{name!r}]", each) for name, each in runs.items()}
 
 
-def _in_plant_units(problem: LinearMPC, runs: Runs, absolute: bool) -> dict[str, Episodes]:
+def _in_plant_units(problem: LinearMPC, runs: Runs, absolute: bool) -> dict[str, Trajectories]:
     """Return episodes with the operating point added; ValueError where they are not of theta."""
     theta_ss, u_ss = problem.theta_ss, problem.model.u_ss
     if absolute:
@@ -259,7 +259,7 @@ def plot_loop(
     ----------
     problem : LinearMPC
         With the operating point, limits, names and units.
-    runs : mapping of str to Episodes
+    runs : mapping of str to Trajectories
         By controller; their observations are theta, their actions inputs.
     quantity : int or str
         An entry of ``[theta, u]``: its index, or a name as in ``problem.labels()``, or an input's.
@@ -308,7 +308,7 @@ def loops_figure(
     ----------
     problem : LinearMPC
         With the operating point, limits, names and units.
-    runs : mapping of str to Episodes
+    runs : mapping of str to Trajectories
         By controller, the first one uppermost; their observations are theta.
     quantities : sequence of int or str, optional
         As of :func:`plot_loop`; all states and inputs by default.
@@ -361,7 +361,7 @@ def loops_figure(
     return figure
 
 
-def _to_draw(problem: LinearMPC, runs: Runs, absolute: bool) -> dict[str, Episodes]:
+def _to_draw(problem: LinearMPC, runs: Runs, absolute: bool) -> dict[str, Trajectories]:
     if not runs or not all(len(each.costs) for each in runs.values()):
         raise ValueError("There are no episodes to draw: pass {name: evaluate(...)} of some seeds.")
     return _in_plant_units(problem, runs, absolute)
@@ -405,7 +405,7 @@ def _draw_loops(
     panels[-1].set_xlabel(f"time ({time_unit})" if time_unit else "time")
 
 
-def _rows(episodes: Episodes, entry: int, n_theta: int) -> Array:
+def _rows(episodes: Trajectories, entry: int, n_theta: int) -> Array:
     """Return an entry of [theta, u] in each episode (episodes, steps), NaN after its end."""
     k = entry - n_theta
     parts, column = (episodes.actions, k) if k >= 0 else (episodes.observations, entry)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_yann.evaluation.episodes import Episodes, as_played
+from sb3_yann.rollout import Trajectories, as_played
 
 WIDTH = 100  # letters in a line of a table that is printed
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-def comparison_table(title: str, before: Episodes, after: Episodes) -> Table:
+def comparison_table(title: str, before: Trajectories, after: Trajectories) -> Table:
     """Return a `rich` table of the cost of each episode before and after, with the mean.
 
     The episodes must be those of the same seeds. A change for the worse is printed red.
@@ -39,7 +39,7 @@ def comparison_table(title: str, before: Episodes, after: Episodes) -> Table:
     return table
 
 
-def summary_table(title: str, before: Episodes, after: Episodes) -> Table:
+def summary_table(title: str, before: Trajectories, after: Trajectories) -> Table:
     """Return a `rich` table of mean and worst cost and of violations, for many episodes.
 
     The episodes must be those of the same seeds. The last rows compare them pair by pair: how
@@ -67,7 +67,7 @@ def summary_table(title: str, before: Episodes, after: Episodes) -> Table:
     return table
 
 
-def _require_pairs(before: Episodes, after: Episodes) -> None:
+def _require_pairs(before: Trajectories, after: Trajectories) -> None:
     """Raise unless there are episodes, and as many before as after."""
     counts = [len(as_played(*each).costs) for each in (("before", before), ("after", after))]
     if counts[0] != counts[1] or not counts[0]:

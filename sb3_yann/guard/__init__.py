@@ -1,8 +1,7 @@
 """The callback that keeps only what is no worse than the MPC that a policy started from."""
 
-from sb3_yann.guard.callback import ImprovementGuard
-from sb3_yann.guard.options import AcceptanceRule, StepSize
-from sb3_yann.guard.session import restore_accepted
-from sb3_yann.guard.state import Decision
+from sb3_yann.compare import AcceptanceRule
+from sb3_yann.guard.callback import ImprovementGuard, StepSize
+from sb3_yann.guard.state import Decision, restore_accepted
 
 __all__ = ["AcceptanceRule", "Decision", "ImprovementGuard", "StepSize", "restore_accepted"]

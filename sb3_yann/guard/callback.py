@@ -1,10 +1,12 @@
-"""The callback that is passed to `learn`."""
+"""The callback that is passed to `learn`: it tries candidates, and restores what is accepted."""
 
 from __future__ import annotations
 
+import math
 import sys
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,30 +16,85 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import check_bool, check_int, check_options
+from sb3_yann._archive import atomic_write
+from sb3_yann._validation import check_bool, check_int, check_options, check_range
 from sb3_yann.audit.callback import CostAudit
-from sb3_yann.evaluation.episodes import LONG, Source, as_source
+from sb3_yann.compare import AcceptanceRule
 from sb3_yann.evaluation.plots import plot_decisions
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
-from sb3_yann.guard.interrupt import Handler, install
-from sb3_yann.guard.options import AcceptanceRule, StepSize
-from sb3_yann.guard.preconditions import (
+from sb3_yann.guard.decide import GuardSettings, Player, decide, decide_at_end
+from sb3_yann.guard.start import (
+    InterruptHandler,
     all_callbacks,
     check_alone,
     check_not_nested,
     check_twin,
+    first_evidence,
+    still_holds,
 )
-from sb3_yann.guard.session import ACCEPTED, GuardSession, restore_accepted
-from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
-from sb3_yann.guard.state import Decision, GuardState, begin_record
-from sb3_yann.guard.summary import summary_of
+from sb3_yann.guard.state import (
+    Decision,
+    GuardState,
+    Record,
+    relative_change,
+    restore_accepted,
+    summary_of,
+)
 from sb3_yann.policy._finite import watch_buffer
+from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import require_same_statistics
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.rollout import (
+    LONG_EPISODE,
+    Source,
+    as_source,
+    name_of,
+    preserve_rng,
+    require_like_training,
+)
 from sb3_yann.twin.plant_twin import PlantTwin
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+ACCEPTED_FILE = "accepted_model.zip"
+
+
+@dataclass(frozen=True)
+class StepSize:
+    """How decisions scale the actor's learning rate.
+
+    Parameters
+    ----------
+    shrink : float, default 0.5
+        Factor after the accepted policy has been restored.
+    grow : float, default 1.5
+        Factor after an acceptance. The product never exceeds 1.
+    smallest : float, default 0.1
+        The product never falls below this.
+
+    Examples
+    --------
+    >>> from sb3_yann import StepSize
+    >>> StepSize(shrink=0.3).grow
+    1.5
+    """
+
+    shrink: float = 0.5
+    grow: float = 1.5
+    smallest: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_range("shrink", self.shrink, 0, 1)
+        check_range("grow", self.grow, 1, np.inf)
+        check_range("smallest", self.smallest, 0, 1)
+
+    def after(self, step: float, decision: Decision) -> float:
+        """Return the factor of the actor's learning rate after a decision."""
+        if decision.verdict == "accepted":
+            return min(1.0, step * self.grow)
+        if decision.verdict == "rejected" and decision.restored:
+            return max(min(self.smallest, step), step * self.shrink)
+        return step
 
 
 class ImprovementGuard(BaseCallback):
@@ -60,7 +117,7 @@ class ImprovementGuard(BaseCallback):
         The simulator: an id, a function that makes an env, or an env other than the training env.
         The first two play all starts side by side. Of a twin all members are played, start by
         start.
-    n_starts : int, default 100
+    n_eval_episodes : int, default 100
         Number of seeded starts.
     n_new_starts : int, default 50
         Number of new starts that confirm a policy before it is accepted, 0 for none. Where it loses
@@ -69,7 +126,7 @@ class ImprovementGuard(BaseCallback):
         Number of new starts that confirm the accepted policy when training ends.
     seed : int, default 1_000_000
         The seed of the first start; the others follow.
-    eval_every : int, default 1
+    eval_freq : int, default 1
         Training episodes from one candidate to the next.
     patience : int, default 5
         Refusals in a row until the accepted policy is restored. Until then the candidate plays on.
@@ -110,7 +167,8 @@ class ImprovementGuard(BaseCallback):
 
     model: OffPolicyAlgorithm
     twin: PlantTwin | None = None
-    _handler: Handler | None = None
+    player: Player
+    _handler: InterruptHandler | None = None
     _has_begun = False
     _audit: CostAudit | None = None
     _steps: Any = 0  # of each env's present episode, in this learn
@@ -119,15 +177,15 @@ class ImprovementGuard(BaseCallback):
         self,
         env: Source | PlantTwin,
         *,
-        n_starts: int = 100,
+        n_eval_episodes: int = 100,
         n_new_starts: int = 50,
         n_final_starts: int | None = None,
         seed: int = 1_000_000,
-        eval_every: int = 1,
+        eval_freq: int = 1,
         patience: int = 5,
         keep_if_worse: bool = False,
         rule: AcceptanceRule | Mapping[str, Any] = AcceptanceRule(),  # noqa: B008 (frozen)
-        step_size: StepSize | Mapping[str, Any] = StepSize(),  # noqa: B008 (frozen)
+        step_size: StepSize | Mapping[str, Any] = StepSize(),
         log_path: str | PathLike[str] | None = None,
         save_path: str | PathLike[str] | None = None,
         verbose: int = 0,
@@ -143,49 +201,33 @@ class ImprovementGuard(BaseCallback):
                 "gymnasium.Env, a function that makes one, or a PlantTwin. On a plant without a "
                 "simulator use Commissioning (docs/commissioning.md)."
             )
-        as_source(env)  # a name that cannot be imported is told here
+        as_source(env)  # a name that cannot be imported is an error here
         if log_path is not None and Path(log_path).is_dir():
             raise ValueError(f"log_path = {log_path!r} is a folder; name a file in it.")
         if save_path is not None and Path(save_path).is_file():
             raise ValueError(f"save_path = {save_path!r} is a file; name a folder.")
-        check_int("n_starts", n_starts)
+        check_int("n_eval_episodes", n_eval_episodes)
         check_int("n_new_starts", n_new_starts, 0)
         n_final = 10 * n_new_starts if n_final_starts is None else n_final_starts
         check_int("n_final_starts", n_final, 0)
         check_int("seed", seed, 0)
-        check_int("eval_every", eval_every)
+        check_int("eval_freq", eval_freq)
         check_int("patience", patience)
         check_bool("keep_if_worse", keep_if_worse)
-        rule = check_options("rule", rule, AcceptanceRule)
-        self.env, self.step_size = env, check_options("step_size", step_size, StepSize)
+        self.env = env
+        self.step_size = check_options("step_size", step_size, StepSize)
         self.log_path = None if log_path is None else Path(log_path)
         self.save_path = None if save_path is None else Path(save_path)
-        self.acceptance = SimulatorAcceptance(
-            name_of(env),
-            range(seed, seed + n_starts),
-            n_new_starts,
-            n_final,
-            eval_every,
-            patience,
-            keep_if_worse,
-            rule,
+        self.settings = GuardSettings(
+            env=name_of(env),
+            seeds=range(seed, seed + n_eval_episodes),
+            n_new_starts=n_new_starts,
+            n_final_starts=n_final,
+            eval_freq=eval_freq,
+            patience=patience,
+            keep_if_worse=keep_if_worse,
+            rule=check_options("rule", rule, AcceptanceRule),
         )
-
-    @property
-    def decisions(self) -> list[Decision]:
-        """All decisions so far, those before a resumed run included."""
-        return self.state.decisions
-
-    def summary(self) -> str:
-        """Return some lines: what is accepted, what was refused most often, and what may help."""
-        return summary_of(self.state, self.session.policy)
-
-    def plot(self, axes: Axes | None = None) -> Axes:
-        """Draw the mean cost of each candidate by the verdict on it; return the axes.
-
-        Without ``axes`` they are a new figure's.
-        """
-        return plot_decisions(self.decisions, axes)
 
     @property
     def state(self) -> GuardState:
@@ -195,58 +237,79 @@ class ImprovementGuard(BaseCallback):
             raise RuntimeError("The guard has no state yet: pass it to learn, as callback=guard.")
         return state
 
+    @property
+    def decisions(self) -> list[Decision]:
+        """All decisions so far, those before a resumed run included."""
+        return self.state.decisions
+
+    def summary(self) -> str:
+        """Return some lines: what is accepted, what was refused most often, and what may help."""
+        return summary_of(self.state, self.player.policy)
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the mean cost of each candidate by the verdict on it; return the axes.
+
+        Without ``axes`` they are a new figure's.
+        """
+        return plot_decisions(self.decisions, axes)
+
     def _init_callback(self) -> None:
         check_not_nested(self)
         policy = require_yann_policy(self.model.policy, "ImprovementGuard")
         if self.twin is not None:
             check_twin(policy, self.twin.problem)
         watch_buffer(self.model)
-        self.session = GuardSession(
-            self.model, policy, self.env, self.step_size, self.log_path, self.verbose
-        )
+        known = getattr(self.model, "guard_state", None)
+        if known is not None:  # a run that goes on has the same weights
+            mpc = known.evidence.mpc
+        else:
+            with preserve_rng():  # building an actor draws weights
+                mpc = ActorCheckpoint.of_mpc(policy)
+        self.player = Player(self.model, policy, self.env, mpc)
         self._saved: ActorCheckpoint | None = None
+        self._final: ActorCheckpoint | None = None
 
     def _on_training_start(self) -> None:
         check_not_nested(self)
         check_alone(self)
         require_same_statistics(self.model)
         self._has_begun, self._steps = False, 0
-        self.acceptance.start(self.session)
-        known = getattr(self.model, "guard_state", None)
-        if known is None or known.settings != self.acceptance.settings:
-            self._start_afresh(known)
-        elif not self.acceptance.still_holds(self.session):
-            warnings.warn(
-                f"The guard's env {self.acceptance.settings['env']} does not play the episodes of "
-                "before: it is another simulator of that name. The policies are tried anew.",
-                stacklevel=2,
-            )
-            self._start_afresh(known)
-        self.state.mpc = self.session.mpc
-        self._handler = install(self.model, self.session.leave_accepted, sys._getframe())
-        self.session.policy.actor_step = self.state.step
+        self._final = None
+        player, settings = self.player, self.settings
+        with preserve_rng():
+            require_like_training(self.env, self.model.get_env(), f"The guard's env {settings.env}")
+        known: GuardState | None = getattr(self.model, "guard_state", None)
+        refusals: list[Decision] = []
+        goes_on = False
+        if known is not None and known.settings == settings.of_evidence:
+            player.max_input_step = known.max_input_step
+            goes_on = still_holds(known.evidence, player)
+            if not goes_on:
+                warnings.warn(
+                    f"The guard's env {settings.env} does not play the episodes of before: it is "
+                    "another simulator of that name. The policies are tried anew.",
+                    stacklevel=2,
+                )
+        if not goes_on:
+            player.max_input_step = None
+            evidence, leading, refusals = first_evidence(player, settings, known)
+            state = GuardState(settings.of_evidence, evidence, player.max_input_step)
+            if known is not None:  # other starts or another plant: what was decided stays
+                state.decisions, state.episodes = [*known.decisions], known.episodes
+            self.model.guard_state = state  # type: ignore[attr-defined]
+            leading.restore(player.policy)
+        restore = self._leave_accepted
+        self._handler = InterruptHandler.install(self.model, restore, sys._getframe())
+        player.policy.actor_step = self.state.step
         self._has_begun = True
+        self._record = None if self.log_path is None else Record(self.log_path, self.decisions)
+        for each in refusals:
+            self._log(each)
         self._folder = self._folder_of_accepted()
         self._save_accepted()
-        self._audit_rewards()
-        if self.log_path is not None:
-            self.session.log_lacks_rows = not begin_record(self.log_path, self.decisions)
+        self._begin_audit()
 
-    def _start_afresh(self, known: GuardState | None) -> None:
-        """Gather first evidence; where that fails, leave everything as it was."""
-        present = ActorCheckpoint.of(self.session.policy)
-        state = GuardState(self.acceptance.settings, present, evidence=None)
-        if known is not None:  # other starts or another plant: the policies are tried anew
-            state.decisions, state.episodes = [*known.decisions], known.episodes
-        self.model.guard_state = state  # type: ignore[attr-defined]
-        try:
-            self.acceptance.first_evidence(self.session, known)
-        except BaseException:
-            present.restore(self.session.policy)
-            self.model.guard_state = known  # type: ignore[attr-defined]
-            raise
-
-    def _audit_rewards(self) -> None:
+    def _begin_audit(self) -> None:
         """Begin to compare the first rewards with the stage cost, unless somebody does or did."""
         passed = all_callbacks(self.locals.get("callback"))
         if self._audit is None and not any(isinstance(each, CostAudit) for each in passed):
@@ -263,18 +326,69 @@ class ImprovementGuard(BaseCallback):
     def _on_step(self) -> bool:
         if self._audit is not None and self._audit.finding is None:
             self._audit.on_step()
-        dones = self.locals["dones"]
-        self.state.episodes += int(np.sum(dones))
+        dones, state = self.locals["dones"], self.state
+        state.episodes += int(np.sum(dones))
         self._warn_of_an_endless_episode(dones)
-        self.acceptance.step(self.session, dones)
+        last = state.last_trial
+        if np.any(dones) and (last is None or state.episodes - last >= self.settings.eval_freq):
+            state.last_trial = state.episodes
+            self._try_candidate()
         self._save_accepted()
         return True
+
+    def _try_candidate(self) -> None:
+        """Accept the present policy, whole or in part, or refuse it.
+
+        Until it is decided, the state is that of before: that is left where Ctrl-C cuts this off.
+        """
+        state, policy = self.state, self.player.policy
+        if state.accepted.is_actor_of(policy):
+            return
+        candidate = ActorCheckpoint.of(policy)
+        decided = decide(state.evidence, candidate, self.player, self.settings)
+        if decided is None:
+            return
+        state.evidence, decision = decided
+        if decision.restored:
+            state.accepted.restore(policy)
+        self._log(decision)
+
+    def _log(self, decision: Decision) -> None:
+        """Set the step size; write a decision to the record, to the logger and to the screen."""
+        state, logger = self.state, self.model.logger
+        step = self.step_size.after(state.step, decision)
+        state.step = self.player.policy.actor_step = step
+        decision = replace(
+            decision, timestep=self.model.num_timesteps, episode=state.episodes, step=step
+        )
+        state.decisions.append(decision)
+        names = ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step")
+        shown = {name: getattr(decision, name) for name in names}
+        for who in ("candidate", "accepted"):
+            change = relative_change(shown[f"{who}_cost"], decision.mpc_cost)
+            shown[f"{who}_change_percent"] = 100 * change
+        for name, value in shown.items():
+            if math.isfinite(value):  # that of a candidate that could not be played is not
+                logger.record(f"guard/{name}", value)
+        rejected = sum(each.verdict == "rejected" for each in state.decisions)
+        logger.record("guard/rejected", rejected)
+        logger.record("guard/accepted", len(state.decisions) - rejected)
+        logger.dump(self.model.num_timesteps)  # as EvalCallback does, or the next would replace it
+        if self.verbose:
+            print(decision)
+        if self._record is not None:
+            self._record.add(state.decisions)
+
+    def _leave_accepted(self) -> None:
+        """Restore the accepted policy where Ctrl-C is about to end `learn`, also in a trial."""
+        self.player.interrupted = True
+        restore_accepted(self.model)
 
     def _folder_of_accepted(self) -> Path | None:
         """Return where to save; warn of a callback whose best model is a candidate."""
         for each in all_callbacks(self.locals.get("callback")):
             if folder := getattr(each, "best_model_save_path", None):
-                instead = (self.save_path or Path(folder)) / ACCEPTED
+                instead = (self.save_path or Path(folder)) / ACCEPTED_FILE
                 warnings.warn(
                     f"The best_model.zip that {type(each).__name__} keeps in {folder} is a "
                     f"candidate, which no guard has accepted. Load {instead} instead, or the model "
@@ -286,25 +400,30 @@ class ImprovementGuard(BaseCallback):
 
     def _save_accepted(self) -> None:
         """Save the model with the accepted policy, if it is another one than was saved last."""
-        accepted = self.state.accepted
+        accepted, policy = self.state.accepted, self.player.policy
         if self._folder is None or accepted is self._saved:
             return
-        self._saved = accepted
+        path = self._folder / ACCEPTED_FILE
+        own = ActorCheckpoint.of(policy)
         try:
-            self.session.save_accepted(self._folder / ACCEPTED)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(path) as part:
+                accepted.restore(policy)
+                self.model.save(part)
+            self._saved = accepted
         except OSError as error:
             self._saved = None
-            warnings.warn(
-                f"{self._folder / ACCEPTED} could not be written ({error}). Training goes on.",
-                stacklevel=2,
-            )
+            warnings.warn(f"{path} could not be written ({error}). Training goes on.", stacklevel=2)
+        finally:
+            if not self.player.interrupted:
+                own.restore(policy)
 
     def _warn_of_an_endless_episode(self, dones: Any) -> None:
         self._steps = np.where(dones, 0, self._steps + 1)
-        if np.any(self._steps == LONG):
+        if np.any(self._steps == LONG_EPISODE):
             warnings.warn(
-                f"An episode of the training env has not ended after {LONG} steps, and the guard "
-                "decides at the ends of episodes. Give it a limit, by "
+                f"An episode of the training env has not ended after {LONG_EPISODE} steps, and the "
+                "guard decides at the ends of episodes. Give it a limit, by "
                 "gymnasium.wrappers.TimeLimit.",
                 stacklevel=2,
             )
@@ -313,14 +432,31 @@ class ImprovementGuard(BaseCallback):
         # The Zoo ends training after Ctrl-C as well, also before there is anything accepted.
         if not self._has_begun:
             return
-        self.session.interrupted = False
+        self.player.interrupted = False
         if self._audit is not None and self._audit.finding is None:
             self._audit.on_training_end()
         try:
-            self.acceptance.end(self.session)
+            self._end()
         finally:
             restore_accepted(self.model)
             self._save_accepted()
-            self.session.close()
+            self.player.close()
             if self._handler is not None:
                 self._handler.remove()
+
+    def _end(self) -> None:
+        """Try the last candidate, and confirm what is accepted on the final new starts."""
+        state, settings = self.state, self.settings
+        # There is no later: a candidate that is refused now is not kept.
+        state.evidence = replace(state.evidence, rejections=settings.patience - 1)
+        try:
+            self._try_candidate()
+        finally:
+            state.evidence = replace(state.evidence, rejections=0)
+        if state.accepted is self._final:  # the Zoo ends its first callback a second time
+            return
+        state.evidence, refusal = decide_at_end(state.evidence, self.player, settings)
+        self._final = state.accepted
+        state.accepted.restore(self.player.policy)
+        if refusal is not None:
+            self._log(refusal)

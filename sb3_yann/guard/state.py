@@ -1,4 +1,4 @@
-"""What the guard has decided so far, for a reader and for a run that goes on."""
+"""What a guard keeps: the evidence, its decisions and their record, the state of a model."""
 
 from __future__ import annotations
 
@@ -7,38 +7,108 @@ import io
 import math
 import os
 import warnings
-from dataclasses import asdict, dataclass, field, fields
+from collections import Counter
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._archive import atomic_write
-from sb3_yann._validation import Array
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann._validation import Array, check_type
+from sb3_yann.compare import Scores, Starts, Verdict, is_above, no_worse
+from sb3_yann.policy.checkpoint import ActorCheckpoint
+from sb3_yann.policy.policies import YannPolicy
 
-Verdict = Literal["accepted", "accepted in part", "rejected"]
+Outcome = Literal["accepted", "accepted in part", "rejected"]
+MAX_PASSED = 20
+"""Earlier accepted checkpoints that are kept, at most."""
+MAX_PASSED_BYTES = 10_000_000
+"""Their size, at most."""
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What a candidate is compared with.
+
+    Attributes
+    ----------
+    accepted, mpc : ActorCheckpoint
+        The policy accepted last, and the MPC with the weights that it goes on to learn from.
+    starts, scores : Starts and Scores
+        The known starts, hard ones that joined them included; the accepted policy's scores there.
+    next_seed, rejections : int, of the next new start; refusals in a row
+    passed : tuple of (ActorCheckpoint, Scores or None), the latest last
+        Earlier accepted checkpoints, with their scores on the first of the known starts.
+    """
+
+    accepted: ActorCheckpoint
+    mpc: ActorCheckpoint
+    starts: Starts
+    scores: Scores
+    next_seed: int
+    passed: tuple[tuple[ActorCheckpoint, Scores | None], ...] = ()
+    rejections: int = 0
+
+    def verdict(self, scores: Scores) -> Verdict:
+        """Return whether a policy is no worse on the known starts."""
+        starts = self.starts
+        return no_worse(scores, self.scores, starts.mpc, starts.tolerance, starts.n_starts)
+
+    def improves(self, scores: Scores) -> bool:
+        """Return whether the mean cost falls, and nothing speaks against the policy."""
+        return is_above(self.scores.costs, scores.costs) and self.verdict(scores).accepted
+
+    def with_accepted(self, checkpoint: ActorCheckpoint, scores: Scores) -> Evidence:
+        """Return the evidence with another accepted policy."""
+        return replace(self, accepted=checkpoint, scores=scores)
+
+    def with_visited(self, candidate: ActorCheckpoint, scores: Scores) -> Evidence:
+        """Return the evidence with a candidate accepted in the regions that its episodes visit.
+
+        In all regions where its networks count in another box of theta: no mixture was played.
+        """
+        visited = scores.visits.any(axis=0)
+        changed = self.accepted.changed_regions(candidate)
+        if self.accepted.is_confined_as(candidate) and np.any(changed & ~visited):
+            candidate = self.accepted.with_regions(candidate, np.flatnonzero(visited).tolist())
+        return self.with_accepted(candidate, scores)
+
+    def without_passed(self, checkpoint: ActorCheckpoint) -> Evidence:
+        """Return the evidence without an earlier checkpoint, which lost on new starts after all."""
+        passed = [each for each in self.passed if not each[0].has_networks_of(checkpoint)]
+        return replace(self, passed=tuple(passed))
+
+    def with_passed(self, checkpoint: ActorCheckpoint, scores: Scores | None) -> Evidence:
+        """Return the evidence with one more earlier checkpoint, as far as memory allows."""
+        kept = self.without_passed(checkpoint)
+        if checkpoint.has_networks_of(self.mpc):  # which is always there
+            return kept
+        passed = (*kept.passed, (checkpoint, scores))
+        most = min(len(passed), MAX_PASSED, max(1, MAX_PASSED_BYTES // checkpoint.size))
+        return replace(kept, passed=passed[-most:])
+
+
+@dataclass(frozen=True, kw_only=True)
 class Decision:
     """One decision of the guard.
 
     Parameters
     ----------
-    timestep, episode : int
-        Steps and episodes of training until then.
     verdict : str
         "accepted", "accepted in part" (the networks of some regions only) or "rejected".
+    candidate_cost, accepted_cost, mpc_cost : float
+        Mean cost of the candidate, the policy accepted now and the MPC, over the first
+        ``n_eval_episodes``: the same in each decision. The hard starts that joined them are left
+        out. That of a candidate that could not be played is nan; the reason says why.
+    timestep, episode : int
+        Steps and episodes of training until then.
     reason : str
         Why not all of it was accepted.
     restored : bool
         Whether the accepted checkpoint was restored.
-    candidate_cost, accepted_cost, mpc_cost : float
-        Mean cost of the candidate, the policy accepted now and the MPC, over the first
-        ``n_starts``: the same in each decision. The hard starts that joined them are left out.
-        That of a candidate that could not be played is nan; the reason says why.
     worst_start : float
         Largest excess of the accepted policy over the MPC on one of these starts.
     regions : tuple of int
@@ -51,22 +121,42 @@ class Decision:
     Examples
     --------
     >>> from sb3_yann import Decision
-    >>> Decision(9, 1, "accepted", "", False, 3.0, 3.0, 4.0, -0.5, (), 1.0).accepted_cost
-    3.0
+    >>> Decision(verdict="accepted", candidate_cost=3, accepted_cost=3, mpc_cost=4).step
+    1.0
     """
 
-    timestep: int
-    episode: int
-    verdict: Verdict
-    reason: str
-    restored: bool
+    timestep: int = 0
+    episode: int = 0
+    verdict: Outcome
+    reason: str = ""
+    restored: bool = False
     candidate_cost: float
     accepted_cost: float
     mpc_cost: float
-    worst_start: float
-    regions: tuple[int, ...]
-    step: float
+    worst_start: float = 0.0
+    regions: tuple[int, ...] = ()
+    step: float = 1.0
     share: float = 0.0
+
+    def __str__(self) -> str:
+        """Return a line for a reader."""
+        reason = f" ({self.reason})" if self.reason else ""
+        costs = [
+            f"{who} {_with_change(cost, self.mpc_cost)}"
+            for who, cost in (
+                ("candidate", self.candidate_cost),
+                ("accepted policy", self.accepted_cost),
+            )
+        ]
+        shown = ", ".join([*costs, f"MPC {self.mpc_cost:.6g}"])
+        return f"Episode {self.episode}: {self.verdict}{reason}; mean costs: {shown}"
+
+
+def _with_change(cost: float, mpc_cost: float) -> str:
+    if not math.isfinite(cost):
+        return "not known"
+    change = relative_change(cost, mpc_cost)
+    return f"{cost:.6g} ({100 * change:+.3g} %)" if math.isfinite(change) else f"{cost:.6g}"
 
 
 def relative_change(cost: float, mpc_cost: float) -> float:
@@ -81,129 +171,95 @@ class GuardState:
     Attributes
     ----------
     settings : dict, what the evidence depends on
-    accepted : ActorCheckpoint, the one accepted last
-    evidence : Evidence or None, what candidates are compared with
+    evidence : Evidence, what is accepted, and what candidates are compared with
+    max_input_step : ndarray, shape (m,), or None
+        How far inputs may move from one sample to the next.
     step : float, factor of the actor's learning rate
-    episodes, rejections : int, training episodes so far, and refusals in a row
-    new_starts, next_start : int, number of new starts so far, and the seed of the next
-    passed : list of (ActorCheckpoint, Outcome or None), the latest last
-        Earlier accepted checkpoints, with their outcomes on the first of the known starts.
+    episodes : int, training episodes so far
+    last_trial : int or None, training episodes until the last candidate
     decisions : list of Decision, all so far
-    input_step : ndarray, shape (m,), or None, how far inputs may move from one sample to the next
-    mpc : ActorCheckpoint or None, the MPC, with the weights that it goes on to learn from
-    last_trial : int or None, training episodes until the last trial in a simulator
     """
 
     settings: dict[str, Any]
-    accepted: ActorCheckpoint
-    evidence: Any
+    evidence: Evidence
+    max_input_step: Array | None = None
     step: float = 1.0
     episodes: int = 0
-    rejections: int = 0
-    new_starts: int = 0
-    next_start: int = 0
-    passed: list[tuple[ActorCheckpoint, Any]] = field(default_factory=list)
-    decisions: list[Decision] = field(default_factory=list)
-    input_step: Array | None = None
-    mpc: ActorCheckpoint | None = None
     last_trial: int | None = None
+    decisions: list[Decision] = field(default_factory=list)
 
-    def accept(self, checkpoint: ActorCheckpoint, evidence: Any) -> None:
-        """Make a checkpoint the accepted one."""
-        self.accepted, self.evidence = checkpoint, evidence
+    @property
+    def accepted(self) -> ActorCheckpoint:
+        """The policy accepted last."""
+        return self.evidence.accepted
 
 
-def log_last(
-    decisions: list[Decision],
-    model: BaseAlgorithm,
-    path: Path | None,
-    verbose: int,
-    anew: bool = False,
-) -> bool:
-    """Write the last decision to the CSV file, to the model's logger and to the screen.
+def restore_accepted(model: BaseAlgorithm) -> None:
+    """Give the model the policy that a guard accepted last, bit for bit.
 
-    Parameters
-    ----------
-    decisions, model : list of Decision and BaseAlgorithm
-        All decisions so far, and the model whose logger is used.
-    path, verbose : Path or None and int
-        The CSV file, if any, and whether to print.
-    anew : bool, default False
-        Whether the file lacks earlier decisions: then all are written.
+    `learn` does so at its end and after Ctrl-C. Call it after another exception, and for a model
+    that was saved during training. A model without a guard is a ValueError.
 
-    Returns
-    -------
-    bool
-        Whether the file holds all decisions. Training goes on where it does not: a warning says so.
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> from sb3_yann import ImprovementGuard, NoActionNoise, restore_accepted
+    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    >>> guard = ImprovementGuard("CSTR-v0", n_eval_episodes=2, n_new_starts=2)
+    >>> _ = model.learn(1, callback=[NoActionNoise(), guard])
+    >>> restore_accepted(model)
     """
-    last = decisions[-1]
-    names = ("candidate_cost", "accepted_cost", "mpc_cost", "worst_start", "step")
-    shown = {name: getattr(last, name) for name in names}
-    for who in ("candidate", "accepted"):
-        change = relative_change(shown[f"{who}_cost"], last.mpc_cost)
-        shown[f"{who}_change_percent"] = 100 * change
-    for name, value in shown.items():
-        if math.isfinite(value):  # that of a candidate that could not be played is not
-            model.logger.record(f"guard/{name}", value)
-    rejected = sum(each.verdict == "rejected" for each in decisions)
-    model.logger.record("guard/rejected", rejected)
-    model.logger.record("guard/accepted", len(decisions) - rejected)
-    model.logger.dump(model.num_timesteps)  # as EvalCallback does, or the next would replace it
-    if verbose:
-        reason = f" ({last.reason})" if last.reason else ""
-        told = [_told("candidate", last.candidate_cost, last.mpc_cost)]
-        told += [_told("accepted policy", last.accepted_cost, last.mpc_cost)]
-        told += [f"MPC {last.mpc_cost:.6g}"]
-        print(f"Episode {last.episode}: {last.verdict}{reason}; mean costs: {', '.join(told)}")
-    return path is None or write_record(path, decisions, anew)
+    check_type("model", model, BaseAlgorithm, "a DDPG or TD3 model")
+    state, policy = getattr(model, "guard_state", None), model.policy
+    if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
+        name = type(model).__name__
+        raise ValueError(f"No ImprovementGuard has been at work on this {name}: pass one to learn.")
+    state.accepted.restore(policy)
+    policy.actor_step = 1.0
 
 
-def _told(who: str, cost: float, mpc_cost: float) -> str:
-    if not math.isfinite(cost):
-        return f"{who} not known"
-    change = relative_change(cost, mpc_cost)
-    percent = f" ({100 * change:+.3g} %)" if math.isfinite(change) else ""
-    return f"{who} {cost:.6g}{percent}"
+class Record:
+    """The CSV file of a guard's decisions; training goes on where it cannot be written."""
 
+    def __init__(self, path: Path, decisions: list[Decision]) -> None:
+        """Write the decisions so far; keep what the file holds of another run beside it.
 
-def write_record(path: Path, decisions: list[Decision], anew: bool) -> bool:
-    """Add the last decision to a record, or write all anew; warn and return False if it fails."""
-    try:
-        if anew or not path.exists():
-            write_csv(path, decisions)
-        else:  # writing all of them would take ever longer
-            with path.open("a", newline="", encoding="utf-8") as file:
-                file.write(_rows(decisions[-1:], header=False))
-    except OSError as error:
-        warnings.warn(
-            f"The guard's record {path} could not be written ({error}). Training goes on, and "
-            "guard.decisions has all decisions; the record is completed once there is room.",
-            stacklevel=2,
-        )
-        return False
-    return True
+        A run that goes on from a checkpoint drops what it had decided after it.
+        """
+        self.path, self.is_complete = path, False
+        try:
+            ours, theirs = _rows(decisions, header=True), path.read_bytes().decode(errors="replace")
+            is_ours = ours.startswith(theirs) or (decisions != [] and theirs.startswith(ours))
+        except FileNotFoundError:
+            is_ours = True
+        except OSError:
+            is_ours = False
+        if not is_ours:
+            numbered = (path.with_name(f"{path.stem}.{i}{path.suffix}") for i in count(1))
+            beside = next(each for each in numbered if not each.exists())
+            os.rename(path, beside)
+            warnings.warn(
+                f"{path} held the record of another run: it is {beside} now.", stacklevel=2
+            )
+        self.add(decisions)
 
-
-def begin_record(path: Path, decisions: list[Decision]) -> bool:
-    """Write the decisions so far; what a file holds of another run is kept beside, with a warning.
-
-    A run that goes on from a checkpoint drops what it had decided after it. Returns whether they
-    could be written, as :func:`write_record` does.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            ours, theirs = _rows(decisions, header=True), file.read()
-        known = ours.startswith(theirs) or (decisions != [] and theirs.startswith(ours))
-    except FileNotFoundError:
-        known = True
-    except OSError:
-        known = False
-    if not known:
-        numbers = (path.with_name(f"{path.stem}.{i}{path.suffix}") for i in count(1))
-        beside = next(each for each in numbers if not each.exists())
-        os.rename(path, beside)
-        warnings.warn(f"{path} held the record of another run: it is {beside} now.", stacklevel=2)
-    return write_record(path, decisions, anew=True)
+    def add(self, decisions: list[Decision]) -> None:
+        """Write the last decision, or all where some are missing; warn where that fails."""
+        try:
+            if self.is_complete and self.path.exists():
+                with self.path.open("a", newline="", encoding="utf-8") as file:
+                    file.write(_rows(decisions[-1:], header=False))
+            else:  # to do so each time would take ever longer
+                write_csv(self.path, decisions)
+            self.is_complete = True
+        except OSError as error:
+            self.is_complete = False
+            warnings.warn(
+                f"The guard's record {self.path} could not be written ({error}). Training goes on, "
+                "and guard.decisions has all decisions; the record is completed once there is "
+                "room.",
+                stacklevel=2,
+            )
 
 
 def write_csv(path: Path, decisions: list[Decision]) -> None:
@@ -214,7 +270,6 @@ def write_csv(path: Path, decisions: list[Decision]) -> None:
 
 
 def _rows(decisions: list[Decision], header: bool) -> str:
-    """Return decisions as lines of a CSV file."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, [each.name for each in fields(Decision)])
     if header:
@@ -222,3 +277,63 @@ def _rows(decisions: list[Decision], header: bool) -> str:
     for each in decisions:
         writer.writerow({**asdict(each), "regions": " ".join(map(str, each.regions))})
     return text.getvalue()
+
+
+ADVICE = {
+    "too little a gain": "see by headroom(mpc, env) what there is to gain",
+    "new starts": "raise n_eval_episodes: the known starts do not show what the new ones do",
+    "violation": "bound the policy (max_correction), or tighten the MPC's own limits",
+    "the env ends": "bound the policy (max_correction), or tighten the MPC's own limits",
+    "finite": "lower the learning rate; CostAudit shows what the critic is told",
+    "too far": "take networks='shared', whose policy is continuous",
+    "costs": "bound the policy (max_correction), or allow the worst starts more (rule.margin)",
+    "mean cost": "see by headroom(mpc, env) what there is to gain, and by CostAudit whether the "
+    "reward is the MPC's cost",
+}
+"""What helps against a reason for a refusal that holds such words: the first one that does."""
+
+
+def summary_of(state: GuardState, policy: YannPolicy) -> str:
+    """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
+    decisions, n_starts = state.decisions, len(state.settings["seeds"])
+    cost = float(state.evidence.scores.costs[:n_starts].mean())
+    mpc_cost = float(state.evidence.starts.mpc.costs[:n_starts].mean())
+    more = "less" if cost < mpc_cost else "more"
+    change = relative_change(cost, mpc_cost)
+    size = f"{100 * abs(change):.2g} % {more}" if math.isfinite(change) else more
+    line = f"costs {cost:.6g}, {size} than the MPC's {mpc_cost:.6g}, on {n_starts} starts."
+    if state.accepted.has_networks_of(state.evidence.mpc):
+        line = f"is the MPC: it costs {mpc_cost:.6g} on {n_starts} starts."
+    elif abs(cost - mpc_cost) <= 1e-3 * abs(mpc_cost):
+        line = (
+            f"is not the MPC, and gains nothing: it costs {cost:.6g} on {n_starts} starts, the MPC "
+            f"{mpc_cost:.6g}."
+        )
+    lines = [f"The policy accepted last {line}"]
+    if not state.accepted.is_actor_of(policy):
+        lines.append(
+            "The model's policy is another one, which no guard has accepted: "
+            "restore_accepted(model) gives it the accepted one."
+        )
+    if not decisions:
+        updates, needed = int(policy.critic_updates), policy.critic_warmup
+        lines.append("The guard has tried no candidate yet.")
+        if updates <= needed:
+            lines.append(
+                f"The critic has had {updates} updates, and the actor moves after critic_warmup = "
+                f"{needed}. Train longer, or lower critic_warmup."
+            )
+        return "\n".join(lines)
+    counts = Counter(each.verdict for each in decisions)
+    lines.append(
+        f"Candidates: {counts['accepted']} accepted, {counts['accepted in part']} in part, "
+        f"{counts['rejected']} refused, in {decisions[-1].episode} episodes."
+    )
+    refused = [each.reason for each in decisions if each.verdict == "rejected"]
+    kinds = [next((words for words in ADVICE if words in why), why) for why in refused]
+    if kinds:
+        kind, times = Counter(kinds).most_common(1)[0]
+        lines.append(f"Refused most often ({times} times): {refused[kinds.index(kind)]}.")
+        if kind in ADVICE:
+            lines.append(f"What may help: {ADVICE[kind]}.")
+    return "\n".join(lines)

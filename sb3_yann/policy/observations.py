@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -235,6 +235,12 @@ def _default(problem: LinearMPC, takes: str) -> str:
         return "deviation"
     why = "u_ss is zero: absolute inputs are deviations" if unknown else f"it takes {takes} inputs"
     raise ValueError(f"What the env shows cannot be told from what it takes ({why}). {SAY}.")
+
+
+def normalized(model: BaseAlgorithm, observations: Any) -> Any:
+    """Return observations as a model's policy has them, of an env below any VecNormalize."""
+    normalize = model.get_vec_normalize_env()
+    return observations if normalize is None else normalize.normalize_obs(np.asarray(observations))
 
 
 def require_frozen(normalize: VecNormalize) -> None:

@@ -14,7 +14,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import atomic_write
 from sb3_yann.audit import Headroom
-from sb3_yann.evaluation.episodes import Source, as_seeds
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.reporting.evidence_parts import (
@@ -29,6 +28,7 @@ from sb3_yann.reporting.html import Html, clean, page, paragraph, table, tag
 from sb3_yann.reporting.loop_parts import distance_part, loops_part, statistics_part
 from sb3_yann.reporting.problem_parts import constraints_part, law_part, plant_part
 from sb3_yann.reporting.subject import Part, Subject
+from sb3_yann.rollout import Source, as_seeds
 from sb3_yann.twin import PlantTwin
 
 TITLE = "Report on a policy that starts as an MPC"

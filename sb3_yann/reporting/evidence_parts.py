@@ -20,10 +20,10 @@ from sb3_yann.commissioning.improve import fingerprint
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.evaluation.plots import decisions_figure, headroom_figure, twin_figure
 from sb3_yann.guard import Decision
-from sb3_yann.guard.simulator_acceptance import name_of
-from sb3_yann.guard.summary import summary_of
+from sb3_yann.guard.state import summary_of
 from sb3_yann.reporting.html import Html, join, lines, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import Finding, Part, Subject, left_out, make_finding
+from sb3_yann.rollout import name_of
 
 MAX_ROWS = 3000  # decisions in the table; of more, refusals in the middle are left out
 
@@ -54,9 +54,9 @@ def guard_part(subject: Subject) -> Part:
         is_range = isinstance(value, range)
         rows.append([name, f"{value.start} to {value.stop - 1}" if is_range else str(value)])
     if subject.guard is not None:
-        given = subject.guard.acceptance
-        names = ("n_new_starts", "n_final_starts", "eval_every", "patience", "keep_if_worse")
-        rows += [[name, str(getattr(given, name))] for name in names if hasattr(given, name)]
+        given = subject.guard.settings
+        names = ("n_new_starts", "n_final_starts", "eval_freq", "patience", "keep_if_worse")
+        rows += [[name, str(getattr(given, name))] for name in names]
         rule = asdict(given.rule).items()
         rows += [[f"rule: {name}", str(v)] for name, v in rule if name not in state.settings]
     settings = [[name if ":" in name else name.replace("_", " "), text] for name, text in rows]

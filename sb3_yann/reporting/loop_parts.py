@@ -41,8 +41,8 @@ def loops_part(subject: Subject) -> Part:
         "and by the policy from the same start, without any noise of actions. A cost is minus the "
         "sum of the rewards."
     )
-    evidence = getattr(subject.state, "evidence", None)
-    known = {*getattr(evidence, "seeds", ())} & {*subject.seeds}
+    state = subject.state
+    known = set() if state is None else {*state.evidence.starts.seeds} & {*subject.seeds}
     warning = (
         f"{len(known)} of these starts are known to the guard, which chose the policy by them: "
         "what they say is too favorable. Pass other seeds."

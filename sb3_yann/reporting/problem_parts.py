@@ -15,10 +15,10 @@ from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of, missing_observer, with_units
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
-from sb3_yann.evaluation.episodes import Episodes
 from sb3_yann.evaluation.law_plots import ActiveConstraints, regions_figure
 from sb3_yann.reporting.html import Html, join, lines, number, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import MPC, POLICY, Finding, Part, Subject, make_finding
+from sb3_yann.rollout import Trajectories
 
 
 def plant_part(subject: Subject) -> Part:
@@ -104,7 +104,7 @@ def constraints_part(subject: Subject) -> Part:
     return Part("Constraints register", join([paragraph(*sentences), table(head, rows)]), findings)
 
 
-def _bound_findings(problem: LinearMPC, loops: dict[str, Episodes]) -> tuple[Finding, ...]:
+def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple[Finding, ...]:
     """Return whether the policy exceeds bounds of the problem by more than the MPC does."""
     mpc, policy = (excess_of_episodes(problem, _pairs(loops[who])) for who in (MPC, POLICY))
     is_worse = bool(
@@ -140,7 +140,7 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Episodes]) -> tuple[Fin
     return tuple(found)
 
 
-def _pairs(episodes: Episodes) -> Iterator[tuple[Array, Array]]:
+def _pairs(episodes: Trajectories) -> Iterator[tuple[Array, Array]]:
     return zip(episodes.observations, episodes.actions, strict=True)
 
 

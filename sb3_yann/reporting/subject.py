@@ -16,12 +16,12 @@ from sb3_yann.commissioning.improve import Improvement, fingerprint
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.choice import Law
-from sb3_yann.evaluation.episodes import Episodes, Source, evaluate, one_env
 from sb3_yann.guard import ImprovementGuard
-from sb3_yann.guard.simulator_acceptance import name_of
 from sb3_yann.guard.state import GuardState
+from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import YannPolicy
 from sb3_yann.reporting.html import Html, tag
+from sb3_yann.rollout import Source, Trajectories, evaluate, name_of, one_env
 from sb3_yann.twin import PlantTwin
 
 POLICY, MPC = "policy", "MPC"
@@ -131,7 +131,7 @@ class Subject:
         return "" if function is None else name_of(function)
 
     @cached_property
-    def loops(self) -> dict[str, Episodes] | None:
+    def loops(self) -> dict[str, Trajectories] | None:
         """The closed loops of MPC and policy: theta and inputs in deviations; None without env."""
         if self.env is None:
             return None
@@ -155,15 +155,10 @@ class Subject:
 
     def act_as_policy(self, observations: Any) -> Any:
         """Return the policy's actions for observations of the env."""
-        return self.model.predict(self._normalized(observations), deterministic=True)[0]
-
-    def _normalized(self, observations: Any) -> Any:
-        """Return observations of the env, which is below any VecNormalize, as the policy does."""
-        normalize = self.model.get_vec_normalize_env()
-        return observations if normalize is None else normalize.normalize_obs(observations)
+        return self.model.predict(normalized(self.model, observations), deterministic=True)[0]
 
     def _theta(self, observations: Any) -> Array:
-        theta = self.policy.theta(self._normalized(np.asarray(observations)))
+        theta = self.policy.theta(normalized(self.model, observations))
         return np.asarray(theta.double().cpu().numpy())
 
     @cached_property

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC
-from sb3_yann.audit.closed_loops import play
+from sb3_yann.rollout import rollout
 
 MPC = LinearMPC(LinearModel([[1.0]], [[1.0]], 1.0), Q=[[1]], R=[[1]], horizon=2, x_min=-4, x_max=4,
                 u_min=-1, u_max=1)  # fmt: skip
@@ -40,12 +40,14 @@ class Dock(gym.Env[Any, Any]):
 
 
 def moving(u: float) -> Any:
-    return lambda t, theta, running: np.full((len(theta), 1), u)
+    return lambda t, theta, rows: np.full((len(theta), 1), u)
 
 
 @pytest.mark.parametrize(("tells", "u", "fine"), [(True, -1, 1), (False, -1, 0), (True, 1, 0)])
 def test_only_a_success_may_end_sooner(tells, u, fine) -> None:
-    slow, quick = (play(MPC, lambda: Dock(tells), [0], moving(each)) for each in (0.0, u))
+    slow, quick = (
+        rollout(moving(each), lambda: Dock(tells), [0], problem=MPC) for each in (0.0, u)
+    )
     assert quick.lengths < slow.lengths
     assert quick.no_worse(slow)[0] == bool(fine)
     assert slow.no_worse(quick)[0]

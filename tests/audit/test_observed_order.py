@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC, headroom
-from sb3_yann.audit.closed_loops import of_law, play
+from sb3_yann.audit.closed_loops import of_law
 from sb3_yann.audit.observed_order import warn_of_order
+from sb3_yann.rollout import rollout
 from sb3_yann_envs import problems
 
 A = np.array([[0.9, 0.3, 0.0], [0.0, 0.7, 0.2], [0.1, 0.0, 0.5]])
@@ -44,8 +45,8 @@ class Shuffled(gym.Env):
 
 
 def told(env: gym.Env, mpc: LinearMPC = MPC, episodes: int = 3) -> list[str]:
-    loops = play(mpc, lambda: env, [0], of_law(mpc))
-    steps = [np.concatenate([part] * episodes) for part in loops.steps()]
+    played = rollout(of_law(mpc), lambda: env, [0], problem=mpc)
+    steps = [np.concatenate([part] * episodes) for part in played.steps()]
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         warn_of_order(mpc, *steps, stacklevel=2)

@@ -12,8 +12,9 @@ import pytest
 from stable_baselines3 import DDPG
 
 from sb3_yann import CostMismatchWarning, LinearModel, LinearMPC, Tracking, headroom, improve
-from sb3_yann.audit.closed_loops import of_law, play
-from sb3_yann.audit.own_reward import as_reward, below_set_points, warn_of_own_reward
+from sb3_yann.audit.closed_loops import of_law
+from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
+from sb3_yann.rollout import Trajectories, as_reward, rollout
 from sb3_yann.wrappers import SetPoint, StageCost
 from sb3_yann_envs import problems
 
@@ -68,10 +69,10 @@ SAME = {
 
 
 def told(env, problem: LinearMPC, seeds: int = 4) -> list[str]:
-    loops = play(problem, env, range(seeds), of_law(problem))
+    played = rollout(of_law(problem), env, range(seeds), problem=problem)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        warn_of_own_reward(problem, loops.thetas, loops.inputs, loops.rewards, stacklevel=2)
+        warn_of_own_reward(problem, played, stacklevel=2)
     return [str(each.message) for each in found]
 
 
@@ -117,10 +118,18 @@ def test_a_reward_that_knows_nothing_of_the_set_points_is_none() -> None:
 
 def test_a_few_steps_and_a_plant_at_rest_say_nothing() -> None:
     problem = mpc()
-    theta, u, rewards = np.ones((10, 1, 2)), np.zeros((9, 1, 1)), np.arange(9.0)[:, None]
-    warn_of_own_reward(problem, theta, u, rewards, stacklevel=2)  # nine steps
-    theta, u = np.zeros((31, 1, 2)), np.zeros((30, 1, 1))
-    warn_of_own_reward(problem, theta, u, np.arange(30.0)[:, None], stacklevel=2)
+    for steps, theta in ((9, 1.0), (30, 0.0)):
+        thetas, inputs = np.full((steps + 1, 2), theta), np.zeros((steps, 1))
+        none, rewards = np.zeros(1, dtype=int), np.arange(float(steps))
+        played = Trajectories(
+            none.astype(float),
+            none,
+            (thetas,),
+            (inputs,),
+            none.astype(bool),
+            own_rewards=(rewards,),
+        )
+        warn_of_own_reward(problem, played, stacklevel=2)
 
 
 def test_a_reward_is_a_number_or_none() -> None:

@@ -26,7 +26,7 @@ from sb3_yann.commissioning.comparison import (
 )
 from sb3_yann.commissioning.plant import Plant
 from sb3_yann.commissioning.watchdog import Alarm
-from sb3_yann.evaluation.episodes import one_env
+from sb3_yann.rollout import one_env
 from twin_samples import Cart, problem
 from weights import is_mpc
 

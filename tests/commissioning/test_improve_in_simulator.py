@@ -191,8 +191,8 @@ def test_plans_that_lose_to_the_mpc_teach_nothing(monkeypatch) -> None:
     assert len(teacher.thetas) == len(teacher.inputs) == (1 + imitation.NEARBY) * rows
 
     class Wrong(Planning):
-        def __call__(self, t, theta, running):
-            return 0 * super().__call__(t, theta, running) + 0.8
+        def __call__(self, t, theta, rows):
+            return 0 * super().__call__(t, theta, rows) + 0.8
 
     monkeypatch.setattr(imitation, "Planning", Wrong)
     teacher = imitation.Teacher(grounds, 0)

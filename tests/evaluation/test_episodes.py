@@ -10,9 +10,8 @@ from stable_baselines3 import DDPG
 
 import unit_samples as units
 from sb3_yann import YannPolicy
-from sb3_yann.audit.closed_loops import maker
-from sb3_yann.evaluation import Episodes, evaluate
-from sb3_yann.evaluation.episodes import EnvPool
+from sb3_yann.evaluation import Trajectories, evaluate
+from sb3_yann.rollout import EnvPool, maker
 from sb3_yann.wrappers import Deviations
 from sb3_yann_envs import problems
 
@@ -101,7 +100,7 @@ def test_a_policy_that_has_learnt_does_the_same_side_by_side_to_rounding() -> No
         np.testing.assert_allclose(one, other, atol=1e-4)
 
 
-def assert_equal(one: Episodes, other: Episodes) -> None:
+def assert_equal(one: Trajectories, other: Trajectories) -> None:
     np.testing.assert_array_equal(one.costs, other.costs)
     np.testing.assert_array_equal(one.violations, other.violations)
     for name in ("observations", "actions"):
@@ -232,7 +231,7 @@ def test_a_pool_keeps_so_many_envs_and_none_after_an_error(monkeypatch) -> None:
     def fails(observation):
         raise RuntimeError("this policy fails")
 
-    monkeypatch.setattr(EnvPool, "MOST", 2)
+    monkeypatch.setattr(EnvPool, "MAX_KEPT", 2)
     before, pool = Countdown.open, EnvPool(Countdown)
     evaluate(Tenth(), pool, [3, 1, 4])
     assert Countdown.open == before + 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC, SoftBounds, Tracking
-from sb3_yann.evaluation import Episodes, evaluate
+from sb3_yann.evaluation import Trajectories, evaluate
 from sb3_yann.evaluation.plots import (
     RegionUse,
     fit_figure,
@@ -34,11 +34,11 @@ def tank(**options) -> LinearMPC:
     return LinearMPC(model, Q=[[1]], R=[[1]], **{**given, **limits, **options})
 
 
-def episodes(count: int, size: int = 1, steps: int = 5) -> Episodes:
+def episodes(count: int, size: int = 1, steps: int = 5) -> Trajectories:
     x = [np.full((steps + 1, size), k / count) for k in range(count)]
     u = [np.full((steps, 1), -k / count) for k in range(count)]
     none = np.zeros(count, int)
-    return Episodes(np.ones(count), none, tuple(x), tuple(u), none.astype(bool))
+    return Trajectories(np.ones(count), none, tuple(x), tuple(u), none.astype(bool))
 
 
 def test_few_episodes_are_lines_in_plant_units() -> None:
@@ -69,7 +69,7 @@ def test_bands_of_several_controllers_are_lines_that_hide_nothing() -> None:
 
 def test_episodes_that_have_ended_count_no_more() -> None:
     long, short = episodes(8), episodes(8, steps=2)
-    both = Episodes(
+    both = Trajectories(
         np.ones(16), np.zeros(16, int), (*long.observations, *short.observations),
         (*long.actions, *short.actions), np.zeros(16, bool),
     )  # fmt: skip

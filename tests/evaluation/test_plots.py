@@ -8,7 +8,7 @@ from matplotlib.image import imread
 
 from sb3_yann import LinearModel, LinearMPC, Tracking
 from sb3_yann.evaluation import (
-    Episodes,
+    Trajectories,
     comparison_table,
     plots,
     save_plant_trajectories,
@@ -16,10 +16,10 @@ from sb3_yann.evaluation import (
 )
 
 
-def fake(costs: list[float]) -> Episodes:
+def fake(costs: list[float]) -> Trajectories:
     steps, count = np.linspace(0, 1, 11)[:, None], len(costs)
     none = np.zeros(count, int)
-    return Episodes(
+    return Trajectories(
         np.array(costs), none, (steps,) * count, (steps[1:],) * count, none.astype(bool)
     )
 
@@ -63,7 +63,9 @@ def test_a_picture_is_in_the_units_of_the_plant_with_its_names(
 ) -> None:
     x = np.ones((11, 3))
     x[-1, 2] = 9  # the set-point of a step that is not taken
-    played = Episodes(np.ones(1), np.zeros(1, int), (x,), (np.zeros((10, 1)),), np.zeros(1, bool))
+    played = Trajectories(
+        np.ones(1), np.zeros(1, int), (x,), (np.zeros((10, 1)),), np.zeros(1, bool)
+    )
     monkeypatch.setattr(plots, "save_figure", lambda figure, path, dpi: figure)
     panels = save_plant_trajectories("run.png", {"mpc": played}, tank(), "s", **options).axes
     assert [panel.get_ylabel() for panel in panels] == labels

@@ -22,7 +22,7 @@ from experiments.yardsticks import (
 )
 from sample_plants import Recorder
 from sb3_yann.control import lqr as formulas
-from sb3_yann.evaluation.episodes import evaluate
+from sb3_yann.rollout import evaluate
 from sb3_yann_envs import problems
 
 ENVS = ["CSTR-v0", "ClippedPendulum-v0"]

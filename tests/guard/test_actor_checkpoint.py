@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,10 +9,10 @@ import pytest
 import torch as th
 
 from guard_samples import LEFT, REGION, RIGHT, actor_bits, build, correct, randomize
-from sb3_yann.guard import new_starts
-from sb3_yann.guard.actor_checkpoint import LARGEST, ActorCheckpoint, diverged
-from sb3_yann.guard.episodes import Outcome
-from sb3_yann.guard.new_starts import drop_passed, keep_passed
+from sb3_yann.compare import Scores, Starts, Tolerance
+from sb3_yann.guard import state
+from sb3_yann.guard.state import Evidence
+from sb3_yann.policy.checkpoint import DIVERGED_SIZE, ActorCheckpoint
 from weights import last_layer
 
 
@@ -109,16 +108,14 @@ def test_regions_of_another_come_with_their_targets() -> None:
 
 @pytest.mark.parametrize(
     ("value", "bad"),
-    [(0.0, False), (LARGEST, False), (-LARGEST, False), (1.01 * LARGEST, True), (-2e9, True),
-     (np.nan, True), (np.inf, True)],
+    [(0.0, False), (DIVERGED_SIZE, False), (-DIVERGED_SIZE, False), (1.01 * DIVERGED_SIZE, True),
+     (-2e9, True), (np.nan, True), (np.inf, True)],
 )  # fmt: skip
 def test_a_parameter_beyond_a_thousand_million_has_diverged(value: float, bad: bool) -> None:
     policy = build().policy
     with th.no_grad():
         last_layer(policy)[0, 0, 0] = value
     assert ActorCheckpoint.of(policy).has_diverged() == bad
-    assert diverged(policy.actor.parameters()) == bad
-    assert diverged([th.zeros(2), th.tensor([1.0, value])]) == bad
 
 
 def test_its_size_counts_actor_target_and_two_moments_of_what_is_trained() -> None:
@@ -133,26 +130,30 @@ def test_its_size_counts_actor_target_and_two_moments_of_what_is_trained() -> No
 
 def test_what_passed_is_kept_once_the_latest_last_and_as_far_as_memory_allows(monkeypatch) -> None:
     policy, mpc, _ = pair()
-    session: Any = SimpleNamespace(mpc=mpc, state=SimpleNamespace(passed=[]))
-    kept = session.state.passed
     some = []
     for value in (0.1, 0.2, 0.3, 0.4):
         correct(policy, RIGHT, value)
         some.append(ActorCheckpoint.of(policy))
-    nothing = Outcome(np.zeros(1), np.zeros((1, 7)), np.zeros((1, 3), bool))
-    for each in (*some[:3], some[0]):
-        keep_passed(session, each, nothing)
-    assert [each for each, _ in kept] == [some[1], some[2], some[0]]
-    assert all(had is nothing for _, had in kept)
-    keep_passed(session, mpc, nothing)  # it is always there
-    assert len(kept) == 3
-    drop_passed(session, some[2])
-    assert [each for each, _ in kept] == [some[1], some[0]]
-    monkeypatch.setattr(new_starts, "MOST_KEPT", 2)
-    keep_passed(session, some[3], None)
-    assert [each for each, _ in kept] == [some[0], some[3]]
+    scores = Scores(np.zeros(1), np.zeros((1, 7)), np.zeros((1, 3), bool))
+    evidence = Evidence(mpc, mpc, Starts((0,), scores, Tolerance(1.0), 1), scores, next_seed=1)
+    for each in (*some[:3], some[0], mpc):  # the MPC is always there
+        evidence = evidence.with_passed(each, scores)
+    assert [each for each, _ in evidence.passed] == [some[1], some[2], some[0]]
+    assert all(had is scores for _, had in evidence.passed)
+    evidence = evidence.without_passed(some[2])
+    assert [each for each, _ in evidence.passed] == [some[1], some[0]]
+    monkeypatch.setattr(state, "MAX_PASSED", 2)
+    evidence = evidence.with_passed(some[3], None)
+    assert [each for each, _ in evidence.passed] == [some[0], some[3]]
     for room, left in ((2.0, 2), (1.99, 1), (0.1, 1)):
-        monkeypatch.setattr(new_starts, "MEMORY", int(room * mpc.size))
-        keep_passed(session, some[1], None)
-        keep_passed(session, some[2], None)
-        assert [each for each, _ in kept] == [some[1], some[2]][-left:]
+        monkeypatch.setattr(state, "MAX_PASSED_BYTES", int(room * mpc.size))
+        found = evidence.with_passed(some[1], None).with_passed(some[2], None)
+        assert [each for each, _ in found.passed] == [some[1], some[2]][-left:]
+
+
+def test_a_checkpoint_knows_whether_it_has_learned_anything() -> None:
+    policy, before, after = pair()
+    assert not before.has_learned() and after.has_learned()
+    assert not after.shrunk(0.0).has_learned()
+    randomize(policy, 0.3)
+    assert ActorCheckpoint.of(policy).has_learned()

@@ -23,7 +23,8 @@ from guard_samples import (
     make_guard,
     train,
 )
-from sb3_yann.guard.interrupt import Handler
+from sb3_yann.guard import callback
+from sb3_yann.guard.start import InterruptHandler
 from weights import is_mpc
 
 
@@ -54,14 +55,14 @@ def interrupted(model, steps: int, *callbacks: BaseCallback) -> None:
 
 
 def test_between_two_steps_the_candidate_gives_way_to_what_was_accepted() -> None:
-    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
+    model, guard = build(learning_rate=0.0), make_guard(eval_freq=100)
     interrupted(model, 40, At([5], better), guard, At([17], ctrl_c))
     assert is_mpc(model)  # no trial has been
 
 
 @pytest.mark.parametrize("part", ["actor", "critic"])
 def test_in_the_midst_of_a_gradient_step_as_well(monkeypatch, part) -> None:
-    model, guard = build(), make_guard(eval_every=100)
+    model, guard = build(), make_guard(eval_freq=100)
     optimizer = getattr(model, part).optimizer
     step, taken = optimizer.step, []
 
@@ -111,12 +112,12 @@ def test_a_simulator_that_swallows_it_ends_the_training_all_the_same() -> None:
 
 
 def test_where_the_end_of_training_fails_the_accepted_policy_is_left(monkeypatch) -> None:
-    def fail(_) -> None:
+    def fail() -> None:
         raise OSError("the simulator is gone")
 
     before = signal.getsignal(signal.SIGINT)
-    model, guard = build(gradient_steps=0), make_guard(eval_every=100)
-    monkeypatch.setattr(guard.acceptance, "end", fail)
+    model, guard = build(gradient_steps=0), make_guard(eval_freq=100)
+    monkeypatch.setattr(guard, "_end", fail)
     with pytest.raises(OSError, match="gone"):
         train(model, 8, At([5], better), guard)
     left(model)
@@ -127,7 +128,7 @@ def test_a_handler_of_ones_own_that_raises_nothing_goes_unnoticed() -> None:
     seen = []
     before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
     try:
-        model, guard = build(), make_guard(eval_every=100)
+        model, guard = build(), make_guard(eval_freq=100)
         candidate = []
         train(
             model,
@@ -143,7 +144,7 @@ def test_a_handler_of_ones_own_that_raises_nothing_goes_unnoticed() -> None:
 
 def test_learn_again_and_again_and_the_handler_is_the_one_before() -> None:
     before = signal.getsignal(signal.SIGINT)
-    model, guard = build(), make_guard(eval_every=100)
+    model, guard = build(), make_guard(eval_freq=100)
     train(model, 8, guard)
     assert signal.getsignal(signal.SIGINT) is before
     interrupted(model, 20, guard, At([7], ctrl_c))
@@ -156,7 +157,7 @@ def test_after_another_error_the_handler_only_passes_on() -> None:
         raise OSError("the plant is gone")
 
     before = signal.getsignal(signal.SIGINT)
-    model, guard = build(learning_rate=0.0), make_guard(eval_every=100)
+    model, guard = build(learning_rate=0.0), make_guard(eval_freq=100)
     with pytest.raises(OSError, match="gone"):
         train(model, 20, guard, At([5], better), At([6], fail))
     candidate = bits(model.policy.actor.state_dict())
@@ -167,7 +168,7 @@ def test_after_another_error_the_handler_only_passes_on() -> None:
 
 
 def test_a_checkpoint_in_between_holds_no_handler(tmp_path) -> None:
-    model, guard = build(), make_guard(eval_every=100)
+    model, guard = build(), make_guard(eval_freq=100)
     interrupted(model, 20, guard, CheckpointCallback(4, str(tmp_path)), At([13], ctrl_c))
     paths = sorted(tmp_path.glob("*.zip"))
     assert len(paths) == 3
@@ -175,14 +176,14 @@ def test_a_checkpoint_in_between_holds_no_handler(tmp_path) -> None:
     for path in paths:
         again = type(model).load(path)
         assert signal.getsignal(signal.SIGINT) is handler
-        assert not any(isinstance(each, Handler) for each in vars(again).values())
+        assert not any(isinstance(each, InterruptHandler) for each in vars(again).values())
         assert np.isfinite(again.predict(np.zeros(1, np.float32))[0]).all()
 
 
-@pytest.mark.parametrize("where", ["start", "first_evidence"])
+@pytest.mark.parametrize("where", ["require_like_training", "first_evidence"])
 def test_before_anything_is_accepted_the_end_of_training_is_none(monkeypatch, where) -> None:
     model, guard = build(), make_guard()
-    monkeypatch.setattr(guard.acceptance, where, ctrl_c)
+    monkeypatch.setattr(callback, where, ctrl_c)
     with pytest.raises(KeyboardInterrupt):
         train(model, 8, guard)
     guard.on_training_end()  # as RL Zoo does after Ctrl-C, before it saves the model

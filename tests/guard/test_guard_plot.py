@@ -20,7 +20,10 @@ from sb3_yann_envs import problems
 
 
 def decision(episode: int, verdict: str, cost: float, accepted: float, restored=False) -> Decision:
-    return Decision(9, episode, verdict, "why", restored, cost, accepted, 10.0, 0.0, (), 1.0)
+    return Decision(
+        episode=episode, verdict=verdict, reason="why", restored=restored, candidate_cost=cost,
+        accepted_cost=accepted, mpc_cost=10.0,
+    )  # fmt: skip
 
 
 DECISIONS = [
@@ -92,7 +95,7 @@ def test_a_twin_draws_its_evidence() -> None:
 @pytest.mark.slow
 def test_pictures_reach_tensorboard(tmp_path) -> None:
     model = DDPG("YannPolicy", "CSTR-v0", device="cpu", tensorboard_log=str(tmp_path))
-    guard = ImprovementGuard("CSTR-v0", n_starts=2, n_new_starts=0)
+    guard = ImprovementGuard("CSTR-v0", n_eval_episodes=2, n_new_starts=0)
     pictures = FigureLog({"guard/picture": guard.plot, "law": decisions_figure_of_none}, every=4)
     model.learn(10, callback=[NoActionNoise(), guard, pictures])
     (run,) = tmp_path.iterdir()

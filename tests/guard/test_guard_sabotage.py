@@ -14,7 +14,6 @@ from guard_samples import (
     MPC,
     RIGHT,
     STEPS,
-    STRICT,
     At,
     Slide,
     accepted_bits,
@@ -29,11 +28,11 @@ from guard_samples import (
     overwrite,
     randomize,
     train,
+    tried,
     verdicts,
     worse,
 )
-from sb3_yann import ImprovementGuard, NonFiniteWarning, StepSize
-from sb3_yann.evaluation.episodes import evaluate
+from sb3_yann import NonFiniteWarning, StepSize
 from weights import first_layer, is_mpc, later_layer
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -49,9 +48,15 @@ SABOTAGE = {
 STATES = np.linspace(-5, 5, 101, dtype=np.float32)[:, None]
 
 
-@ALGORITHMS
-@pytest.mark.parametrize("sabotage", SABOTAGE.values(), ids=SABOTAGE)
-@pytest.mark.parametrize("place", ["before the guard", "after the guard"])
+@pytest.mark.parametrize(
+    ("algorithm", "sabotage", "place"),
+    [
+        *((DDPG, each, "before the guard") for each in SABOTAGE.values()),
+        (DDPG, randomize, "after the guard"),
+        (TD3, blow_up, "before the guard"),
+        (TD3, worse, "after the guard"),
+    ],
+)
 def test_a_sabotaged_actor_is_rejected_and_restored_bit_for_bit(algorithm, sabotage, place) -> None:
     # Without learning: what is not the accepted policy's is the sabotage's.
     model, guard = build(algorithm, gradient_steps=0), make_guard()
@@ -71,8 +76,7 @@ def test_a_sabotaged_actor_is_rejected_and_restored_bit_for_bit(algorithm, sabot
     assert bits(model.policy.actor.state_dict()) == seen[0]
 
 
-@ALGORITHMS
-@pytest.mark.parametrize("sabotage", [worse, randomize], ids=["worse", "random"])
+@pytest.mark.parametrize(("algorithm", "sabotage"), [(DDPG, worse), (TD3, randomize)])
 def test_amid_learning_actor_target_and_moments_return_to_those_last_accepted(
     algorithm, sabotage
 ) -> None:
@@ -126,16 +130,6 @@ def test_a_policy_that_diverged_before_training_gives_way_to_the_mpc(value) -> N
     assert not np.isnan(guard.decisions[0].accepted_cost)
 
 
-def test_a_policy_that_is_better_before_training_is_kept() -> None:
-    model, guard = build(gradient_steps=0), make_guard()
-    better(model.policy)
-    before = actor_bits(model.policy)
-    train(model, 2 * STEPS, guard)
-    assert actor_bits(model.policy) == before == accepted_bits(guard)
-    assert guard.decisions == []
-    assert guard.state.evidence.paired.costs.mean() < guard.state.evidence.paired.mpc_costs.mean()
-
-
 @pytest.mark.parametrize("margin", [0.0, 0.01])
 def test_equal_costs_neither_refuse_a_policy_before_training_nor_a_candidate(margin) -> None:
     class Indifferent(Slide):
@@ -154,28 +148,12 @@ def test_equal_costs_neither_refuse_a_policy_before_training_nor_a_candidate(mar
 
 
 def test_sabotage_before_a_second_learn_is_rejected_too() -> None:
-    model, guard = build(gradient_steps=0), make_guard()
-    train(model, STEPS, At([1], better), guard)
+    model, guard = tried(better)
     before = actor_bits(model.policy)
     randomize(model.policy)
     train(model, 2 * STEPS, guard)
     assert verdicts(guard) == ["accepted", "rejected"]
     assert actor_bits(model.policy) == before
-
-
-@pytest.mark.slow
-@ALGORITHMS
-def test_the_final_model_is_the_accepted_policy_also_when_loaded(algorithm, tmp_path) -> None:
-    model, guard = build(algorithm), make_guard(patience=3)
-    train(model, 10 * STEPS + 1, guard, At([4 * STEPS, 10 * STEPS + 1], randomize))
-    assert bits(model.policy.actor.state_dict()) == bits(guard.state.accepted.actor)
-    model.save(tmp_path / "model")
-    loaded = algorithm.load(tmp_path / "model", device="cpu")
-    np.testing.assert_array_equal(loaded.predict(STATES)[0], model.predict(STATES)[0])
-    assert bits(loaded.guard_state.accepted.actor) == bits(loaded.policy.actor.state_dict())
-    played = evaluate(model, Slide, guard.acceptance.seeds)
-    np.testing.assert_allclose(played.costs, guard.state.evidence.paired.costs, atol=1e-6)
-    assert np.all(played.costs <= guard.state.evidence.paired.mpc_costs + 1e-2)
 
 
 @pytest.mark.slow
@@ -191,8 +169,8 @@ def test_a_violation_is_rejected_at_once_though_the_cost_falls_and_patience_is_l
     env = partial(Slide, limits=(-1.1, -0.6))  # positive starts: the MPC's -1 is allowed
     env = partial(env, low=3.0)
     model = build(env=env(), gradient_steps=0)
-    guard = make_guard(partial(Slide, limits=(-1.1, -0.6), low=3.9), patience=5)
-    guard.acceptance.seeds = range(2)
+    simulator = partial(Slide, limits=(-1.1, -0.6), low=3.9)
+    guard = make_guard(simulator, patience=5, n_eval_episodes=2, seed=0)
     train(model, 2 * STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
     assert verdicts(guard) == ["rejected"]
     assert guard.decisions[0].restored
@@ -229,17 +207,6 @@ def test_patience_begins_anew_when_it_was_spent() -> None:
     move = At(range(STEPS, 7 * STEPS, STEPS), lambda p: correct(p, RIGHT, next(left)))
     train(model, 6 * STEPS + 1, move, guard)
     assert [each.restored for each in guard.decisions[:6]] == [False, False, True] * 2
-
-
-@pytest.mark.parametrize("sabotage", [worse, randomize, partial(overwrite, value=np.nan)])
-def test_with_the_default_patience_what_is_worse_than_the_mpc_returns_at_once(sabotage) -> None:
-    model, guard = build(gradient_steps=0), ImprovementGuard(Slide, n_starts=10, rule=STRICT)
-    before = actor_bits(model.policy)
-    seen: list[bool] = []
-    look = At([2 * STEPS], lambda policy: seen.append(actor_bits(policy) == before))
-    train(model, 2 * STEPS + 1, At([2 * STEPS], sabotage), guard, look)
-    assert seen == [True]
-    assert verdicts(guard) == ["rejected"]
 
 
 def test_with_patience_left_the_end_returns_all_the_same_and_says_so() -> None:
@@ -279,7 +246,7 @@ def test_the_step_multiplies_the_actor_s_learning_rate() -> None:
 
 
 def test_candidates_are_tried_every_so_many_episodes_and_at_the_end() -> None:
-    model, guard = build(gradient_steps=0), make_guard(eval_every=3)
+    model, guard = build(gradient_steps=0), make_guard(eval_freq=3)
     values = iter(np.linspace(0.1, 0.3, 20))
     train(
         model, 9 * STEPS, At(range(1, 100), lambda p: correct(p, RIGHT, next(values, 0.3))), guard

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 
-import gymnasium as gym
-import numpy as np
 import pytest
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from guard_samples import (
-    RIGHT,
     STEPS,
     At,
     Slide,
@@ -20,7 +17,6 @@ from guard_samples import (
     bits,
     buffer_bits,
     build,
-    correct,
     critic_bits,
     env_random_states,
     make_guard,
@@ -30,7 +26,8 @@ from guard_samples import (
     verdicts,
 )
 from sb3_yann import ImprovementGuard
-from sb3_yann.guard.statistics import PairedEpisodes
+from sb3_yann.compare import Verdict
+from sb3_yann.guard.state import Evidence
 from weights import is_mpc
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DDPG, TD3])
@@ -56,7 +53,7 @@ def after_training(algorithm, *guards: ImprovementGuard, **kwargs):
 def test_a_run_whose_candidates_are_all_accepted_is_the_run_without_a_guard(
     algorithm, env, monkeypatch
 ) -> None:
-    monkeypatch.setattr(PairedEpisodes, "objection", lambda *_: "")
+    monkeypatch.setattr(Evidence, "verdict", lambda *_: Verdict())
     guard = make_guard(Slide() if env == "an instance" else env)
     free, expected = after_training(algorithm)
     model, state = after_training(algorithm, guard)
@@ -69,7 +66,7 @@ def test_a_run_whose_candidates_are_all_accepted_is_the_run_without_a_guard(
 def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
     algorithm, monkeypatch
 ) -> None:
-    monkeypatch.setattr(PairedEpisodes, "objection", lambda *_: "no")
+    monkeypatch.setattr(Evidence, "verdict", lambda *_: Verdict("no"))
     free, expected = after_training(algorithm)
     model, state = after_training(algorithm, guard := make_guard(patience=1000, keep_if_worse=True))
     assert set(verdicts(guard)) == {"rejected"}
@@ -82,7 +79,7 @@ def test_while_patience_lasts_rejections_change_nothing_but_the_final_actor(
 def test_a_guard_that_rejects_everything_leaves_the_mpc_while_the_critic_learns(
     algorithm, monkeypatch
 ) -> None:
-    monkeypatch.setattr(PairedEpisodes, "objection", lambda *_: "no")
+    monkeypatch.setattr(Evidence, "verdict", lambda *_: Verdict("no"))
     fresh = build(algorithm)
     seen: list[bool] = []
     look = At(range(STEPS, 9 * STEPS, STEPS), lambda p: seen.append(is_mpc(p)))
@@ -105,13 +102,13 @@ def test_a_check_moves_no_random_state_and_not_the_training_env(monkeypatch) -> 
         after = random_states(), env_random_states(model), model.env.envs[0].unwrapped.played
         checks.append(before == after)
 
-    for name in ("start", "first_evidence", "step", "end"):
-        method = getattr(guard.acceptance, name)
-        monkeypatch.setattr(guard.acceptance, name, partial(unchanged, method))
+    for name in ("_on_training_start", "_try_candidate", "_end"):
+        method = getattr(guard, name)
+        monkeypatch.setattr(guard, name, partial(unchanged, method))
     randomize(model.policy)  # the MPC takes its place: that builds an actor
     train(model, 3 * STEPS, guard, At([STEPS], better))
     assert "rejected" in verdicts(guard)
-    assert len(checks) == 3 * STEPS + 3
+    assert len(checks) == 6
     assert all(checks)
 
 
@@ -129,14 +126,3 @@ def test_two_training_envs_side_by_side_count_their_episodes_together() -> None:
     assert [each.episode for each in guard.decisions] == [2]
     assert guard.decisions[0].timestep == 2 * STEPS
     assert guard.state.episodes == 4
-
-
-@pytest.mark.slow
-def test_id_instance_and_factory_are_the_same_simulator() -> None:
-    costs = []
-    for env in ("Slide-v0", Slide(), Slide, lambda: gym.make("Slide-v0")):
-        model, guard = build(gradient_steps=0), make_guard(env)
-        train(model, STEPS, At([1], partial(correct, region=RIGHT, value=0.4)), guard)
-        costs.append(guard.state.evidence.paired.costs)
-    for each in costs[1:]:
-        np.testing.assert_allclose(each, costs[0], atol=1e-6)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from guard_samples import At, Slide, better, build, make_guard, train
-from sb3_yann.guard.state import Decision
-from sb3_yann.guard.summary import ADVICE, summary_of
+from sb3_yann.guard.state import ADVICE, Decision, summary_of
 
 
 def decision(verdict: str, accepted: float, reason: str = "", mpc: float = 40.0) -> Decision:
-    return Decision(9, 7, verdict, reason, False, 1.0, accepted, mpc, 0.0, (), 1.0)
+    return Decision(
+        timestep=9, episode=7, verdict=verdict, reason=reason, candidate_cost=1.0,
+        accepted_cost=accepted, mpc_cost=mpc,
+    )  # fmt: skip
 
 
 def said_of(
@@ -28,9 +30,8 @@ def said_of(
     state: Any = SimpleNamespace(
         decisions=decisions,
         settings={"seeds": range(n)},
-        evidence=SimpleNamespace(accepted=costs, mpc=mpc),
+        evidence=SimpleNamespace(scores=costs, starts=SimpleNamespace(mpc=mpc), mpc=checkpoint),
         accepted=checkpoint,
-        mpc=checkpoint,
     )
     policy: Any = SimpleNamespace(critic_updates=updates, critic_warmup=5)
     return summary_of(state, policy).splitlines()

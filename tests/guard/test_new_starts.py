@@ -23,6 +23,7 @@ from guard_samples import (
     correct,
     make_guard,
     train,
+    tried,
 )
 from weights import is_mpc, last_layer
 
@@ -58,8 +59,7 @@ def spoil_left(policy) -> None:
 
 
 def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_lose() -> None:
-    model, guard = build(gradient_steps=0), make_guard(OftenRight, n_new_starts=20)
-    train(model, STEPS, At([STEPS], spoil_left), guard)
+    model, guard = tried(spoil_left, env=OftenRight, n_new_starts=20)
     decision = guard.decisions[0]
     assert decision.verdict == "accepted in part"
     assert "7 of 20 new starts lose against the MPC, seed 1000" in decision.reason
@@ -67,16 +67,9 @@ def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_
     assert decision.regions == (REGION[RIGHT],)
     weights = last_layer(model)[:, :, -1]
     assert not weights[REGION[LEFT]].any() and weights[REGION[RIGHT]].any()
-    known = guard.state.evidence.seeds
+    known = guard.state.evidence.starts.seeds
     assert known[:10] == tuple(range(FIRST, FIRST + 10))
     assert len(known) == 17 and all(seed % 3 == 0 for seed in known[10:])
-
-
-def test_without_new_starts_it_passes() -> None:
-    model, guard = build(gradient_steps=0), make_guard(OftenRight, n_new_starts=0)
-    train(model, STEPS, At([STEPS], spoil_left), guard)
-    assert [each.verdict for each in guard.decisions] == ["accepted"]
-    assert guard.state.evidence.seeds == tuple(range(FIRST, FIRST + 10))
 
 
 @pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
@@ -84,7 +77,7 @@ def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, 
     model = build(gradient_steps=0)
     guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=final, rule=WHOLE)
     train(model, STEPS, At([STEPS], spoil_left), guard)
-    assert guard.state.new_starts == seeds
+    assert guard.state.evidence.next_seed == FIRST + 10 + seeds
     assert is_mpc(model) == (final is not None)
     if final is not None:
         assert guard.decisions[-1].reason.startswith("at the end, 10 of 30 new starts lose")
@@ -107,7 +100,7 @@ def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> No
     first, second = guard.decisions[:2]
     assert "new starts" in first.reason
     assert "new starts" not in second.reason and "costs" in second.reason
-    assert guard.state.new_starts == 20  # the second was refused before any other start was asked
+    assert guard.state.evidence.next_seed == FIRST + 30
 
 
 def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() -> None:
@@ -133,16 +126,6 @@ def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() 
     assert guard.decisions[-1].accepted_cost == pytest.approx(guard.decisions[-1].mpc_cost)
 
 
-def test_of_what_was_accepted_before_the_regions_that_do_not_lose_are_kept() -> None:
-    simulator = partial(OftenRight, after=FIRST + 30)
-    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20)
-    second = At([2 * STEPS], lambda policy: correct(policy, RIGHT, 0.1))  # would be no better
-    train(model, 2 * STEPS, At([STEPS], spoil_left), second, guard)
-    weights = last_layer(model)[:, 0, -1]
-    assert weights[REGION[RIGHT]] == 0.5 and weights[REGION[LEFT]] == 0
-    assert actor_bits(model.policy) == accepted_bits(guard)
-
-
 def test_violations_on_new_starts_are_refused_though_they_cost_less() -> None:
     # On the left the better input, -1 + 0.5, is beyond the limit; the MPC's own, -1, is not.
     class Brittle(OftenRight):
@@ -162,14 +145,13 @@ def test_violations_on_new_starts_are_refused_though_they_cost_less() -> None:
 def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
     # Only the very last of them shows the left.
     simulator = partial(OftenRight, left_of=1, after=FIRST + 10 + 20 + 199)
-    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20)
-    train(model, STEPS, At([STEPS], spoil_left), guard)
+    model, guard = tried(spoil_left, env=simulator, n_new_starts=20)
     whole, end = guard.decisions
     assert whole.verdict == "accepted"
     assert end.verdict == "accepted in part" and end.reason.startswith("at the end, 1 of 200 new")
     assert not last_layer(model)[REGION[LEFT], :, -1].any()
     assert actor_bits(model.policy) == accepted_bits(guard)
-    assert guard.state.evidence.seeds[10:] == (FIRST + 10 + 20 + 199,)
+    assert guard.state.evidence.starts.seeds[10:] == (FIRST + 10 + 20 + 199,)
 
 
 def test_new_starts_are_others_each_time_and_after_a_load(tmp_path) -> None:
@@ -180,18 +162,17 @@ def test_new_starts_are_others_each_time_and_after_a_load(tmp_path) -> None:
             seen.append(seed)
             return super().reset(seed=seed, options=options)
 
-    model, guard = build(gradient_steps=0), make_guard(Counting, n_new_starts=5)
-    train(model, STEPS, At([STEPS], better), guard)
+    model, guard = tried(better, env=Counting, n_new_starts=5)
     new = {seed for seed in seen if seed is not None and seed >= FIRST + 10}
     assert new == set(range(FIRST + 10, FIRST + 10 + 5 + 50))
-    assert guard.state.new_starts == 55
+    assert guard.state.evidence.next_seed == FIRST + 65
     model.save(tmp_path / "model")
     loaded = type(model).load(tmp_path / "model", env=Slide())
-    assert loaded.guard_state.new_starts == 55
+    assert loaded.guard_state.evidence.next_seed == FIRST + 65
 
 
 def test_the_mpc_itself_is_not_tried() -> None:
     env = gym.make("Slide-v0")
     model, guard = build(gradient_steps=0), make_guard(env.unwrapped, n_new_starts=20)
     train(model, 2 * STEPS, guard)
-    assert guard.state.new_starts == 0
+    assert guard.state.evidence.next_seed == FIRST + 10

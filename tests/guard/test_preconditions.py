@@ -14,21 +14,26 @@ from stable_baselines3 import DDPG
 from guard_samples import LAW, STEPS, At, Slide, better, build, make_guard, train, verdicts
 from sb3_yann import AcceptanceRule, ImprovementGuard, StepSize
 from sb3_yann.evaluation import evaluate
-from sb3_yann.guard.simulator_acceptance import SimulatorAcceptance, name_of
+from sb3_yann.guard.decide import GuardSettings
+from sb3_yann.rollout import name_of
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"env": 3}, TypeError, "env = 3 must be a simulator of the plant: the id of an environment"),
     ({"env": None}, TypeError, "env = None .* On a plant without a simulator use Commissioning"),
     ({"env": ["CSTR-v0"]}, TypeError, r"env = \['CSTR-v0'\] must be"),
-    ({"n_starts": 0}, ValueError, "n_starts = 0 must be a whole number of at least 1"),
-    ({"n_starts": 2.5}, ValueError, "n_starts = 2.5 must be a whole number"),
-    ({"n_starts": True}, ValueError, "n_starts = True must be a whole number"),
+    (
+        {"n_eval_episodes": 0},
+        ValueError,
+        "n_eval_episodes = 0 must be a whole number of at least 1",
+    ),
+    ({"n_eval_episodes": 2.5}, ValueError, "n_eval_episodes = 2.5 must be a whole number"),
+    ({"n_eval_episodes": True}, ValueError, "n_eval_episodes = True must be a whole number"),
     ({"seed": -1}, ValueError, "seed = -1 must be a whole number of at least 0"),
     ({"n_new_starts": -1}, ValueError, "n_new_starts = -1 must be a whole number of at least 0"),
     ({"n_final_starts": -1}, ValueError, "n_final_starts = -1 must be a whole number of at least"),
     ({"n_final_starts": True}, ValueError, "n_final_starts = True must be a whole number"),
-    ({"eval_every": 0}, ValueError, "eval_every = 0 must be"),
-    ({"eval_every": None}, ValueError, "eval_every = None must be"),
+    ({"eval_freq": 0}, ValueError, "eval_freq = 0 must be"),
+    ({"eval_freq": None}, ValueError, "eval_freq = None must be"),
     ({"patience": 0}, ValueError, "patience = 0 must be"),
     ({"keep_if_worse": 1}, TypeError, "keep_if_worse = 1 must be True or False"),
     ({"rule": {"margin": -0.1}}, ValueError, "margin = -0.1 must be"),
@@ -37,7 +42,7 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"rule": {"significance": 0.6}}, ValueError, "significance = 0.6 must be between 0 and 0.5"),
     ({"rule": {"by_region": "no"}}, TypeError, "by_region = 'no' must be True or False"),
     ({"rule": 0.01}, TypeError, r"rule = 0.01 .*=AcceptanceRule\(\.\.\.\), or a m"),
-    ({"rule": {"fresh": 3}}, TypeError, "rule has no 'fresh'. .* margin, tail, by_region"),
+    ({"rule": {"fresh": 3}}, TypeError, "rule has no 'fresh'. .* margin, cvar_alpha, by_region"),
     ({"rule": StepSize()}, TypeError, "rule = StepSize.* must be"),
     ({"step_size": {"shrink": 1.5}}, ValueError, "shrink = 1.5 must be between 0 and 1"),
     ({"step_size": {"grow": 0.9}}, ValueError, "grow = 0.9 must be a finite number of at least 1"),
@@ -55,12 +60,8 @@ def test_a_bad_argument_is_named_with_its_value(arguments, error, message) -> No
 def test_options_are_the_same_from_a_mapping_as_yaml_has_it() -> None:
     one = ImprovementGuard(Slide, rule={"margin": 0.5}, step_size={"grow": 2.0})
     other = ImprovementGuard(Slide, rule=AcceptanceRule(margin=0.5), step_size=StepSize(grow=2.0))
-    assert one.acceptance == other.acceptance
+    assert one.settings == other.settings
     assert one.step_size == other.step_size
-
-
-def test_an_id_alone_is_enough() -> None:
-    assert isinstance(ImprovementGuard("CSTR-v0"), ImprovementGuard)
 
 
 @pytest.mark.parametrize("name", ["state", "decisions"])
@@ -92,7 +93,7 @@ def other_actions(low: float) -> gym.Env:
 
 @pytest.mark.parametrize("env", [two_observations, partial(other_actions, -2)])
 def test_a_simulator_of_another_shape_is_refused(env) -> None:
-    with pytest.raises(ValueError, match="Give the guard a simulator of this plant"):
+    with pytest.raises(ValueError, match="Give it a simulator of this plant"):
         train(build(), STEPS, make_guard(env))
 
 
@@ -106,26 +107,19 @@ def test_an_unknown_id_is_gymnasium_s_own_error() -> None:
         train(build(), STEPS, make_guard("Sldie-v0"))
 
 
-def test_what_is_given_reaches_the_acceptance_and_what_is_not_has_its_default() -> None:
-    plain = ImprovementGuard(Slide).acceptance
-    assert plain == SimulatorAcceptance(
-        "Slide", range(1_000_000, 1_000_100), 50, 500, 1, 5, False, AcceptanceRule()
-    )
-    some = ImprovementGuard(
-        "CSTR-v0", n_starts=7, n_new_starts=3, n_final_starts=2, seed=40, eval_every=6, patience=8,
-        keep_if_worse=True, rule={"margin": 0.5},
-    ).acceptance  # fmt: skip
+def test_what_is_given_reaches_the_settings_and_what_is_not_has_its_default() -> None:
     rule = AcceptanceRule(margin=0.5)
-    assert some == SimulatorAcceptance("CSTR-v0", range(40, 47), 3, 2, 6, 8, True, rule)
-    assert some.settings == {
-        "env": "CSTR-v0",
-        "seeds": range(40, 47),
-        "margin": 0.5,
-        "tail": 0.05,
-        "excess_room": 1e-3,
-    }
-    bounded = ImprovementGuard(Slide, n_new_starts=4, rule={"largest_step": 2.0}).acceptance
-    assert bounded.n_final_starts == 40 and bounded.settings["largest_step"] == 2.0
+    given = {"n_new_starts": 3, "n_final_starts": 2, "eval_freq": 6, "patience": 8}
+    some = ImprovementGuard(
+        "CSTR-v0", n_eval_episodes=7, seed=40, keep_if_worse=True, rule={"margin": 0.5}, **given
+    ).settings
+    assert some == GuardSettings("CSTR-v0", range(40, 47), **given, keep_if_worse=True, rule=rule)
+    plain = ImprovementGuard(Slide).settings
+    assert plain == GuardSettings(
+        "Slide", range(1_000_000, 1_000_100), n_new_starts=50, n_final_starts=500, eval_freq=1,
+        patience=5, keep_if_worse=False, rule=AcceptanceRule(),
+    )  # fmt: skip
+    assert ImprovementGuard(Slide, n_new_starts=4).settings.n_final_starts == 40
 
 
 def test_a_simulator_may_be_named_by_its_module_as_in_a_yaml_file() -> None:
@@ -194,20 +188,20 @@ def test_starts_that_are_all_the_same_are_told_and_one_alone_is_not() -> None:
         UserWarning, match="All 10 starts of the guard's env .* are one and the same"
     ):
         begun(same)
-    begun(same, n_starts=1)
+    begun(same, n_eval_episodes=1)
 
 
-def test_how_far_an_input_may_move_is_a_multiple_of_the_mpc_s_largest_step() -> None:
-    guard = begun(Slide, rule={"largest_step": 2.0})
+def test_how_far_an_input_may_move_is_a_multiple_of_the_mpc_s_max_input_step() -> None:
+    guard = begun(Slide, rule={"max_input_step": 2.0})
     episodes = evaluate(LAW, Slide, range(1_000_000, 1_000_010))
     most = max(np.abs(np.diff(each, axis=0)).max() for each in episodes.actions)
-    np.testing.assert_allclose(guard.state.input_step, [2 * most + 2e-6], rtol=1e-6)
-    assert begun(Slide).state.input_step is None
+    np.testing.assert_allclose(guard.state.max_input_step, [2 * most + 2e-6], rtol=1e-6)
+    assert begun(Slide).state.max_input_step is None
 
 
 def test_the_tolerance_is_a_share_of_the_mpc_s_median_cost() -> None:
-    evidence = begun(Slide, rule=AcceptanceRule(margin=0.02, tail=0.1)).state.evidence
+    evidence = begun(Slide, rule=AcceptanceRule(margin=0.02, cvar_alpha=0.1)).state.evidence.starts
     typical = np.median(evidence.mpc.costs)
     found = evidence.tolerance
-    assert (found.margin, found.tail, found.typical) == (0.02 * typical, 0.1, typical)
+    assert (found.margin, found.cvar_alpha, found.typical) == (0.02 * typical, 0.1, typical)
     assert evidence.n_starts == 10 and evidence.seeds == (*range(1_000_000, 1_000_010),)

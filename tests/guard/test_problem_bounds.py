@@ -20,10 +20,9 @@ from sb3_yann import (
     OutputBounds,
     SoftBounds,
 )
-from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.compare import Scores, Tolerance, less_safe, no_worse, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.evaluation import evaluate
-from sb3_yann.guard.statistics import PairedEpisodes, Tolerance
 from sb3_yann.wrappers import StageCost
 from weights import first_layer, last_layer
 
@@ -77,10 +76,9 @@ def test_a_policy_that_is_cheaper_beyond_a_hard_bound_is_refused(kind: str) -> N
     assert played[1].costs.mean() < played[0].costs.mean()
     found = [excess_of_episodes(mpc, zip(p.observations, p.actions, strict=True)) for p in played]
     unsafe = [unsafe_columns(0, 0, 0, each) for each in found]
-    paired = PairedEpisodes(played[0].costs, played[0].costs, unsafe[0], Tolerance(1e9))
-    assert "a larger excess over the problem's bounds" in paired.objection(
-        played[1].costs, unsafe[1]
-    )
+    mpc_scores, scores = (Scores(p.costs, u) for p, u in zip(played, unsafe, strict=True))
+    reason = no_worse(scores, mpc_scores, mpc_scores, Tolerance(1e9)).reason
+    assert "a larger excess over the problem's bounds" in reason
     assert not less_safe(unsafe[0], unsafe[0]).any()
     assert found[0].largest.max() < 1e-3
 
@@ -117,8 +115,8 @@ def test_the_guard_never_accepts_a_faster_policy_than_the_bounds_let(kind: str) 
     assert max(np.abs(each[:, 1]).max() for each in pushed.observations) > 1.1 * LIMIT
     model = DDPG("YannPolicy", make(), policy_kwargs=options, device="cpu", seed=0,
                  learning_starts=10**6)  # fmt: skip
-    rule = {"retreat": False, "by_region": False}
-    guard = ImprovementGuard(make, n_starts=4, n_new_starts=4, n_final_starts=4, rule=rule)
+    rule = {"backtrack": False, "by_region": False}
+    guard = ImprovementGuard(make, n_eval_episodes=4, n_new_starts=4, n_final_starts=4, rule=rule)
     model.learn(24, callback=[NoActionNoise(), At([6], push), guard])
     log = evaluate(model, make, range(20, 24))
     assert guard.decisions[0].verdict == "rejected"

@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch as th
 from stable_baselines3 import DDPG, TD3
 
 from guard_samples import (
@@ -24,20 +23,14 @@ from guard_samples import (
     correct,
     make_guard,
     train,
+    tried,
     verdicts,
 )
-from sb3_yann.evaluation.episodes import evaluate
-from sb3_yann.guard import region_mixing as guard_regions
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.guard import decide
+from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import YannPolicy
-from weights import first_layer, is_learnt, is_mpc, last_layer
-
-
-@th.no_grad()
-def spoil_center(policy: YannPolicy) -> None:
-    first_layer(policy)[REGION[CENTER], ..., :-1] = 3.0
-    first_layer(policy)[REGION[CENTER], ..., -1] = 0.0
-    last_layer(policy)[REGION[CENTER]] = 3.0
+from sb3_yann.rollout import evaluate
+from weights import is_learnt, last_layer
 
 
 def half_good(policy: YannPolicy) -> None:
@@ -87,11 +80,10 @@ def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorit
 
 
 def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
-    model, guard = build(gradient_steps=0), make_guard()
-    train(model, STEPS, At([STEPS], half_good), guard)
+    model, guard = tried(half_good)
     assert guard.decisions[0].regions == (REGION[RIGHT],)
-    played = evaluate(model, Slide, guard.acceptance.seeds)
-    np.testing.assert_allclose(guard.state.evidence.paired.costs, played.costs, atol=1e-5)
+    played = evaluate(model, Slide, guard.settings.seeds)
+    np.testing.assert_allclose(guard.state.evidence.scores.costs, played.costs, atol=1e-5)
     assert guard.decisions[0].accepted_cost == pytest.approx(played.costs.mean())
     assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
     assert guard.decisions[0].candidate_cost > guard.decisions[0].mpc_cost
@@ -102,48 +94,24 @@ def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
 def test_only_the_starts_that_come_through_a_region_are_played_again(
     most_lost, monkeypatch
 ) -> None:
-    monkeypatch.setattr(guard_regions, "MOST_LOST", most_lost)
+    monkeypatch.setattr(decide, "MAX_LOST_SHARE", most_lost)
     simulator = Slide()
     model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=0)
     count: list[int] = []
     before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
     train(model, STEPS, At([STEPS], half_good), before, guard, after)
     assert guard.decisions[0].regions == (REGION[RIGHT],)
-    left, right = guard.state.evidence.visits[:, [REGION[LEFT], REGION[RIGHT]]].sum(0)
+    left, right = guard.state.evidence.scores.visits[:, [REGION[LEFT], REGION[RIGHT]]].sum(0)
     assert 0 < left < right < 10
     # One by one, the candidate's own episodes stand for those that come through one region only.
     episodes = 10 if most_lost == 0 else 10 + left
     assert count[1] - count[0] == episodes * STEPS
 
 
-def test_a_region_that_no_start_comes_through_is_never_taken_over() -> None:
-    simulator = partial(Slide, low=2.0)
-    model, guard = build(gradient_steps=0), make_guard(simulator)
-
-    def change(policy) -> None:
-        spoil_center(policy)
-        correct(policy, RIGHT, 0.5)
-        correct(policy, LEFT, -0.5)
-
-    train(model, STEPS, At([STEPS], change), guard)
-    assert not guard.state.evidence.visits[:, REGION[LEFT]].any()
-    assert guard.decisions[0].regions == (REGION[RIGHT],)
-    assert not last_layer(model)[REGION[LEFT], :, -1].any()
-
-
-def test_without_by_region_the_whole_returns() -> None:
-    model, guard = build(gradient_steps=0), make_guard(rule={"by_region": False})
-    train(model, STEPS, At([STEPS], half_good), guard)
-    assert verdicts(guard) == ["rejected"]
-    assert guard.decisions[0].regions == ()
-    assert is_mpc(model)
-
-
 def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
     # To the right half the input violates; nothing else does.
     simulator = partial(Slide, low=-4.0, limits=(-1.1, 0.9))
-    model, guard = build(gradient_steps=0), make_guard(simulator)
-    train(model, STEPS, At([STEPS], lambda policy: correct(policy, RIGHT, 2.0)), guard)
+    _, guard = tried(lambda policy: correct(policy, RIGHT, 2.0), env=simulator)
     assert verdicts(guard) == ["rejected"]
     assert "violations" in guard.decisions[0].reason
 

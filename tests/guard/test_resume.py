@@ -26,7 +26,7 @@ from resumed import (
 )
 from sb3_yann.policy import policies
 
-RARE = {"eval_every": 3}
+RARE = {"eval_freq": 3}
 """A candidate after every third episode."""
 
 
@@ -83,4 +83,4 @@ def test_the_mpc_that_is_restored_has_the_same_weights_after_loading(tmp_path) -
     model.save(tmp_path / "model")
     again, other = DDPG.load(tmp_path / "model", env=envs(1), device="cpu"), guard_in_simulator()
     train(again, 1, other, reset_num_timesteps=False)
-    assert all_bits(other.session.mpc) == all_bits(guard.session.mpc)
+    assert all_bits(other.player.mpc) == all_bits(guard.player.mpc)

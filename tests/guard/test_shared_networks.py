@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch as th
 
-from guard_samples import STEPS, At, accepted_bits, actor_bits, build, make_guard, train
+from guard_samples import STEPS, At, accepted_bits, actor_bits, build, make_guard, train, tried
 from sb3_yann.policy.policies import YannPolicy
 from weights import first_layer, is_mpc, last_layer
 
@@ -36,8 +36,7 @@ def test_a_better_network_is_accepted_and_a_worse_one_is_not(actor) -> None:
 
 @SHARED
 def test_nothing_of_a_bad_network_is_accepted_in_part(actor) -> None:
-    model, guard = build(gradient_steps=0, actor=actor), make_guard(n_new_starts=0)
-    train(model, STEPS, At([STEPS], lambda policy: push(policy, -0.4)), guard)
+    model, guard = tried(lambda policy: push(policy, -0.4), actor=actor, n_new_starts=0)
     assert guard.decisions[0].verdict not in ("accepted", "accepted in part")
     assert guard.decisions[0].regions == ()
     assert is_mpc(model)

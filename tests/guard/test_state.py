@@ -34,6 +34,7 @@ from guard_samples import (
     verdicts,
 )
 from sb3_yann import Decision
+from sb3_yann.guard import callback
 from sb3_yann.guard import state as record
 
 NAMES = [each.name for each in dataclasses.fields(Decision)]
@@ -176,7 +177,9 @@ def test_verbose_prints_a_line_for_each_decision_and_silence_is_the_default(caps
 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 @pytest.mark.parametrize("place", ["before the guard", "after the guard"])
-def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place, tmp_path) -> None:
+def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(
+    algorithm, place, tmp_path, monkeypatch
+) -> None:
     model, guard = build(algorithm), make_guard(log_path=tmp_path / "guard.csv")
     stop = 4 * STEPS
     save = CheckpointCallback(stop, str(tmp_path), "model")
@@ -184,28 +187,28 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place,
 
     def keep(policy) -> None:
         kept.extend([accepted_bits(guard), [*guard.decisions], guard.state.step])
-        kept.extend([guard.state.episodes, guard.state.evidence.paired])
+        kept.extend([guard.state.episodes, guard.state.evidence.scores])
 
     spoil = At([2 * STEPS], randomize)
     callbacks = (
         [save, At([stop], keep), guard] if place[0] == "b" else [guard, save, At([stop], keep)]
     )
     train(model, 5 * STEPS, spoil, *callbacks)
-    bits_, decisions, step, episodes, paired = kept
+    bits_, decisions, step, episodes, scores = kept
     assert decisions
     assert "rejected" in [each.verdict for each in decisions]
 
     loaded = algorithm.load(tmp_path / f"model_{stop}_steps", env=Slide(), device="cpu")
-    again = make_guard(log_path=tmp_path / "guard.csv", n_starts=10)
+    again = make_guard(log_path=tmp_path / "guard.csv", n_eval_episodes=10)
     seen: list[object] = []
-    again.acceptance.first_evidence = lambda _: seen.append("afresh")  # type: ignore[method-assign]
+    monkeypatch.setattr(callback, "first_evidence", lambda *_: seen.append("afresh"))
     look = At(
         [1], lambda p: seen.extend([accepted_bits(again), p.actor_step, again.state.episodes])
     )
     train(loaded, 3 * STEPS, look, again, reset_num_timesteps=False)
     assert seen == [bits_, step, episodes]
     assert again.decisions[: len(decisions)] == decisions
-    assert again.state.evidence.paired.costs.mean() <= paired.costs.mean() + 1e-9
+    assert again.state.evidence.scores.costs.mean() <= scores.costs.mean() + 1e-9
     assert again.decisions[-1].timestep > stop
     assert bits(loaded.policy.actor.state_dict()) == bits(again.state.accepted.actor)
     assert [row["verdict"] for row in rows(tmp_path / "guard.csv")] == verdicts(again)
@@ -214,7 +217,7 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(algorithm, place,
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
-    [{"n_starts": 4}, {"seed": 7}, {"rule": {"margin": 0.5}}, {"env": "Slide-v0"}],
+    [{"n_eval_episodes": 4}, {"seed": 7}, {"rule": {"margin": 0.5}}, {"env": "Slide-v0"}],
 )
 def test_with_other_settings_the_guard_starts_afresh(change) -> None:
     first, second = make_guard(), make_guard(**change)
@@ -230,16 +233,16 @@ def test_with_other_settings_the_guard_starts_afresh(change) -> None:
 def test_what_does_not_concern_the_evidence_may_change_in_between() -> None:
     model = three_decisions(make_guard())
     others = {"rule": {"by_region": False}, "step_size": {"shrink": 0.9}, "log_path": None}
-    second = make_guard(eval_every=2, patience=2, **others)
+    second = make_guard(eval_freq=2, patience=2, **others)
     train(model, 1, second)
     assert len(second.decisions) == 3
 
 
 def test_a_simulator_made_by_a_partial_is_known_again_in_another_process() -> None:
     one, other = (make_guard(partial(partial(Slide, low=0.0), high=2.0)) for _ in range(2))
-    assert one.acceptance.settings == other.acceptance.settings
-    assert "0x" not in str(one.acceptance.settings)
-    assert one.acceptance.settings != make_guard(partial(Slide, low=0.5)).acceptance.settings
+    assert one.settings.of_evidence == other.settings.of_evidence
+    assert "0x" not in str(one.settings.of_evidence)
+    assert one.settings.of_evidence != make_guard(partial(Slide, low=0.5)).settings.of_evidence
 
 
 def test_a_second_learn_goes_on_and_the_step_is_the_one_decided_last() -> None:

@@ -105,7 +105,9 @@ def test_frames_stacked_by_gymnasium_start_as_the_law_and_train(tmp_path) -> Non
     for _ in range(6):
         assert error(model, observation, env.unwrapped.x) < 1e-5
         observation, *_ = env.step(model.predict(observation)[0])
-    guard = ImprovementGuard(lambda: FrameStackObservation(Seen(lambda x: x, 3), 4), n_starts=3)
+    guard = ImprovementGuard(
+        lambda: FrameStackObservation(Seen(lambda x: x, 3), 4), n_eval_episodes=3
+    )
     model.learn(50, callback=[NoActionNoise(), ControlDiagnostics(), guard])
     model.save(tmp_path / "model")
     loaded = DDPG.load(tmp_path / "model", env=env)

@@ -12,7 +12,7 @@ from stable_baselines3 import DDPG, TD3
 
 from policy_samples import build, scalar_mpc
 from sb3_yann import AffineObservation
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
+from sb3_yann.policy.checkpoint import ActorCheckpoint
 
 Make = Callable[..., Any]
 KINDS: dict[str, dict[str, Any]] = {

@@ -136,12 +136,12 @@ def test_commissioning_plays_the_plant_in_its_units(shows: str, takes: str) -> N
 def test_the_guard_s_simulator_shows_what_the_plant_shows() -> None:
     make = partial(units.plant, "absolute", "absolute")
     model = build(make())
-    guard = ImprovementGuard(make, n_starts=4, n_new_starts=4)
+    guard = ImprovementGuard(make, n_eval_episodes=4, n_new_starts=4)
     model.learn(100, callback=[NoActionNoise(), guard])
     evidence = guard.state.evidence
     plain = partial(units.plant, "deviation", "deviation")
-    expected = evaluate(MPC.explicit(), plain, evidence.seeds)
-    np.testing.assert_allclose(evidence.mpc.costs, expected.costs, rtol=1e-5)
+    expected = evaluate(MPC.explicit(), plain, evidence.starts.seeds)
+    np.testing.assert_allclose(evidence.starts.mpc.costs, expected.costs, rtol=1e-5)
 
 
 def refused(env: Any, observation: Any = None, mpc: LinearMPC = MPC) -> str:

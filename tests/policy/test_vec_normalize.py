@@ -42,12 +42,12 @@ def test_the_frozen_statistics_of_a_vec_normalize_are_folded_in(tmp_path) -> Non
     obs = env.normalize_obs((states() + STEADY).astype(np.float32))
     assert error(model, obs, states()) < 1e-5
     # The guard's own env is one without a VecNormalize, as the training env is below its own.
-    guard = ImprovementGuard(lambda: Seen(lambda x: x + STEADY, 3), n_starts=5)
+    guard = ImprovementGuard(lambda: Seen(lambda x: x + STEADY, 3), n_eval_episodes=5)
     model.learn(120, callback=[NoActionNoise(), ControlDiagnostics(), guard])
     seen = law().locate(model.policy.theta(env.normalize_obs(env.get_original_obs())).numpy())
-    assert guard.state.evidence.visits[:, seen].any()
+    assert guard.state.evidence.scores.visits[:, seen].any()
     evidence = guard.state.evidence
-    assert evidence.paired.mpc_costs == pytest.approx(mpc_costs(evidence.seeds))
+    assert evidence.starts.mpc.costs == pytest.approx(mpc_costs(evidence.starts.seeds))
     model.save(tmp_path / "model")
     loaded = DDPG.load(tmp_path / "model", env=env)
     np.testing.assert_array_equal(loaded.predict(obs)[0], model.predict(obs)[0])

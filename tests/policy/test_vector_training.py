@@ -32,8 +32,7 @@ from sb3_yann import (
     NoActionNoise,
     YannPolicy,
 )
-from sb3_yann.guard.actor_checkpoint import ActorCheckpoint
-from sb3_yann.guard.session import GuardSession
+from sb3_yann.policy.checkpoint import ActorCheckpoint
 
 MPC = two_input_mpc()
 STEPS = 6
@@ -74,7 +73,7 @@ def test_all_callbacks_work_with_envs_in_other_processes(start_method) -> None:
     try:
         noise = NormalActionNoise(np.zeros(2), np.ones(2))
         model = build(env, gradient_steps=0, action_noise=noise)
-        guard = ImprovementGuard(plant, n_starts=3)
+        guard = ImprovementGuard(plant, n_eval_episodes=3)
         audit, diagnostics = CostAudit(steps=40, strict=True), ControlDiagnostics()
         model.learn(60, callback=[NoActionNoise(), guard, diagnostics, audit])
         assert_every_action_is_the_law_s(model)
@@ -117,17 +116,20 @@ def test_our_envs_start_in_other_processes_by_an_id_that_names_the_package() -> 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_it_learns_from_several_envs_and_the_guard_counts_all_episodes(algorithm) -> None:
     model = build(DummyVecEnv([plant] * 3), algorithm, gradient_steps=-1)
-    before, guard = copy.deepcopy(model.actor), ImprovementGuard(plant, n_starts=3, eval_every=6)
+    before, guard = (
+        copy.deepcopy(model.actor),
+        ImprovementGuard(plant, n_eval_episodes=3, eval_freq=6),
+    )
     tried: list[int] = []
     learnt: list[dict[str, th.Tensor]] = []
-    attempt = guard.acceptance.try_candidate
+    attempt = guard._try_candidate
 
-    def note(session: GuardSession) -> None:
-        tried.append(session.state.episodes)
-        learnt.append(ActorCheckpoint.of(session.policy).networks())
-        attempt(session)
+    def note() -> None:
+        tried.append(guard.state.episodes)
+        learnt.append(ActorCheckpoint.of(model.policy).networks())
+        attempt()
 
-    guard.acceptance.try_candidate = note
+    guard._try_candidate = note
     callbacks = [NoActionNoise(), guard, ControlDiagnostics(), CostAudit(60, strict=True)]
     model.learn(3 * STEPS * 6, callback=callbacks)
     assert model._n_updates == 3 * STEPS * 6

@@ -97,7 +97,7 @@ def whole(tmp_path_factory) -> tuple[Path, DDPG]:
     """A report with all its parts."""
     kwargs = {"critic_warmup": 20}
     model = DDPG("YannPolicy", "ClippedPendulum-v0", policy_kwargs=kwargs, device="cpu", seed=0)
-    guard = guard_samples.ImprovementGuard("ClippedPendulum-v0", n_starts=4, n_new_starts=0)
+    guard = guard_samples.ImprovementGuard("ClippedPendulum-v0", n_eval_episodes=4, n_new_starts=0)
     model.learn(60, callback=[NoActionNoise(), guard])
     mpc = model.policy.problem
     log = evaluate(mpc.explicit(), "ClippedPendulum-v0", range(5))

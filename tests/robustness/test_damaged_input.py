@@ -197,8 +197,8 @@ def _record(folder: Path) -> Target:
 
 
 SETTINGS = """
-guard: {n_starts: 20, n_new_starts: 5, patience: 3, seed: 1, eval_every: 2, keep_if_worse: true}
-rule: {margin: 0.01, tail: 0.05, by_region: true}
+guard: {n_eval_episodes: 20, n_new_starts: 5, patience: 3, eval_freq: 2, keep_if_worse: true}
+rule: {margin: 0.01, cvar_alpha: 0.05, by_region: true}
 step_size: {shrink: 0.5, grow: 1.5, smallest: 0.1}
 critic: {kind: afterstate, reward_scale: 1.0}
 checks: {hold: 5, recover: 10, transfer: 5, frozen_after: 30, late_after: 1.5}
@@ -216,7 +216,7 @@ def _settings(folder: Path) -> Target:
         given = given if isinstance(given, dict) else {"guard": given}
         part = {name: given.get(name) or {} for name in ("rule", "step_size", "critic", "checks")}
         guard = given.get("guard")
-        options = guard if isinstance(guard, dict) else {"n_starts": guard}
+        options = guard if isinstance(guard, dict) else {"n_eval_episodes": guard}
         ImprovementGuard("CSTR-v0", rule=part["rule"], step_size=part["step_size"], **options)
         as_critic_options(part["critic"])
         checks = part["checks"]

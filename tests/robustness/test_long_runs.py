@@ -39,7 +39,9 @@ def test_nothing_grows(tmp_path) -> None:
     model = DDPG(
         "YannPolicy", "CSTR-v0", device="cpu", seed=0, train_freq=16, tau=0.02, buffer_size=5_000
     )
-    guard = ImprovementGuard("CSTR-v0", n_starts=10, eval_every=10, log_path=tmp_path / "guard.csv")
+    guard = ImprovementGuard(
+        "CSTR-v0", n_eval_episodes=10, eval_freq=10, log_path=tmp_path / "guard.csv"
+    )
     usage = Usage()
     model.learn(STEPS, callback=[NoActionNoise(), guard, usage])
     memory, files, threads = np.array(usage.rows).T

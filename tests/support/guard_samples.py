@@ -106,14 +106,26 @@ def build(algorithm=DDPG, env: Any = None, actor: dict[str, Any] | None = None, 
     return algorithm(YannPolicy, env, policy_kwargs=policy | (actor or {}), **(options | kwargs))
 
 
-STRICT = {"tail": 0, "retreat": False}
+STRICT = {"cvar_alpha": 0, "backtrack": False}
 """No single start may lose, and nothing but regions of a candidate is tried."""
 
 
 def make_guard(env: Any = Slide, *, rule: Any = {}, **kwargs) -> ImprovementGuard:  # noqa: B006
+    """Return a strict guard of ten known starts, and of few new ones unless it is said how many."""
     if isinstance(rule, dict):
         rule = STRICT | rule
-    return ImprovementGuard(env, rule=rule, **({"n_starts": 10, "patience": 1} | kwargs))
+    options = {"n_eval_episodes": 10, "patience": 1}
+    if "n_new_starts" not in kwargs:
+        options |= {"n_new_starts": 5, "n_final_starts": 10}
+    return ImprovementGuard(env, rule=rule, **(options | kwargs))
+
+
+def tried(*acts: Callable[[YannPolicy], Any], env: Any = Slide, actor: Any = None, **options):
+    """Return a model and its guard, after an episode for each act, which makes a candidate."""
+    model, guard = build(gradient_steps=0, actor=actor), make_guard(env, **options)
+    moves = [At([(i + 1) * STEPS], act) for i, act in enumerate(acts)]
+    train(model, len(acts) * STEPS, *moves, guard)
+    return model, guard
 
 
 @th.no_grad()

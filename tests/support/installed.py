@@ -29,7 +29,7 @@ def main() -> None:
         env.reset(seed=0)
         env.step(env.action_space.sample())
     model = DDPG("YannPolicy", "CSTR-v0", device="cpu", policy_kwargs={"critic_warmup": 50})
-    guard = sb3_yann.ImprovementGuard("CSTR-v0", n_starts=3, n_new_starts=3)
+    guard = sb3_yann.ImprovementGuard("CSTR-v0", n_eval_episodes=3, n_new_starts=3)
     model.learn(500, callback=[sb3_yann.NoActionNoise(), guard])
     for algorithm in ("ddpg", "td3"):
         text = (files("sb3_yann.hyperparams") / f"{algorithm}.yml").read_text(encoding="utf-8")

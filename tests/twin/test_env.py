@@ -68,10 +68,10 @@ def test_an_action_that_is_none_is_refused(action) -> None:
 def test_a_model_trains_in_it_under_a_guard_that_plays_every_member() -> None:
     found = twin()
     model = DDPG(YannPolicy, found.env(), seed=0, learning_starts=0, batch_size=32)
-    guard = ImprovementGuard(found, n_starts=10, n_new_starts=0)
+    guard = ImprovementGuard(found, n_eval_episodes=10, n_new_starts=0)
     model.learn(180, callback=[NoActionNoise(), guard])
-    assert guard.state.evidence.mpc.costs.shape == (10,)
-    assert guard.acceptance.settings["env"] == "PlantTwin.env"
+    assert guard.state.evidence.starts.mpc.costs.shape == (10,)
+    assert guard.settings.of_evidence["env"] == "PlantTwin.env"
 
 
 def test_a_start_that_is_none_is_refused() -> None:

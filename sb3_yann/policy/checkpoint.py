@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from sb3_yann.policy.policies import YannPolicy
 
 Tensors = dict[str, th.Tensor]
-LARGEST = 1e9
+DIVERGED_SIZE = 1e9
 """Parameters beyond this count as diverged: the actor's sums could overflow."""
-DIVERGED = "a parameter of the actor is not a finite number, or too large"
 
 
 @dataclass(frozen=True)
@@ -37,9 +36,13 @@ class ActorCheckpoint:
         )
 
     @classmethod
-    def of_parts(cls, actor: Tensors, optimizer: dict[str, Any]) -> ActorCheckpoint:
-        """Return a copy of an actor that is its own target, and of an optimizer."""
-        return cls(_copied(actor), _copied(actor), _copied(optimizer))
+    def of_mpc(cls, policy: YannPolicy) -> ActorCheckpoint:
+        """Return the MPC itself: the policy where it has learnt nothing, else as a new one."""
+        if policy.actor.mu.network.is_zero():
+            return cls.of(policy)
+        actor = _copied(policy.make_actor().state_dict())
+        optimizer = {**policy.actor.optimizer.state_dict(), "state": {}}
+        return cls(actor, _copied(actor), _copied(optimizer))
 
     def restore(self, policy: YannPolicy) -> None:
         """Restore actor, target and optimizer, bit for bit."""
@@ -63,13 +66,27 @@ class ActorCheckpoint:
 
     def has_diverged(self) -> bool:
         """Return whether a trainable parameter is not a finite number, or too large."""
-        return diverged(self.networks().values())
+        largest = [each.abs().max() for each in self.networks().values()]
+        return not all(bool(each <= DIVERGED_SIZE) for each in largest)  # nor does nan pass
+
+    def has_learned(self) -> bool:
+        """Return whether the networks correct the MPC anywhere."""
+        for name, value in self.networks().items():
+            if not name.endswith(".nodes"):
+                if th.any(value[..., -1] != 0):  # biases of later layers
+                    return True
+                continue
+            half = value.shape[1] // 2  # nodes in pairs of opposite sign, and perhaps one more
+            pairs = value[:, :half] + value[:, half : 2 * half]
+            if th.any(th.cat([pairs, value[:, 2 * half :]], dim=1).sum(dim=1) != 0):
+                return True
+        return False
 
     def is_actor_of(self, policy: YannPolicy) -> bool:
         """Return whether the policy's actor is still that of the checkpoint, bit for bit."""
         now = {name: value.cpu() for name, value in policy.actor.state_dict().items()}
         alike = all(th.equal(value, now[name]) for name, value in self.actor.items())
-        return alike and _are_confined_alike(self.actor, now)
+        return alike and _have_same_box(self.actor, now)
 
     def has_networks_of(self, other: ActorCheckpoint) -> bool:
         """Return whether both hold the same networks, whatever their optimizers remember."""
@@ -91,7 +108,7 @@ class ActorCheckpoint:
 
     def is_confined_as(self, other: ActorCheckpoint) -> bool:
         """Return whether the networks of both count in the same box of theta."""
-        return _are_confined_alike(self.actor, other.actor)
+        return _have_same_box(self.actor, other.actor)
 
     def with_regions(self, other: ActorCheckpoint, regions: Iterable[int]) -> ActorCheckpoint:
         """Return a copy with the networks of some regions, and their moments, from another.
@@ -104,8 +121,8 @@ class ActorCheckpoint:
             ours, theirs = getattr(mixed, name), getattr(other, name)
             for key in self.networks():
                 ours[key][index] = theirs[key][index]
-        ours, theirs = mixed.optimizer["state"], other.optimizer["state"]
-        for key, state in theirs.items():
+        ours = mixed.optimizer["state"]
+        for key, state in other.optimizer["state"].items():
             # A parameter without moments has not been stepped yet: they are zero.
             known = ours.setdefault(key, {k: th.zeros_like(v) for k, v in state.items()})
             for entry, value in state.items():
@@ -136,13 +153,7 @@ class ActorCheckpoint:
         return mixed
 
 
-def diverged(parameters: Iterable[th.Tensor]) -> bool:
-    """Return whether a parameter is not a finite number, or too large."""
-    largest = [each.detach().abs().max() for each in parameters]
-    return not all(bool(each <= LARGEST) for each in largest)  # nor does nan pass
-
-
-def _are_confined_alike(ours: Tensors, theirs: Tensors) -> bool:
+def _have_same_box(ours: Tensors, theirs: Tensors) -> bool:
     """Return whether two actors have the same box; one saved before there were boxes has none."""
     first, second = (
         {key: box for key, box in each.items() if key.endswith("confines") and box.any()}

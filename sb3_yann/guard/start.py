@@ -1,0 +1,224 @@
+"""What happens before the first step: checks, first evidence, and a handler of Ctrl-C."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import warnings
+import weakref
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+
+from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, Scores, Starts
+from sb3_yann.control import LinearMPC
+from sb3_yann.guard.decide import GuardSettings, Player, Unplayable, try_before_training
+from sb3_yann.guard.state import Decision, Evidence, GuardState
+from sb3_yann.policy.checkpoint import ActorCheckpoint
+from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin
+from sb3_yann.rollout import Trajectories
+
+
+def first_evidence(
+    player: Player, settings: GuardSettings, known: GuardState | None
+) -> tuple[Evidence, ActorCheckpoint, list[Decision]]:
+    """Play the MPC; accept an earlier run's policy, or the present one, if no worse.
+
+    Return the evidence, the checkpoint to go on from, and decisions on what is refused. The hard
+    starts of an earlier run stay.
+    """
+    present = ActorCheckpoint.of(player.policy)
+    candidates, seeds, next_seed = [present], (*settings.seeds,), settings.seeds.stop
+    if known is not None:
+        candidates = [known.accepted, present]
+        next_seed = max(known.evidence.next_seed, next_seed)
+        hard = {*known.evidence.starts.seeds} - {*known.settings["seeds"], *seeds}
+        seeds = (*seeds, *sorted(hard))
+    mpc = _first_scores(player, settings, seeds)
+    tolerance = settings.rule.tolerance(mpc.costs[: len(settings.seeds)])
+    starts = Starts(seeds, mpc, tolerance, len(seeds))
+    evidence = Evidence(player.mpc, player.mpc, starts, mpc, next_seed)
+    leading, decisions = player.mpc, list[Decision]()
+    for candidate in candidates:
+        if candidate.has_networks_of(leading):
+            continue
+        evidence, refusal = try_before_training(evidence, candidate, player, settings)
+        leading = candidate if refusal is None else evidence.accepted
+        decisions += [] if refusal is None else [refusal]
+    for checkpoint, _ in () if known is None else known.evidence.passed:
+        evidence = evidence.with_passed(checkpoint, None)
+    return evidence.with_passed(evidence.accepted, evidence.scores), leading, decisions
+
+
+def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int]) -> Scores:
+    """Return the MPC's scores; raise ValueError if the simulator cannot compare policies.
+
+    The actor plays, not the law in float64: the MPC must be no worse than itself to the last bit.
+    """
+    name = settings.env
+    mpc = player.episodes(player.mpc, seeds)
+    for seed, cost in zip(seeds, mpc.costs, strict=True):
+        if not np.isfinite(cost):
+            raise ValueError(
+                f"The MPC's episode of the guard's env {name} from the seed {seed} costs {cost:g}. "
+                "Policies are compared by their costs: rewards must be finite numbers."
+            )
+    again = player.episodes(player.mpc, seeds)
+    for seed, first, second in zip(seeds, mpc.costs, again.costs, strict=True):
+        if not np.isclose(first, second, rtol=1e-6, atol=0):
+            raise ValueError(
+                f"The MPC played two episodes of the guard's env {name} from the seed {seed}, "
+                f"at costs of {first:g} and {second:g}. Episodes are compared in pairs: all that "
+                "is random in the env must come from self.np_random."
+            )
+    if len(seeds) > 1 and _all_alike(mpc):
+        warnings.warn(
+            f"All {len(seeds)} starts of the guard's env {name} are one and the same: its reset "
+            "ignores its seed. What the guard accepts is compared from this start only.",
+            stacklevel=2,
+        )
+    if settings.rule.max_input_step is not None:
+        moved = [np.abs(np.diff(each, axis=0)) for each in mpc.actions if len(each) > 1]
+        most = np.max([each.max(axis=0) for each in moved], axis=0) if moved else np.inf
+        space: Any = player.policy.action_space
+        rounding = COST_ROUNDING * (space.high - space.low)
+        player.max_input_step = np.asarray(settings.rule.max_input_step * most + rounding)
+    return player.scores(mpc)
+
+
+def _all_alike(played: Trajectories) -> bool:
+    first = played.observations[0][0]
+    starts = all(np.array_equal(each[0], first) for each in played.observations)
+    return starts and bool(np.allclose(played.costs, played.costs[0], rtol=1e-6, atol=0))
+
+
+def still_holds(evidence: Evidence, player: Player) -> bool:
+    """Return whether five episodes are still what the evidence says: only a name is known."""
+    starts = evidence.starts
+    some = np.unique(np.linspace(0, len(starts.seeds) - 1, 5).astype(int))
+    expected = evidence.scores.at(some)
+    try:
+        again = player.scores(player.episodes(evidence.accepted, starts.at(some).seeds))
+    except Unplayable:
+        return False
+    margin = starts.tolerance.margin
+    return (
+        np.allclose(again.costs, expected.costs, rtol=1e-5, atol=1e-3 * margin)
+        and again.unsafe.shape == expected.unsafe.shape
+        and np.allclose(again.unsafe, expected.unsafe, atol=EXCESS_ROOM)
+    )
+
+
+def check_not_nested(guard: BaseCallback) -> None:
+    """Raise ValueError if a callback is within one that does not tell it of the end."""
+    event = guard.parent if isinstance(guard.parent, EventCallback) else None
+    event = event or _event_above(guard, guard.locals.get("callback"))
+    if event is not None:
+        raise ValueError(
+            f"The guard is within a callback of the class {type(event).__name__}, which does not "
+            "tell it of each step and of the end: the final model might not be an accepted one. "
+            "Pass the guard to learn itself; eval_freq=... makes trials rarer."
+        )
+
+
+def check_alone(guard: BaseCallback) -> None:
+    """Raise ValueError if another guard is among what was passed to learn."""
+    callbacks = all_callbacks(guard.locals.get("callback"))
+    found = [each for each in callbacks if isinstance(each, type(guard))]
+    if len(found) > 1:
+        raise ValueError(
+            f"{len(found)} guards were passed to learn, expected is one: each would restore what "
+            "it accepted itself. Give one guard all starts, by n_eval_episodes or a simulator of "
+            "both."
+        )
+
+
+def check_twin(policy: YannPolicy, problem: LinearMPC) -> None:
+    """Raise ValueError unless a twin shows what the policy observes, theta of the same problem."""
+    require_problem_of_twin(policy, problem)
+    if policy.observation is not None:
+        raise ValueError(
+            "The twin shows theta, but the model's policy makes theta of its observations. Guard "
+            "it in a simulator that shows those, or improve it with improve(model, twin)."
+        )
+
+
+def all_callbacks(callback: Any) -> list[BaseCallback]:
+    """Return a callback that was passed to learn, and those within it."""
+    if not isinstance(callback, BaseCallback):
+        return []
+    within = [*getattr(callback, "callbacks", [])]
+    within += [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]
+    return [callback, *(found for each in within for found in all_callbacks(each))]
+
+
+def _event_above(guard: BaseCallback, callback: Any) -> EventCallback | None:
+    """Return an EventCallback that the guard is under, among what was passed to learn."""
+    above = [
+        each
+        for each in all_callbacks(callback)
+        if isinstance(each, EventCallback) and guard in all_callbacks(each)[1:]
+    ]
+    return above[-1] if above else None
+
+
+class InterruptHandler:
+    """Ctrl-C during `learn`, of which SB3 tells no callback.
+
+    Calls the handler that was there; where that raises, it restores the accepted policy. Once
+    another exception has ended `learn`, it only passes on.
+    """
+
+    def __init__(self, model: BaseAlgorithm, restore: Callable[[], None], before: Any) -> None:
+        self.before, self.run, self.model = before, model.start_time, weakref.ref(model)
+        self.restore = weakref.WeakMethod(restore, lambda _: self.remove())
+
+    @classmethod
+    def install(
+        cls, model: BaseAlgorithm, restore: Callable[[], None], frame: FrameType
+    ) -> InterruptHandler | None:
+        """Return the handler for a `learn` that begins; None where there can or need be none.
+
+        ``restore`` is a bound method, held weakly; ``frame`` is the caller's. Handlers of runs
+        that are over are passed by.
+        """
+        before: Any = signal.getsignal(signal.SIGINT)
+        while isinstance(before, InterruptHandler) and not before.is_needed(frame):
+            before = before.before
+        if threading.current_thread() is not threading.main_thread() or not callable(before):
+            return None
+        handler = cls(model, restore, before)
+        signal.signal(signal.SIGINT, handler)
+        return handler
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle the signal."""
+        try:
+            self.before(number, frame)
+        except BaseException:
+            restore = self.restore()
+            if restore is not None and self.is_needed(frame):
+                restore()
+            self.remove()
+            raise
+
+    def is_needed(self, frame: FrameType | None) -> bool:
+        """Return whether what is running is the same `learn` as at the beginning."""
+        model = self.model()
+        if self.restore() is None or model is None or model.start_time != self.run:
+            return False
+        while frame is not None:
+            if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is model:
+                return True
+            frame = frame.f_back
+        return False
+
+    def remove(self) -> None:
+        """Restore the handler that was there, unless somebody else's handler has come since."""
+        present: object = signal.getsignal(signal.SIGINT)
+        if threading.current_thread() is threading.main_thread() and present is self:
+            signal.signal(signal.SIGINT, self.before)

@@ -1,0 +1,672 @@
+"""Closed loops of a controller and a plant, from seeded starts: the one loop that steps envs."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import random
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_yann._validation import Array, check_int, check_type
+from sb3_yann.compare import less_safe, unsafe_columns
+from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
+from sb3_yann.control.linearization.wrapper_stack import require_state_shown
+from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
+from sb3_yann.control.mpc.plant_units import InputUnits
+
+Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
+Rows = NDArray[np.intp]
+Controller = Callable[[int, NDArray[Any], Rows], NDArray[Any]]
+"""From the step, observations (r, n) and the numbers (r,) of the episodes that show them to actions
+(r, m). At step 0 it is asked for all episodes."""
+LONG_EPISODE = 100_000
+"""Steps of an episode after which a warning is given."""
+MAX_EPISODE_STEPS = 1_000_000
+"""Steps of an episode after which it counts as endless, which is an error."""
+
+
+class Predictor(Protocol):
+    """What Stable-Baselines3's models and policies offer."""
+
+    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
+        """Return the actions for a batch of observations, and a recurrent state."""
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Closed-loop episodes, in the order of their seeds.
+
+    Attributes
+    ----------
+    costs : ndarray, shape (episodes,)
+        Minus the sum of the rewards; with a problem, the sum of its stage costs, with the penalty
+        of soft bounds.
+    violations : ndarray of int, shape (episodes,)
+        Steps whose ``info["violation"]`` is true.
+    observations : tuple of ndarray, shapes (steps + 1, n)
+    actions : tuple of ndarray, shapes (steps, m)
+    terminated : ndarray of bool, shape (episodes,)
+        Whether the env ended the episode itself, other than by a time limit, or with
+        ``info["is_success"]``.
+    truncated : ndarray of bool, shape (episodes,)
+        Whether only a time limit ended it.
+    succeeded : ndarray of bool, shape (episodes,)
+        Whether its last ``info["is_success"]`` was true.
+    rewards : tuple of ndarray, shapes (steps,)
+    own_rewards : tuple of ndarray, shapes (steps,)
+        The same; NaN at a violation, or an end, which may have changed the reward.
+    excess : BoundExcess, optional
+        By how much each episode exceeds the bounds of the problem, where one was given.
+
+    Examples
+    --------
+    >>> from sb3_yann.evaluation import evaluate
+    >>> episodes = evaluate(lambda observation: [0.0], "CSTR-v0", seeds=[0, 1])
+    >>> [len(actions) for actions in episodes.actions]
+    [400, 400]
+    """
+
+    costs: Array
+    violations: NDArray[np.int64]
+    observations: tuple[Array, ...]
+    actions: tuple[Array, ...]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    succeeded: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    rewards: tuple[Array, ...] = ()
+    own_rewards: tuple[Array, ...] = ()
+    excess: BoundExcess | None = None
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """Number of steps of each episode (episodes,)."""
+        return np.array([len(each) for each in self.actions], dtype=np.int64)
+
+    @property
+    def pairs(self) -> list[tuple[Array, Array]]:
+        """Observations (steps + 1, n) and actions (steps, m) of each episode."""
+        return [*zip(self.observations, self.actions, strict=True)]
+
+    def padded(self) -> tuple[Array, Array, Array]:
+        """Return observations (T + 1, k, n), actions (T, k, m) and own rewards (T, k).
+
+        After its end an episode stays where it is, and its rewards are NaN.
+        """
+        longest = int(self.lengths.max())
+
+        def filled(parts: Sequence[Array], length: int) -> Array:
+            rows = [np.minimum(np.arange(length), len(each) - 1) for each in parts]
+            return np.stack([each[at] for each, at in zip(parts, rows, strict=True)], axis=1)
+
+        rewards = np.full((longest, len(self.actions)), np.nan)
+        for i, each in enumerate(self.own_rewards):
+            rewards[: len(each), i] = each
+        return filled(self.observations, longest + 1), filled(self.actions, longest), rewards
+
+    def steps(self) -> tuple[Array, Array, Array]:
+        """Return observations, actions and following observations of all steps, in time."""
+        states, actions, _ = self.padded()
+        taken = np.arange(len(actions))[:, None] < self.lengths
+        return states[:-1][taken], actions[taken], states[1:][taken]
+
+    def sooner(self, longest: int) -> NDArray[np.int64]:
+        """Return by how many steps each is shorter (episodes,); 0 where its end is a success."""
+        return np.where(self.succeeded, 0, np.maximum(longest - self.lengths, 0))
+
+    def no_worse(self, others: Trajectories) -> NDArray[np.bool_]:
+        """Return which episodes are as long as others, and break no bound by more."""
+        longest, unsafe = int(others.lengths.max(initial=0)), []
+        for each in (self, others):
+            assert each.excess is not None
+            lost, sooner = ~np.isfinite(each.costs), each.sooner(longest)
+            unsafe.append(unsafe_columns(each.violations, sooner, lost, each.excess))
+        return np.asarray(~less_safe(unsafe[0], unsafe[1]).any(axis=1))
+
+
+class EnvPool:
+    """Envs that play again and again: making one often takes longer than its episode.
+
+    Parameters
+    ----------
+    source : gymnasium.Env, str or callable
+        As for :func:`evaluate`, which takes a pool in its place.
+    """
+
+    MAX_KEPT = 200
+    """Envs that are kept."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = as_source(source)
+        self.envs: list[gym.Env[Any, Any]] = []
+
+    @contextmanager
+    def acquire(self, n: int) -> Iterator[list[gym.Env[Any, Any]]]:
+        """Yield n envs. After an error none is kept: their episodes are not over."""
+        try:
+            while len(self.envs) < n:
+                self.envs.append(make_env(self.source))
+            yield self.envs[:n]
+        except BaseException:
+            self.close()
+            raise
+        self._close_beyond(self.MAX_KEPT)
+
+    def close(self) -> None:
+        """Close all envs."""
+        self._close_beyond(0)
+
+    def _close_beyond(self, kept: int) -> None:
+        while len(self.envs) > kept:
+            self.envs.pop().close()
+
+
+def evaluate(
+    policy: Predictor | Callable[[Any], Any],
+    env: Source | EnvPool,
+    seeds: Iterable[int],
+    starts: Sequence[ArrayLike] | None = None,
+) -> Trajectories:
+    """Return one whole episode for each seed, under the policy without any noise.
+
+    Parameters
+    ----------
+    policy : model or callable
+        Something with ``predict(observation, deterministic=True)``, or a function from an
+        observation to an action, such as the explicit law.
+    env : gymnasium.Env, str or callable
+        Must end its episodes within a million steps. A given env runs them one after the other.
+        A named one, or a function that makes one, is made for each seed: the episodes run side by
+        side, and the policy sees them as one batch. An :class:`EnvPool` keeps them for next time.
+    seeds : iterable of int
+        ``env.reset(seed=seed)`` starts each episode; the rest of it must follow from that.
+    starts : sequence of array_like, optional
+        The state of each start, ``env.reset(options={"state": ...})``, for envs that have one.
+
+    Raises
+    ------
+    RuntimeError
+        If an episode does not end.
+
+    Examples
+    --------
+    >>> import gymnasium
+    >>> law = gymnasium.make("CSTR-v0").observation_space.problem.explicit()
+    >>> bool(evaluate(law, "CSTR-v0", seeds=[0]).costs[0] > 0)
+    True
+    """
+
+    def check(env: Any) -> None:
+        if isinstance(env, VectorEnv):
+            _require_same_inputs(policy, env.single_action_space)
+        else:
+            _require_same_inputs(policy, env.action_space)
+            _require_state_shown(policy, env)
+
+    return rollout(as_controller(policy), env, seeds, starts, check=check)
+
+
+def rollout(
+    controller: Controller,
+    plant: Source | EnvPool,
+    seeds: Iterable[int],
+    starts: Sequence[ArrayLike] | None = None,
+    *,
+    problem: LinearMPC | None = None,
+    check: Callable[[Any], None] = lambda env: None,
+) -> Trajectories:
+    """Return one whole episode for each seed.
+
+    Parameters
+    ----------
+    controller : callable
+        What acts in all episodes; see `Controller`.
+    plant : gymnasium.Env, str, callable or EnvPool
+        As for :func:`evaluate`. A registered env whose copies step as one array is stepped so.
+    seeds, starts : iterable of int, and sequence of array_like
+        As for :func:`evaluate`.
+    problem : LinearMPC, optional
+        Whose theta the plant shows, and whose inputs it takes: then ``costs`` are its stage costs,
+        and ``excess`` is known. Inputs reach the plant in the type of its action space.
+    check : callable, optional
+        Is called with the first env, and raises if it does not fit.
+    """
+    seeds = as_seeds(seeds)
+    options = [None] * len(seeds) if starts is None else [{"state": start} for start in starts]
+    resets = [*zip(seeds, options, strict=True)]
+    pool = plant if isinstance(plant, EnvPool) else None
+    source: Source = plant.source if isinstance(plant, EnvPool) else as_source(plant)
+    if isinstance(source, gym.Env):
+        check(source)
+        played = _joined(
+            [
+                _play(_of_episode(controller, i), _Envs([source], [each], problem))
+                for i, each in enumerate(resets)
+            ]
+        )
+    elif isinstance(source, str) and (vector_env := _vector_env(source, len(seeds))) is not None:
+        with closing(vector_env):
+            check(vector_env)
+            played = _play(controller, _Copies(vector_env, seeds, starts))
+    else:
+        own = EnvPool(source)
+        with closing(own), (pool or own).acquire(len(seeds)) as envs:
+            for each in envs[:1]:
+                check(each)
+            if len({id(each.unwrapped) for each in envs}) < len(envs):
+                raise ValueError(
+                    "The function that makes envs returned the same one twice. Make a new one each "
+                    "time, since episodes run side by side, or pass the env itself."
+                )
+            played = _play(controller, _Envs(envs, resets, problem)) if envs else _joined([])
+    return played if problem is None else _with_stage_costs(played, problem)
+
+
+def as_controller(policy: Predictor | Callable[[Any], Any]) -> Controller:
+    """Return a model, a law, or a function from an observation to an action as a controller."""
+    if isinstance(policy, LinearMPC):
+        raise TypeError(
+            "policy is a LinearMPC, which is a problem: pass its law, mpc.explicit() or mpc.law(); "
+            "for an env in absolute values mpc.explicit().plant_input."
+        )
+    if hasattr(policy, "predict"):
+        predict = policy.predict
+        return lambda t, observations, rows: predict(observations, deterministic=True)[0]
+    if not callable(policy):
+        raise TypeError(f"policy = {policy!r} must have a predict method or be callable.")
+    act = policy
+    if isinstance(policy, PiecewiseAffine):
+        return lambda t, observations, rows: act(observations)
+    return lambda t, observations, rows: np.array([act(each) for each in observations])
+
+
+def _of_episode(controller: Controller, number: int) -> Controller:
+    """Return the controller of one episode that is played alone."""
+    return lambda t, observations, rows: controller(t, observations, rows + number)
+
+
+class _Step(NamedTuple):
+    """What one step of some episodes brings, (r,) each."""
+
+    observations: NDArray[Any]
+    rewards: Array
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    violated: NDArray[np.bool_]
+    succeeded: NDArray[np.bool_]
+    changed: NDArray[np.bool_]
+    """Whether a violation may have changed the reward."""
+
+
+class _Envs:
+    """One env for each episode; those that are over wait for the others."""
+
+    steps_all = False
+
+    def __init__(
+        self,
+        envs: Sequence[gym.Env[Any, Any]],
+        resets: Sequence[tuple[int, dict[str, Any] | None]],
+        problem: LinearMPC | None,
+    ) -> None:
+        self.envs, self.resets, self.problem = envs, resets, problem
+
+    def reset(self) -> NDArray[Any]:
+        """Return the first observations (k, n)."""
+        pairs = zip(self.envs, self.resets, strict=True)
+        # A copy of each: an env may write its next observation into the same array.
+        return np.stack([np.array(env.reset(seed=s, options=o)[0]) for env, (s, o) in pairs])
+
+    def step(self, actions: Any, rows: Rows) -> _Step:
+        """Step the envs ``rows`` (r,) with actions (r, m)."""
+        found = []
+        for i, action in zip(rows, actions, strict=True):
+            if self.problem is not None:
+                action = action.astype(self.envs[i].action_space.dtype)
+            observation, reward, terminated, truncated, info = self.envs[i].step(action)
+            violated = bool(info.get("violation", False))
+            success = bool(info.get("is_success", False))
+            ends = bool(terminated), bool(truncated)
+            changed = may_change_reward(info)
+            found.append(
+                (np.array(observation), as_reward(reward), *ends, violated, success, changed)
+            )
+        observations, *others = zip(*found, strict=True)
+        return _Step(np.stack(observations), *map(np.array, others))
+
+
+class _Copies:
+    """Copies of an env that step as one array; those that are over begin another, unused."""
+
+    steps_all = True
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        seeds: Sequence[int],
+        starts: Sequence[ArrayLike] | None,
+    ) -> None:
+        self.envs = [env]
+        self.env, self.seeds = env, seeds
+        self.options = None if starts is None else {"state": starts}
+
+    def reset(self) -> NDArray[Any]:
+        """Return the first observations (k, n)."""
+        shown = self.env.reset(seed=self.seeds, options=self.options)[0]  # type: ignore[arg-type]
+        return np.array(shown)
+
+    def step(self, actions: Any, rows: Rows) -> _Step:
+        """Step all copies with actions (k, m)."""
+        observations, rewards, terminated, truncated, info = self.env.step(actions)
+        none = np.zeros(len(rows), dtype=bool)
+        violated = np.array(info.get("violation", none), dtype=bool)
+        success = np.array(info.get("is_success", none), dtype=bool)
+        earned = np.array(rewards, dtype=np.float64)
+        ends = np.array(terminated, dtype=bool), np.array(truncated, dtype=bool)
+        return _Step(np.array(observations), earned, *ends, violated, success, violated)
+
+
+def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
+    """Play one episode in each env of a plant, side by side."""
+    shown = plant.reset()
+    n = len(shown)
+    running, rows = np.ones(n, dtype=bool), np.arange(n)
+    lengths, costs = np.zeros(n, dtype=np.int64), np.zeros(n)
+    violations = np.zeros(n, dtype=np.int64)
+    terminated, truncated, succeeded = np.zeros((3, n), dtype=bool)
+    states, inputs = [np.array(shown, dtype=np.float64)], list[Array]()
+    rewards, own_rewards = list[Array](), list[Array]()
+    while running.any():
+        actions = np.asarray(controller(len(inputs), shown, rows))
+        step = plant.step(actions, rows)
+        live = running[rows]
+        now = rows[live]
+        played = np.zeros((n, *actions.shape[1:]))
+        played[rows] = actions
+        inputs.append(played)
+        reached = states[-1].copy()
+        reached[rows] = step.observations
+        states.append(reached)
+        earned, own = np.full((2, n), np.nan)
+        earned[now] = step.rewards[live]
+        own[now] = np.where(step.changed | step.terminated, np.nan, step.rewards)[live]
+        rewards.append(earned)
+        own_rewards.append(own)
+        costs[now] -= step.rewards[live]
+        violations[now] += step.violated[live]
+        lengths[now] += 1
+        terminated[now] = (step.terminated & ~step.succeeded)[live]
+        truncated[now] = (step.truncated & ~step.terminated)[live]
+        over = step.terminated | step.truncated
+        succeeded[now] = (step.succeeded & over)[live]
+        running[now] = ~over[live]
+        if running.any():
+            _watch_length(plant.envs[rows[0] if len(plant.envs) > 1 else 0], len(inputs))
+        shown = step.observations if plant.steps_all else step.observations[~over]
+        rows = rows if plant.steps_all else rows[~over]
+
+    def parts(values: Sequence[Array], more: int = 0) -> tuple[Array, ...]:
+        together = np.array(values)
+        return tuple(together[: k + more, i].copy() for i, k in enumerate(lengths))
+
+    return Trajectories(
+        costs=costs,
+        violations=violations,
+        observations=parts(states, 1),
+        actions=parts(inputs),
+        terminated=terminated,
+        truncated=truncated,
+        succeeded=succeeded,
+        rewards=parts(rewards),
+        own_rewards=parts(own_rewards),
+    )
+
+
+def _joined(parts: Sequence[Trajectories]) -> Trajectories:
+    """Return the episodes of all parts as one."""
+
+    def arrays(name: str, dtype: Any) -> NDArray[Any]:
+        return np.array([getattr(each, name)[0] for each in parts], dtype=dtype)
+
+    def rows(name: str) -> tuple[Array, ...]:
+        return tuple(getattr(each, name)[0] for each in parts)
+
+    return Trajectories(
+        costs=arrays("costs", np.float64),
+        violations=arrays("violations", np.int64),
+        observations=rows("observations"),
+        actions=rows("actions"),
+        terminated=arrays("terminated", bool),
+        truncated=arrays("truncated", bool),
+        succeeded=arrays("succeeded", bool),
+        rewards=rows("rewards"),
+        own_rewards=rows("own_rewards"),
+    )
+
+
+def _with_stage_costs(played: Trajectories, problem: LinearMPC) -> Trajectories:
+    """Return the same with the stage costs of a problem, and the excess over its bounds."""
+    thetas, inputs, _ = played.padded()
+    taken = np.arange(len(inputs))[:, None] < played.lengths
+    excess = bound_excess(problem, thetas, inputs, taken)
+    costs = np.sum(problem.stage_cost(thetas[:-1], inputs), axis=0, where=taken) + excess.penalty
+    return replace(played, costs=costs, excess=excess)
+
+
+def _watch_length(env: Any, steps: int) -> None:
+    """Warn of an episode that is long, and raise RuntimeError where it seems to have no end."""
+    if steps not in (LONG_EPISODE, MAX_EPISODE_STEPS):
+        return
+    message = (
+        f"An episode of {env} has not ended after {steps} steps, all of which are kept in memory. "
+        "Give it a limit: max_episode_steps when it is registered, or gymnasium.wrappers.TimeLimit."
+    )
+    if steps == MAX_EPISODE_STEPS:
+        raise RuntimeError(message)
+    warnings.warn(message, stacklevel=3)
+
+
+@contextmanager
+def one_env(source: Source | EnvPool) -> Iterator[gym.Env[Any, Any]]:
+    """Yield the env that is given, one of a pool, or one that is made and closed afterwards."""
+    given = source.source if isinstance(source, EnvPool) else source
+    if isinstance(given, gym.Env):
+        yield given
+    elif isinstance(source, EnvPool):
+        with source.acquire(1) as (env,):
+            yield env
+    else:
+        with closing(make_env(source)) as made:
+            yield made
+
+
+def require_like_training(source: Source | EnvPool, training_env: Any, name: str) -> None:
+    """Raise ValueError if a simulator is the training env, or an env of another shape."""
+    training = [env.unwrapped for env in getattr(training_env, "envs", [])]
+    with one_env(source) as env:
+        if any(env.unwrapped is each for each in training):
+            raise ValueError(
+                f"{name} is the training env, whose episodes its own would interrupt. Give it "
+                "another one, e.g. its id."
+            )
+        ours, theirs = env.observation_space.shape, training_env.observation_space.shape
+        if ours != theirs or env.action_space != training_env.action_space:
+            raise ValueError(
+                f"{name} has observations of shape {ours} and {env.action_space}, the training env "
+                f"{theirs} and {training_env.action_space}. Give it a simulator of this plant."
+            )
+
+
+def as_seeds(seeds: Iterable[int]) -> list[int]:
+    """Return the seeds of episodes, whole numbers of at least 0."""
+    if not isinstance(seeds, Iterable):
+        raise TypeError(f"seeds = {seeds!r} must hold a seed for each episode, e.g. range(20).")
+    return [check_int("seeds", each, 0) for each in seeds]
+
+
+def as_source(env: Any) -> Any:
+    """Return the id of an env, an env, or what makes one; else raise TypeError or ValueError.
+
+    Of ``"module:name"`` the function is imported, unless the module registers an env of that name.
+    """
+    if isinstance(env, str) and ":" in env:
+        module, name = env.split(":", 1)
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise ValueError(f"env = {env!r}: {module!r} cannot be imported ({error}).") from error
+        if name in gym.registry:
+            return name
+        found = getattr(sys.modules[module], name, None)
+        if not (callable(found) or isinstance(found, gym.Env)):
+            raise ValueError(
+                f"env = {env!r}: {module!r} has no function {name!r} that makes an env, and "
+                "registers no env of that id."
+            )
+        return found
+    if not (isinstance(env, str | gym.Env) or callable(env)):
+        raise TypeError(
+            f"env = {env!r} must be the id of an environment, a gymnasium.Env, or a function that "
+            "makes one."
+        )
+    return env
+
+
+def make_env(source: Source) -> gym.Env[Any, Any]:
+    """Return the env that is given, or one that is made."""
+    source = as_source(source)
+    if isinstance(source, gym.Env):
+        return source
+    made = gym.make(source, disable_env_checker=True) if isinstance(source, str) else source()
+    if not isinstance(made, gym.Env):
+        raise TypeError(f"The function that makes envs returned {made!r}, not a gymnasium.Env.")
+    return made
+
+
+def maker(env: Source, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]]:
+    """Return a function that makes envs like the one that is given, by this name, or made."""
+    if isinstance(env, str):
+        env = as_source(env)  # "module:function" is a function
+    if isinstance(env, str):
+        return partial(gym.make, env, disable_env_checker=True)
+    if isinstance(env, gym.Env):
+        try:
+            copy.deepcopy(env)
+        except Exception as error:  # whatever a simulator raises that cannot be copied
+            raise TypeError(
+                f"{name} = {env!r} cannot be copied ({error}). Pass a function that makes "
+                "such an env: the starts are played side by side."
+            ) from error
+        return partial(copy.deepcopy, env)
+    if not callable(env):
+        raise TypeError(
+            f"{name} = {env!r} must be a single gymnasium.Env, its id, a function that makes "
+            "one, or a PlantTwin."
+        )
+
+    def made() -> gym.Env[Any, Any]:
+        found = env()
+        if not isinstance(found, gym.Env):
+            raise TypeError(f"{name} = {env!r} made {found!r}. It must return a gymnasium.Env.")
+        return found
+
+    return made
+
+
+def name_of(env: Any) -> str:
+    """Return a name of a simulator that is the same in another process."""
+    if isinstance(env, str):
+        return env
+    if isinstance(env, gym.Env):
+        spec = env.spec
+        return type(env.unwrapped).__name__ if spec is None else f"{spec.id}{spec.kwargs or ''}"
+    if isinstance(env, partial):  # its repr holds an address, which the next process does not have
+        return f"{name_of(env.func)}{env.args}{env.keywords}"
+    return getattr(env, "__qualname__", repr(env))
+
+
+def as_reward(value: Any) -> float:
+    """Return a reward as a number, NaN where it is none."""
+    try:
+        number = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        return np.nan
+    return float(number.ravel()[0]) if number.size == 1 else np.nan
+
+
+def may_change_reward(info: Mapping[str, Any]) -> bool:
+    """Tell whether a step reports a violation for which its reward may be another one.
+
+    An env whose every step is one would be compared nowhere: `StageCost` says what it added.
+    """
+    return bool(info.get("violation", False)) and info.get("violation_cost") != 0
+
+
+@contextmanager
+def preserve_rng() -> Iterator[None]:
+    """Restore the global random states that older envs, and modules of torch, draw from."""
+    python, legacy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    torch: Any = sys.modules.get("torch")
+    cpu = None if torch is None else torch.get_rng_state()
+    cuda = torch.cuda.get_rng_state_all() if torch and torch.cuda.is_initialized() else []
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(legacy)  # noqa: NPY002
+        if cpu is not None:
+            torch.set_rng_state(cpu)
+        if cuda:
+            torch.cuda.set_rng_state_all(cuda)
+
+
+def as_played(name: str, value: Trajectories) -> Trajectories:
+    """Return ``value`` if it is Trajectories, else raise TypeError."""
+    return check_type(name, value, Trajectories, "the Trajectories that evaluate returns")
+
+
+def _require_state_shown(policy: Any, env: gym.Env[Any, Any]) -> None:
+    """Raise if an env does not show a law the state; other policies may take anything."""
+    acts = getattr(policy, "policy", policy)  # a model's
+    owner = getattr(acts, "__self__", acts)  # of a method, such as law.plant_input
+    if isinstance(owner, PiecewiseAffine | OnlineLaw) or hasattr(owner, "told"):
+        require_state_shown(env, getattr(owner, "told", False))
+
+
+def _require_same_inputs(policy: Any, space: Any) -> None:
+    """Raise if a law puts out deviations, and an env takes absolute inputs."""
+    model = getattr(policy, "model", None)
+    if not isinstance(policy, PiecewiseAffine | OnlineLaw) or not isinstance(model, LinearModel):
+        return
+    if not isinstance(space, gym.spaces.Box):
+        return
+    units = InputUnits.between(policy.u_min, policy.u_max, model.u_ss, space.low, space.high)
+    if units is not None and units.kind == "absolute":
+        raise ValueError(
+            f"The env takes absolute inputs, from {space.low.tolist()} to {space.high.tolist()}, "
+            f"and the law puts out deviations, from {policy.u_min.tolist()} to "
+            f"{policy.u_max.tolist()}. Pass law.plant_input where the env shows absolute values "
+            "too, else wrap the plant in sb3_yann.wrappers.Deviations(env, mpc.model)."
+        )
+
+
+def _vector_env(env_id: str, n: int) -> VectorEnv[Any, Any, Any] | None:
+    """Return n copies of an env that step as one array, None where there is no such env of it."""
+    spec = gym.spec(env_id)
+    if spec.vector_entry_point is None or spec.additional_wrappers or n == 0:
+        return None
+    made = gym.make_vec(env_id, num_envs=n, vectorization_mode="vector_entry_point")
+    if made.metadata.get("seeds_each", False):  # most take one seed for all of them together
+        return made
+    made.close()
+    return None
