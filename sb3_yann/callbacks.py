@@ -14,9 +14,9 @@ from stable_baselines3.common.logger import Figure as LoggedFigure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import check_int, check_type
-from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import require_frozen, require_same_statistics
 from sb3_yann.policy.policies import YannPolicy, require_yann_policy
+from sb3_yann.policy.sb3_hooks import watch_buffer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

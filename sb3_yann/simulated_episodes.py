@@ -14,9 +14,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, check_int, check_range
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
-from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.policy.sb3_hooks import watch_buffer
 from sb3_yann.rollout import (
     EnvPool,
     Rows,

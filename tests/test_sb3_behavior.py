@@ -81,7 +81,7 @@ def learn(steps: int = STEPS + 1, callback=None, **kwargs):
 
 
 def test_a_policy_is_built_by_a_method_of_its_algorithm() -> None:
-    """policy._sb3_hooks.algorithm_under_construction looks for it, or for the learning rate."""
+    """policy.sb3_hooks.algorithm_under_construction looks for it, or for the learning rate."""
 
     class Asks(TD3Policy):
         def __init__(self, *args, **kwargs) -> None:
@@ -151,7 +151,7 @@ def test_each_update_is_one_step_of_the_critic_then_of_the_actor(algorithm) -> N
 
 
 def test_the_learning_rate_is_set_anew_before_each_training() -> None:
-    """policy._sb3_hooks multiplies the rate for one step and restores it."""
+    """policy.sb3_hooks multiplies the rate for one step and restores it."""
     model = learn(learning_rate=1e-3)
     for group in model.actor.optimizer.param_groups:
         group["lr"] = 7.0
@@ -234,7 +234,7 @@ def test_noise_and_random_actions_are_attributes_that_a_callback_may_change() ->
 
 
 def test_the_buffer_of_an_instance_may_have_its_own_add() -> None:
-    """policy._finite leaves rows out there, and reads these arrays."""
+    """policy.sb3_hooks leaves rows out there, and reads these arrays."""
     model, rows = build(), []
     buffer = model.replay_buffer
     buffer.add = lambda *args: (rows.append(args), type(buffer).add(buffer, *args))

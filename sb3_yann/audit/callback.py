@@ -22,9 +22,9 @@ from sb3_yann.audit.finding import (
 )
 from sb3_yann.audit.offset import steady_offset
 from sb3_yann.audit.sample import FEWEST, Sample
-from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.observations import require_frozen
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.policy.sb3_hooks import watch_buffer
 from sb3_yann.rollout import may_change_reward
 
 

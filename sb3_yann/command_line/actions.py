@@ -105,7 +105,7 @@ def commission(options: Namespace) -> None:
 
 def problem_of(given: str) -> Any:
     """Return the LinearMPC that a name or ``"module:attribute"`` stands for."""
-    from sb3_yann.policy.problem_registry import resolve_problem
+    from sb3_yann.policy.checks import resolve_problem
 
     return resolve_problem(given, None)
 

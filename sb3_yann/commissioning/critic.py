@@ -9,7 +9,7 @@ import torch as th
 
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.simulator_twin import SimulatorTwin
-from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.policies import YannPolicy
 from sb3_yann.twin.gradient import actor
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -30,7 +30,7 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin | SimulatorTwin, seed: int)
     first = first + SPREAD * half * rng.standard_normal(first.shape)
     first = np.clip(first, problem.deviations.u_min, problem.deviations.u_max)
     costs = _costs(policy, twin, layer, starts, first)
-    options = policy.critic_options
+    options = policy.actor_critic
     returns = options.offset_of_return(policy.gamma) - options.reward_scale * costs
     known = np.isfinite(returns)
     if np.count_nonzero(known) < BATCH:  # too few to say anything

@@ -11,7 +11,7 @@ import torch as th
 from sb3_yann._validation import Array
 from sb3_yann.control import ExplicitLimitError, ExplicitSolutionError, LinearMPC, OnlineLaw
 from sb3_yann.networks import RowAdam
-from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.networks.yann import LawLayer
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
 

@@ -17,7 +17,7 @@ from sb3_yann.commissioning.distillation import fit_layer
 from sb3_yann.commissioning.grounds import value_at_end
 from sb3_yann.commissioning.simulator_grounds import FINAL, RULE, SimulatorGrounds, controller_of
 from sb3_yann.commissioning.trial import Inputs
-from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.networks.yann import LawLayer
 from sb3_yann.rollout import Controller, Rows
 from sb3_yann.twin.gradient import actor
 

@@ -24,7 +24,7 @@ from sb3_yann.commissioning.search import Pace, Search, decisive
 from sb3_yann.commissioning.simulator_grounds import RULE, SimulatorGrounds
 from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.trial import Check
-from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin, require_yann_policy
 from sb3_yann.rollout import Source, name_of
 from sb3_yann.twin.plant_twin import PlantTwin

@@ -14,7 +14,7 @@ from sb3_yann._validation import Array
 from sb3_yann.commissioning.grounds import Grounds, Valued
 from sb3_yann.commissioning.trial import Check
 from sb3_yann.networks import RowAdam
-from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.networks.yann import LawLayer
 from sb3_yann.twin.gradient import accumulate_gradient, actor
 
 PLATEAU = 1e-4

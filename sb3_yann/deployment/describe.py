@@ -14,9 +14,9 @@ from sb3_yann.control.model.labels import labels_of, missing_observer
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.code import scale_within
 from sb3_yann.deployment.controller import FORMAT
-from sb3_yann.networks import SharedYannLayer, YannLayer
-from sb3_yann.networks.law_layer import ALL, NONE, LawLayer
-from sb3_yann.policy._features import AffineFeatures, keeps_entries
+from sb3_yann.networks import YannLayer
+from sb3_yann.networks.yann import FADE_END, FADE_START, LawLayer
+from sb3_yann.policy.observations import AffineFeatures, keeps_entries
 from sb3_yann.policy.policies import YannPolicy
 
 Exportable = BaseAlgorithm | YannPolicy | LinearMPC | PiecewiseAffine | OnlineLaw
@@ -67,7 +67,7 @@ def describe(
         )
     if isinstance(policy, YannPolicy):
         layer = policy.actor.mu
-        law = _explicit(layer.given if isinstance(layer, SharedYannLayer) else layer.explicit_law)
+        law = _explicit(layer.base_law)
         networks = _network_arrays(layer, law)
         change = layer.change.cpu().numpy() if layer.rated else np.empty((0, law.n_inputs))
     else:
@@ -214,7 +214,7 @@ def _no_networks(law: PiecewiseAffine) -> dict[str, Any]:
         "activation": "tanh",
         "reach": np.inf,
         "confines": np.zeros((2, n)),
-        "fades": np.array([ALL, NONE]),
+        "fades": np.array([FADE_START, FADE_END]),
     }
 
 

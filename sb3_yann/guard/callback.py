@@ -39,10 +39,10 @@ from sb3_yann.guard.state import (
     restore_accepted,
     summary_of,
 )
-from sb3_yann.policy._finite import watch_buffer
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import require_same_statistics
 from sb3_yann.policy.policies import require_yann_policy
+from sb3_yann.policy.sb3_hooks import watch_buffer
 from sb3_yann.rollout import (
     LONG_EPISODE,
     Source,

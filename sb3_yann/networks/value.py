@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import operator
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -18,16 +20,10 @@ from sb3_yann._validation import (
     check_positive,
     check_positive_vector,
 )
-from sb3_yann.networks.prediction import (
-    LinearPrediction,
-    PredictionModel,
-    require_prediction,
-    untrained,
-)
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
 
-LOOPS = 48
-"""Parameters and inputs up to which loops over a quadratic form are faster than BLAS."""
+PredictionModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
+"""``(theta, u) -> next theta``: (batch, n), (batch, m) to (batch, n), float64, physical units."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +62,30 @@ class Ranges:
     def u_middle(self) -> Array:
         """The inputs at action 0, (m,)."""
         return (self.u_max + self.u_min) / 2
+
+
+class LinearPrediction(nn.Module):
+    """``(theta, u) -> A theta + B u``, from :attr:`LinearMPC.prediction`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> predict = LinearPrediction(np.eye(1), np.ones((1, 1)))
+    >>> predict(th.ones(1, 1).double(), th.ones(1, 1).double()).tolist()
+    [[2.0]]
+    """
+
+    A: th.Tensor
+    B: th.Tensor
+
+    def __init__(self, A: Array, B: Array) -> None:
+        super().__init__()
+        self.register_buffer("A", th.as_tensor(A.T.copy()))
+        self.register_buffer("B", th.as_tensor(B.T.copy()))
+
+    def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+        """Return the predicted next theta, (batch, n)."""
+        return theta @ self.A + u @ self.B
 
 
 class QuadraticForm(nn.Module):
@@ -235,9 +255,10 @@ class AfterstateValue(nn.Module):
     def compiles(self) -> bool:
         """Whether there is compiled code for such a value where it is now."""
         modules: Any = self._modules
+        largest = 48  # parameters and inputs; beyond, BLAS is faster than loops
         linear = isinstance(modules.get("model"), LinearPrediction)
         weight: Any = self._buffers["W"]
-        if not linear or weight.dtype != th.float64 or len(weight) > LOOPS:
+        if not linear or weight.dtype != th.float64 or len(weight) > largest:
             return False
         double: bool = modules["quadratic"].entries.dtype == th.float64
         return double and modules["network"].compiles
@@ -306,3 +327,35 @@ class AfterstateValue(nn.Module):
         learnt: th.Tensor = self.network((theta * self.network_scale).float())
         total: th.Tensor = self.quadratic(theta) + self.scale * learnt.double()
         return total
+
+
+def require_prediction(model: PredictionModel, n: int, m: int) -> None:
+    """Raise unless the model returns a next theta for each row that depends on u."""
+    batch = n + m + 1  # no other size of the problem, so that a mistaken axis shows
+    theta = th.zeros(batch, n, dtype=th.float64)
+    u = th.zeros(batch, m, dtype=th.float64, requires_grad=True)
+    with th.enable_grad():
+        predicted = model(theta, u)
+    if not isinstance(predicted, th.Tensor) or predicted.shape != theta.shape:
+        shape = getattr(predicted, "shape", type(predicted).__name__)
+        raise ValueError(
+            f"The prediction model returned {shape} for theta ({batch}, {n}) and u ({batch}, {m}); "
+            f"it must return the next theta, shape ({batch}, {n})."
+        )
+    if not bool(th.isfinite(predicted).all()):
+        raise ValueError(f"The prediction model returned {predicted[0].tolist()} for zeros.")
+    if not predicted.requires_grad:
+        raise ValueError(
+            "The prediction has no gradient with respect to u, by which the actor learns: compute "
+            "it by operations of torch on u itself, without detach or numpy."
+        )
+
+
+def untrained(model: nn.Module) -> nn.Module:
+    """Return a copy with buffers for parameters: no optimizer or target update moves those."""
+    model = copy.deepcopy(model).double()
+    for module in model.modules():
+        for name, parameter in [*module.named_parameters(recurse=False)]:
+            delattr(module, name)
+            module.register_buffer(name, parameter.detach())
+    return model

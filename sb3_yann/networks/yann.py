@@ -1,6 +1,7 @@
-"""The YANN layer: the active region's affine law plus that region's own trainable network.
+"""The YANN layers: a law, exactly, plus trainable networks that are zero at first.
 
-It puts out actions in [-1, 1], which stand for ``u_min`` and ``u_max`` of the law.
+They put out actions in [-1, 1], which stand for ``u_min`` and ``u_max`` of the law. `YannLayer` has
+a network for each region, as in the paper. `SharedYannLayer` has one network for any law.
 """
 
 from __future__ import annotations
@@ -12,11 +13,205 @@ from typing import Any
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
+from torch import nn
 
-from sb3_yann._validation import Array
+from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.law import PiecewiseAffine
-from sb3_yann.networks.law_layer import LawLayer, Rate, require_finite_inputs
+from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
+
+Rate = tuple[Array, Array]
+FADE_START = 1.0
+"""Within how many half-widths of a box a correction counts in full."""
+FADE_END = 1.25
+"""Beyond how many half-widths of a box a correction does not count."""
+
+
+class LawLayer(nn.Module):
+    """theta -> input in [-1, 1]: a law, and what networks add to it within bounds.
+
+    Parameters
+    ----------
+    law : PiecewiseAffine or OnlineLaw
+        With finite input bounds, which map to -1 and 1.
+    rate : pair of ndarray, shape (m,), optional
+        ``du_min`` and ``du_max``: the input never moves by more from the previous one, the last m
+        entries of theta.
+    """
+
+    theta_half: th.Tensor
+    middle: th.Tensor
+    half_range: th.Tensor
+    change: th.Tensor
+    confines: th.Tensor
+    network: ZeroOutputNetwork
+    reach: float | None
+    constants: tuple[Array, Array, float]  # for compiled code
+
+    def __init__(self, law: Law, rate: Rate | None) -> None:
+        super().__init__()
+        # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
+        import_module("sb3_yann.networks._kernels.yann_layer")
+        if not np.all(np.isfinite([law.u_min, law.u_max])):
+            raise ValueError(
+                f"The law has u_min = {law.u_min.tolist()} and u_max = {law.u_max.tolist()}; "
+                "a policy needs finite bounds on every input. Pass u_min and u_max to LinearMPC."
+            )
+        self.base_law = law
+        self.rated = rate is not None
+        self.row_gradients = False
+        middle = (law.u_max + law.u_min) / 2
+        half_range = (law.u_max - law.u_min) / 2
+        half = half_widths(law.theta_min, law.theta_max)
+        self.register_buffer("theta_half", th.as_tensor(half, dtype=th.float32))
+        change: Array = np.empty((0, law.n_inputs))
+        if rate is not None:
+            if np.shape(rate) != (2, law.n_inputs) or law.n_theta < law.n_inputs:
+                raise ValueError(
+                    f"rate has shape {np.shape(rate)}, expected (2, {law.n_inputs}) and a theta "
+                    f"that ends with the {law.n_inputs} previous inputs; it has {law.n_theta}."
+                )
+            # In both directions a little is left for the rounding of actions and observations.
+            room = np.maximum(np.stack([-rate[0], rate[1]]) / half_range - 1e-6, 0.0)
+            change = room * [[-1.0], [1.0]]
+            register_constants(self, change=change)
+        if rate is not None or not isinstance(self, YannLayer):
+            register_constants(self, middle=middle, half_range=half_range)
+        self.register_buffer("confines", th.zeros((2, law.n_theta), dtype=th.float64))
+        no_box = np.zeros(2 * law.n_theta)
+        scaling = [1 / half, middle, 1 / half_range, no_box, [FADE_START, FADE_END]]
+        self.constants = (np.concatenate(scaling), change, np.inf)
+
+    @property
+    def n_networks(self) -> int:
+        """How many networks there are: one for each region, or one."""
+        return len(self.network.pinned)
+
+    def law(self, theta: th.Tensor) -> th.Tensor:
+        """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
+        raise NotImplementedError
+
+    def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
+        """Return which network each row of theta (batch, n) goes through."""
+        raise NotImplementedError
+
+    def _correction(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the law and what the networks put out, by torch's operations, both (batch, m)."""
+        raise NotImplementedError
+
+    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array]:
+        """Return the law, packed, and room for its inputs; or nothing packed, and the inputs."""
+        raise NotImplementedError
+
+    def forward(self, theta: th.Tensor) -> th.Tensor:
+        """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
+        network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
+        if theta.device.type == "cpu" and not theta.requires_grad and network.compiles:
+            from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
+
+            own = network.weights(), network.pinned_array
+            return layer_on_cpu(self._for_loops, theta, self.constants, *own, self.row_gradients)
+        law, correction = self._correction(theta)
+        if self.reach is not None:
+            # The bound holds for weights that overflow, or are no numbers, as well.
+            correction = correction.nan_to_num(0.0, self.reach, -self.reach)
+            correction = clamp_with_inward_gradient(correction, -self.reach, self.reach)
+        part = self.confined(theta)
+        output = law + th.where(part > 0, correction * part, 0.0)
+        # As compiled: where theta is not finite nothing is passed off as an input.
+        output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
+        bounds = self.reachable(theta) if self.rated else (-1.0, 1.0)
+        return clamp_with_inward_gradient(output, *bounds)
+
+    @th.no_grad()
+    def reachable(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the bounds (batch, m) that the rate leaves of [-1, 1]."""
+        previous = (theta[:, -len(self.middle) :] - self.middle) / self.half_range
+        low, high = (previous + self.change[:, None]).clamp(-1, 1).to(self.theta_half)
+        return low, high
+
+    @property
+    def explicit_law(self) -> PiecewiseAffine | None:
+        """The law; None where it is solved online."""
+        return self.base_law if isinstance(self.base_law, PiecewiseAffine) else None
+
+    def slopes_of_law(self, theta: Array) -> Array:
+        """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""
+        law = self.base_law
+        slopes: Array = law.gain(theta) / ((law.u_max - law.u_min) / 2)[:, None]
+        u = law(theta)
+        slopes[(u <= law.u_min) | (u >= law.u_max)] = 0.0
+        if isinstance(law, PiecewiseAffine) and law.infeasible == "zero_input":
+            slopes[~law.in_domain(theta)] = 0.0  # as the gain of an online law is
+        return slopes
+
+    @property
+    def packed(self) -> tuple[Any, ...] | None:
+        """Law, ranges and networks for compiled code, None where there is none for them.
+
+        They are as `yann_layer.forward` takes them. Weights share their memory.
+        """
+        law = self.explicit_law
+        if law is None or not self.network.compiles:
+            return None
+        from sb3_yann.networks._kernels.stack import to_numpy  # which loads numba
+
+        weights = map(to_numpy, self.network.weights())
+        return (*law.packed, *self.constants, *weights, self.network.pinned_array)
+
+    def frozen(self) -> Callable[[Array], NDArray[Any]]:
+        """Return the layer of now, on the CPU, as a function of theta (batch, n): (batch, m).
+
+        It is faster for small batches where there is compiled code: it does without torch.
+        """
+        if self.network.compiles:
+            from sb3_yann.networks._kernels.yann_layer import frozen_layer
+
+            own = self.network.weights(), self.network.pinned_array
+            return frozen_layer(self._for_loops, self.constants, *own)
+
+        @th.no_grad()
+        def act(theta: Array) -> NDArray[Any]:
+            found: NDArray[Any] = self(th.as_tensor(theta)).double().numpy()
+            return found
+
+        return act
+
+    def limit(self, max_correction: float | None) -> None:
+        """Bound the network's output to a fraction of the input range, or not at all."""
+        # The input range is 2 here. A little is left for the float32 rounding of what follows, and
+        # for what the rate's own room may take from the law.
+        left = 2e-6 if self.rated else 1e-6
+        self.reach = None if max_correction is None else max(0.0, 2 * max_correction - left)
+        self.constants = (*self.constants[:2], np.inf if self.reach is None else self.reach)
+
+    def confine(self, low: Array | None, high: Array | None) -> None:
+        """Let the network's output count in a box of theta only, or everywhere for None.
+
+        It counts in full within, and falls to nothing at a quarter of a half-width beyond.
+        """
+        box: Array = np.zeros((2, len(self.theta_half)))  # its middle, and one over its half-widths
+        if low is not None and high is not None:
+            least = 0.01 * self.theta_half.double().cpu().numpy()  # of the problem's half-widths
+            box = np.stack([(high + low) / 2, 1 / np.maximum((high - low) / 2, least)])
+        self.confines.copy_(th.as_tensor(box))
+        self._keep_confines()
+
+    def confined(self, theta: th.Tensor) -> th.Tensor:
+        """Return the part (batch, 1), from 1 to 0, of the network's output that counts."""
+        beyond = ((theta - self.confines[0]).abs() * self.confines[1]).amax(1, keepdim=True)
+        return ((FADE_END - beyond) / (FADE_END - FADE_START)).clamp(0, 1).to(self.theta_half)
+
+    def _keep_confines(self) -> None:
+        confines = self.confines.cpu().numpy().ravel()
+        scaling = self.constants[0][: -len(confines) - 2]
+        # As data: a constant of another file stays what it was in code that has been compiled.
+        scaling = np.concatenate([scaling, confines, [FADE_START, FADE_END]])
+        self.constants = (scaling, *self.constants[1:])
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+        self._keep_confines()
 
 
 class YannLayer(LawLayer):
@@ -51,6 +246,7 @@ class YannLayer(LawLayer):
     True
     """
 
+    base_law: PiecewiseAffine
     gains: th.Tensor
     offsets: th.Tensor
     half_space_A: th.Tensor
@@ -66,37 +262,19 @@ class YannLayer(LawLayer):
         pinned: bool = True,
         rate: Rate | None = None,
     ) -> None:
-        super().__init__()
-        # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
-        import_module("sb3_yann.networks._kernels.yann_layer")
-        require_finite_inputs(law)
-        self.infeasible, self.piecewise_affine = law.infeasible, law
-        self.tolerance, self.tie_tolerance = law.tolerance, law.tie_tolerance
+        super().__init__(law, rate)
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
         # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
-        register_constants(self, **_constants(law))
-        self._set_ranges(law, rate)
+        register_constants(self, **_law_in_actions(law))
         at_origin = np.minimum.reduceat(law.b, law.starts) >= -law.tolerance
-        stay, sizes = th.as_tensor(at_origin & pinned), (law.n_theta, law.n_inputs)
-        self.network = ZeroOutputNetwork(*sizes, hidden, activation=activation, pinned=stay)
+        self.network = ZeroOutputNetwork(
+            law.n_theta,
+            law.n_inputs,
+            hidden,
+            activation=activation,
+            pinned=th.as_tensor(at_origin & pinned),
+        )
         self.limit(max_correction)
-        self.has_its_law = True
-
-    def forward(self, theta: th.Tensor) -> th.Tensor:
-        """Return the input in [-1, 1], shape (batch, m), for theta of shape (batch, n)."""
-        fixed = theta.device.type == "cpu" and not theta.requires_grad
-        if fixed and self.has_its_law and self.network.compiles:
-            return self._compiled(theta)
-        region, inside = self.locate(theta)
-        correction = self.network((theta / self.theta_half).to(self.theta_half), region)
-        return self._with_correction(theta, self._law(theta, region, inside), correction)
-
-    def _compiled(self, theta: th.Tensor) -> th.Tensor:
-        from sb3_yann.networks._kernels.yann_layer import layer_on_cpu  # compiled once
-
-        network: Any = self._modules["network"]  # an attribute of a module takes a microsecond
-        law, own = self.piecewise_affine.packed, (network.weights(), network.pinned_array)
-        return layer_on_cpu(theta, law, self.constants, *own, self.row_gradients)
 
     def law(self, theta: th.Tensor) -> th.Tensor:
         """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
@@ -104,13 +282,10 @@ class YannLayer(LawLayer):
 
     def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
         """Return the region in use for each row of theta (batch, n), the first if not finite."""
-        if not self.has_its_law:
-            by_torch: NDArray[np.int64] = self.locate(theta)[0].cpu().numpy()
-            return by_torch
         points = theta.detach().double().cpu().numpy()
         finite = np.isfinite(points).all(axis=1)
         found = np.zeros(len(points), dtype=np.int64)
-        found[finite] = self.piecewise_affine.locate(points[finite])
+        found[finite] = self.base_law.locate(points[finite])
         return found
 
     @th.no_grad()
@@ -119,60 +294,46 @@ class YannLayer(LawLayer):
         slack = th.addmm(self.half_space_b, theta.double(), self.half_space_A, alpha=-1)
         slack = th.unflatten(slack, 1, (-1, len(self.gains))).amin(1)
         largest = slack.amax(-1)
-        nearly = largest - self.tie_tolerance * (1 + largest.abs())
-        return (slack >= nearly[:, None]).byte().argmax(-1), largest >= -self.tolerance
+        nearly = largest - self.base_law.tie_tolerance * (1 + largest.abs())
+        return (slack >= nearly[:, None]).byte().argmax(-1), largest >= -self.base_law.tolerance
+
+    def _correction(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        region, inside = self.locate(theta)
+        correction = self.network((theta / self.theta_half).to(self.theta_half), region)
+        return self._law(theta, region, inside), correction
 
     def _law(self, theta: th.Tensor, region: th.Tensor, inside: th.Tensor) -> th.Tensor:
         u = (self.gains[region] * theta[:, None]).sum(-1) + self.offsets[region]
-        if self.infeasible == "zero_input":
+        if self.base_law.infeasible == "zero_input":
             u = th.where(inside[:, None], u, self.resting)
         u = u.clamp(-1, 1).to(self.theta_half)
         return u.clamp(*self.reachable(theta)) if self.rated else u
 
-    @property
-    def explicit_law(self) -> PiecewiseAffine | None:
-        """The law in use; None where weights with another one have been loaded."""
-        return self.piecewise_affine if self.has_its_law else None
+    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array]:
+        return *self.base_law.packed, np.empty((len(theta), self.base_law.n_inputs))
 
-    def _frozen(self, *packed: Any) -> Callable[[Array], NDArray[Any]]:
-        from sb3_yann.networks._kernels.yann_layer import frozen_layer
-
-        return frozen_layer(*packed)
-
-    def slopes_of_law(self, theta: Array) -> Array:
-        """Return the derivatives (rows, m, n) of the law in [-1, 1], zero where it is clipped."""
-        region = self.regions(th.as_tensor(theta))
-        slopes: Array = self.gains[region].numpy().copy()
-        raw = (slopes @ theta[..., None])[..., 0] + self.offsets[region].numpy()
-        slopes[np.abs(raw) >= 1] = 0.0
-        if self.infeasible == "zero_input":
-            slopes[~self.piecewise_affine.in_domain(theta)] = 0.0
-        return slopes
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        # What is compiled goes by the law that was given: with another one it must not be used.
-        self.has_its_law = all(
-            np.array_equal(value, self.get_buffer(name).cpu())
-            for name, value in _constants(self.piecewise_affine).items()
-        )
+    def _load_from_state_dict(
+        self, state_dict: Any, prefix: str, metadata: Any, strict: bool, *lists: Any
+    ) -> None:
+        constants = "gains", "offsets", "resting", "half_space_A", "half_space_b"
+        own = {name: self.get_buffer(name).clone() for name in constants}
+        super()._load_from_state_dict(state_dict, prefix, metadata, strict, *lists)
+        # Compiled code and regions go by the law that was given.
+        for name, ours in own.items():
+            loaded = self.get_buffer(name)
+            size = float(ours[ours.isfinite()].abs().max())
+            if not th.allclose(loaded, ours, rtol=1e-5, atol=1e-5 * size):
+                lists[-1].append(f"{prefix}{name} is that of another law.")
+            loaded.copy_(ours)
 
 
-def _constants(law: PiecewiseAffine) -> dict[str, Array]:
-    """Return the law for actions in [-1, 1], as the layer keeps it."""
-    middle, reach = (law.u_max + law.u_min) / 2, (law.u_max - law.u_min) / 2
-    A, b = _padded_half_spaces(law)
-    return {
-        "gains": law.gains / reach[:, None],
-        "offsets": (law.offsets - middle) / reach,
-        "resting": np.clip(-middle / reach, -1, 1),
-        "half_space_A": A,
-        "half_space_b": b,
-    }
+def _law_in_actions(law: PiecewiseAffine) -> dict[str, Array]:
+    """Return the law for actions in [-1, 1], as the layer keeps it.
 
-
-def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
-    """Return (n, q_max p) and (q_max p,): the first half-space of every region, the second, ..."""
+    The half-spaces are (n, q_max p) and (q_max p,): the first of every region, the second, ...
+    """
+    middle = (law.u_max + law.u_min) / 2
+    half_range = (law.u_max - law.u_min) / 2
     # Regions with fewer than q_max are filled up with half-spaces that never bind.
     counts = np.diff([*law.starts, law.n_halfspaces])
     A = np.zeros((law.n_theta, counts.max(), law.n_regions))
@@ -180,4 +341,168 @@ def _padded_half_spaces(law: PiecewiseAffine) -> tuple[Array, Array]:
     for i, (start, count) in enumerate(zip(law.starts, counts, strict=True)):
         A[:, :count, i] = law.A[start : start + count].T
         b[:count, i] = law.b[start : start + count]
-    return A.reshape(law.n_theta, -1), b.ravel()
+    return {
+        "gains": law.gains / half_range[:, None],
+        "offsets": (law.offsets - middle) / half_range,
+        "resting": np.clip(-middle / half_range, -1, 1),
+        "half_space_A": A.reshape(law.n_theta, -1),
+        "half_space_b": b.ravel(),
+    }
+
+
+class SharedYannLayer(LawLayer):
+    """theta -> input in [-1, 1]: a law, exactly, plus one network for all of it.
+
+    At first the network is exactly zero and the layer is the law, to float32 rounding. The network
+    does not grow with the law, and leaves it as continuous as it is.
+
+    The law is evaluated by numpy, on the processor. The state_dict holds samples of it, by which
+    parameters of another law are recognized.
+
+    Parameters
+    ----------
+    law : PiecewiseAffine or OnlineLaw
+        With finite input bounds, which map to -1 and 1.
+    hidden : tuple of int, default (64, 64)
+        Widths of the network.
+    activation, max_correction, pinned, rate
+        As in :class:`YannLayer`.
+
+    Examples
+    --------
+    >>> from sb3_yann_envs import problems
+    >>> law = problems.cstr().online()
+    >>> layer, theta = SharedYannLayer(law), np.full(4, 0.1)
+    >>> u = layer(th.as_tensor(theta)[None]).detach().numpy()[0] * law.u_max  # from [-1, 1]
+    >>> bool(np.allclose(u, law(theta), atol=1e-5))
+    True
+    """
+
+    samples: th.Tensor
+
+    def __init__(
+        self,
+        law: Law,
+        hidden: tuple[int, ...] = (64, 64),
+        activation: Activation = th.tanh,
+        max_correction: float | None = None,
+        pinned: bool = True,
+        rate: Rate | None = None,
+    ) -> None:
+        super().__init__(law, rate)
+        law(np.zeros(law.n_theta))  # compiled now, not in the midst of learn
+        theta = sample_points(law)
+        register_constants(self, samples=np.hstack([theta, self._actions(theta)]))
+        self.network = ZeroOutputNetwork(
+            law.n_theta,
+            law.n_inputs,
+            hidden,
+            activation=activation,
+            pinned=th.tensor([pinned]),
+        )
+        self.limit(max_correction)
+
+    def law(self, theta: th.Tensor) -> th.Tensor:
+        """Return the law alone, in [-1, 1], whatever has been learnt; (batch, m)."""
+        tracing = th.jit.is_tracing() or th.compiler.is_compiling()  # type: ignore[attr-defined, no-untyped-call]
+        if tracing:
+            raise RuntimeError(
+                "A law beside a shared network is evaluated outside of torch: it cannot be traced "
+                "or compiled by it. Trace a policy with networks='per_region'."
+            )
+        u: th.Tensor = _Law.apply(theta, self)  # type: ignore[no-untyped-call]
+        return u.clamp(*self.reachable(theta)) if self.rated else u
+
+    def regions(self, theta: th.Tensor) -> NDArray[np.int64]:
+        """Return zeros: all rows of theta (batch, n) go through the one network."""
+        return np.zeros(len(theta), np.int64)
+
+    def inputs(self, theta: Array) -> Array:
+        """Return the law's inputs (batch, m), NaN where theta (batch, n) is not finite."""
+        finite = np.isfinite(theta).all(axis=1)
+        if finite.all():
+            u: Array = self.base_law(theta)
+            return u
+        u = np.full((len(theta), self.base_law.n_inputs), np.nan)
+        if finite.any():
+            u[finite] = self.base_law(theta[finite])
+        return u
+
+    def _correction(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        correction = self.network((theta / self.theta_half).to(self.theta_half))
+        return self.law(theta), correction
+
+    def _for_loops(self, theta: Array) -> tuple[Array, NDArray[np.int64], Array]:
+        return np.empty(0), np.empty(0, np.int64), self.inputs(theta)
+
+    def _actions(self, theta: Array) -> Array:
+        middle = self.middle.double().cpu().numpy()
+        actions: Array = (self.base_law(theta) - middle) / self.half_range.double().cpu().numpy()
+        return actions
+
+    def answers_as(self, samples: th.Tensor, rounding: float) -> bool:
+        """Return whether rows ``[theta, action]`` are the law's, where the MPC has a solution."""
+        rows: Array = samples.double().cpu().numpy()
+        if not np.isfinite(rows).all():
+            return False
+        theta, actions = np.split(rows, [self.base_law.n_theta], axis=1)
+        apart = np.abs(self._actions(theta) - actions).max(1)
+        return bool(np.all(apart[self.base_law.in_domain(theta)] <= rounding))
+
+
+def sample_points(law: Law) -> Array:
+    """Return points (rows, n) in the box of a law, most of them near its middle.
+
+    Far from there many laws have the same answer: a bound.
+    """
+    bounded = np.isfinite(law.theta_min) & np.isfinite(law.theta_max)
+    middle = np.where(bounded, law.theta_max / 2 + law.theta_min / 2, 0.0)
+    shares = np.random.default_rng(0).uniform(-1, 1, (32, law.n_theta))
+    near = 2.0 ** -(np.arange(len(shares)) % 8)[:, None]
+    points: Array = middle + near * shares * half_widths(law.theta_min, law.theta_max)
+    return points
+
+
+class _Law(th.autograd.Function):
+    """A law in [-1, 1], with its gain for a gradient where theta has one."""
+
+    @staticmethod
+    def forward(ctx: Any, theta: th.Tensor, layer: SharedYannLayer) -> th.Tensor:
+        ctx.layer = layer
+        ctx.save_for_backward(theta)
+        points = theta.detach().double().cpu().numpy()
+        u = th.as_tensor(layer.inputs(points), device=theta.device)
+        return ((u - layer.middle) / layer.half_range).to(layer.theta_half)
+
+    @staticmethod
+    @th.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor, None]:
+        (theta,) = ctx.saved_tensors
+        points = theta.detach().double().cpu().nan_to_num(0.0, 0.0, 0.0).numpy()
+        slopes = th.as_tensor(ctx.layer.slopes_of_law(points), device=theta.device)
+        return (gradients[0].double()[:, None] @ slopes)[:, 0].to(theta), None
+
+
+class _InwardGradientClamp(th.autograd.Function):
+    """Clamp to [low, high]; backward, stop only what would push further out."""
+
+    @staticmethod
+    def forward(ctx: Any, x: th.Tensor, low: Any, high: Any) -> th.Tensor:
+        ctx.save_for_backward(x)
+        ctx.low = low
+        ctx.high = high
+        return x.clamp(low, high)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor, None, None]:
+        (x,) = ctx.saved_tensors
+        (gradient,) = gradients
+        # Descent moves x against its gradient.
+        outward = ((x >= ctx.high) & (gradient < 0)) | ((x <= ctx.low) & (gradient > 0))
+        return gradient.masked_fill(outward, 0.0), None, None
+
+
+def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:
+    """Return x clamped to numbers or tensors, with a gradient that can still lead inside."""
+    clamped: th.Tensor = _InwardGradientClamp.apply(x, low, high)  # type: ignore[no-untyped-call]
+    return clamped

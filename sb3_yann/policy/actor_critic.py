@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch as th
@@ -16,20 +17,95 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from sb3_yann import networks
-from sb3_yann._validation import NonFiniteWarning, check_choice
+from sb3_yann._validation import (
+    NonFiniteWarning,
+    check_choice,
+    check_number,
+    check_options,
+    check_positive,
+)
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.networks import AfterstateValue, SharedYannLayer, YannLayer
-from sb3_yann.networks.law_layer import LawLayer
-from sb3_yann.policy._features import SeesTheta, keeps_entries, without_entries
-from sb3_yann.policy._finite import what_is_not_finite
-from sb3_yann.policy._own_parameters import require_own_problem
-from sb3_yann.policy._precision import KeepsPrecision
-from sb3_yann.policy.critic_options import CriticOptions
+from sb3_yann.networks.value import PredictionModel
+from sb3_yann.networks.yann import LawLayer
+from sb3_yann.policy.checks import require_own_problem
+from sb3_yann.policy.observations import SeesTheta, keeps_entries, without_entries
+from sb3_yann.policy.sb3_hooks import KeepsPrecision, what_is_not_finite
 
 LONGEST = 100
 """Samples that a cost counts for good as, at most."""
 NETWORKS = ("per_region", "shared")
+CRITICS = ("afterstate", "state_action")
+
+
+@dataclass(frozen=True)
+class CriticOptions:
+    """Options of the critic, for ``policy_kwargs={"critic": ...}``.
+
+    Parameters
+    ----------
+    kind : {"afterstate", "state_action"}, default "afterstate"
+        What is learnt: the value of the predicted next state (:class:`AfterstateValue`), or the
+        paper's function of state and action (:class:`QuadraticStateActionValue`).
+    prediction_model : callable, optional
+        ``(theta, u) -> next theta`` for the afterstate critic, differentiable, of float64 tensors
+        (batch, n) and (batch, m) in physical units. The default is the MPC's ``A theta + B u``.
+    value_scale : float, optional
+        Factor of the afterstate critic's network: the order of the changes of V to be learnt. The
+        default is the mean stage cost of what is learnt from while the actor is still the MPC
+        (``critic_warmup``), over ``1 - gamma``, or 0.01 where that is more.
+    reward_scale, reward_offset : float, default 1 and 0
+        The env's reward is ``reward_scale * (-c) + reward_offset`` for the problem's stage cost c.
+        :class:`CostAudit` finds these numbers.
+
+    Examples
+    --------
+    >>> CriticOptions(reward_scale=0.01, value_scale=10.0).kind
+    'afterstate'
+    """
+
+    kind: str = "afterstate"
+    prediction_model: PredictionModel | None = None
+    value_scale: float | None = None
+    reward_scale: float = 1.0
+    reward_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_choice("kind", self.kind, CRITICS)
+        if self.prediction_model is not None and not callable(self.prediction_model):
+            raise TypeError(
+                f"prediction_model = {self.prediction_model!r} must be a function of tensors "
+                "(theta, u) that returns the next theta, or None for the linear model."
+            )
+        if self.prediction_model is not None and self.kind == "state_action":
+            raise ValueError("prediction_model is for kind='afterstate', not for 'state_action'.")
+        if self.value_scale is not None:
+            check_positive(
+                "value_scale", self.value_scale, "It multiplies the network, or is None."
+            )
+        check_positive("reward_scale", self.reward_scale, "Give 1 for the cost as it is.")
+        check_number("reward_offset", self.reward_offset)
+
+    @property
+    def scales_itself(self) -> bool:
+        """Whether the scale of the values comes from what is learnt from."""
+        return self.value_scale is None and self.kind == "afterstate"
+
+    def offset_of_return(self, gamma: float) -> float:
+        """Return what ``reward_offset`` adds up to; ValueError if that is no finite number."""
+        if self.reward_offset == 0:
+            return 0.0
+        if not gamma < 1:
+            raise ValueError(f"reward_offset = {self.reward_offset!r} needs a discount below 1.")
+        return float(self.reward_offset) / (1 - gamma)
+
+
+def as_critic_options(critic: str | CriticOptions | Mapping[str, Any]) -> CriticOptions:
+    """Return the options of a critic from its kind, a mapping of some of them, or themselves."""
+    if isinstance(critic, CriticOptions | Mapping):
+        return check_options("critic", critic, CriticOptions)
+    return CriticOptions(check_choice("critic", critic, CRITICS))
 
 
 class YannActor(KeepsPrecision, SeesTheta, Actor):
@@ -291,3 +367,46 @@ def _initial_value(
         model = networks.LinearPrediction(*problem.prediction)
     W, P, scale = problem.stage_matrix, problem.value_matrix(gamma), options.value_scale
     return AfterstateValue(W, P, model, gamma, scale=scale, **common)
+
+
+EPS = 1e-8
+"""Of Adam, for gradients in units of the values' scale."""
+FOLLOWS, RECENT = 10, 0.1
+"""Updates after which the values' scale is looked at; share of that batch in the mean cost."""
+
+
+def follow_scale(
+    actor: YannActor,
+    critic: YannCritic,
+    target: YannCritic,
+    mean: th.Tensor,
+    taken: int,
+    eps: float,
+) -> None:
+    """Let the factor of the critic's networks follow the mean stage cost, by factors of two.
+
+    What they put out stays, to the bit: Pop-Art (van Hasselt et al., *Learning values across
+    many orders of magnitude*, 2016).
+
+    Parameters
+    ----------
+    actor, critic, target
+        The target is the critic's.
+    mean : Tensor, shape ()
+        The mean stage cost until now, which takes in that of the critic's batch.
+    taken : int
+        Updates of the critic so far: it is looked at after every tenth.
+    eps : float
+        Of both optimizers, in units of their gradients.
+    """
+    if taken % FOLLOWS:
+        return
+    cost, share = critic.stage_cost_of_batch(), max(FOLLOWS / (taken + FOLLOWS), RECENT)
+    mean.add_(share * (cost - mean))
+    if taken == 0:  # the critic has taken its first batch's for the unit, the target had none
+        target.load_state_dict(critic.state_dict())
+    scale = critic.rescale(float(mean), critic.optimizer)
+    target.rescale(float(mean))
+    for optimizer, power in ((actor.optimizer, 1), (critic.optimizer, 2)):
+        for group in optimizer.param_groups:
+            group["eps"] = eps * (critic.scale * scale) ** power

@@ -32,16 +32,25 @@ from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.choice import LAWS
 from sb3_yann.networks import RowAdam, SharedYannLayer
 from sb3_yann.networks.zero_output import FEW
-from sb3_yann.policy import _checks, _sb3_hooks
-from sb3_yann.policy._features import AffineFeatures
-from sb3_yann.policy._finite import finite_gradient, warn_of_refused_step, watch_buffer
-from sb3_yann.policy._own_parameters import require_own_problem
-from sb3_yann.policy._precision import KeepsPrecision, single_precision
-from sb3_yann.policy.actor_critic import YannActor, YannCritic, layer_for
-from sb3_yann.policy.critic_options import CriticOptions, as_critic_options
-from sb3_yann.policy.observations import AffineObservation, Shown, as_observation
-from sb3_yann.policy.problem_registry import resolve_problem
-from sb3_yann.policy.value_scale import EPS, follow_scale
+from sb3_yann.policy import checks, sb3_hooks
+from sb3_yann.policy.actor_critic import (
+    EPS,
+    CriticOptions,
+    YannActor,
+    YannCritic,
+    as_critic_options,
+    follow_scale,
+    layer_for,
+)
+from sb3_yann.policy.checks import require_own_problem, resolve_problem
+from sb3_yann.policy.observations import AffineFeatures, AffineObservation, Shown, as_observation
+from sb3_yann.policy.sb3_hooks import (
+    KeepsPrecision,
+    finite_gradient,
+    single_precision,
+    warn_of_refused_step,
+    watch_buffer,
+)
 
 
 class YannPolicy(KeepsPrecision, TD3Policy):
@@ -141,29 +150,29 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         networks: str | None = None,
         **sb3_kwargs: Any,
     ) -> None:
-        algorithm = _sb3_hooks.algorithm_under_construction(lr_schedule)
-        _checks.require_plain_td3(algorithm)
+        algorithm = sb3_hooks.algorithm_under_construction(lr_schedule)
+        checks.require_plain_td3(algorithm)
         names = [*inspect.signature(YannPolicy).parameters]
-        _checks.require_sb3_kwargs(sb3_kwargs, own=names[names.index("problem") : -1])
-        _checks.require_box("observation_space", observation_space, observation is not None)
-        _checks.require_box("action_space", action_space)
+        checks.require_sb3_kwargs(sb3_kwargs, own=names[names.index("problem") : -1])
+        checks.require_box("observation_space", observation_space, observation is not None)
+        checks.require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
-        self.saved_kwargs = _sb3_hooks.own_policy_kwargs(algorithm)
+        self.saved_kwargs = sb3_hooks.own_policy_kwargs(algorithm)
         if isinstance(problem, str):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             self.saved_kwargs["problem"] = self.problem
         # Whether the user said what the env shows.
         self.told = told = observation is not None
-        self.input_units = _checks.as_input_units(self.problem, action_space, told)
+        self.input_units = checks.as_input_units(self.problem, action_space, told)
         self.observation = as_observation(observation, self.problem, self.input_units)
-        _checks.require_theta(self.problem, observation_space, self.observation)
-        _checks.warn_of_absolute_inputs(self.problem, algorithm, self.input_units)
+        checks.require_theta(self.problem, observation_space, self.observation)
+        checks.warn_of_absolute_inputs(self.problem, algorithm, self.input_units)
         self.undone = isinstance(observation, AffineObservation | Mapping)
         self._meets(algorithm)
         if told or self.observation is not None:
             self.saved_kwargs["observation"] = self.observation or "deviation"
         self.looked = False  # at the first observation
-        self.gamma = check_discount(_checks.as_gamma(gamma, algorithm))
+        self.gamma = check_discount(checks.as_gamma(gamma, algorithm))
         self.lr_mult = {
             "actor": check_range("actor_lr_mult", actor_lr_mult, 0, np.inf, "[)"),
             "critic": check_range("critic_lr_mult", critic_lr_mult, 0, np.inf, "[)"),
@@ -183,9 +192,9 @@ class YannPolicy(KeepsPrecision, TD3Policy):
             observation_space,
             action_space,
             lr_schedule,
-            net_arch=_checks.as_net_arch(net_arch, shared),
-            activation_fn=_checks.as_activation(activation_fn),
-            **_checks.with_fused_adam(sb3_kwargs),
+            net_arch=checks.as_net_arch(net_arch, shared),
+            activation_fn=checks.as_activation(activation_fn),
+            **checks.with_fused_adam(sb3_kwargs),
         )
         self._algorithm = _as_reference(algorithm)
         self._met = _as_reference(None if algorithm is None else algorithm.get_env())
@@ -195,7 +204,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
     def _meets(self, algorithm: BaseAlgorithm | None) -> None:
         """Raise unless the observations of an algorithm's env are what the policy takes."""
         given = self.observation if self.undone else None
-        _checks.require_undone_normalization(self.problem, algorithm, given)
+        checks.require_undone_normalization(self.problem, algorithm, given)
         if algorithm is not None and algorithm.get_env() is not None:
             require_state_shown(algorithm.get_env(), self.told)
 
@@ -227,7 +236,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         self.actor.optimizer.register_step_pre_hook(self._before_actor_step)
         self.critic.optimizer.register_step_pre_hook(self._before_critic_step)
         for network in (self.actor, self.critic):
-            network.optimizer.register_step_post_hook(_sb3_hooks.restore_learning_rate)
+            network.optimizer.register_step_post_hook(sb3_hooks.restore_learning_rate)
 
     def _refuses(self, name: str, optimizer: th.optim.Optimizer) -> bool:
         """Return whether a step must not be taken, and take its gradient away then."""
@@ -244,7 +253,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
             optimizer.zero_grad()  # no gradient at all: neither parameters nor moments move
         else:
             self._refuses("actor", optimizer)
-        _sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
+        sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["actor"] * self.actor_step)
 
     def _before_critic_step(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
         self.batch_is_finite = not self._refuses("critic", optimizer)
@@ -254,7 +263,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
                 taken, eps = int(self.critic_updates), self.optimizer_kwargs.get("eps", EPS)
                 follow_scale(*networks, self.mean_stage_cost, taken, eps)
             self.critic_updates.add_(1)
-        _sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
+        sb3_hooks.multiply_learning_rate(optimizer, self.lr_mult["critic"])
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -296,7 +305,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         if not self.looked:
             self.looked = True
             rows = np.reshape(observation, (-1, *cast(Any, self.observation_space.shape)))
-            _checks.warn_of_misread_states(self.problem, self.theta(rows).double().cpu().numpy())
+            checks.warn_of_misread_states(self.problem, self.theta(rows).double().cpu().numpy())
         return predicted
 
     def unscale_action(self, scaled_action: Array) -> Array:
@@ -356,7 +365,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         ValueError
             If an edge has another shape or is not finite, or ``low`` is above ``high``.
         """
-        box = _checks.as_box(low, high, self.problem.n_theta)
+        box = checks.as_box(low, high, self.problem.n_theta)
         for actor in (self.actor, self.actor_target):
             actor.mu.confine(*box)
 

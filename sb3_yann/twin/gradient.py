@@ -18,7 +18,7 @@ import torch as th
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
-from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.networks.yann import LawLayer
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.row_layout import RowLayout
 

@@ -20,7 +20,7 @@ from sample_laws import (
     to_action,
 )
 from sb3_yann.networks import AfterstateValue, LinearPrediction, QuadraticStateActionValue, Ranges
-from sb3_yann.networks.prediction import PredictionModel
+from sb3_yann.networks.value import PredictionModel
 from weights import first_layer, last_layer
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])

@@ -70,19 +70,12 @@ def test_where_the_law_acts_alone_nothing_is_learnt() -> None:
 
 
 @pytest.mark.parametrize("kind", ["per_region", "shared"])
-def test_the_box_travels_with_the_weights_and_older_weights_have_none(kind) -> None:
+def test_the_box_travels_with_the_weights(kind) -> None:
     mpc, layer = layer_of(kind)
     layer.confine(-0.1 * mpc.theta_half, 0.1 * mpc.theta_half)
     theta, other = drawn(mpc, 1.0), layer_of(kind)[1]
     other.load_state_dict(layer.state_dict())
     assert th.equal(other(theta), layer(theta))
-    before = {key: each for key, each in layer.state_dict().items() if key != "confines"}
-    fresh = layer_of(kind)[1]
-    fresh.load_state_dict(before)
-    other.load_state_dict(before)  # which had a box
-    assert not fresh.confines.any() and not other.confines.any()
-    layer.confine(None, None)
-    assert th.equal(fresh(theta), layer(theta)) and th.equal(other(theta), layer(theta))
 
 
 def test_a_policy_s_box_is_saved_and_what_is_no_box_is_named(tmp_path) -> None:

@@ -14,7 +14,7 @@ from partitions import as_range, edges, mixture, reordered, slacks, steepest
 from random_problems import examples, problems
 from sb3_yann import LinearMPC
 from sb3_yann.networks import SharedYannLayer, YannLayer
-from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.networks.yann import LawLayer
 
 SEEDS = st.integers(0, 2**32 - 1)
 KINDS = st.sampled_from(["per region", "shared", "shared, online"])
@@ -74,7 +74,7 @@ def test_shared_network_leaves_no_jump_whatever_its_weights(
     at, ways = edges(mpc.explicit(), seed, each=2)
     for kind in ("shared", "shared, online"):
         layer = shaken(layer_of(mpc, kind, (4, 3)), size, seed)
-        law: Any = layer.given  # type: ignore[attr-defined]
+        law: Any = layer.base_law  # type: ignore[attr-defined]
         one, other = at - step * ways, at + step * ways
         kept = law.in_domain(one) & law.in_domain(other)
         with th.no_grad():

@@ -118,7 +118,7 @@ def test_it_learns_and_copies() -> None:
     layer, theta = layer_of(reactor(), "online"), drawn(reactor())
     other = copy.deepcopy(layer)
     train(layer, theta, 0.5, steps=30)
-    assert other.given is layer.given
+    assert other.base_law is layer.base_law
     assert not layer.network.is_zero()
     assert other.network.is_zero()
     other.load_state_dict(layer.state_dict())

@@ -18,7 +18,7 @@ from sample_layers import EVERY_LAW, INFEASIBLE, region_of, scrambled, train
 from sb3_yann import LinearMPC
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.networks import YannLayer
-from sb3_yann.networks.law_layer import clamp_with_inward_gradient
+from sb3_yann.networks.yann import clamp_with_inward_gradient
 from weights import last_layer
 
 # --- the law -----------------------------------------------------------------------------------

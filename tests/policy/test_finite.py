@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from general_problems import servo
 from sample_plants import LinearPlant, Recorder, two_input_mpc
 from sb3_yann import AffineObservation, NoActionNoise, NonFiniteWarning, RateLimits, YannPolicy
-from sb3_yann.policy._finite import FiniteRows
+from sb3_yann.policy.sb3_hooks import FiniteRows
 from sb3_yann_envs import problems
 
 OPTIONS = {"seed": 0, "device": "cpu", "buffer_size": 1000, "batch_size": 32}

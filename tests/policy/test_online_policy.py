@@ -46,7 +46,7 @@ def test_it_is_saved_with_its_law_and_loaded_without_a_search(options, tmp_path,
         monkeypatch.setattr(LinearMPC, "explicit", None)
     again = TD3.load(tmp_path / "model.zip", device="cpu")
     assert np.array_equal(again.predict(theta)[0], model.predict(theta)[0])
-    assert isinstance(again.actor.mu.given, OnlineLaw) == ("law" in options)
+    assert isinstance(again.actor.mu.base_law, OnlineLaw) == ("law" in options)
     model.policy.save(tmp_path / "policy")
     policy = YannPolicy.load(tmp_path / "policy", device="cpu")
     assert np.array_equal(policy.predict(theta)[0], model.predict(theta)[0])

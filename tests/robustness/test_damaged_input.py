@@ -27,7 +27,7 @@ from sb3_yann.command_line import main as command_line
 from sb3_yann.commissioning.journal import Journal, Outlook
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.record import Record
-from sb3_yann.policy.critic_options import as_critic_options
+from sb3_yann.policy.actor_critic import as_critic_options
 
 SECONDS = 10
 """After which a reader counts as hung."""

@@ -12,7 +12,7 @@ import torch as th
 
 from sb3_yann import LinearModel, LinearMPC, PlantTwin
 from sb3_yann.networks import SharedYannLayer, YannLayer
-from sb3_yann.networks.law_layer import LawLayer
+from sb3_yann.networks.yann import LawLayer
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.gradient import Objective, accumulate_gradient, actor
 from sb3_yann.twin.residuals import Nothing, Polynomial

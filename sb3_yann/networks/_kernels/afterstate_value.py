@@ -9,7 +9,7 @@ import torch as th
 
 from sb3_yann._numba import Single, compiled
 from sb3_yann._validation import Array
-from sb3_yann.networks._kernels.mlp import (
+from sb3_yann.networks._kernels.stack import (
     at_zero,
     first_layers,
     hidden_layer,

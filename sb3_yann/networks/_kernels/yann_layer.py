@@ -1,4 +1,4 @@
-"""The YANN layer on a CPU: compiled, and one operation of torch with its gradient."""
+"""The YANN layers on a CPU: compiled loops, and one operation of torch with its gradient."""
 
 from __future__ import annotations
 
@@ -8,81 +8,331 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_yann._numba import Integers, Single
+from sb3_yann._numba import Integers, Single, compiled
 from sb3_yann._validation import Array
-from sb3_yann.networks._kernels.layer_loops import backward, forward, forward_shared
-from sb3_yann.networks._kernels.mlp import to_numpy
+from sb3_yann.control._kernels.law import input_at
+from sb3_yann.networks._kernels.stack import (
+    WEIGHTS,
+    network,
+    network_backward,
+    prepared,
+    slopes_by_x,
+    to_numpy,
+)
+
+KEPT = (
+    "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1], float32[:, :, ::1]"
+)
+"""Types of what a forward pass keeps: x, used, slot, two hidden layers, outputs, see `forward`."""
+Constants = tuple[Array, Array, float]
+"""``scaling``, ``change`` and ``limit``, as in `forward`."""
+PackedLaw = tuple[Array, Integers, Array]
+"""A packed law, and room for its inputs; or two empty arrays, and the inputs of any law."""
+
+
+@compiled()
+def _locate(
+    floats: Array, whole: Integers, theta: Array, p: int, used: Integers, slot: Integers, u: Array
+) -> int:
+    """Write inputs (batch, m), NaN for theta that is not finite; return how many regions are used.
+
+    Write which these are, and each row's place among them.
+    """
+    slot_of = np.full(p, -1)
+    slots = 0
+    region = -1
+    for row in range(len(theta)):
+        region = input_at(floats, whole, theta, u, row, region)
+        if region < 0:
+            u[row] = np.nan
+            region = 0
+        if slot_of[region] < 0:
+            used[slots] = region
+            slot_of[region] = slots
+            slots += 1
+        slot[row] = slot_of[region]
+    return slots
+
+
+@compiled()
+def _between(value: Any, low: Any, high: Any) -> Any:
+    """Return a value clamped to bounds; NaN stays what it is."""
+    value = high if value > high else value
+    return low if value < low else value
+
+
+@compiled()
+def _confined(theta: Any, box: Any) -> Any:
+    """Return the part, from 1 to 0, of a correction that counts at theta (n,).
+
+    ``box`` (2 n + 2,) holds its middle, one over its half-widths, and within how many of these a
+    correction counts in full, and beyond how many not.
+    """
+    n = len(theta)
+    beyond = 0.0
+    for j in range(n):
+        beyond = max(beyond, abs(theta[j] - box[j]) * box[n + j])
+    return np.float32(min(max((box[-1] - beyond) / (box[-1] - box[-2]), 0.0), 1.0))
+
+
+@compiled(
+    f"int64(float64[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[::1], "
+    f"float64[:, ::1], float64, {WEIGHTS}, float32[:, ::1], {KEPT})"
+)
+def forward(
+    floats: Array,
+    whole: Integers,
+    u: Array,
+    theta: Array,
+    scaling: Array,
+    change: Array,
+    limit: float,
+    nodes: Single,
+    second: Single,
+    last: Single,
+    pinned: Single,
+    actions: Single,
+    x: Single,
+    used: Integers,
+    slot: Integers,
+    hidden1: Single,
+    hidden2: Single,
+    outputs: Single,
+) -> int:
+    """Write the actions and what :func:`backward` needs; return how much of ``used`` is in use.
+
+    Parameters
+    ----------
+    floats, whole : ndarray
+        A packed law; empty where u holds the inputs of a law and there is one network.
+    u, theta : ndarray, shapes (batch, m) and (batch, n)
+    scaling : ndarray, shape (3 n + 2 m + 2,)
+        One over the half-widths of the box of theta; the middles of the input ranges; one over
+        their half-widths; what :func:`_confined` takes, with zeros for half-widths without end.
+    change : ndarray, shape (2, m) or (0, m)
+        By how much an action may differ from the previous input, the last m entries of theta.
+    limit : float
+        The network's output is clamped to [-limit, limit].
+    nodes, second, last, pinned : ndarray
+        The networks, as in `stack.network`.
+    actions, x, used, slot, hidden1, hidden2, outputs : ndarray
+        What is written; the last one, (5, batch, m), are the networks' outputs, the actions before
+        they are clamped, the lower and upper bounds, and the part of the correction that counts.
+    """
+    slots = 1
+    if len(whole):
+        slots = _locate(floats, whole, theta, len(pinned), used, slot, u)
+    else:
+        used[0] = 0
+        slot[:] = 0
+    used = used[:slots]
+    ready = prepared(used, nodes, second, pinned)
+    batch, n = theta.shape
+    m = last.shape[1]
+    for row in range(batch):
+        for j in range(n):
+            x[row, j] = theta[row, j] * scaling[j]
+    out = outputs[0]
+    total = outputs[1]
+    bounds = outputs[2:4]
+    part = outputs[4]
+    network(x, used, slot, ready, last, pinned, hidden1, hidden2, out)
+    bounds[0] = -1
+    bounds[1] = 1
+    for row in range(batch):
+        part[row] = _confined(theta[row], scaling[n + 2 * m :])
+        for k in range(m):
+            for side in range(len(change)):
+                previous = (theta[row, n - m + k] - scaling[n + k]) * scaling[n + m + k]
+                bounds[side, row, k] = min(max(previous + change[side, k], -1.0), 1.0)
+            low = bounds[0, row, k]
+            high = bounds[1, row, k]
+            law = np.float32((u[row, k] - scaling[n + k]) * scaling[n + m + k])
+            correction = out[row, k]
+            if limit < np.inf:  # which NaN and infinite weights do not pass either
+                correction = np.float32(min(max(correction, -limit), limit))
+                correction = correction if out[row, k] == out[row, k] else np.float32(0)
+            if part[row, k] < 1:  # at the full part a NaN stays what it is
+                correction = correction * part[row, k] if part[row, k] > 0 else np.float32(0)
+            total[row, k] = _between(law, low, high) + correction
+            actions[row, k] = _between(total[row, k], low, high)
+    return slots
+
+
+@compiled(
+    f"void(float32[:, ::1], boolean, float64, {WEIGHTS}, {KEPT}, "
+    "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1])"
+)
+def backward(
+    gradient: Single,
+    dense: bool,
+    limit: float,
+    nodes: Single,
+    second: Single,
+    last: Single,
+    pinned: Single,
+    x: Single,
+    used: Integers,
+    slot: Integers,
+    hidden1: Single,
+    hidden2: Single,
+    outputs: Single,
+    by_nodes: Single,
+    by_second: Single,
+    by_last: Single,
+) -> None:
+    """Write the gradients of a loss by nodes, second and last, see :func:`network_backward`.
+
+    ``gradient`` (batch, m) is that of the loss by the actions. What would push an action, or a
+    correction, further beyond its bound is stopped: descent moves against the gradient.
+    """
+    out = outputs[0]
+    total = outputs[1]
+    bounds = outputs[2:4]
+    back = gradient * outputs[4]
+    for row in range(len(back)):
+        for k in range(back.shape[1]):
+            above = total[row, k] >= bounds[1, row, k] or out[row, k] >= limit
+            below = total[row, k] <= bounds[0, row, k] or out[row, k] <= -limit
+            if (above and back[row, k] < 0) or (below and back[row, k] > 0):
+                back[row, k] = 0
+    network_backward(
+        back, x, used, slot, dense, nodes, second, last, pinned,
+        hidden1, hidden2, by_nodes, by_second, by_last,
+    )  # fmt: skip
+
+
+@compiled()
+def add_slopes(
+    back: Array,
+    theta: Array,
+    row: int,
+    u: Array,
+    of_law: Array,
+    scaling: Array,
+    change: Array,
+    limit: float,
+    by_network: Single,
+    s: int,
+    ready: Any,
+    last: Single,
+    i: int,
+    hidden1: Single,
+    hidden2: Single,
+    outputs: Single,
+    by_theta: Array,
+) -> None:
+    """Add ``back @ slopes`` of the actions at a row of theta (batch, n) to that of by_theta.
+
+    Law and network do not move on their bounds, and on those of the rate with the previous input.
+
+    Parameters
+    ----------
+    back : ndarray, shape (m,)
+        The gradient by the actions.
+    theta, scaling, change, limit, hidden1, hidden2, outputs
+        As in :func:`forward`, which has written the last three.
+    row : int
+    u, of_law : ndarray, shapes (m,) and (m, n)
+        The law's inputs, and their slopes: zero where they are clipped.
+    by_network : ndarray, shape (m,)
+        Overwritten.
+    s, ready, last, i
+        The network, as in :func:`slopes_by_x`.
+    by_theta : ndarray, shape (batch, n)
+    """
+    n = theta.shape[1]
+    m = len(back)
+    previous = n - m
+    part = outputs[4, row, 0]
+    by_part = 0.0
+    any_free = False
+    for k in range(m):
+        total = outputs[1, row, k]
+        low = outputs[2, row, k]
+        high = outputs[3, row, k]
+        by_network[k] = 0
+        if total <= low or total >= high:
+            if len(change) and abs(low if total <= low else high) < 1:
+                by_theta[row, previous + k] += back[k] * scaling[n + m + k]
+            continue
+        law = np.float32((u[k] - scaling[n + k]) * scaling[n + m + k])
+        if law <= low or law >= high:
+            if len(change) and abs(low if law <= low else high) < 1:
+                by_theta[row, previous + k] += back[k] * scaling[n + m + k]
+        else:
+            for j in range(n):
+                by_theta[row, j] += back[k] * scaling[n + m + k] * of_law[k, j]
+        correction = outputs[0, row, k]
+        if abs(correction) < limit:
+            by_network[k] = back[k] * part
+            any_free = True
+        by_part += back[k] * min(max(correction, -limit), limit)
+    if part <= 0:
+        return
+    if any_free:
+        by_x = np.empty(n, np.float32)
+        slopes_by_x(by_network, row, s, ready, last, i, hidden1, hidden2, by_x)
+        for j in range(n):
+            by_theta[row, j] += by_x[j] * scaling[j]
+    if part < 1:
+        box = n + 2 * m
+        largest = -1.0
+        of = 0
+        for j in range(n):
+            beyond = abs(theta[row, j] - scaling[box + j]) * scaling[box + n + j]
+            if beyond > largest:
+                largest = beyond
+                of = j
+        sign = 1.0 if theta[row, of] > scaling[box + of] else -1.0
+        span = scaling[box + 2 * n + 1] - scaling[box + 2 * n]
+        by_theta[row, of] -= by_part * sign * scaling[box + n + of] / span
 
 
 def layer_on_cpu(
+    pack: Callable[[Array], PackedLaw],
     theta: th.Tensor,
-    law: tuple[Array, Integers],
-    constants: tuple[Array, Array, float],
+    constants: Constants,
     weights: tuple[th.Tensor, ...],
     pinned: Single,
     by_row: bool,
 ) -> th.Tensor:
-    """Return the actions (batch, m) of a YANN layer, with a gradient by its weights.
+    """Return the actions (batch, m) of a layer, with a gradient by its weights.
 
     Parameters
     ----------
+    pack : callable
+        From theta (batch, n) to what :func:`forward` takes of the law.
     theta : Tensor, shape (batch, n)
-    law : pair of ndarray
-        The law, packed.
     constants : tuple
-        ``scaling``, ``change`` and ``limit``, as in `layer_loops`.
     weights : tuple of Tensor
         Nodes, second and last.
     pinned : ndarray, shape (p,)
     by_row : bool
         Whether gradients are sparse, with the rows of the regions in use.
     """
-    _require_width(theta, int(law[1][0]))
-    known = (*law, to_numpy(theta, np.float64), *constants)
-    return _run(forward, known, weights, pinned, by_row)
+    points = _rows(theta, weights[0])
+    known = (*pack(points), points, *constants)
+    if th.is_grad_enabled():
+        actions: th.Tensor = _Layer.apply(known, pinned, by_row, *weights)  # type: ignore[no-untyped-call]
+        return actions
+    return th.from_numpy(_actions([*known, *map(to_numpy, weights), pinned])[0])
 
 
-def shared_layer_on_cpu(
-    theta: th.Tensor,
-    u: Array,
-    constants: tuple[Array, Array, float],
+def frozen_layer(
+    pack: Callable[[Array], PackedLaw],
+    constants: Constants,
     weights: tuple[th.Tensor, ...],
     pinned: Single,
-) -> th.Tensor:
-    """Return the actions (batch, m) for inputs u (batch, m) of a law, and one network.
-
-    What else it takes is in :func:`layer_on_cpu`.
-    """
-    _require_width(theta, (len(constants[0]) - 2 - 2 * u.shape[1]) // 3)
-    known = (u, to_numpy(theta, np.float64), *constants)
-    return _run(forward_shared, known, weights, pinned, by_row=False)
-
-
-def frozen_layer(floats: Array, whole: Integers, *rest: Any) -> Callable[[Array], Single]:
-    """Return a YANN layer, packed, as a function from theta (batch, n) to actions (batch, m)."""
+) -> Callable[[Array], Single]:
+    """Return a layer of now as a function from theta (batch, n) to actions (batch, m)."""
+    rest = (*constants, *map(to_numpy, weights), pinned)
 
     def act(theta: Array) -> Single:
-        rows = _as_rows(theta, int(whole[0]))
-        return _actions(forward, [floats, whole, rows, *rest])[0]
+        rows = _rows(theta, rest[3])
+        return _actions([*pack(rows), rows, *rest])[0]
 
     return act
-
-
-def frozen_shared_layer(law: Callable[[Array], Array], *rest: Any) -> Callable[[Array], Single]:
-    """Return what :func:`frozen_layer` does, for inputs of a law and one network."""
-    n = rest[3].shape[3] - 1
-
-    def act(theta: Array) -> Single:
-        rows = _as_rows(theta, n)
-        return _actions(forward_shared, [law(rows), rows, *rest])[0]
-
-    return act
-
-
-def _as_rows(theta: Array, n: int) -> Array:
-    if theta.ndim != 2 or theta.shape[1] != n:  # compiled code does not look
-        raise ValueError(f"theta has shape {theta.shape}, expected (batch, {n}).")
-    return np.ascontiguousarray(theta, np.float64)
 
 
 def kept_for_gradient(actions: th.Tensor) -> list[Any]:
@@ -92,35 +342,29 @@ def kept_for_gradient(actions: th.Tensor) -> list[Any]:
     return found
 
 
-def _require_width(theta: th.Tensor, n: int) -> None:
-    if theta.dim() != 2 or theta.shape[1] != n:  # compiled code does not look
+def _rows(theta: Any, nodes: Any) -> Array:
+    """Return theta (batch, n) for compiled code, which does not look at shapes."""
+    n = nodes.shape[3] - 1
+    if theta.ndim != 2 or theta.shape[1] != n:
         raise ValueError(f"theta has shape {tuple(theta.shape)}, expected (batch, {n}).")
+    if isinstance(theta, th.Tensor):
+        return to_numpy(theta, np.float64)
+    return np.ascontiguousarray(theta, np.float64)
 
 
-def _run(
-    loops: Any,
-    known: tuple[Any, ...],
-    weights: tuple[th.Tensor, ...],
-    pinned: Single,
-    by_row: bool,
-) -> th.Tensor:
-    if th.is_grad_enabled():
-        given = loops, known, pinned, by_row
-        actions: th.Tensor = _Layer.apply(*given, *weights)  # type: ignore[no-untyped-call]
-        return actions
-    return th.from_numpy(_actions(loops, [*known, *map(to_numpy, weights), pinned])[0])
-
-
-def _actions(loops: Any, given: list[Any]) -> tuple[Single, list[Any]]:
-    """Return the actions and what :func:`backward` needs, of all that a forward pass takes."""
-    (batch, n), second, (p, m, columns) = given[-8].shape, given[-3], given[-2].shape
-    used, slot = np.empty(min(batch, p), np.int64), np.empty(batch, np.int64)
+def _actions(given: list[Any]) -> tuple[Single, list[Any]]:
+    """Return the actions and what :func:`backward` needs, of all that :func:`forward` takes."""
+    batch, n = given[3].shape
+    second = given[-3]
+    p, m, columns = given[-2].shape
+    actions = np.empty((batch, m), np.float32)
     x = np.empty((batch, n), np.float32)
+    used = np.empty(max(min(batch, p), 1), np.int64)
+    slot = np.empty(batch, np.int64)
     hidden1 = np.empty((batch, second.shape[2] - 1), np.float32)
     hidden2 = np.empty((batch, columns - 1), np.float32)
-    actions, outputs = np.empty((batch, m), np.float32), np.empty((5, batch, m), np.float32)
-    written: list[Any] = [actions, x, used, slot, hidden1, hidden2, outputs]
-    slots = loops(*given, *written)
+    outputs = np.empty((5, batch, m), np.float32)
+    slots = forward(*given, actions, x, used, slot, hidden1, hidden2, outputs)
     return actions, [x, used[:slots], slot, hidden1, hidden2, outputs]
 
 
@@ -129,30 +373,27 @@ class _Layer(th.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        loops: Any,
-        known: tuple[Any, ...],
-        pinned: Single,
-        by_row: bool,
-        *weights: th.Tensor,
+        ctx: Any, known: tuple[Any, ...], pinned: Single, by_row: bool, *weights: th.Tensor
     ) -> th.Tensor:
         given = [*known, *map(to_numpy, weights), pinned]
-        actions, kept = _actions(loops, given)
+        actions, kept = _actions(given)
         # torch notices weights that change before the backward pass
         ctx.save_for_backward(*weights)
-        ctx.given, ctx.kept, ctx.by_row = given[-5:], kept, by_row
+        ctx.given = given[-5:]
+        ctx.kept = kept
+        ctx.by_row = by_row
         return th.from_numpy(actions)
 
     @staticmethod
     @th.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        weights, (_, used, *_) = ctx.saved_tensors, ctx.kept
-        gradient = to_numpy(gradients[0])
+        weights = ctx.saved_tensors
+        used = ctx.kept[1]
         sizes = [
             (len(used), *weight.shape[1:]) if ctx.by_row else weight.shape for weight in weights
         ]
         arrays = [np.zeros(size, np.float32) for size in sizes]
-        backward(gradient, not ctx.by_row, *ctx.given, *ctx.kept, *arrays)
+        backward(to_numpy(gradients[0]), not ctx.by_row, *ctx.given, *ctx.kept, *arrays)
         found = [th.from_numpy(each) for each in arrays]
         if ctx.by_row:
             rows = th.from_numpy(used)[None]
@@ -160,4 +401,4 @@ class _Layer(th.autograd.Function):
                 th.sparse_coo_tensor(rows, by_weight, weight.shape, check_invariants=False)
                 for by_weight, weight in zip(found, weights, strict=True)
             ]
-        return None, None, None, None, *found
+        return None, None, None, *found

@@ -7,9 +7,8 @@ import numpy as np
 from sb3_yann._numba import Integers, Single, compiled
 from sb3_yann._validation import Array
 from sb3_yann.control._kernels.law import slopes_at
-from sb3_yann.networks._kernels.layer_loops import KEPT
-from sb3_yann.networks._kernels.mlp import WEIGHTS, prepared
-from sb3_yann.networks._kernels.slopes import add_slopes
+from sb3_yann.networks._kernels.stack import WEIGHTS, prepared
+from sb3_yann.networks._kernels.yann_layer import KEPT, add_slopes
 from sb3_yann.twin._kernels.step import ROWS, TWIN, monomials
 
 _POLICY = f"float64[::1], int64[::1], float64[::1], float64[:, ::1], float64, {WEIGHTS}"

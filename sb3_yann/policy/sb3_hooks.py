@@ -1,11 +1,18 @@
-"""What is not a finite number: named at once, and not learnt from."""
+"""What a policy does around Stable-Baselines3 and PyTorch.
+
+It asks for its algorithm, scales its learning rate, keeps its precision, and leaves out of replay
+buffers and gradients what is not finite.
+"""
 
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -16,10 +23,74 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_yann._validation import NonFiniteWarning
 
-LARGE = 1e36
-"""Sums of squares up to this leave no doubt that all entries are finite in float32."""
-AGAIN = 100
-"""Steps after which the same thing is named again."""
+
+def algorithm_under_construction(lr_schedule: Any) -> BaseAlgorithm | None:
+    """Return the algorithm that is building a policy, None where nobody is.
+
+    SB3 hands a policy its spaces and its learning rate, but not the discount, which the critic
+    needs to be exact; so the whole call stack is asked, whatever decorators and factories are on
+    the way. The algorithm is the one whose `_setup_model` is running, or that holds the learning
+    rate. Called from a policy's `__init__` only.
+    """
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None:
+        held = frame.f_locals
+        caller = held.get("self")
+        if frame.f_code.co_name == "_setup_model" and isinstance(caller, BaseAlgorithm):
+            return caller
+        for each in held.values():
+            if isinstance(each, BaseAlgorithm):
+                if getattr(each, "lr_schedule", None) is lr_schedule:
+                    return each
+        frame = frame.f_back
+    return None
+
+
+def own_policy_kwargs(algorithm: BaseAlgorithm | None) -> dict[str, Any]:
+    """Return the keywords that an algorithm saves, to be changed; no longer the user's own dict."""
+    if algorithm is None:
+        return {}
+    algorithm.policy_kwargs = dict(algorithm.policy_kwargs)
+    return algorithm.policy_kwargs
+
+
+def multiply_learning_rate(optimizer: th.optim.Optimizer, factor: float) -> None:
+    """Make one step use ``factor`` times the rate that SB3 keeps setting."""
+    for group in optimizer.param_groups:
+        group["scheduled_lr"] = group["lr"]
+        group["lr"] = factor * group["lr"]
+
+
+def restore_learning_rate(optimizer: th.optim.Optimizer, *_: Any) -> None:
+    """Undo :func:`multiply_learning_rate` after the step."""
+    for group in optimizer.param_groups:
+        group["lr"] = group.pop("scheduled_lr")
+
+
+@contextmanager
+def single_precision() -> Iterator[None]:
+    """Make networks of float32 within, as SB3's replay buffer holds actions and rewards."""
+    default = th.get_default_dtype()
+    th.set_default_dtype(th.float32)
+    try:
+        yield
+    finally:
+        th.set_default_dtype(default)
+
+
+class KeepsPrecision:
+    """A module that moves to other devices, and refuses other types of numbers."""
+
+    def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> Any:
+        for dtype in (th.float32, th.float64):
+            if (asked := fn(th.zeros(1, dtype=dtype)).dtype) != dtype:
+                raise TypeError(
+                    f"{type(self).__name__} cannot become {asked}: the law is computed in float64 "
+                    "and the networks in float32, to which the compiled loops and SB3's replay "
+                    "buffer keep. Leave double(), float(), half() and to(dtype) out; to(device) "
+                    "is fine."
+                )
+        return super()._apply(fn, recurse)  # type: ignore[misc]
 
 
 class FiniteRows:
@@ -53,7 +124,8 @@ class FiniteRows:
             buffer.pos, buffer.full, self.keeps_place = 0, False, False
         parts = (obs, next_obs, action, reward)
         total = sum(float(np.vdot(part, part)) for part in parts)
-        if total < LARGE or not (found := _not_finite(buffer, parts)):  # nor is NaN below it
+        sure = 1e36  # sums of squares up to this are of entries that are finite in float32
+        if total < sure or not (found := _not_finite(buffer, parts)):  # nor is NaN below it
             if (simulated := vars(buffer).get("simulated")) is not None:
                 simulated[buffer.pos] = False
             type(buffer).add(buffer, obs, next_obs, action, reward, done, infos)
@@ -67,7 +139,8 @@ class FiniteRows:
             nothing = np.full(np.shape(reward), np.nan)
             type(buffer).add(buffer, s, after, u, nothing, done, infos)
             self.keeps_place = True
-        new = [key for key in found if self.rows - self.named.get(key, -AGAIN) >= AGAIN]
+        again = 100  # steps after which the same thing is named again
+        new = [key for key in found if self.rows - self.named.get(key, -again) >= again]
         self.named.update(dict.fromkeys(new, self.rows))
         if new:
             what = ", ".join(f"{name}[{j}] of env {i} is {found[name, i, j]}" for name, i, j in new)

@@ -1,9 +1,10 @@
-"""Checks of what a policy is given: spaces, algorithm and keywords."""
+"""Checks of what a policy is given: problem, spaces, algorithm, keywords and parameters."""
 
 from __future__ import annotations
 
 import inspect
 import warnings
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,14 +21,75 @@ from sb3_yann._validation import Array, check_int
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.plant_units import InputUnits, misread_state
+from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, SharedYannLayer
+from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.observations import (
     SAY,
+    AffineFeatures,
     AffineObservation,
     require_frozen,
     require_outermost,
     statistics_of,
 )
 from sb3_yann.twin.replay_buffer import LOST_STATISTICS
+from sb3_yann_envs.spaces import resolve_reference
+
+_registered: dict[str, LinearMPC | Callable[[], LinearMPC] | str] = {
+    "CSTR-v0": "sb3_yann_envs.problems:cstr",
+    "ClippedPendulum-v0": "sb3_yann_envs.problems:clipped_pendulum",
+}
+
+
+def register_problem(name: str, problem: LinearMPC | Callable[[], LinearMPC] | str) -> None:
+    """Make ``problem`` known as ``name``, for YAML files and ``policy_kwargs``.
+
+    Parameters
+    ----------
+    name : str
+        Without a colon. Registering a name again replaces its problem.
+    problem : LinearMPC, callable or str
+        The problem, a function without arguments that returns it, or ``"module:attribute"``.
+
+    Examples
+    --------
+    >>> register_problem("my-reactor", "sb3_yann_envs.problems:cstr")
+    >>> resolve_problem("my-reactor", None).model.n_states
+    4
+    """
+    if not isinstance(name, str) or not name or ":" in name:
+        raise ValueError(f"name = {name!r} must be a non-empty string without ':'.")
+    if not (isinstance(problem, LinearMPC | str) or inspect.isroutine(problem)):
+        wanted = 'a LinearMPC, a function that returns one, or "module:attribute"'
+        raise TypeError(f"problem = {problem!r} must be {wanted}.")
+    _registered[name] = problem
+
+
+def resolve_problem(problem: LinearMPC | str | None, observation_space: Any) -> LinearMPC:
+    """Return the LinearMPC that is meant: given, named, or carried by the observation space."""
+    if problem is None:
+        problem = getattr(observation_space, "problem", None)
+    if problem is None:
+        raise ValueError(
+            f"YannPolicy has no problem: the observation space {observation_space} carries none. "
+            'Pass policy_kwargs={"problem": mpc} with a LinearMPC, a registered name '
+            f'({", ".join(sorted(_registered))}) or "module:attribute".'
+        )
+    found: Any = problem
+    if isinstance(found, str) and ":" not in found:
+        if found not in _registered:
+            raise ValueError(
+                f"No problem is registered as {found!r}; there are {sorted(_registered)}. Call "
+                'sb3_yann.register_problem, or refer to it as "module:attribute".'
+            )
+        found = _registered[found]
+    if isinstance(found, str):
+        found = resolve_reference(found)
+    if inspect.isroutine(found):
+        found = found()
+    if not isinstance(found, LinearMPC):
+        raise TypeError(f"problem = {problem!r} is {found!r}, expected a LinearMPC.")
+    return found
+
 
 SB3_KWARGS = (
     "n_critics features_extractor_class features_extractor_kwargs normalize_images "
@@ -370,3 +432,81 @@ def as_box(
     if np.any(edges[0] > edges[1]):
         raise ValueError(f"low = {low!r} must not be above high = {high!r}.")
     return edges[0], edges[1]
+
+
+FIXED = LawLayer, AfterstateValue, QuadraticStateActionValue, AffineFeatures
+"""Modules whose buffers follow from the problem, or from the map to its theta."""
+FREE = {"confines", "value_scale"}
+"""Buffers of theirs that follow from what was learnt."""
+RECENT = {"samples"}
+"""Those that earlier saves do not have."""
+OF_ORDER_ONE = {"offsets", "resting", "half_space_b", "change"}
+"""Those that are in units of a range: zeros among them are not exact."""
+ROUNDING, SMALLEST = 1e-6, 1e-9
+"""A law that another machine has solved differs by less, of each number and of the largest."""
+
+
+class OtherProblemError(ValueError, RuntimeError):
+    """Parameters are those of another problem than the policy's.
+
+    torch says what does not fit by a RuntimeError, and `DDPG.load` hands on no other.
+    """
+
+
+def require_own_problem(module: nn.Module, state: Mapping[str, Any], strict: bool) -> None:
+    """Raise unless what follows from the problem is in a state_dict as it is in the module.
+
+    Parameters
+    ----------
+    module : Module
+        A policy or an actor.
+    state : mapping
+        What is to be loaded into it.
+    strict : bool
+        Whether nothing may be missing.
+    """
+    for name, part in module.named_modules():
+        if isinstance(part, FIXED):
+            prefix = f"{name}." if name else ""
+            if difference := _difference(part, prefix, state, strict):
+                raise OtherProblemError(
+                    "The parameters are those of a policy with another problem, observation or "
+                    f"networks: {difference}. Load that model as a whole, DDPG.load(path), or load "
+                    "them into a model that was made with the problem that they were trained with."
+                )
+
+
+def _difference(part: nn.Module, prefix: str, state: Mapping[str, Any], strict: bool) -> str:
+    """Return in words what of a state_dict is not a module's own; nothing where all of it is."""
+    own = {name: each for name, each in part.named_buffers(recurse=False) if name not in FREE}
+    given = {key[len(prefix) :] for key in state if key.startswith(prefix)}
+    given = {name for name in given if "." not in name} - FREE
+    if strict and (missing := sorted(own.keys() - given - RECENT)):
+        return f"there is no {prefix}{missing[0]}"
+    if strict and (unknown := sorted(given - own.keys())):
+        return f"there is {prefix}{unknown[0]}, which this policy does not have"
+    for name in sorted(own.keys() & given):
+        value, wanted = state[f"{prefix}{name}"], own[name]
+        if value.shape != wanted.shape:
+            return f"{prefix}{name} has shape {tuple(value.shape)}, expected {tuple(wanted.shape)}"
+        if not th.equal(value.to(wanted), wanted) and not _agree(part, name, value, wanted):
+            return f"{prefix}{name} holds other numbers"
+    return ""
+
+
+def _agree(part: nn.Module, name: str, value: th.Tensor, wanted: th.Tensor) -> bool:
+    """Return whether numbers are the same but for the rounding of another machine."""
+    if isinstance(part, SharedYannLayer) and name == "samples":
+        return part.answers_as(value, ROUNDING)
+    ours, theirs = wanted.double().cpu(), value.double().cpu()
+    size = _largest(ours)
+    if name in OF_ORDER_ONE:
+        size = max(size, 1.0)
+    if name == "middle":  # of the inputs, often zero: in their ranges
+        ranges = "half_range" if isinstance(part, LawLayer) else "to_input"
+        size = max(size, _largest(part.get_buffer(ranges)))
+    return th.allclose(theirs, ours, rtol=ROUNDING, atol=SMALLEST * size)
+
+
+def _largest(numbers: th.Tensor) -> float:
+    return float(numbers[numbers.isfinite()].abs().max()) if numbers.numel() else 0.0
