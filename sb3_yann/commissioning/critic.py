@@ -30,7 +30,7 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin | SimulatorTwin, seed: int)
     first = first + SPREAD * half * rng.standard_normal(first.shape)
     first = np.clip(first, problem.deviations.u_min, problem.deviations.u_max)
     costs = _costs(policy, twin, layer, starts, first)
-    options = policy.actor_critic
+    options = policy.critic_options
     returns = options.offset_of_return(policy.gamma) - options.reward_scale * costs
     known = np.isfinite(returns)
     if np.count_nonzero(known) < BATCH:  # too few to say anything

@@ -79,8 +79,9 @@ class LawLayer(nn.Module):
             register_constants(self, middle=middle, half_range=half_range)
         self.register_buffer("confines", th.zeros((2, law.n_theta), dtype=th.float64))
         no_box = np.zeros(2 * law.n_theta)
-        scaling = [1 / half, middle, 1 / half_range, no_box, [FADE_START, FADE_END]]
-        self.constants = (np.concatenate(scaling), change, np.inf)
+        fades = np.array([FADE_START, FADE_END])
+        scaling = np.concatenate([1 / half, middle, 1 / half_range, no_box, fades])
+        self.constants = (scaling, change, np.inf)
 
     @property
     def n_networks(self) -> int:

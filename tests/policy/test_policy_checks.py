@@ -185,7 +185,7 @@ def test_options_of_a_critic_compare_by_value_when_a_model_is_loaded(critic, tmp
     for changes in ({}, {"critic": copy.deepcopy(critic)}):
         kwargs = {"problem": scalar_mpc(), "critic": critic, "n_critics": 1, **changes}
         loaded = DDPG.load(tmp_path / "model", policy_kwargs=kwargs)
-        assert loaded.policy.actor_critic == CriticOptions(reward_scale=2.0)
+        assert loaded.policy.critic_options == CriticOptions(reward_scale=2.0)
     with pytest.raises(ValueError, match="policy kwargs"):
         DDPG.load(tmp_path / "model", policy_kwargs={**kwargs, "critic": CriticOptions()})
 
