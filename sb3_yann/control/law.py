@@ -72,8 +72,8 @@ class PlantLaw(ReadOnlyArrays):
     def on_plant(self, model: LinearModel, theta_ss: ArrayLike) -> Self:
         """Return the same law with its plant; theta_ss is (n_theta,)."""
         law = object.__new__(type(self))
-        own = {"model": model, "theta_ss": np.array(theta_ss, np.float64)}
-        law.__setstate__({**self.__getstate__(), **own})
+        plant = {"model": model, "theta_ss": np.array(theta_ss, np.float64)}
+        law.__setstate__({**self.__getstate__(), **plant})
         return law
 
     def plant_input(self, shown: ArrayLike) -> Array:
@@ -149,8 +149,8 @@ class PlantLaw(ReadOnlyArrays):
     @classmethod
     def _from_arrays(cls, data: dict[str, Any]) -> Self:
         """Return the law of such arrays; what is missing or damaged raises some error."""
-        own = {each.name: data[each.name] for each in fields(cls)}  # type: ignore[arg-type]
-        law = cls(**{name: each if each.ndim else each.item() for name, each in own.items()})
+        values = {each.name: data[each.name] for each in fields(cls)}  # type: ignore[arg-type]
+        law = cls(**{name: each if each.ndim else each.item() for name, each in values.items()})
         law._restore(data)
         if not any(name == "theta_ss" or name.startswith("model_") for name in data):
             return law
@@ -163,7 +163,7 @@ class PlantLaw(ReadOnlyArrays):
         return law.on_plant(model, check_array("theta_ss", data["theta_ss"], (law.n_theta,)))
 
     def _restore(self, data: dict[str, Any]) -> None:
-        """Take over what a file holds besides."""
+        """Take over the search tree of a file; most laws have none."""
 
     def __deepcopy__(self, memo: object = None) -> Self:
         """Return the law itself: nothing of it can change."""

@@ -104,7 +104,8 @@ def slices(law: Any, entries: tuple[int, int], at: Array) -> dict[int, Array]:
     The box is clipped by one half-plane after the other (Sutherland and Hodgman, *Communications of
     the ACM* 17, 1974).
     """
-    low, high = law.theta_min[[*entries]], law.theta_max[[*entries]]
+    low = law.theta_min[[*entries]]
+    high = law.theta_max[[*entries]]
     if not np.all(np.isfinite([low, high])):
         raise ValueError(
             f"The law's box is not bounded in entries {list(entries)} of theta: there is no frame "
@@ -113,7 +114,8 @@ def slices(law: Any, entries: tuple[int, int], at: Array) -> dict[int, Array]:
     fixed = np.array(at, np.float64)
     fixed[[*entries]] = 0.0
     box = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-    rows, levels = law.A[:, [*entries]], law.b - law.A @ fixed
+    rows = law.A[:, [*entries]]
+    levels = law.b - law.A @ fixed
     found = {}
     for i, (first, last) in enumerate(pairwise([*law.starts, len(law.b)])):
         polygon = _clipped(box, rows[first:last], levels[first:last])

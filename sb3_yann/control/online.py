@@ -229,13 +229,13 @@ class OnlineLaw(PlantLaw):
             feasible[i] = self._ask_daqp(rows[i], u[i], found, i)
         feasible &= self.dual.meets_fixed(rows)
         softened = None
-        lost = np.flatnonzero(~feasible)
-        if len(lost) and self.infeasible == "zero_input":
-            u[lost] = 0.0
-        elif len(lost):
-            again = np.ascontiguousarray(rows[lost])
+        outside = np.flatnonzero(~feasible)
+        if len(outside) and self.infeasible == "zero_input":
+            u[outside] = 0.0
+        elif len(outside):
+            again = np.ascontiguousarray(rows[outside])
             softened = self.dual.solve(again, soft=True)
-            u[lost] = self.dual.soft_inputs(again, softened)
+            u[outside] = self.dual.soft_inputs(again, softened)
         u = np.nan_to_num(u, nan=0.0)  # inf - inf, far from everything
         return np.clip(u, self.u_min, self.u_max), feasible, found, softened
 

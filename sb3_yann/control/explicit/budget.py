@@ -109,7 +109,8 @@ class BudgetTimer:
     def stage(self, name: str, done: str, steps: int) -> None:
         """Begin to show another stage, of so many steps; ``done`` says what has been before."""
         self._bar.close()
-        self._done, self._bar = f" {done}", self._new_bar(name, steps)
+        self._done = f" {done}"
+        self._bar = self._new_bar(name, steps)
 
     def advance(self, more: int = 1, effort: float = 0.0) -> None:
         """Count steps of a stage; raise ExplicitLimitError if the time is over."""

@@ -31,7 +31,7 @@ LAW_TOL = 1e-6
 INSIDE_TOL = 1e-8
 """How far a point may lie from a region that holds it, in half-widths of the box."""
 IMPLIED_TOL = 1e-9
-"""How far a region may reach beyond its conditions, and equal half-spaces differ; likewise."""
+"""How far a region may reach beyond its conditions, and equal half-spaces may differ."""
 NEEDLE = 1e-7
 """A region that holds no ball of this radius, in half-widths of the box, may be left to its
 neighbors where its conditions are rounding: such regions crowd at the border of a feasible set."""
@@ -223,7 +223,7 @@ class Certificate:
         """Return which conditions the half-spaces of region i just do not imply.
 
         They are left out where they seem to touch the region alone. Raise if it lies farther
-        beyond one, and a QP there disagrees; ``known`` tells which of the conditions are among the
+        beyond one, and a QP there disagrees; ``known`` marks the conditions that are among the
         half-spaces.
         """
         region = self.regions[i]

@@ -48,7 +48,7 @@ def walk(program: ParametricQP, timer: BudgetTimer) -> list[Region]:
     Across a facet where constraint k becomes active, or inactive, lies the region of the active
     set with k added, or removed. If k depends on the active constraints, it takes the place of one
     of those that it contains with a positive factor; if there is none, nothing feasible lies there
-    (Farkas' lemma). Where these sets have no region, a QP just across the middle of the facet tells
+    (Farkas' lemma). Where these sets have no region, a QP just across the middle of the facet shows
     what lies there. Last, QPs at random points look for what the walk has not met. Sets of
     constraints are whole numbers, with bit k for k.
     """
@@ -197,8 +197,8 @@ class _Walk:
 class _Factors:
     """QR factors of some active sets of one size: ``N[index]' = Q R``.
 
-    ``inverse`` and ``right`` are those of R and R', ``NQ`` is N Q, and ``depends`` tells which
-    constraints the active ones make up.
+    ``inverse`` and ``right`` are those of R and R', ``NQ`` is N Q, and ``depends`` marks the
+    constraints that are combinations of the active ones.
     """
 
     index: NDArray[np.intp]

@@ -191,7 +191,7 @@ class SteepQP(ParametricQP):
         return found.law @ np.append(theta, 1.0), active
 
     def conditions_at(self, theta: Array, active: int) -> Optimality | None:
-        """Return the KKT conditions that hold at theta, begun from an active set; None: none do.
+        """Return the KKT conditions that hold at theta, from an active set on; None: none do.
 
         They hold up to 1e-9, in half-widths of the box. At most 100 active sets are tried.
         """
@@ -396,7 +396,7 @@ def batches(
 ) -> Iterator[tuple[int, list[int]]]:
     """Yield each size, ascending, with the indices that have it, at most 256 at a time.
 
-    ``numbers`` tells how many numbers one of a size needs: a batch holds 4 million, or 32 MB.
+    ``numbers`` is how many numbers one of a size needs: a batch holds 4 million, or 32 MB.
     """
     indices: dict[int, list[int]] = {}
     for i, size in enumerate(sizes):

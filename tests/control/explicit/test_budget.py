@@ -42,13 +42,6 @@ def test_too_long_a_search_is_an_error_that_says_what_to_change(solver: str) -> 
         benchmark().explicit(solver, time_limit=1e-6)
 
 
-def test_after_a_limit_the_law_can_still_be_had() -> None:
-    mpc = benchmark()
-    with pytest.raises(ExplicitLimitError):
-        mpc.explicit(region_limit=1)
-    assert mpc.explicit().n_regions == 9
-
-
 @pytest.mark.parametrize(
     ("limits", "error", "message"),
     [

@@ -71,19 +71,6 @@ def test_a_gain_off_by_a_thousandth_is_found(
     assert solved(name).explicit().locate(theta) == index
 
 
-def test_a_wrong_law_in_a_thin_region_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    widths: list[float] = []
-
-    def spoil(regions: Regions) -> Regions:
-        widths.append(width(regions[thinnest(regions)]))
-        return with_changed_gain(regions, thinnest(regions), 1.1)
-
-    message, theta = error_of(monkeypatch, THIN, spoil)
-    assert widths[0] < 1e-4  # of the box's half-width: random points miss it
-    assert "is not optimal inside it" in message
-    assert OnlineMPC(solved(THIN))(theta) is not None
-
-
 def test_a_region_that_reaches_too_far_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(regions: Regions) -> Regions:
         wide = dataclasses.replace(regions[0], b=regions[0].b + 0.05)

@@ -21,18 +21,12 @@ from sb3_yann.control.polyhedra import Region, bounded_region, farthest_point, l
 
 # Those that ppopt solves in about a second.
 NAMES = [
-    *("pendulum", "reactor", "reactor, predicted states bounded", "benchmark", "terminal set"),
-    *("asymmetric input bounds", "discounted", "one step", "only one state bounded"),
-    *("a final state held to 1e-4", "every state bound twice", "a constraint that only touches"),
-    *("a constraint without a state", "inputs that do the same", "an input without effect"),
-    *("coupled inputs", "unstable, part of the box infeasible", "only predicted states bounded"),
-    *("nothing bounded", "zero input not allowed", "origin outside the box"),
-    *("states without weight", "cheap inputs", "expensive inputs", "one state"),
+    *("pendulum", "reactor", "benchmark", "terminal set", "a final state held to 1e-4"),
+    *("every state bound twice", "a constraint that only touches", "inputs that do the same"),
+    *("an input without effect", "unstable, part of the box infeasible", "nothing bounded"),
+    *("origin outside the box", "states without weight", "cheap inputs", "one state"),
     *("states of 1e-9 and 1e7, inputs of 1e6", "four states, two inputs"),
-]
-GENERAL_NAMES = [
-    *("servo", "servo with rates", "servo with a weight on the rate", "soft states"),
-    *("invariant with all of it", "two tanks", "two tanks, all parts"),
+    *("servo with rates", "soft states", "invariant with all of it", "two tanks, all parts"),
 ]
 
 
@@ -61,7 +55,7 @@ def assert_same_regions(mpc: LinearMPC) -> None:
         assert len(one.b) <= len(other.b)
 
 
-@pytest.mark.parametrize("name", [*NAMES, *GENERAL_NAMES])
+@pytest.mark.parametrize("name", NAMES)
 def test_regions_are_those_of_ppopt(name: str) -> None:
     assert_same_regions(problem(name))
 
@@ -72,7 +66,7 @@ def test_regions_of_random_problems_are_those_of_ppopt(mpc: LinearMPC) -> None:
     assert_same_regions(mpc)
 
 
-@pytest.mark.parametrize("name", ["two inputs", "servo with all of it", "two tanks, all parts"])
+@pytest.mark.parametrize("name", ["two inputs", "servo with all of it"])
 def test_every_half_space_of_a_region_bounds_it(name: str) -> None:
     for region in regions_of(problem(name), "walk"):
         np.testing.assert_allclose(np.linalg.norm(region.A, axis=1), 1)

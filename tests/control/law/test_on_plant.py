@@ -81,22 +81,6 @@ def test_a_damaged_plant_is_a_value_error(saved: Any, damage: dict[str, Any]) ->
         kind.load(path)
 
 
-def test_a_file_without_a_part_of_its_plant_is_a_value_error(saved: Any) -> None:
-    _, path, kind = saved
-    write_arrays(path, {k: v for k, v in read_arrays(path).items() if k != "model_u_ss"})
-    with pytest.raises(ValueError, match=r"does not hold .*model_u_ss"):
-        kind.load(path)
-
-
 def test_a_pickle_keeps_the_plant(saved: Any) -> None:
     copy = pickle.loads(pickle.dumps(saved[0]))
     assert copy.model == reactor().model and not copy.theta_ss.flags.writeable
-
-
-def test_a_law_without_a_plant_is_saved_as_before(tmp_path: Path) -> None:
-    law = PiecewiseAffine(
-        gains=[[[-2.0]]], offsets=[[0.0]], A=[[1.0], [-1.0]], b=[1.0, 1.0], starts=[0],
-        u_min=[-1.0], u_max=[1.0], theta_min=[-1.0], theta_max=[1.0],
-    )  # fmt: skip
-    law.save(tmp_path / "law.npz")
-    assert PiecewiseAffine.load(tmp_path / "law.npz").model is None
