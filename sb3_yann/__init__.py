@@ -26,7 +26,7 @@ __version__ = "0.1.0"
 _NAMES = {
     "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning Headroom "
     "SteadyOffsetWarning headroom",
-    "sb3_yann.callbacks": "ControlDiagnostics FigureLog NoActionNoise",
+    "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
     "sb3_yann.commissioning": "Batch Commissioning Improvement improve",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
     "ExplicitSolutionError Identified LinearMPC LinearModel OnlineLaw OnlineLawWarning "

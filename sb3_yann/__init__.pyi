@@ -6,7 +6,6 @@ from sb3_yann.audit import Headroom as Headroom
 from sb3_yann.audit import SteadyOffsetWarning as SteadyOffsetWarning
 from sb3_yann.audit import headroom as headroom
 from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
-from sb3_yann.callbacks import FigureLog as FigureLog
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
 from sb3_yann.commissioning import Batch as Batch
 from sb3_yann.commissioning import Commissioning as Commissioning

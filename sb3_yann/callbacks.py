@@ -46,7 +46,8 @@ class NoActionNoise(BaseCallback):
                 "NoActionNoise needs an off-policy algorithm, such as DDPG or TD3, not "
                 f"{type(self.model).__name__}."
             )
-        self.model.action_noise, self.model.learning_starts = None, 0
+        self.model.action_noise = None
+        self.model.learning_starts = 0
         if isinstance(self.model.policy, YannPolicy):
             watch_buffer(self.model)  # another one may have been loaded since
             require_same_statistics(self.model)
@@ -73,14 +74,41 @@ class ControlDiagnostics(BaseCallback):
       that of ``|G|``. G is the discounted return that followed; where the episode was cut off, the
       critic's value of its last state is added.
 
+    Parameters
+    ----------
+    figures : mapping of str to callable, optional
+        Pictures for tensorboard, by name: functions without arguments that return Axes or a Figure,
+        such as ``guard.plot``. They are drawn every ``figure_freq`` steps and when `learn` ends.
+    figure_freq : int, default 10_000
+        Steps between two pictures.
+
     Examples
     --------
     >>> from stable_baselines3 import DDPG
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> _ = model.learn(10, callback=[NoActionNoise(), ControlDiagnostics()])
+    >>> pictures = {"law/regions": model.policy.problem.explicit().plot}
+    >>> _ = model.learn(10, callback=[NoActionNoise(), ControlDiagnostics(pictures)])
     """
 
     model: OffPolicyAlgorithm
+
+    def __init__(
+        self,
+        figures: Mapping[str, Callable[[], Axes | Figure]] | None = None,
+        figure_freq: int = 10_000,
+    ) -> None:
+        super().__init__()
+        wanted = "a mapping of names to functions that draw, such as {'guard': guard.plot}"
+        self.figures = dict(
+            check_type("figures", {} if figures is None else figures, Mapping, wanted)
+        )
+        for name, draw in self.figures.items():
+            if not callable(draw):
+                raise TypeError(
+                    f"figures[{name!r}] = {draw!r} must be a function that draws, such as "
+                    "guard.plot, without parentheses."
+                )
+        self.figure_freq = check_int("figure_freq", figure_freq)
 
     def _init_callback(self) -> None:
         self.policy = require_yann_policy(self.model.policy, "ControlDiagnostics")
@@ -90,7 +118,25 @@ class ControlDiagnostics(BaseCallback):
         n_envs = self.training_env.num_envs
         self._episodes: list[list[tuple[Any, ...]]] = [[] for _ in range(n_envs)]
 
+    def _on_training_start(self) -> None:
+        self._last_figures = self.num_timesteps
+
+    def _on_training_end(self) -> None:
+        self._draw()
+
+    def _draw(self) -> None:
+        self._last_figures = self.num_timesteps
+        for name, draw in self.figures.items():
+            drawn: Any = draw()
+            figure = getattr(drawn, "figure", None) or drawn  # of Axes, else itself
+            picture = LoggedFigure(figure, close=False)
+            self.logger.record(name, picture, exclude=("stdout", "log", "json", "csv"))
+        if self.figures:
+            self.logger.dump(self.num_timesteps)
+
     def _on_step(self) -> bool:
+        if self.num_timesteps - self._last_figures >= self.figure_freq:
+            self._draw()
         if "yann/violations" not in self.logger.name_to_value and self._recorded:
             self._forget()  # the logger was dumped
         observations = np.asarray(self.model._last_obs)  # still s_t: SB3 advances it later
@@ -152,56 +198,3 @@ class ControlDiagnostics(BaseCallback):
                 th.as_tensor(actions, dtype=th.float32, device=self.model.device),
             )
         return np.asarray(q.cpu().numpy()[:, 0])
-
-
-class FigureLog(BaseCallback):
-    """Shows pictures in tensorboard, every so many steps and when `learn` ends.
-
-    Parameters
-    ----------
-    figures : mapping of str to callable
-        What to draw, by the name in tensorboard: functions without arguments that return Axes or a
-        Figure, such as ``guard.plot``. They are called anew each time.
-    every : int, default 10_000
-        Steps between two pictures.
-
-    Examples
-    --------
-    >>> from stable_baselines3 import DDPG
-    >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> pictures = FigureLog({"law/regions": model.policy.problem.explicit().plot})
-    >>> _ = model.learn(10, callback=[NoActionNoise(), pictures])
-    """
-
-    def __init__(
-        self, figures: Mapping[str, Callable[[], Axes | Figure]], every: int = 10_000
-    ) -> None:
-        super().__init__()
-        wanted = "a mapping of names to functions that draw, such as {'guard': guard.plot}"
-        for name, draw in check_type("figures", figures, Mapping, wanted).items():
-            if not callable(draw):
-                raise TypeError(
-                    f"figures[{name!r}] = {draw!r} must be a function that draws, such as "
-                    "guard.plot, without parentheses."
-                )
-        self.figures, self.every = dict(figures), check_int("every", every)
-
-    def _on_training_start(self) -> None:
-        self.last = self.num_timesteps
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps - self.last >= self.every:
-            self._write()
-        return True
-
-    def _on_training_end(self) -> None:
-        self._write()
-
-    def _write(self) -> None:
-        self.last = self.num_timesteps
-        for name, draw in self.figures.items():
-            drawn: Any = draw()
-            figure = getattr(drawn, "figure", None) or drawn  # of Axes, else itself
-            picture = LoggedFigure(figure, close=False)
-            self.logger.record(name, picture, exclude=("stdout", "log", "json", "csv"))
-        self.logger.dump(self.num_timesteps)

@@ -639,8 +639,8 @@ def _require_state_shown(policy: Any, env: gym.Env[Any, Any]) -> None:
     """Raise if an env does not show a law the state; other policies may take anything."""
     acts = getattr(policy, "policy", policy)  # a model's
     owner = getattr(acts, "__self__", acts)  # of a method, such as law.plant_input
-    if isinstance(owner, PiecewiseAffine | OnlineLaw) or hasattr(owner, "told"):
-        require_state_shown(env, getattr(owner, "told", False))
+    if isinstance(owner, PiecewiseAffine | OnlineLaw) or hasattr(owner, "observation_given"):
+        require_state_shown(env, getattr(owner, "observation_given", False))
 
 
 def _require_same_inputs(policy: Any, space: Any) -> None:

@@ -131,7 +131,7 @@ class SimulatedEpisodes(BaseCallback):
         with preserve_rng():
             require_like_training(self._pool, self.training_env, "The simulator")
             with one_env(self._pool) as env:
-                require_state_shown(env, self.policy.told)
+                require_state_shown(env, self.policy.observation_given)
 
     def _on_rollout_start(self) -> None:  # what was last seen of the plant is in the buffer now
         if self.state.due:

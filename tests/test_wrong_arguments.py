@@ -9,8 +9,8 @@ from stable_baselines3 import DDPG
 from policy_samples import scalar_mpc
 from sample_plants import LinearPlant
 from sb3_yann import (
+    ControlDiagnostics,
     DisturbanceObserver,
-    FigureLog,
     ImprovementGuard,
     LinearModel,
     NoActionNoise,
@@ -62,7 +62,10 @@ WRONG_KINDS = {
         lambda: PreviousInput(plant(), initial="none"),
         "initial = 'none' is not an array of real numbers",
     ),
-    "FigureLog of nothing": (lambda: FigureLog(None), "figures = None must be a mapping of names"),
+    "figures that are none": (
+        lambda: ControlDiagnostics(3),
+        "figures = 3 must be a mapping of names",
+    ),
     "restoring no model": (lambda: restore_accepted(None), "model = None must be a DDPG or TD3"),
     "a simulator that is none": (lambda: SimulatedEpisodes(None), "env = None must be the id of"),
     "episodes of no env": (lambda: evaluate(lambda _: [0.0], None, [0]), "env = None must be the"),

@@ -51,7 +51,7 @@ class FromOperatingPoint(gym.Wrapper[Vector, Vector, Vector, Vector]):
 
 
 def showing_theta(
-    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC, told: bool = False
+    make: Callable[[], gym.Env[Any, Any]], problem: LinearMPC, observation_given: bool = False
 ) -> Callable[[], gym.Env[Any, Any]]:
     """Return a function that makes envs that show theta and take deviations.
 
@@ -61,7 +61,7 @@ def showing_theta(
         Makes an env that shows as many values as theta has.
     problem : LinearMPC
         Where it is absolute, an env that takes absolute inputs shows absolute values.
-    told : bool, default False
+    observation_given : bool, default False
         Whether the user said what the env shows.
 
     Raises
@@ -71,7 +71,7 @@ def showing_theta(
     """
     with closing(make()) as env:
         space = require_vector(env, "action_space")
-        require_state_shown(env, told)
+        require_state_shown(env, observation_given)
     units = InputUnits.of(problem, space.low, space.high)
     if units is None or units.kind == "deviation":
         return make

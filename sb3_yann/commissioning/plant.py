@@ -78,7 +78,7 @@ class Plant:
         self.yann = require_yann_policy(model.policy, "Commissioning")
         self.problem = self.yann.problem
         normalization_of(model)  # or raise, before anything acts on the plant
-        require_state_shown(env, self.yann.told)
+        require_state_shown(env, self.yann.observation_given)
         for name in ("observation_space", "action_space"):
             own, its = getattr(model, name), getattr(env, name)
             if own.shape != its.shape or (

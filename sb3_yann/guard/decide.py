@@ -498,7 +498,7 @@ class Player:
 
     def _check(self, env: Any) -> None:
         if isinstance(env, gym.Env):
-            require_state_shown(env, self.policy.told)
+            require_state_shown(env, self.policy.observation_given)
 
     def _act(self, t: int, observations: NDArray[Any], rows: Rows) -> NDArray[Any]:
         seen = normalized(self.model, observations)

@@ -164,7 +164,7 @@ def as_activation(value: Any) -> type[nn.Module]:
     return value
 
 
-def require_undone_normalization(
+def require_inverse_normalization(
     problem: LinearMPC, algorithm: BaseAlgorithm | None, observation: AffineObservation | None
 ) -> None:
     """Raise unless ``observation`` can undo what a VecNormalize does to the observations."""
@@ -186,7 +186,7 @@ def require_undone_normalization(
         )
     require_outermost(normalize, algorithm.observation_space.shape)
     vars(algorithm)["sees_normalized"] = True  # both are saved with the model
-    vars(algorithm).setdefault("undone_statistics", statistics_of(normalize))
+    vars(algorithm).setdefault("vec_normalize_statistics", statistics_of(normalize))
     largest = _largest_observation(problem, observation)
     if largest > normalize.clip_obs:
         raise ValueError(
@@ -227,7 +227,9 @@ def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) ->
         )
 
 
-def as_input_units(problem: LinearMPC, action_space: spaces.Box, told: bool) -> InputUnits:
+def as_input_units(
+    problem: LinearMPC, action_space: spaces.Box, observation_given: bool
+) -> InputUnits:
     """Return how the env takes inputs; raise unless its bounds are those of the problem.
 
     Parameters
@@ -236,7 +238,7 @@ def as_input_units(problem: LinearMPC, action_space: spaces.Box, told: bool) -> 
         With finite bounds of the inputs.
     action_space : gymnasium.spaces.Box
         Of deviations, of absolute inputs, or [-1, 1].
-    told : bool
+    observation_given : bool
         Whether the user said what the env shows. Else only an absolute problem has absolute inputs.
     """
     if not np.issubdtype(action_space.dtype, np.floating):
@@ -245,7 +247,7 @@ def as_input_units(problem: LinearMPC, action_space: spaces.Box, told: bool) -> 
     if not action_space.is_bounded():
         raise ValueError(f"action_space = {action_space} must have finite bounds.")
     units = InputUnits.of(problem, action_space.low, action_space.high)
-    if units is not None and (units.kind != "absolute" or told or problem.absolute):
+    if units is not None and (units.kind != "absolute" or observation_given or problem.absolute):
         return units
     low, high, u_ss = problem.u_min.tolist(), problem.u_max.tolist(), problem.model.u_ss
     advice = (

@@ -184,7 +184,7 @@ class AffineObservation(ReadOnlyArrays):
         return f"AffineObservation(matrix={self.matrix.tolist()}, offset={self.offset.tolist()})"
 
 
-Shown = AffineObservation | str | Mapping[str, ArrayLike]
+ObservationSpec = AffineObservation | str | Mapping[str, ArrayLike]
 """What may be said of an observation, see :func:`as_observation`."""
 SAY = (
     "Say what it shows: policy_kwargs={'observation': 'deviation'}, 'absolute', or "
@@ -193,7 +193,7 @@ SAY = (
 
 
 def as_observation(
-    given: Shown | None, problem: LinearMPC, inputs: InputUnits
+    given: ObservationSpec | None, problem: LinearMPC, inputs: InputUnits
 ) -> AffineObservation | None:
     """Return the map from what an env shows to theta, None for the identity.
 
@@ -275,7 +275,7 @@ def require_same_statistics(model: BaseAlgorithm) -> None:
     if normalize is None:
         return
     require_frozen(normalize)
-    known = getattr(model, "undone_statistics", None)
+    known = getattr(model, "vec_normalize_statistics", None)
     if known is None or not normalize.norm_obs:
         return
     if not all(map(np.array_equal, known, statistics_of(normalize))):

@@ -43,7 +43,12 @@ from sb3_yann.policy.actor_critic import (
     layer_for,
 )
 from sb3_yann.policy.checks import require_own_problem, resolve_problem
-from sb3_yann.policy.observations import AffineFeatures, AffineObservation, Shown, as_observation
+from sb3_yann.policy.observations import (
+    AffineFeatures,
+    AffineObservation,
+    ObservationSpec,
+    as_observation,
+)
 from sb3_yann.policy.sb3_hooks import (
     KeepsPrecision,
     finite_gradient,
@@ -145,7 +150,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         critic_warmup: int = 2000,
         max_correction: float | None = None,
         pin_equilibrium: bool | None = None,
-        observation: Shown | None = None,
+        observation: ObservationSpec | None = None,
         law: str = "auto",
         networks: str | None = None,
         **sb3_kwargs: Any,
@@ -162,16 +167,16 @@ class YannPolicy(KeepsPrecision, TD3Policy):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             self.saved_kwargs["problem"] = self.problem
         # Whether the user said what the env shows.
-        self.told = told = observation is not None
-        self.input_units = checks.as_input_units(self.problem, action_space, told)
+        self.observation_given = observation is not None
+        self.input_units = checks.as_input_units(self.problem, action_space, self.observation_given)
         self.observation = as_observation(observation, self.problem, self.input_units)
         checks.require_theta(self.problem, observation_space, self.observation)
         checks.warn_of_absolute_inputs(self.problem, algorithm, self.input_units)
-        self.undone = isinstance(observation, AffineObservation | Mapping)
+        self.has_explicit_map = isinstance(observation, AffineObservation | Mapping)
         self._meets(algorithm)
-        if told or self.observation is not None:
+        if self.observation_given or self.observation is not None:
             self.saved_kwargs["observation"] = self.observation or "deviation"
-        self.looked = False  # at the first observation
+        self.first_obs_checked = False  # at the first observation
         self.gamma = check_discount(checks.as_gamma(gamma, algorithm))
         self.lr_mult = {
             "actor": check_range("actor_lr_mult", actor_lr_mult, 0, np.inf, "[)"),
@@ -203,10 +208,10 @@ class YannPolicy(KeepsPrecision, TD3Policy):
 
     def _meets(self, algorithm: BaseAlgorithm | None) -> None:
         """Raise unless the observations of an algorithm's env are what the policy takes."""
-        given = self.observation if self.undone else None
-        checks.require_undone_normalization(self.problem, algorithm, given)
+        given = self.observation if self.has_explicit_map else None
+        checks.require_inverse_normalization(self.problem, algorithm, given)
         if algorithm is not None and algorithm.get_env() is not None:
-            require_state_shown(algorithm.get_env(), self.told)
+            require_state_shown(algorithm.get_env(), self.observation_given)
 
     def _meets_another_env(self) -> None:
         """Do the same where `set_env` has given the algorithm another env since."""
@@ -302,8 +307,8 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         """Return SB3's prediction; name an absolute observation that is taken for a deviation."""
         self._meets_another_env()
         predicted = super().predict(observation, *args, **kwargs)
-        if not self.looked:
-            self.looked = True
+        if not self.first_obs_checked:
+            self.first_obs_checked = True
             rows = np.reshape(observation, (-1, *cast(Any, self.observation_space.shape)))
             checks.warn_of_misread_states(self.problem, self.theta(rows).double().cpu().numpy())
         return predicted
@@ -380,7 +385,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
             "critic_warmup": self.critic_warmup,
             "max_correction": self.max_correction,
             "pin_equilibrium": self.pin_equilibrium,
-            "observation": self.observation or ("deviation" if self.told else None),
+            "observation": self.observation or ("deviation" if self.observation_given else None),
             "law": self.law,
             "networks": self.networks,
         }

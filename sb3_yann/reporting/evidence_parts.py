@@ -187,12 +187,13 @@ def cost_part(subject: Subject) -> Part:
             taken.append(1e6 * (perf_counter() - begun))
         return f"{np.median(taken):.1f}", f"{np.percentile(taken, 99):.1f}"
 
-    looked, policy.looked = policy.looked, True  # no observation of the env
+    checked = policy.first_obs_checked
+    policy.first_obs_checked = True  # no observation of the env
     rows = [
         ["model.predict, one observation", *times(lambda: subject.model.predict(observation))],
         ["the MPC's law, one theta", *times(lambda: law(theta))],
     ]
-    policy.looked = looked
+    policy.first_obs_checked = checked
     tensors = policy.actor.state_dict().values()
     sizes = {
         "the actor's weights and constants": sum(t.numel() * t.element_size() for t in tensors)

@@ -136,7 +136,7 @@ class Subject:
         if self.env is None:
             return None
         with one_env(self.env) as env:
-            require_state_shown(env, self.policy.told)
+            require_state_shown(env, self.policy.observation_given)
         found = {}
         for name, act in {MPC: self.act_as_mpc, POLICY: self.act_as_policy}.items():
             played = evaluate(_Player(act), self.env, self.seeds)

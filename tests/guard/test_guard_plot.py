@@ -7,7 +7,14 @@ import pytest
 from stable_baselines3 import DDPG
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_yann import Decision, FigureLog, Headroom, ImprovementGuard, NoActionNoise, PlantTwin
+from sb3_yann import (
+    ControlDiagnostics,
+    Decision,
+    Headroom,
+    ImprovementGuard,
+    NoActionNoise,
+    PlantTwin,
+)
 from sb3_yann.evaluation import evaluate
 from sb3_yann.evaluation.plots import (
     decisions_figure,
@@ -96,8 +103,8 @@ def test_a_twin_draws_its_evidence() -> None:
 def test_pictures_reach_tensorboard(tmp_path) -> None:
     model = DDPG("YannPolicy", "CSTR-v0", device="cpu", tensorboard_log=str(tmp_path))
     guard = ImprovementGuard("CSTR-v0", n_eval_episodes=2, n_new_starts=0)
-    pictures = FigureLog({"guard/picture": guard.plot, "law": decisions_figure_of_none}, every=4)
-    model.learn(10, callback=[NoActionNoise(), guard, pictures])
+    figures = {"guard/picture": guard.plot, "law": decisions_figure_of_none}
+    model.learn(10, callback=[NoActionNoise(), guard, ControlDiagnostics(figures, 4)])
     (run,) = tmp_path.iterdir()
     events = EventAccumulator(str(run)).Reload()
     assert [each.step for each in events.Images("guard/picture")] == [4, 8, 10]
@@ -110,4 +117,4 @@ def decisions_figure_of_none():
 
 def test_what_does_not_draw_is_refused_by_name() -> None:
     with pytest.raises(TypeError, match=r"figures\['law'\] = 3 must be a function"):
-        FigureLog({"law": 3})
+        ControlDiagnostics({"law": 3})

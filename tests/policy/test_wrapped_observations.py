@@ -113,7 +113,7 @@ def test_worker_processes_are_asked_as_well() -> None:
     venv = SubprocVecEnv([make_welford], start_method="fork")
     try:
         with pytest.raises(ValueError, match=r"in the processes of SubprocVecEnv scales"):
-            require_state_shown(venv, told=True)
+            require_state_shown(venv, observation_given=True)
     finally:
         venv.close()
 
@@ -160,9 +160,9 @@ def test_a_frozen_normalization_is_refused_with_the_map_that_undoes_it() -> None
 def test_stacked_and_late_observations_are_named_unless_they_are_meant() -> None:
     stacked = VecFrameStack(DummyVecEnv([plant]), 3)
     with pytest.raises(ValueError, match=r"newest_frame\(3, 3\)"):
-        require_state_shown(stacked, told=False)
-    require_state_shown(stacked, told=True)
-    require_state_shown(VecFrameStack(DummyVecEnv([plant]), 1), told=False)
+        require_state_shown(stacked, observation_given=False)
+    require_state_shown(stacked, observation_given=True)
+    require_state_shown(VecFrameStack(DummyVecEnv([plant]), 1), observation_given=False)
     with pytest.warns(UserWarning, match="DelayObservation shows past states"):
         build(wrappers.DelayObservation(plant(), 2))
     with pytest.warns(UserWarning, match="StickyAction repeats past inputs"):
@@ -170,6 +170,6 @@ def test_stacked_and_late_observations_are_named_unless_they_are_meant() -> None
 
 
 def test_wrappers_of_rewards_and_of_fixed_numbers_pass() -> None:
-    require_state_shown(wrappers.NormalizeReward(plant()), told=False)
-    require_state_shown(wrappers.RecordEpisodeStatistics(plant()), told=False)
-    require_state_shown(Fixed(plant()), told=False)
+    require_state_shown(wrappers.NormalizeReward(plant()), observation_given=False)
+    require_state_shown(wrappers.RecordEpisodeStatistics(plant()), observation_given=False)
+    require_state_shown(Fixed(plant()), observation_given=False)

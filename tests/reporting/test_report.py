@@ -165,7 +165,7 @@ def test_timing_leaves_what_the_policy_has_looked_at_as_it_was() -> None:
     kwargs = {"problem": mpc, "observation": "deviation"}
     model = DDPG("YannPolicy", env, policy_kwargs=kwargs, device="cpu")
     evidence_parts.cost_part(subject_of(model))
-    assert not model.policy.looked
+    assert not model.policy.first_obs_checked
 
 
 def test_a_policy_that_the_guard_has_not_accepted_is_named() -> None:

@@ -26,7 +26,7 @@ def layers_of(env: Any) -> Iterator[Any]:
         waiting += [*(held.get("envs") or [])]
 
 
-def require_state_shown(env: Any, told: bool) -> None:
+def require_state_shown(env: Any, observation_given: bool) -> None:
     """Raise unless an observation means the same state at any time.
 
     Unknown wrappers pass. Where states are late or inputs are not applied, it warns.
@@ -35,14 +35,14 @@ def require_state_shown(env: Any, told: bool) -> None:
     ----------
     env : gymnasium.Env, VecEnv or gymnasium.vector.VectorEnv
         Also one whose wrappers are in other processes. A `VecNormalize` is not looked at.
-    told : bool
+    observation_given : bool
         Whether the user said what is shown. Else it must be the parameter of the law.
 
     Raises
     ------
     ValueError
-        If a wrapper scales observations or actions by statistics of its own, or, unless ``told``,
-        rescales or stacks observations.
+        If a wrapper scales observations or actions by statistics of its own. Unless
+        ``observation_given``, also if one rescales or stacks observations.
     """
     for layer in layers_of(env):
         name = type(layer).__name__
@@ -52,13 +52,15 @@ def require_state_shown(env: Any, told: bool) -> None:
                 f"same number means another state at each step, and the law takes the state. "
                 f"{LEAVE_OUT}"
             )
-        if not told and (undo := _other_observation(layer)):
+        if not observation_given and (undo := _other_observation(layer)):
             raise ValueError(
                 f"{name} shows other numbers than the state that the law takes. Say what they "
                 f"mean: policy_kwargs={{'observation': {undo}}}, or 'deviation' where the model is "
                 "one of what is shown. A law without a policy takes the env without the wrapper."
             )
-        if not told and (late := _library_names(layer) & {"DelayObservation", "StickyAction"}):
+        if not observation_given and (
+            late := _library_names(layer) & {"DelayObservation", "StickyAction"}
+        ):
             what = "shows past states" if "DelayObservation" in late else "repeats past inputs"
             warnings.warn(
                 f"{name} {what}, and the law is one of the present state and input. Leave it out, "
@@ -67,7 +69,9 @@ def require_state_shown(env: Any, told: bool) -> None:
             )
         is_wrapped = getattr(layer, "env_is_wrapped", None)
         if is_wrapped is not None and "envs" not in vars(layer) and "venv" not in vars(layer):
-            for kind in (KeepsStatistics,) if told else (KeepsStatistics, ShowsOtherNumbers):
+            for kind in (
+                (KeepsStatistics,) if observation_given else (KeepsStatistics, ShowsOtherNumbers)
+            ):
                 if any(is_wrapped(kind)):
                     raise ValueError(
                         f"A wrapper in the processes of {name} {kind.__doc__} The law takes the "
@@ -76,7 +80,7 @@ def require_state_shown(env: Any, told: bool) -> None:
 
 
 class _Judged(type):
-    """Classes whose instances are told by what they hold, so that a worker process can ask too."""
+    """Classes whose instances are recognized by what they hold: a worker process can ask too."""
 
     def __instancecheck__(cls, layer: Any) -> bool:
         return bool(cls.judge(layer))  # type: ignore[attr-defined]
