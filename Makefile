@@ -10,7 +10,7 @@ PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} MPLBACKEND=$${MPLBACKEND:-Agg} \
 # python -m, not the scripts in .venv/bin: their first line breaks on a path with spaces.
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
-CODE := sb3_yann envs benchmarks experiments examples tests noxfile.py docs/conf.py docs/messages.py docs/pictures.py
+CODE := sb3_yann envs benchmarks experiments examples tests noxfile.py docs/conf.py docs/pictures.py
 
 .DEFAULT_GOAL := help
 .PHONY: help demo paper bench test test-all test-fast coverage check docs format clean

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 from stable_baselines3 import DDPG
 
-from sb3_yann import PlantTwin, headroom
 from sb3_yann.evaluation import evaluate, plots
 from sb3_yann_envs import problems
 
@@ -78,14 +77,6 @@ def main() -> None:
     save(plots.decisions_figure(model.guard_state.decisions), "decisions")
     shown = {"quantities": ["C_B", "T", 4], "time_unit": "h"}
     save(plots.loops_figure(mpc, runs, **shown), "loops")
-    frame = ([0.49, 469], [1.29, 480])
-    surfaces = plots.surfaces_figure(mpc, mpc.law(), model, entries=("C_B", "T"), frame=frame)
-    save(surfaces, "surfaces")
-    save(plots.use_figure(mpc, model, runs["trained"]), "use")
-    log = evaluate(mpc.explicit(), "CSTR-v0", range(5))
-    twin = PlantTwin.fit(mpc, list(zip(log.observations, log.actions, strict=True)))
-    save(twin.plot()[0].figure, "twin")
-    save(plots.headroom_figure(headroom(mpc, "CSTR-v0")), "headroom")
 
 
 if __name__ == "__main__":

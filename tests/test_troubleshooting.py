@@ -143,7 +143,7 @@ CASES: dict[str, Callable[[], object]] = {
     ),
     "Step 1: reward[0] of env 0 is nan. The transition is not learnt from": lost_reward,
     # The guard
-    "The guard's env is the training env": lambda: learn(ImprovementGuard(env := Plant()), env),
+    "The guard's env Plant is the training env": lambda: learn(ImprovementGuard(env := Plant()), env),
     "The MPC played two episodes of the guard's env": lambda: learn(
         ImprovementGuard(lambda: gym.wrappers.TimeLimit(Plant(noise=0.1), 5), n_eval_episodes=2)
     ),
@@ -167,7 +167,7 @@ CASES: dict[str, Callable[[], object]] = {
 
 def quoted() -> list[str]:
     """Return the beginnings of messages that the page quotes."""
-    return re.findall(r"^\*\*`(.+?)`\*\*", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    return re.findall(r"^\| `(.+?)` \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
 
 
 def test_each_message_of_the_page_is_one_of_the_cases() -> None:

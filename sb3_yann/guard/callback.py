@@ -199,7 +199,7 @@ class ImprovementGuard(BaseCallback):
             raise TypeError(
                 f"env = {env!r} must be a simulator of the plant: the id of an environment, a "
                 "gymnasium.Env, a function that makes one, or a PlantTwin. On a plant without a "
-                "simulator use Commissioning (docs/commissioning.md)."
+                "simulator use Commissioning (docs/improve.md)."
             )
         as_source(env)  # a name that cannot be imported is an error here
         if log_path is not None and Path(log_path).is_dir():
