@@ -7,13 +7,13 @@ much on average (their conditional value at risk), is the mean cost higher?
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from sb3_yann._validation import Array, check_bool, check_range
+from sb3_yann._validation import Array, check_bool, check_range, former_names
 from sb3_yann.control.mpc.bound_excess import BoundExcess
 
 UNSAFE = (
@@ -88,6 +88,11 @@ class AcceptanceRule:
     least_gain: float = 0.001
     max_input_step: float | None = None
     excess_room: float = EXCESS_ROOM
+    former: ClassVar[dict[str, str]] = {
+        "tail": "cvar_alpha",
+        "retreat": "backtrack",
+        "largest_step": "max_input_step",
+    }
 
     def __post_init__(self) -> None:
         check_range("margin", self.margin, 0, np.inf)
@@ -113,6 +118,9 @@ class AcceptanceRule:
     def standard_errors(self) -> float:
         """How many standard errors a mean cost must be below the MPC's in the final trial."""
         return float(special.ndtri(1 - self.significance)) if self.cvar_alpha else 0.0
+
+
+AcceptanceRule.__init__ = former_names(**AcceptanceRule.former)(AcceptanceRule.__init__)  # type: ignore[method-assign]
 
 
 class Verdict(NamedTuple):

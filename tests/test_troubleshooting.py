@@ -143,7 +143,9 @@ CASES: dict[str, Callable[[], object]] = {
     ),
     "Step 1: reward[0] of env 0 is nan. The transition is not learnt from": lost_reward,
     # The guard
-    "The guard's env Plant is the training env": lambda: learn(ImprovementGuard(env := Plant()), env),
+    "The guard's env Plant is the training env": lambda: learn(
+        ImprovementGuard(env := Plant()), env
+    ),
     "The MPC played two episodes of the guard's env": lambda: learn(
         ImprovementGuard(lambda: gym.wrappers.TimeLimit(Plant(noise=0.1), 5), n_eval_episodes=2)
     ),
