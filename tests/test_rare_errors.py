@@ -113,15 +113,6 @@ def test_an_export_in_the_plants_units_needs_a_law_that_knows_them(tmp_path) -> 
         export(hand_made(), tmp_path / "law.npz", absolute=True)
 
 
-def test_an_export_of_a_law_that_another_machine_has_solved_is_refused(tmp_path) -> None:
-    model = build()
-    weights = {name: each.clone() for name, each in model.policy.state_dict().items()}
-    weights["actor.mu.gains"] *= 1 + 1e-9
-    model.policy.load_state_dict(weights)
-    with pytest.raises(ValueError, match=r"weights hold another law than its problem's\. Load"):
-        export(model, tmp_path / "law.npz")
-
-
 def test_an_operators_output_has_the_shape_of_the_inputs(tmp_path) -> None:
     export(scalar_mpc().explicit(), tmp_path / "law.npz")
     controller = Controller.load(tmp_path / "law.npz")

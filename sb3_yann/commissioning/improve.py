@@ -6,12 +6,14 @@ import copy
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from rich.progress import track
+from stable_baselines3 import DDPG
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import check_bool, check_int, check_range
@@ -24,9 +26,11 @@ from sb3_yann.commissioning.search import Pace, Search, decisive
 from sb3_yann.commissioning.simulator_grounds import RULE, SimulatorGrounds
 from sb3_yann.commissioning.simulator_twin import SimulatorTwin
 from sb3_yann.commissioning.trial import Check
+from sb3_yann.control import LinearMPC
+from sb3_yann.deployment.exporting import Exported, export
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin, require_yann_policy
-from sb3_yann.rollout import Source, name_of
+from sb3_yann.rollout import Source, maker, name_of
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.trust import Trust
 
@@ -75,6 +79,8 @@ class Improvement:
         The arguments.
     policy : str
         Fingerprint of the policy's weights when it ended.
+    model : DDPG or TD3, optional
+        With the policy; not in the model's zip.
 
     Examples
     --------
@@ -91,6 +97,11 @@ class Improvement:
     episodes: int = 0
     settings: dict[str, float] = field(default_factory=dict)
     policy: str = ""
+    model: Any = field(default=None, repr=False, compare=False)
+
+    def export(self, path: str | PathLike[str], **options: Any) -> Exported:
+        """Write the policy as a file or as code: :func:`sb3_yann.export` of the model."""
+        return export(self.model, path, **options)
 
     @property
     def reason(self) -> str:
@@ -129,7 +140,7 @@ class Improvement:
 
 
 def improve(  # noqa: PLR0913 (settings of a user, each by its name)
-    model: OffPolicyAlgorithm,
+    model: OffPolicyAlgorithm | LinearMPC,
     twin: PlantTwin | Source,
     iterations: int = 120,
     *,
@@ -177,8 +188,9 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
 
     Parameters
     ----------
-    model : DDPG or TD3
-        With a :class:`YannPolicy` of the twin's problem.
+    model : DDPG, TD3 or LinearMPC
+        With a :class:`YannPolicy` of the twin's problem. An MPC gets a DDPG model of its own, which
+        the result holds: ``result.model``, ``result.export("controller.c")``.
     twin : PlantTwin, gymnasium.Env, str or callable
         A twin, which must be trusted; or a simulator, which shows theta of the model's problem, or
         absolute values where that is absolute. The problem's stage cost counts, and no reward: a
@@ -231,14 +243,23 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     ``improve(model, "CSTR-v0")`` does it in the simulator.
     """
     given = dict(locals())
-    if not isinstance(model, OffPolicyAlgorithm):
-        raise TypeError(f"model = {model!r} must be a DDPG or TD3 model.")
-    policy = require_yann_policy(model.policy, "improve")
+    if not isinstance(model, OffPolicyAlgorithm | LinearMPC):
+        raise TypeError(f"model = {model!r} must be a DDPG or TD3 model, or a LinearMPC.")
     if not (isinstance(twin, PlantTwin | str | gym.Env) or callable(twin)):
         raise TypeError(
             f"twin = {twin!r} must be a PlantTwin; or a simulator: a single gymnasium.Env, its id, "
             "or a function that makes one."
         )
+    if isinstance(model, LinearMPC):
+        model = DDPG(
+            YannPolicy,
+            twin.env() if isinstance(twin, PlantTwin) else maker(twin)(),
+            gamma=min(model.gamma, 0.99),
+            seed=check_int("seed", seed, 0),
+            device="cpu",
+            policy_kwargs={"problem": model},
+        )
+    policy = require_yann_policy(model.policy, "improve")
     if isinstance(twin, PlantTwin):
         require_problem_of_twin(policy, twin.problem)
     counts = {"iterations": iterations, "batch": batch, "n_starts": n_starts}
@@ -273,7 +294,7 @@ def improve(  # noqa: PLR0913 (settings of a user, each by its name)
     found = replace(found, source=source, episodes=episodes, settings=settings, policy=prints)
     record: Any = model
     record.improvements = (*getattr(model, "improvements", ()), found)
-    return found
+    return replace(found, model=model)
 
 
 def fingerprint(state: dict[str, th.Tensor]) -> str:

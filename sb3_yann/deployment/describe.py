@@ -148,12 +148,7 @@ def _signal_maps(
 
 
 def _explicit(law: Any) -> PiecewiseAffine:
-    """Return an explicit law; raise ValueError for none, or for one that is solved online."""
-    if law is None:
-        raise ValueError(
-            "The policy's weights hold another law than its problem's. Load the model with the "
-            "problem that it was trained with."
-        )
+    """Return an explicit law; raise ValueError for one that is solved online."""
     if not isinstance(law, PiecewiseAffine):
         raise ValueError(
             "The law is solved online, by a quadratic program at each step; an export holds an "

@@ -55,6 +55,14 @@ def test_on_the_reactor_five_episodes_are_enough_and_the_model_goes_on(tmp_path)
     again.learn(20, callback=NoActionNoise())
 
 
+def test_an_mpc_is_enough_and_the_result_holds_its_model(tmp_path) -> None:
+    found = improve(problem(), twin(), iterations=4, batch=4, n_starts=4, check_every=4)
+    assert isinstance(found.model, DDPG) and found.model.policy.problem == problem()
+    assert found.export(tmp_path / "controller.npz").paths
+    assert found.report() in str(found)
+    assert found.model.improvements[-1].model is None  # no circle in the zip
+
+
 def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
     passed = Check(20, True, "", -0.021, 0.0004, True, -0.015, 0.003)
     refused = Check(40, False, "2 starts with violations", -0.03, 0.0, False)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,8 @@ from sb3_yann.control.explicit.budget import BudgetTimer, SolveBudget
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.explicit.solve import load_kernels, require_sane_sizes, solve_explicit
 from sb3_yann.control.law import INFEASIBLE, PiecewiseAffine
+from sb3_yann.control.linearization.simulator import borrow
+from sb3_yann.control.model.identify import Identified
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability, simulation
@@ -37,6 +40,9 @@ from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.terminal_set import invariant_set
 from sb3_yann.control.online import OnlineLaw
+
+if TYPE_CHECKING:
+    from sb3_yann.control.linearization.simulator import Maker
 
 G = TypeVar("G")
 
@@ -63,8 +69,8 @@ class LinearMPC(MPCProblem):
 
     Parameters
     ----------
-    model : LinearModel
-        The prediction model, n states and m inputs.
+    model : LinearModel or Identified
+        The prediction model, n states and m inputs; or what `identify` returns.
     Q : array_like, shape (n, n)
         Weight of the state, symmetric positive semi-definite.
     R : array_like, shape (m, m)
@@ -121,7 +127,7 @@ class LinearMPC(MPCProblem):
 
     def __init__(  # noqa: PLR0913 (the user's arguments)
         self,
-        model: LinearModel,
+        model: LinearModel | Identified,
         *,
         Q: ArrayLike,
         R: ArrayLike,
@@ -143,6 +149,8 @@ class LinearMPC(MPCProblem):
         absolute: bool = False,
         _stored: LinearMPC | None = None,
     ) -> None:
+        if isinstance(model, Identified):
+            model = model.model
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
         sides = (x_min, x_max), (u_min, u_max), (theta_min, theta_max)
@@ -190,6 +198,46 @@ class LinearMPC(MPCProblem):
                 "Look for the inputs' effect in the model's units and sampling time."
             )
         self._store(absolute=bool(absolute))
+
+    @classmethod
+    def from_env(
+        cls, env: Maker, *, Q: ArrayLike, R: ArrayLike, horizon: int, **options: Any
+    ) -> LinearMPC:
+        """Return the MPC of a simulator: its model by differences, its bounds from its spaces.
+
+        The inputs keep the bounds of the action space. The box of states for which the problem is
+        solved is the observation space, where that shows the state and has bounds.
+
+        Parameters
+        ----------
+        env : gymnasium.Env, str or callable
+            The simulator, its id or a function that makes it, as `LinearModel.from_env` takes it.
+        Q, R, horizon : array_like, shapes (n, n) and (m, m), and int
+            As of `LinearMPC`.
+        **options
+            ``x_ss``, ``u_ss``, ``dt``, ``set_state``, ``get_state`` and ``scale`` are those of
+            `LinearModel.from_env`; all others those of `LinearMPC`, as the plant shows them.
+
+        Examples
+        --------
+        >>> mpc = LinearMPC.from_env("ClippedPendulum-v0", Q=np.eye(2), R=[[1]], horizon=2)
+        >>> mpc.u_max.tolist(), mpc.theta_max.tolist()
+        ([2.0], [2.0, 8.0])
+        """
+        names = ("x_ss", "u_ss", "dt", "set_state", "get_state", "scale")
+        of_model = {name: options.pop(name) for name in names if name in options}
+        model = LinearModel.from_env(env, **of_model)
+        with contextlib.closing(borrow(env)) as borrowed:
+            shown = borrowed.env.observation_space
+            action = borrowed.env.action_space
+        limits = {"u_min": action.low, "u_max": action.high, "absolute": True}
+        if shown.shape == (model.n_states,):
+            low = np.asarray(shown.low, np.float64)
+            high = np.asarray(shown.high, np.float64)
+            bounded = np.abs([low, high]) < 1e6  # "no bound" may be the largest float32
+            limits["theta_min"] = np.where(bounded[0], low, -np.inf)
+            limits["theta_max"] = np.where(bounded[1], high, np.inf)
+        return cls(model, Q=Q, R=R, horizon=horizon, **{**limits, **options})
 
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the next theta on the model; theta is (n_theta,) or (batch, n_theta)."""
