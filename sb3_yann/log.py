@@ -134,7 +134,7 @@ class Log:
         """
         x = _matrices("states", states)
         u = _matrices("actions", inputs)
-        d = [np.zeros((len(each), 0)) for each in u]
+        d: list[Array] = [np.zeros((len(each), 0)) for each in u]
         if disturbances is not None:
             d = _matrices("disturbances", disturbances)
         for name, parts in (("actions", u), ("disturbances", d)):

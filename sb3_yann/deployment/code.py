@@ -50,6 +50,7 @@ def search_tolerances(data: Arrays, precision: str) -> dict[str, float]:
     relative to 1 + their size, tie. The others are those of the law's own compiled search. In float
     they are coarser: a slack is known to some 1e-6.
     """
+    found: tuple[float, ...]
     if precision == "float":
         found = (1e-5, 2e-6, 1e-5, 1e-4, 1e-5)
     else:
