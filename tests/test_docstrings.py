@@ -68,18 +68,13 @@ def public_names(module: Any) -> list[str]:
 
 
 def public_callables() -> dict[str, tuple[Callable[..., Any], str]]:
-    """Return functions, methods and constructors of public modules, each with its docstring."""
+    """Return what the packages export, functions, methods and constructors, with docstrings."""
     found: dict[str, tuple[Callable[..., Any], str]] = {}
-    for module in MODULES:
-        if re.search(r"(^|\.)_", module.__name__):
-            continue
-        for name, value in vars(module).items():
-            if name.startswith("_") or getattr(value, "__module__", None) != module.__name__:
-                continue
-            if inspect.isfunction(value):
-                found[f"{module.__name__}.{name}"] = value, value.__doc__ or ""
-            elif inspect.isclass(value):
-                found |= methods(f"{module.__name__}.{name}", value)
+    for name, value in exported().items():
+        if inspect.isclass(value):
+            found |= methods(name, value)
+        else:
+            found[name] = value, value.__doc__ or ""
     return found
 
 

@@ -39,6 +39,7 @@ def run_code(name: str, code: str) -> dict[str, object]:
     shortened = shortened.replace(
         'improve(model, "CSTR-v0")', 'improve(model, "CSTR-v0", 5, n_starts=5)'
     )
+    shortened = shortened.replace("improve(model, twin)", "improve(model, twin, 10, n_starts=5)")
     # A number that nothing here knows would train in full.
     steps = re.findall(r"\.learn\(\s*(?:total_timesteps\s*=\s*)?([^\s,)]*)", shortened)
     assert set(steps) <= {"500"}, f"{name}: learn is called with {steps}"

@@ -489,7 +489,8 @@ def plot_decisions(
     Examples
     --------
     >>> from sb3_yann import Decision
-    >>> first = Decision(9, 1, "accepted", "", False, 3.0, 3.0, 4.0, -0.5, (), 1.0)
+    >>> costs = {"candidate_cost": 3.0, "accepted_cost": 3.0, "mpc_cost": 4.0}
+    >>> first = Decision(verdict="accepted", episode=1, **costs)
     >>> plot_decisions([first]).get_xlabel()
     'training episodes'
     """
@@ -646,6 +647,11 @@ def fit_figure(
     time_unit: str = "",
 ) -> Figure:
     """Return a figure of :func:`plot_fit` for each state, with its arguments.
+
+    Parameters
+    ----------
+    model, states, actions, disturbances, time_unit
+        As of :func:`plot_fit`.
 
     Examples
     --------

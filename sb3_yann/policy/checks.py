@@ -440,8 +440,6 @@ FIXED = LawLayer, AfterstateValue, QuadraticStateActionValue, AffineFeatures
 """Modules whose buffers follow from the problem, or from the map to its theta."""
 FREE = {"confines", "value_scale"}
 """Buffers of theirs that follow from what was learnt."""
-RECENT = {"samples"}
-"""Those that earlier saves do not have."""
 OF_ORDER_ONE = {"offsets", "resting", "half_space_b", "change"}
 """Those that are in units of a range: zeros among them are not exact."""
 ROUNDING, SMALLEST = 1e-6, 1e-9
@@ -483,7 +481,7 @@ def _difference(part: nn.Module, prefix: str, state: Mapping[str, Any], strict: 
     own = {name: each for name, each in part.named_buffers(recurse=False) if name not in FREE}
     given = {key[len(prefix) :] for key in state if key.startswith(prefix)}
     given = {name for name in given if "." not in name} - FREE
-    if strict and (missing := sorted(own.keys() - given - RECENT)):
+    if strict and (missing := sorted(own.keys() - given)):
         return f"there is no {prefix}{missing[0]}"
     if strict and (unknown := sorted(given - own.keys())):
         return f"there is {prefix}{unknown[0]}, which this policy does not have"

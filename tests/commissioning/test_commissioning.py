@@ -17,7 +17,6 @@ from sb3_yann import Commissioning, Improvement, YannPolicy
 from sb3_yann.commissioning import Check, commissioning
 from sb3_yann.commissioning.comparison import (
     Costs,
-    _standard_error,
     is_confirmed,
     is_kept,
     pays_its_own,
@@ -425,14 +424,6 @@ def test_a_policy_is_kept_where_it_surely_costs_less_in_turns() -> None:
     assert is_kept(costs) and not is_kept(costs._replace(error=0.2))
     assert not is_kept(costs._replace(pairs=1, error=0.0))
     assert not is_kept(costs._replace(actual=np.nan)) and not is_kept(costs._replace(mpc=np.nan))
-
-
-def test_neighboring_differences_that_are_alike_widen_the_error() -> None:
-    values = np.repeat(np.random.default_rng(0).normal(size=10), 4)
-    plain = values.std(ddof=1) / np.sqrt(len(values))
-    assert _standard_error(values) > 1.8 * plain
-    shuffled = np.random.default_rng(1).permutation(values)
-    assert _standard_error(shuffled) == pytest.approx(plain, rel=0.3)
 
 
 def test_a_reward_of_its_own_decides_what_is_kept() -> None:
