@@ -210,7 +210,7 @@ class Tolerance:
         margin: Any = self.margin
         if self.cvar_alpha:
             margin = self.margin * np.maximum(1.0, np.abs(mpc_costs) / self.typical)
-        return np.maximum(margin, COST_ROUNDING * np.abs(mpc_costs))
+        return np.asarray(np.maximum(margin, COST_ROUNDING * np.abs(mpc_costs)))
 
     def excess(self, mpc_costs: Array, costs: Array) -> Array:
         """Return what each start costs more than with the MPC, in units of what it may.

@@ -380,7 +380,8 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
     """Play one episode in each env of a plant, side by side."""
     shown = plant.reset()
     n = len(shown)
-    running, rows = np.ones(n, dtype=bool), np.arange(n)
+    running = np.ones(n, dtype=bool)
+    rows: Rows = np.arange(n)
     lengths, costs = np.zeros(n, dtype=np.int64), np.zeros(n)
     violations = np.zeros(n, dtype=np.int64)
     terminated, truncated, succeeded = np.zeros((3, n), dtype=bool)

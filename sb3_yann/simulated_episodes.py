@@ -186,14 +186,14 @@ class SimulatedEpisodes(BaseCallback):
         for i in range(n):
             own = range(i, len(scaled), n)
             over = [np.arange(1, length + 1) == length for length in played.lengths[own]]
-            cut = [each & bool(played.truncated[k]) for k, each in zip(own, over, strict=True)]
+            cuts = [each & bool(played.truncated[k]) for k, each in zip(own, over, strict=True)]
             parts = (
                 [played.observations[k][:-1] for k in own],
                 [played.observations[k][1:] for k in own],
                 [np.array(scaled[k]) for k in own],
                 [played.rewards[k].astype(np.float32) for k in own],
                 over,
-                cut,
+                cuts,
             )
             columns.append([np.concatenate(each) for each in parts])
         length = min(len(column[0]) for column in columns)

@@ -56,7 +56,7 @@ def describe(
     problem, note = None, ""
     if isinstance(policy, YannPolicy | LinearMPC):
         problem = policy.problem if isinstance(policy, YannPolicy) else policy
-    model = policy.model if problem is None else problem.model
+    model: Any = policy.model if problem is None else problem.model
     if model is not None:
         note = missing_observer(model)
     if check_choice("observer", observer, ("none", "caller")) == "none" and note:
@@ -77,7 +77,8 @@ def describe(
             change = np.array([problem.rate.du_min, problem.rate.du_max]) / _input_range(law)[2]
 
     n, states = law.n_theta, np.zeros(law.n_theta, bool)
-    state_names, input_names = [], [f"u[{i}]" for i in range(law.n_inputs)]
+    state_names: list[str] = []
+    input_names = [f"u[{i}]" for i in range(law.n_inputs)]
     if law.model is not None:
         state_names, input_names = labels_of(law.model)
     states[: len(state_names)] = True
@@ -125,14 +126,16 @@ def _signal_maps(
     """
     n = law.n_theta
     if isinstance(policy, YannPolicy) and not absolute:
-        extractor, box = policy.actor.features_extractor, policy.action_space
+        extractor = policy.actor.features_extractor
+        box: Any = policy.action_space
         matrix, offset = np.eye(n), np.zeros(n)
         if isinstance(extractor, AffineFeatures):
             matrix, offset = extractor.matrix.T.cpu().numpy(), extractor.offset.cpu().numpy()
         low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
         shift = (high + low) / 2
         return matrix, offset, scale_within((high - low) / 2, shift, low, high), shift
-    theta_ss, u_ss = np.zeros(n), np.zeros(law.n_inputs)
+    theta_ss: Array = np.zeros(n)
+    u_ss: Array = np.zeros(law.n_inputs)
     if absolute:
         if law.model is None or law.theta_ss is None:
             raise ValueError(

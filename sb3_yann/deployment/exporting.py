@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from sb3_yann._archive import atomic_write, digest_of, write_arrays
 from sb3_yann._validation import check_bool, check_choice, check_options
@@ -151,7 +152,7 @@ def export(
     elif kind == "onnx":
         files = {target: onnx_model(data, precision, digest)}
     else:
-        write = {"st": st_text, "xml": plcopen_xml, "fmu": fmu_file}[kind]
+        write: Any = {"st": st_text, "xml": plcopen_xml, "fmu": fmu_file}[kind]
         files = {target: write(data, precision, about)}
     with ExitStack() as stack:  # all of them, or none
         parts = [stack.enter_context(atomic_write(each)) for each in files]

@@ -170,7 +170,7 @@ class _Surface:
     def values(self, policy: Any) -> Array:
         """Return the input of a policy on the grid."""
         u = inputs_of(self.problem, policy, self.theta)[:, self.output]
-        return (u + self.problem.model.u_ss[self.output]).reshape(self.inside.shape)
+        return np.reshape(u + self.problem.model.u_ss[self.output], self.inside.shape)
 
     def draw(self, axes: Axes, u: Array, scale: tuple[float, float]) -> Any:
         """Draw values in colors of a scale, and the border of where the MPC has a solution."""

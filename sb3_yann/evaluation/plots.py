@@ -344,7 +344,7 @@ def loops_figure(
             for panel in own:
                 panel.set_axis_off()
             continue
-        _draw_loops(own, problem, groups, entries[k], time_unit)
+        _draw_loops([*own], problem, groups, entries[k], time_unit)
         for panel, group in zip(own, groups, strict=True):
             if column == 0 and many and len(groups) > 1:
                 panel.set_title(next(iter(group)), loc="left", fontsize="medium")

@@ -505,4 +505,4 @@ class Player:
         actions, _ = self.policy.predict(seen, deterministic=True)
         if not np.all(np.isfinite(actions)):  # of a subclass: the actor itself puts out no NaN
             raise Unplayable("an action of the actor is not a finite number")
-        return actions
+        return np.asarray(actions)

@@ -364,8 +364,8 @@ def _actions(given: list[Any]) -> tuple[Single, list[Any]]:
     hidden1 = np.empty((batch, second.shape[2] - 1), np.float32)
     hidden2 = np.empty((batch, columns - 1), np.float32)
     outputs = np.empty((5, batch, m), np.float32)
-    written = actions, x, used, slot, hidden1, hidden2, outputs
-    slots = forward(*given, *written)
+    arrays = [*given, actions, x, used, slot, hidden1, hidden2, outputs]
+    slots = forward(*arrays)
     return actions, [x, used[:slots], slot, hidden1, hidden2, outputs]
 
 
