@@ -44,7 +44,6 @@ def test_all_that_is_known_to_be_called_is_looked_at() -> None:
         "forward",
     }
     assert names >= {
-        "forward_shared",
         "solve_batch",
         "inputs_of_batch",
         "recall",
