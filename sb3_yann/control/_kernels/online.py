@@ -4,9 +4,9 @@ The program comes in its dual form. With the unconstrained optimum eliminated, t
 constraints are ``s = d(theta) + gram lam``, where the multipliers ``lam >= 0`` must be zero where s
 is not, and ``s >= 0``. Constraints are in units in which the diagonal of ``gram`` is 1.
 
-DAQP's workspace, set up once and called from Python, takes 0.8 to 4 times as long for one point and
-4 to 50 times as long for each of a batch (2 variables: 20 against 0.4 microseconds; 20 variables,
-160 constraints: 67 against 10; 100 and 800: 520 against 53). A guard plays millions of points.
+DAQP's workspace, set up once and called from Python, takes 0.7 to 3.8 times as long for one point,
+and 4 to 35 times for each of a batch (2 variables: 20 against 0.8 microseconds; 20 variables, 160
+constraints: 67 against 10; 101 and 801: 519 against 53).
 """
 
 from __future__ import annotations

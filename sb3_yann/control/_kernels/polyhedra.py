@@ -2,7 +2,7 @@
 
 From a point inside, an active-set method climbs along the edges. It compares directions with zero,
 never distances: a polyhedron of width 1e-9 is as good as a round one. A region asks for dozens of
-such programs and takes half a millisecond; one call of HiGHS takes a whole one.
+such programs.
 """
 
 from __future__ import annotations
