@@ -62,9 +62,8 @@ def envs(n: int, kind: Any = Slide) -> DummyVecEnv:
 def all_bits(value: Any) -> Any:
     """Return what compares bit for bit, of dataclasses and numbers that are NaN as well."""
     if dataclasses.is_dataclass(value):
-        return {
-            each.name: all_bits(getattr(value, each.name)) for each in dataclasses.fields(value)
-        }
+        compared = [each.name for each in dataclasses.fields(value) if each.compare]
+        return {name: all_bits(getattr(value, name)) for name in compared}
     if isinstance(value, dict):
         return {str(key): all_bits(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
