@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -21,7 +20,7 @@ from sb3_yann.guard.state import GuardState
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import YannPolicy
 from sb3_yann.reporting.html import Html, tag
-from sb3_yann.rollout import Source, Trajectories, evaluate, name_of, one_env
+from sb3_yann.rollout import Source, Trajectories, name_of, one_env, rollout
 from sb3_yann.twin import PlantTwin
 
 POLICY, MPC = "policy", "MPC"
@@ -52,17 +51,6 @@ class Part:
 def left_out(title: str, why: str, *findings: Finding) -> Part:
     """Return a part that says in a sentence why it is not there."""
     return Part(title, tag("p", why, class_="said"), findings)
-
-
-class _Player:
-    """A policy on observations as the env shows them."""
-
-    def __init__(self, act: Callable[[Any], Any]) -> None:
-        self.act = act
-
-    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, None]:
-        """Return the actions."""
-        return self.act(observation), None
 
 
 @dataclass
@@ -139,7 +127,7 @@ class Subject:
             require_state_shown(env, self.policy.observation_given)
         found = {}
         for name, act in {MPC: self.act_as_mpc, POLICY: self.act_as_policy}.items():
-            played = evaluate(_Player(act), self.env, self.seeds)
+            played = rollout(lambda t, shown, rows, act=act: act(shown), self.env, self.seeds)
             found[name] = replace(
                 played,
                 observations=tuple(map(self._theta, played.observations)),
