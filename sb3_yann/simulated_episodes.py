@@ -198,13 +198,14 @@ class SimulatedEpisodes(BaseCallback):
             columns.append([np.concatenate(each) for each in parts])
         length = min(len(column[0]) for column in columns)
         for k in range(length):
-            obs, after, u, reward, done, cut = (
+            obs, after, u, reward, done, stopped = (
                 np.array([column[part][k] for column in columns]) for part in range(6)
             )
             if k == length - 1:  # longer columns end here
-                cut, done = cut | ~done, np.ones(n, dtype=bool)
+                stopped = stopped | ~done
+                done = np.ones(n, dtype=bool)
             at = buffer.pos
-            infos = [{"TimeLimit.truncated": bool(each)} for each in cut]
+            infos = [{"TimeLimit.truncated": bool(each)} for each in stopped]
             buffer.add(obs, after, u, reward, done, infos)
             marks[at] = True
 

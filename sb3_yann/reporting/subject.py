@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -20,7 +21,7 @@ from sb3_yann.guard.state import GuardState
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import YannPolicy
 from sb3_yann.reporting.html import Html, tag
-from sb3_yann.rollout import Source, Trajectories, name_of, one_env, rollout
+from sb3_yann.rollout import Controller, Source, Trajectories, name_of, one_env, rollout
 from sb3_yann.twin import PlantTwin
 
 POLICY, MPC = "policy", "MPC"
@@ -51,6 +52,10 @@ class Part:
 def left_out(title: str, why: str, *findings: Finding) -> Part:
     """Return a part that says in a sentence why it is not there."""
     return Part(title, tag("p", why, class_="said"), findings)
+
+
+def _as_controller(act: Callable[[Any], Any]) -> Controller:
+    return lambda t, observations, rows: act(observations)
 
 
 @dataclass
@@ -127,7 +132,7 @@ class Subject:
             require_state_shown(env, self.policy.observation_given)
         found = {}
         for name, act in {MPC: self.act_as_mpc, POLICY: self.act_as_policy}.items():
-            played = rollout(lambda t, shown, rows, act=act: act(shown), self.env, self.seeds)
+            played = rollout(_as_controller(act), self.env, self.seeds)
             found[name] = replace(
                 played,
                 observations=tuple(map(self._theta, played.observations)),

@@ -1,17 +1,21 @@
-"""What was decided can be read, and a stopped run goes on from there."""
+"""What was decided can be read, saved and shown, and a stopped run goes on from there."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
 import os
+import warnings
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from stable_baselines3 import DDPG, TD3
-from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.monitor import Monitor
 
 from event_files import scalars
 from guard_samples import (
@@ -33,9 +37,12 @@ from guard_samples import (
     train,
     verdicts,
 )
+from resumed import model_bits
 from sb3_yann import Decision
 from sb3_yann.guard import callback
 from sb3_yann.guard import state as record
+from sb3_yann.guard.state import ADVICE, summary_of
+from weights import is_mpc
 
 NAMES = [each.name for each in dataclasses.fields(Decision)]
 
@@ -175,8 +182,9 @@ def test_verbose_prints_a_line_for_each_decision_and_silence_is_the_default(caps
     assert lines[2].startswith("Episode 3: accepted; mean costs: ") and lines[2].endswith(ends)
 
 
-@pytest.mark.parametrize("algorithm", [DDPG, TD3])
-@pytest.mark.parametrize("place", ["before the guard", "after the guard"])
+@pytest.mark.parametrize(
+    ("algorithm", "place"), [(DDPG, "before the guard"), (TD3, "after the guard")]
+)
 def test_a_run_that_was_stopped_goes_on_with_what_was_accepted(
     algorithm, place, tmp_path, monkeypatch
 ) -> None:
@@ -273,3 +281,161 @@ def test_a_saved_model_holds_the_guard_s_state_in_main_memory(tmp_path) -> None:
     memory = {each.data_ptr() for each in model.policy.state_dict().values()}
     kept = model.guard_state.accepted
     assert memory.isdisjoint(each.data_ptr() for each in kept.actor.values())
+
+
+def saved(folder: Path) -> Any:
+    return DDPG.load(folder / "accepted_model.zip", device="cpu")
+
+
+def evaluates(folder: Path) -> EvalCallback:
+    return EvalCallback(
+        Monitor(Slide()),
+        best_model_save_path=str(folder),
+        eval_freq=2,
+        n_eval_episodes=1,
+        verbose=0,
+    )
+
+
+def test_the_file_holds_what_is_accepted_from_the_first_step_on(tmp_path) -> None:
+    folder = tmp_path / "new" / "folder"
+    model, guard = build(gradient_steps=0), make_guard(save_path=folder)
+    seen: list[Any] = []
+    look = At([1, STEPS + 1, 2 * STEPS], lambda _: seen.append(saved(folder)))
+    worse = At([STEPS + 2], partial(correct, region=RIGHT, value=2.0))
+    train(model, 2 * STEPS, At([2], better), worse, guard, look)
+    first, accepted, later = seen
+    assert is_mpc(first) and not is_mpc(accepted)
+    assert actor_bits(accepted.policy) == actor_bits(later.policy) == accepted_bits(guard)
+    assert actor_bits(saved(folder).policy) == actor_bits(model.policy)
+    assert [each.name for each in folder.iterdir()] == ["accepted_model.zip"]
+
+
+def test_saving_changes_no_bit_of_the_training(tmp_path) -> None:
+    found = []
+    for options in ({}, {"save_path": tmp_path}):
+        model = build()
+        train(model, 4 * STEPS, guard := make_guard(**options))
+        found.append(model_bits(model))
+        assert len(guard.decisions) > 2
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_best_model_that_nobody_accepted_is_told_and_the_accepted_one_lies_beside(
+    tmp_path, nested
+) -> None:
+    best = evaluates(tmp_path)
+    other = EveryNTimesteps(1, best) if nested else best
+    model, guard = build(gradient_steps=0), make_guard(n_new_starts=5)
+    with pytest.warns(
+        UserWarning, match="best_model.zip that EvalCallback.*accepted_model.zip"
+    ) as told:
+        train(model, STEPS, At([2], partial(correct, region=RIGHT, value=2.0)), guard, other)
+    assert len(told) == 1
+    assert (tmp_path / "best_model.zip").is_file()
+    assert is_mpc(saved(tmp_path))
+
+
+def test_a_folder_of_ones_own_is_used_and_a_callback_that_keeps_no_model_is_not_told(
+    tmp_path,
+) -> None:
+    model, guard = build(gradient_steps=0), make_guard(save_path=tmp_path / "mine")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train(model, 2, guard, EvalCallback(Monitor(Slide()), eval_freq=99, verbose=0))
+    with pytest.warns(UserWarning, match="mine"):
+        train(model, 2, guard, evaluates(tmp_path / "best"))
+    assert (tmp_path / "mine" / "accepted_model.zip").is_file()
+    assert not (tmp_path / "best" / "accepted_model.zip").exists()
+
+
+def test_a_disk_that_is_full_stops_no_training(tmp_path, monkeypatch) -> None:
+    model, guard = build(gradient_steps=0), make_guard(save_path=tmp_path)
+
+    def full(*_: Any) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.warns(UserWarning, match=r"accepted_model.zip could not be written \(No space"):
+        train(model, STEPS, At([2], better), guard)
+    assert not is_mpc(model) and [*tmp_path.iterdir()] == []
+
+
+def test_a_file_is_no_folder(tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=r"save_path = .* is a file; name a folder"):
+        make_guard(save_path=tmp_path / "file")
+
+
+def decision(verdict: str, accepted: float, reason: str = "", mpc: float = 40.0) -> Decision:
+    return Decision(
+        timestep=9, episode=7, verdict=verdict, reason=reason, candidate_cost=1.0,
+        accepted_cost=accepted, mpc_cost=mpc,
+    )  # fmt: skip
+
+
+def said_of(
+    decisions: list[Decision], n: int = 5, is_mpc: bool = False, updates: int = 9, acts: bool = True
+) -> list[str]:
+    """Return the lines about decisions on n starts, and one hard start that is left out."""
+    last = decisions[-1] if decisions else decision("accepted", 40.0)
+    costs = SimpleNamespace(costs=np.array([last.accepted_cost] * n + [999.0]))
+    mpc = SimpleNamespace(costs=np.array([last.mpc_cost] * n + [999.0]))
+    checkpoint = SimpleNamespace(has_networks_of=lambda _: is_mpc, is_actor_of=lambda _: acts)
+    state: Any = SimpleNamespace(
+        decisions=decisions,
+        settings={"seeds": range(n)},
+        evidence=SimpleNamespace(scores=costs, starts=SimpleNamespace(mpc=mpc), mpc=checkpoint),
+        accepted=checkpoint,
+    )
+    policy: Any = SimpleNamespace(critic_updates=updates, critic_warmup=5)
+    return summary_of(state, policy).splitlines()
+
+
+def test_it_counts_verdicts_and_says_what_the_last_policy_costs() -> None:
+    kind = next(iter(ADVICE))
+    refused = [decision("rejected", 39.0, f"seed {i}: {kind}, by {i}") for i in (3, 4)]
+    others = [decision("rejected", 39.0, "mean cost 5"), decision("accepted", 39.0)]
+    decisions = [*refused, *others, decision("accepted in part", 30.0, "half")]
+    assert said_of(decisions, 12) == [
+        "The policy accepted last costs 30, 25 % less than the MPC's 40, on 12 starts.",
+        "Candidates: 1 accepted, 1 in part, 3 refused, in 7 episodes.",
+        f"Refused most often (2 times): seed 3: {kind}, by 3.",
+        f"What may help: {ADVICE[kind]}.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("last", "words"),
+    [
+        (decision("accepted", 41.0), "costs 41, 2.5 % more than the MPC's 40"),
+        (decision("rejected", 40.0, "x"), "is not the MPC, and gains nothing: it costs 40 on 5"),
+        (decision("accepted", -2.0, mpc=0.0), "costs -2, less than the MPC's 0"),
+        (decision("accepted", -50.0, mpc=-40.0), "costs -50, 25 % less than the MPC's -40"),
+    ],
+    ids=["more", "as much", "an MPC that costs nothing", "negative costs"],
+)
+def test_the_change_is_against_the_size_of_the_mpc_s_cost(last, words) -> None:
+    assert words in said_of([last])[0]
+
+
+def test_nothing_was_tried_and_why() -> None:
+    mpc = "The policy accepted last is the MPC: it costs 40 on 5 starts."
+    assert said_of([], is_mpc=True) == [mpc, "The guard has tried no candidate yet."]
+    assert "had 3 updates, and the actor moves after" in said_of([], is_mpc=True, updates=3)[2]
+
+
+def test_a_changed_policy_is_never_called_the_mpc() -> None:
+    """What a policy learnt before training is not the MPC, nor is what changed it since."""
+    model, guard = build(gradient_steps=0, actor={"critic_warmup": 99}), make_guard(Slide)
+    better(model.policy)
+    train(model, 2, guard)
+    said = guard.summary()
+    assert "is the MPC" not in said and "% less than the MPC's" in said
+    assert "tried no candidate yet" in said and "critic_warmup = 99" in said
+    other, guard = build(gradient_steps=0), make_guard(Slide)
+    train(other, 2, At([], better), guard)
+    assert "accepted last is the MPC" in guard.summary()
+    better(other.policy)
+    assert "The model's policy is another one, which no guard has accepted" in guard.summary()

@@ -1,0 +1,617 @@
+"""What becomes of a candidate: whole, in part, on new starts, at the end, or not at all."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG, TD3
+
+from guard_samples import (
+    CENTER,
+    FIRST,
+    LAW,
+    LEFT,
+    REGION,
+    RIGHT,
+    STEPS,
+    At,
+    CutOff,
+    Slide,
+    accepted_bits,
+    actor_bits,
+    better,
+    bits,
+    build,
+    correct,
+    make_guard,
+    train,
+    tried,
+    verdicts,
+)
+from sb3_yann import restore_accepted
+from sb3_yann.guard import decide
+from sb3_yann.policy.checkpoint import ActorCheckpoint
+from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.rollout import evaluate
+from weights import first_layer, is_learnt, is_mpc, last_layer
+
+WHOLE = {"by_region": False}
+
+
+class OftenRight(Slide):
+    """Starts on the right, but for some seeds beyond the guard's own.
+
+    And for the first of its own, from which no input makes a difference.
+    """
+
+    def __init__(self, left_of: int = 3, after: int = FIRST + 10, **kwargs) -> None:
+        super().__init__(**kwargs)
+        self.left_of, self.after = left_of, after
+
+    def reset(self, *, seed=None, options=None):
+        self.indifferent = seed == FIRST
+        left = seed is not None and seed >= self.after and seed % self.left_of == 0
+        left |= self.indifferent
+        self.low, self.high = (-4.0, -2.0) if left else (2.0, 4.0)
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, -1.0 if self.indifferent else reward, *rest
+
+
+def spoil_left(policy) -> None:
+    """Make the right better than the MPC, and the left, where no known start shows it, worse."""
+    correct(policy, RIGHT, 0.5)
+    correct(policy, LEFT, -2.0)
+
+
+def test_a_policy_that_loses_on_new_starts_is_accepted_without_the_regions_that_lose() -> None:
+    model, guard = tried(spoil_left, env=OftenRight, n_new_starts=20)
+    decision = guard.decisions[0]
+    assert decision.verdict == "accepted in part"
+    assert "7 of 20 new starts lose against the MPC, seed 1000" in decision.reason
+    assert decision.reason.endswith("; what it has learnt in other regions is kept")
+    assert decision.regions == (REGION[RIGHT],)
+    weights = last_layer(model)[:, :, -1]
+    assert not weights[REGION[LEFT]].any() and weights[REGION[RIGHT]].any()
+    known = guard.state.evidence.starts.seeds
+    assert known[:10] == tuple(range(FIRST, FIRST + 10))
+    assert len(known) == 17 and all(seed % 3 == 0 for seed in known[10:])
+
+
+@pytest.mark.parametrize(("final", "seeds"), [(None, 0), (30, 30)])
+def test_what_passes_for_want_of_new_starts_is_found_on_those_at_the_end(final, seeds) -> None:
+    model = build(gradient_steps=0)
+    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=final, rule=WHOLE)
+    train(model, STEPS, At([STEPS], spoil_left), guard)
+    assert guard.state.evidence.next_seed == FIRST + 10 + seeds
+    assert is_mpc(model) == (final is not None)
+    if final is not None:
+        assert guard.decisions[-1].reason.startswith("at the end, 10 of 30 new starts lose")
+
+
+def test_without_by_region_the_whole_of_it_is_refused() -> None:
+    model, guard = build(gradient_steps=0), make_guard(OftenRight, n_new_starts=20, rule=WHOLE)
+    before = actor_bits(model.policy)
+    train(model, STEPS, At([STEPS], spoil_left), guard)
+    (decision,) = guard.decisions
+    assert (decision.verdict, decision.restored) == ("rejected", True)
+    assert actor_bits(model.policy) == accepted_bits(guard) == before
+
+
+def test_starts_that_were_lost_once_are_tried_with_every_later_candidate() -> None:
+    simulator = partial(OftenRight, after=FIRST + 10)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
+    again = At([2 * STEPS], spoil_left)
+    train(model, 2 * STEPS, At([STEPS], spoil_left), again, guard)
+    first, second = guard.decisions[:2]
+    assert "new starts" in first.reason
+    assert "new starts" not in second.reason and "costs" in second.reason
+    assert guard.state.evidence.next_seed == FIRST + 30
+
+
+def test_what_was_accepted_before_gives_way_to_the_mpc_where_it_loses_as_well() -> None:
+    # The first twenty new starts show the right only: all of it is accepted.
+    simulator = partial(OftenRight, after=FIRST + 30)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=20, rule=WHOLE)
+
+    def a_little_better(policy) -> None:
+        correct(policy, RIGHT, 0.4)
+
+    def still_better(policy) -> None:
+        correct(policy, RIGHT, 0.5)
+
+    def spoiled(policy) -> None:
+        a_little_better(policy)
+        correct(policy, LEFT, -2.0)
+
+    steps = [At([STEPS], spoiled), At([2 * STEPS], still_better)]
+    train(model, 2 * STEPS, *steps, guard)
+    assert [each.verdict for each in guard.decisions] == ["accepted", "rejected"]
+    assert actor_bits(model.policy) == accepted_bits(guard)
+    assert is_mpc(model)
+    assert guard.decisions[-1].accepted_cost == pytest.approx(guard.decisions[-1].mpc_cost)
+
+
+def test_violations_on_new_starts_are_refused_though_they_cost_less() -> None:
+    # On the left the better input, -1 + 0.5, is beyond the limit; the MPC's own, -1, is not.
+    class Brittle(OftenRight):
+        def step(self, action):
+            observation, reward, terminated, truncated, _ = super().step(action)
+            u = float(np.asarray(action)[0])
+            violation = 0.3 < u < 0.8 and not self.indifferent
+            return observation, reward, terminated, truncated, {"violation": violation}
+
+    model = build(gradient_steps=0)
+    guard = make_guard(Brittle, n_new_starts=20, rule=WHOLE, patience=5)
+    train(model, STEPS, At([STEPS], lambda policy: correct(policy, LEFT, -0.5)), guard)
+    (decision,) = guard.decisions
+    assert "violates a limit" in decision.reason and decision.restored
+
+
+def test_at_the_end_ten_times_as_many_new_starts_are_tried() -> None:
+    # Only the very last of them shows the left.
+    simulator = partial(OftenRight, left_of=1, after=FIRST + 10 + 20 + 199)
+    model, guard = tried(spoil_left, env=simulator, n_new_starts=20)
+    whole, end = guard.decisions
+    assert whole.verdict == "accepted"
+    assert end.verdict == "accepted in part" and end.reason.startswith("at the end, 1 of 200 new")
+    assert not last_layer(model)[REGION[LEFT], :, -1].any()
+    assert actor_bits(model.policy) == accepted_bits(guard)
+    assert guard.state.evidence.starts.seeds[10:] == (FIRST + 10 + 20 + 199,)
+
+
+def test_new_starts_are_others_each_time_and_after_a_load(tmp_path) -> None:
+    seen: list[int] = []
+
+    class Counting(Slide):
+        def reset(self, *, seed=None, options=None):
+            seen.append(seed)
+            return super().reset(seed=seed, options=options)
+
+    model, guard = tried(better, env=Counting, n_new_starts=5)
+    new = {seed for seed in seen if seed is not None and seed >= FIRST + 10}
+    assert new == set(range(FIRST + 10, FIRST + 10 + 5 + 50))
+    assert guard.state.evidence.next_seed == FIRST + 65
+    model.save(tmp_path / "model")
+    loaded = type(model).load(tmp_path / "model", env=Slide())
+    assert loaded.guard_state.evidence.next_seed == FIRST + 65
+
+
+def test_the_mpc_itself_is_not_tried() -> None:
+    env = gym.make("Slide-v0")
+    model, guard = build(gradient_steps=0), make_guard(env.unwrapped, n_new_starts=20)
+    train(model, 2 * STEPS, guard)
+    assert guard.state.evidence.next_seed == FIRST + 10
+
+
+GENTLE = {"cvar_alpha": 0.05, "backtrack": True}
+SHARED_NETWORK = {"networks": "shared"}
+
+
+def test_of_a_step_too_far_half_is_accepted() -> None:
+    model = build(gradient_steps=0, actor=SHARED_NETWORK)
+    guard = make_guard(n_new_starts=0, rule=GENTLE)
+    train(model, STEPS, At([STEPS], lambda policy: push(policy, 2.4)), guard)
+    (decision, *_) = guard.decisions
+    assert (decision.verdict, decision.share) == ("accepted in part", 0.5)
+    assert decision.candidate_cost > decision.mpc_cost > decision.accepted_cost
+    assert not is_mpc(model)
+
+
+def test_without_backtracking_it_is_refused() -> None:
+    model = build(gradient_steps=0, actor=SHARED_NETWORK)
+    guard = make_guard(n_new_starts=0, rule={**GENTLE, "backtrack": False})
+    train(model, STEPS, At([STEPS], lambda policy: push(policy, 2.4)), guard)
+    assert (guard.decisions[0].verdict, guard.decisions[0].share) == ("rejected", 0.0)
+    assert is_mpc(model)
+
+
+def test_at_the_end_half_of_a_correction_is_kept_that_loses() -> None:
+    """On the left, which only the last starts show, the whole costs more, and half costs less."""
+    model = build(gradient_steps=0)
+    rule = {**GENTLE, "by_region": False}
+    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=60, rule=rule)
+    train(model, STEPS, At([STEPS], lambda policy: push_left(policy)), guard)
+    last = guard.decisions[-1]
+    assert last.reason.startswith("at the end") and "50 % of its correction is kept" in last.reason
+    assert last_layer(model)[:, :, -1].abs().max().item() == pytest.approx(0.6)
+
+
+def push_left(policy) -> None:
+    correct(policy, RIGHT, 0.5)
+    correct(policy, LEFT, -1.2)  # the best is -.5
+
+
+def test_a_fall_back_to_the_mpc_is_called_that() -> None:
+    model = build(gradient_steps=0)
+    rule = {**GENTLE, "by_region": False, "backtrack": False}
+    guard = make_guard(OftenRight, n_new_starts=0, n_final_starts=60, rule=rule)
+    train(model, STEPS, At([STEPS], push_left), guard)
+    assert guard.decisions[-1].reason.endswith("; the guard falls back to the MPC")
+    assert is_mpc(model)
+    said = guard.summary()
+    assert "accepted last is the MPC" in said and "raise n_eval_episodes" in said
+
+
+@pytest.mark.parametrize("rule", [{}, {"least_gain": 0.0}, {"cvar_alpha": 0}])
+def test_what_gains_little_is_the_mpc_at_the_end_but_where_any_gain_will_do(rule) -> None:
+    model = build(gradient_steps=0)
+    guard = make_guard(n_final_starts=60, rule={**GENTLE, **rule})
+    train(model, STEPS, At([STEPS], lambda policy: correct(policy, RIGHT, 1e-4)), guard)
+    assert guard.decisions[0].verdict == "accepted"
+    assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
+    assert is_mpc(model) is not bool(rule)
+    last = guard.decisions[-1].reason
+    assert ("too little a gain; the guard falls back to the MPC" in last) is not bool(rule)
+
+
+def half_good(policy: YannPolicy) -> None:
+    correct(policy, LEFT, -2.0)
+    correct(policy, RIGHT, 0.5)
+
+
+def rows(checkpoint: ActorCheckpoint, region: int) -> list[object]:
+    """Return what belongs to a region: parameters of actor and target, and moments."""
+    parts = [checkpoint.actor, checkpoint.target, *checkpoint.optimizer["state"].values()]
+    tensors = [
+        value
+        for part in parts
+        for key, value in part.items()
+        if str(key).startswith("exp_avg") or is_learnt(str(key))
+    ]
+    return [bits(value[region]) for value in tensors]
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_the_good_region_is_the_candidate_s_and_the_others_are_as_before(algorithm) -> None:
+    model, guard = build(algorithm), make_guard(rule={"margin": 0.03})
+    checkpoints: dict[str, ActorCheckpoint] = {}
+
+    def change(policy) -> None:
+        checkpoints["accepted"] = guard.state.accepted
+        half_good(policy)
+        checkpoints["candidate"] = ActorCheckpoint.of(policy)
+
+    step = 3 * STEPS  # the first candidate, from the first episode, is accepted with its moments
+    seen: list[bool] = []
+    look = At([step], lambda policy: seen.append(actor_bits(policy) == accepted_bits(guard)))
+    keep = At([step], lambda policy: checkpoints.update(mixed=ActorCheckpoint.of(policy)))
+    fix = At([STEPS], lambda policy: correct(policy, LEFT, -0.2))
+    train(model, step, fix, At([step], change), guard, look, keep)
+    assert checkpoints["accepted"].optimizer["state"]
+    (decision,) = [each for each in guard.decisions if each.timestep == step][:1]
+    assert decision.verdict == "accepted in part"
+    assert REGION[RIGHT] in decision.regions
+    assert REGION[LEFT] not in decision.regions
+    assert "costs" in decision.reason
+    for region in REGION.values():
+        source = "candidate" if region in decision.regions else "accepted"
+        assert rows(checkpoints["mixed"], region) == rows(checkpoints[source], region)
+    assert rows(checkpoints["candidate"], 0) != rows(checkpoints["accepted"], 0)
+    assert seen == [True]
+
+
+def test_the_evidence_is_that_of_the_policy_that_was_put_together() -> None:
+    model, guard = tried(half_good)
+    assert guard.decisions[0].regions == (REGION[RIGHT],)
+    played = evaluate(model, Slide, guard.settings.seeds)
+    np.testing.assert_allclose(guard.state.evidence.scores.costs, played.costs, atol=1e-5)
+    assert guard.decisions[0].accepted_cost == pytest.approx(played.costs.mean())
+    assert guard.decisions[0].accepted_cost < guard.decisions[0].mpc_cost
+    assert guard.decisions[0].candidate_cost > guard.decisions[0].mpc_cost
+    assert guard.decisions[0].step == 1  # neither shrinks nor grows
+
+
+@pytest.mark.parametrize("most_lost", [0.0, 0.5], ids=["one by one", "all but those that lose"])
+def test_only_the_starts_that_come_through_a_region_are_played_again(
+    most_lost, monkeypatch
+) -> None:
+    monkeypatch.setattr(decide, "MAX_LOST_SHARE", most_lost)
+    simulator = Slide()
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=0)
+    count: list[int] = []
+    before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
+    train(model, STEPS, At([STEPS], half_good), before, guard, after)
+    assert guard.decisions[0].regions == (REGION[RIGHT],)
+    left, right = guard.state.evidence.scores.visits[:, [REGION[LEFT], REGION[RIGHT]]].sum(0)
+    assert 0 < left < right < 10
+    # One by one, the candidate's own episodes stand for those that come through one region only.
+    episodes = 10 if most_lost == 0 else 10 + left
+    assert count[1] - count[0] == episodes * STEPS
+
+
+def test_a_region_that_violates_a_limit_is_not_taken_over() -> None:
+    # To the right half the input violates; nothing else does.
+    simulator = partial(Slide, low=-4.0, limits=(-1.1, 0.9))
+    _, guard = tried(lambda policy: correct(policy, RIGHT, 2.0), env=simulator)
+    assert verdicts(guard) == ["rejected"]
+    assert "violations" in guard.decisions[0].reason
+
+
+def test_regions_may_be_taken_over_while_patience_lasts() -> None:
+    model, guard = build(gradient_steps=0), make_guard(patience=2, keep_if_worse=True)
+    seen: list[bytes] = []
+    before, after = (
+        At([STEPS], lambda policy: seen.append(bits(policy.actor.state_dict()))) for _ in range(2)
+    )
+    train(model, STEPS + 1, At([STEPS], half_good), before, guard, after)
+    assert seen[0] == seen[1]  # the actor goes on as it was
+    assert guard.decisions[0].verdict == "accepted in part"
+    weight = last_layer(model)
+    assert float(weight[REGION[RIGHT], 0, -1].detach()) == 0.5
+    assert float(weight[REGION[LEFT], 0, -1].detach()) == 0
+
+
+def test_moments_that_the_accepted_policy_has_not_got_are_zero_elsewhere() -> None:
+    trained = build()
+    train(trained, 3)
+    mixed = ActorCheckpoint.of(build().policy).with_regions(
+        ActorCheckpoint.of(trained.policy), [REGION[RIGHT]]
+    )
+    assert mixed.optimizer["state"]
+    for state in mixed.optimizer["state"].values():
+        assert float(state["step"]) == 3
+        for region in (REGION[LEFT], REGION[CENTER]):
+            assert not state["exp_avg"][region].any()
+            assert not state["exp_avg_sq"][region].any()
+
+
+def test_a_candidate_in_another_box_is_accepted_with_it_or_mixed_within_the_old() -> None:
+    box = 2 * np.ones(build().policy.problem.n_theta)
+
+    def confined(change, policy) -> None:
+        change(policy)
+        policy.confine_correction(-box, box)
+
+    for change, verdict, kept in ((half_good, "accepted in part", False), (good, "accepted", True)):
+        model, guard = build(gradient_steps=0), make_guard()
+        before = ActorCheckpoint.of(model.policy)
+        train(model, STEPS + 1, At([STEPS], partial(confined, change)), guard)
+        assert guard.decisions[0].verdict == verdict
+        assert bool(model.actor.mu.confines.any()) == kept
+        assert float(last_layer(model)[REGION[RIGHT], 0, -1].detach()) == 0.5
+        other = ActorCheckpoint.of(build(gradient_steps=0).policy)
+        assert before.changed_regions(guard.state.accepted).all() == kept
+        assert not before.changed_regions(other)[REGION[LEFT]]
+
+
+def test_a_checkpoint_from_before_there_were_boxes_has_none() -> None:
+    policy = build().policy
+    half_good(policy)
+    old, now = ActorCheckpoint.of(policy), ActorCheckpoint.of(policy)
+    for weights in (old.actor, old.target):
+        del weights["mu.confines"]
+    assert now.has_networks_of(old) and old.has_networks_of(now) and old.is_actor_of(policy)
+    box = np.ones(policy.problem.n_theta)
+    policy.confine_correction(-box, box)
+    boxed = ActorCheckpoint.of(policy)
+    assert boxed.changed_regions(old).all() and old.changed_regions(boxed).all()
+    assert not old.is_actor_of(policy)
+    old.restore(policy)
+    assert not policy.actor.mu.confines.any() and not policy.actor_target.mu.confines.any()
+
+
+def good(policy: YannPolicy) -> None:
+    correct(policy, RIGHT, 0.5)
+
+
+def weights(model) -> np.ndarray:
+    return last_layer(model)[:, 0, -1].detach().numpy().copy()
+
+
+class LateLosses(Slide):
+    """Of the starts from a seed on, on some the left costs a lot, and on some any correction."""
+
+    late = FIRST + 10 + 40
+
+    def reset(self, *, seed=None, options=None):
+        late = seed is not None and seed >= self.late
+        self.left, self.touchy = late and seed % 5 < 2, late and seed % 5 == 2
+        self.indifferent = seed == FIRST  # a known start on the left, where all inputs cost alike
+        self.low, self.high = (-4.0, -2.0) if self.left or self.indifferent else (2.0, 4.0)
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        away = abs(float(np.asarray(action)[0]) - float(LAW(self.x)[0]))
+        observation, reward, *rest = super().step(action)
+        reward -= 3 * away if self.touchy else 0
+        return observation, -1.0 if self.indifferent else reward, *rest
+
+
+def test_what_is_put_back_at_the_end_is_tried_on_all_of_the_new_starts() -> None:
+    def left_as_well(policy) -> None:
+        correct(policy, LEFT, -3.0)
+
+    model, guard = build(gradient_steps=0), make_guard(LateLosses, n_new_starts=20)
+    first = At([1], partial(correct, region=RIGHT, value=0.4))
+    train(model, 2 * STEPS, first, At([STEPS + 1], left_as_well), guard)
+    assert guard.decisions[-1].reason.startswith("at the end, 120 of 200 new starts lose")
+    seeds = range(FIRST + 10 + 40, FIRST + 10 + 40 + 200)
+    costs, mpc = (evaluate(each, LateLosses, seeds).costs for each in (model, build()))
+    assert np.all(costs <= mpc + guard.state.evidence.starts.tolerance.margin)
+    assert costs.mean() <= mpc.mean() + 1e-6
+
+
+class ALittleWorse(Slide):
+    """On the known starts half the input is best; on others the MPC's, by less than a margin."""
+
+    def reset(self, *, seed=None, options=None):
+        self.known = seed is None or seed < FIRST + 10
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        away = float(np.asarray(action)[0]) - float(LAW(self.x)[0])
+        observation, reward, *rest = super().step(action)
+        return observation, reward if self.known else -1 - 0.15 * away**2, *rest
+
+
+def test_a_policy_whose_mean_cost_on_new_starts_is_above_the_mpc_s_is_refused() -> None:
+    simulator = partial(ALittleWorse, low=2.0, high=2.8)
+    model, guard = tried(
+        partial(correct, region=RIGHT, value=0.5), env=simulator, n_new_starts=50, patience=5
+    )
+    assert "mean cost 4.0375 on 50 new starts, MPC 4" in guard.decisions[0].reason
+    assert is_mpc(model)
+    assert (
+        guard.state.evidence.starts.tolerance.margin > 0.0375
+    )  # no single start would have been refused
+
+
+@pytest.mark.parametrize("how", ["one learn", "two", "a load in between"])
+def test_what_was_accepted_in_an_earlier_learn_can_be_gone_back_to(how, tmp_path) -> None:
+    class LaterLeft(LateLosses):
+        late = FIRST + 10 + (20 if how == "one learn" else 20 + 200)
+
+        def reset(self, *, seed=None, options=None):
+            observation = super().reset(seed=seed, options=options)
+            self.touchy = False
+            return observation
+
+    def spoiled(policy) -> None:
+        correct(policy, RIGHT, 0.5)
+        correct(policy, LEFT, -2.0)
+
+    good = partial(correct, region=RIGHT, value=0.4)
+    model, options = build(gradient_steps=0), {"n_new_starts": 20, "rule": {"by_region": False}}
+    if how == "one learn":
+        moves = At([1], good), At([STEPS + 1], spoiled)
+        train(model, 2 * STEPS, *moves, guard := make_guard(LaterLeft, **options))
+    else:
+        train(model, STEPS, At([1], good), make_guard(LaterLeft, **options))
+        if how == "a load in between":
+            model.save(tmp_path / "model")
+            model = DDPG.load(tmp_path / "model", env=Slide(), device="cpu")
+        train(model, STEPS, At([1], spoiled), guard := make_guard(LaterLeft, **options))
+    assert verdicts(guard)[:2] == ["accepted", "rejected"]
+    assert weights(model)[REGION[RIGHT]] == np.float32(0.4)
+    assert weights(model)[REGION[LEFT]] == 0
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+@pytest.mark.parametrize("at", [FIRST + 12, FIRST + 10 + 5 + 7], ids=["a trial", "the end"])
+def test_a_trial_that_is_cut_off_accepts_nothing_and_leaves_the_candidate(error, at) -> None:
+    def stop() -> None:
+        raise error("stopped")
+
+    simulator = partial(CutOff, at, stop)
+    model, guard = build(gradient_steps=0), make_guard(simulator, n_new_starts=5)
+    with pytest.raises(error):
+        train(model, 2 * STEPS, At([1], better), guard)
+    assert weights(model)[REGION[RIGHT]] == 0.5
+    passed_once = at > FIRST + 15
+    assert len(guard.decisions) == len(guard.state.evidence.passed) == passed_once
+    restore_accepted(model)
+    assert is_mpc(model) != passed_once
+    assert actor_bits(model.policy) == accepted_bits(guard)
+
+
+@pytest.mark.parametrize("alone", [True, False], ids=["alone", "beside an improvement"])
+@pytest.mark.parametrize("when", ["before training", "as a candidate"])
+def test_a_region_that_no_start_comes_through_stays_as_it_was(alone, when) -> None:
+    def sabotage(policy) -> None:
+        correct(policy, LEFT, -7.0)
+        if not alone:
+            correct(policy, RIGHT, 0.4)
+
+    model, guard = build(gradient_steps=0), make_guard(partial(Slide, low=2.0), n_new_starts=5)
+    if when == "before training":
+        sabotage(model.policy)
+    train(model, STEPS, At([1], sabotage), guard)
+    assert weights(model)[REGION[LEFT]] == 0
+    assert weights(model)[REGION[RIGHT]] == np.float32(0 if alone else 0.4)
+    assert actor_bits(model.policy) == accepted_bits(guard)
+
+
+def test_what_no_start_can_tell_apart_is_not_played() -> None:
+    simulator = Slide(low=2.0)
+    model, guard = build(gradient_steps=0), make_guard(simulator)
+    count: list[int] = []
+    before, after = (At([STEPS], lambda _: count.append(simulator.played)) for _ in range(2))
+    train(
+        model, STEPS + 1, At([1], partial(correct, region=LEFT, value=-7.0)), before, guard, after
+    )
+    assert count[0] == count[1]
+
+
+def test_an_error_of_the_simulator_under_a_candidate_alone_is_a_refusal() -> None:
+    class Brittle(Slide):
+        def step(self, action):
+            if abs(float(action[0])) < 0.7 and self.x[0] > 1.9:
+                raise FloatingPointError("integrator failed")
+            return super().step(action)
+
+    model, guard = build(gradient_steps=0), make_guard(partial(Brittle, low=2.0))
+    train(model, 2 * STEPS, At([1], partial(correct, region=RIGHT, value=0.5)), guard)
+    (decision,) = guard.decisions
+    assert decision.reason == "the simulator failed: FloatingPointError: integrator failed"
+    assert decision.restored
+    assert is_mpc(model)
+
+
+SHARED = pytest.mark.parametrize("actor", [{"networks": "shared"}, {"law": "online"}])
+
+
+@th.no_grad()
+def push(policy: YannPolicy, size: float) -> None:
+    """Add ``size tanh(x / 5)`` to the law, against its own sign."""
+    first_layer(policy).zero_()
+    last_layer(policy).zero_()
+    first_layer(policy)[0, 0, 0, 0], last_layer(policy)[0, 0, 0] = 1.0, size
+
+
+@SHARED
+def test_a_better_network_is_accepted_and_a_worse_one_is_not(actor) -> None:
+    model, guard = build(gradient_steps=0, actor=actor), make_guard(n_new_starts=0)
+    good = At([STEPS], lambda policy: push(policy, 0.4))
+    bad = At([2 * STEPS], lambda policy: push(policy, -0.4))
+    train(model, 2 * STEPS, good, bad, guard)
+    first, second = guard.decisions[:2]
+    assert first.verdict == "accepted"
+    assert first.accepted_cost < first.mpc_cost
+    assert second.verdict not in ("accepted", "accepted in part")
+    assert not is_mpc(model)
+    assert actor_bits(model.policy) == accepted_bits(guard)
+
+
+def restless(policy) -> None:
+    """Cost less in both saturated regions, and enter the middle one with a larger step."""
+    correct(policy, LEFT, -0.7)
+    correct(policy, RIGHT, 0.7)
+
+
+def decided(max_input_step):
+    model, guard = tried(restless, rule={"max_input_step": max_input_step}, n_new_starts=50)
+    return model, guard
+
+
+@pytest.mark.parametrize("max_input_step", [None, 3.0])
+def test_a_cheaper_policy_is_accepted_without_a_bound_or_within_it(max_input_step) -> None:
+    model, guard = decided(max_input_step)
+    assert guard.decisions[0].verdict == "accepted"
+    assert float(last_layer(model)[REGION[RIGHT], 0, -1].detach()) == np.float32(0.7)
+
+
+def test_beyond_the_bound_it_is_refused_with_the_reason() -> None:
+    model, guard = decided(1.0)
+    assert guard.decisions[0].verdict == "rejected"
+    assert "an input that moves too far in one step" in guard.decisions[0].reason
+    assert is_mpc(model)
+    mpc = guard.state.evidence.starts.mpc
+    assert not mpc.unsafe[:, 3].any()  # the MPC itself never counts
+
+
+def test_a_model_that_goes_on_knows_the_bound(tmp_path) -> None:
+    model, guard = decided(1.0)
+    bound = guard.state.max_input_step
+    model.save(tmp_path / "model")
+    again = type(model).load(tmp_path / "model", env=model.get_env(), device="cpu")
+    later = make_guard(rule={"max_input_step": 1.0})
+    again.learn(STEPS + 1, callback=[At([STEPS], restless), later], reset_num_timesteps=False)
+    np.testing.assert_array_equal(later.state.max_input_step, bound)
+    assert later.decisions[-1].verdict == "rejected"

@@ -1,0 +1,531 @@
+"""Bad input, a simulator or a training that does not fit: an error that names it, or a warning."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import TransformObservation
+from stable_baselines3 import DDPG
+from stable_baselines3.common.callbacks import (
+    CallbackList,
+    CheckpointCallback,
+    EvalCallback,
+    EveryNTimesteps,
+)
+from stable_baselines3.common.env_util import make_vec_env
+
+from guard_samples import (
+    FIRST,
+    LAW,
+    REGION,
+    RIGHT,
+    STEPS,
+    At,
+    Slide,
+    actor_bits,
+    better,
+    build,
+    correct,
+    make_guard,
+    random_states,
+    train,
+    tried,
+    verdicts,
+)
+from sb3_yann import (
+    AcceptanceRule,
+    CostAudit,
+    CostMismatchWarning,
+    ImprovementGuard,
+    NoActionNoise,
+    StepSize,
+    restore_accepted,
+)
+from sb3_yann.guard.decide import GuardSettings
+from sb3_yann.rollout import evaluate, name_of
+from weights import is_mpc, last_layer
+
+BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"env": 3}, TypeError, "env = 3 must be a simulator of the plant: the id of an environment"),
+    ({"env": None}, TypeError, "env = None .* On a plant without a simulator use Commissioning"),
+    ({"env": ["CSTR-v0"]}, TypeError, r"env = \['CSTR-v0'\] must be"),
+    (
+        {"n_eval_episodes": 0},
+        ValueError,
+        "n_eval_episodes = 0 must be a whole number of at least 1",
+    ),
+    ({"n_eval_episodes": 2.5}, ValueError, "n_eval_episodes = 2.5 must be a whole number"),
+    ({"n_eval_episodes": True}, ValueError, "n_eval_episodes = True must be a whole number"),
+    ({"seed": -1}, ValueError, "seed = -1 must be a whole number of at least 0"),
+    ({"n_new_starts": -1}, ValueError, "n_new_starts = -1 must be a whole number of at least 0"),
+    ({"n_final_starts": -1}, ValueError, "n_final_starts = -1 must be a whole number of at least"),
+    ({"n_final_starts": True}, ValueError, "n_final_starts = True must be a whole number"),
+    ({"eval_freq": 0}, ValueError, "eval_freq = 0 must be"),
+    ({"eval_freq": None}, ValueError, "eval_freq = None must be"),
+    ({"patience": 0}, ValueError, "patience = 0 must be"),
+    ({"keep_if_worse": 1}, TypeError, "keep_if_worse = 1 must be True or False"),
+    ({"rule": {"margin": -0.1}}, ValueError, "margin = -0.1 must be"),
+    ({"rule": {"margin": np.nan}}, ValueError, "margin = nan must be"),
+    ({"rule": {"margin": "1 %"}}, TypeError, "margin = '1 %' must be a number"),
+    ({"rule": {"significance": 0.6}}, ValueError, "significance = 0.6 must be between 0 and 0.5"),
+    ({"rule": {"by_region": "no"}}, TypeError, "by_region = 'no' must be True or False"),
+    ({"rule": 0.01}, TypeError, r"rule = 0.01 .*=AcceptanceRule\(\.\.\.\), or a m"),
+    ({"rule": {"fresh": 3}}, TypeError, "rule has no 'fresh'. .* margin, cvar_alpha, by_region"),
+    ({"rule": StepSize()}, TypeError, "rule = StepSize.* must be"),
+    ({"step_size": {"shrink": 1.5}}, ValueError, "shrink = 1.5 must be between 0 and 1"),
+    ({"step_size": {"grow": 0.9}}, ValueError, "grow = 0.9 must be a finite number of at least 1"),
+    ({"step_size": {"grow": np.inf}}, ValueError, "grow = inf must be"),
+    ({"step_size": {"smallest": 2}}, ValueError, "smallest = 2 must be between 0 and 1"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "error", "message"), BAD)
+def test_a_bad_argument_is_named_with_its_value(arguments, error, message) -> None:
+    with pytest.raises(error, match=message):
+        ImprovementGuard(**{"env": Slide, **arguments})
+
+
+def test_options_are_the_same_from_a_mapping_as_yaml_has_it() -> None:
+    one = ImprovementGuard(Slide, rule={"margin": 0.5}, step_size={"grow": 2.0})
+    other = ImprovementGuard(Slide, rule=AcceptanceRule(margin=0.5), step_size=StepSize(grow=2.0))
+    assert one.settings == other.settings
+    assert one.step_size == other.step_size
+
+
+@pytest.mark.parametrize("name", ["state", "decisions"])
+def test_before_learn_the_guard_says_that_it_has_no_state_yet(name) -> None:
+    with pytest.raises(RuntimeError, match="no state yet: pass it to learn"):
+        getattr(make_guard(), name)
+
+
+@pytest.mark.parametrize("how", ["itself", "wrapped", "by a function"])
+def test_the_training_env_is_refused(how) -> None:
+    env = Slide()
+    wrapped = gym.wrappers.TimeLimit(env, STEPS)
+    given = {"itself": env, "wrapped": wrapped, "by a function": lambda: env}[how]
+    model = build(env=env)
+    with pytest.raises(ValueError, match="the training env, whose episodes its own would"):
+        train(model, STEPS, make_guard(given))
+
+
+def two_observations() -> gym.Env:
+    space = gym.spaces.Box(-5, 5, (2,), np.float32)
+    return TransformObservation(Slide(), lambda x: np.repeat(x, 2), space)
+
+
+def other_actions(low: float) -> gym.Env:
+    env = Slide()
+    env.action_space = gym.spaces.Box(low, 1, (1,), np.float32)
+    return env
+
+
+@pytest.mark.parametrize("env", [two_observations, partial(other_actions, -2)])
+def test_a_simulator_of_another_shape_is_refused(env) -> None:
+    with pytest.raises(ValueError, match="Give it a simulator of this plant"):
+        train(build(), STEPS, make_guard(env))
+
+
+def test_a_policy_without_an_mpc_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"needs a YannPolicy.*TD3Policy"):
+        train(DDPG("MlpPolicy", Slide()), STEPS, make_guard())
+
+
+def test_what_is_given_reaches_the_settings_and_what_is_not_has_its_default() -> None:
+    rule = AcceptanceRule(margin=0.5)
+    given = {"n_new_starts": 3, "n_final_starts": 2, "eval_freq": 6, "patience": 8}
+    some = ImprovementGuard(
+        "CSTR-v0", n_eval_episodes=7, seed=40, keep_if_worse=True, rule={"margin": 0.5}, **given
+    ).settings
+    assert some == GuardSettings("CSTR-v0", range(40, 47), **given, keep_if_worse=True, rule=rule)
+    plain = ImprovementGuard(Slide).settings
+    assert plain == GuardSettings(
+        "Slide", range(1_000_000, 1_000_100), n_new_starts=50, n_final_starts=500, eval_freq=1,
+        patience=5, keep_if_worse=False, rule=AcceptanceRule(),
+    )  # fmt: skip
+    assert ImprovementGuard(Slide, n_new_starts=4).settings.n_final_starts == 40
+
+
+def test_a_simulator_may_be_named_by_its_module_as_in_a_yaml_file() -> None:
+    model, guard = build(learning_rate=0.0), make_guard("guard_samples:Slide", n_new_starts=4)
+    train(model, 8, At([2], better), guard)
+    assert verdicts(guard)[0] == "accepted"
+    assert guard.state.settings["env"] == "guard_samples:Slide"
+    with pytest.raises(
+        ValueError, match="'guard_samples' has no function 'Slid' that makes an env"
+    ):
+        make_guard("guard_samples:Slid")
+
+
+def test_a_simulator_has_the_same_name_in_another_process() -> None:
+    class Named(Slide):
+        """An env of a test."""
+
+    assert name_of("CSTR-v0") == "CSTR-v0"
+    assert name_of(Slide()) == "Slide" and name_of(Slide) == "Slide"
+    assert name_of(Named).endswith("<locals>.Named")
+    assert name_of(gym.make("Slide-v0")) == "Slide-v0"
+    assert name_of(gym.make("Slide-v0", low=1.0)) == "Slide-v0{'low': 1.0}"
+    assert name_of(partial(Slide, low=2.0)) == "Slide(){'low': 2.0}"
+    assert name_of(partial(partial(Slide), (0, 1))) == "Slide((0, 1),){}"
+    assert "<lambda>" in name_of(lambda: Slide())
+
+
+NOISE = np.random.default_rng(0)
+
+
+class Wobbly(Slide):
+    """Costs that differ from episode to episode by so much, or are not finite from a seed on."""
+
+    def __init__(self, size: float = 0.0, lost: int | None = None) -> None:
+        super().__init__()
+        self.size, self.lost = size, lost
+
+    def reset(self, *, seed=None, options=None):
+        self.bad = self.lost is not None and seed is not None and seed >= self.lost
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        seen, reward, *rest = super().step(action)
+        reward *= 1 + self.size * NOISE.uniform(-1, 1)
+        return seen, np.inf if self.bad else reward, *rest
+
+
+def begun(env: Any, **options: Any) -> ImprovementGuard:
+    """Return a guard that has played its first episodes."""
+    guard = make_guard(env, n_new_starts=0, **options)
+    train(build(gradient_steps=0), 1, guard)
+    return guard
+
+
+def test_costs_of_the_mpc_that_differ_by_more_than_a_millionth_cannot_be_compared() -> None:
+    begun(partial(Wobbly, 1e-7))
+    with pytest.raises(ValueError, match=r"played two episodes .* from the seed 1000000, at costs"):
+        begun(partial(Wobbly, 1e-4))
+    with pytest.raises(ValueError, match=r"from the seed 1000003 costs -inf"):
+        begun(partial(Wobbly, lost=1_000_003))
+
+
+def test_starts_that_are_all_the_same_are_told_and_one_alone_is_not() -> None:
+    same = partial(Slide, low=2.0, high=2.0)
+    with pytest.warns(
+        UserWarning, match="All 10 starts of the guard's env .* are one and the same"
+    ):
+        begun(same)
+    begun(same, n_eval_episodes=1)
+
+
+def test_how_far_an_input_may_move_is_a_multiple_of_the_mpc_s_max_input_step() -> None:
+    guard = begun(Slide, rule={"max_input_step": 2.0})
+    episodes = evaluate(LAW, Slide, range(1_000_000, 1_000_010))
+    most = max(np.abs(np.diff(each, axis=0)).max() for each in episodes.actions)
+    np.testing.assert_allclose(guard.state.max_input_step, [2 * most + 2e-6], rtol=1e-6)
+    assert begun(Slide).state.max_input_step is None
+
+
+def test_the_tolerance_is_a_share_of_the_mpc_s_median_cost() -> None:
+    evidence = begun(Slide, rule=AcceptanceRule(margin=0.02, cvar_alpha=0.1)).state.evidence.starts
+    typical = np.median(evidence.mpc.costs)
+    found = evidence.tolerance
+    assert (found.margin, found.cvar_alpha, found.typical) == (0.02 * typical, 0.1, typical)
+    assert evidence.n_starts == 10 and evidence.seeds == (*range(1_000_000, 1_000_010),)
+
+
+def test_a_fault_while_the_first_episodes_are_played_leaves_the_next_learn_a_clean_start() -> None:
+    class Busy(Slide):
+        calls = 0
+
+        def reset(self, *, seed=None, options=None):
+            if seed is not None and seed >= FIRST:
+                Busy.calls += 1
+                if Busy.calls == 13:  # while the MPC is in the policy's place
+                    raise OSError("licence server busy")
+            return super().reset(seed=seed, options=options)
+
+    model = build(gradient_steps=0)
+    better(model.policy)
+    before = actor_bits(model.policy)
+    with pytest.raises(OSError, match="busy"):
+        train(model, STEPS, make_guard(Busy))
+    assert actor_bits(model.policy) == before
+    train(model, STEPS, guard := make_guard(Busy))
+    assert len(guard.state.evidence.starts.seeds) == 10
+    assert actor_bits(model.policy) == before
+
+
+def test_new_starts_where_the_mpc_s_cost_is_no_number_are_left_out() -> None:
+    class Faulty(Slide):
+        def reset(self, *, seed=None, options=None):
+            self.faulty = seed is not None and seed > FIRST + 10 and seed % 3 == 0
+            return super().reset(seed=seed, options=options)
+
+        def step(self, action):
+            observation, reward, *rest = super().step(action)
+            return observation, np.nan if self.faulty else reward, *rest
+
+    _, guard = tried(better, env=Faulty, n_new_starts=5)
+    assert verdicts(guard) == ["accepted"]
+
+
+def test_another_simulator_of_the_same_name_begins_afresh_and_says_so() -> None:
+    def simulator(cost: float):
+        class Plant(Slide):
+            def step(self, action):
+                observation, reward, *rest = super().step(action)
+                return observation, reward * cost, *rest
+
+        return lambda: Plant()
+
+    model = build(gradient_steps=0)
+    train(model, STEPS, At([1], better), first := make_guard(simulator(1.0)))
+    costs = first.state.evidence.scores.costs
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train(model, STEPS, make_guard(simulator(1.0)))
+    with pytest.warns(UserWarning, match="it is another simulator of that name"):
+        train(model, STEPS, second := make_guard(simulator(1.1)))
+    np.testing.assert_allclose(second.state.evidence.scores.costs, 1.1 * costs)
+    assert second.state.settings == first.settings.of_evidence
+
+
+class Legacy(Slide):
+    """Seeds the global generator, and draws from it."""
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            np.random.seed(seed)  # noqa: NPY002
+        _, info = super().reset(seed=seed)
+        self.x = np.random.uniform(-4, 4, 1)  # noqa: NPY002
+        return self.x.astype(np.float32), info
+
+
+def test_a_simulator_that_seeds_the_global_generator_does_not_seed_it_for_others() -> None:
+    states = []
+    for callbacks in ([], [make_guard(Legacy, n_new_starts=5)]):
+        model = build(gradient_steps=0)
+        moves = [At([1], better), At([STEPS + 1], partial(correct, region=RIGHT, value=0.4))]
+        train(model, 3 * STEPS, *moves, *callbacks)
+        states.append(random_states())
+    assert len(callbacks[0].decisions) >= 2
+    assert states[0] == states[1]
+
+
+@pytest.mark.parametrize("together", [lambda a, b: [a, b], lambda a, b: [CallbackList([a]), b]])
+def test_two_guards_at_once_are_refused(together) -> None:
+    guards = together(make_guard(), make_guard())
+    with pytest.raises(ValueError, match="2 guards were passed to learn, expected is one"):
+        train(build(), STEPS, *guards)
+
+
+@pytest.mark.parametrize(("kind", "deep"), [("every", False), ("every", True), ("eval", False)])
+def test_a_guard_within_an_event_callback_is_refused(deep, kind) -> None:
+    guard = make_guard()
+    inner = CallbackList([CallbackList([guard])]) if deep else guard
+    outer = (
+        EveryNTimesteps(STEPS, inner)
+        if kind == "every"
+        else EvalCallback(Slide(), callback_on_new_best=inner)
+    )
+    with pytest.raises(
+        ValueError, match=r"within a callback of the class E.* Pass the guard to learn"
+    ):
+        train(build(), STEPS, outer)
+
+
+def test_with_other_settings_the_accepted_policy_the_hard_starts_and_the_count_are_kept() -> None:
+    class LostLater(Slide):
+        """From new starts on, a strong correction on the right loses."""
+
+        def reset(self, *, seed=None, options=None):
+            seen.append(seed)
+            self.new = seed is not None and seed >= FIRST + 10
+            return super().reset(seed=seed, options=options)
+
+        def step(self, action):
+            strong = self.new and self.x[0] > 1.9 and float(action[0]) > -0.65
+            observation, reward, *rest = super().step(action)
+            return observation, reward - (1.0 if strong else 0.0), *rest
+
+    seen: list[int] = []
+    model, values = build(gradient_steps=0), iter([0.3, 0.5])
+    moves = At([1, STEPS + 1], lambda policy: correct(policy, RIGHT, next(values)))
+    train(model, 2 * STEPS, moves, first := make_guard(LostLater, n_new_starts=10))
+    hard = set(first.state.evidence.starts.seeds) - set(range(FIRST, FIRST + 10))
+    assert hard
+    used = first.state.evidence.next_seed
+    correct(model.policy, RIGHT, 1.9)  # what the model has got when the next learn begins
+    seen.clear()
+    train(model, STEPS, second := make_guard(LostLater, n_new_starts=10, n_eval_episodes=4))
+    assert set(second.state.evidence.starts.seeds) >= hard | set(range(FIRST, FIRST + 4))
+    right = last_layer(model)[REGION[RIGHT], 0, -1]
+    assert float(right.detach()) == pytest.approx(0.3)
+    new = {seed for seed in seen if seed is not None} - set(second.state.evidence.starts.seeds)
+    assert new
+    assert min(new) >= used
+
+
+def _halved(env: gym.Env) -> gym.Env:
+    return gym.wrappers.TransformReward(env, lambda reward: reward / 2)
+
+
+def test_a_guard_names_a_reward_that_is_not_the_cost_once_and_a_passed_audit_alone() -> None:
+    model = DDPG("YannPolicy", _halved(gym.make("CSTR-v0")), seed=0, device="cpu", batch_size=2)
+    guard = ImprovementGuard(
+        lambda: _halved(gym.make("CSTR-v0")), n_eval_episodes=2, n_new_starts=0
+    )
+    for callbacks, count in (([guard], 1), ([guard], 0), ([guard, CostAudit()], 1)):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            model.learn(110, callback=[NoActionNoise(), *callbacks])
+        found = [str(each.message) for each in told if each.category is CostMismatchWarning]
+        assert len(found) == count
+        assert all("0.5 times minus the cost" in each for each in found)
+
+
+def test_a_guard_says_nothing_of_a_reward_that_is_the_cost() -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", seed=1, device="cpu", batch_size=2)
+    guard = ImprovementGuard("CSTR-v0", n_eval_episodes=2, n_new_starts=0)
+    model.learn(110, callback=[NoActionNoise(), guard])  # a warning would be an error
+    assert guard._audit is not None and guard._audit.finding.matches
+
+
+class InPlace(Slide):
+    """Returns its own state, which the next step overwrites."""
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        self.observation = observation
+        return self.observation, info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        self.observation[:] = observation
+        return self.observation, *rest
+
+
+class Door(gym.Env):
+    """x runs away; the env ends the episode beyond 3, whatever the MPC does there."""
+
+    def __init__(self, success: bool = False) -> None:
+        self.success = success
+        self.observation_space = gym.spaces.Box(-5, 5, (1,), np.float32)
+        self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.t = self.np_random.uniform(1.7, 1.8, 1), 0
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        self.x = 1.3 * self.x + 0.1 * float(np.asarray(action)[0])
+        self.t += 1
+        out = bool(abs(self.x[0]) > 3)
+        info = {"violation": out and not self.success, "is_success": out and self.success}
+        return self.x.astype(np.float32), -float(self.x[0] ** 2), out, self.t == 20, info
+
+
+@pytest.mark.parametrize("success", [False, True], ids=["a trip", "a goal"])
+def test_an_episode_that_ends_sooner_is_refused_unless_its_end_is_a_success(success) -> None:
+    """All episodes end under the MPC too; without its input they end a step sooner, and cheaper."""
+    model = build(learning_rate=0.0, env=Door(success))
+    guard = make_guard(partial(Door, success), n_new_starts=0, n_final_starts=0)
+    # The MPC's input is -1 right of 1.4: plus 2 it is 1.
+    train(model, 8, At([2], partial(correct, region=RIGHT, value=2.0)), guard)
+    first = guard.decisions[0]
+    assert first.candidate_cost < first.mpc_cost
+    assert first.verdict == ("accepted" if success else "rejected")
+    if not success:
+        assert "ends, or ends sooner" in first.reason and "is_success" in first.reason
+        assert is_mpc(model)
+
+
+class Endless(Slide):
+    def step(self, action):
+        observation, reward, *_ = super().step(action)
+        return observation, reward, False, False, {}
+
+
+def test_an_env_that_overwrites_its_observation_gives_the_same_episodes() -> None:
+    seeds, policy = range(3), build().policy
+    for ours, theirs in zip(
+        evaluate(policy, InPlace, seeds).observations,
+        evaluate(policy, Slide, seeds).observations,
+        strict=True,
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_one_env_for_all_starts_is_refused() -> None:
+    env = Slide()
+    with pytest.raises(ValueError, match="returned the same one twice"):
+        train(build(), 4, make_guard(lambda: env))
+
+
+def test_envs_are_made_for_the_first_trial_kept_for_the_others_and_closed_at_the_end() -> None:
+    counts = {"made": 0, "closed": 0}
+
+    class Counted(Slide):
+        def __init__(self) -> None:
+            counts["made"] += 1
+            super().__init__()
+
+        def close(self) -> None:
+            counts["closed"] += 1
+
+    guard = make_guard(Counted, n_new_starts=0)
+    train(build(), 12, At([2], better), guard)
+    trials = len(guard.decisions)
+    assert trials > 1
+    # One more, whose spaces are looked at before.
+    assert counts["made"] == counts["closed"] <= len(guard.state.evidence.starts.seeds) + 1
+
+
+def test_a_function_that_makes_no_env_is_named() -> None:
+    with pytest.raises(TypeError, match=r"returned None, not a gymnasium\.Env"):
+        train(build(), 4, make_guard(lambda: None))
+
+
+def test_an_episode_that_is_long_is_told_before_memory_is_full(monkeypatch) -> None:
+    monkeypatch.setattr("sb3_yann.rollout.LONG_EPISODE", 20)
+    monkeypatch.setattr("sb3_yann.rollout.MAX_EPISODE_STEPS", 50)
+    with (
+        pytest.warns(UserWarning, match=r"not ended after 20 steps, all of which .*TimeLimit"),
+        pytest.raises(RuntimeError, match="has not ended after 50 steps"),
+    ):
+        train(build(), 4, make_guard(Endless))
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_training_env_that_never_ends_is_told(n_envs, monkeypatch) -> None:
+    monkeypatch.setattr("sb3_yann.guard.callback.LONG_EPISODE", 20)
+    endless = build(env=make_vec_env(Endless, n_envs))
+    with pytest.warns(
+        UserWarning, match=r"training env has not ended after 20 .*TimeLimit"
+    ) as told:
+        train(endless, 30 * n_envs, NoActionNoise(), make_guard())
+    assert sum("has not ended" in str(each.message) for each in told) == 1
+
+
+def test_a_guard_counts_the_steps_of_the_present_learn_whatever_its_envs(monkeypatch) -> None:
+    monkeypatch.setattr("sb3_yann.guard.callback.LONG_EPISODE", 5)
+    guard = make_guard(n_new_starts=0, n_final_starts=0)
+    for n_envs in (2, 3, 3):  # stopped amid episodes of 4 steps; a warning is an error
+        train(build(env=make_vec_env(Slide, n_envs)), 3 * n_envs, NoActionNoise(), guard)
+
+
+def test_the_accepted_policy_can_be_had_from_a_checkpoint(tmp_path) -> None:
+    model, guard = build(learning_rate=0.0), make_guard(eval_freq=100)
+    train(model, 6, At([5], better), guard, CheckpointCallback(5, str(tmp_path), "run"))
+    loaded = DDPG.load(tmp_path / "run_5_steps", device="cpu")
+    assert not is_mpc(loaded)
+    restore_accepted(loaded)
+    assert is_mpc(loaded)
+
+
+def test_a_model_without_a_guard_has_nothing_to_restore() -> None:
+    with pytest.raises(ValueError, match="No ImprovementGuard has been at work on this DDPG"):
+        restore_accepted(build())
