@@ -154,12 +154,9 @@ class ActorCheckpoint:
 
 
 def _have_same_box(ours: Tensors, theirs: Tensors) -> bool:
-    """Return whether two actors have the same box; one saved before there were boxes has none."""
-    first, second = (
-        {key: box for key, box in each.items() if key.endswith("confines") and box.any()}
-        for each in (ours, theirs)
-    )
-    return first.keys() == second.keys() and all(th.equal(first[key], second[key]) for key in first)
+    """Return whether the networks of two actors count in the same box of theta."""
+    boxes = (name for name in ours if name.endswith("confines"))
+    return all(th.equal(ours[name], theirs[name]) for name in boxes)
 
 
 def _copied(value: Any) -> Any:

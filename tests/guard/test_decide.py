@@ -381,22 +381,6 @@ def test_a_candidate_in_another_box_is_accepted_with_it_or_mixed_within_the_old(
         assert not before.changed_regions(other)[REGION[LEFT]]
 
 
-def test_a_checkpoint_from_before_there_were_boxes_has_none() -> None:
-    policy = build().policy
-    half_good(policy)
-    old, now = ActorCheckpoint.of(policy), ActorCheckpoint.of(policy)
-    for weights in (old.actor, old.target):
-        del weights["mu.confines"]
-    assert now.has_networks_of(old) and old.has_networks_of(now) and old.is_actor_of(policy)
-    box = np.ones(policy.problem.n_theta)
-    policy.confine_correction(-box, box)
-    boxed = ActorCheckpoint.of(policy)
-    assert boxed.changed_regions(old).all() and old.changed_regions(boxed).all()
-    assert not old.is_actor_of(policy)
-    old.restore(policy)
-    assert not policy.actor.mu.confines.any() and not policy.actor_target.mu.confines.any()
-
-
 def good(policy: YannPolicy) -> None:
     correct(policy, RIGHT, 0.5)
 
