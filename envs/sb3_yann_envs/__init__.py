@@ -35,7 +35,7 @@ def register_envs() -> None:
             gymnasium.register(
                 id=env_id,
                 entry_point=f"sb3_yann_envs.{module}:{name}Env",
-                vector_entry_point=f"sb3_yann_envs.vector:{name}VectorEnv",
+                vector_entry_point=f"sb3_yann_envs.{module}:{name}VectorEnv",
                 max_episode_steps=max_episode_steps,
             )
 

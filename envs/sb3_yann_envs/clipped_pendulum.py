@@ -6,10 +6,17 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann_envs._problem_env import Array, ProblemEnv, constant
-from sb3_yann_envs.rendering import Frame, pendulum_frame
+from sb3_yann_envs._problem_env import (
+    Array,
+    Frame,
+    ProblemEnv,
+    ProblemVectorEnv,
+    constant,
+    new_figure,
+    pixels,
+)
 from sb3_yann_envs.spaces import ProblemBox
 
 GRAVITY = 10.0  # m/s2
@@ -153,7 +160,8 @@ class ClippedPendulumEnv(ProblemEnv):
         speed = next_speed(float(np.sin(theta)), speed, u)
         speed = min(max(speed, -MAX_SPEED), MAX_SPEED)
         # The angle is not wrapped inside, as in Gymnasium: wrapping would change its last bits.
-        self._state, self._torque = (theta + speed * DT, speed), u
+        self._state = (theta + speed * DT, speed)
+        self._torque = u
         return cost, False
 
     def _observed(self) -> Array:
@@ -167,3 +175,43 @@ class ClippedPendulumEnv(ProblemEnv):
 def wrapped(angle: Any) -> Any:
     """Return the angle in [-pi, pi), of a float or an array."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+class ClippedPendulumVectorEnv(ProblemVectorEnv):
+    """Many :class:`ClippedPendulumEnv`."""
+
+    single = ClippedPendulumEnv
+
+    def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
+        theta, speed = self._state
+        cost = stage_cost(theta, speed, u)
+        speed = next_speed(np.sin(theta), speed, u)
+        speed = np.clip(speed, -MAX_SPEED, MAX_SPEED)
+        self._state = np.array([theta + speed * DT, speed])
+        return cost, np.zeros(self.num_envs, dtype=bool)
+
+    def _observed(self) -> Array:
+        return np.column_stack([wrapped(self._state[0]), self._state[1]])
+
+
+def pendulum_frame(theta: float, torque: float, max_torque: float) -> Frame:
+    """Return the picture of a pendulum, shape (400, 400, 3).
+
+    The angle from upright is positive counter-clockwise. The arrow points the way the torque turns,
+    and sweeps a right angle at the largest torque.
+    """
+    figure = new_figure(4.0, 4.0)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), aspect="equal", xlim=(-1.3, 1.3), ylim=(-1.3, 1.3))
+    axes.set_axis_off()
+    rod = ([0.0, -math.sin(theta)], [0.0, math.cos(theta)])
+    axes.plot(*rod, color="tab:red", lw=14, solid_capstyle="round")
+    axes.plot([0.0], [0.0], "o", color="black", markersize=7)
+    if torque:
+        sweep = np.linspace(0.0, torque / max_torque * math.pi / 2, 30) + math.pi / 2
+        x, y = 0.45 * np.cos(sweep), 0.45 * np.sin(sweep)
+        axes.plot(x, y, color="tab:blue", lw=3)
+        ahead = math.copysign(0.15, torque)
+        tip = (x[-1] - ahead * math.sin(sweep[-1]), y[-1] + ahead * math.cos(sweep[-1]))
+        head = {"arrowstyle": "-|>", "color": "tab:blue", "mutation_scale": 25, "shrinkA": 0}
+        axes.annotate("", tip, (x[-1], y[-1]), arrowprops=head)
+    return pixels(figure)

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
 
+import numba
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann_envs._compiled import compiled
-from sb3_yann_envs._problem_env import Array, ProblemEnv, constant, not_reset
-from sb3_yann_envs.rendering import Frame, reactor_frame
+from sb3_yann_envs._problem_env import (
+    Array,
+    Frame,
+    ProblemEnv,
+    ProblemVectorEnv,
+    constant,
+    new_figure,
+    not_reset,
+    pixels,
+)
 from sb3_yann_envs.spaces import ProblemBox
 
 DT = 1 / 60  # h
@@ -91,6 +100,25 @@ PRINTED_B = constant([[0.0], [0.0], [0.0], [-0.0007]])
 """Input matrix as printed in the paper, for deviations and one sample."""
 
 _STATE = "UniTuple(float64, 4)"  # which numba returns without running Python code
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def compiled(signature: str) -> Callable[[F], F]:
+    """Return a decorator that compiles a function for given types, and keeps the machine code.
+
+    What it calls must be in this file: numba looks at no other to see whether the machine code is
+    up to date. It returns numbers only: to return an array, numba runs Python code, in which a
+    Ctrl-C becomes a SystemError.
+    """
+
+    def compile_it(function: F) -> F:
+        try:
+            result: Any = numba.njit(signature, cache=True, error_model="numpy")(function)
+        except Exception:  # no folder to write to, a full disk, a damaged file
+            result = numba.njit(signature, error_model="numpy")(function)
+        return cast(F, result)
+
+    return compile_it
 
 
 def dynamics(x: ArrayLike, u: ArrayLike) -> Array:
@@ -294,3 +322,57 @@ class CSTREnv(ProblemEnv):
 
     def _frame(self) -> Frame:
         return reactor_frame(DT, self._temperatures, self._inputs, TEMPERATURE_LIMIT, MAX_INPUT)
+
+
+class CSTRVectorEnv(ProblemVectorEnv):
+    """Many :class:`CSTREnv`."""
+
+    single = CSTREnv
+
+    def _advance(self, u: Array) -> tuple[Array, NDArray[np.bool_]]:
+        a, b, s, t = self._state
+        cost = stage_cost(a, b, s, t, u)
+        after = np.empty_like(self._state)
+        advance_all(self._state, U_SS[0] + u, after)
+        self._state = after
+        terminated = X_SS[3] + self._state[3] > TEMPERATURE_LIMIT
+        return cost + PENALTY * terminated, terminated
+
+
+def reactor_frame(
+    sample_time: float,
+    temperatures: Sequence[float],
+    inputs: Sequence[float],
+    limit: float,
+    max_input: float,
+) -> Frame:
+    """Return the history of a reactor episode, shape (400, 600, 3).
+
+    Parameters
+    ----------
+    sample_time : float
+        Sample time in h.
+    temperatures : sequence of float, length k + 1
+        Temperature in K at the start and after each of k steps.
+    inputs : sequence of float, length k
+        Input deviation of each step in kJ/(h m2 K).
+    limit, max_input : float
+        Temperature limit in K, and largest input deviation.
+    """
+    figure = new_figure(6.0, 4.0)
+    figure.set_layout_engine("constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    hours = sample_time * np.arange(len(temperatures))
+    upper.plot(hours, temperatures, color="tab:red")
+    upper.plot(hours[-1:], temperatures[-1:], "o", color="tab:red")
+    upper.axhline(limit, color="0.25", linestyle="--")
+    place = (0.01, limit), (0, 3), ("axes fraction", "data"), "offset points"
+    upper.annotate(f"limit {limit:g} K", *place, color="0.25")
+    # A fixed floor keeps the axis still while the temperature stays near its steady state.
+    upper.set_ylim(min(465.0, min(temperatures) - 1.0), max(limit, *temperatures) + 2.5)
+    upper.set_ylabel("temperature (K)")
+    lower.stairs(inputs, hours, baseline=None, color="tab:blue")
+    lower.set(ylim=(-1.1 * max_input, 1.1 * max_input), xlim=(0.0, max(1.0, hours[-1])))
+    lower.set(ylabel="input deviation\n(kJ/(h m² K))", xlabel="time (h)")
+    figure.align_ylabels()
+    return pixels(figure)

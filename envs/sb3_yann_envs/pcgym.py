@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -18,13 +18,84 @@ from scipy.optimize import least_squares
 
 from sb3_yann.control import LinearModel, Tracking
 from sb3_yann_envs._problem_env import asked_start, not_reset
-from sb3_yann_envs.pcgym_cases import UNITS, checked, ranges
 from sb3_yann_envs.pcgym_flow import flow_of, rate_of
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
+Parameters = dict[str, Any]
+
 DISTURBED = 0.1  # of half a state's range: what a disturbance of 1 adds to it in a sample
+
+
+def _stairs(values: Sequence[float], steps: int) -> list[float]:
+    """Return a schedule of ``steps`` entries that holds each value equally long."""
+    return [value for value in values for _ in range(steps // len(values))]
+
+
+def _cstr() -> Parameters:
+    """Return the reactor: 26 min in 120 samples, C_A follows its set-point by the jacket."""
+    return {
+        "model": "cstr",
+        "N": 120,
+        "tsim": 26.0,
+        "SP": {"Ca": _stairs([0.85, 0.9, 0.87], 120)},
+        "o_space": {"low": np.array([0.7, 300, 0.8]), "high": np.array([1, 350, 0.9])},
+        "a_space": {"low": np.array([295.0]), "high": np.array([302.0])},
+        "x0": np.array([0.8, 330, 0.8]),
+        "r_scale": {"Ca": 1e3},
+    }
+
+
+def _four_tank() -> Parameters:
+    """Return the four tanks: 1,000 s in 60 samples, both upper levels follow set-points."""
+    return {
+        "model": "four_tank",
+        "N": 60,
+        "tsim": 1000.0,
+        "SP": {"h3": _stairs([0.5, 0.1], 60), "h4": _stairs([0.2, 0.3], 60)},
+        "o_space": {"low": np.zeros(6), "high": np.array([0.5] * 6)},
+        "a_space": {"low": np.array([0.1, 0.1]), "high": np.array([10.0, 10.0])},
+        "x0": np.array([0.141, 0.112, 0.072, 0.42, 0.5, 0.2]),
+        "r_scale": {"h3": 1e3, "h4": 1e3},
+    }
+
+
+def _multistage_extraction() -> Parameters:
+    """Return the extraction column: 60 h in 60 samples, X5 follows its set-point by two flows."""
+    return {
+        "model": "multistage_extraction",
+        "N": 60,
+        "tsim": 60.0,
+        "SP": {"X5": _stairs([0.3, 0.4, 0.3], 60)},
+        "o_space": {"low": np.array([0.0] * 10 + [0.3]), "high": np.array([1.0] * 10 + [0.4])},
+        "a_space": {"low": np.array([5.0, 10.0]), "high": np.array([500.0, 1000.0])},
+        "x0": np.array([0.55, 0.3, 0.45, 0.25, 0.4, 0.2, 0.35, 0.15, 0.25, 0.1, 0.3]),
+        "r_scale": {"X5": 1e3},
+    }
+
+
+CASES: dict[str, Callable[[], Parameters]] = {
+    "cstr": _cstr,
+    "four_tank": _four_tank,
+    "multistage_extraction": _multistage_extraction,
+}
+"""Makers of PC-Gym's parameters. Two weights of the error, which PC-Gym has at 1, are 1,000."""
+
+UNITS: dict[str, dict[str, str]] = {
+    "cstr": {"Ca": "mol/L", "T": "K", "Tc": "K"},
+    "four_tank": {**dict.fromkeys(["h1", "h2", "h3", "h4"], "m"), "v1": "V", "v2": "V"},
+    "multistage_extraction": {
+        **{f"{phase}{stage}": "kg/m³" for phase in "XY" for stage in range(1, 6)},
+        "L": "m³/h",
+        "G": "m³/h",
+    },
+}
+"""Units of the states and inputs of PC-Gym's models, by the model's name."""
+
+NEEDED = ("N", "tsim", "SP", "o_space", "a_space", "x0")
+NOT_HERE = ("a_delta", "disturbances", "uncertainty_percentages")
+"""What PC-Gym adds to theta or to the plant in ways of its own."""
 
 
 class PCGymEnv(gymnasium.Env[Single, Single]):
@@ -62,7 +133,7 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
     Parameters
     ----------
     parameters : str or mapping
-        A name in ``sb3_yann_envs.pcgym_cases.CASES``, or the mapping that ``pcgym.make_env`` takes.
+        A name in ``sb3_yann_envs.pcgym.CASES``, or the mapping that ``pcgym.make_env`` takes.
         ``normalise_a`` and ``normalise_o`` play no part.
     set_points : mapping from name to (low, high), optional
         Ranges to draw from, uniformly. The default is the range of each one's schedule ``SP``.
@@ -95,7 +166,7 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         set_points: Mapping[str, tuple[float, float]] | None = None,
         draw: bool = True,
     ) -> None:
-        given = _playable(checked(parameters))
+        given = _playable(_checked(parameters))
         # do-mpc warns of what of it is not installed, CasADi of the way PC-Gym calls it.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -108,7 +179,7 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
         self.x0: Array = np.array(given["x0"], np.float64)[:n]
         self.outputs = [self.state_names.index(name) for name in given["SP"]]
         self.schedule: Array = np.array([*given["SP"].values()], np.float64).T  # (N, p)
-        self.r_min, self.r_max = ranges(given["SP"], set_points)
+        self.r_min, self.r_max = _ranges(given["SP"], set_points)
         self.x_min, self.x_max = (np.array(given["o_space"][s][:n], float) for s in ("low", "high"))
         self.u_min, self.u_max = (np.array(given["a_space"][s], float) for s in ("low", "high"))
         self.noise = float(given.get("noise_percentage", 0)) if given.get("noise") else 0.0
@@ -334,3 +405,39 @@ def _make_env() -> Any:
             "pip install 'sb3-yann[pcgym]'."
         ) from error
     return make_env
+
+
+def _checked(given: str | Mapping[str, Any]) -> Parameters:
+    """Return PC-Gym's parameters, checked, for absolute values and its CasADi integrator."""
+    if isinstance(given, str):
+        if given not in CASES:
+            raise ValueError(
+                f"parameters = {given!r} must be one of {sorted(CASES)}, or the mapping that "
+                "pcgym.make_env takes."
+            )
+        given = CASES[given]()
+    if not isinstance(given, Mapping):
+        raise TypeError(f"parameters = {given!r} must be a name or a mapping.")
+    missing = [key for key in NEEDED if key not in given]
+    unknown = [key for key in NOT_HERE if given.get(key) is not None]
+    if missing or unknown:
+        raise ValueError(
+            f"parameters lack {missing} and hold {unknown}, which is not supported here. Give what "
+            "is missing; for the rest pass a custom_model of the plant as it is."
+        )
+    return {**given, "normalise_a": False, "normalise_o": False, "integration_method": "casadi"}
+
+
+def _ranges(
+    schedules: Mapping[str, ArrayLike], asked: Mapping[str, tuple[float, float]] | None
+) -> tuple[Array, Array]:
+    """Return the lowest and highest set-points (p,)."""
+    asked = {} if asked is None else asked
+    unknown = sorted(set(asked) - set(schedules))
+    if unknown:
+        raise ValueError(f"set_points holds {unknown}; the plant's are {sorted(schedules)}.")
+    both = [asked.get(k, (np.min(v), np.max(v))) for k, v in schedules.items()]
+    low, high = np.array(both, np.float64).T
+    if not np.all(low <= high):  # nor is NaN
+        raise ValueError(f"set_points = {dict(asked)} must hold pairs (low, high) in this order.")
+    return low, high

@@ -12,8 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from sb3_yann import DisturbanceBounds, DisturbanceObserver, LinearModel, LinearMPC
 from sb3_yann.wrappers import Deviations, ObserveDisturbance
 from sb3_yann_envs import pcgym, pcgym_flow
-from sb3_yann_envs.pcgym import PCGymEnv
-from sb3_yann_envs.pcgym_cases import CASES
+from sb3_yann_envs.pcgym import CASES, PCGymEnv
 
 needs_pcgym = pytest.mark.skipif(
     importlib.util.find_spec("pcgym") is None, reason="PC-Gym is not installed"
