@@ -2,7 +2,7 @@
 
 import sys
 
-from sb3_yann.command_line import main
+from sb3_yann.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -33,7 +33,7 @@ FLOORS = [
     {"sb3_yann.commissioning"},
     {"sb3_yann.reporting"},
     {"sb3_yann"},
-    {"sb3_yann.command_line"},
+    {"sb3_yann.cli"},
     {"sb3_yann.__main__"},
 ]
 """Each floor may import from those before it: control -> networks -> twin -> the parts for

@@ -23,7 +23,7 @@ import yaml
 
 from sb3_yann import Checks, Controller, ImprovementGuard, LinearModel, LinearMPC, export
 from sb3_yann._archive import digest_of, read_arrays, write_arrays
-from sb3_yann.command_line import main as command_line
+from sb3_yann.cli import main as command_line
 from sb3_yann.commissioning.journal import Journal, Outlook
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.record import Record

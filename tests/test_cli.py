@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -11,7 +12,7 @@ import pytest
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 
 from sb3_yann import Controller, LinearMPC, PiecewiseAffine, YannPolicy, export
-from sb3_yann.command_line import main
+from sb3_yann.cli import main
 from twin_samples import Cart, problem
 
 PLANT = """
@@ -34,14 +35,21 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def model(folder):
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
     """A saved model whose correction is not zero."""
     model = DDPG(YannPolicy, Cart(), device="cpu", seed=0, learning_starts=10)
     model.policy.critic_warmup = 0
-    model.learn(130)
-    model.save(folder / "cart")
-    return model
+    model.learn(40)
+    path = tmp_path_factory.mktemp("model") / "cart.zip"
+    model.save(path)
+    return path
+
+
+@pytest.fixture
+def model(folder, saved):
+    """The saved model in the user's folder."""
+    return shutil.copy(saved, folder)
 
 
 def test_solve_prints_the_report_and_saves_the_law(folder, capsys) -> None:

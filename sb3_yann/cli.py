@@ -1,0 +1,307 @@
+"""The command ``sb3-yann``: its arguments, what each command does, its errors and exit codes.
+
+Each command imports what it uses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import zipfile
+from argparse import Namespace
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from sb3_yann import __version__
+from sb3_yann._validation import check_int
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command, and return the exit code: 0, 1 for an error, 130 for Ctrl-C.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The default is the command line's.
+
+    Examples
+    --------
+    >>> main(["solve", "no-such-problem"])
+    1
+    """
+    options = _parser().parse_args(arguments)
+    if os.getcwd() not in sys.path:  # modules of the user's, as with python -m
+        sys.path.insert(0, os.getcwd())
+    try:
+        options.run(options)
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if options.traceback:
+            raise
+        kind = "" if isinstance(error, OSError | TypeError | ValueError) else type(error).__name__
+        print(f"sb3-yann {options.command}: {kind}{': ' * bool(kind)}{error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    problem = 'a registered problem ("CSTR-v0") or "module:attribute", a LinearMPC of your own'
+    env = 'the plant: the id of an environment, or "module:attribute", a function that makes one'
+    model = "a model that model.save(path) has written"
+    found = argparse.ArgumentParser(
+        prog="sb3-yann",
+        description="Reinforcement learning that starts as a linear MPC, exactly.",
+        epilog="Exit codes: 0 done, 1 not done (the message says why), 2 wrong arguments, "
+        "130 interrupted.",
+    )
+    found.add_argument("--version", action="version", version=__version__)
+    found.add_argument("--traceback", action="store_true", help="show where an error came from")
+    commands = found.add_subparsers(dest="command", required=True, metavar="command")
+
+    def add(name: str, run: Callable[[Namespace], None], text: str) -> argparse.ArgumentParser:
+        one = commands.add_parser(name, help=text)
+        one.set_defaults(run=run)
+        return one
+
+    one = add("solve", _solve, "solve a problem, describe its law, save it")
+    one.add_argument("problem", help=problem)
+    one.add_argument("--save", metavar="LAW.npz", help="where to write the law")
+    one.add_argument("--time-limit", type=float, metavar="SECONDS", help="default: none")
+    one.add_argument("--region-limit", type=int, metavar="N", help="default: none")
+
+    one = add("plot", _plot, "draw the regions of a law")
+    one.add_argument("law", help=f"a law's .npz file, {model}, or {problem}")
+    one.add_argument("picture", help="where to write it: .png, .svg or .pdf")
+    one.add_argument(
+        "--axes", type=int, nargs=2, default=(0, 1), metavar=("I", "J"), help="coordinates of theta"
+    )
+
+    one = add("evaluate", _evaluate, "play episodes of a model and of its MPC")
+    one.add_argument("model", help=model)
+    one.add_argument("--env", required=True, help=env)
+    one.add_argument("--episodes", type=int, default=20, metavar="N", help="default: 20")
+    one.add_argument("--seed", type=int, default=0, help="of the first episode; default: 0")
+
+    one = add("report", _report, "write a report that can be signed")
+    one.add_argument("model", help=model)
+    one.add_argument("page", help="where to write it: .html")
+    one.add_argument("--env", help=f"{env}; without it nothing is played")
+    one.add_argument("--episodes", type=int, default=20, metavar="N", help="default: 20")
+
+    one = add("export", _export, "write a controller: C code, a function block, ...")
+    one.add_argument("law", help=f"{model}, a law's .npz file, or {problem}")
+    one.add_argument("path", help="where to write it: .c, .npz, .onnx, .st, .xml (PLCopen) or .fmu")
+    one.add_argument("--name", help="prefix of all names in code; default: the file's")
+    one.add_argument("--float", action="store_true", help="code in single precision")
+    one.add_argument("--absolute", action="store_true", help="readings and inputs as the plant's")
+    one.add_argument(
+        "--checks", metavar="FILE.json", help="limits of readings, and how to fall back"
+    )
+    one.add_argument(
+        "--observer",
+        choices=("none", "caller"),
+        default="none",
+        help="who estimates what an observer does: an export holds none",
+    )
+
+    one = add("commission", _commission, "improve a model on its plant, batch by batch")
+    one.add_argument("model", help=model)
+    one.add_argument("--env", required=True, help=env)
+    one.add_argument("--record", required=True, metavar="FOLDER", help="goes on where it ended")
+    one.add_argument("--batches", type=int, default=3, metavar="N", help="in all; default: 3")
+    one.add_argument("--batch", type=int, default=4, metavar="N", help="episodes of the first one")
+    one.add_argument("--max-correction", type=float, default=0.1, metavar="SHARE")
+    one.add_argument("--shadow", action="store_true", help="the MPC acts; the policy only computes")
+    one.add_argument("--save", metavar="MODEL.zip", help="where to write the accepted model")
+    return found
+
+
+# ---- What each command does ----
+
+
+def _solve(options: Namespace) -> None:
+    """Solve a problem, print its report, and save the law."""
+    if options.save:  # what takes long is not done in vain
+        path = Path(options.save)
+        if path.is_dir():
+            raise IsADirectoryError(f"{path} is a folder; name a file in it.")
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"There is no folder {path.parent}: make it first.")
+    problem = _problem(options.problem)
+    law = problem.explicit(
+        time_limit=options.time_limit, region_limit=options.region_limit, progress=True
+    )
+    print(problem.report())
+    if options.save:
+        law.save(options.save)
+        print(f"Written: {options.save}")
+
+
+def _evaluate(options: Namespace) -> None:
+    """Play the same episodes with a model's MPC and with the model, and print how they compare."""
+    from rich.console import Console
+
+    from sb3_yann import evaluation
+
+    seeds = _seeds(options.episodes, options.seed)
+    model, env = _model(options.model), _env(options.env)
+    policy = evaluation.evaluate(model, env, seeds)
+    model.policy.limit_correction(0.0)  # what is left is the MPC
+    mpc = evaluation.evaluate(model, env, seeds)
+    title = f"{options.episodes} episodes from seed {options.seed}: the MPC, and {options.model}"
+    Console().print(evaluation.summary_table(title, mpc, policy))
+
+
+def _plot(options: Namespace) -> None:
+    """Draw the regions of a law."""
+    from sb3_yann._drawing import new_figure, save_figure
+
+    figure = new_figure()
+    _law(options.law).plot(figure.subplots(), entries=tuple(options.axes))
+    print(f"Written: {save_figure(figure, options.picture, dpi=150)}")
+
+
+def _report(options: Namespace) -> None:
+    """Write the report on a model."""
+    from sb3_yann import report as write
+
+    seeds, env = _seeds(options.episodes), _env(options.env) if options.env else None
+    written = write(_model(options.model), options.page, env=env, seeds=seeds)
+    print(f"Written: {written}")
+
+
+def _export(options: Namespace) -> None:
+    """Write a controller, and print what it costs."""
+    from sb3_yann import export as write
+
+    if _is_model(options.law):
+        given = _model(options.law)
+    elif Path(options.law).suffix == ".npz":
+        given = _law(options.law)
+    else:
+        given = _problem(options.law)
+    written = write(
+        given,
+        options.path,
+        name=options.name,
+        precision="float" if options.float else "double",
+        absolute=options.absolute,
+        checks=_checks(options.checks),
+        observer=options.observer,
+    )
+    print(f"Written: {written}")
+
+
+def _commission(options: Namespace) -> None:
+    """Run a commissioning, or go on with one, and print its batches."""
+    from sb3_yann import Commissioning
+
+    model = _model(options.model)
+    found = Commissioning(
+        model,
+        _env(options.env),
+        batch=options.batch,
+        max_correction=options.max_correction,
+        log_path=options.record,
+        shadow=options.shadow,
+        verbose=1,
+    )
+    found.run(options.batches)
+    print(found.report())
+    if options.save:
+        model.save(options.save)
+        print(f"Written: {options.save}")
+
+
+# ---- What an argument stands for ----
+
+
+def _problem(given: str) -> Any:
+    """Return the LinearMPC that a name or ``"module:attribute"`` stands for."""
+    from sb3_yann.policy.checks import resolve_problem
+
+    return resolve_problem(given, None)
+
+
+def _env(given: str) -> Any:
+    """Return an env's id as it is, and what ``"module:attribute"`` names, if there is such."""
+    module, _, attribute = given.partition(":")
+    # "module:Env-v0" is Gymnasium's own: import the module, then look the id up.
+    return getattr(import_module(module), attribute, given) if attribute else given
+
+
+def _model(path: str) -> Any:
+    """Return a saved model.
+
+    DDPG is TD3 with other defaults: what TD3 loads acts and learns as it was saved.
+    """
+    from stable_baselines3 import TD3
+    from stable_baselines3.common.save_util import load_from_zip_file
+
+    from sb3_yann import YannPolicy
+
+    if not Path(path).exists() and not Path(f"{path}.zip").exists():
+        raise FileNotFoundError(f"There is no model {path}: model.save(path) writes one.")
+    if not _is_model(path):
+        raise ValueError(f"{path} is no model: pass a .zip file that model.save(path) has written.")
+    data = load_from_zip_file(path, device="cpu")[0] or {}  # TD3 fails at others' without a word
+    kind = data.get("policy_class")
+    if not (isinstance(kind, type) and issubclass(kind, YannPolicy)):
+        found = kind.__name__ if isinstance(kind, type) else "nothing that is known"
+        raise ValueError(
+            f"{path} holds {found} as its policy: sb3-yann needs a YannPolicy. Build the model as "
+            'DDPG("YannPolicy", env), and save it by model.save(path).'
+        )
+    return TD3.load(path, device="cpu")
+
+
+def _checks(path: str | None) -> Any:
+    """Return the Checks that a JSON file sets; None without one."""
+    if path is None:
+        return None
+    from sb3_yann import Checks
+
+    try:
+        given = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON: {error}") from None
+    known = [each.name for each in fields(Checks)]
+    if not isinstance(given, dict) or not set(given) <= set(known):
+        raise ValueError(
+            f"{path} must be an object with some of {', '.join(known)}; it holds {given!r}."
+        )
+    return Checks(**given)
+
+
+def _law(given: str) -> Any:
+    """Return a law from its file, from a model, or from a problem."""
+    from sb3_yann import OnlineLaw, PiecewiseAffine
+    from sb3_yann.control.law import read_law
+
+    if _is_model(given):
+        policy = _model(given).policy
+        return policy.problem.law(policy.law)
+    if not Path(given).suffix == ".npz":
+        return _problem(given).law()
+    is_explicit = read_law("a law", given, lambda data: "gains" in data)
+    return PiecewiseAffine.load(given) if is_explicit else OnlineLaw.load(given)
+
+
+def _seeds(episodes: int, first: int = 0) -> range:
+    """Return the seeds of so many episodes, one at least."""
+    first = check_int("--seed", first, 0)
+    return range(first, first + check_int("--episodes", episodes))
+
+
+def _is_model(given: str) -> bool:
+    """Tell whether a file is a model's: a zip archive that is no .npz."""
+    found = given if Path(given).exists() else f"{given}.zip"  # model.save("m") writes m.zip
+    return Path(found).suffix != ".npz" and zipfile.is_zipfile(found)
