@@ -18,15 +18,16 @@ from sb3_yann.control.mpc.bound_excess import BoundExcess
 
 UNSAFE = (
     "violations",
-    "an episode that the env ends, or ends sooner",
+    "an episode that the env ends, or that ends sooner",
     "a cost or an observation that is no finite number",
     "an input that moves too far in one step",
     "a larger excess over the problem's bounds",
     "a larger summed excess over the problem's bounds",
 )
-"""What the columns of ``unsafe`` are. A seventh is the excess over hard and soft bounds."""
-ENDS_EARLY, INPUT_STEP = 1, 3
-"""Columns: how early the env ends an episode; steps in which an input moves too far."""
+"""What the first columns of ``unsafe`` are; the others are what it takes to compare them."""
+ENDED, INPUT_STEP, ANY_BOUND, MISSING = 1, 3, 6, 7
+"""Columns: how an episode ends; steps in which an input moves too far; the excess over hard and
+soft bounds; minus the number of steps."""
 SUCCESS_HINT = 'where an end is a success, the env says so by info["is_success"]'
 EXCESS_ROOM = 1e-3
 """Half-widths of a bound by which an excess may be larger: less is noise."""
@@ -153,7 +154,7 @@ class Scores(NamedTuple):
     ----------
     costs : ndarray, shape (episodes,)
         With the penalty of soft bounds.
-    unsafe : ndarray, shape (episodes, 7)
+    unsafe : ndarray, shape (episodes, 8)
         As :func:`unsafe_columns` returns it.
     visits : ndarray of bool, shape (episodes, regions)
         Which regions the episodes come through: other networks have no effect on them.
@@ -279,7 +280,7 @@ def no_worse(
         column = int(np.argmax(less.any(axis=0)))
         which = np.flatnonzero(less[:, column])
         reason = f"{len(which)} starts with {UNSAFE[column]}, the first is number {which[0]}"
-        if column == ENDS_EARLY:
+        if column == ENDED:
             reason = f"{reason}; {SUCCESS_HINT}"
     elif costly := tolerance.objection(excess, n_starts):
         worst = np.argmax(excess)
@@ -476,19 +477,22 @@ def unsafe_columns(
     lost: ArrayLike,
     excess: BoundExcess,
     far: ArrayLike = 0,
+    lengths: ArrayLike = 0,
 ) -> Array:
-    """Return what :func:`less_safe` compares, (episodes, 7).
+    """Return what :func:`less_safe` compares, (episodes, 8).
 
     Parameters
     ----------
-    violations, ended, lost, far : array_like, shape (episodes,)
-        Steps in which the env reports a violation; how early the env ends an episode; whether its
-        cost or an observation is not finite; steps in which an input moves too far.
+    violations, ended, lost, far, lengths : array_like, shape (episodes,)
+        Steps in which the env reports a violation; whether the env ends an episode itself, -1 where
+        its end is a success; whether its cost or an observation is not finite; steps in which an
+        input moves too far; all steps.
     excess : BoundExcess
         Over the bounds of the problem.
     """
     size = np.shape(excess.largest)
     columns = [violations, ended, lost, far, excess.largest, excess.summed, excess.any_bound]
+    columns.append(-np.asarray(lengths))
     return np.column_stack([np.broadcast_to(each, size).astype(np.float64) for each in columns])
 
 
@@ -500,11 +504,12 @@ def less_safe(now: Array, before: Array, room: float = EXCESS_ROOM) -> NDArray[n
       larger on average over all episodes, too.
     - Where the env reported violations before, and the problem's bounds tell their size, a tenth
       more steps of them, or one, count only where they are larger.
+    - An episode may be shorter where its end is a success.
     - Of all else nothing may be more.
 
     Parameters
     ----------
-    now, before : ndarray, shape (episodes, 7)
+    now, before : ndarray, shape (episodes, 8)
         As :func:`unsafe_columns` returns them, of the same starts.
     room : float
         Half-widths of a bound by which an excess may be larger.
@@ -512,8 +517,10 @@ def less_safe(now: Array, before: Array, room: float = EXCESS_ROOM) -> NDArray[n
     more = now[:, : len(UNSAFE)] > before[:, : len(UNSAFE)]
     larger = ~(now <= allowed_excess(before, room))
     few = now[:, 0] <= before[:, 0] + np.maximum(1.0, EXCESS_SHARE * before[:, 0])
-    known = (before[:, 0] > 0) & (now[:, 6] > 0) & few & ~larger[:, 6]
+    known = (before[:, 0] > 0) & (now[:, ANY_BOUND] > 0) & few & ~larger[:, ANY_BOUND]
     more[:, 0] &= ~known
+    shorter = (now[:, ENDED] >= 0) & (now[:, MISSING] > before[:, MISSING])
+    more[:, ENDED] = shorter | (more[:, ENDED] & (now[:, ENDED] > 0))
     more[:, 4] = larger[:, 4]
     step = before[:, 4]  # one more of the largest
     longer = ~(now[:, 5] <= allowed_excess(before[:, 5], room) + step)

@@ -120,18 +120,20 @@ class Trajectories:
         taken = np.arange(len(actions))[:, None] < self.lengths
         return states[:-1][taken], actions[taken], states[1:][taken]
 
-    def sooner(self, longest: int) -> NDArray[np.int64]:
-        """Return by how many steps each is shorter (episodes,); 0 where its end is a success."""
-        return np.where(self.succeeded, 0, np.maximum(longest - self.lengths, 0))
+    def unsafe(self, far: ArrayLike = 0) -> Array:
+        """Return what :func:`~sb3_yann.compare.less_safe` compares of each; the excess is known.
+
+        ``far`` (episodes,) counts steps in which an input moves too far.
+        """
+        assert self.excess is not None
+        finite = [bool(np.all(np.isfinite(each))) for each in self.observations]
+        lost = ~(np.isfinite(self.costs) & np.array(finite, dtype=bool))
+        ended = np.where(self.succeeded, -1, self.terminated)
+        return unsafe_columns(self.violations, ended, lost, self.excess, far, self.lengths)
 
     def no_worse(self, others: Trajectories) -> NDArray[np.bool_]:
         """Return which episodes are as long as others, and break no bound by more."""
-        longest, unsafe = int(others.lengths.max(initial=0)), []
-        for each in (self, others):
-            assert each.excess is not None
-            lost, sooner = ~np.isfinite(each.costs), each.sooner(longest)
-            unsafe.append(unsafe_columns(each.violations, sooner, lost, each.excess))
-        return np.asarray(~less_safe(unsafe[0], unsafe[1]).any(axis=1))
+        return np.asarray(~less_safe(self.unsafe(), others.unsafe()).any(axis=1))
 
 
 class EnvPool:

@@ -19,7 +19,6 @@ from sb3_yann.compare import (
     Tolerance,
     less_safe,
     no_worse,
-    unsafe_columns,
 )
 from sb3_yann.rollout import Controller, Rows, Trajectories
 
@@ -106,10 +105,7 @@ class SimulatedTrial(Comparison):
         return self._outcome(self.last)
 
     def _outcome(self, played: Trajectories) -> Outcome:
-        assert played.excess is not None
-        short = played.sooner(int(self.base.lengths.max()))
-        lost = ~np.isfinite(played.costs)
-        return played.costs, unsafe_columns(played.violations, short, lost, played.excess)
+        return played.costs, played.unsafe()
 
     def second_objection(self, act: Inputs) -> str:
         """Return nothing: the simulator has spoken."""

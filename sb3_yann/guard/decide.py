@@ -24,7 +24,6 @@ from sb3_yann.compare import (
     Verdict,
     is_above,
     less_safe,
-    unsafe_columns,
 )
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
@@ -33,7 +32,6 @@ from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import YannPolicy
 from sb3_yann.rollout import (
-    MAX_EPISODE_STEPS,
     EnvPool,
     Rows,
     Source,
@@ -477,10 +475,6 @@ class Player:
         inputs = [policy.inputs(each) for each in played.actions]
         pairs = zip((each.double().cpu().numpy() for each in thetas), inputs, strict=True)
         excess = excess_of_episodes(policy.problem, pairs)
-        finite = [np.all(np.isfinite(each)) for each in played.observations]
-        lost = ~(np.isfinite(played.costs) & finite)
-        # How early the env ends an episode, 0 where it does not.
-        sooner = np.where(played.terminated, MAX_EPISODE_STEPS + 1 - played.lengths, 0)
         far: Any = 0
         if self.max_input_step is not None:
             moved = [np.abs(np.diff(each, axis=0)) for each in played.actions]
@@ -488,7 +482,7 @@ class Player:
         visits = np.zeros((len(played.costs), layer.n_networks), dtype=bool)
         for visited, theta in zip(visits, thetas, strict=True):
             visited[layer.regions(theta[:-1])] = True
-        unsafe = unsafe_columns(played.violations, sooner, lost, excess, far)
+        unsafe = replace(played, excess=excess).unsafe(far)
         return Scores(played.costs + excess.penalty, unsafe, visits)
 
     def close(self) -> None:

@@ -15,6 +15,7 @@ from sb3_yann.audit import Headroom
 from sb3_yann.commissioning.improve import Improvement, fingerprint
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
+from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.state import GuardState
@@ -138,6 +139,8 @@ class Subject:
                 observations=tuple(map(self._theta, played.observations)),
                 actions=tuple(map(self.policy.inputs, played.actions)),
             )
+            excess = excess_of_episodes(self.problem, found[name].pairs)
+            found[name] = replace(found[name], excess=excess)
         return found
 
     def act_as_mpc(self, observations: Any) -> Any:

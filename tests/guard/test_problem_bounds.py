@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from stable_baselines3 import DDPG
 
 from guard_samples import At
 from sb3_yann import (
+    AcceptanceRule,
     ImprovementGuard,
     LinearModel,
     LinearMPC,
@@ -133,3 +135,57 @@ def test_stage_cost_tells_the_excess_and_the_penalty() -> None:
         assert infos[-1].get("violation", False) == hard
         assert (infos[-1]["penalty"] > 0) != hard
         assert infos[0]["excess"] == infos[0]["penalty"] == 0
+
+
+OHM, BACK, HENRY, DT = 1.0, 0.1, 0.25, 0.05
+
+
+def drive_matrices(ohm: float) -> tuple[Any, Any]:
+    """Return A and B of a motor's speed and current, for a resistance of the winding."""
+    return np.array([[1, DT], [-BACK * DT / HENRY, 1 - ohm * DT / HENRY]]), np.array(
+        [[0], [DT / HENRY]]
+    )
+
+
+class Drive(Carriage):
+    """A DC motor whose winding has 8 % less resistance than the model's: 1.6 % more current."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Begin at a speed from which the current goes to its limit."""
+        gym.Env.reset(self, seed=seed)
+        self.x = np.array([self.np_random.uniform(1.0, 1.5), 0.0])
+        return self.x.copy(), {}
+
+    def step(self, action: Any) -> Any:
+        """Turn."""
+        a, b = drive_matrices(0.92 * OHM)
+        self.x = a @ self.x + b @ np.clip(action, -6, 6)
+        return self.x.copy(), 0.0, False, False, {}
+
+
+def drive_mpc(limit: float = 1.0, weight: float = 0.0) -> LinearMPC:
+    return LinearMPC(
+        LinearModel(*drive_matrices(OHM), dt=DT), Q=np.diag([1, weight]), R=[[1e-3]], horizon=3,
+        u_min=-6, u_max=6, x_min=[-9, -limit], x_max=[9, limit],
+        theta_min=[-3, -1.5], theta_max=[3, 1.5],
+    )  # fmt: skip
+
+
+def test_an_mpc_that_rides_its_bound_is_no_veto_and_no_excuse() -> None:
+    mpc = drive_mpc()
+
+    def scores(problem: LinearMPC) -> Scores:
+        played = evaluate(problem.law(), lambda: TimeLimit(StageCost(Drive(), mpc), 50), range(4))
+        excess = excess_of_episodes(mpc, played.pairs)
+        return Scores(played.costs, replace(played, excess=excess).unsafe())
+
+    # Without a weight of the current it stays at its limit for one more step, and costs less.
+    own, cheaper, beyond = map(scores, (drive_mpc(weight=0.01), mpc, drive_mpc(1.02)))
+    assert beyond.costs.mean() < cheaper.costs.mean() < own.costs.mean()
+    steps, largest = own.unsafe[:, 0], own.unsafe[:, 4]
+    np.testing.assert_array_equal(cheaper.unsafe[:, 0] - steps, [1, 1, 0, 1])
+    np.testing.assert_allclose(cheaper.unsafe[:, 4], largest, rtol=1e-3)
+    assert 0.005 < largest.min() <= largest.max() < 0.02
+    tolerance = AcceptanceRule().tolerance(own.costs)
+    assert no_worse(cheaper, own, own, tolerance).accepted
+    assert no_worse(beyond, own, own, tolerance).breaks_limit
