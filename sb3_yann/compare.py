@@ -6,7 +6,7 @@ much on average (their conditional value at risk), is the mean cost higher?
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from sb3_yann._validation import Array, check_bool, check_range, former_names
-from sb3_yann.control.mpc.bound_excess import BoundExcess
+from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames
 
 UNSAFE = (
     "violations",
@@ -25,9 +25,9 @@ UNSAFE = (
     "a larger summed excess over the problem's bounds",
 )
 """What the first columns of ``unsafe`` are; the others are what it takes to compare them."""
-ENDED, INPUT_STEP, ANY_BOUND, MISSING = 1, 3, 6, 7
-"""Columns: how an episode ends; steps in which an input moves too far; the excess over hard and
-soft bounds; minus the number of steps."""
+ENDED, INPUT_STEP, LARGEST, ANY_BOUND, MISSING, WORST = 1, 3, 4, 6, 7, 8
+"""Columns: how an episode ends; steps in which an input moves too far; the excess over hard bounds,
+and over soft ones too; minus the number of steps; which bound is exceeded most."""
 SUCCESS_HINT = 'where an end is a success, the env says so by info["is_success"]'
 EXCESS_ROOM = 1e-3
 """Half-widths of a bound by which an excess may be larger: less is noise."""
@@ -110,10 +110,11 @@ class AcceptanceRule:
         check_bool("backtrack", self.backtrack)
         check_range("significance", self.significance, 0, 0.5)
 
-    def tolerance(self, mpc_costs: Array) -> Tolerance:
+    def tolerance(self, mpc_costs: Array, bounds: BoundNames | None = None) -> Tolerance:
         """Return what starts may cost more, given what they cost with the MPC."""
         typical = float(np.median(np.abs(mpc_costs)))
-        return Tolerance(self.margin * typical, self.cvar_alpha, typical, self.excess_room)
+        names = bounds or BoundNames()
+        return Tolerance(self.margin * typical, self.cvar_alpha, typical, self.excess_room, names)
 
     @property
     def standard_errors(self) -> float:
@@ -154,7 +155,7 @@ class Scores(NamedTuple):
     ----------
     costs : ndarray, shape (episodes,)
         With the penalty of soft bounds.
-    unsafe : ndarray, shape (episodes, 8)
+    unsafe : ndarray, shape (episodes, 9)
         As :func:`unsafe_columns` returns it.
     visits : ndarray of bool, shape (episodes, regions)
         Which regions the episodes come through: other networks have no effect on them.
@@ -199,12 +200,19 @@ class Tolerance:
         and no start may cost more than `WORST_START` times as much as the average may.
     typical : float, the MPC's median cost
     excess_room : float, half-widths by which an excess over bounds may be larger
+    bounds : BoundNames, which reasons name
     """
 
     margin: float
     cvar_alpha: float = 0.0
     typical: float = np.inf
     excess_room: float = EXCESS_ROOM
+    bounds: BoundNames = field(default_factory=BoundNames)
+
+    def exceeded(self, policy: Scores, episode: int) -> str:
+        """Return which bound an episode exceeds most, and by how much; empty where none is."""
+        row = policy.unsafe[episode]
+        return self.bounds.in_words(row[WORST], row[LARGEST])
 
     def allowed(self, mpc_costs: Array) -> Array:
         """Return what each start may cost more, rounding at least."""
@@ -280,8 +288,11 @@ def no_worse(
         column = int(np.argmax(less.any(axis=0)))
         which = np.flatnonzero(less[:, column])
         reason = f"{len(which)} starts with {UNSAFE[column]}, the first is number {which[0]}"
+        words = tolerance.exceeded(policy, int(which[0]))
         if column == ENDED:
             reason = f"{reason}; {SUCCESS_HINT}"
+        elif column != INPUT_STEP and words:
+            reason = f"{reason}: {words}"
     elif costly := tolerance.objection(excess, n_starts):
         worst = np.argmax(excess)
         more = policy.costs[worst] - mpc.costs[worst]
@@ -372,7 +383,9 @@ class Starts:
             breaks, also = False, ""
             if self.less_safe(policy).any():
                 breaks = policy.breaks_more_than(self.mpc, self.tolerance.excess_room)
-                also = f" and {'violates a limit' if breaks else 'moves an input too far'}"
+                words = self.tolerance.exceeded(policy, int(first))
+                limit = f"violates a limit: {words}" if words else "violates a limit"
+                also = f" and {limit if breaks else 'moves an input too far'}"
             more = (policy.costs - self.mpc.costs)[first]
             reason = (
                 f"{self.lost(policy).sum()} of {len(self.seeds)} new starts lose against the MPC, "
@@ -479,7 +492,7 @@ def unsafe_columns(
     far: ArrayLike = 0,
     lengths: ArrayLike = 0,
 ) -> Array:
-    """Return what :func:`less_safe` compares, (episodes, 8).
+    """Return what :func:`less_safe` compares, (episodes, 9).
 
     Parameters
     ----------
@@ -492,7 +505,7 @@ def unsafe_columns(
     """
     size = np.shape(excess.largest)
     columns = [violations, ended, lost, far, excess.largest, excess.summed, excess.any_bound]
-    columns.append(-np.asarray(lengths))
+    columns += [-np.asarray(lengths), excess.worst]
     return np.column_stack([np.broadcast_to(each, size).astype(np.float64) for each in columns])
 
 
@@ -509,7 +522,7 @@ def less_safe(now: Array, before: Array, room: float = EXCESS_ROOM) -> NDArray[n
 
     Parameters
     ----------
-    now, before : ndarray, shape (episodes, 8)
+    now, before : ndarray, shape (episodes, 9)
         As :func:`unsafe_columns` returns them, of the same starts.
     room : float
         Half-widths of a bound by which an excess may be larger.

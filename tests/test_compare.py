@@ -27,7 +27,7 @@ STRICT = Tolerance(1.0)
 
 def scores(costs: Any, unsafe: Any = (), visits: Any = None) -> Scores:
     """Return scores of episodes with the first columns of what is unsafe."""
-    rows = np.zeros((len(costs), 8))
+    rows = np.zeros((len(costs), 9))
     unsafe = np.array(unsafe, float)
     if unsafe.size:
         rows[:, : unsafe.shape[1]] = unsafe

@@ -12,7 +12,12 @@ from sb3_yann.commissioning.journal import Journal
 from sb3_yann.commissioning.plant import Inputs, Plant, PlantEpisode
 from sb3_yann.compare import PairedMean, allowed_excess
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess, excess_of_episodes
+from sb3_yann.control.mpc.bound_excess import (
+    BoundExcess,
+    BoundNames,
+    bound_excess,
+    excess_of_episodes,
+)
 from sb3_yann.twin.plant_twin import PlantTwin
 
 ENOUGH = 0.5
@@ -150,7 +155,7 @@ def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
     """Return the excess over the bounds of the MPC's own episodes in the log, one 0 without any."""
     own = [journal.episodes[i] for i in journal.log if not journal.by_policy[i]]
     if not own:
-        return BoundExcess(*np.zeros((4, 1)))
+        return BoundExcess(*np.zeros((5, 1)))
     return excess_of_episodes(problem, ((each.thetas, each.actions) for each in own))
 
 
@@ -160,9 +165,11 @@ def _longer(journal: Journal, problem: LinearMPC, played: Sequence[PlantEpisode]
     summed, before = float(ours.summed.mean()), float(mpc.summed.mean())
     if summed <= allowed_excess(before) + mpc.largest.max():
         return ""
+    most = int(np.argmax(ours.largest))
+    words = BoundNames.of(problem).in_words(np.asarray(ours.worst)[most], ours.largest[most])
     return (
         f"it exceeded hard bounds by {summed:.3g} half-widths, summed over an episode, the MPC by "
-        f"{before:.3g}"
+        f"{before:.3g}: {words}"
     )
 
 

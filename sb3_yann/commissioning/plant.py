@@ -15,7 +15,7 @@ from sb3_yann._validation import Array
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
-from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
@@ -166,14 +166,19 @@ class Plant:
             observation, gained, terminated, over, info = self.env.step(action)
             over, read = over or terminated, self._theta(observation)
             after = self._known(known, u, read)
-            excess = bound_excess(self.problem, np.array([known, after]), u[None]).largest
+            beyond = bound_excess(self.problem, np.array([known, after]), u[None])
+            excess = beyond.largest
             limit = allowed if act == self.policy else np.inf
             sized = EXCESS_ROOM < excess <= limit
             reported = bool(info.get("violation", False)) and not sized
             unsafe = reported or terminated or bool(excess > limit)
             reward, violations = reward + float(gained), violations + unsafe
             if alarm is None:
-                found = self._look(watchdog, known, u, read, unsafe)
+                why = "The plant reports a violation, or ends the episode." if unsafe else ""
+                if excess > limit:
+                    names = BoundNames.of(self.problem)
+                    why = f"On the plant {names.in_words(float(beyond.worst), float(excess))}."
+                found = self._look(watchdog, known, u, read, why)
                 if found is not None:
                     alarm, step, act = found, len(actions), self.mpc
             known = after
@@ -196,12 +201,12 @@ class Plant:
         return np.where(np.isfinite(read), read, predicted)
 
     def _look(
-        self, watchdog: Watchdog | None, known: Array, u: Array, read: Array, unsafe: bool
+        self, watchdog: Watchdog | None, known: Array, u: Array, read: Array, why: str
     ) -> Alarm | None:
         if not np.isfinite(read).all():
             return Alarm("not a number", f"It reads {self._not_finite(read)}.")
-        if unsafe:
-            return Alarm("violation", "The plant reports a violation, or exceeds a hard bound.")
+        if why:
+            return Alarm("violation", why)
         if watchdog is None:
             return None
         return watchdog.watch(known, u.astype(np.float64), read)

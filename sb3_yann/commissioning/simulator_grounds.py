@@ -20,6 +20,7 @@ from sb3_yann.compare import (
     less_safe,
     no_worse,
 )
+from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.rollout import Controller, Rows, Trajectories
 
 RULE = AcceptanceRule()
@@ -39,9 +40,12 @@ class Comparison:
     ----------
     mpc : tuple of ndarray
         What came of the MPC.
+    bounds : BoundNames
+        Of the problem.
     """
 
     mpc: Outcome = field(init=False)
+    bounds: BoundNames = field(init=False)
 
     @property
     def mean(self) -> float:
@@ -51,7 +55,7 @@ class Comparison:
     @property
     def tolerance(self) -> Tolerance:
         """What episodes may cost more than with the MPC."""
-        return RULE.tolerance(self.mpc[0])
+        return RULE.tolerance(self.mpc[0], self.bounds)
 
     def check(self, iteration: int, played: Outcome, accepted: Outcome) -> Check:
         """Compare a policy with the accepted one and the MPC, by what came of them."""
@@ -97,7 +101,7 @@ class SimulatedTrial(Comparison):
             self.seeds = [given[i] for i in np.flatnonzero(finite)]
             self.base = self.twin.play(law, self.seeds)
         self.last = self.base
-        self.mpc = self._outcome(self.base)
+        self.mpc, self.bounds = self._outcome(self.base), BoundNames.of(self.twin.problem)
 
     def play(self, act: Inputs) -> Outcome:
         """Return what comes of a policy."""
@@ -148,6 +152,7 @@ class FinalTrial(Comparison):
 
     def __post_init__(self) -> None:
         self.mpc = _joined(each.mpc for each in self.blocks)
+        self.bounds = self.blocks[0].bounds
 
     def play(self, act: Inputs) -> Outcome:
         """Return what comes of a policy."""

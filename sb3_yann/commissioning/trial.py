@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
 from sb3_yann.compare import Scores, Tolerance, less_safe, no_worse, unsafe_columns
-from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
+from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
 from sb3_yann.twin.dynamics import Dynamics, law_of
 from sb3_yann.twin.hidden_dynamics import HiddenDynamics
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -184,7 +184,8 @@ class Trial:
         allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
         safe = not np.any(less_safe(unsafe, allowed))
         policy, before, mpc = (Scores(c[known], u[known]) for c, u in (played, accepted, self.mpc))
-        reason = no_worse(policy, before, mpc, Tolerance(MARGIN * mean)).reason
+        allowed_more = Tolerance(MARGIN * mean, bounds=BoundNames.of(self.twin.problem))
+        reason = no_worse(policy, before, mpc, allowed_more).reason
         (logged, error), (of_accepted, _) = map(
             self._as_logged, (excess, accepted[0] - self.mpc[0])
         )

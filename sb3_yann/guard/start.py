@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 
 from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, Scores, Starts
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.guard.decide import GuardSettings, Player, Unplayable, try_before_training
 from sb3_yann.guard.state import Decision, Evidence, GuardState
 from sb3_yann.policy.checkpoint import ActorCheckpoint
@@ -39,7 +40,8 @@ def first_evidence(
         hard = {*known.evidence.starts.seeds} - {*known.settings["seeds"], *seeds}
         seeds = (*seeds, *sorted(hard))
     mpc = _first_scores(player, settings, seeds)
-    tolerance = settings.rule.tolerance(mpc.costs[: len(settings.seeds)])
+    names = BoundNames.of(player.policy.problem)
+    tolerance = settings.rule.tolerance(mpc.costs[: len(settings.seeds)], names)
     starts = Starts(seeds, mpc, tolerance, len(seeds))
     evidence = Evidence(player.mpc, player.mpc, starts, mpc, next_seed)
     leading, decisions = player.mpc, list[Decision]()

@@ -14,7 +14,7 @@ from sb3_yann._validation import Array
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of, missing_observer, with_units
-from sb3_yann.control.mpc.bound_excess import excess_of_episodes
+from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.evaluation.law_plots import ActiveConstraints, regions_figure
 from sb3_yann.reporting.html import Html, join, lines, number, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import MPC, POLICY, Finding, Part, Subject, make_finding
@@ -106,7 +106,8 @@ def constraints_part(subject: Subject) -> Part:
 
 def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple[Finding, ...]:
     """Return whether the policy exceeds bounds of the problem by more than the MPC does."""
-    mpc, policy = (excess_of_episodes(problem, _pairs(loops[who])) for who in (MPC, POLICY))
+    mpc, policy = loops[MPC].excess, loops[POLICY].excess
+    assert mpc is not None and policy is not None
     is_worse = bool(
         np.any(less_safe(unsafe_columns(0, 0, 0, policy), unsafe_columns(0, 0, 0, mpc)))
     )
@@ -118,9 +119,12 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
     )
     if is_worse:
         worst = int(np.argmax(policy.largest - mpc.largest))
+        which = np.asarray(policy.worst)[worst]
+        names = BoundNames.of(problem)
         text += (
             f" In episode {worst} the policy exceeds them by {policy.largest[worst]:.3g}, the MPC "
-            f"by {mpc.largest[worst]:.3g}: the policy breaks a bound that the MPC keeps."
+            f"by {mpc.largest[worst]:.3g}: {names.in_words(which, policy.largest[worst])} with the "
+            "policy."
         )
     passed = None if np.any(policy.largest > 0) else True
     found = [make_finding(False if is_worse else passed, text)]

@@ -23,7 +23,7 @@ from sb3_yann import (
     SoftBounds,
 )
 from sb3_yann.compare import Scores, Tolerance, less_safe, no_worse, unsafe_columns
-from sb3_yann.control.mpc.bound_excess import excess_of_episodes
+from sb3_yann.control.mpc.bound_excess import BoundNames, excess_of_episodes
 from sb3_yann.evaluation import evaluate
 from sb3_yann.wrappers import StageCost
 from weights import first_layer, last_layer
@@ -60,7 +60,8 @@ class Carriage(gym.Env[Any, Any]):
 
 
 def carriage(kind: str) -> tuple[LinearMPC, Any]:
-    mpc = LinearMPC(LinearModel(A, B, dt=0.2), **COMMON, **KINDS[kind])
+    names: Any = {"state_names": ["place", "speed"], "units": ["m", "m/s", "N"]}
+    mpc = LinearMPC(LinearModel(A, B, dt=0.2, **names), **COMMON, **KINDS[kind])
     return mpc, lambda: TimeLimit(StageCost(Carriage(), mpc), 12)
 
 
@@ -79,8 +80,12 @@ def test_a_policy_that_is_cheaper_beyond_a_hard_bound_is_refused(kind: str) -> N
     found = [excess_of_episodes(mpc, zip(p.observations, p.actions, strict=True)) for p in played]
     unsafe = [unsafe_columns(0, 0, 0, each) for each in found]
     mpc_scores, scores = (Scores(p.costs, u) for p, u in zip(played, unsafe, strict=True))
-    reason = no_worse(scores, mpc_scores, mpc_scores, Tolerance(1e9)).reason
+    tolerance = Tolerance(1e9, bounds=BoundNames.of(mpc))
+    reason = no_worse(scores, mpc_scores, mpc_scores, tolerance).reason
     assert "a larger excess over the problem's bounds" in reason
+    over = np.abs(played[1].observations[0][:, 1]).max() - LIMIT
+    name, unit = ("speed", " m/s") if kind == "hard states" else ("y[0]", "")
+    assert reason.endswith(f"{name} exceeds its bound by {over:.3g}{unit}")
     assert not less_safe(unsafe[0], unsafe[0]).any()
     assert found[0].largest.max() < 1e-3
 
@@ -122,6 +127,8 @@ def test_the_guard_never_accepts_a_faster_policy_than_the_bounds_let(kind: str) 
     model.learn(24, callback=[NoActionNoise(), At([6], push), guard])
     log = evaluate(model, make, range(20, 24))
     assert guard.decisions[0].verdict == "rejected"
+    named = {"hard states": "speed exceeds its bound by", "hard outputs": "y[0] exceeds its bound"}
+    assert named.get(kind, "more than with the MPC") in guard.decisions[0].reason
     assert max(np.abs(each[:, 1]).max() for each in log.observations) < LIMIT * 1.01
 
 

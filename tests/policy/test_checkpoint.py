@@ -134,7 +134,7 @@ def test_what_passed_is_kept_once_the_latest_last_and_as_far_as_memory_allows(mo
     for value in (0.1, 0.2, 0.3, 0.4):
         correct(policy, RIGHT, value)
         some.append(ActorCheckpoint.of(policy))
-    scores = Scores(np.zeros(1), np.zeros((1, 8)), np.zeros((1, 3), bool))
+    scores = Scores(np.zeros(1), np.zeros((1, 9)), np.zeros((1, 3), bool))
     evidence = Evidence(mpc, mpc, Starts((0,), scores, Tolerance(1.0), 1), scores, next_seed=1)
     for each in (*some[:3], some[0], mpc):  # the MPC is always there
         evidence = evidence.with_passed(each, scores)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.problem import MPCProblem
 
 ROUNDING = 1e-6
@@ -33,6 +34,8 @@ class Bounds:
         Which are of single states; the others are of outputs.
     states : slice
         Where theta has the states.
+    used : ndarray of bool, shape (n + q,)
+        Which states and outputs these are.
     """
 
     C: Array
@@ -42,6 +45,7 @@ class Bounds:
     softness: Array
     of_states: NDArray[np.bool_]
     states: slice
+    used: NDArray[np.bool_]
 
     @classmethod
     def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
@@ -66,6 +70,7 @@ class Bounds:
             softness=softness[used],
             of_states=(np.arange(len(used)) < n)[used],
             states=problem.layout.state,
+            used=used,
         )
 
     def beyond(self, thetas: Array, room: float = 0.0) -> Array:
@@ -76,6 +81,47 @@ class Bounds:
         y = thetas[..., self.states] @ self.C.T
         above = np.maximum((y - self.high) / self.half - room, 0)
         return np.asarray(above - np.maximum((self.low - y) / self.half - room, 0))
+
+
+class BoundNames(NamedTuple):
+    """What the bounds of a problem are called: those of `Bounds`, the inputs', and their rates'.
+
+    Attributes
+    ----------
+    names, units : tuple of str
+    half : tuple of float
+        Half-widths.
+    """
+
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    half: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, problem: MPCProblem) -> BoundNames:
+        """Return those of a problem."""
+        model, bounds = problem.model, Bounds.of(problem)
+        states, inputs = labels_of(model)
+        units = [*(model.units or [""] * (len(states) + len(inputs)))]
+        of_states = [*zip(states, units, strict=False)]
+        of_inputs = [*zip(inputs, units[len(states) :], strict=True)]
+        every = [*of_states, *((f"y[{i}]", "") for i in range(len(problem.outputs.C)))]
+        found = [each for each, used in zip(every, bounds.used, strict=True) if used]
+        found += of_inputs
+        half = [*bounds.half, *problem.u_half]
+        if problem.layout.n_previous:
+            found += [(f"the change of {name} in a step", unit) for name, unit in of_inputs]
+            half += [*problem.u_half]
+        called, measured = zip(*found, strict=True)
+        return cls(called, measured, tuple(map(float, half)))
+
+    def in_words(self, worst: float, largest: float) -> str:
+        """Return which bound is exceeded most, and by how much in its unit; empty for none."""
+        if not (0 <= worst < len(self.names) and largest > 0):
+            return ""
+        k = int(worst)
+        by = f"{largest * self.half[k]:.3g} {self.units[k]}".strip()
+        return f"{self.names[k]} exceeds its bound by {by}"
 
 
 class BoundExcess(NamedTuple):
@@ -90,12 +136,15 @@ class BoundExcess(NamedTuple):
     penalty : ndarray, shape (...,)
         What soft bounds cost, summed over the steps: ``penalty (s + s^2)`` of the largest
         violation s of the states' bounds at a step, and of the outputs'.
+    worst : ndarray, shape (...,)
+        Number of the hard bound that ``largest`` is of, as in `BoundNames`; -1 where there is none.
     """
 
     largest: Array
     summed: Array
     any_bound: Array
     penalty: Array
+    worst: Array = np.array(-1.0)
 
 
 def bound_excess(
@@ -142,7 +191,7 @@ def bound_excess(
     counts = ~(over <= ROUNDING) & np.asarray(taken)[..., None]
     nothing = np.zeros(thetas.shape[1:-1])
     if not counts.any():  # mostly
-        return BoundExcess(nothing, nothing, nothing, nothing)
+        return BoundExcess(nothing, nothing, nothing, nothing, nothing - 1)
     over = np.where(counts, np.where(np.isnan(over), np.inf, over), 0.0)
     first = len(bounds.half)
     hard = np.append(bounds.softness <= 0, np.ones(over.shape[-1] - first, dtype=bool))
@@ -153,11 +202,14 @@ def bound_excess(
             units = bounds.half[soft] / bounds.softness[soft]
             s = np.max(over[..., :first][..., soft] * units, axis=-1)
             penalty = penalty + problem.soft.penalty * np.sum(s + s**2, axis=0)
+    of_hard = np.max(np.where(hard, over, 0.0), axis=0)
+    largest = of_hard.max(axis=-1)
     return BoundExcess(
-        largest=np.max(over[..., hard], axis=(0, -1), initial=0.0),
+        largest=largest,
         summed=np.sum(over[..., hard], axis=(0, -1)),
         any_bound=np.max(over, axis=(0, -1), initial=0.0),
         penalty=penalty,
+        worst=np.where(largest > 0, np.argmax(of_hard, axis=-1), -1.0),
     )
 
 
@@ -172,4 +224,4 @@ def excess_of_episodes(problem: MPCProblem, episodes: Iterable[tuple[Array, Arra
         Thetas and inputs of each.
     """
     found = [bound_excess(problem, thetas, inputs) for thetas, inputs in episodes]
-    return BoundExcess(*np.array(found, dtype=np.float64).reshape(-1, 4).T)
+    return BoundExcess(*np.array(found, dtype=np.float64).reshape(-1, 5).T)
