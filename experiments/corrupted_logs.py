@@ -223,7 +223,7 @@ def fitted(mpc: LinearMPC, episodes: Log, n_members: int = 1) -> PlantTwin | Non
 def improved(mpc: LinearMPC, make: Any, twin: PlantTwin) -> float | None:
     """Return the change of the cost on the plant, in %; None where nothing is accepted."""
     model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": mpc}, device="cpu", seed=0)
-    if not improve(model, twin, iterations=40, n_starts=20).accepted:
+    if not improve(model, twin, n_starts=20).accepted:
         return None
     act = lambda theta: model.predict(theta.astype(np.float32), deterministic=True)[0]  # noqa: E731
     costs = [

@@ -27,13 +27,14 @@ _NAMES = {
     "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning Headroom "
     "SteadyOffsetWarning headroom",
     "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
-    "sb3_yann.commissioning": "Batch Commissioning Improvement improve",
+    "sb3_yann.commissioning": "Batch Commissioning",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
     "ExplicitSolutionError Identified LinearMPC LinearModel OnlineLaw OnlineLawWarning "
     "OutputBounds PiecewiseAffine RateLimits SoftBounds Terminal Tracking identify offset_free",
     "sb3_yann.deployment.checks": "Checks",
     "sb3_yann.deployment.controller": "Controller",
     "sb3_yann.deployment.exporting": "Exported export",
+    "sb3_yann.improvement": "Improvement improve",
     "sb3_yann.log": "Log",
     "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "

@@ -9,8 +9,6 @@ from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
 from sb3_yann.commissioning import Batch as Batch
 from sb3_yann.commissioning import Commissioning as Commissioning
-from sb3_yann.commissioning import Improvement as Improvement
-from sb3_yann.commissioning import improve as improve
 from sb3_yann.control import DisturbanceBounds as DisturbanceBounds
 from sb3_yann.control import DisturbanceObserver as DisturbanceObserver
 from sb3_yann.control import ExplicitLimitError as ExplicitLimitError
@@ -37,6 +35,8 @@ from sb3_yann.guard import Decision as Decision
 from sb3_yann.guard import ImprovementGuard as ImprovementGuard
 from sb3_yann.guard import StepSize as StepSize
 from sb3_yann.guard import restore_accepted as restore_accepted
+from sb3_yann.improvement import Improvement as Improvement
+from sb3_yann.improvement import improve as improve
 from sb3_yann.log import Log as Log
 from sb3_yann.policy import AffineObservation as AffineObservation
 from sb3_yann.policy import CriticOptions as CriticOptions

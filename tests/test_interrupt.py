@@ -10,11 +10,11 @@ from fresh_process import run_python
 from sb3_yann.control import search_tree
 from sb3_yann.control._kernels import law, online, polyhedra
 from sb3_yann.networks._kernels import afterstate_value, yann_layer
-from sb3_yann.twin._kernels import costates, step
+from sb3_yann.twin._kernels import step
 from sb3_yann_envs import cstr
 
 LAWS = law, online, polyhedra, search_tree
-MODULES = (*LAWS, yann_layer, afterstate_value, step, costates, cstr)
+MODULES = (*LAWS, yann_layer, afterstate_value, step, cstr)
 CALLED = {
     f"{module.__name__}.{name}": function
     for module in MODULES
@@ -51,7 +51,7 @@ def test_all_that_is_known_to_be_called_is_looked_at() -> None:
         "support",
     }
     assert names >= {"backward", "_forms", "_output", "_output_backward", "_forms_backward"}
-    assert names >= {"_rates", "advance", "advance_all", "is_rich", "step", "costates"}
+    assert names >= {"_rates", "advance", "advance_all", "is_rich", "step"}
 
 
 @pytest.mark.slow

@@ -37,9 +37,11 @@ def run_code(name: str, code: str) -> dict[str, object]:
     """Run code with a shorter training; return its names."""
     shortened = code.replace("20_000", "500").replace(", progress_bar=True", "")
     shortened = shortened.replace(
-        'improve(model, "CSTR-v0")', 'improve(model, "CSTR-v0", 5, n_starts=5)'
+        'improve(model, "CSTR-v0")', 'improve(model, "CSTR-v0", rounds=1, n_starts=5, updates=50)'
     )
-    shortened = shortened.replace("improve(model, twin)", "improve(model, twin, 10, n_starts=5)")
+    shortened = shortened.replace(
+        "improve(model, twin)", "improve(model, twin, rounds=1, n_starts=5, updates=50)"
+    )
     # A number that nothing here knows would train in full.
     steps = re.findall(r"\.learn\(\s*(?:total_timesteps\s*=\s*)?([^\s,)]*)", shortened)
     assert set(steps) <= {"500"}, f"{name}: learn is called with {steps}"

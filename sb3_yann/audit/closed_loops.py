@@ -71,10 +71,17 @@ class Excited:
     ----------
     problem : LinearMPC
     seed : int
+    push : float, default 0.1
+        Half-widths by which they are moved at most.
+    often : float, default 1
+        Share of the time in which they are.
     """
 
-    def __init__(self, problem: LinearMPC, seed: int) -> None:
+    def __init__(
+        self, problem: LinearMPC, seed: int, push: float = DITHER, often: float = 1.0
+    ) -> None:
         self.problem, self.rng, self.law = problem, np.random.default_rng(seed), of_law(problem)
+        self.push, self.often = push, often
         self.moved: Array = np.zeros((0, 0))
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
@@ -83,7 +90,9 @@ class Excited:
         if t == 0:
             self.moved = np.zeros((len(rows), problem.model.n_inputs))
         if t % HELD == 0:  # one draw for each episode, also for those that are over
-            self.moved = DITHER * problem.u_half * self.rng.uniform(-1, 1, self.moved.shape)
+            self.moved = self.push * problem.u_half * self.rng.uniform(-1, 1, self.moved.shape)
+            if self.often < 1:
+                self.moved *= self.rng.random((len(self.moved), 1)) < self.often
         u = self.law(t, theta, rows) + self.moved[rows]
         return np.asarray(np.clip(u, problem.deviations.u_min, problem.deviations.u_max))
 

@@ -42,42 +42,63 @@ class Plant(Protocol):
 
 
 class TwinPlant:
-    """The members of a twin, one for each start.
+    """The members of a twin, one for each start, or their mean.
 
     Parameters
     ----------
     dynamics : Dynamics
         The twin's.
-    members : sequence of int
-        Which acts after each start.
+    members : sequence of int, optional
+        Which acts after each start; by default the mean of all does.
     """
 
-    def __init__(self, dynamics: Dynamics, members: Iterable[int]) -> None:
-        self.dynamics, self.members = dynamics, [*members]
+    def __init__(self, dynamics: Dynamics, members: Iterable[int] | None = None) -> None:
+        self.dynamics, self.members = dynamics, None if members is None else [*members]
         self._known: dict[bytes, Dynamics] = {}
 
     def _acting(self, rows: Rows) -> Dynamics:
+        if self.members is None:
+            return self.dynamics
         key, every = rows.tobytes(), self.dynamics
         if key not in self._known:
             chosen = tuple(every.members[self.members[row]] for row in rows)
             self._known[key] = Dynamics(every.problem, every.coordinates, chosen)
         return self._known[key]
 
+    def advance(self, theta: Array, u: Array, rows: Rows) -> Array:
+        """Return the next rows of the twin (k, size), with what an observer remembers."""
+        acting = self._acting(rows)
+        if self.members is not None:
+            return np.asarray(acting.step(theta[:, None], u[:, None])[:, 0])
+        every = (len(acting.members), 1, 1)
+        after = acting.step(np.tile(theta, every), np.tile(u, every))
+        return np.asarray(after.mean(axis=0))
+
     def step(self, theta: Array, u: Array, rows: Rows) -> Array:
         """Return the next theta (k, n_theta); an estimated d stays, as in an env's plan."""
-        row, acting = self.dynamics.row, self._acting(rows)
-        after = acting.step(row.begin(theta)[:, None], u[:, None])[:, 0]
+        row, after = self.dynamics.row, self.advance(self.dynamics.row.begin(theta), u, rows)
         found, parts = row.shown(after).copy(), self.dynamics.problem.layout
         if row.observer is not None:
             found[:, parts.state] = after[:, row.state]
             found[:, parts.disturbance] = theta[:, parts.disturbance]
         return found
 
+    def _slopes(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return the derivatives of rows at theta (T, k, size) and u (T, k, m)."""
+        acting, (steps, k) = self._acting(rows), theta.shape[:2]
+        if self.members is not None:
+            swapped = np.swapaxes(theta, 0, 1), np.swapaxes(u, 0, 1)
+            A, B = (np.swapaxes(each, 0, 1) for each in acting.jacobians(*swapped))
+            return A, B
+        flat = (each.reshape(1, steps * k, -1) for each in (theta, u))
+        means = (each.mean(axis=0) for each in acting.jacobians(*flat))
+        A, B = (each.reshape(steps, k, *each.shape[1:]) for each in means)
+        return A, B
+
     def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
         """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
         row, parts = self.dynamics.row, self.dynamics.problem.layout
-        swapped = row.begin(np.swapaxes(theta, 0, 1)), np.swapaxes(u, 0, 1)
-        A, B = (np.swapaxes(each, 0, 1) for each in self._acting(rows).jacobians(*swapped))
+        A, B = self._slopes(row.begin(theta), u, rows)
         if row.observer is None:
             return A, B
         number, n = np.arange(parts.size), parts.size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -14,6 +15,16 @@ from sb3_yann.control.mpc.bound_excess import Bounds
 INSIDE, WEIGHT = 1e-3, 1e4
 """How far inside of the bounds plans stay, in half-widths; what one half-width beyond that costs in
 a step, in mean costs of a step."""
+
+
+class Doubt(Protocol):
+    """A price on what a model does not know, a sum of squares."""
+
+    def costs(self, thetas: Array, inputs: Array) -> Array:
+        """Return what steps cost (T, k), at thetas (T, k, n_theta) and inputs (T, k, m)."""
+
+    def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
+        """Return gradients (T, k, n_theta + m) and Gauss-Newton curvatures of that."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +41,8 @@ class Task:
         ``theta' end theta`` is the cost of what comes after the last step.
     weight : float
         What one half-width beyond a bound costs in a step, `WEIGHT` typical stage costs.
+    doubt : Doubt, optional
+        What a plan pays where the members of a model disagree.
     """
 
     problem: LinearMPC
@@ -37,6 +50,7 @@ class Task:
     high: Array
     end: Array
     weight: float
+    doubt: Doubt | None = None
 
     @cached_property
     def _bounds(self) -> Bounds:
@@ -49,6 +63,8 @@ class Task:
             end = np.sum((thetas[-1] @ self.end) * thetas[-1], axis=-1)
             outside = np.sum(self._bounds.beyond(thetas[1:], -INSIDE) ** 2, axis=(0, 2))
             total = stage + end + self.weight * outside
+            if self.doubt is not None:
+                total = total + self.doubt.costs(thetas[:-1], inputs).sum(axis=0)
         return np.where(np.isfinite(total), total, np.inf)
 
     def limits(self, thetas: Array) -> tuple[Array, Array]:

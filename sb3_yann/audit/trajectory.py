@@ -191,6 +191,10 @@ def _backward(
     F = np.concatenate([A, B], axis=-1)
     W = 2 * problem.stage_matrix
     slopes = np.concatenate([thetas[:-1], inputs], axis=-1) @ W
+    curved = np.broadcast_to(W, (len(inputs), len(rows), *W.shape))
+    if task.doubt is not None:
+        slope, more = task.doubt.slopes(thetas[:-1], inputs)
+        slopes, curved = slopes + slope, curved + more
     gradient, curvature = task.penalty(thetas[1:])
     limits = task.limits(thetas[:-1])
     low, high = (each - inputs for each in limits)
@@ -206,7 +210,7 @@ def _backward(
         V[:, states, states] += curvature[t]
         Ft = F[t].swapaxes(1, 2)
         q = slopes[t] + (Ft @ v[..., None])[..., 0]
-        H = W + Ft @ V @ F[t]
+        H = curved[t] + Ft @ V @ F[t]
         qx, qu = q[:, :size], q[:, size:]
         Hxx, Hux, Huu = H[:, :size, :size], H[:, size:, :size], H[:, size:, size:]
         move = _bounded_step(Huu + damped, qu, low[t], high[t])

@@ -23,13 +23,13 @@ from sb3_yann.commissioning.comparison import (
     is_kept,
     why_taken_back,
 )
-from sb3_yann.commissioning.improve import improve
 from sb3_yann.commissioning.incumbent import Incumbent
 from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
 from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
 from sb3_yann.compare import allowed_excess
+from sb3_yann.improvement import improve
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.rollout import Source, one_env
 from sb3_yann.twin.observers import observer_of
@@ -76,10 +76,8 @@ class Commissioning:
         models lie beside it.
     shadow : bool, default False
         The MPC acts throughout; the record shows what the policy would have done.
-    reidentify : bool, default True
-        As in :func:`improve`: a second search begins at the re-identified MPC.
-    iterations : int, default 120
-        Of :func:`improve`.
+    rounds, updates : int, default 4 and 4000
+        As in :func:`improve`.
     seed : int, default 0
         Of the episodes, the twins and the improvements.
     verbose : int, default 0
@@ -95,7 +93,7 @@ class Commissioning:
     >>> from stable_baselines3 import DDPG
     >>> from sb3_yann import Commissioning
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> first = Commissioning(model, "CSTR-v0", batch=2, iterations=20).run(batches=1)[0]
+    >>> first = Commissioning(model, "CSTR-v0", batch=2, updates=500).run(batches=1)[0]
     >>> first.acted, first.episodes
     ('MPC', 2)
     """
@@ -109,8 +107,8 @@ class Commissioning:
         max_correction: float = 0.1,
         log_path: str | PathLike[str] | None = None,
         shadow: bool = False,
-        reidentify: bool = True,
-        iterations: int = 120,
+        rounds: int = 4,
+        updates: int = 4000,
         seed: int = 0,
         verbose: int = 0,
     ) -> None:
@@ -125,8 +123,9 @@ class Commissioning:
         self.batch = check_int("batch", batch, 2)
         self.smallest = check_range("max_correction", max_correction, 0, 1, "(]")
         self.shadow = check_bool("shadow", shadow)
-        self.reidentify = check_bool("reidentify", reidentify)
-        self.iterations, self.seed = check_int("iterations", iterations), check_int("seed", seed, 0)
+        self.rounds = check_int("rounds", rounds)
+        self.updates = check_int("updates", updates)
+        self.seed = check_int("seed", seed, 0)
         self.twin: PlantTwin | None = None
         self.watchdog: Watchdog | None = None
         self.observer = observer_of(model.get_env()) or observer_of(plant_env)
@@ -294,8 +293,7 @@ class Commissioning:
         self.incumbent.take_candidate()
         held = ActorCheckpoint.of(self.policy)
         self.incumbent.limit(outlook.max_correction)
-        reidentify, count = self.reidentify, self.iterations
-        found = improve(self.model, twin, count, reidentify=reidentify, seed=seed)
+        found = improve(self.model, twin, rounds=self.rounds, updates=self.updates, seed=seed)
         before = found.before
         if found.accepted or (before is not None and before.accepted):
             return outlook, "accepted", f"{100 * found.change:+.2f} % in the twin."
@@ -341,8 +339,8 @@ class Commissioning:
             "batch": self.batch,
             "max_correction": self.smallest,
             "shadow": self.shadow,
-            "reidentify": self.reidentify,
-            "iterations": self.iterations,
+            "rounds": self.rounds,
+            "updates": self.updates,
             "seed": self.seed,
             "learner": learner,
             "problem": hashlib.sha256(numbers).hexdigest()[:16],

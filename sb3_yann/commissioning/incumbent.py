@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,8 +9,13 @@ from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann.policy.checkpoint import ActorCheckpoint, Tensors
-from sb3_yann.policy.policies import YannPolicy, require_yann_policy
+from sb3_yann.policy.checkpoint import (
+    ActorCheckpoint,
+    all_or_nothing,
+    restore_whole,
+    whole_policy,
+)
+from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.rollout import preserve_rng
 
 
@@ -76,7 +80,7 @@ class Incumbent:
         """
         if self._shown is not None:
             return
-        whole = _whole(self.policy), self.policy.max_correction
+        whole = whole_policy(self.policy), self.policy.max_correction
         if self._kept is None:
             self.give_back()
         else:
@@ -96,7 +100,7 @@ class Incumbent:
             shown, (whole, its_bound) = self._shown
             self._shown = None
             if shown.is_actor_of(self.policy):
-                _restore_whole(self.policy, whole)
+                restore_whole(self.policy, whole)
                 self.limit(its_bound)
         if held.is_actor_of(self.policy) and bound == self.policy.max_correction:
             return
@@ -123,29 +127,3 @@ class Incumbent:
             self._kept = kept
             raise
         self.hold()
-
-
-@contextmanager
-def all_or_nothing(policy: YannPolicy) -> Iterator[None]:
-    """Undo what happens to a policy's weights and optimizers, if an error or Ctrl-C cuts it off."""
-    whole = _whole(policy)
-    try:
-        yield
-    except BaseException:
-        _restore_whole(policy, whole)
-        raise
-
-
-def _whole(policy: YannPolicy) -> tuple[Tensors, list[Any]]:
-    """Return a copy of a policy's weights, and of its optimizers' states."""
-    optimizers = policy.actor.optimizer, policy.critic.optimizer
-    weights = {name: each.clone() for name, each in policy.state_dict().items()}
-    return weights, [copy.deepcopy(each.state_dict()) for each in optimizers]
-
-
-def _restore_whole(policy: YannPolicy, whole: tuple[Tensors, list[Any]]) -> None:
-    weights, states = whole
-    policy.load_state_dict(weights)
-    optimizers = policy.actor.optimizer, policy.critic.optimizer
-    for optimizer, state in zip(optimizers, states, strict=True):
-        optimizer.load_state_dict(copy.deepcopy(state))

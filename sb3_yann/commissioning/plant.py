@@ -16,10 +16,10 @@ from sb3_yann.commissioning.watchdog import Alarm, Watchdog
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess
+from sb3_yann.improvement.imitation import policy_of
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.twin.dynamics import law_of
-from sb3_yann.twin.gradient import actor
 from sb3_yann.twin.replay_buffer import normalization_of
 
 Inputs = Callable[[Array], Array]
@@ -96,7 +96,7 @@ class Plant:
         """Return the policy's inputs (rows, m); the MPC's where they are not finite."""
         layer = self.yann.actor.mu
         if self.device.type == "cpu":
-            u = actor(layer, self.problem)(theta)
+            u = policy_of(layer, self.problem)(theta)
         else:
             with th.no_grad():
                 actions = layer(th.as_tensor(theta, device=self.device)).double().cpu().numpy()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -151,6 +152,33 @@ class ActorCheckpoint:
         for tensors in (mixed.actor, mixed.target):
             tensors[last] = share * tensors[last]
         return mixed
+
+
+@contextmanager
+def all_or_nothing(policy: YannPolicy) -> Iterator[None]:
+    """Undo what happens to a policy's weights and optimizers, if an error or Ctrl-C cuts it off."""
+    whole = whole_policy(policy)
+    try:
+        yield
+    except BaseException:
+        restore_whole(policy, whole)
+        raise
+
+
+def whole_policy(policy: YannPolicy) -> tuple[Tensors, list[Any]]:
+    """Return a copy of a policy's weights, and of its optimizers' states."""
+    optimizers = policy.actor.optimizer, policy.critic.optimizer
+    weights = {name: each.clone() for name, each in policy.state_dict().items()}
+    return weights, [copy.deepcopy(each.state_dict()) for each in optimizers]
+
+
+def restore_whole(policy: YannPolicy, whole: tuple[Tensors, list[Any]]) -> None:
+    """Give a policy back what :func:`whole_policy` copied."""
+    weights, states = whole
+    policy.load_state_dict(weights)
+    optimizers = policy.actor.optimizer, policy.critic.optimizer
+    for optimizer, state in zip(optimizers, states, strict=True):
+        optimizer.load_state_dict(copy.deepcopy(state))
 
 
 def _have_same_box(ours: Tensors, theirs: Tensors) -> bool:

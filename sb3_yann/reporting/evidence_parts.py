@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.type_aliases import TrainFreq
 
-from sb3_yann.commissioning.improve import fingerprint
 from sb3_yann.control import PiecewiseAffine
 from sb3_yann.evaluation.plots import decisions_figure, headroom_figure, twin_figure
 from sb3_yann.guard import Decision
 from sb3_yann.guard.state import summary_of
+from sb3_yann.improvement.improve import fingerprint
 from sb3_yann.reporting.html import Html, join, lines, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import Finding, Part, Subject, left_out, make_finding
 from sb3_yann.rollout import name_of

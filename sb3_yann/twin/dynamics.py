@@ -63,6 +63,12 @@ class Coordinates:
         """Return what residuals are fed, inside the box."""
         return np.asarray(np.clip(features, self.low, self.high) / self.scale)
 
+    def regression(self, episode: Episode) -> tuple[Array, Array]:
+        """Return z (T, k), and what the linear model leaves of the next states (T, n)."""
+        row, rows, u = self.row, episode.thetas, episode.actions
+        linear = np.concatenate([rows[:-1], u], axis=1) @ row.linear[row.state].T
+        return self.scaled(row.features(rows[:-1], u)), rows[1:, row.state] - linear
+
 
 def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
     """Return the law as a function of rows (batch, n_theta); NaN where one is not finite."""
@@ -154,7 +160,7 @@ class Dynamics:
         J = self._each("jacobian", self.coordinates.scaled(at))
         inside = (at > self.coordinates.low) & (at < self.coordinates.high)
         J = J * (inside / self.coordinates.scale)[..., None, :]
-        whole = np.broadcast_to(row.linear, (*at.shape[:-1], *row.linear.shape)).copy()
+        whole = np.broadcast_to(row.linear, (*J.shape[:-2], *row.linear.shape)).copy()
         whole[..., row.inputs] += row.spread @ J
         if row.observer is not None:  # on its bounds the shown estimate does not move
             free = row.clip(self.step(theta, u))

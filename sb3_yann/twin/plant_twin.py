@@ -25,9 +25,25 @@ from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.sampling import cut_at_gaps
-from sb3_yann.twin.selection import FOLDS, Candidate, candidates, choose, fitted
+from sb3_yann.twin.selection import (
+    FOLDS,
+    MORE_THAN_A_POLYNOMIAL,
+    NETWORK,
+    Networks,
+    candidates,
+    choose,
+    fitted,
+    networks_may_help,
+)
 from sb3_yann.twin.starts import Starts
-from sb3_yann.twin.trust import Trust, UntrustedTwinError, evidence
+from sb3_yann.twin.trust import (
+    Trust,
+    UntrustedTwinError,
+    costs_of_each,
+    evidence,
+    held_out_costs,
+    relative_error,
+)
 from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
 
 if TYPE_CHECKING:
@@ -35,7 +51,7 @@ if TYPE_CHECKING:
 
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
-KINDS = ("none", "linear", "quadratic", "cubic")
+KINDS = ("none", "linear", "quadratic", "cubic", "network")
 SHORT = 0.1
 """The least length of a second opinion, relative to the largest values in the log."""
 
@@ -135,9 +151,10 @@ class PlantTwin:
             The one whose estimates x and d of theta are, of all states: that of
             :class:`ObserveDisturbance`. Without ``disturbances`` states (T + 1, n) are what it
             measured, and it is run over them.
-        residuals : sequence, default ("none", "linear", "quadratic", "cubic")
-            What there is to choose from; "gaussian process" and "network" take longer. A function
-            makes a regressor with ``fit(z, y)`` and ``predict(z)``, as scikit-learn has it.
+        residuals : sequence, default ("none", "linear", "quadratic", "cubic", "network")
+            What there is to choose from; "gaussian process" takes longer. Networks are tried where
+            nothing else predicts well. A function makes a regressor with ``fit(z, y)`` and
+            ``predict(z)``, as scikit-learn has it.
         n_members : int, default 5
             The first is fitted to all episodes, the others to as many drawn from them.
         seed : int, default 0
@@ -163,8 +180,8 @@ class PlantTwin:
         check_bool("absolute", absolute)
         check_bool("units_confirmed", units_confirmed)
         row, given = RowLayout(problem, observer), (references, disturbances, previous)
-        found = observer is not None
-        log = as_episodes(problem, episodes, *given, observed=found, absolute=absolute)
+        observed = observer is not None
+        log = as_episodes(problem, episodes, *given, observed=observed, absolute=absolute)
         notes: tuple[str, ...] = ()
         if time is not None:
             log, notes = cut_at_gaps(log, time, problem.model.dt)
@@ -173,19 +190,36 @@ class PlantTwin:
         if observer is None:
             warn_of_estimates(problem, log)
         log = tuple(Episode(*row.recovered(each.thetas, each.actions)) for each in log)
-        coordinates, rng = Coordinates.of(problem, log, observer), np.random.default_rng(seed)
-        asked = candidates(problem, residuals, rng)
+        coordinates = Coordinates.of(problem, log, observer)
+        asked = candidates(problem, residuals)
         # The model as it is comes first, to compare with, whether it may be chosen or not.
         others = [each for each in asked if each.name != "none"]
-        choices = [*candidates(problem, ["none"], rng), *others]
-        parts, first = pieces(log, FOLDS), int(len(others) == len(asked))
+        choices = [*candidates(problem, ["none"]), *others]
+        parts, first = pieces(log, FOLDS), int(bool(asked) and len(others) == len(asked))
         runs, chosen = choose(problem, coordinates, parts, choices, first)
-        choice = choices[chosen]
-        drawn = log if len(log) >= FOLDS else pieces(log, BLOCKS)
-        members = _members(problem, coordinates, drawn, choice, n_members, seed)
+        blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
+        draws = np.random.default_rng(seed).integers(len(blocks), size=(n_members - 1, len(blocks)))
+        drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
+        known, networks = held_out_costs(problem, coordinates, parts, choices[chosen]), None
+        error, alone = relative_error(*known), not asked
+        if NETWORK in residuals and len(parts) > 1 and (alone or networks_may_help(error, parts)):
+            tried = Networks.fit(coordinates, parts, drawn, seed)
+            runs = tried.compared(problem, coordinates, parts, runs)
+            freedom = [each.freedom for each in choices] + [2 * MORE_THAN_A_POLYNOMIAL]
+            chosen = first + runs.from_number(first).choose(freedom[first:])
+            chosen = len(choices) if alone else chosen
+            networks = tried if chosen == len(choices) else None
+        if networks is None:
+            make = choices[chosen].make
+            found = [fitted(problem, coordinates, each, [make()])[0] for each in drawn]
+            members: tuple[Residual, ...] = tuple(found)
+        else:
+            members = networks.members
+            by_part = [networks.by_fold[i % FOLDS] for i in range(len(parts))]
+            known = costs_of_each(problem, coordinates, parts, by_part)
         dynamics = Dynamics(problem, coordinates, members)
-        trust = evidence(dynamics, parts, (choices, chosen, runs), units_confirmed)
-        return cls(problem, log, choice.name, dynamics, trust, notes)
+        trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
+        return cls(problem, log, runs.names[chosen], dynamics, trust, notes)
 
     @classmethod
     def from_buffer(cls, model: Any, **options: Any) -> PlantTwin:
@@ -314,20 +348,3 @@ class PlantTwin:
     def vec_env(self, n_envs: int, member: int | None = None) -> TwinVecEnv:
         """Return as many of :meth:`env`, which step as one array, for Stable-Baselines3."""
         return TwinVecEnv(copies(self.env(member), n_envs))
-
-
-def _members(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    log: tuple[Episode, ...],
-    choice: Candidate,
-    n_members: int,
-    seed: int,
-) -> tuple[Residual, ...]:
-    """Return one residual fitted to all episodes, and others to episodes drawn from them."""
-    rng = np.random.default_rng(seed)
-    members = fitted(problem, coordinates, log, [choice.make()])
-    for _ in range(n_members - 1):
-        drawn = rng.integers(len(log), size=len(log))
-        members += fitted(problem, coordinates, [log[i] for i in drawn], [choice.make()])
-    return tuple(members)

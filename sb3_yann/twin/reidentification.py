@@ -23,7 +23,7 @@ def reidentified(
     problem, coordinates, log : LinearMPC, Coordinates and tuple of Episode
         Of a twin; two episodes at least.
     """
-    choices = candidates(problem, ["none", "linear"], np.random.default_rng(0))
+    choices = candidates(problem, ["none", "linear"])
     _, chosen = choose(problem, coordinates, pieces(log, FOLDS), choices, 0)
     if chosen == 0:
         return problem

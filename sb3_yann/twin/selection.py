@@ -9,23 +9,29 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.ensemble import NetworkResidual, fit_ensemble
 from sb3_yann.twin.gaussian_process import GaussianProcess
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.network import Network
 from sb3_yann.twin.residuals import Nothing, Polynomial, Regressor, Residual
 
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
 INPUT_FACTORS = (1.0, 30.0)
 STIFFNESSES = (1.0, 10.0, 100.0)
-DECAYS = (1e-4, 1e-3, 1e-2)
 MORE_THAN_A_POLYNOMIAL = 20.0
-"""Freedom of a Gaussian process, and half that of a network: they are taken where they win."""
-NAMES = ("none", *DEGREES, "gaussian process", "network")
+"""Freedom of a Gaussian process, and half that of networks: they are taken where they win."""
+NETWORK = "network"
+AHEAD = 20
+"""Steps of the windows that networks are fitted to."""
+ROWS, LACKS = 300, 0.05
+"""Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
+episodes err by so much of the mean."""
+NAMES = ("none", *DEGREES, "gaussian process", NETWORK)
 LONGEST = 100
 """Steps of a free run, at most."""
 RUNS = 20
@@ -51,16 +57,14 @@ class Candidate:
     freedom: float
 
 
-def candidates(
-    problem: LinearMPC, kinds: Sequence[Any], rng: np.random.Generator
-) -> list[Candidate]:
-    """Return what there is to choose from; a kind is a name, or makes something with fit."""
+def candidates(problem: LinearMPC, kinds: Sequence[Any]) -> list[Candidate]:
+    """Return what there is to choose from but networks; a kind is a name, or makes a regressor."""
     if isinstance(kinds, str) or not kinds:
         raise ValueError(f"residuals = {kinds!r} must be a list with at least one kind.")
-    return [each for kind in kinds for each in _of_a_kind(problem, kind, rng)]
+    return [each for k in kinds if k != NETWORK for each in _of_a_kind(problem, k)]
 
 
-def _of_a_kind(problem: LinearMPC, kind: Any, rng: np.random.Generator) -> Iterator[Candidate]:
+def _of_a_kind(problem: LinearMPC, kind: Any) -> Iterator[Candidate]:
     offset = problem.layout.has_constants
     if kind == "none":
         yield Candidate("none", partial(Nothing, problem.model.n_states), -np.inf)
@@ -75,11 +79,6 @@ def _of_a_kind(problem: LinearMPC, kind: Any, rng: np.random.Generator) -> Itera
             process = partial(GaussianProcess, offset, stiffness)
             freedom = MORE_THAN_A_POLYNOMIAL - np.log10(stiffness)
             yield Candidate(f"{kind}, stiffness {stiffness:g}", process, freedom)
-    elif kind == "network":
-        for decay in DECAYS:
-            network = partial(Network, rng, decay, offset)
-            freedom = 2 * MORE_THAN_A_POLYNOMIAL - np.log10(decay)
-            yield Candidate(f"{kind}, decay {decay:g}", network, freedom)
     elif callable(kind):
         name = getattr(kind, "__name__", type(kind).__name__)
         yield Candidate(name, partial(Regressor, kind), np.inf)
@@ -109,7 +108,7 @@ def fitted(
     made : sequence
         Residuals that are not fitted yet.
     """
-    z, y = zip(*(regression(coordinates, each) for each in episodes), strict=True)
+    z, y = zip(*(coordinates.regression(each) for each in episodes), strict=True)
     z_all, y_all = np.concatenate(z), np.concatenate(y)
     moments: dict[tuple[int, bool], Any] = {}  # which do not depend on the shrinkage
     for residual in made:
@@ -121,13 +120,6 @@ def fitted(
         elif not isinstance(residual, Nothing):
             residual.fit(z_all, y_all)
     return list(made)
-
-
-def regression(coordinates: Coordinates, episode: Episode) -> tuple[Array, Array]:
-    """Return z (T, k), and what the linear model leaves of the next states (T, n)."""
-    row, rows, u = coordinates.row, episode.thetas, episode.actions
-    linear = np.concatenate([rows[:-1], u], axis=1) @ row.linear[row.state].T
-    return coordinates.scaled(row.features(rows[:-1], u)), rows[1:, row.state] - linear
 
 
 @dataclass(frozen=True)
@@ -151,12 +143,16 @@ class FreeRuns:
         """Root mean squares over all episodes, (candidates, h)."""
         return np.asarray(np.sqrt(np.nanmean(self.by_episode**2, axis=1)))
 
+    def from_number(self, first: int) -> FreeRuns:
+        """Return those of the candidates from a number on."""
+        return FreeRuns(self.horizons, self.by_episode[first:], self.names[first:])
+
     @property
     def scores(self) -> Array:
         """The mean logarithm over horizons, (candidates, episodes): less is better."""
         return np.asarray(np.nanmean(np.log(self.by_episode + 1e-12), axis=2))
 
-    def choose(self, freedom: Array) -> int:
+    def choose(self, freedom: ArrayLike) -> int:
         """Return the least free candidate that is within one standard error of the best.
 
         The error is that of the difference of the two, over episodes (the one-standard-error rule
@@ -169,7 +165,56 @@ class FreeRuns:
         error = behind.std(axis=1, ddof=1) / np.sqrt(behind.shape[1])
         near = behind.mean(axis=1) <= error
         near[best] = True
-        return int(np.flatnonzero(near)[np.argmin(freedom[near])])
+        return int(np.flatnonzero(near)[np.argmin(np.asarray(freedom)[near])])
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Networks of a log.
+
+    Attributes
+    ----------
+    by_fold : tuple of NetworkResidual
+        Each has not seen one fold of the episodes.
+    members : tuple of NetworkResidual
+        The first one has seen all, the others what was drawn.
+    """
+
+    by_fold: tuple[NetworkResidual, ...]
+    members: tuple[NetworkResidual, ...]
+
+    @classmethod
+    def fit(
+        cls,
+        coordinates: Coordinates,
+        parts: Sequence[Episode],
+        drawn: Sequence[Sequence[Episode]],
+        seed: int,
+    ) -> Networks:
+        """Return those of a log: one without each fold of its parts, one for each of the drawn."""
+        kept = [[e for i, e in enumerate(parts) if i % FOLDS != k] for k in range(_folds(parts))]
+        found = fit_ensemble(coordinates, [*kept, *drawn], seed, ahead=AHEAD)
+        return cls(tuple(found[: len(kept)]), tuple(found[len(kept) :]))
+
+    def compared(
+        self, problem: LinearMPC, coordinates: Coordinates, parts: Sequence[Episode], runs: FreeRuns
+    ) -> FreeRuns:
+        """Return free runs of other candidates, with those of the networks behind them."""
+        found = np.empty((1, *runs.by_episode.shape[1:]))
+        for i, each in enumerate(parts):
+            mine = [self.by_fold[i % FOLDS]]
+            found[:, i] = np.sqrt(_errors(problem, coordinates, each, mine, runs.horizons))
+        errors = np.concatenate([runs.by_episode, found])
+        return FreeRuns(runs.horizons, errors, (*runs.names, NETWORK))
+
+
+def networks_may_help(error: float, episodes: Sequence[Episode]) -> bool:
+    """Return whether a log is long enough for networks, and lacks a model without them."""
+    return sum(map(len, episodes)) >= ROWS and not error <= LACKS
+
+
+def _folds(parts: Sequence[Episode]) -> int:
+    return min(FOLDS, len(parts))
 
 
 def held_out(
@@ -232,8 +277,8 @@ def choose(
         errors = np.full((len(choices), 1, 1), np.inf)
         return FreeRuns(np.array([1]), errors, tuple(each.name for each in choices)), first
     runs = held_out(problem, coordinates, log, choices)
-    asked = FreeRuns(runs.horizons, runs.by_episode[first:], runs.names[first:])
-    return runs, first + asked.choose(np.array([each.freedom for each in choices[first:]]))
+    freedom = [each.freedom for each in choices[first:]]
+    return runs, first + runs.from_number(first).choose(freedom)
 
 
 def _errors(

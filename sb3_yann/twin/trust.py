@@ -17,6 +17,7 @@ from sb3_yann.control.model.labels import labels_of, name_of
 from sb3_yann.twin.alignment import objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
 from sb3_yann.twin.log import Episode, records
+from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.selection import Candidate, FreeRuns, fitted
 
 COST_ERROR = 0.25
@@ -29,6 +30,8 @@ POOR = 2.0
 """From so many times on, a report asks whether it is the same plant."""
 OUTSIDE = 0.05
 """Share of logged rows beyond the box of theta from which on units are doubted."""
+LAW = 1e-3
+"""How far an input may be from the MPC's own, in half-widths."""
 PREVIOUS = 0.01
 """How far theta's previous input may be from the one before it, in half-widths."""
 ROUNDING = 1e-6
@@ -130,10 +133,22 @@ def held_out_costs(
     """
     if len(episodes) < 2:
         return np.empty(0), np.empty(0)
-    predicted = []
-    for i, episode in enumerate(episodes):
+    unaware = []
+    for i in range(len(episodes)):
         others = episodes[:i] + episodes[i + 1 :]
-        (residual,) = fitted(problem, coordinates, others, [choice.make()])
+        unaware += fitted(problem, coordinates, others, [choice.make()])
+    return costs_of_each(problem, coordinates, episodes, unaware)
+
+
+def costs_of_each(
+    problem: LinearMPC,
+    coordinates: Coordinates,
+    episodes: tuple[Episode, ...],
+    unaware: Sequence[Residual],
+) -> tuple[Array, Array]:
+    """Return predicted and actual costs of episodes, of each by a residual that has not seen it."""
+    predicted = []
+    for residual, episode in zip(unaware, episodes, strict=True):
         with np.errstate(all="ignore"):
             cost = Dynamics(problem, coordinates, (residual,)).replay_in_closed_loop(episode)
         predicted.append(float(np.nan_to_num(cost[0], nan=1e150, posinf=1e150)))
@@ -161,6 +176,15 @@ def excitation(problem: LinearMPC, episodes: tuple[Episode, ...]) -> tuple[Array
     variance = np.var(u, axis=0)
     share = np.where(variance > 0, np.var(left, axis=0) / np.maximum(variance, 1e-300), 0.0)
     return share, np.sqrt(variance) / problem.u_half
+
+
+def follows_law(problem: LinearMPC, episodes: tuple[Episode, ...]) -> bool:
+    """Return whether nearly every logged input is the MPC's own, so its units are beyond doubt."""
+    theta = np.concatenate([each.thetas[:-1, : problem.n_theta] for each in episodes])
+    u = np.concatenate([each.actions for each in episodes])
+    apart = np.abs(u - law_of(problem)(theta)) / problem.u_half
+    moves = np.std(u, axis=0) / problem.u_half > STILL
+    return bool(moves.all() and np.mean((apart <= LAW).all(axis=1)) >= 1 - OUTSIDE)
 
 
 def beyond_the_box(problem: LinearMPC, episodes: tuple[Episode, ...]) -> Array:
@@ -287,7 +311,7 @@ def judge(
 def evidence(
     dynamics: Dynamics,
     log: tuple[Episode, ...],
-    found: tuple[list[Candidate], int, FreeRuns],
+    found: tuple[FreeRuns, int, tuple[Array, Array]],
     units_confirmed: bool = False,
 ) -> Trust:
     """Return the evidence for a twin.
@@ -298,17 +322,17 @@ def evidence(
         The twin's.
     log : tuple of Episode
         Each is left out once.
-    found : tuple of list, int and FreeRuns
-        The candidates, which was chosen, and their free runs.
+    found : tuple of FreeRuns, int and pair of ndarray
+        Free runs of the candidates, which was chosen, and its predicted costs beside the actual.
     units_confirmed : bool, default False
         As in :meth:`PlantTwin.fit`.
     """
-    (choices, chosen, runs), problem = found, dynamics.problem
+    runs, chosen, costs = found
+    problem = dynamics.problem
     coordinates, row = dynamics.coordinates, dynamics.row
     standing = standing_still(coordinates, log, runs.horizons)
-    costs = held_out_costs(problem, coordinates, log, choices[chosen])
     inputs = excitation(problem, log)
-    shares = beyond_the_box(problem, log)
+    shares = beyond_the_box(problem, log) * (not follows_law(problem, log))
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]
     names = problem.model.input_names
     independent = sum(len(each[::2]) for each in records(log))

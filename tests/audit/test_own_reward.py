@@ -144,5 +144,5 @@ def test_headroom_and_improve_tell_once_and_point_to_the_call() -> None:
     assert [each.filename for each in found] == [__file__]
     model = DDPG("YannPolicy", env, policy_kwargs={"problem": problem}, device="cpu")
     with pytest.warns(CostMismatchWarning, match="it is ignored") as found:
-        improve(model, env, iterations=1, n_starts=2)
+        improve(model, env, updates=1, n_starts=2, rounds=1)
     assert [each.filename for each in found] == [__file__]

@@ -51,7 +51,7 @@ def test_a_log_in_the_plants_units_improves_a_policy_that_acts_in_them(tmp_path)
     twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], absolute=True)
     assert twin.trusted
     model = DDPG("YannPolicy", AbsoluteCart(), policy_kwargs={"problem": mpc}, seed=0)
-    found = improve(model, twin, iterations=30)
+    found = improve(model, twin, updates=1000, n_starts=10)
     assert found.accepted and str(found).startswith("Accepted: -")
     model.save(tmp_path / "model")
     again = DDPG.load(tmp_path / "model", env=AbsoluteCart())

@@ -33,7 +33,7 @@ from weights import is_mpc
 def commission(path: Any = None, env: Any = Cart, **options: Any) -> Commissioning:
     """Return a short commissioning of the cart."""
     model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
-    options = {"batch": 5, "iterations": 40, "max_correction": 0.2} | options
+    options = {"batch": 5, "updates": 1000, "max_correction": 0.2} | options
     return Commissioning(model, env, log_path=path, **options)
 
 
@@ -95,7 +95,7 @@ def test_what_noise_costs_is_not_held_against_the_policy() -> None:
             observation, *rest = super().step(action)
             return (observation + 0.001 * rng.standard_normal(2).astype(np.float32), *rest)
 
-    run = commission(env=Noisy, iterations=1)
+    run = commission(env=Noisy, updates=1)
     first = run.run(1)[0]
     twin = run._fit(run.journal.log, 1)
     with one_env(Noisy) as env:
@@ -266,7 +266,7 @@ def test_what_the_model_had_learnt_before_waits_for_its_test() -> None:
     with th.no_grad():
         for each in model.policy.actor.parameters():
             each.add_(0.01)
-    run = Commissioning(model, Cart, batch=3, iterations=1)
+    run = Commissioning(model, Cart, batch=3, updates=1)
     assert is_mpc(model) and run.incumbent.candidate is not None
 
 
@@ -318,7 +318,7 @@ def test_another_cost_is_another_commissioning(tmp_path) -> None:
     model = DDPG(YannPolicy, Cart(), seed=0, device="cpu")
     other = replace(problem(), Q=np.diag([1.5, 0.1]))
     model = DDPG(YannPolicy, Cart(), policy_kwargs={"problem": other}, device="cpu")
-    options = {"batch": 5, "iterations": 40, "max_correction": 0.2}
+    options = {"batch": 5, "updates": 1000, "max_correction": 0.2}
     with pytest.raises(ValueError, match="begun with problem"):
         Commissioning(model, Cart, log_path=tmp_path, **options)
 
@@ -363,7 +363,7 @@ def test_shadow_computes_and_does_not_act() -> None:
         ({"batch": 1}, "batch = 1"),
         ({"max_correction": 0.0}, "max_correction = 0"),
         ({"env": 3}, "plant_env = 3"),
-        ({"iterations": 0}, "iterations = 0"),
+        ({"updates": 0}, "updates = 0"),
         ({"seed": -1}, "seed = -1"),
     ],
 )
@@ -446,7 +446,7 @@ def test_a_reward_of_its_own_decides_what_is_kept() -> None:
 
 
 def test_a_reward_that_is_the_stage_cost_up_to_a_line_is_no_reward_of_its_own() -> None:
-    run = commission(iterations=1)
+    run = commission(updates=1)
     run.run(1)
     assert not pays_its_own(problem(), run.episodes)
     for factor, offset in ((0.01, 0.0), (3.0, -50.0), (0.0, 0.0)):

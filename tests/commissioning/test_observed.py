@@ -39,7 +39,7 @@ def test_the_twin_predicts_what_episodes_cost_that_it_has_not_seen() -> None:
 
 def test_what_is_improved_in_the_twin_is_better_on_the_plant() -> None:
     ours = model()
-    found = improve(ours, observed(), iterations=80)
+    found = improve(ours, observed(), updates=2000, n_starts=20)
     seeds = range(800, 840)
     mpc = evaluate(offset_free_problem()[0].explicit(), plant, seeds).costs
     change = evaluate(ours, plant, seeds).costs - mpc
@@ -64,7 +64,7 @@ def test_the_watchdog_is_quiet_and_sees_what_the_observer_smooths() -> None:
 
 
 def test_commissioning_takes_the_observer_of_the_env() -> None:
-    run = Commissioning(model(), plant(), batch=3, iterations=20)
+    run = Commissioning(model(), plant(), batch=3, updates=500)
     batches = run.run(batches=1)
     assert run.twin is not None and run.twin.dynamics.row.observer is not None
     assert run.twin.trusted and batches[0].acted == "MPC"

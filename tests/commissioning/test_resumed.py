@@ -43,7 +43,7 @@ def model(n_envs: int = 1, **options: Any) -> DDPG:
 @pytest.fixture(autouse=True)
 def small_gains_count(monkeypatch) -> None:
     """These runs are short, and gain little."""
-    module = importlib.import_module("sb3_yann.commissioning.improve")
+    module = importlib.import_module("sb3_yann.improvement.improve")
     monkeypatch.setattr(module, "OF_COST_ERROR", 0.0)
 
 
@@ -62,7 +62,7 @@ def test_a_twin_that_was_saved_predicts_and_improves_as_before() -> None:
     found = []
     for each in (again, twin()):
         learner = model()
-        said = improve(learner, each, iterations=6, batch=10, n_starts=5, reidentify=False)
+        said = improve(learner, each, updates=500, n_starts=5)
         found.append([all_bits(said), model_bits(learner)])
         assert said.accepted
     assert found[0] == found[1]
@@ -73,7 +73,7 @@ def test_a_twin_that_was_saved_predicts_and_improves_as_before() -> None:
 
 def commission(path: Any, learner: DDPG | None = None) -> Commissioning:
     learner = model() if learner is None else learner
-    options = {"batch": 4, "iterations": 20, "max_correction": 0.2, "reidentify": False}
+    options = {"batch": 4, "updates": 500, "max_correction": 0.2}
     return Commissioning(
         learner, partial(Short, 2 * STEPS), log_path=path / "plant.jsonl", **options
     )

@@ -10,7 +10,7 @@ import pytest
 from stable_baselines3 import DDPG
 
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, improve
-from sb3_yann.commissioning.trial import Check, Trial
+from sb3_yann.improvement.trial import Check, Trial
 from sb3_yann_envs import ProblemBox
 from twin_samples import Cart, log, problem
 
@@ -106,4 +106,4 @@ def test_the_second_opinion_knows_the_log_and_nothing_beyond() -> None:
 def test_what_gains_on_the_plant_passes() -> None:
     twin = PlantTwin.fit(problem(), log(5))
     model = DDPG("YannPolicy", Cart(), device="cpu", seed=0)
-    assert improve(model, twin, iterations=40).accepted
+    assert improve(model, twin, updates=1000, n_starts=20).accepted

@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sb3_yann.commissioning.grounds import TwinGrounds
-from sb3_yann.commissioning.trial import Check, Trial
+from sb3_yann.improvement.trial import Check, Trial
 from sb3_yann.twin.dynamics import law_of
 from twin_samples import observed, twin
 
 
 def trial() -> Trial:
     """Return one of a plant whose set-points change amid an episode."""
-    return TwinGrounds(observed(), n_runs=5, n_starts=12, seed=0).trial
+    return Trial.draw(observed(), 12, np.random.default_rng([0, 1]))
 
 
 def test_every_other_start_goes_on_with_the_set_points_of_a_logged_episode() -> None:
@@ -33,7 +32,7 @@ def test_every_other_start_goes_on_with_the_set_points_of_a_logged_episode() -> 
 
 
 def test_without_set_points_all_that_begin_as_the_log_does_count() -> None:
-    found = TwinGrounds(twin(), n_runs=5, n_starts=12, seed=0).trial
+    found = Trial.draw(twin(), 12, np.random.default_rng([0, 1]))
     assert (found.follow >= 0).tolist() == [True] * 12 + [False] * 12
 
 

@@ -32,9 +32,9 @@ from sb3_yann import (
     offset_free,
     report,
 )
-from sb3_yann.commissioning.improve import Improvement
-from sb3_yann.commissioning.trial import Check
 from sb3_yann.evaluation import evaluate
+from sb3_yann.improvement.improve import Improvement
+from sb3_yann.improvement.trial import Check
 from sb3_yann.reporting import assemble, evidence_parts, loop_parts, problem_parts
 from sb3_yann_envs import problems
 from weights import last_layer, unpin
@@ -328,7 +328,7 @@ def improved(tmp_path_factory):
     """A saved and loaded model that `improve` has made better in a twin, the twin, and its page."""
     twin, problem = twin_samples.twin(), twin_samples.problem()
     model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": problem}, device="cpu", seed=0)
-    found = improve(model, twin, iterations=30, n_starts=7)
+    found = improve(model, twin, updates=1000, n_starts=7)
     assert found.accepted
     folder = tmp_path_factory.mktemp("improved")
     model.save(folder / "model.zip")
@@ -348,7 +348,7 @@ def test_what_improve_did_travels_with_the_model_and_is_on_the_page(improved) ->
     text, (found,) = Outline(page).text, model.improvements
     for said in (
         "The policy is the one that improve accepted last, in the twin (5 episodes",
-        found.report(), found.source, "n starts 7", "iterations 30",
+        found.report(), found.source, "n starts 7", "updates 1000",
     ):  # fmt: skip
         assert said in text
     assert "nothing has confirmed" not in text and found.settings["n_starts"] == 7

@@ -19,17 +19,14 @@ from sb3_yann.twin.selection import (
     choose,
     fitted,
     held_out,
-    regression,
 )
 from twin_samples import problem
 from twin_samples import random_episode as episode
 
-RNG = np.random.default_rng(0)
-
 
 @pytest.mark.parametrize(("kind", "degree"), [("linear", 1), ("quadratic", 2), ("cubic", 3)])
 def test_polynomials_are_tried_with_each_shrinkage_and_that_of_inputs(kind, degree) -> None:
-    found = candidates(problem(), [kind], RNG)
+    found = candidates(problem(), [kind])
     expected = [(1e-6 * 10**i, factor) for i in range(7) for factor in (1.0, 30.0)]
     assert len(found) == len(expected)
     for each, (shrinkage, factor) in zip(found, expected, strict=True):
@@ -44,10 +41,10 @@ def test_polynomials_are_tried_with_each_shrinkage_and_that_of_inputs(kind, degr
 
 def test_where_theta_holds_set_points_a_residual_has_a_constant_term() -> None:
     mpc = solved("servo")
-    kinds = ("linear", "gaussian process", "network")
-    made = [each.make() for each in candidates(mpc, kinds, RNG)]
+    kinds = ("linear", "gaussian process")
+    made = [each.make() for each in candidates(mpc, kinds)]
     assert all(each.offset is True for each in made)
-    plain = [each.make() for each in candidates(problem(), kinds, RNG)]
+    plain = [each.make() for each in candidates(problem(), kinds)]
     assert not any(each.offset for each in plain)
 
 
@@ -55,20 +52,17 @@ def test_what_predicts_as_well_is_taken_in_the_order_of_its_freedom() -> None:
     class Own:
         """A regressor."""
 
-    kinds = ["none", "cubic", "gaussian process", "network", Own]
-    found = {each.name: each for each in candidates(problem(), kinds, RNG)}
+    kinds = ["none", "cubic", "gaussian process", Own]
+    found = {each.name: each for each in candidates(problem(), kinds)}
     assert found["none"].freedom == -np.inf and found["Own"].freedom == np.inf
     processes = [found[f"gaussian process, stiffness {s}"] for s in (1, 10, 100)]
-    networks = [found[f"network, decay {d}"] for d in ("0.0001", "0.001", "0.01")]
     assert [each.freedom for each in processes] == pytest.approx([20, 19, 18])
-    assert [each.freedom for each in networks] == pytest.approx([44, 43, 42])
     assert [each.make().stiffness for each in processes] == [1, 10, 100]
-    assert [each.make().decay for each in networks] == pytest.approx([1e-4, 1e-3, 1e-2])
     cubic = [each.freedom for each in found.values() if each.name.startswith("cubic")]
     assert max(cubic) < min(each.freedom for each in processes)
     for wrong in ("cubic", []):
         with pytest.raises(ValueError, match="must be a list with at least one kind"):
-            candidates(problem(), wrong, RNG)
+            candidates(problem(), wrong)
 
 
 def test_residuals_are_fitted_to_what_the_model_leaves_of_each_step() -> None:
@@ -83,7 +77,7 @@ def test_residuals_are_fitted_to_what_the_model_leaves_of_each_step() -> None:
         z.append(np.clip(features, box.low, box.high) / box.scale)
         model = theta[:, :2] @ mpc.model.A.T + u @ mpc.model.B.T + theta[:, 3:4] @ mpc.model.E.T
         y.append(each.thetas[1:, :2] - model)
-        for ours, expected in zip(regression(box, each), (z[-1], y[-1]), strict=True):
+        for ours, expected in zip(box.regression(each), (z[-1], y[-1]), strict=True):
             np.testing.assert_allclose(ours, expected, atol=1e-12)
     found = fitted(mpc, box, log, made)
     assert found == made
@@ -130,7 +124,7 @@ def test_an_episode_that_is_too_short_for_any_horizon_says_nothing() -> None:
     found.by_episode[:, 1] = np.nan
     assert found.choose(np.array([1.0, 0.0])) == 0
     log = [episode(problem(), steps, seed) for seed, steps in enumerate((4, 20, 20))]
-    some = candidates(problem(), ["none"], RNG)
+    some = candidates(problem(), ["none"])
     short = held_out(problem(), Coordinates.of(problem(), log), log, some)
     assert np.isnan(short.by_episode[:, 0]).all() and np.isfinite(short.by_episode[:, 1:]).all()
 
@@ -171,7 +165,7 @@ def test_free_runs_are_as_long_as_the_median_episode_and_a_hundred_steps_at_most
 ) -> None:
     log = [episode(problem(), steps, seed) for seed in range(2)]
     found = held_out(problem(), Coordinates.of(problem(), log), log, candidates(
-        problem(), ["none"], RNG))  # fmt: skip
+        problem(), ["none"]))  # fmt: skip
     assert found.horizons.tolist() == horizons
     assert np.isfinite(found.by_episode).all()
 
@@ -181,7 +175,7 @@ def test_a_free_run_s_error_is_that_of_the_model_from_twenty_logged_states() -> 
     log = [episode(mpc, 45, seed) for seed in range(2)]
     log.append(episode(mpc, 9, 3))  # too short for most horizons
     box = Coordinates.of(mpc, log)
-    found = held_out(mpc, box, log, candidates(mpc, ["none"], RNG))
+    found = held_out(mpc, box, log, candidates(mpc, ["none"]))
     assert found.horizons.tolist() == [5, 7, 12, 18, 28, 45]
     A, B, E = mpc.model.A, mpc.model.B, mpc.model.E
     for i, each in enumerate(log):
@@ -208,7 +202,7 @@ def test_a_run_that_blows_up_has_a_large_error_and_not_none() -> None:
             self.predict = lambda z: np.full((len(z), 2), np.inf)
 
     log = [episode(problem(), 20, seed) for seed in range(3)]
-    some = [Candidate("bursts", Bursts, 0.0), *candidates(problem(), ["none"], RNG)]
+    some = [Candidate("bursts", Bursts, 0.0), *candidates(problem(), ["none"])]
     found = held_out(problem(), Coordinates.of(problem(), log), log, some)
     np.testing.assert_array_equal(found.by_episode[0], 1e6)
     assert np.all(found.by_episode[1] < 1e6)
@@ -219,7 +213,7 @@ def test_those_before_the_first_are_compared_and_never_chosen() -> None:
     thetas, inputs = zip(*(mpc.simulate([x, -1.0, 0.5], 12) for x in (2.0, 1.0, -2.0)), strict=True)
     log = [*map(Episode, thetas, inputs)]
     box = Coordinates.of(mpc, log)
-    some = candidates(mpc, ["none", "linear"], RNG)
+    some = candidates(mpc, ["none", "linear"])
     runs_of, chosen = choose(mpc, box, log, some, 0)
     assert chosen == 0 and len(runs_of.names) == 15  # the model is true
     free = np.array([each.freedom for each in some])

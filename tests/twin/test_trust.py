@@ -8,14 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from scipy.optimize import check_grad
 
 from general_problems import solved
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, RateLimits
 from sb3_yann.evaluation.plots import twin_figure
 from sb3_yann.twin import trust as trusts
 from sb3_yann.twin.log import Episode, as_episodes, records
-from sb3_yann.twin.network import UNITS, Network
 from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import Nothing
 from sb3_yann.twin.selection import Candidate, FreeRuns
@@ -179,27 +177,6 @@ def test_the_report_shows_these_numbers() -> None:
     assert "x[0] 0.15, x[1] 0.0011." in said_of_little
     rests = dataclasses.replace(given, excitation=np.array([0.0199]))
     assert "1.99 %: its gain rests on the given B" in report(problem(), twin().episodes, "", rests)
-
-
-@pytest.mark.parametrize("offset", [False, True])
-def test_the_slope_of_a_networks_loss_is_that_of_its_value(offset) -> None:
-    rng = np.random.default_rng(0)
-    z, y, network = rng.normal(size=(30, 3)), rng.normal(size=(30, 2)), Network(rng, 0.1, offset)
-    flat = rng.normal(size=(3 + 1 + 2) * UNITS + 2)
-    free = slice(None) if offset else slice(0, -2)  # without one the constant does not move
-
-    def at(part):
-        whole = flat.copy()
-        whole[free] = part
-        return network._loss(whole, z, y)
-
-    error = check_grad(lambda p: at(p)[0], lambda p: at(p)[1][free], flat[free])
-    assert error < 1e-5 * np.linalg.norm(at(flat[free])[1])
-    weights = network._parts(flat, 3, 2)
-    zero = [np.zeros_like(each) for each in weights[2:]]
-    silent = np.concatenate([flat[: 4 * UNITS], *(each.ravel() for each in zero)])
-    decay = 0.1 * np.sum(weights[0] ** 2)
-    assert network._loss(silent, z, y)[0] == pytest.approx(np.sum(y**2) / 30 + decay)
 
 
 def test_standing_still_errs_by_how_far_the_states_move_in_units_of_the_log() -> None:

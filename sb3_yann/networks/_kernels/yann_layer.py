@@ -335,13 +335,6 @@ def frozen_layer(
     return act
 
 
-def kept_for_gradient(actions: th.Tensor) -> list[Any]:
-    """Return what a forward pass has kept: x, used, slot, two hidden layers, outputs."""
-    node: Any = actions.grad_fn
-    found: list[Any] = node.kept
-    return found
-
-
 def _rows(theta: Any, nodes: Any) -> Array:
     """Return theta (batch, n) for compiled code, which does not look at shapes."""
     n = nodes.shape[3] - 1

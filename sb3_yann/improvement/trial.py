@@ -10,15 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.compare import Scores, Tolerance, less_safe, no_worse, unsafe_columns
+from sb3_yann.compare import AcceptanceRule, Scores, less_safe, no_worse, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
+from sb3_yann.improvement.model import Scenarios
 from sb3_yann.twin.dynamics import Dynamics, law_of
 from sb3_yann.twin.hidden_dynamics import HiddenDynamics
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.starts import RARE
 
-MARGIN = 5e-4
-"""What one start may cost more than with the MPC on one member, in mean costs of the MPC."""
+RULE = AcceptanceRule()
+"""When a policy is no worse on the starts that begin as the log does: as a guard has it."""
+MARGIN = 0.01
+"""What one start around the log may cost more on one member, in mean costs of the MPC."""
 AROUND, RAREST = 0.005, 10.0
 """What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; how
 many times as much at most where it is rare."""
@@ -26,6 +29,8 @@ OTHERWISE = 0.01
 """What one start may cost more by the second opinion, in mean costs of the MPC."""
 FURTHER = 0.01
 """How much farther than the MPC a run may leave what the log shows, in its widths."""
+HARDEST = 40
+"""Scenarios that are planned anew after a check, at most."""
 NEARLY = 0.5
 """A start that loses so much of what it may lose is a hard one."""
 
@@ -101,6 +106,24 @@ class Trial:
     given: Array = field(init=False)
     far: Array = field(init=False)
     mpc: Outcome = field(init=False)
+
+    @classmethod
+    def draw(cls, twin: PlantTwin, count: int, rng: np.random.Generator) -> Trial:
+        """Return a trial on new starts, the same for every member.
+
+        Those that begin as the log does go on so, one logged episode after the other: a policy that
+        gains at set-points that stay may lose where they change. Every other one has set-points
+        between those of the log, which stay.
+        """
+        starts = twin.starts
+        drawn = np.concatenate([starts.draw_between(count, rng), starts.draw_around(count, rng)])
+        between = twin.dynamics.row.given.start < twin.dynamics.row.given.stop
+        follow = np.full(len(drawn), -1)
+        logged = np.arange(count)[int(between) :: 1 + between]
+        follow[logged] = np.arange(len(logged)) % len(twin.episodes)
+        drawn[logged] = starts.draw(len(logged), rng, follow[logged])
+        rows = np.repeat(drawn[None], len(twin.dynamics.members), axis=0)
+        return cls(twin, rows, count, follow)
 
     def __post_init__(self) -> None:
         episodes, part = self.twin.episodes, self.twin.dynamics.row.given
@@ -184,7 +207,7 @@ class Trial:
         allowed = np.minimum(accepted[1], self.mpc[1])  # neither is exceeded
         safe = not np.any(less_safe(unsafe, allowed))
         policy, before, mpc = (Scores(c[known], u[known]) for c, u in (played, accepted, self.mpc))
-        allowed_more = Tolerance(MARGIN * mean, bounds=BoundNames.of(self.twin.problem))
+        allowed_more = RULE.tolerance(self.mpc[0][known], BoundNames.of(self.twin.problem))
         reason = no_worse(policy, before, mpc, allowed_more).reason
         (logged, error), (of_accepted, _) = map(
             self._as_logged, (excess, accepted[0] - self.mpc[0])
@@ -223,9 +246,13 @@ class Trial:
         more = AROUND * rare * np.abs(self.mpc[0]) * ~self.known
         return np.asarray(MARGIN * self.mean + more)
 
-    def hard(self, played: Outcome) -> list[Array]:
-        """Return the starts of each member that a policy loses, or nearly."""
-        loses = ~(played[0] - self.mpc[0] <= NEARLY * self.room())
-        unsafe = np.any(less_safe(played[1], self.mpc[1]), axis=1)
-        chosen = (loses | unsafe).reshape(self.starts.shape[:2])
-        return [starts[which] for starts, which in zip(self.starts, chosen, strict=True)]
+    def hard(self, played: Outcome) -> Scenarios | None:
+        """Return the scenarios that a policy loses, or nearly, the worst first; None where none."""
+        loses = (played[0] - self.mpc[0]) / np.maximum(NEARLY * self.room(), 1e-300)
+        loses[np.any(less_safe(played[1], self.mpc[1]), axis=1)] = np.inf
+        worst = np.argsort(-np.nan_to_num(loses, nan=np.inf), kind="stable")
+        worst = worst[~(loses[worst] <= 1)][:HARDEST]
+        if not len(worst):
+            return None
+        members, starts = np.divmod(worst, self.starts.shape[1])
+        return Scenarios(self.twin, members, self.starts[members, starts], self.given[:, starts])

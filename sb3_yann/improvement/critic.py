@@ -8,25 +8,24 @@ import numpy as np
 import torch as th
 
 from sb3_yann._validation import Array
-from sb3_yann.commissioning.simulator_twin import SimulatorTwin
+from sb3_yann.improvement.imitation import policy_of
+from sb3_yann.improvement.model import Model
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.policies import YannPolicy
-from sb3_yann.twin.gradient import actor
-from sb3_yann.twin.plant_twin import PlantTwin
 
 SAMPLES, STEPS, BATCH, UPDATES, RATE = 1000, 100, 256, 200, 1e-3
 SPREAD = 0.1
 """Standard deviation of the first input, in half-widths: the critic must know its slope."""
 
 
-def refit_critic(policy: YannPolicy, twin: PlantTwin | SimulatorTwin, seed: int) -> None:
+def refit_critic(policy: YannPolicy, twin: Model, seed: int) -> None:
     """Fit the critics to the returns of the policy in the twin, from inputs near its own."""
     problem, rng = policy.problem, np.random.default_rng([seed, 2])
     layer, half = copy.deepcopy(policy.actor.mu).cpu(), problem.u_half
     members = len(twin.dynamics.members)
     starts = twin.starts.draw_logged(SAMPLES // members * members, rng)
     seen = twin.dynamics.row.shown(starts)
-    first = actor(layer, problem)(seen)
+    first = policy_of(layer, problem)(seen)
     first = first + SPREAD * half * rng.standard_normal(first.shape)
     first = np.clip(first, problem.deviations.u_min, problem.deviations.u_max)
     costs = _costs(policy, twin, layer, starts, first)
@@ -40,9 +39,7 @@ def refit_critic(policy: YannPolicy, twin: PlantTwin | SimulatorTwin, seed: int)
     policy.critic_target.load_state_dict(policy.critic.state_dict())
 
 
-def _costs(
-    policy: YannPolicy, twin: PlantTwin | SimulatorTwin, layer: LawLayer, at: Array, u: Array
-) -> Array:
+def _costs(policy: YannPolicy, twin: Model, layer: LawLayer, at: Array, u: Array) -> Array:
     """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
     problem, gamma, dynamics = policy.problem, policy.gamma, twin.dynamics
     shape = len(dynamics.members), -1
@@ -50,7 +47,7 @@ def _costs(
     shown = dynamics.row.shown
     with np.errstate(all="ignore"):
         first = dynamics.step(starts, u)
-        rows, inputs = dynamics.roll_out(actor(layer, problem), first, STEPS)
+        rows, inputs = dynamics.roll_out(policy_of(layer, problem), first, STEPS)
         thetas = shown(rows)
         stage = problem.stage_cost(thetas[:-1], inputs)
         end = np.sum((thetas[-1] @ problem.value_matrix(gamma)) * thetas[-1], axis=-1)

@@ -1,0 +1,159 @@
+"""Pairs of episodes, one of the policy and one of the MPC, until they tell: the plant decides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import special
+
+from sb3_yann._validation import Array
+from sb3_yann.audit.closed_loops import of_law
+from sb3_yann.compare import (
+    UNSAFE,
+    AcceptanceRule,
+    less_safe,
+    tail_average,
+)
+from sb3_yann.control.mpc.bound_excess import BoundNames
+from sb3_yann.improvement.imitation import Inputs, controller_of
+from sb3_yann.improvement.simulator import Simulator
+from sb3_yann.improvement.trial import Check
+from sb3_yann.twin.log import Episode
+
+RULE = AcceptanceRule()
+FIRST_LOOK = 10  # pairs of a trial between rounds
+LOOKS = (10, 20, 40, 80)  # pairs after which it is decided, or more are played
+ENOUGH = 40  # pairs that an acceptance takes: the worst 5 % of the starts are two of them
+
+
+@dataclass
+class Pairs:
+    """The same starts with the MPC and with a policy.
+
+    Attributes
+    ----------
+    simulator : Simulator
+    seeds : list of int
+    mpc, policy : ndarray, shape (pairs,)
+        Costs.
+    unsafe_of_mpc, unsafe : ndarray, shape (pairs, 9)
+        As :func:`~sb3_yann.compare.unsafe_columns` returns it.
+    episodes : list of Episode or None
+        Those of the policy.
+    """
+
+    simulator: Simulator
+    seeds: list[int] = field(default_factory=list)
+    mpc: Array = field(default_factory=lambda: np.empty(0))
+    policy: Array = field(default_factory=lambda: np.empty(0))
+    unsafe_of_mpc: Array = field(default_factory=lambda: np.empty((0, 9)))
+    unsafe: Array = field(default_factory=lambda: np.empty((0, 9)))
+    episodes: list[Episode | None] = field(default_factory=list)
+
+    def play(self, act: Inputs | None, seeds: Sequence[int]) -> None:
+        """Add pairs, and let the simulator's model learn of them; without a policy the MPC's."""
+        mpc = self.simulator.play(of_law(self.simulator.problem), seeds)
+        ours = mpc if act is None else self.simulator.play(controller_of(act), seeds)
+        known = np.isfinite(mpc.costs)  # where the MPC's own cost is none, nothing is compared
+        self.seeds += [seed for seed, finite in zip(seeds, known, strict=True) if finite]
+        self.mpc = np.append(self.mpc, mpc.costs[known])
+        self.policy = np.append(self.policy, ours.costs[known])
+        self.unsafe_of_mpc = np.concatenate([self.unsafe_of_mpc, mpc.unsafe()[known]])
+        self.unsafe = np.concatenate([self.unsafe, ours.unsafe()[known]])
+        self.episodes += [e for e, k in zip(self.simulator.learn(ours), known, strict=True) if k]
+
+    def replay(self, act: Inputs) -> Pairs:
+        """Return the pairs of another policy from the same starts; the MPC's are known."""
+        ours = self.simulator.play(controller_of(act), self.seeds)
+        return replace(
+            self, policy=ours.costs, unsafe=ours.unsafe(), episodes=self.simulator.learn(ours)
+        )
+
+    @property
+    def relative(self) -> Array:
+        """What each costs against the MPC, in its own cost or the MPC's typical one."""
+        own = np.maximum(np.abs(self.mpc), np.median(np.abs(self.mpc)))
+        return np.asarray((self.policy - self.mpc) / np.where(own > 0, own, 1.0))
+
+    @property
+    def change(self) -> float:
+        """Mean cost against the MPC's: -0.02 is 2 % less."""
+        mean = max(float(np.abs(self.mpc).mean()), 1e-300)
+        return float((self.policy - self.mpc).mean()) / mean
+
+    @property
+    def lost(self) -> list[Episode]:
+        """The policy's episodes that cost more than with the MPC, or are less safe."""
+        worse = (self.relative > 0) | less_safe(self.unsafe, self.unsafe_of_mpc).any(axis=1)
+        return [e for e, lost in zip(self.episodes, worse, strict=True) if lost and e is not None]
+
+    def check(self, number: int, level: float, final: bool) -> Check:
+        """Return what they say of the policy, at a one-sided level of significance."""
+        problem, count = self.simulator.problem, len(self.seeds)
+        mean = max(float(np.abs(self.mpc).mean()), 1e-300)
+        relative = self.relative
+        error = float(relative.std(ddof=1) / np.sqrt(count)) if count > 1 else np.inf
+        average = float(relative.mean())
+        room = float(special.stdtrit(max(count - 1, 1), 1 - level)) * error
+        less = less_safe(self.unsafe, self.unsafe_of_mpc)
+        worst = float((self.policy - self.mpc).max()) / mean if count else np.inf
+        tolerance = RULE.tolerance(self.mpc, BoundNames.of(problem))
+        excess = tolerance.excess(self.mpc, self.policy)
+        reason = ""
+        if less.any():
+            column = int(np.argmax(less.any(axis=0)))
+            which = np.flatnonzero(less[:, column])
+            at = self.unsafe[which[0]]
+            words = tolerance.bounds.in_words(at[8], at[4])
+            reason = f"{len(which)} of {count} starts with {UNSAFE[column]}"
+            reason += f": {words}" if words else ""
+        elif not np.all(np.isfinite(relative)):
+            reason = "a cost that is no finite number"
+        elif tail_average(excess, RULE.cvar_alpha, count)[0] > 1:
+            share = 100 * RULE.cvar_alpha
+            reason = f"the worst {share:g} % of {count} starts cost too much more, up to "
+            reason += f"{100 * worst:.3g} % of the MPC's mean cost"
+        elif not (self.change <= -RULE.least_gain and average + room < 0):
+            reason = f"{100 * self.change:+.2g} % (± {100 * error:.1g}) in {count} pairs: too "
+            reason += "small a gain, or not sure"
+        safe = not less.any()
+        shown = self.change, worst, safe, average, error
+        return Check(number, not reason, reason, *shown, final=final)
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether more pairs would hardly change a refusal: it costs more, or breaks a bound."""
+        relative, count = self.relative, len(self.seeds)
+        if less_safe(self.unsafe, self.unsafe_of_mpc).any() or not np.isfinite(relative).all():
+            return True
+        error = relative.std(ddof=1) / np.sqrt(count)
+        return bool(relative.mean() - error > -RULE.least_gain / 2)
+
+
+def confirm(act: Inputs, simulator: Simulator, number: int) -> tuple[Check, Pairs]:
+    """Play pairs from new starts until they tell; return the last look, and all pairs.
+
+    Looks come after 10, 20, 40 and 80 pairs. The j-th one may err with a probability of
+    ``significance / (j (j + 1))``, so all of them together with no more than ``significance``. A
+    policy that breaks a bound, or does not gain, is refused at the first look that shows it.
+
+    Parameters
+    ----------
+    act : callable
+        The policy.
+    simulator : Simulator
+        It plays them.
+    number : int
+        Of the check.
+    """
+    pairs = Pairs(simulator)
+    for look, count in enumerate(LOOKS, start=1):
+        pairs.play(act, simulator.new_seeds(count - len(pairs.seeds)))
+        found = pairs.check(number, RULE.significance / (look * (look + 1)), final=True)
+        if found.accepted and count >= ENOUGH:
+            break
+        if not found.accepted and pairs.is_hopeless:
+            break
+    return found, pairs

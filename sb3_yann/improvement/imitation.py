@@ -1,0 +1,246 @@
+"""Nearly optimal plans in a model, and a policy that learns to do what they do."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.audit.closed_loops import PAUSE, Planning, of_law
+from sb3_yann.audit.task import WEIGHT, Task
+from sb3_yann.audit.trajectory import Plans, follow
+from sb3_yann.compare import less_safe
+from sb3_yann.control import LinearMPC
+from sb3_yann.improvement.model import DOUBT, Disagreement, Imagined, Scenarios
+from sb3_yann.networks import RowAdam
+from sb3_yann.networks.yann import LawLayer
+from sb3_yann.rollout import Controller, Rows
+
+Inputs = Callable[[Array], Array]
+BATCH = 512  # rows in a step of Adam
+RATE = 1e-2  # of Adam at first; it falls to zero
+NEARBY = 3  # states beside each of a plan that its feedback answers
+SPREAD = 0.1  # how far they are, in standard deviations of the states in the episodes
+FITS = 6  # fits to plans in a model, at most: after each the policy's own states are planned from
+HARDEST = 20  # scenarios that are planned anew after a fit
+NEAR = 0.02  # share of what plans gain that a policy may lack when its fits end
+
+
+class Teacher:
+    """Plans the episodes of a model, and keeps what plans and their feedback do.
+
+    Plans are those of :func:`headroom`: differential dynamic programming, which knows neither
+    changes of references nor disturbances before they come.
+
+    Parameters
+    ----------
+    scenarios : Scenarios
+        What is planned.
+    seed : int
+        Of the states beside plans, and of the batches.
+
+    Attributes
+    ----------
+    mpc : Imagined
+        What came of the MPC.
+    best : ndarray, shape (k,)
+        The least cost that a plan or the MPC had in each scenario.
+    """
+
+    def __init__(self, scenarios: Scenarios, seed: int) -> None:
+        self.scenarios, self.rng = scenarios, np.random.default_rng([seed, 4])
+        model, problem = scenarios.model, scenarios.model.problem
+        self.problem, self.units = problem, model.dynamics.coordinates.units
+        self.mpc = scenarios.play(of_law(problem))
+        self.best = self.mpc.costs.copy()
+        self.steps = len(self.mpc.inputs)
+        finite = self.mpc.costs[np.isfinite(self.mpc.costs)]
+        unit = max(float(np.abs(finite).mean()) / self.steps, 1e-300) if len(finite) else 1.0
+        doubt = None
+        if scenarios.members is None and model.dynamics.row.observer is None:
+            doubt = Disagreement(model.dynamics, DOUBT * unit)
+        end, limits = value_at_end(problem), model.limits
+        self.task = Task(problem, limits.low, limits.high, end, WEIGHT * unit, doubt)
+        self.thetas: list[Array] = []
+        self.inputs: list[Array] = []
+
+    @property
+    def gain(self) -> float:
+        """What plans gain, as a fraction of what the scenarios cost with the MPC."""
+        finite = np.isfinite(self.mpc.costs)
+        whole = max(float(np.abs(self.mpc.costs[finite]).sum()), 1e-300)
+        return float(np.sum((self.mpc.costs - self.best)[finite])) / whole
+
+    def show(self, begins: NDArray[np.int64] | None = None, act: Inputs | None = None) -> None:
+        """Plan the scenarios, from the steps ``begins`` (k,) on, until which a policy acts.
+
+        Those with a step of -1 are left out. What costs more than with the MPC, or breaks a bound
+        by more, shows nothing.
+        """
+        pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
+        planning = Planning(self.scenarios.plant, self.task, self.steps, pause)
+        first = np.zeros(len(self.scenarios), dtype=np.int64) if begins is None else begins
+        later = _Later(planning, first, act or self.problem.law())
+        shown = self.scenarios.play(later)
+        safe = ~less_safe(shown.unsafe, self.mpc.unsafe).any(axis=1)
+        taught = (first >= 0) & safe & (shown.costs <= self.mpc.costs)
+        self.best = np.where(taught, np.fmin(self.best, shown.costs), self.best)
+        for i in np.flatnonzero(taught):
+            for t in range(first[i], self.steps):
+                when, plan, _ = later.plans[t][i]
+                theta = shown.thetas[t, i]
+                near = np.tile(theta, (NEARBY, 1))
+                states = self.problem.layout.state
+                moved = self.rng.standard_normal(near[:, states].shape)
+                near[:, states] += SPREAD * self.units * moved
+                at = min(t, self.steps - 1) - when
+                answers = np.concatenate([follow(plan, at, each[None]) for each in near])
+                self.thetas += [theta, *near]
+                self.inputs += [shown.inputs[t, i], *np.clip(answers, *self.task.limits(near))]
+
+    def teach(self, layer: LawLayer, updates: int) -> None:
+        """Fit a layer to all that was shown."""
+        fit_layer(
+            layer, self.problem, np.array(self.thetas), np.array(self.inputs), self.rng, updates
+        )
+
+    def hardest(self, played: Imagined) -> NDArray[np.int64]:
+        """Return the steps (k,) to plan from next: -1 where a policy does nearly as well as plans.
+
+        Half of the others begin at their start, half amid the episode.
+        """
+        behind = np.where(np.isfinite(played.costs), played.costs - self.best, np.inf)
+        behind[less_safe(played.unsafe, self.mpc.unsafe).any(axis=1)] = np.inf
+        chosen = np.argsort(-behind, kind="stable")[:HARDEST]
+        chosen = chosen[behind[chosen] > 0]
+        begins = np.full(len(behind), -1, dtype=np.int64)
+        begins[chosen] = self.rng.integers(0, self.steps, size=len(chosen))
+        begins[chosen[::2]] = 0
+        return begins
+
+
+class _Later:
+    """A controller from a step of each episode on.
+
+    Parameters
+    ----------
+    planning : Planning
+        Acts from there on.
+    begins : ndarray of int, shape (k,)
+        The steps; where -1, never.
+    act : callable
+        The policy that acts before.
+
+    Attributes
+    ----------
+    plans : list of dict
+        Those of `Planning` at every step.
+    """
+
+    def __init__(self, planning: Planning, begins: NDArray[np.int64], act: Inputs) -> None:
+        self.planning, self.begins, self.act = planning, begins, act
+        self.plans: list[dict[int, tuple[int, Plans, Array]]] = []
+
+    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
+        """Return the inputs (r, m)."""
+        begun = (self.begins[rows] >= 0) & (self.begins[rows] <= t)
+        u = np.array(controller_of(self.act)(t, theta, rows), np.float64)
+        if np.any(begun):
+            u[begun] = self.planning(t, theta[begun], rows[begun])
+        self.plans.append({**self.planning.plans})
+        return u
+
+
+def imitate(layer: LawLayer, teacher: Teacher, updates: int) -> float:
+    """Fit a layer to plans of a model's episodes, and to their feedback nearby.
+
+    Then the policy plays these episodes in the model, and learns more where it does worse than
+    plans: from their starts, and from where it had got to (S. Ross, G. Gordon and D. Bagnell, *A
+    reduction of imitation learning and structured prediction to no-regret online learning*, AISTATS
+    2011). The layer ends with the fit that cost the least. Return what it gains in the model, as a
+    fraction of the MPC's cost.
+    """
+    mpc, best = teacher.mpc, copy.deepcopy(layer.state_dict())
+    finite = np.isfinite(mpc.costs)
+    whole = max(float(np.abs(mpc.costs[finite]).sum()), 1e-300)
+    least = np.inf
+    for fit in range(FITS):
+        teacher.teach(layer, updates if fit == 0 else updates // 2)
+        act = policy_of(layer, teacher.problem)
+        played = teacher.scenarios.play(controller_of(act))
+        change = float(np.sum((played.costs - mpc.costs)[finite])) / whole
+        if change < least:
+            least, best = change, copy.deepcopy(layer.state_dict())
+        if -least >= (1 - NEAR) * teacher.gain or fit == FITS - 1:
+            break
+        teacher.show(teacher.hardest(played), act)
+    layer.load_state_dict(best)
+    return -least
+
+
+def fit_layer(
+    layer: LawLayer,
+    problem: LinearMPC,
+    rows: Array,
+    inputs: Array,
+    rng: np.random.Generator,
+    updates: int,
+) -> None:
+    """Fit a layer to inputs at theta: least squares on actions in [-1, 1], with Adam.
+
+    Parameters
+    ----------
+    layer : LawLayer
+        Its networks go on from where they are.
+    problem : LinearMPC
+        Whose theta and inputs they are.
+    rows, inputs : ndarray, shapes (rows, n_theta) and (rows, m)
+        Rows that are not finite are left out.
+    rng : numpy.random.Generator
+        Draws the batches.
+    updates : int
+        Steps of Adam.
+    """
+    low, half = problem.deviations.u_min, problem.u_half
+    wanted = np.clip((inputs - low) / half - 1, -1, 1)
+    finite = np.isfinite(rows).all(axis=1) & np.isfinite(wanted).all(axis=1)
+    at, to = th.as_tensor(rows[finite]), th.as_tensor(wanted[finite], dtype=th.float32)
+    kind = RowAdam if layer.row_gradients else th.optim.Adam
+    optimizer: Any = kind(layer.network.weights(), lr=RATE)
+    for k in range(updates if len(at) else 0):
+        optimizer.param_groups[0]["lr"] = RATE * (1 - k / updates)
+        chosen = th.as_tensor(rng.integers(len(at), size=BATCH))
+        optimizer.zero_grad()
+        th.nn.functional.mse_loss(layer(at[chosen]), to[chosen]).backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    optimizer.zero_grad()
+
+
+def policy_of(layer: LawLayer, problem: LinearMPC) -> Inputs:
+    """Return an actor of now as a function from theta (rows, n_theta) to inputs (rows, m)."""
+    middle, half = (problem.deviations.u_max + problem.deviations.u_min) / 2, problem.u_half
+    act = layer.frozen()
+    return lambda theta: np.asarray(middle + half * act(theta))
+
+
+def controller_of(act: Inputs) -> Controller:
+    """Return a policy as what acts in episodes side by side; on what is not finite, as at rest."""
+
+    def controller(t: int, theta: Array, rows: Rows) -> Array:
+        finite = np.isfinite(theta).all(axis=1, keepdims=True)
+        return act(np.where(finite, theta, 0.0))
+
+    return controller
+
+
+def value_at_end(problem: LinearMPC) -> Array:
+    """Return the undiscounted value of the law, or one discounted a little where there is none."""
+    try:
+        return problem.value_matrix(1.0)
+    except ValueError:
+        return problem.value_matrix(0.99)

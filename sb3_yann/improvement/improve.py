@@ -1,0 +1,498 @@
+"""A better policy from a twin or a simulator: plans in a learnt model, imitated, then confirmed."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import time
+from dataclasses import dataclass, field, replace
+from os import PathLike
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3 import DDPG
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_yann._validation import check_bool, check_int
+from sb3_yann.control import LinearMPC
+from sb3_yann.deployment.exporting import Exported, export
+from sb3_yann.improvement.confirmation import FIRST_LOOK, RULE, Pairs, confirm
+from sb3_yann.improvement.critic import refit_critic
+from sb3_yann.improvement.imitation import Teacher, imitate, policy_of
+from sb3_yann.improvement.model import Model, Scenarios, SimulatorModel
+from sb3_yann.improvement.simulator import OutOfStepsError, Simulator
+from sb3_yann.improvement.trial import Check, Trial
+from sb3_yann.networks.yann import LawLayer
+from sb3_yann.policy.checkpoint import all_or_nothing
+from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin, require_yann_policy
+from sb3_yann.rollout import Source, maker, name_of
+from sb3_yann.twin.plant_twin import PlantTwin
+from sb3_yann.twin.trust import Trust
+
+EXACT = 0.5  # errors of a twin relative to the given model's below which it is an exact one
+LEAST = 2e-3  # what a policy must gain in a twin, relative to the MPC's mean cost
+LEAST_OF_EXACT = 2e-4  # and in an exact one
+OF_COST_ERROR = 0.1  # and relative to the error of the twin's costs
+RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
+PROMISED = 0.95  # share of what the model promised that, shown by the simulator, ends the rounds
+LITTLE = 0.02  # share of a gain by which another round must raise it
+TRIES = 3  # confirmations of a policy that is taught what it has lost
+
+Weights = dict[str, th.Tensor]
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """What :func:`improve` did; it travels in the model's zip, in ``model.improvements``.
+
+    Attributes
+    ----------
+    checks : tuple of Check
+        The comparisons with the MPC, in the twin or in the simulator.
+    change : float
+        The accepted policy's mean cost there against the MPC's: -0.02 is 2 % less.
+    accepted : bool
+        Whether a policy passed. If none did, the model is as it was.
+    before : Check, optional
+        Of what the model had learnt before, if it had.
+    where : {"the twin", "the simulator"}
+    source : str
+        Which twin or simulator.
+    episodes : int
+        Of the log that the twin was fitted to, or played in the simulator.
+    steps : int
+        Taken in the simulator, all of them.
+    settings : dict of str to number
+        The arguments.
+    policy : str
+        Fingerprint of the policy's weights when it ended.
+    model : DDPG or TD3, optional
+        With the policy; not in the model's zip.
+
+    Examples
+    --------
+    >>> Improvement(checks=(), change=-0.02, accepted=True).reason
+    ''
+    """
+
+    checks: tuple[Check, ...]
+    change: float
+    accepted: bool
+    before: Check | None = None
+    where: str = "the twin"
+    source: str = ""
+    episodes: int = 0
+    steps: int = 0
+    settings: dict[str, float] = field(default_factory=dict)
+    policy: str = ""
+    model: Any = field(default=None, repr=False, compare=False)
+    note: str = ""
+
+    def export(self, path: str | PathLike[str], **options: Any) -> Exported:
+        """Write the policy as a file or as code: :func:`sb3_yann.export` of the model."""
+        return export(self.model, path, **options)
+
+    @property
+    def reason(self) -> str:
+        """Why nothing was accepted; empty where something was."""
+        if self.accepted:
+            return ""
+        refused = [each for each in self.checks if each is not self.before]
+        final = [each for each in refused if each.final] or refused
+        said = self.note or (final[-1].reason if final else "")
+        if not said and final:
+            gained = -100 * final[-1].change
+            said = f"a gain of {gained:.2g} % in {self.where} is too small, or not sure"
+        return f"Nothing better was found: {said or f'no gain in {self.where}'}."
+
+    def report(self) -> str:
+        """Return in words what was accepted, or why nothing was, and what it took."""
+        passed = sum(each.accepted for each in self.checks)
+        taken = f"{passed} of {len(self.checks)} checks passed."
+        if self.steps:
+            taken += f" {self.steps:,} steps of the simulator."
+        if not self.accepted:
+            return f"{self.reason} The model is as it was. {taken}"
+        last = next((each for each in reversed(self.checks) if each.accepted), None)
+        said = f"Accepted: {100 * self.change:+.2f} % of the MPC's stage cost in {self.where}"
+        if last is not None:
+            twin = self.where == "the twin"
+            whose = "on episodes like the log's" if twin else "of an episode's own on average"
+            said += f", {100 * last.logged:+.2f} % (± {100 * last.error:.2f}) {whose}"
+            said += f", {100 * last.worst:+.2f} % from the worst start"
+        return f"{said}. {taken}"
+
+    __str__ = report
+
+
+def improve(
+    model: OffPolicyAlgorithm | LinearMPC,
+    twin: PlantTwin | Source,
+    *,
+    max_steps: int | None = None,
+    n_starts: int = 40,
+    rounds: int = 4,
+    updates: int = 4000,
+    confine: bool = True,
+    seed: int = 0,
+    progress_bar: bool = False,
+) -> Improvement:
+    """Improve a model's policy in a twin of its plant, or with a simulator; the plant sees nothing.
+
+    Nearly optimal plans, those of :func:`headroom`, are made in a learnt model, from many starts at
+    once, and the actor's networks learn to do what they do, and what their feedback does nearby.
+    Then the policy plays the same episodes in the model, and is taught more where plans do better.
+
+    *In a simulator* the model is an ensemble of small networks on top of the MPC's own, fitted to
+    some twenty episodes of the MPC, half of them with random inputs on top. Each round plays the
+    policy from ten starts, and fits the model anew to what that showed, until the simulator shows
+    what the model promised. The best policy is then confirmed on new starts, in pairs with the MPC:
+    after 10, 20, 40 and 80 of them a paired test says whether it surely gains 0.1 %, with an error
+    of 5 % over all looks. Its worst 5 % of the starts must be no worse by 1 %, and no bound may be
+    exceeded by more than with the MPC. What it loses is taught, and it is tried again on other
+    starts, three times; then half of the correction.
+
+    *In a twin* the members take turns in planning. A policy is accepted if it is no worse than the
+    MPC from new starts on every member, and gains twice the standard error on episodes that go on
+    as those of the log. The twin's second opinion, a model without a form, must see a gain as well.
+    What is refused is taught; then half and a quarter of the correction are tried. Beyond what the
+    log shows the MPC acts alone: no member of the twin knows the plant there.
+
+    The model ends with the policy that was accepted and a critic that is refitted to it, else as it
+    was. It saves and goes on learning as any other.
+
+    Parameters
+    ----------
+    model : DDPG, TD3 or LinearMPC
+        With a :class:`YannPolicy` of the twin's problem. An MPC gets a DDPG model of its own, with
+        one network for all regions, which the result holds: ``result.model``,
+        ``result.export("controller.c")``.
+    twin : PlantTwin, gymnasium.Env, str or callable
+        A twin, which must be trusted; or a simulator, which shows theta of the model's problem, or
+        absolute values where that is absolute. The problem's stage cost counts, and no reward: a
+        :class:`CostMismatchWarning` says where that is another one. A function or an id makes as
+        many as are played side by side, a given env is copied.
+    max_steps : int, optional
+        Of the simulator, for everything. Where they do not suffice nothing is accepted.
+    n_starts : int, default 40
+        Episodes that are planned in the model; in a twin, also starts of a check for each member,
+        so many as the log begins, and as many around.
+    rounds : int, default 4
+        How often a model is fitted and planned in, at most; in a twin, how often a policy is taught
+        what a check refuses.
+    updates : int, default 4000
+        Steps of Adam of a fit of the actor to plans.
+    confine : bool, default True
+        Whether, in a twin, the MPC acts alone beyond what the log shows: see
+        :meth:`YannPolicy.confine_correction`.
+    seed : int, default 0
+        Of the starts, the models and the batches. No other random numbers are drawn.
+    progress_bar : bool, default False
+        Whether to print a line for each part that is done.
+
+    Raises
+    ------
+    UntrustedTwinError
+        If the twin is not to be trusted: the model stays as it is.
+    TypeError, ValueError
+        If the model has no YannPolicy, or another problem than the twin or the simulator.
+
+    Examples
+    --------
+    >>> from sb3_yann import PlantTwin, improve
+    >>> from sb3_yann.evaluation import evaluate
+    >>> from sb3_yann_envs import problems
+    >>> mpc = problems.cstr()
+    >>> log = evaluate(mpc.explicit(), "CSTR-v0", seeds=range(5))  # a plant's own episodes
+    >>> twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions)])
+    >>> improve(mpc, twin, n_starts=20, updates=1000).change < -0.005
+    True
+
+    ``improve(mpc, "CSTR-v0")`` does it with the simulator.
+    """
+    given = dict(locals())
+    if not isinstance(model, OffPolicyAlgorithm | LinearMPC):
+        raise TypeError(f"model = {model!r} must be a DDPG or TD3 model, or a LinearMPC.")
+    if not (isinstance(twin, PlantTwin | str | gym.Env) or callable(twin)):
+        raise TypeError(
+            f"twin = {twin!r} must be a PlantTwin; or a simulator: a single gymnasium.Env, its id, "
+            "or a function that makes one."
+        )
+    for name in ("n_starts", "rounds", "updates"):
+        check_int(name, given[name])
+    if max_steps is not None:
+        check_int("max_steps", max_steps)
+    check_int("seed", seed, 0)
+    check_bool("confine", confine)
+    check_bool("progress_bar", progress_bar)
+    if isinstance(model, LinearMPC):
+        model = DDPG(
+            YannPolicy,
+            twin.env() if isinstance(twin, PlantTwin) else maker(twin)(),
+            gamma=min(model.gamma, 0.99),
+            seed=seed,
+            device="cpu",
+            policy_kwargs={"problem": model, "networks": "shared"},
+        )
+    policy = require_yann_policy(model.policy, "improve")
+    if isinstance(twin, PlantTwin):
+        require_problem_of_twin(policy, twin.problem)
+        twin.require_trust()
+    work = _Work(policy, n_starts, rounds, updates, seed, _Progress(progress_bar))
+    if isinstance(twin, PlantTwin):
+        work.layer.confine(*twin.starts.shown) if confine else work.layer.confine(None, None)
+        found = work.in_twin(twin)
+        found = replace(found, source=repr(twin), episodes=len(twin.episodes))
+    else:
+        found = replace(work.with_simulator(twin, max_steps), source=name_of(twin))
+    names = "max_steps", "n_starts", "rounds", "updates", "confine", "seed"
+    settings = {name: given[name] for name in names if given[name] is not None}
+    prints = fingerprint(policy.actor.state_dict())
+    found = replace(found, settings=settings, policy=prints)
+    record: Any = model
+    record.improvements = (*getattr(model, "improvements", ()), found)
+    return replace(found, model=model)
+
+
+def fingerprint(state: dict[str, th.Tensor]) -> str:
+    """Return the SHA-256 of tensors, whatever their order and device."""
+    found = hashlib.sha256()
+    for name in sorted(state):
+        found.update(name.encode())
+        found.update(np.ascontiguousarray(state[name].cpu().numpy()).tobytes())
+    return found.hexdigest()
+
+
+def least_gain(trust: Trust) -> float:
+    """Return what a policy must gain in a twin, as a fraction of the MPC's mean cost.
+
+    What is promised is a difference of two predicted costs, which errs less than each of them, but
+    not without end: an evaporator's twin that was off by a fifth promised 1 %, and cost 0.3 % more.
+    """
+    least = LEAST_OF_EXACT if trust.error_ratio < EXACT else LEAST
+    return max(least, OF_COST_ERROR * trust.cost_error)
+
+
+class _Progress:
+    """Lines that say what is done: they read as well in a file as on a screen."""
+
+    def __init__(self, shown: bool) -> None:
+        self.shown, self.begun = shown, time.monotonic()
+        self.simulator: Simulator | None = None
+
+    def __call__(self, text: str) -> None:
+        """Print a line."""
+        if self.shown:
+            steps = f" {self.simulator.steps:>9,} steps" if self.simulator else ""
+            print(f"[{time.monotonic() - self.begun:5.0f} s{steps}] {text}", flush=True)
+
+
+class _Work:
+    """The search for a better actor: a copy of a policy's layer, which is given back if it passes.
+
+    Parameters
+    ----------
+    policy : YannPolicy
+        Whose actor and critic are changed, or not.
+    n_starts, rounds, updates, seed : int
+        As for :func:`improve`.
+    say : callable
+        Is told what is done.
+    """
+
+    def __init__(
+        self,
+        policy: YannPolicy,
+        n_starts: int,
+        rounds: int,
+        updates: int,
+        seed: int,
+        say: _Progress,
+    ) -> None:
+        self.policy, self.problem, self.say = policy, policy.problem, say
+        self.n_starts, self.rounds, self.updates, self.seed = n_starts, rounds, updates, seed
+        self.layer: LawLayer = copy.deepcopy(policy.actor.mu).cpu()
+        self.rng = np.random.default_rng([seed, 1])
+        self.checks: list[Check] = []
+        self.has_learnt = not self.layer.network.is_zero()
+
+    def act(self) -> Any:
+        """Return the layer as it is now as a policy."""
+        return policy_of(self.layer, self.problem)
+
+    def weights(self) -> Weights:
+        """Return a copy of the layer's weights."""
+        return copy.deepcopy(self.layer.state_dict())
+
+    def scale(self, share: float, weights: Weights) -> None:
+        """Give the layer a share of a correction."""
+        last = [key for key in weights if key.startswith("network.rest.")][-1]
+        self.layer.load_state_dict(weights | {last: share * weights[last]})
+
+    def accept(self, model: Model) -> None:
+        """Give the policy the layer as it is, and a critic that knows it."""
+        policy = self.policy
+        with all_or_nothing(policy):
+            policy.actor.mu.load_state_dict(self.layer.state_dict())
+            policy.actor_target.load_state_dict(policy.actor.state_dict())
+            for network in (policy.actor, policy.critic):
+                network.optimizer.state.clear()  # what other weights were moved by
+            refit_critic(policy, model, self.seed)
+
+    def in_twin(self, twin: PlantTwin) -> Improvement:
+        """Plan in the members of a twin, imitate, and check on every member."""
+        trial, least = Trial.draw(twin, self.n_starts, self.rng), least_gain(twin.trust)
+        before = self._check_in(trial) if self.has_learnt else None
+        best = before.change if before is not None and before.accepted else 0.0
+
+        def passes(share: float) -> bool:
+            found = self._check_in(trial, share)
+            return found.accepted and found.gains(least) and found.change < best
+
+        def improvement(accepted: bool, note: str = "") -> Improvement:
+            if accepted:
+                self.accept(twin)
+            change = self.checks[-1].change if accepted else 0.0
+            return Improvement(tuple(self.checks), change, accepted, before, note=note)
+
+        episodes = [twin.episodes[i % len(twin.episodes)] for i in range(self.n_starts)]
+        scenarios: Scenarios | None = Scenarios.like(twin, episodes, self.rng, each=True)
+        shown: Teacher | None = None
+        for number in range(self.rounds):
+            if scenarios is None:
+                break
+            teacher = Teacher(scenarios, self.seed + number)
+            teacher.show()
+            gain = f"{100 * teacher.gain:.3g} %"
+            if shown is None and teacher.gain < least:
+                return improvement(False, f"plans gain {gain} in the twin, too little to teach")
+            if shown is not None:
+                teacher.thetas += shown.thetas
+                teacher.inputs += shown.inputs
+            gained = imitate(self.layer, teacher, self.updates)
+            shown = teacher
+            self.say(
+                f"round {number + 1} of at most {self.rounds}: the policy gains "
+                f"{100 * gained:.3g} % of plans' {gain} in the twin"
+            )
+            if passes(1.0):
+                return improvement(True)
+            scenarios = trial.hard(trial.play(self.act()))
+        whole = self.weights()
+        for share in RETREATS:
+            self.scale(share, whole)
+            if passes(share):
+                return improvement(True)
+        return improvement(False)
+
+    def _check_in(self, trial: Trial, share: float = 1.0) -> Check:
+        """Check the layer on the known starts of a twin, then on new ones, and by other models."""
+        act, number = self.act(), len(self.checks) + 1
+        found = trial.check(number, trial.play(act), trial.mpc)
+        if found.accepted:
+            new = Trial.draw(trial.twin, self.n_starts, self.rng)
+            confirmed = new.check(number, new.play(act), new.mpc)
+            if not confirmed.accepted:
+                reason = f"on new starts, {confirmed.reason}"
+                found = replace(found, accepted=False, reason=reason)
+            elif doubt := new.second_objection(act):
+                found = replace(found, accepted=False, reason=doubt)
+        self.checks.append(found)
+        self.say(
+            f"{share:.0%} of the correction: {100 * found.change:+.2f} %, "
+            f"{found.reason or 'no worse anywhere'}"
+        )
+        return found
+
+    def with_simulator(self, env: Source, max_steps: int | None) -> Improvement:
+        """Learn a model of a simulator, plan in it, imitate, and let the simulator decide."""
+        simulator = Simulator(self.problem, env, self.seed, max_steps)
+        self.say.simulator = simulator
+        before: Check | None = None
+        note, accepted = "", False
+        try:
+            self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")
+            trial = Pairs(simulator)
+            known = self.act() if self.has_learnt else None
+            trial.play(known, simulator.new_seeds(FIRST_LOOK))
+            if self.has_learnt:
+                before = trial.check(0, RULE.significance, final=False)
+                self.checks.append(before)
+            best = before.change if before is not None and before.accepted else 0.0
+            model, note = self._rounds(simulator, trial, best)
+            if not note:
+                accepted = self._confirm(simulator, model, best)
+        except OutOfStepsError:
+            note = f"max_steps = {max_steps:,} are too few to go on, {simulator.steps:,} are taken"
+        finally:
+            simulator.close()
+        change = self.checks[-1].change if accepted else 0.0
+        found = Improvement(tuple(self.checks), change, accepted, before, "the simulator")
+        return replace(found, episodes=simulator.played, steps=simulator.steps, note=note)
+
+    def _taught(self, simulator: Simulator, lost: list[Any], number: int) -> tuple[Model, Teacher]:
+        """Return a model of all episodes so far, and plans in it: of what was lost first."""
+        model = SimulatorModel.fit(
+            self.problem, simulator.episodes, simulator.row.observer, self.seed + number
+        )
+        order = self.rng.permutation(len(simulator.episodes))
+        chosen = [simulator.episodes[i] for i in order]
+        # Twice each: as it began, and elsewhere with the same references.
+        first = [each for one in lost[: self.n_starts // 4] for each in (one, one)]
+        scenarios = Scenarios.like(model, (first + chosen)[: self.n_starts], self.rng, each=False)
+        teacher = Teacher(scenarios, self.seed + number)
+        teacher.show()
+        return model, teacher
+
+    def _rounds(self, simulator: Simulator, trial: Pairs, best: float) -> tuple[Model, str]:
+        """Fit, plan and imitate until the simulator shows what the model promised."""
+        lost: list[Any] = []
+        weights, least, note = self.weights(), best, ""
+        for number in range(self.rounds):
+            model, teacher = self._taught(simulator, lost, number)
+            if teacher.gain < RULE.least_gain:
+                note = f"plans gain {100 * teacher.gain:.2g} %, too little to teach"
+                break
+            promised = imitate(self.layer, teacher, self.updates)
+            played = trial.replay(self.act())
+            found = played.check(number + 1, RULE.significance, final=False)
+            self.checks.append(found)
+            self.say(
+                f"round {number + 1} of at most {self.rounds}: the model promises "
+                f"{-100 * promised:+.2f} %, the simulator shows {100 * found.change:+.2f} %"
+                f" from {len(played.seeds)} starts; plans gain {100 * teacher.gain:.2f} %"
+            )
+            lost, useful = played.lost, found.safe and found.change < least
+            stalls = least < best and found.change > (1 + LITTLE) * least
+            if useful:
+                weights, least, note = self.weights(), found.change, ""
+            elif least == best:
+                note = found.reason or "no gain in the simulator"
+            kept = useful and found.accepted and -found.change >= PROMISED * teacher.gain
+            if kept or (number and stalls):
+                break
+        self.layer.load_state_dict(weights)
+        return model, note if least == best else ""
+
+    def _confirm(self, simulator: Simulator, model: Model, best: float) -> bool:
+        """Let the simulator decide; teach what is lost, at most three times, then retreat."""
+        for attempt in range(TRIES + 1):
+            if attempt == TRIES:
+                self.scale(RETREATS[0], self.weights())
+            found, pairs = confirm(self.act(), simulator, len(self.checks) + 1)
+            if found.accepted and not found.change < best:
+                found = replace(found, accepted=False, reason="the model's own policy is as good")
+            self.checks.append(found)
+            self.say(
+                f"confirmation on {len(pairs.seeds)} new starts: {100 * found.change:+.2f} %, "
+                f"{found.reason or 'accepted'}"
+            )
+            if found.accepted:
+                self.accept(model)
+                return True
+            if attempt < TRIES - 1:
+                model, teacher = self._taught(simulator, pairs.lost, self.rounds + attempt)
+                imitate(self.layer, teacher, self.updates)
+        return False
