@@ -209,10 +209,18 @@ class Tolerance:
     excess_room: float = EXCESS_ROOM
     bounds: BoundNames = field(default_factory=BoundNames)
 
-    def exceeded(self, policy: Scores, episode: int) -> str:
-        """Return which bound an episode exceeds most, and by how much; empty where none is."""
+    def exceeded(self, policy: Scores, episode: int, mpc: Scores | None = None) -> str:
+        """Return which bound an episode exceeds most, and by how much; empty where none is.
+
+        It is a hard one, if one is exceeded. With the MPC's scores it is empty where the MPC
+        exceeds a bound by as much.
+        """
         row = policy.unsafe[episode]
-        return self.bounds.in_words(row[WORST], row[LARGEST])
+        if mpc is not None:
+            allowed = allowed_excess(mpc.unsafe[episode, ANY_BOUND], self.excess_room)
+            if row[ANY_BOUND] <= allowed:
+                return ""
+        return self.bounds.in_words(row[WORST], row[LARGEST] or row[ANY_BOUND])
 
     def allowed(self, mpc_costs: Array) -> Array:
         """Return what each start may cost more, rounding at least."""
@@ -297,6 +305,8 @@ def no_worse(
         worst = np.argmax(excess)
         more = policy.costs[worst] - mpc.costs[worst]
         reason = f"{costly} costs {more:.4g} more than with the MPC"
+        if words := tolerance.exceeded(policy, int(worst), mpc):
+            reason = f"{reason}: {words}"
     elif is_above(policy.costs, accepted.costs):
         mean, other = format_distinct(policy.costs.mean(), accepted.costs.mean())
         reason = f"mean cost {mean}, accepted {other}"
@@ -380,7 +390,8 @@ class Starts:
         above_mpc = is_above(policy.costs, self.mpc.costs)
         if self.is_lost(policy):
             first = self.hardest(policy)[0]
-            breaks, also = False, ""
+            breaks, words = False, self.tolerance.exceeded(policy, int(first), self.mpc)
+            also = f": {words}" if words else ""
             if self.less_safe(policy).any():
                 breaks = policy.breaks_more_than(self.mpc, self.tolerance.excess_room)
                 words = self.tolerance.exceeded(policy, int(first))

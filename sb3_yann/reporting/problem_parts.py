@@ -140,6 +140,11 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
             f"{policy.penalty.mean():.4g} with the policy, {mpc.penalty.mean():.4g} with the "
             f"MPC. Stage costs and penalty together: {new:.6g} and {old:.6g}."
         )
+        over = np.where(policy.largest > 0, 0.0, policy.any_bound)
+        worst = int(np.argmax(over))
+        which = np.asarray(policy.worst)[worst]
+        if words := BoundNames.of(problem).in_words(which, over[worst]):
+            text += f" In episode {worst} {words} with the policy."
         found.append(make_finding(not costs_more, text))
     return tuple(found)
 
