@@ -310,7 +310,10 @@ class Commissioning:
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]
-        log = [(each.thetas, each.actions) for each in episodes]
+        units = self.policy.problem.units
+        log = [
+            (units.to_plant(each.thetas), units.input_to_plant(each.actions)) for each in episodes
+        ]
         return PlantTwin.fit(self.policy.problem, log, observer=self.observer, seed=seed)
 
     @property

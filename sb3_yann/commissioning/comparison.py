@@ -208,7 +208,9 @@ def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inpu
             now = [each.thetas[min(k, last)] for each, last in zip(episodes, lengths, strict=True)]
             theta[..., row.given] = np.array(now)[:, row.given]
             u = act(row.shown(theta.reshape(-1, shape[-1]))).reshape(*shape[:2], -1)
-            costs += np.where(k < lengths, twin.problem.stage_cost(row.shown(theta), u), 0.0)
+            costs += np.where(
+                k < lengths, twin.problem.deviations.stage_cost(row.shown(theta), u), 0.0
+            )
             after = dynamics.step(theta, u)
             reached = np.array([row.shown(theta), row.shown(after)])
             soft = bound_excess(twin.problem, reached, u[None]).penalty

@@ -12,9 +12,9 @@ import numpy as np
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.closed_loops import Excited, of_law, require_repeated
+from sb3_yann.audit.in_deviations import in_deviations, require_theta_shown
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
-from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import simulated_dynamics
 from sb3_yann.control import LinearMPC
 from sb3_yann.rollout import Controller, EnvPool, Source, Trajectories, maker, rollout
@@ -71,7 +71,7 @@ class SimulatorTwin:
         problem : LinearMPC
             Of the policy.
         env : gymnasium.Env, str or callable
-            It shows theta of the problem, or absolute values where the problem is absolute.
+            It shows theta of the problem, and takes its inputs, in plant units.
         seed : int, default 0
             Of the episodes.
 
@@ -80,7 +80,7 @@ class SimulatorTwin:
         TypeError, ValueError
             If it is no such env.
         """
-        make = showing_theta(maker(env, "twin"), problem)
+        make = in_deviations(maker(env, "twin"), problem)
         envs = EnvPool(make)
         with envs.acquire(1) as (one,):
             row, unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
@@ -88,7 +88,7 @@ class SimulatorTwin:
         first = FIRST + APART * seed
         seeds = range(first, first + LOGGED)
         played = rollout(of_law(problem), envs, seeds, problem=problem)
-        require_deviations(problem, played.steps()[0])
+        require_theta_shown(problem, played.steps()[0])
         require_repeated(problem, envs, first, played.costs[0])
         warn_of_order(problem, *played.steps(), stacklevel=4)
         if not unaware:
@@ -104,7 +104,9 @@ class SimulatorTwin:
         if dynamics is None:
             excited = rollout(Excited(problem, seed), envs, seeds, problem=problem)
             log = [*logged, *_usable(excited)]
-            twin = PlantTwin.fit(problem, log, observer=row.observer, n_members=1, seed=seed)
+            twin = PlantTwin.fit(
+                problem.deviations, log, observer=row.observer, n_members=1, seed=seed
+            )
             dynamics = twin.dynamics
         units = Coordinates.of(problem, episodes, row.observer).units
         return cls(problem, episodes, dynamics, units, seeds, envs)

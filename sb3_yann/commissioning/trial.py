@@ -134,7 +134,10 @@ class Trial:
         excess = bound_excess(twin.problem, twin.dynamics.row.shown(thetas), inputs)
         excess = BoundExcess(*(each.ravel() for each in excess))
         with np.errstate(all="ignore"):
-            costs = twin.problem.stage_cost(shown, inputs).sum(axis=0).ravel() + excess.penalty
+            costs = (
+                twin.problem.deviations.stage_cost(shown, inputs).sum(axis=0).ravel()
+                + excess.penalty
+            )
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
         return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
 

@@ -234,6 +234,6 @@ class Dynamics:
             theta[..., parts.given] = episode.thetas[k, parts.given]
             correction = law(parts.shown(theta[:, 0])) - logged[k]
             u = np.clip(episode.actions[k] + correction, u_min, u_max)[:, None]
-            costs += self.problem.stage_cost(parts.shown(theta), u)[:, 0]
+            costs += self.problem.deviations.stage_cost(parts.shown(theta), u)[:, 0]
             theta = self.step(theta, u)
         return costs

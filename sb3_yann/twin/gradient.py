@@ -94,7 +94,7 @@ class Objective:
         """Return the costs of runs with those of soft bounds, without the penalty."""
         thetas = rows[..., : self.problem.n_theta]
         end = thetas[-1]
-        stage = self.problem.stage_cost(thetas[:-1], inputs).sum(axis=0)
+        stage = self.problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0)
         soft = bound_excess(self.problem, thetas, inputs).penalty
         return np.asarray(stage + soft + np.sum((end @ self.value) * end, axis=-1))
 

@@ -49,7 +49,8 @@ class Bounds:
 
     @classmethod
     def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
-        """Return those of a problem, and of its states (n,) besides."""
+        """Return those of a problem, and of its states (n,) besides, in deviations."""
+        problem = problem.deviations
         outputs, n = problem.outputs, problem.model.n_states
         size = (problem.theta_max - problem.theta_min)[:n] / 2
         # Without a box the size of a bound is the unit: one that is fixed would be hidden.
@@ -183,6 +184,7 @@ def bound_excess(
     >>> float(bound_excess(mpc, np.array([[4.0, 2], [6.0, 2]]), np.zeros((1, 1))).largest)
     0.2
     """
+    problem = problem.deviations
     bounds = Bounds.of(problem) if bounds is None else bounds
     with np.errstate(invalid="ignore", over="ignore"):
         parts = [
