@@ -50,17 +50,16 @@ def draw_training(mpc: LinearMPC, fresh: DDPG, model: DDPG) -> None:
     theta[:, 1] = c_b
     figure = Figure(figsize=(8, 3), layout="constrained")
     left, right = figure.subplots(1, 2)
-    shown = c_b + mpc.model.x_ss[1]
-    left.plot(shown, mpc.law()(theta) + mpc.model.u_ss, color="0.75", linewidth=6, label="MPC")
+    left.plot(c_b, mpc.law()(theta), color="0.75", linewidth=6, label="MPC")
     for name, each, line in (("before", fresh, "--"), ("after", model, "-")):
         u = each.predict(theta)[0]
         with torch.no_grad():
             action = torch.as_tensor(each.policy.scale_action(u))
             value = each.critic(torch.as_tensor(theta), action)[0].numpy()
-        left.plot(shown, u + mpc.model.u_ss, line, label=f"policy, {name}")
-        right.plot(shown, -value, line, label=f"critic, {name}")
-    left.set(xlabel="C_B (mol/L)", ylabel="U (kJ/(h m² K))")
-    right.set(xlabel="C_B (mol/L)", ylabel="cost still to come")
+        left.plot(c_b, u, line, label=f"policy, {name}")
+        right.plot(c_b, -value, line, label=f"critic, {name}")
+    left.set(xlabel="C_B (mol/L, from the steady state)", ylabel="U (kJ/(h m² K))")
+    right.set(xlabel="C_B (mol/L, from the steady state)", ylabel="cost still to come")
     left.legend()
     right.legend()
     save(figure, "before-after")

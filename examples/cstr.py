@@ -13,7 +13,7 @@ from stable_baselines3 import DDPG
 
 from sb3_yann import ControlDiagnostics, ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.evaluation import comparison_table, evaluate, save_plant_trajectories
-from sb3_yann_envs.cstr import TEMPERATURE_LIMIT
+from sb3_yann_envs.cstr import TEMPERATURE_LIMIT, X_SS
 
 STEPS = 400  # of one episode
 TEST_SEEDS = range(1000, 1010)  # starts that training never sees
@@ -52,7 +52,8 @@ def main() -> None:
         model.policy.problem,
         "h",
         entries=[3, 0],
-        limits={3: (TEMPERATURE_LIMIT, f"limit, {TEMPERATURE_LIMIT:g} K")},
+        labels={3: f"T - {X_SS[3]:g} K", 0: "C_A - steady state (mol/L)"},
+        limits={3: (TEMPERATURE_LIMIT - X_SS[3], f"limit, {TEMPERATURE_LIMIT:g} K")},
     )
     console.print(f"Trajectories: {picture}    Curves: tensorboard --logdir out/tensorboard")
 

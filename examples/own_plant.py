@@ -17,7 +17,7 @@ from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
 from sb3_yann import CostAudit, ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
 from sb3_yann.evaluation import evaluate, save_plant_trajectories, summary_table
-from sb3_yann.wrappers import Deviations, MeasuredDisturbance, SetPoint, StageCost
+from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
 TEST_SEEDS = range(2000, 2050)  # starts, set-points and disturbances that training never sees
@@ -35,12 +35,12 @@ def design() -> LinearMPC:
     wanted = Tracking([0, 1], plant.x_ss[:2] - 4, plant.x_ss[:2] + 4)
     wishes = {"tracking": wanted, "disturbances": DisturbanceBounds(-1, 1)}
     limits = {"u_min": 0, "u_max": MAX_VOLTAGE, "theta_min": 0, "theta_max": FULL}
-    return LinearMPC(plant, **weights, **wishes, **limits, absolute=True)  # as the plant shows them
+    return LinearMPC(plant, **weights, **wishes, **limits)  # as the plant shows them
 
 
 def make_env(mpc: LinearMPC) -> gymnasium.Env:
-    """Return the plant of today, in deviations, with all that the MPC's theta holds."""
-    env = Deviations(QuadrupleTank(noise=0.03, wear=0.1), mpc.model)
+    """Return the plant of today, with all that the MPC's theta holds."""
+    env = QuadrupleTank(noise=0.03, wear=0.1)
     env = SetPoint(env, mpc.tracking.r_min, mpc.tracking.r_max, hold=HOLD)
     env = MeasuredDisturbance(env, mpc.disturbances.d_min, mpc.disturbances.d_max)
     return TimeLimit(StageCost(env, mpc), STEPS)

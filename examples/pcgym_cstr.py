@@ -9,19 +9,19 @@ from stable_baselines3 import DDPG
 
 from sb3_yann import ImprovementGuard, LinearMPC, NoActionNoise, SimulatedEpisodes, offset_free
 from sb3_yann.evaluation import evaluate, summary_table
-from sb3_yann.wrappers import Deviations, ObserveDisturbance, StageCost
+from sb3_yann.wrappers import ObserveDisturbance, StageCost
 from sb3_yann_envs.pcgym import PCGymEnv
 
 plant = PCGymEnv("cstr")
 weights = {"Q": np.diag([1e3, 0]), "R": [[2e-3]], "horizon": 5, "gamma": 0.95}
-box = {"tracking": plant.tracking, **plant.bounds, "absolute": True}
+box = {"tracking": plant.tracking, **plant.bounds}
 mpc, observer = offset_free(LinearMPC(plant.linear_model(), **weights, **box))
 d = mpc.disturbances  # one of each state, which the observer estimates
 
 
 def make_env() -> StageCost:
-    """Return the plant in deviations, with the estimated disturbance in theta."""
-    env = ObserveDisturbance(Deviations(PCGymEnv("cstr"), mpc), observer, d.d_min, d.d_max)
+    """Return the plant, with the estimated disturbance in theta."""
+    env = ObserveDisturbance(PCGymEnv("cstr"), observer, d.d_min, d.d_max)
     return StageCost(env, mpc)
 
 

@@ -19,7 +19,7 @@ from quadrotor_plant import DT, MAX_THRUST, STARTS, Quadrotor, derivative
 from sb3_yann import ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import LinearModel, LinearMPC, SoftBounds
 from sb3_yann.evaluation import evaluate, save_plant_trajectories, summary_table
-from sb3_yann.wrappers import Deviations, StageCost
+from sb3_yann.wrappers import StageCost
 
 STEPS = 100  # of one episode: 5 s
 TEST_SEEDS = range(3000, 3100)  # starts that training and guard never see
@@ -38,12 +38,12 @@ def hover() -> LinearMPC:
     limits = {"x_min": -tilt, "x_max": tilt, "u_min": 0.0, "u_max": MAX_THRUST}
     limits |= {"theta_min": -4 * STARTS - 3, "theta_max": 4 * STARTS + 3}
     weights = {"Q": np.diag(np.repeat([10.0, 1.0, 1.0, 0.1], 3)), "R": 0.5 * np.eye(4)}
-    return LinearMPC(model, **weights, horizon=20, gamma=0.99, soft=soft, absolute=True, **limits)
+    return LinearMPC(model, **weights, horizon=20, gamma=0.99, soft=soft, **limits)
 
 
 def make_env(mpc: LinearMPC) -> gymnasium.Env:
-    """Return the plant in deviations from hovering, which costs what the MPC minimizes."""
-    return TimeLimit(StageCost(Deviations(Quadrotor(), mpc.model), mpc), STEPS)
+    """Return the plant, which costs what the MPC minimizes."""
+    return TimeLimit(StageCost(Quadrotor(), mpc), STEPS)
 
 
 def main() -> None:

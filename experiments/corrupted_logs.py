@@ -21,6 +21,7 @@ from examples import quadruple_tank as tank
 from experiments import plants
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, improve
 from sb3_yann._validation import Array
+from sb3_yann.audit.in_deviations import in_deviations
 from sb3_yann.wrappers import SetPoint
 
 Log = list[tuple[Array, Array]]
@@ -103,6 +104,7 @@ def worn_tank() -> tuple[LinearMPC, Any]:
     slope = lambda x, v: np.array(tank.derivative(x, v))  # noqa: E731
     model = LinearModel.from_dynamics(slope, [np.nan] * 4, u, tank.DT)
     rest = model.x_ss
+    model = LinearModel(model.A, model.B, tank.DT)  # in deviations, as the plant
     mpc = LinearMPC(
         model, Q=np.diag([1, 1, 0, 0]), R=0.1 * np.eye(2), horizon=3, gamma=0.98, u_min=-3, u_max=3,
         tracking=Tracking([0, 1], [-2, -2], [2, 2]), theta_min=-rest, theta_max=20 - rest,
@@ -113,10 +115,10 @@ def worn_tank() -> tuple[LinearMPC, Any]:
 
 
 def textbook(make: Callable[[], plants.TextbookPlant]) -> tuple[LinearMPC, Any]:
-    """Return the MPC of a textbook's plant, and what makes the plant."""
+    """Return the MPC of a textbook's plant, and what makes the plant, both in deviations."""
     plant = make()
     mpc = plant.mpc()
-    return mpc, lambda: plant.env(mpc)
+    return mpc.deviations, in_deviations(lambda: plant.env(mpc), mpc)
 
 
 PLANTS: dict[str, Callable[[], tuple[LinearMPC, Any]]] = {

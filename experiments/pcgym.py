@@ -37,7 +37,7 @@ from sb3_yann import (
     improve,
 )
 from sb3_yann.evaluation import Trajectories, evaluate
-from sb3_yann.wrappers import Deviations, ObserveDisturbance, StageCost
+from sb3_yann.wrappers import ObserveDisturbance, StageCost
 from sb3_yann_envs.pcgym import PCGymEnv
 
 HORIZONS = {"cstr": 5, "four_tank": 3, "multistage_extraction": 1}
@@ -90,13 +90,13 @@ class Case:
             self.observer = DisturbanceObserver(model, **noise, disturbance_noise=10)
         self.mpc = LinearMPC(
             model, Q=np.diag(error), R=np.diag(0.1 / (plant.u_max - plant.u_min) ** 2),
-            horizon=HORIZONS[name], gamma=0.95, tracking=plant.tracking, absolute=True,
+            horizon=HORIZONS[name], gamma=0.95, tracking=plant.tracking,
             **more, **plant.bounds,
         )  # fmt: skip
 
     def env(self) -> gym.Env[Any, Any]:
-        """Return the plant in deviations, with PC-Gym's reward."""
-        env: gym.Env[Any, Any] = Deviations(PCGymEnv(self.name), self.mpc)
+        """Return the plant, with PC-Gym's reward."""
+        env: gym.Env[Any, Any] = PCGymEnv(self.name)
         if self.observer is None:
             return env
         bounds = self.mpc.disturbances
@@ -117,15 +117,16 @@ class Rival:
     """What a model of `scaled` does to theta."""
 
     def __init__(self, model: Any, case: Case) -> None:
-        self.model, self.mpc, self.plant = model, case.mpc, case.plant
+        self.model, self.plant = model, case.plant
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
-        """Return inputs (batch, m), as deviations."""
+        """Return inputs (batch, m)."""
         box, plant = self.plant.observation_space, self.plant
-        shown = 2 * (theta + self.mpc.theta_ss - box.low) / (box.high - box.low) - 1
+        shown = 2 * (theta - box.low) / (box.high - box.low) - 1
         action = self.model.predict(shown.astype(np.float32), deterministic=True)[0]
-        u = plant.u_min + (np.clip(action, -1, 1) + 1) / 2 * (plant.u_max - plant.u_min)
-        return np.asarray(u - self.mpc.model.u_ss)
+        return np.asarray(
+            plant.u_min + (np.clip(action, -1, 1) + 1) / 2 * (plant.u_max - plant.u_min)
+        )
 
 
 class Batched:

@@ -56,10 +56,10 @@ class NonlinearMPC:
         self.plans: dict[int, Any] = {}
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
-        """Return inputs (batch, m), as deviations; each row goes on with its own plan."""
-        given = np.atleast_2d(theta) + self.mpc.theta_ss
+        """Return inputs (batch, m); each row goes on with its own plan."""
+        given = np.atleast_2d(theta)
         found = np.array([self.low[self.n :] + self._next(i, row) for i, row in enumerate(given)])
-        return found.reshape(*np.shape(theta)[:-1], self.m) - self.mpc.model.u_ss
+        return found.reshape(*np.shape(theta)[:-1], self.m)
 
     def _next(self, i: int, row: np.ndarray) -> np.ndarray:
         """Return how far above their least the inputs (m,) of the i-th episode are to be."""

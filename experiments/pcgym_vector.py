@@ -68,9 +68,7 @@ class CaseVectorEnv(VectorEnv[Any, Any, Any]):
         plant, mpc, space = self.case.plant, self.case.mpc, self.single_action_space
         u = np.clip(np.asarray(actions, np.float64), space.low, space.high)
         costs = mpc.stage_cost(self.theta.astype(np.float64), u)
-        low, high = plant.action_space.low, plant.action_space.high
-        absolute = np.clip(u + mpc.model.u_ss, low, high).astype(np.float32).astype(np.float64)
-        self.x = plant.advance(self.x, np.clip(absolute, plant.u_min, plant.u_max))
+        self.x = plant.advance(self.x, np.clip(u, plant.u_min, plant.u_max))
         self.taken += 1
         self.theta = self._shown(u)
         over = np.full(self.num_envs, self.taken >= len(plant.schedule) - 1)
@@ -81,17 +79,18 @@ class CaseVectorEnv(VectorEnv[Any, Any, Any]):
         case, observer = self.case, self.case.observer
         assert observer is not None
         seen = np.concatenate([self.x, self.wanted[:, self.taken]], axis=1).astype(np.float32)
-        shift = np.concatenate([case.mpc.model.x_ss, case.mpc.tracking.C @ case.mpc.model.x_ss])
-        y, r = np.split(seen.astype(np.float64) - shift, [observer.n_measured], axis=1)
-        n = case.mpc.model.n_states
+        y, r = np.split(seen, [observer.n_measured], axis=1)
+        units, n = case.mpc.units, case.mpc.model.n_states
+        y = units.to_deviations(y)
         if u is None:
             start = y @ np.linalg.pinv(observer.C).T
             self.estimate = np.hstack([start, np.zeros((len(y), case.mpc.model.n_disturbances))])
         else:
+            u = units.input_to_deviations(u)
             predicted = self.estimate @ observer.A.T + u @ observer.B.T
             self.estimate = predicted + (y - predicted @ observer.seen.T) @ observer.gain.T
         d = np.clip(self.estimate[:, n:], *self.bounds)
-        shown = np.hstack([self.estimate[:, :n], r, d]).astype(np.float32)
+        shown = np.hstack([units.to_plant(self.estimate[:, :n]), r, d]).astype(np.float32)
         inside = self.one.get_wrapper_attr("_inside")
         rounded = self.one.get_wrapper_attr("_rounded")
         for bound, within in zip(rounded, inside, strict=True):

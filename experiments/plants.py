@@ -24,7 +24,7 @@ import own_plant
 import quadruple_tank
 from sb3_yann import LinearModel, LinearMPC, Tracking, offset_free
 from sb3_yann._validation import Array
-from sb3_yann.wrappers import Deviations, ObserveDisturbance, SetPoint
+from sb3_yann.wrappers import ObserveDisturbance, SetPoint
 from sb3_yann_envs import cstr, problems
 
 Step = Callable[[Array, Array], Array]
@@ -78,18 +78,17 @@ class TextbookPlant:
             u_max=self.u_high,
             theta_min=self.low,
             theta_max=self.high,
-            absolute=True,
         )
 
     def env(self, mpc: LinearMPC) -> gym.Env[Any, Any]:
-        """Return the plant with set-points, in deviations."""
+        """Return the plant with set-points."""
         bounds = mpc.tracking.r_min, mpc.tracking.r_max
-        env = SetPoint(Deviations(TextbookEnv(self), mpc), *bounds, hold=self.hold)
+        env = SetPoint(TextbookEnv(self), *bounds, hold=self.hold)
         return TimeLimit(env, self.steps)
 
 
 class TextbookEnv(gym.Env[Array, Array]):
-    """A plant that shows its state and takes its inputs, both absolute; it has no reward."""
+    """A plant that shows its state and takes its inputs; it has no reward."""
 
     def __init__(self, plant: TextbookPlant) -> None:
         self.plant = plant
@@ -226,7 +225,8 @@ def conical_tank() -> TextbookPlant:
 
 def true_reactor() -> LinearMPC:
     """Return the reactor's MPC with the model that its equations give, not the printed one."""
-    model = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
+    found = LinearModel.from_dynamics(cstr.dynamics, cstr.X_SS, cstr.U_SS, cstr.DT)
+    model = LinearModel(found.A, found.B, cstr.DT)  # in deviations, as the environment is
     return replace(problems.cstr(), model=model, terminal=None)
 
 
@@ -273,12 +273,12 @@ def worn_tank() -> Case:
         theta_min=0,
         theta_max=quadruple_tank.FULL,
         tracking=Tracking([0, 1], model.x_ss[:2] - 4, model.x_ss[:2] + 4),
-        absolute=True,
     )
 
     def make() -> gym.Env[Any, Any]:
-        env = Deviations(quadruple_tank.QuadrupleTank(wear=0.1), mpc.model)
-        return TimeLimit(SetPoint(env, [-2.0, -2.0], [2.0, 2.0], hold=20), 60)
+        wanted = model.x_ss[:2] - 2, model.x_ss[:2] + 2
+        env = SetPoint(quadruple_tank.QuadrupleTank(wear=0.1), *wanted, hold=20)
+        return TimeLimit(env, 60)
 
     return Case(mpc, make)
 

@@ -101,7 +101,6 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("path", help="where to write it: .c, .npz, .onnx, .st, .xml (PLCopen) or .fmu")
     one.add_argument("--name", help="prefix of all names in code; default: the file's")
     one.add_argument("--float", action="store_true", help="code in single precision")
-    one.add_argument("--absolute", action="store_true", help="readings and inputs as the plant's")
     one.add_argument(
         "--checks", metavar="FILE.json", help="limits of readings, and how to fall back"
     )
@@ -193,7 +192,6 @@ def _export(options: Namespace) -> None:
         options.path,
         name=options.name,
         precision="float" if options.float else "double",
-        absolute=options.absolute,
         checks=_checks(options.checks),
         observer=options.observer,
     )

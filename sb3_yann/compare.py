@@ -37,6 +37,8 @@ COST_ROUNDING = 1e-6
 """Of a mean cost: what float32 actions and batches of other sizes make of one policy's."""
 WORST_START = 10.0
 """With a CVaR: how many times as much as on average a single start may cost more."""
+FEW_PAIRS = 12
+"""Pairs that a drift can line up by the order that is drawn, which no standard error tells."""
 HARDEST = 10
 """New starts that join those of every later candidate at a time."""
 
@@ -209,10 +211,18 @@ class Tolerance:
     excess_room: float = EXCESS_ROOM
     bounds: BoundNames = field(default_factory=BoundNames)
 
-    def exceeded(self, policy: Scores, episode: int) -> str:
-        """Return which bound an episode exceeds most, and by how much; empty where none is."""
+    def exceeded(self, policy: Scores, episode: int, mpc: Scores | None = None) -> str:
+        """Return which bound an episode exceeds most, and by how much; empty where none is.
+
+        It is a hard one, if one is exceeded. With the MPC's scores it is empty where the MPC
+        exceeds a bound by as much.
+        """
         row = policy.unsafe[episode]
-        return self.bounds.in_words(row[WORST], row[LARGEST])
+        if mpc is not None:
+            allowed = allowed_excess(mpc.unsafe[episode, ANY_BOUND], self.excess_room)
+            if row[ANY_BOUND] <= allowed:
+                return ""
+        return self.bounds.in_words(row[WORST], row[LARGEST] or row[ANY_BOUND])
 
     def allowed(self, mpc_costs: Array) -> Array:
         """Return what each start may cost more, rounding at least."""
@@ -297,6 +307,8 @@ def no_worse(
         worst = np.argmax(excess)
         more = policy.costs[worst] - mpc.costs[worst]
         reason = f"{costly} costs {more:.4g} more than with the MPC"
+        if words := tolerance.exceeded(policy, int(worst), mpc):
+            reason = f"{reason}: {words}"
     elif is_above(policy.costs, accepted.costs):
         mean, other = format_distinct(policy.costs.mean(), accepted.costs.mean())
         reason = f"mean cost {mean}, accepted {other}"
@@ -380,7 +392,8 @@ class Starts:
         above_mpc = is_above(policy.costs, self.mpc.costs)
         if self.is_lost(policy):
             first = self.hardest(policy)[0]
-            breaks, also = False, ""
+            breaks, words = False, self.tolerance.exceeded(policy, int(first), self.mpc)
+            also = f": {words}" if words else ""
             if self.less_safe(policy).any():
                 breaks = policy.breaks_more_than(self.mpc, self.tolerance.excess_room)
                 words = self.tolerance.exceeded(policy, int(first))
@@ -420,23 +433,37 @@ class PairedMean(NamedTuple):
     error : float
         Its standard error, widened where pairs that follow each other are correlated.
     pairs : int
+    chance : float, default 0
+        How often the order that was drawn for each pair alone brings a mean as low: exact under
+        any drift. It is not computed for more than `FEW_PAIRS`, where the error counts a drift.
     """
 
     mean: float
     error: float
     pairs: int
+    chance: float = 0.0
 
     @classmethod
     def of(cls, differences: Array) -> PairedMean:
         """Return that of differences in the order in which they were played."""
-        if len(differences) < 2:
-            return cls(float(differences.mean()), 0.0, len(differences))
+        n = len(differences)
+        chance = 0.0
+        if n <= FEW_PAIRS:
+            orders = 1 - 2 * (np.arange(2**n)[:, None] >> np.arange(n) & 1)
+            as_low = differences.sum() + COST_ROUNDING * np.abs(differences).sum()
+            chance = float(np.mean(orders @ differences <= as_low))
+        if n < 2:
+            return cls(float(differences.mean()), 0.0, n, chance)
         left = differences - differences.mean()
         size = float(left @ left)
         lag = float(np.clip(left[1:] @ left[:-1] / size, 0.0, 0.95)) if size > 0 else 0.0
         widened = np.sqrt((1 + lag) / (1 - lag))  # an autoregression's variance of the mean
-        error = float(widened * differences.std(ddof=1) / np.sqrt(len(differences)))
-        return cls(float(differences.mean()), error, len(differences))
+        error = float(widened * differences.std(ddof=1) / np.sqrt(n))
+        return cls(float(differences.mean()), error, n, chance)
+
+    def is_below_zero(self) -> bool:
+        """Return whether the mean is surely negative: by chance in one of twenty cases at most."""
+        return self.pairs >= 2 and self.chance <= 0.05 and self.mean + self.room() < 0
 
     def room(self, level: float = 0.95) -> float:
         """Return how far from 0 the mean may be by chance, one-sided; inf for a single pair."""

@@ -18,12 +18,12 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_yann._validation import Array, check_int, check_type
+from sb3_yann._validation import Array, check_int, check_type, half_widths
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
-from sb3_yann.control.mpc.plant_units import InputUnits
+from sb3_yann.units import same_bounds
 
 Source = gym.Env[Any, Any] | str | Callable[[], gym.Env[Any, Any]]
 Rows = NDArray[np.intp]
@@ -238,8 +238,9 @@ def rollout(
     seeds, starts : iterable of int, and sequence of array_like
         As for :func:`evaluate`.
     problem : LinearMPC, optional
-        Whose theta the plant shows, and whose inputs it takes: then ``costs`` are its stage costs,
-        and ``excess`` is known. Inputs reach the plant in the type of its action space.
+        Whose theta the plant shows, and whose inputs it takes, both in deviations: then ``costs``
+        are its stage costs, and ``excess`` is known. Inputs reach the plant in the type of its
+        action space.
     check : callable, optional
         Is called with the first env, and raises if it does not fit.
     """
@@ -278,8 +279,7 @@ def as_controller(policy: Predictor | Callable[[Any], Any]) -> Controller:
     """Return a model, a law, or a function from an observation to an action as a controller."""
     if isinstance(policy, LinearMPC):
         raise TypeError(
-            "policy is a LinearMPC, which is a problem: pass its law, mpc.explicit() or mpc.law(); "
-            "for an env in absolute values mpc.explicit().plant_input."
+            "policy is a LinearMPC, which is a problem: pass its law, mpc.explicit() or mpc.law()."
         )
     if hasattr(policy, "predict"):
         predict = policy.predict
@@ -287,6 +287,8 @@ def as_controller(policy: Predictor | Callable[[Any], Any]) -> Controller:
     if not callable(policy):
         raise TypeError(f"policy = {policy!r} must have a predict method or be callable.")
     act = policy
+    if isinstance(policy, PiecewiseAffine | OnlineLaw) and policy.units.shifted:
+        act = policy.plant_input
     if isinstance(policy, PiecewiseAffine):
         return lambda t, observations, rows: act(observations)
     return lambda t, observations, rows: np.array([act(each) for each in observations])
@@ -462,7 +464,8 @@ def _with_stage_costs(played: Trajectories, problem: LinearMPC) -> Trajectories:
     thetas, inputs, _ = played.padded()
     taken = np.arange(len(inputs))[:, None] < played.lengths
     excess = bound_excess(problem, thetas, inputs, taken)
-    costs = np.sum(problem.stage_cost(thetas[:-1], inputs), axis=0, where=taken) + excess.penalty
+    costs = problem.deviations.stage_cost(thetas[:-1], inputs)
+    costs = np.sum(costs, axis=0, where=taken) + excess.penalty
     return replace(played, costs=costs, excess=excess)
 
 
@@ -647,19 +650,18 @@ def _require_state_shown(policy: Any, env: gym.Env[Any, Any]) -> None:
 
 
 def _require_same_inputs(policy: Any, space: Any) -> None:
-    """Raise if a law puts out deviations, and an env takes absolute inputs."""
+    """Raise if an env takes deviations, and a law has a plant with an operating point."""
     model = getattr(policy, "model", None)
     if not isinstance(policy, PiecewiseAffine | OnlineLaw) or not isinstance(model, LinearModel):
         return
-    if not isinstance(space, gym.spaces.Box):
+    if not isinstance(space, gym.spaces.Box) or not np.any(model.u_ss):
         return
-    units = InputUnits.between(policy.u_min, policy.u_max, model.u_ss, space.low, space.high)
-    if units is not None and units.kind == "absolute":
+    own, half = (policy.u_min, policy.u_max), half_widths(policy.u_min, policy.u_max)
+    if same_bounds((space.low, space.high), own, half):
         raise ValueError(
-            f"The env takes absolute inputs, from {space.low.tolist()} to {space.high.tolist()}, "
-            f"and the law puts out deviations, from {policy.u_min.tolist()} to "
-            f"{policy.u_max.tolist()}. Pass law.plant_input where the env shows absolute values "
-            "too, else wrap the plant in sb3_yann.wrappers.Deviations(env, mpc.model)."
+            f"The env takes deviations, from {space.low.tolist()} to {space.high.tolist()}, and "
+            f"the law is of a plant with u_ss = {model.u_ss.tolist()}. Leave x_ss and u_ss out of "
+            "the model, or take the env in plant units."
         )
 
 

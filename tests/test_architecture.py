@@ -17,7 +17,7 @@ PACKAGES = {"sb3_yann": ROOT, "sb3_yann_envs": ROOT / "envs"}
 
 FLOORS = [
     {"sb3_yann._archive", "sb3_yann._validation", "sb3_yann._numba", "sb3_yann._drawing"},
-    {"sb3_yann.log"},
+    {"sb3_yann.log", "sb3_yann.units"},
     {"sb3_yann.control"},
     {"sb3_yann.compare"},
     {"sb3_yann.rollout"},
@@ -47,6 +47,7 @@ FORBIDDEN = {
     "sb3_yann._validation": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann._numba": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann._drawing": {"torch", "stable_baselines3", "gymnasium"},
+    "sb3_yann.units": {"torch", "stable_baselines3", "gymnasium"},
     "sb3_yann.control": {"torch", "stable_baselines3", "sb3_contrib", "rl_zoo3"},
     "sb3_yann.networks": {
         "stable_baselines3",

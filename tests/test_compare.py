@@ -331,6 +331,17 @@ def test_pairs_that_follow_each_other_alike_are_fewer_than_they_seem() -> None:
     assert PairedMean.of(np.array([1.0])).room() == np.inf
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.5])
+def test_a_drift_that_the_drawn_orders_line_up_is_no_gain_in_one_of_twenty_cases(noise) -> None:
+    rng = np.random.default_rng(0)
+    for pairs in range(2, 10):
+        drift = 1 + noise * rng.standard_normal(pairs)  # the second of a pair costs more
+        orders = 1 - 2 * (np.arange(2**pairs)[:, None] >> np.arange(pairs) & 1)
+        kept = [PairedMean.of(order * drift).is_below_zero() for order in orders]
+        assert np.mean(kept) <= 0.05
+        assert any(kept) == (pairs > 4)  # of four pairs one order in sixteen does it
+
+
 @pytest.mark.parametrize(
     ("name", "good", "bad"),
     [

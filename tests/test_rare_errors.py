@@ -108,11 +108,6 @@ def test_it_is_named(call, error, message) -> None:
         call()
 
 
-def test_an_export_in_the_plants_units_needs_a_law_that_knows_them(tmp_path) -> None:
-    with pytest.raises(ValueError, match="absolute = True needs a law that knows its operating"):
-        export(hand_made(), tmp_path / "law.npz", absolute=True)
-
-
 def test_an_operators_output_has_the_shape_of_the_inputs(tmp_path) -> None:
     export(scalar_mpc().explicit(), tmp_path / "law.npz")
     controller = Controller.load(tmp_path / "law.npz")

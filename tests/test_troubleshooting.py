@@ -85,14 +85,14 @@ def normalized() -> DDPG:
     return model(VecNormalize(DummyVecEnv([Plant]), training=False, norm_reward=False))
 
 
-def absolute_states() -> None:
+def shown_deviations() -> None:
     shown = Plant(observation_space=box(300, 400))
     shown.start = 0
     plant = LinearModel([[0.9]], [[1]], 1, x_ss=[350], state_names=["T"])
-    design = {"Q": [[1]], "R": [[1]], "horizon": 2, "x_min": -5, "x_max": 5}
+    design = {"Q": [[1]], "R": [[1]], "horizon": 2, "x_min": 345, "x_max": 355}
     problem = LinearMPC(plant, **design, u_min=-1, u_max=1)
     built = DDPG(YannPolicy, shown, policy_kwargs={"problem": problem})
-    built.predict(np.array([352], np.float32))
+    built.predict(np.array([2], np.float32))
 
 
 def lost_reward() -> None:
@@ -133,7 +133,7 @@ CASES: dict[str, Callable[[], object]] = {
         Plant(action_space=box(-2, 2))
     ),
     NO_BOX: lambda: model(Plant(action_space=gym.spaces.Discrete(3))),
-    "state 'T' = 352 is shown, and the operating point is 350": absolute_states,
+    "T = 2 is shown, and the operating point is 350": shown_deviations,
     "VecNormalize normalizes observations, and the law takes the state.": normalized,
     # The reward
     "The reward is not minus the cost of the problem": lambda: learn(

@@ -285,12 +285,12 @@ class PCGymEnv(gymnasium.Env[Single, Single]):
 
     @property
     def tracking(self) -> Tracking:
-        """The outputs that follow set-points, and the box of these; absolute."""
+        """The outputs that follow set-points, and the box of these, in plant units."""
         return Tracking(self.outputs, self.r_min, self.r_max)
 
     @property
     def bounds(self) -> dict[str, Array]:
-        """Bounds of a :class:`LinearMPC`: of the inputs, and the box of states; absolute."""
+        """Bounds of a :class:`LinearMPC`: of the inputs, and the box of states, in plant units."""
         return {
             "u_min": self.u_min,
             "u_max": self.u_max,

@@ -39,7 +39,9 @@ def clipped_pendulum() -> LinearMPC:
 
 
 def cstr() -> LinearMPC:
-    """Return the reactor's MPC: N = 2, deviations from the steady state, undiscounted.
+    """Return the reactor's MPC: N = 2, undiscounted, in deviations, as the environment is.
+
+    Its model has no operating point: the steady state is 0 here.
 
     The box of -2 to 2 mol/L and -70 to 5 K bounds the parameter only. With predicted
     states bounded as well, as the paper's text has it, there are 79 half-spaces instead of 56.
@@ -49,9 +51,7 @@ def cstr() -> LinearMPC:
     >>> cstr().explicit().n_halfspaces
     56
     """
-    model = LinearModel(
-        reactor.PRINTED_A, reactor.PRINTED_B, reactor.DT, reactor.X_SS, reactor.U_SS
-    )
+    model = LinearModel(reactor.PRINTED_A, reactor.PRINTED_B, reactor.DT)
     units = [*["mol/L"] * 3, "K", "kJ/(h m² K)"]
     model = model.named(["C_A", "C_B", "C_S", "T"], ["U"], units)
     return LinearMPC(

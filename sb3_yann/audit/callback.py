@@ -11,7 +11,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array, check_bool, check_int, check_positive
-from sb3_yann.audit.absolute import absolute_observation
 from sb3_yann.audit.causes import Cause, likely_cause, not_finite
 from sb3_yann.audit.finding import (
     CostFinding,
@@ -127,8 +126,6 @@ class CostAudit(BaseCallback):
         cause = self._of_the_vec_normalize()
         if cause is None and enough and not sample.is_the_problem_s_cost(self.tolerance):
             cause = likely_cause(sample, self.tolerance)
-        if enough and (cause is None or cause.name == "unknown"):
-            cause = absolute_observation(self.policy.problem, sample.theta) or cause
         if lost.any():
             cause = not_finite(lost, records, cause)
         beside = self._resting_beside(sample) if enough else ""
@@ -177,8 +174,9 @@ class CostAudit(BaseCallback):
             rounding=self._rounding(observations),
             scale=options.reward_scale,
             offset=options.reward_offset,
-            stage_cost=problem.stage_cost,
-            step=problem.predict,
+            stage_cost=problem.deviations.stage_cost,
+            step=problem.deviations.predict,
+            theta_ss=problem.theta_ss,
             gamma=self.model.gamma,
         )
 
@@ -186,7 +184,7 @@ class CostAudit(BaseCallback):
         """Return by how much theta may err, (steps, n_theta); see AffineObservation."""
         digits = observations.dtype if observations.dtype.kind == "f" else np.float64
         size = np.abs(observations).astype(np.float64)
-        if (seen := self.policy.observation) is not None:
+        if (seen := self.policy.to_theta) is not None:
             # What a normalization hides of its size is in the offset.
             size = size @ np.abs(seen.matrix).T + np.abs(seen.offset)
         return np.asarray(size * float(np.finfo(digits).eps))

@@ -97,8 +97,6 @@ def judged(sample: Sample, cause: Cause | None, venv: VecEnv, rest: str = "") ->
     wrappers = _suspects(venv)
     if cause.name == "not finite":
         message = f"The rewards cannot all be compared: {cause.explanation}"
-    elif cause.name == "absolute observation":
-        message = f"The observation is not the theta of the law: {cause.explanation}"
     else:
         message = " ".join(_in_words(sample, cause, wrappers, line))
     numbers = line.scale, line.offset, line.r2, steps

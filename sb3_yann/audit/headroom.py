@@ -24,10 +24,10 @@ from sb3_yann.audit.closed_loops import (
     require_repeated,
 )
 from sb3_yann.audit.gains import LITTLE, UNKNOWN, WORTH, Headroom, gain, verdict_of
+from sb3_yann.audit.in_deviations import in_deviations, require_theta_shown
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.offset import remaining_offset
 from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
-from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.audit.plants import (
     Access,
     Plant,
@@ -85,8 +85,8 @@ def headroom(
         Its stage cost is what counts. A :class:`CostMismatchWarning` says where the env's own
         reward is another one.
     env_or_twin : gymnasium.Env, str, callable or PlantTwin
-        A simulator that shows theta of the MPC and takes its inputs, both as deviations, or both
-        absolute where the MPC has ``absolute=True``. It plays the same episode again from the same
+        A simulator that shows theta of the MPC and takes its inputs, in plant units where the MPC's
+        model has an operating point. It plays the same episode again from the same
         seed and inputs, and is copied. Or a twin of the MPC's plant, each of
         whose members has its share of the starts.
     n_starts : int, default 30
@@ -168,7 +168,7 @@ class _Search:
         else:
             self.make = maker(given)
             self.source = _name(mpc, self.make)
-            self.make = showing_theta(self.make, mpc)
+            self.make = in_deviations(self.make, mpc)
 
     def play_mpc(self) -> None:
         """Play the MPC, and see that the env repeats an episode."""
@@ -180,7 +180,7 @@ class _Search:
                 f"The MPC's episode from the seed {self.seeds[i]} costs {base.costs[i]}: what the "
                 "env shows must be finite numbers."
             )
-        require_deviations(self.mpc, base.steps()[0])
+        require_theta_shown(self.mpc, base.steps()[0])
         require_repeated(self.mpc, self.make, self.seeds[0], base.costs[0])
         if self.twin is None:
             warn_of_order(self.mpc, *base.steps(), stacklevel=4)
@@ -195,7 +195,9 @@ class _Search:
         if mpc.layout.n_disturbances:
             return
         thetas, inputs, following = self.base.steps()
-        beyond = np.abs(following - mpc.predict(thetas, inputs)).max(axis=0)[mpc.layout.state]
+        beyond = np.abs(following - mpc.deviations.predict(thetas, inputs)).max(axis=0)[
+            mpc.layout.state
+        ]
         unit = mpc.theta_half[mpc.layout.state]
         try:
             largest = np.maximum(2 * beyond, 1e-6 * unit)
@@ -212,7 +214,7 @@ class _Search:
             if self.twin is not None:
                 other = self.twin.reidentified()
             else:
-                log = as_episodes(self.mpc, self.base.pairs)
+                log = as_episodes(self.mpc.deviations, self.base.pairs)
                 other = reidentified(self.mpc, Coordinates.of(self.mpc, log), log)
         except ValueError:  # a model without a steady state or a Riccati solution
             return
@@ -255,7 +257,7 @@ class _Search:
         others = rollout(Excited(self.mpc, self.seeds[0]), self.make, self.seeds, problem=self.mpc)
         self.logged = self.base, others
         log = [*self.base.pairs, *others.pairs]
-        twin = PlantTwin.fit(self.mpc, log, observer=self._observer(), n_members=1)
+        twin = PlantTwin.fit(self.mpc.deviations, log, observer=self._observer(), n_members=1)
         self.doubted = not twin.trusted
         return TwinPlant(twin.dynamics, [0] * len(self.seeds)), twin.limits.low, twin.limits.high
 
@@ -321,7 +323,7 @@ def _name(mpc: LinearMPC, make: Callable[[], gym.Env[Any, Any]]) -> str:
         raise ValueError(
             f"The env shows {shape} and takes {actions}; theta of the MPC has {mpc.n_theta} "
             f"entries {mpc.layout.names}, and there are {mpc.model.n_inputs} inputs. Wrap the env "
-            "so that it shows theta: see Deviations, PastInputs and ObserveDisturbance in "
+            "so that it shows theta: see PastInputs and ObserveDisturbance in "
             "sb3_yann.wrappers."
         )
     name = getattr(env.spec, "id", type(env.unwrapped).__name__)

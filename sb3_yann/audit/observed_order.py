@@ -74,7 +74,7 @@ def _left_open(
     """Return the share of the states' movement that the model leaves open, 1 where none moves."""
     at, after, states = theta.copy(), following.copy(), problem.layout.state
     at[:, order], after[:, order] = theta[:, states], following[:, states]
-    error = (after - problem.predict(at, u))[:, states]
+    error = (after - problem.deviations.predict(at, u))[:, states]
     moved = np.sum((after - at)[:, states] ** 2, axis=0)
     moving = moved > 0
     if not moving.any():

@@ -47,7 +47,7 @@ def warn_of_own_reward(problem: LinearMPC, played: Trajectories, stacklevel: int
         Of the warning.
     """
     thetas, inputs, rewards = played.padded()
-    costs = [problem.stage_cost(at, inputs) for at in (thetas[:-1], thetas[1:])]
+    costs = [problem.deviations.stage_cost(at, inputs) for at in (thetas[:-1], thetas[1:])]
     known: Mask = np.asarray(np.all(np.isfinite([rewards, *costs]), axis=0), dtype=np.bool_)
     if np.count_nonzero(known) < FEWEST or not np.any(rewards[known]):
         return

@@ -123,7 +123,7 @@ class SimulatedPlant:
         Of the env.
     put, got : ndarray, shape (n,)
         What a state has more than that of theta where it is set, and where it is read: an env in
-        the plant's own units is put into absolute states, and its wrappers show deviations.
+        plant units is put into states of the plant, and shows deviations here.
     """
 
     def __init__(self, problem: LinearMPC, simulator: Simulator, put: Array, got: Array) -> None:

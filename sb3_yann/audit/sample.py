@@ -24,7 +24,7 @@ class Sample:
 
     Attributes
     ----------
-    theta, following : ndarray, shape (steps, n), before and after the step
+    theta, following : ndarray, shape (steps, n), before and after the step, in deviations
     u : ndarray, shape (steps, m), as it was sent to the env
     rewards : ndarray, shape (steps,)
     counted : ndarray of bool, shape (steps,)
@@ -38,6 +38,7 @@ class Sample:
     stage_cost : callable, (steps, n), (steps, m) to (steps,)
     step : callable, the model: (steps, n), (steps, m) to (steps, n)
     gamma : float, the learner's discount
+    theta_ss : ndarray, shape (n,), what deviations count from
     """
 
     theta: Array
@@ -56,6 +57,7 @@ class Sample:
     stage_cost: Callable[[Array, Array], Array]
     step: Callable[[Array, Array], Array]
     gamma: float
+    theta_ss: Array
 
     @cached_property
     def cost(self) -> Array:

@@ -103,7 +103,9 @@ def scaled_entries(sample: Sample, tolerance: float) -> list[tuple[str, str, str
             near = [np.allclose(found, np.r_[each[1:]], rtol=APART, atol=APART) for each in fitting]
             if not any(near):
                 fitting.append((name, s, z0))
-    return [(name, *_explanation(name, s, z0, state)) for name, s, z0 in fitting]
+    rest = np.append(sample.theta_ss, np.zeros(sample.u.shape[1]))
+    # In plant units, which the map of an observation leads to.
+    return [(name, *_explanation(name, s, z0 + (1 - s) * rest, state)) for name, s, z0 in fitting]
 
 
 def _matrix(sample: Sample) -> Array | None:
@@ -138,7 +140,7 @@ def _explanation(name: str, s: Array, z0: Array, state: Mask) -> tuple[str, str]
             "other units (the square roots of these numbers)."
         ), ""
     if name == "shifted observation":
-        what = f"theta = obs + {shift}: observations are absolute, or deviations from another point"
+        what = f"theta = obs + {shift}: observations count from another point"
         undo = f"deviation({_listed(-z0[state])})"
     else:
         what = f"theta = {scale} * obs + {shift}{f', and {u}' if 'action' in name else ''}: "

@@ -59,7 +59,7 @@ class Task:
     def costs(self, thetas: Array, inputs: Array) -> Array:
         """Return the costs (k,) of thetas (T + 1, k, n_theta) and inputs (T, k, m); inf for NaN."""
         with np.errstate(over="ignore", invalid="ignore"):
-            stage = self.problem.stage_cost(thetas[:-1], inputs).sum(axis=0)
+            stage = self.problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0)
             end = np.sum((thetas[-1] @ self.end) * thetas[-1], axis=-1)
             outside = np.sum(self._bounds.beyond(thetas[1:], -INSIDE) ** 2, axis=(0, 2))
             total = stage + end + self.weight * outside

@@ -85,7 +85,7 @@ class Tracks:
                 inputs[:, -1], problem.deviations.u_min, problem.deviations.u_max, out=inputs[:, -1]
             )
         at = np.vstack([rows[:, -1], theta]), np.vstack([inputs[:, -1], u])
-        cost = problem.stage_cost(row.shown(at[0]), at[1])
+        cost = problem.deviations.stage_cost(row.shown(at[0]), at[1])
         self.costs += cost[:-1]
         self.cost += float(cost[-1])
         self.steps += 1

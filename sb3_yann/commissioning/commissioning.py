@@ -43,10 +43,11 @@ class Commissioning:
     and the policy is improved in it (:func:`improve`). One that was accepted there is on trial in
     the next batch: the MPC and the policy take turns, in an order that is drawn for each pair. Only
     the plant decides. It is kept where it surely cost less than the MPC in these turns, and the MPC
-    is back where it surely cost more, by t tests of the pairs. A policy acts at first within a
-    small ``max_correction``, which doubles when the plant confirms at least half of the gain that
-    the twin promised. So it is where it exceeds a hard
-    bound of the problem by more than the MPC has on this plant. Nothing else ever acts.
+    is back where it surely cost more, by t tests of the pairs. Fewer than five pairs keep nothing:
+    a drift of the plant may do it by the order. The MPC is also back where the policy exceeds a
+    hard bound of the problem by more than the MPC has on this plant. A policy acts at first within
+    a small ``max_correction``, which doubles when the plant confirms at least half of the gain that
+    the twin promised. Nothing else ever acts.
 
     What counts is the stage cost, or the plant's own reward where that is another one. The twin's
     searches know the stage cost alone.
@@ -307,7 +308,10 @@ class Commissioning:
 
     def _fit(self, numbers: list[int], seed: int) -> PlantTwin:
         episodes = [self.journal.episodes[i] for i in numbers]
-        log = [(each.thetas, each.actions) for each in episodes]
+        units = self.policy.problem.units
+        log = [
+            (units.to_plant(each.thetas), units.input_to_plant(each.actions)) for each in episodes
+        ]
         return PlantTwin.fit(self.policy.problem, log, observer=self.observer, seed=seed)
 
     @property

@@ -52,6 +52,8 @@ class Costs(NamedTuple):
         are stage costs, promises nothing then.
     longer : str, default ""
         By how much more than the MPC the policy exceeds hard bounds, summed over an episode.
+    chance : float, default 0
+        How often the order that was drawn for each of few pairs alone brings a mean as low.
     """
 
     actual: float
@@ -62,11 +64,12 @@ class Costs(NamedTuple):
     pairs: int = 0
     own_reward: bool = False
     longer: str = ""
+    chance: float = 0.0
 
     @property
-    def room(self) -> float:
-        """How far from the MPC's cost a mean cost may be by chance; inf for a single pair."""
-        return PairedMean(self.actual - self.mpc, self.error, self.pairs).room()
+    def difference(self) -> PairedMean:
+        """The policy's cost less the MPC's."""
+        return PairedMean(self.actual - self.mpc, self.error, self.pairs, self.chance)
 
 
 def compare(
@@ -106,7 +109,8 @@ def compare(
         more = more - (starts[0] - starts[1])
     found = PairedMean.of(more)
     mpc = mean - found.mean
-    return Costs(mean, predicted, promised, mpc, found.error, pairs, pays_own, longer)
+    error, chance = found.error, found.chance
+    return Costs(mean, predicted, promised, mpc, error, pairs, pays_own, longer, chance)
 
 
 def pays_its_own(problem: LinearMPC, episodes: Sequence[PlantEpisode]) -> bool:
@@ -139,7 +143,7 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
     alarms = sum(each.alarm is not None for each in played)
     if alarms >= max(2.0, ALARMS * len(played)):
         return f"{alarms} of its {len(played)} episodes had an alarm"
-    room = min(costs.room, MOST * abs(costs.mpc))
+    room = min(costs.difference.room(), MOST * abs(costs.mpc))
     if not costs.actual <= costs.mpc + room < np.inf:  # nor does NaN pass
         by = "by the plant's reward, " if costs.own_reward else ""
         return f"{by}it cost {costs.actual:.5g}, the MPC in turns with it {costs.mpc:.5g}"
@@ -148,7 +152,7 @@ def why_taken_back(journal: Journal, costs: Costs) -> str:
 
 def is_kept(costs: Costs) -> bool:
     """Return whether the plant has shown that the policy surely costs less than the MPC."""
-    return costs.pairs >= 2 and costs.actual + costs.room < costs.mpc
+    return costs.difference.is_below_zero()
 
 
 def excess_of_mpc(journal: Journal, problem: LinearMPC) -> BoundExcess:
@@ -204,7 +208,9 @@ def predicted_costs(twin: PlantTwin, episodes: Sequence[PlantEpisode], act: Inpu
             now = [each.thetas[min(k, last)] for each, last in zip(episodes, lengths, strict=True)]
             theta[..., row.given] = np.array(now)[:, row.given]
             u = act(row.shown(theta.reshape(-1, shape[-1]))).reshape(*shape[:2], -1)
-            costs += np.where(k < lengths, twin.problem.stage_cost(row.shown(theta), u), 0.0)
+            costs += np.where(
+                k < lengths, twin.problem.deviations.stage_cost(row.shown(theta), u), 0.0
+            )
             after = dynamics.step(theta, u)
             reached = np.array([row.shown(theta), row.shown(after)])
             soft = bound_excess(twin.problem, reached, u[None]).penalty

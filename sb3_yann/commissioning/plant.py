@@ -90,7 +90,8 @@ class Plant:
                 )
         self.law, self.device = law_of(self.problem), self.yann.device
         self.range = self.problem.deviations.u_max - self.problem.deviations.u_min
-        self.as_is = self.yann.input_units.kind == "deviation"
+        units = self.yann.action_units
+        self.as_is = units.kind == "plant" and not np.any(units.shift)
 
     def policy(self, theta: Array) -> Array:
         """Return the policy's inputs (rows, m); the MPC's where they are not finite."""
@@ -161,7 +162,7 @@ class Plant:
             wanted = u if act == self.policy else self.policy(known[None])[0]
             law = self.mpc(known[None])[0]
             apart = max(apart, float(np.max(np.abs(wanted - law) / self.range)))
-            action = u if self.as_is else self.yann.input_units.action(u).astype(np.float32)
+            action = u if self.as_is else self.yann.action_units.action(u).astype(np.float32)
             action = np.clip(action, space.low, space.high).astype(space.dtype)  # to the last bit
             observation, gained, terminated, over, info = self.env.step(action)
             over, read = over or terminated, self._theta(observation)
@@ -197,7 +198,7 @@ class Plant:
         """Return a reading, with the model's prediction in place of what is not finite."""
         if np.isfinite(read).all():
             return read
-        predicted = np.asarray(self.problem.predict(before, u.astype(np.float64)))
+        predicted = np.asarray(self.problem.deviations.predict(before, u.astype(np.float64)))
         return np.where(np.isfinite(read), read, predicted)
 
     def _look(

@@ -23,6 +23,7 @@ from sb3_yann._validation import (
 )
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.polyhedra import largest_ball
+from sb3_yann.units import Units
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,7 +95,7 @@ class PlantLaw(ReadOnlyArrays):
         >>> from sb3_yann.control import LinearMPC
         >>> tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
         >>> weights = {"Q": [[1]], "R": [[1]], "horizon": 3}
-        >>> limits = {"x_min": 0, "x_max": 20, "u_min": 0, "u_max": 10, "absolute": True}
+        >>> limits = {"x_min": 0, "x_max": 20, "u_min": 0, "u_max": 10}
         >>> law = LinearMPC(tank, **weights, **limits).explicit()
         >>> law.plant_input([12.0])
         array([3.])
@@ -110,7 +111,15 @@ class PlantLaw(ReadOnlyArrays):
             raise ValueError(
                 f"shown has shape {values.shape}, expected ({size},) or (batch, {size})."
             )
-        return np.asarray(self(values - self.theta_ss) + self.model.u_ss)
+        units = self.units
+        return units.input_to_plant(self(units.to_deviations(values)))
+
+    @property
+    def units(self) -> Units:
+        """The operating point of its plant; zero for a law that was built by hand."""
+        if self.model is None or self.theta_ss is None:
+            return Units(np.zeros(self.n_theta), np.zeros(self.n_inputs))
+        return Units(self.theta_ss, self.model.u_ss)
 
     def plot(self, axes: Axes | None = None, **options: Any) -> Axes:
         """Draw the regions by :func:`~sb3_yann.control.law_plot.plot_law`; return the axes.

@@ -197,10 +197,11 @@ class OnlineLaw(PlantLaw):
         return u
 
     def _warn_beyond_reach(self, rows: Array) -> None:
-        """Warn of rows in the box at which soft bounds give way, but no answer is certain."""
+        """Warn once of rows in the box where soft bounds give way, but no answer is certain."""
         inside = np.all((rows >= self.theta_min) & (rows <= self.theta_max), axis=1)
-        if self.model is None or not inside.any():
+        if self.model is None or not inside.any() or "_has_warned" in vars(self):
             return
+        vars(self)["_has_warned"] = True
         steps = (len(self.c) - self.n_slacks) // self.n_inputs
         warnings.warn(
             f"{lqr.long_horizon(self.model.A, steps)}, no solution was found at theta = "
@@ -295,7 +296,7 @@ class OnlineLaw(PlantLaw):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what follows from the rest, and what is remembered."""
-        derived = ("dual", "known", "program", "scaled", "half", "_first_rows")
+        derived = ("dual", "known", "program", "scaled", "half", "_first_rows", "_has_warned")
         return {name: each for name, each in vars(self).items() if name not in derived}
 
 

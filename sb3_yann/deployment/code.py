@@ -276,7 +276,7 @@ def known_answers(data: Arrays, precision: str) -> dict[str, str]:
         raise ValueError(
             f"In {precision} a rounding of a reading moves the output by more than "
             f"{ROOM[precision]:g} of its range, at all points tried: readings are large beside "
-            "what they move by. Pass precision='double', or export without absolute=True."
+            "what they move by. Pass precision='double'."
         )
     steps = np.arange(n_steps)
     readings = obs[steps // 4 % len(obs)]

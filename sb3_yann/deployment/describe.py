@@ -23,22 +23,19 @@ Exportable = BaseAlgorithm | YannPolicy | LinearMPC | PiecewiseAffine | OnlineLa
 
 
 def describe(
-    given: Exportable, name: str, checks: Checks, absolute: bool = False, observer: str = "none"
+    given: Exportable, name: str, checks: Checks, observer: str = "none"
 ) -> dict[str, Any]:
     """Return the arrays of a controller.
 
     Parameters
     ----------
     given : model, YannPolicy, LinearMPC or PiecewiseAffine
-        Of an MPC or a law the controller takes theta and puts out u, of a model it does what
-        `predict` does.
+        Of an MPC or a law the controller takes theta and puts out u, in plant units where its model
+        has an operating point; of a model it does what `predict` does.
     name : str
         What the controller is called.
     checks : Checks
         Limits of the readings, and how to fall back.
-    absolute : bool, default False
-        Whether it takes theta and puts out inputs in the plant's own units, not in those of the env
-        or the law.
     observer : {"none", "caller"}, default "none"
         Who runs the observer of estimated disturbances.
 
@@ -90,9 +87,9 @@ def describe(
             verb = "estimated by" if i in problem.model.estimated else "from"
             labels[first + i] += f" ({verb} the caller's {who})"
 
-    matrix, offset, scale, shift = _signal_maps(policy, law, absolute)
+    matrix, offset, scale, shift = _signal_maps(policy, law)
     watched = states
-    if isinstance(policy, YannPolicy) and not absolute:
+    if isinstance(policy, YannPolicy):
         if not keeps_entries(policy.actor.features_extractor):
             labels = [f"obs[{i}]" for i in range(matrix.shape[1])]
             shown = matrix != 0  # entries are watched that say what states are, and nothing else
@@ -117,15 +114,13 @@ def describe(
     }
 
 
-def _signal_maps(
-    policy: Any, law: PiecewiseAffine, absolute: bool
-) -> tuple[Array, Array, Array, Array]:
+def _signal_maps(policy: Any, law: PiecewiseAffine) -> tuple[Array, Array, Array, Array]:
     """Return matrix, offset, scale and shift.
 
     Theta is ``matrix @ obs + offset``, an action ``scale * y + shift`` for y in [-1, 1].
     """
     n = law.n_theta
-    if isinstance(policy, YannPolicy) and not absolute:
+    if isinstance(policy, YannPolicy):
         extractor = policy.actor.features_extractor
         box: Any = policy.action_space
         matrix, offset = np.eye(n), np.zeros(n)
@@ -134,15 +129,7 @@ def _signal_maps(
         low, high = np.asarray(box.low, np.float64), np.asarray(box.high, np.float64)
         shift = (high + low) / 2
         return matrix, offset, scale_within((high - low) / 2, shift, low, high), shift
-    theta_ss: Array = np.zeros(n)
-    u_ss: Array = np.zeros(law.n_inputs)
-    if absolute:
-        if law.model is None or law.theta_ss is None:
-            raise ValueError(
-                "absolute = True needs a law that knows its operating point: one from LinearMPC, "
-                "not one built by hand."
-            )
-        theta_ss, u_ss = law.theta_ss, law.model.u_ss
+    theta_ss, u_ss = law.units.theta_ss, law.units.u_ss
     finite, middle, half = _input_range(law)
     low = np.where(finite, law.u_min, -1.0) + u_ss
     high = np.where(finite, law.u_max, 1.0) + u_ss

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_yann._archive import atomic_write, digest_of, write_arrays
-from sb3_yann._validation import check_bool, check_choice, check_options
+from sb3_yann._validation import check_choice, check_options
 from sb3_yann.deployment.c_code import c_files
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.code import Cost
@@ -19,6 +19,7 @@ from sb3_yann.deployment.describe import Exportable, describe
 from sb3_yann.deployment.fmu import fmu_file
 from sb3_yann.deployment.onnx_graph import onnx_model
 from sb3_yann.deployment.structured_text import RESERVED, plcopen_xml, st_text
+from sb3_yann.units import warn_of_absolute
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def export(
     format: str | None = None,
     name: str | None = None,
     precision: str = "double",
-    absolute: bool = False,
+    absolute: bool | None = None,
     checks: Checks | None = None,
     observer: str = "none",
 ) -> Exported:
@@ -77,7 +78,8 @@ def export(
     Parameters
     ----------
     given : model, YannPolicy, LinearMPC or PiecewiseAffine
-        An MPC and a law take theta and put out the input in deviations. A law alone does not know
+        An MPC and a law take theta and put out the input, in plant units where the model has an
+        operating point. A law alone does not know
         the `RateLimits` of its problem: pass the problem, and they are kept.
     path : str or PathLike
         Its suffix tells the format.
@@ -91,9 +93,8 @@ def export(
         Prefix of all names in code; the file's by default.
     precision : {"double", "float"}, default "double"
         Of the numbers in code and graphs.
-    absolute : bool, default False
-        Whether observations are theta, and actions inputs, as the plant has them. By default they
-        are the env's, or the law's.
+    absolute : bool, optional
+        Does nothing, and is deprecated: the model's operating point tells.
     checks : Checks, optional
         Limits of the readings and how to fall back. By default only what is not finite is a fault,
         and late steps where the time is told.
@@ -118,6 +119,7 @@ def export(
     >>> [path.name for path in written.paths]
     ['reactor.c', 'reactor.h', 'reactor_selftest.c']
     """
+    warn_of_absolute(absolute)
     target = Path(path)
     kind = format or target.suffix.lstrip(".")
     check_choice("format", kind, ("npz", "c", "onnx", "st", "xml", "fmu"))
@@ -137,7 +139,7 @@ def export(
             f"{target.stem}.h would stand in for C's own header: call the file something else."
         )
     limits = check_options("checks", checks or Checks(), Checks)
-    data = describe(given, prefix, limits, check_bool("absolute", absolute), observer)
+    data = describe(given, prefix, limits, observer)
     digest, note = digest_of(data)[:12], str(data["note"])
     about = (
         f"{prefix}, a controller, written by sb3-yann {version('sb3-yann')}; digest {digest}."

@@ -323,7 +323,7 @@ class RegionUse:
         """Return it of a law, model or policy; the observations of the episodes are theta."""
         law = problem.explicit()
         theta = np.concatenate([each[:-1] for each in episodes.observations])
-        theta = theta[np.isfinite(theta).all(axis=1)]
+        theta = problem.units.to_deviations(theta[np.isfinite(theta).all(axis=1)])
         apart = np.abs(inputs_of(problem, policy, theta) - law(theta)) / problem.u_half
         distance, region = apart.max(axis=1), law.locate(theta)
         found, where, visits = np.unique(region, return_inverse=True, return_counts=True)

@@ -7,7 +7,6 @@ the figure.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +25,7 @@ from sb3_yann._drawing import (
     new_figure,
     save_figure,
 )
-from sb3_yann._validation import Array, check_array, check_bool, check_int, check_type, to_float
+from sb3_yann._validation import Array, check_array, check_int, check_type, to_float
 from sb3_yann.control import LinearModel, LinearMPC
 from sb3_yann.control.model.labels import with_units
 from sb3_yann.evaluation.law_plots import (
@@ -152,9 +151,8 @@ def save_plant_trajectories(
     entries: Sequence[int] | None = None,
     labels: Mapping[int, str] | None = None,
     limits: Mapping[int, tuple[float, str]] | None = None,
-    absolute: bool = False,
 ) -> Path:
-    """Save a picture in the plant's own units, with the model's names; return its path.
+    """Save a picture of theta and inputs, with the model's names; return its path.
 
     A state with a set-point shows it as a dashed line.
 
@@ -174,8 +172,6 @@ def save_plant_trajectories(
         Labels of entries that the model has no name for.
     limits : mapping of int to (float, str), optional
         A limit of an entry, in plant units, and its label.
-    absolute : bool, default False
-        Whether the episodes are in the plant's units already.
 
     Raises
     ------
@@ -199,7 +195,7 @@ def save_plant_trajectories(
     references = {i: r for i, r in problem.set_points.items() if i in shown}
     return save_trajectories(
         path,
-        _in_plant_units(problem, _check_runs(runs), check_bool("absolute", absolute)),
+        _of_theta(problem, runs),
         {i: names[i] for i in shown},
         with_units(problem.model)[1],
         problem.model.dt,
@@ -215,25 +211,18 @@ def _check_runs(runs: Runs) -> dict[str, Trajectories]:
     return {name: as_played(f"runs[{name!r}]", each) for name, each in runs.items()}
 
 
-def _in_plant_units(problem: LinearMPC, runs: Runs, absolute: bool) -> dict[str, Trajectories]:
-    """Return episodes with the operating point added; ValueError where they are not of theta."""
-    theta_ss, u_ss = problem.theta_ss, problem.model.u_ss
-    if absolute:
-        theta_ss, u_ss = 0 * theta_ss, 0 * u_ss
-    found = {}
-    for name, episodes in runs.items():
+def _of_theta(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
+    """Return episodes by their names; ValueError where they are not of theta."""
+    found = _check_runs(runs)
+    n, m = problem.n_theta, problem.model.n_inputs
+    for name, episodes in found.items():
         for x, u in zip(episodes.observations, episodes.actions, strict=True):
-            if x.shape[1:] != theta_ss.shape or u.shape[1:] != u_ss.shape:
+            if x.shape[1:] != (n,) or u.shape[1:] != (m,):
                 raise ValueError(
                     f"An episode of {name!r} has observations {x.shape} and actions {u.shape}, but "
-                    f"theta has {theta_ss.size} entries and there are {u_ss.size} inputs. Draw "
-                    "what the env shows by save_trajectories."
+                    f"theta has {n} entries and there are {m} inputs. Draw what the env shows by "
+                    "save_trajectories."
                 )
-        found[name] = replace(
-            episodes,
-            observations=tuple(x + theta_ss for x in episodes.observations),
-            actions=tuple(u + u_ss for u in episodes.actions),
-        )
     return found
 
 
@@ -247,7 +236,6 @@ def plot_loop(
     axes: Axes | None = None,
     *,
     time_unit: str = "",
-    absolute: bool = False,
 ) -> Axes:
     """Draw one quantity over time, in plant units, with its limits and its set-point.
 
@@ -267,8 +255,6 @@ def plot_loop(
         Where to draw; a new figure's by default.
     time_unit : str, optional
         Of ``model.dt``, for the label.
-    absolute : bool, default False
-        Whether the episodes are in the plant's units already.
 
     Raises
     ------
@@ -285,7 +271,7 @@ def plot_loop(
     'U (kJ/(h m² K))'
     """
     entry = entry_of(problem, quantity, inputs=True)
-    runs = _to_draw(problem, runs, absolute)
+    runs = _to_draw(problem, runs)
     axes = axes_or_new(axes, 6.4, 3.0)
     _draw_loops([axes], problem, [runs], entry, time_unit)
     legend_above(axes, columns=1 if len(runs) > 2 else 2)
@@ -298,7 +284,6 @@ def loops_figure(
     *,
     quantities: Sequence[Quantity] | None = None,
     time_unit: str = "",
-    absolute: bool = False,
 ) -> Figure:
     """Return a figure of several quantities.
 
@@ -314,8 +299,6 @@ def loops_figure(
         As of :func:`plot_loop`; all states and inputs by default.
     time_unit : str, optional
         Of ``model.dt``, for the label.
-    absolute : bool, default False
-        Whether the episodes are in the plant's units already.
 
     Examples
     --------
@@ -326,7 +309,7 @@ def loops_figure(
     >>> len(loops_figure(mpc, runs, time_unit="s").axes)
     3
     """
-    runs = _to_draw(problem, runs, absolute)
+    runs = _to_draw(problem, runs)
     if quantities is None:
         n = problem.n_theta
         quantities = [*range(problem.model.n_states), *range(n, n + problem.model.n_inputs)]
@@ -361,10 +344,10 @@ def loops_figure(
     return figure
 
 
-def _to_draw(problem: LinearMPC, runs: Runs, absolute: bool) -> dict[str, Trajectories]:
+def _to_draw(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
     if not runs or not all(len(each.costs) for each in runs.values()):
         raise ValueError("There are no episodes to draw: pass {name: evaluate(...)} of some seeds.")
-    return _in_plant_units(problem, runs, absolute)
+    return _of_theta(problem, runs)
 
 
 def _draw_loops(
@@ -441,15 +424,14 @@ def _draw_rows(
 
 def _draw_limits(axes: Axes, problem: LinearMPC, entry: int, low: float, high: float) -> None:
     """Draw limits near the data, name those far away, and set the range of the axis."""
-    k, model, bounds = entry - problem.n_theta, problem.model, problem.deviations
+    k, model = entry - problem.n_theta, problem.model
     kind = ""
     sides = -np.inf, np.inf
     if k >= 0:
-        sides = bounds.u_min[k] + model.u_ss[k], bounds.u_max[k] + model.u_ss[k]
+        sides = problem.u_min[k], problem.u_max[k]
         kind = "bound of the input"
     elif entry < model.n_states:
-        x_ss = model.x_ss[entry]
-        sides = bounds.x_min[entry] + x_ss, bounds.x_max[entry] + x_ss
+        sides = problem.x_min[entry], problem.x_max[entry]
         kind = "soft limit" if problem.soft.penalty and problem.soft.x[entry] > 0 else "limit"
     width = max(high - low, 1e-9 * max(abs(low), abs(high), 1.0))
     bottom, top = low, high

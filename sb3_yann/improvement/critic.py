@@ -49,12 +49,12 @@ def _costs(policy: YannPolicy, twin: Model, layer: LawLayer, at: Array, u: Array
         first = dynamics.step(starts, u)
         rows, inputs = dynamics.roll_out(policy_of(layer, problem), first, STEPS)
         thetas = shown(rows)
-        stage = problem.stage_cost(thetas[:-1], inputs)
+        stage = problem.deviations.stage_cost(thetas[:-1], inputs)
         end = np.sum((thetas[-1] @ problem.value_matrix(gamma)) * thetas[-1], axis=-1)
         later = np.tensordot(gamma ** np.arange(STEPS), stage, axes=1) + gamma**STEPS * end
         # What leaves the log is not known, and may be many times as dear as all the rest.
         later = np.where(twin.limits.violated(rows).any(axis=0), np.nan, later)
-        return np.asarray(problem.stage_cost(shown(starts), u) + gamma * later).ravel()
+        return np.asarray(problem.deviations.stage_cost(shown(starts), u) + gamma * later).ravel()
 
 
 def _fit(

@@ -170,8 +170,8 @@ def improve(
         one network for all regions, which the result holds: ``result.model``,
         ``result.export("controller.c")``.
     twin : PlantTwin, gymnasium.Env, str or callable
-        A twin, which must be trusted; or a simulator, which shows theta of the model's problem, or
-        absolute values where that is absolute. The problem's stage cost counts, and no reward: a
+        A twin, which must be trusted; or a simulator, which shows theta of the model's problem, in
+        plant units where that is. The problem's stage cost counts, and no reward: a
         :class:`CostMismatchWarning` says where that is another one. A function or an id makes as
         many as are played side by side, a given env is copied.
     max_steps : int, optional

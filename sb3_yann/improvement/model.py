@@ -224,7 +224,7 @@ class Scenarios:
                 rows[t + 1] = self.plant.advance(rows[t], inputs[t], numbers)
             thetas = row.shown(rows)
             excess = bound_excess(problem, thetas, inputs)
-            costs = problem.stage_cost(thetas[:-1], inputs).sum(axis=0) + excess.penalty
+            costs = problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0) + excess.penalty
         lost = ~(np.isfinite(costs) & np.isfinite(thetas).all(axis=(0, 2)))
         costs = np.where(lost, np.inf, costs)
         return Imagined(thetas, inputs, costs, unsafe_columns(0, 0, lost, excess))

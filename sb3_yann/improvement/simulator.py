@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_yann.audit.closed_loops import Excited, of_law, require_repeated
+from sb3_yann.audit.in_deviations import in_deviations, require_theta_shown
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
-from sb3_yann.audit.own_units import require_deviations, showing_theta
 from sb3_yann.control import LinearMPC
 from sb3_yann.rollout import Controller, EnvPool, Source, Trajectories, maker, rollout
 from sb3_yann.twin.log import SHORTEST, Episode
@@ -39,7 +39,7 @@ class Simulator:
     problem : LinearMPC
         Of the policy.
     env : gymnasium.Env, str or callable
-        It shows theta of the problem, or absolute values where the problem is absolute.
+        It shows theta of the problem, and takes its inputs, in plant units.
     seed : int
         Of the episodes.
     max_steps : int, optional
@@ -63,7 +63,7 @@ class Simulator:
     ) -> None:
         self.problem, self.seed, self.max_steps = problem, seed, max_steps
         self.steps = self.played = 0
-        make = showing_theta(maker(env, "twin"), problem)
+        make = in_deviations(maker(env, "twin"), problem)
         self.envs = EnvPool(make)
         with self.envs.acquire(1) as (one,):
             self.row, unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
@@ -78,7 +78,7 @@ class Simulator:
         while each < MOST // 2 and 2 * each * self.longest < SHORT:
             each += EPISODES // 4
         logged = self.play(of_law(problem), self.new_seeds(each - 1))
-        require_deviations(problem, logged.steps()[0])
+        require_theta_shown(problem, logged.steps()[0])
         warn_of_order(problem, *logged.steps(), stacklevel=4)
         if not unaware:
             warn_of_own_reward(problem, logged, stacklevel=4)

@@ -157,7 +157,10 @@ class Trial:
         excess = bound_excess(twin.problem, twin.dynamics.row.shown(thetas), inputs)
         excess = BoundExcess(*(each.ravel() for each in excess))
         with np.errstate(all="ignore"):
-            costs = twin.problem.stage_cost(shown, inputs).sum(axis=0).ravel() + excess.penalty
+            costs = (
+                twin.problem.deviations.stage_cost(shown, inputs).sum(axis=0).ravel()
+                + excess.penalty
+            )
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
         return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
 
@@ -175,7 +178,7 @@ class Trial:
     def _objection(self, opinion: Dynamics | HiddenDynamics, act: Inputs, name: str) -> str:
         """Return what one model says against a policy."""
         starts = self.starts[:1, : self.n_known]
-        given, stage_cost = self.given[:, : self.n_known], self.twin.problem.stage_cost
+        given, stage_cost = self.given[:, : self.n_known], self.twin.problem.deviations.stage_cost
         with np.errstate(all="ignore"):
             runs = (opinion.roll_out(each, starts, self.steps, given) for each in (self._law, act))
             mpc, costs = (

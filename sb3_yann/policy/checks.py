@@ -14,17 +14,14 @@ from numpy.typing import ArrayLike
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from sb3_yann._validation import Array, check_int
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.model.labels import labels_of
-from sb3_yann.control.mpc.plant_units import InputUnits, misread_state
+from sb3_yann.control.mpc.misread_bounds import misread_in_words
 from sb3_yann.networks import AfterstateValue, QuadraticStateActionValue, SharedYannLayer
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.observations import (
-    SAY,
     AffineFeatures,
     AffineObservation,
     require_frozen,
@@ -32,6 +29,7 @@ from sb3_yann.policy.observations import (
     statistics_of,
 )
 from sb3_yann.twin.replay_buffer import LOST_STATISTICS
+from sb3_yann.units import ActionUnits
 from sb3_yann_envs.spaces import resolve_reference
 
 _registered: dict[str, LinearMPC | Callable[[], LinearMPC] | str] = {
@@ -181,8 +179,7 @@ def require_inverse_normalization(
     if observation is None:
         raise ValueError(
             "VecNormalize normalizes observations, and the law takes the state. Undo it: "
-            "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}. Where it "
-            "normalizes absolute values: AffineObservation.deviation(mpc.theta_ss) @ that."
+            "policy_kwargs={'observation': AffineObservation.from_vec_normalize(venv)}."
         )
     require_outermost(normalize, algorithm.observation_space.shape)
     vars(algorithm)["sees_normalized"] = True  # both are saved with the model
@@ -201,7 +198,7 @@ def _largest_observation(problem: LinearMPC, observation: AffineObservation) -> 
     if np.linalg.matrix_rank(matrix) < matrix.shape[1]:  # theta does not tell what was observed
         return np.inf
     back = np.linalg.pinv(matrix)
-    middle = (problem.deviations.theta_max + problem.deviations.theta_min) / 2 - observation.offset
+    middle = (problem.theta_max + problem.theta_min) / 2 - observation.offset
     reach = np.abs(back) @ problem.theta_half
     return float(np.max(np.abs(back @ middle) + reach))
 
@@ -227,9 +224,7 @@ def require_box(name: str, space: spaces.Space[Any], flattened: bool = False) ->
         )
 
 
-def as_input_units(
-    problem: LinearMPC, action_space: spaces.Box, observation_given: bool
-) -> InputUnits:
+def as_action_units(problem: LinearMPC, action_space: spaces.Box) -> ActionUnits:
     """Return how the env takes inputs; raise unless its bounds are those of the problem.
 
     Parameters
@@ -237,134 +232,44 @@ def as_input_units(
     problem : LinearMPC
         With finite bounds of the inputs.
     action_space : gymnasium.spaces.Box
-        Of deviations, of absolute inputs, or [-1, 1].
-    observation_given : bool
-        Whether the user said what the env shows. Else only an absolute problem has absolute inputs.
+        The bounds of the problem, or [-1, 1].
     """
     if not np.issubdtype(action_space.dtype, np.floating):
         dtype = action_space.dtype
         raise TypeError(f"action_space has dtype {dtype}: inputs are real, use numpy.float32.")
     if not action_space.is_bounded():
         raise ValueError(f"action_space = {action_space} must have finite bounds.")
-    units = InputUnits.of(problem, action_space.low, action_space.high)
-    if units is not None and (units.kind != "absolute" or observation_given or problem.absolute):
+    units = ActionUnits.of(problem, action_space.low, action_space.high)
+    if units is not None:
         return units
     low, high, u_ss = problem.u_min.tolist(), problem.u_max.tolist(), problem.model.u_ss
     advice = (
-        "They must be the same: build the LinearMPC with the bounds of the env, as deviations from "
-        "u_ss of its model, or as absolute inputs with absolute=True. Or rescale actions to [-1, 1]"
-        " in all entries."
+        "They must be the same: build the LinearMPC with the bounds of the env, or rescale actions "
+        "to [-1, 1] in all entries."
     )
-    if units is not None:
+    if np.any(u_ss) and ActionUnits.of(problem.deviations, action_space.low, action_space.high):
         advice = (
-            f"The env takes absolute inputs, and the MPC deviations from u_ss = {u_ss.tolist()}. "
-            f"{SAY}. Or, before its observation is completed, wrap it: env = gymnasium.wrappers."
-            f"RescaleAction(env, numpy.float32({low}), numpy.float32({high}))."
+            f"The env takes deviations from u_ss = {u_ss.tolist()}, and the MPC is in plant units: "
+            "leave x_ss and u_ss out of its model, or take the env in plant units."
         )
     space = f"[{action_space.low.tolist()}, {action_space.high.tolist()}]"
     raise ValueError(
-        f"The action space is {space}, but the MPC has u_min = {low} and u_max = {high}"
-        f"{_in_absolute(problem)}. {advice}"
+        f"The action space is {space}, but the MPC has u_min = {low} and u_max = {high}. {advice}"
     )
-
-
-def _in_absolute(problem: LinearMPC) -> str:
-    u_ss = problem.model.u_ss
-    if not np.any(u_ss):
-        return ""
-    low, high = (problem.u_min + u_ss).tolist(), (problem.u_max + u_ss).tolist()
-    return f", in absolute values {low} and {high}"
-
-
-def warn_of_absolute_inputs(
-    problem: LinearMPC, algorithm: BaseAlgorithm | None, units: InputUnits
-) -> None:
-    """Warn where an unwrapped plant seems to take absolute inputs, and the MPC deviations.
-
-    Where the bounds are its absolute ones, or [-1, 1], there is nothing to doubt.
-    """
-    venv = None if algorithm is None else algorithm.get_env()
-    plain = None if venv is None else venv.unwrapped
-    if units.kind != "deviation" or venv is None or not isinstance(plain, DummyVecEnv):
-        return
-    space, u_ss = venv.action_space, problem.model.u_ss
-    if not (isinstance(space, spaces.Box) and plain.envs[0].unwrapped.action_space == space):
-        return
-    if getattr(plain.observation_space, "problem", None) is not None:
-        return  # they are made for each other
-    if np.any(u_ss != 0) and np.all((space.low < u_ss) & (u_ss < space.high)):
-        low, high = (space.low - u_ss).tolist(), (space.high - u_ss).tolist()
-        warnings.warn(
-            f"The model's operating point u_ss = {u_ss.tolist()} lies between the bounds of the "
-            f"env's own actions. If the env takes absolute inputs, give the MPC u_min = {low} and "
-            f"u_max = {high}, and wrap the env: sb3_yann.wrappers.Deviations(env, mpc.model). If "
-            "it takes deviations, leave u_ss out of the model.",
-            stacklevel=2,
-        )
 
 
 def warn_of_misread_states(problem: LinearMPC, theta: Array) -> None:
-    """Warn where theta (batch, n_theta) holds absolute states, or lacks the operating point twice.
+    """Warn where an env shows deviations, and the problem is in plant units.
 
     Parameters
     ----------
     problem : LinearMPC
         The policy's.
     theta : ndarray, shape (batch, n_theta)
-        What the policy made of its first observations.
+        What the policy made of its first observations, in deviations.
     """
-    for sign in (1, -1):
-        warn_of_misread_references(problem, theta, sign)
-        i = misread_state(problem, theta, sign)
-        if i is None:
-            continue
-        name, point = labels_of(problem.model)[0][i], problem.model.x_ss[i]
-        shown = theta[0, i] + (0 if sign == 1 else point)
-        said = f"state {name!r} = {shown:.6g} is shown, and the operating point is {point:.6g}: "
-        if sign == 1:
-            said += (
-                "the env shows absolute values, and the policy takes deviations. Wrap the plant in "
-                "sb3_yann.wrappers.Deviations(env, mpc.model), or pass "
-                "policy_kwargs={'observation': 'absolute'}."
-            )
-        else:
-            said += (
-                "the env shows deviations, and the policy takes absolute values. Pass "
-                "policy_kwargs={'observation': 'deviation'}."
-            )
-        warnings.warn(said, stacklevel=4)
-
-
-def warn_of_misread_references(problem: LinearMPC, theta: Array, sign: int) -> None:
-    """Warn where set-points lie outside their box, and inside it with the operating point.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        The policy's.
-    theta : ndarray, shape (batch, n_theta)
-        What the policy made of its first observations.
-    sign : {1, -1}
-        Whether they are shown in absolute values, or the operating point was taken off deviations.
-    """
-    low, high = problem.tracking.r_min, problem.tracking.r_max
-    point = problem.tracking.C @ problem.model.x_ss
-    r, room = theta[:, problem.layout.reference], 1e-6 * (high - low)
-    shown, meant = (
-        np.all((low - room <= each) & (each <= high + room), axis=0)
-        for each in (r, r - sign * point)
-    )
-    for i in np.flatnonzero(meant & ~shown)[:1]:
-        seen = r[0, i] + (0 if sign == 1 else point[i])
-        what, takes = ("absolute values", "deviations")[::sign], (low, high)
-        if sign == -1:
-            takes = low + point, high + point
-        warnings.warn(
-            f"Set-point {i} = {seen:.6g} is shown, and the policy takes {what[1]} from "
-            f"{takes[0][i]:.6g} to {takes[1][i]:.6g}: these are {what[0]}. Give SetPoint its low "
-            f"and high in {what[1]}.",
-            stacklevel=5,
-        )
+    if words := misread_in_words(problem, problem.units.to_plant(theta)):
+        warnings.warn(words, stacklevel=4)
 
 
 def require_theta(
@@ -375,6 +280,15 @@ def require_theta(
     """Raise unless theta is what is observed, or what ``observation`` makes of it."""
     shape, names = observation_space.shape, ", ".join(problem.labels())
     takes = f"takes theta of shape ({problem.n_theta},), that is {names}"
+    states_alone = shape == (problem.model.n_states,) != (problem.n_theta,)
+    if states_alone and (observation is None or observation.n_obs == problem.n_theta):
+        raise ValueError(
+            f"The observation has shape {shape}, but the law of the problem {takes}. Wrap the env "
+            "so that it shows all of theta: SetPoint, MeasuredDisturbance, ObserveDisturbance and "
+            "PreviousInput in sb3_yann.wrappers append what is missing. Or pass the map from an "
+            "observation to theta: policy_kwargs={'observation': AffineObservation(matrix, "
+            "offset)}."
+        )
     if observation is None:
         if shape != (problem.n_theta,):
             raise ValueError(
@@ -383,12 +297,6 @@ def require_theta(
                 "policy_kwargs={'observation': AffineObservation(matrix, offset)}."
             )
         return
-    if shape == (problem.model.n_states,) != (problem.n_theta,) == (observation.n_obs,):
-        raise ValueError(
-            f"The observation has shape {shape}, but the law of the problem {takes}. Wrap the env "
-            "so that it shows all of theta: SetPoint, MeasuredDisturbance, ObserveDisturbance and "
-            "PreviousInput in sb3_yann.wrappers append what is missing."
-        )
     given = f"The map to theta has a matrix of shape {observation.matrix.shape}, but the"
     if shape is None or observation.n_obs != np.prod(shape):
         raise ValueError(

@@ -18,14 +18,14 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from torch import nn
 
-from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_choice, check_int
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int
 from sb3_yann.control import LinearMPC
-from sb3_yann.control.mpc.plant_units import InputUnits
+from sb3_yann.units import warn_of_absolute
 
 
 @dataclass(frozen=True, eq=False)
 class AffineObservation(ReadOnlyArrays):
-    """The map ``theta = matrix @ obs + offset`` from an observation to the parameter of the law.
+    """The map ``theta = matrix @ obs + offset`` from an observation to theta in plant units.
 
     For ``policy_kwargs={"observation": ...}``. It flattens an observation in C order, and computes
     in float64. Maps compose like matrices: ``outer @ inner`` applies ``inner`` first.
@@ -38,11 +38,11 @@ class AffineObservation(ReadOnlyArrays):
 
     Examples
     --------
-    The env shows ``(T - 400) / 20``; the law takes deviations from 410.
+    The env shows ``(T - 400) / 20``.
 
-    >>> seen = AffineObservation.deviation([410]) @ AffineObservation.normalized([400], [20])
+    >>> seen = AffineObservation.normalized([400], [20])
     >>> seen([0.5])
-    array([0.])
+    array([410.])
     """
 
     matrix: Array
@@ -60,7 +60,7 @@ class AffineObservation(ReadOnlyArrays):
 
     @classmethod
     def deviation(cls, x_ss: ArrayLike) -> AffineObservation:
-        """Return ``theta = obs - x_ss``, for absolute observations of deviations from x_ss (n,)."""
+        """Return ``theta = obs - x_ss``, for a problem about zero that is not the env's, (n,)."""
         steady = check_array("x_ss", x_ss, ("n",))
         return cls(np.eye(len(steady)), -steady)
 
@@ -136,8 +136,6 @@ class AffineObservation(ReadOnlyArrays):
     def from_vec_normalize(cls, venv: VecEnv) -> AffineObservation:
         """Return the map that undoes the frozen statistics of a `VecNormalize`.
 
-        For a law in deviations compose it:
-        ``AffineObservation.deviation(x_ss) @ AffineObservation.from_vec_normalize(venv)``.
         The policy takes normalized observations from then on, also where it is loaded alone.
         """
         normalize = unwrap_vec_normalize(venv)
@@ -184,63 +182,50 @@ class AffineObservation(ReadOnlyArrays):
         return f"AffineObservation(matrix={self.matrix.tolist()}, offset={self.offset.tolist()})"
 
 
-ObservationSpec = AffineObservation | str | Mapping[str, ArrayLike]
+ObservationSpec = AffineObservation | Mapping[str, ArrayLike]
 """What may be said of an observation, see :func:`as_observation`."""
-SAY = (
-    "Say what it shows: policy_kwargs={'observation': 'deviation'}, 'absolute', or "
-    "{'center': ..., 'scale': ...} for (absolute - center) / scale"
-)
 
 
 def as_observation(
-    given: ObservationSpec | None, problem: LinearMPC, inputs: InputUnits
+    given: ObservationSpec | str | None, problem: LinearMPC
 ) -> AffineObservation | None:
-    """Return the map from what an env shows to theta, None for the identity.
+    """Return the map from what an env shows to theta in plant units, None for the identity.
 
     Parameters
     ----------
-    given : AffineObservation, {"deviation", "absolute"} or mapping, optional
-        The mapping has a ``center`` in absolute values and a ``scale``, both (n_theta,): the env
-        shows ``(absolute - center) / scale``. By default an env that takes deviations shows them;
-        it shows absolute values where it takes them and the problem was stated in them.
+    given : AffineObservation or mapping, optional
+        The mapping has a ``center`` and a ``scale``, both (n_theta,): the env shows
+        ``(theta - center) / scale``. By default it shows theta.
     problem : LinearMPC
-        Its operating point is taken off what is absolute.
-    inputs : InputUnits
-        What the env takes.
+        Whose theta it is.
 
     Raises
     ------
     TypeError, ValueError
-        If ``given`` is none of these, or nobody can tell what the env shows.
+        If ``given`` is none of these.
     """
-    if given is None:
-        given = _default(problem, inputs.kind)
-    if isinstance(given, AffineObservation):
+    if given is None or isinstance(given, AffineObservation):
         return given
     if isinstance(given, Mapping):
         if set(given) != {"center", "scale"}:
             raise ValueError(f"observation = {dict(given)} must have a 'center' and a 'scale'.")
         center = check_array("observation['center']", given["center"], (problem.n_theta,))
-        return AffineObservation.normalized(center - problem.theta_ss, given["scale"])
-    if not isinstance(given, str):
-        raise TypeError(
-            f"observation = {given!r} must be an AffineObservation, 'deviation', 'absolute', a "
-            "mapping with 'center' and 'scale', or None."
-        )
-    absolute = check_choice("observation", given, ("deviation", "absolute")) == "absolute"
-    shifted = absolute and bool(np.any(problem.theta_ss))
-    return AffineObservation.deviation(problem.theta_ss) if shifted else None
+        return AffineObservation.normalized(center, given["scale"])
+    if isinstance(given, str) and given == "absolute":
+        warn_of_absolute(True)
+        return None
+    raise TypeError(
+        f"observation = {given!r} must be an AffineObservation, a mapping with 'center' and "
+        "'scale', or None: an env shows plant units."
+    )
 
 
-def _default(problem: LinearMPC, takes: str) -> str:
-    """Return what an env shows of which nothing is said."""
-    if takes == "absolute" and problem.absolute:
-        return "absolute"
-    unknown = problem.absolute and np.any(problem.theta_ss) and not np.any(problem.model.u_ss)
-    if takes == "deviation" and not unknown:
-        return "deviation"
-    why = "u_ss is zero: absolute inputs are deviations" if unknown else f"it takes {takes} inputs"
-    raise ValueError(f"What the env shows cannot be told from what it takes ({why}). {SAY}.")
+def to_deviations(given: AffineObservation | None, problem: LinearMPC) -> AffineObservation | None:
+    """Return the map from what an env shows to theta as the law takes it, None for the identity."""
+    if not np.any(problem.theta_ss):
+        return given
+    shifted = AffineObservation.deviation(problem.theta_ss)
+    return shifted if given is None else shifted @ given
 
 
 def normalized(model: BaseAlgorithm, observations: Any) -> Any:

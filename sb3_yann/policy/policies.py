@@ -45,9 +45,9 @@ from sb3_yann.policy.actor_critic import (
 from sb3_yann.policy.checks import require_own_problem, resolve_problem
 from sb3_yann.policy.observations import (
     AffineFeatures,
-    AffineObservation,
     ObservationSpec,
     as_observation,
+    to_deviations,
 )
 from sb3_yann.policy.sb3_hooks import (
     KeepsPrecision,
@@ -73,7 +73,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
     observation_space : gymnasium.spaces.Box
         The parameter theta of the law, shape (n_theta,), or what ``observation`` makes theta of.
     action_space : gymnasium.spaces.Box, shape (m,)
-        Its bounds are ``u_min`` and ``u_max`` of the problem, these in absolute values, or [-1, 1].
+        Its bounds are ``u_min`` and ``u_max`` of the problem, or [-1, 1].
     lr_schedule : callable
         SB3's learning rate schedule.
     problem : LinearMPC or str, optional
@@ -98,11 +98,10 @@ class YannPolicy(KeepsPrecision, TD3Policy):
     pin_equilibrium : bool, optional
         Whether actor and critic keep their value at ``theta = 0`` for good: not where the model's
         steady-state input is wrong. False for problems with references or disturbances, else True.
-    observation : AffineObservation, {"deviation", "absolute"} or mapping, optional
-        What the env shows, or its map to theta. A mapping has a ``center``, in absolute values, and
-        a ``scale`` of ``(absolute - center) / scale``. An env that takes deviations shows them by
-        default. One that takes absolute inputs shows absolute values, if the problem has
-        ``absolute=True``.
+    observation : AffineObservation or mapping, optional
+        The map from what the env shows to theta. A mapping has a ``center`` and a ``scale`` of
+        ``(theta - center) / scale``. By default the env shows theta, in plant units where the
+        problem's model has an operating point.
     law : {"auto", "explicit", "online"}, default "auto"
         The explicit law, or the one whose program is solved at each point: see
         :meth:`LinearMPC.law`.
@@ -166,16 +165,15 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         if isinstance(problem, str):
             # Saved by value with the model: a load then neither looks it up nor solves it again.
             self.saved_kwargs["problem"] = self.problem
+        self.action_units = checks.as_action_units(self.problem, action_space)
+        self.observation = as_observation(observation, self.problem)
         # Whether the user said what the env shows.
-        self.observation_given = observation is not None
-        self.input_units = checks.as_input_units(self.problem, action_space, self.observation_given)
-        self.observation = as_observation(observation, self.problem, self.input_units)
+        self.observation_given = self.observation is not None
         checks.require_theta(self.problem, observation_space, self.observation)
-        checks.warn_of_absolute_inputs(self.problem, algorithm, self.input_units)
-        self.has_explicit_map = isinstance(observation, AffineObservation | Mapping)
+        self.to_theta = to_deviations(self.observation, self.problem)
         self._meets(algorithm)
-        if self.observation_given or self.observation is not None:
-            self.saved_kwargs["observation"] = self.observation or "deviation"
+        if self.observation is not None:
+            self.saved_kwargs["observation"] = self.observation
         self.first_obs_checked = False  # at the first observation
         self.gamma = check_discount(checks.as_gamma(gamma, algorithm))
         self.lr_mult = {
@@ -208,8 +206,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
 
     def _meets(self, algorithm: BaseAlgorithm | None) -> None:
         """Raise unless the observations of an algorithm's env are what the policy takes."""
-        given = self.observation if self.has_explicit_map else None
-        checks.require_inverse_normalization(self.problem, algorithm, given)
+        checks.require_inverse_normalization(self.problem, algorithm, self.observation)
         if algorithm is not None and algorithm.get_env() is not None:
             require_state_shown(algorithm.get_env(), self.observation_given)
 
@@ -292,19 +289,19 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         self._attach_hooks()
 
     def theta(self, observations: ArrayLike) -> th.Tensor:
-        """Return the parameter of the law, (batch, n_theta), for observations (batch, ...)."""
+        """Return what the law takes, theta in deviations (batch, n_theta), for observations."""
         obs = th.as_tensor(np.asarray(observations), device=self.device)
         with th.no_grad():
             return self.actor.extract_features(obs, self.actor.features_extractor)
 
     def inputs(self, actions: ArrayLike) -> Array:
         """Return the inputs in deviations, (batch, m), of actions as the env takes them."""
-        return self.input_units.input(actions)
+        return self.action_units.input(actions)
 
     def predict(
         self, observation: Any, *args: Any, **kwargs: Any
     ) -> tuple[Any, tuple[Any, ...] | None]:
-        """Return SB3's prediction; name an absolute observation that is taken for a deviation."""
+        """Return SB3's prediction; name a deviation that is shown in place of plant units."""
         self._meets_another_env()
         predicted = super().predict(observation, *args, **kwargs)
         if not self.first_obs_checked:
@@ -323,9 +320,9 @@ class YannPolicy(KeepsPrecision, TD3Policy):
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Return the map from an observation to theta."""
-        if self.observation is None:
+        if self.to_theta is None:
             return super().make_features_extractor()
-        return AffineFeatures(self.observation_space, self.observation)
+        return AffineFeatures(self.observation_space, self.to_theta)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
         """Return an actor that equals the law, with networks that are zero."""
@@ -385,7 +382,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
             "critic_warmup": self.critic_warmup,
             "max_correction": self.max_correction,
             "pin_equilibrium": self.pin_equilibrium,
-            "observation": self.observation or ("deviation" if self.observation_given else None),
+            "observation": self.observation,
             "law": self.law,
             "networks": self.networks,
         }

@@ -64,7 +64,7 @@ def loops_part(subject: Subject) -> Part:
         [
             paragraph(how, warning if known else ""),
             table(["", "MPC", "policy", "change"], rows),
-            picture(partial(loops_figure, subject.problem, loops), caption),
+            picture(partial(loops_figure, subject.problem, subject.shown_loops), caption),
             tag("h3", "Every episode"),
             table(head, single[:1000]),
         ]
@@ -198,7 +198,7 @@ def _farthest(subject: Subject) -> Html:
         return paragraph(
             "At the random points the policy is the MPC: nothing has been learnt there."
         )
-    far = theta[int(np.argmax(apart))] + problem.theta_ss
+    far = problem.units.to_plant(theta[int(np.argmax(apart))])
     named = zip(problem.labels(units=True), far, strict=True)
     point = ", ".join(f"{name} = {value:.4g}" for name, value in named)
     rest = float(_distance(subject, np.zeros((1, problem.n_theta))).max())
@@ -216,7 +216,9 @@ def _pictures(subject: Subject) -> list[Html]:
             "The regions that the policy's closed loops visit, and how far it is from the MPC in "
             "each, in the input that is farthest."
         )
-        found.append(picture(partial(use_figure, problem, policy, loops[POLICY]), caption))
+        found.append(
+            picture(partial(use_figure, problem, policy, subject.shown_loops[POLICY]), caption)
+        )
     if problem.n_theta < 2:
         return found
     plane = subject.steepest_plane

@@ -30,9 +30,7 @@ def plant_part(subject: Subject) -> Part:
     for i, value in enumerate(model.d_ss):
         kind = "estimated disturbance" if i in model.estimated else "disturbance"
         point.append([f"d[{i}]", kind, number(value)])
-    low = problem.deviations.theta_min + problem.theta_ss
-    high = problem.deviations.theta_max + problem.theta_ss
-    ends = zip(problem.labels(units=True), low, high, strict=True)
+    ends = zip(problem.labels(units=True), problem.theta_min, problem.theta_max, strict=True)
     soft = problem.soft.penalty
     facts = [
         ["horizon", f"{problem.horizon} steps of {model.dt:g}"],
@@ -130,7 +128,9 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
     found = [make_finding(False if is_worse else passed, text)]
     if problem.soft.penalty:
         old, new = (
-            np.mean([np.sum(problem.stage_cost(x[:-1], u)) for x, u in _pairs(loops[who])])
+            np.mean(
+                [np.sum(problem.deviations.stage_cost(x[:-1], u)) for x, u in _pairs(loops[who])]
+            )
             + each.penalty.mean()
             for who, each in ((MPC, mpc), (POLICY, policy))
         )
@@ -140,6 +140,11 @@ def _bound_findings(problem: LinearMPC, loops: dict[str, Trajectories]) -> tuple
             f"{policy.penalty.mean():.4g} with the policy, {mpc.penalty.mean():.4g} with the "
             f"MPC. Stage costs and penalty together: {new:.6g} and {old:.6g}."
         )
+        over = np.where(policy.largest > 0, 0.0, policy.any_bound)
+        worst = int(np.argmax(over))
+        which = np.asarray(policy.worst)[worst]
+        if words := BoundNames.of(problem).in_words(which, over[worst]):
+            text += f" In episode {worst} {words} with the policy."
         found.append(make_finding(not costs_more, text))
     return tuple(found)
 

@@ -143,10 +143,23 @@ class Subject:
             found[name] = replace(found[name], excess=excess)
         return found
 
+    @property
+    def shown_loops(self) -> dict[str, Trajectories]:
+        """The same loops in plant units."""
+        units = self.problem.units
+        return {
+            name: replace(
+                each,
+                observations=tuple(map(units.to_plant, each.observations)),
+                actions=tuple(map(units.input_to_plant, each.actions)),
+            )
+            for name, each in (self.loops or {}).items()
+        }
+
     def act_as_mpc(self, observations: Any) -> Any:
         """Return the MPC's actions for observations of the env; what is not finite is at rest."""
         theta = np.nan_to_num(self._theta(observations), nan=0.0, posinf=0.0, neginf=0.0)
-        action = self.policy.input_units.action(self.law(theta))
+        action = self.policy.action_units.action(self.law(theta))
         return action.astype(self.policy.action_space.dtype)
 
     def act_as_policy(self, observations: Any) -> Any:

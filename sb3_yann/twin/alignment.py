@@ -146,10 +146,9 @@ def _on_law(log: _Log, shift: int, change: tuple[Array, Array] | None = None) ->
     slope, offset, deviation, room = np.zeros((4, m, m))
     error, left, left_of_rows = np.ones((3, m, m))
     unique = np.zeros(m, dtype=bool)
+    own = log.problem.deviations
     for i in range(m):
-        inside = np.minimum(
-            answer[:, i] - log.problem.u_min[i], log.problem.u_max[i] - answer[:, i]
-        )
+        inside = np.minimum(answer[:, i] - own.u_min[i], own.u_max[i] - answer[:, i])
         inside = inside > 1e-3 * log.problem.u_half[i]
         y, a, x = u[inside], answer[inside, i], theta[inside]
         if len(a) < LEAST_ROWS or np.std(a) < 1e-6 * log.problem.u_half[i]:
@@ -365,14 +364,15 @@ def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
         return
     A, names = log.problem.model.A, labels_of(log.problem.model)[0]
     rest = np.linalg.lstsq(np.eye(len(A)) - A, fit.drift, rcond=1e-3)[0]
+    x_ss = log.problem.model.x_ss
     away = np.abs(rest / log.coordinates.units)
     if np.max(away) > 5:  # beyond the log: a state that hardly returns, or noise
         return
     for i in np.flatnonzero(away > 0.5):
         yield (
-            f"Without inputs the logged plant rests at {names[i]} = {rest[i]:.4g}, the problem's "
-            "at 0: compare units and operating point of states and inputs; an absolute log needs "
-            f"absolute=True. {CONFIRM}"
+            f"Without inputs the logged plant rests at {names[i]} = {rest[i] + x_ss[i]:.4g}, the "
+            f"problem's at {x_ss[i]:.4g}: compare units and operating point of states and inputs. "
+            f"{CONFIRM}"
         )
 
 

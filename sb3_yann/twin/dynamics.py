@@ -150,7 +150,7 @@ class Dynamics:
             step(*given)
         else:
             after = np.concatenate([theta, u], axis=-1) @ self.row.linear.T
-            after += self.residual(theta, u) @ self.row.spread.T
+            after = after + self.residual(theta, u) @ self.row.spread.T
         self.row.clip(after)
         return np.asarray(after)
 
@@ -240,6 +240,6 @@ class Dynamics:
             theta[..., parts.given] = episode.thetas[k, parts.given]
             correction = law(parts.shown(theta[:, 0])) - logged[k]
             u = np.clip(episode.actions[k] + correction, u_min, u_max)[:, None]
-            costs += self.problem.stage_cost(parts.shown(theta), u)[:, 0]
+            costs += self.problem.deviations.stage_cost(parts.shown(theta), u)[:, 0]
             theta = self.step(theta, u)
         return costs

@@ -25,6 +25,8 @@ Single = NDArray[np.float32]
 class TwinEnv(gym.Env[Single, Single]):
     """Episodes of a member of a twin: theta is observed, the reward is minus the stage cost.
 
+    Theta and inputs are in plant units where the problem's model has an operating point.
+
     ``info["excess"]`` and ``info["penalty"]`` are those of
     :class:`~sb3_yann.wrappers.StageCost`, and an excess is a violation.
 
@@ -91,6 +93,7 @@ class TwinEnv(gym.Env[Single, Single]):
         row = self.dynamics.row
         theta = row.shown(self._episode.thetas[0]).copy()
         state = problem.layout.state
+        units = problem.units
         theta[state] = self.starts.draw(1, self.np_random)[0, state]
         if options:
             given = np.asarray(options.get("state"), np.float64)
@@ -99,9 +102,10 @@ class TwinEnv(gym.Env[Single, Single]):
                 raise ValueError(f"options['state'] has shape {given.shape}, expected {sizes}.")
             if not np.all(np.isfinite(given)):
                 raise ValueError(f"options['state'] = {given.tolist()} must be finite numbers.")
-            theta[: len(given)] = given
+            theta[: len(given)] = units.to_deviations(given)
         self._theta, self._steps = row.begin(theta), 0
-        return theta.astype(np.float32), {"state": theta.copy(), "member": acting}
+        shown = units.to_plant(theta)
+        return shown.astype(np.float32), {"state": shown.copy(), "member": acting}
 
     def step(self, action: Single) -> tuple[Single, float, bool, bool, dict[str, Any]]:
         """Hold an input, clipped to its bounds, for one sample."""
@@ -112,7 +116,7 @@ class TwinEnv(gym.Env[Single, Single]):
             wanted = f"{self.action_space.shape} finite numbers"
             raise ValueError(f"action = {action!r} must be {wanted}.")
         rows, told, over = step_all([self], self._acting, u[None])
-        thetas = self.dynamics.row.shown(rows)
+        thetas = self.dynamics.problem.units.to_plant(self.dynamics.row.shown(rows))
         info = {name: each[0].item() for name, each in told.items()} | {"state": thetas[0]}
         return thetas[0].astype(np.float32), -info["cost"], False, bool(over[0]), info
 
@@ -122,6 +126,8 @@ def step_all(
 ) -> tuple[Array, dict[str, NDArray[Any]], NDArray[np.bool_]]:
     """Step envs of one twin as one array; return rows, what infos tell, and who is over.
 
+    Rows are in deviations.
+
     Parameters
     ----------
     envs : sequence of TwinEnv
@@ -129,10 +135,12 @@ def step_all(
     dynamics : Dynamics
         One member for each env: the one that acts.
     actions : ndarray, shape (envs, m)
-        Clipped to their bounds.
+        In plant units; they are clipped to their bounds.
     """
-    problem, row = dynamics.problem, dynamics.row
-    u = np.clip(actions, problem.u_min, problem.u_max)
+    row = dynamics.row
+    u = dynamics.problem.units.input_to_deviations(actions)
+    problem = dynamics.problem.deviations
+    u = np.clip(u, problem.u_min, problem.u_max)
     before = np.array([each._theta for each in envs])
     costs = np.asarray(problem.stage_cost(row.shown(before), u))
     after = dynamics.step(before[:, None], u[:, None])[:, 0]

@@ -48,9 +48,8 @@ def as_episodes(
     previous: Sequence[ArrayLike] | None = None,
     *,
     observed: bool = False,
-    absolute: bool = False,
 ) -> tuple[Episode, ...]:
-    """Return episodes as the problem sees them.
+    """Return episodes, given in plant units, as the law sees them: in deviations.
 
     Parameters
     ----------
@@ -61,11 +60,9 @@ def as_episodes(
     references, disturbances : sequence of array_like, shapes (T + 1, p) and (T + 1, d)
         What theta holds besides, one for each episode, or one row for all of it.
     previous : sequence of array_like, shape (m,), optional
-        The input before each episode; zero by default.
+        The input before each episode; that of the operating point by default.
     observed : bool, default False
         Whether an observer estimates the disturbances: they are NaN where none are given.
-    absolute : bool, default False
-        Whether all of it is in absolute values, off which the operating point is taken.
 
     Raises
     ------
@@ -73,14 +70,13 @@ def as_episodes(
         For no episodes, wrong shapes, entries that are not finite, inputs beyond their bounds.
     """
     layout, pairs = problem.layout, _pairs(episodes)
-    point = problem.theta_ss if absolute else np.zeros(layout.size)
-    u_ss = problem.model.u_ss if absolute else np.zeros(problem.model.n_inputs)
+    units = problem.units
     given = {"references": references, "disturbances": disturbances, "previous": previous}
     for name, values in given.items():
         _one_for_each(name, values, len(pairs))
     found = []
     for i, (states, actions) in enumerate(pairs):
-        u = _actions(problem, i, actions, u_ss)
+        u = _actions(problem, i, actions)
         x = _finite(f"episode {i}: states", states)
         if x.ndim == 1:
             x = x[:, None]
@@ -102,8 +98,8 @@ def as_episodes(
         beside = [name for name, each in given.items() if each is not None]
         if whole and beside:
             raise ValueError(f"{beside} is given, but states are all of theta: leave it out.")
-        x = x - point[: x.shape[1]]
-        found.append(Episode(x if whole else _theta(problem, i, x, u, own, observed, point), u))
+        x = units.to_deviations(x)
+        found.append(Episode(x if whole else _theta(problem, i, x, u, own, observed), u))
     return tuple(found)
 
 
@@ -193,24 +189,23 @@ def _finite(name: str, values: ArrayLike) -> Array:
     return array
 
 
-def _actions(problem: LinearMPC, i: int, actions: ArrayLike, u_ss: Array) -> Array:
+def _actions(problem: LinearMPC, i: int, actions: ArrayLike) -> Array:
     u = _finite(f"episode {i}: actions", actions)
     u = u[:, None] if u.ndim == 1 else u
     m = problem.model.n_inputs
     if u.ndim != 2 or u.shape[1] != m:
         raise ValueError(f"episode {i}: actions have shape {u.shape}, expected (T, {m}).")
-    u = u - u_ss
     room = 1e-3 * problem.u_half
     beyond = (u < problem.u_min - room) | (u > problem.u_max + room)
     if beyond.any():
         row, k = np.argwhere(beyond)[0]
-        low, high, value = (each[k] + u_ss[k] for each in (problem.u_min, problem.u_max, u[row]))
+        low, high = problem.u_min[k], problem.u_max[k]
         raise ValueError(
-            f"episode {i}: action {k} is {value:g} in row {row}, beyond the bounds {low:g} and "
-            f"{high:g} of the problem. Are these in the problem's units? A log of absolute values "
-            "needs absolute=True."
+            f"episode {i}: action {k} is {u[row, k]:g} in row {row}, beyond the bounds {low:g} and "
+            f"{high:g} of the problem. A log is in plant units where the model has an operating "
+            "point, and in the model's own where it has none."
         )
-    return np.clip(u, problem.u_min, problem.u_max)
+    return problem.units.input_to_deviations(np.clip(u, problem.u_min, problem.u_max))
 
 
 def _theta(
@@ -220,9 +215,9 @@ def _theta(
     u: Array,
     given: dict[str, Any],
     observed: bool,
-    point: Array,
 ) -> Array:
     layout = problem.layout
+    point = problem.theta_ss
     theta = np.zeros((len(x), layout.size))
     theta[:, layout.state] = x
     for name, part in (("references", layout.reference), ("disturbances", layout.disturbance)):

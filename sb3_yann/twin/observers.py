@@ -55,7 +55,7 @@ def warn_of_estimates(problem: LinearMPC, episodes: Sequence[Episode]) -> None:
         d = each.thetas[:, parts.disturbance]
         free = np.all((d > d_min + room) & (d < d_max - room), axis=1)
         free = free[1:] & free[:-1]
-        left = each.thetas[1:] - problem.predict(each.thetas[:-1], each.actions)
+        left = each.thetas[1:] - problem.deviations.predict(each.thetas[:-1], each.actions)
         errors.append(left[free, parts.state])
         moves.append(np.diff(d, axis=0)[free])
     e, moved = np.concatenate(errors), np.concatenate(moves)

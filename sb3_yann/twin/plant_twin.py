@@ -45,6 +45,7 @@ from sb3_yann.twin.trust import (
     relative_error,
 )
 from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
+from sb3_yann.units import warn_of_absolute
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -128,7 +129,7 @@ class PlantTwin:
         residuals: Sequence[str | Callable[[], Any]] = KINDS,
         n_members: int = 5,
         seed: int = 0,
-        absolute: bool = False,
+        absolute: bool | None = None,
         units_confirmed: bool = False,
     ) -> PlantTwin:
         """Return the twin of a plant that was logged.
@@ -138,8 +139,8 @@ class PlantTwin:
         problem : LinearMPC
             The MPC of the plant: its model is where the twin starts from.
         episodes : sequence of pairs
-            States (T + 1, n), or all of theta (T + 1, n_theta), and actions (T, m), in the units
-            of the problem.
+            States (T + 1, n), or all of theta (T + 1, n_theta), and actions (T, m), in plant units
+            where the problem's model has an operating point.
         references, disturbances : sequence of array_like, optional
             What theta holds besides the state, shapes (T + 1, p) and (T + 1, d) for each episode.
         previous : sequence of array_like, shape (m,), optional
@@ -159,9 +160,8 @@ class PlantTwin:
             The first is fitted to all episodes, the others to as many drawn from them.
         seed : int, default 0
             Of the draws of episodes, and of the weights that networks start from.
-        absolute : bool, default False
-            Whether the log holds absolute values, as the plant shows them: the operating point is
-            taken off states, references and inputs. The twin itself is in deviations.
+        absolute : bool, optional
+            Does nothing, and is deprecated: the model's operating point tells.
         units_confirmed : bool, default False
             Whether somebody has checked the log's units. A plant whose gain is below 0.6 or above
             1.7 times the model's looks like an input in other units, and a controller that is a
@@ -177,11 +177,11 @@ class PlantTwin:
             raise TypeError(f"problem = {problem!r} must be a LinearMPC.")
         check_int("n_members", n_members)
         check_int("seed", seed, 0)
-        check_bool("absolute", absolute)
+        warn_of_absolute(absolute)
         check_bool("units_confirmed", units_confirmed)
         row, given = RowLayout(problem, observer), (references, disturbances, previous)
         observed = observer is not None
-        log = as_episodes(problem, episodes, *given, observed=observed, absolute=absolute)
+        log = as_episodes(problem, episodes, *given, observed=observed)
         notes: tuple[str, ...] = ()
         if time is not None:
             log, notes = cut_at_gaps(log, time, problem.model.dt)
@@ -274,9 +274,9 @@ class PlantTwin:
         Its A, B and E are fitted to the log, and shrunk towards the given ones as far as held-out
         free runs ask for it. It is :attr:`problem` itself where no linear model predicts better.
 
-        With references or disturbances its operating point is where the plant rests today: its
-        ``theta`` is in deviations from the new ``model.x_ss`` and ``model.u_ss``. The terminal cost
-        is solved anew, and a terminal set is the new model's invariant one.
+        With references or disturbances its operating point is where the plant rests today. Bounds
+        and boxes are the same. The terminal cost is solved anew, and a terminal set is the new
+        model's invariant one.
 
         Raises
         ------

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.control import LinearModel, LinearMPC, OutputBounds, Terminal
-from sb3_yann.control.mpc.linear_mpc import derived
+from sb3_yann.control import LinearModel, LinearMPC, Terminal
 from sb3_yann.control.mpc.steady_state import steady_states
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import Episode, pieces
@@ -41,7 +42,8 @@ def reidentified(
     own = {"A": A, "B": B, "E": E, "x_ss": model.x_ss + x, "u_ss": model.u_ss + u}
     own |= {"notes": [*model.notes, note], "drift": None}
     found = LinearModel(**{**vars(model), **own})
-    return _with(problem, found, x, u)
+    terminal = Terminal(set="invariant" if len(problem.terminal.set[1]) else None)
+    return replace(problem, model=found, terminal=terminal)
 
 
 def _rest(problem: LinearMPC, A: Array, B: Array, drift: Array) -> tuple[Array, Array]:
@@ -54,21 +56,3 @@ def _rest(problem: LinearMPC, A: Array, B: Array, drift: Array) -> tuple[Array, 
     weights = problem.Q, problem.R, x_unit, problem.u_half
     found = steady_states(drifting, problem.tracking.C, *weights)
     return found.x[:, -1], found.u[:, -1]
-
-
-def _with(problem: LinearMPC, model: LinearModel, x: Array, u: Array) -> LinearMPC:
-    """Return the problem with another model, whose operating point lies x and u from its own."""
-    outputs, states = problem.outputs, problem.layout.state
-    y = outputs.C @ x
-    return derived(
-        problem,
-        model=model,
-        x_min=problem.x_min - x,
-        x_max=problem.x_max - x,
-        u_min=problem.u_min - u,
-        u_max=problem.u_max - u,
-        theta_min=problem.theta_min[states] - x,
-        theta_max=problem.theta_max[states] - x,
-        outputs=OutputBounds(outputs.C, outputs.y_min - y, outputs.y_max - y),
-        terminal=Terminal(set="invariant" if len(problem.terminal.set[1]) else None),
-    )

@@ -33,7 +33,7 @@ def normalization_of(model: Any) -> Any:
 def episodes_of(model: Any) -> list[tuple[Array, Array]]:
     """Return the episodes (thetas, actions) that a model's replay buffer holds, whole or in part.
 
-    Those of a simulator are left out.
+    They are in plant units. Those of a simulator are left out.
 
     Raises
     ------
@@ -57,15 +57,14 @@ def episodes_of(model: Any) -> list[tuple[Array, Array]]:
 
     def theta(observations: Any) -> Array:
         seen = observations if normalize is None else normalize.normalize_obs(observations)
-        return np.asarray(policy.theta(seen).double().cpu().numpy())
+        found: Array = problem.units.to_plant(policy.theta(seen).double().cpu().numpy())
+        return found
 
     found = []
     for env in range(buffer.n_envs):
         now, after = buffer.observations[order, env], buffer.next_observations[order, env]
         scaled = buffer.actions[order, env].astype(np.float64)
-        u = problem.deviations.u_min + (scaled + 1) / 2 * (
-            problem.deviations.u_max - problem.deviations.u_min
-        )
+        u = problem.u_min + (scaled + 1) / 2 * (problem.u_max - problem.u_min)
         ends = buffer.dones[order, env].astype(bool)
         same = np.all(now[1:] == after[:-1], axis=tuple(range(1, now.ndim)))
         ends[:-1] |= ~same

@@ -109,7 +109,7 @@ def relative_error(predicted: Array, actual: Array) -> float:
 def costs_of(problem: LinearMPC, episode: Episode) -> float:
     """Return the stage cost of a logged episode."""
     thetas = episode.thetas[:-1, : problem.n_theta]
-    return float(np.sum(problem.stage_cost(thetas, episode.actions)))
+    return float(np.sum(problem.deviations.stage_cost(thetas, episode.actions)))
 
 
 def held_out_costs(
@@ -294,10 +294,7 @@ def judge(
             f"{100 * beyond[0]:.3g} % of the logged {beyond[1]} lie beyond the problem's box of "
             "theta."
         )
-        advice.append(
-            "Compare units and operating point of the log and the model; an absolute log needs "
-            "absolute=True."
-        )
+        advice.append("Compare units and operating point of the log and the model.")
     error = relative_error(*costs)
     if n_episodes > 1 and not error <= COST_ERROR:
         problems.append(

@@ -40,7 +40,8 @@ class _Copies:
         if u.shape != shape or not np.all(np.isfinite(u)):
             raise ValueError(f"actions = {actions!r} must be {shape} finite numbers.")
         rows, told, over = step_all(self.envs, self._stack, u)
-        return first.dynamics.row.shown(rows), told, over
+        units = first.dynamics.problem.units
+        return units.to_plant(first.dynamics.row.shown(rows)), told, over
 
 
 class TwinVectorEnv(VectorEnv[Single, Single, NDArray[Any]]):

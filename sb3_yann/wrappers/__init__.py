@@ -1,4 +1,4 @@
-"""Wrappers that complete theta, set the reward, shift units, and cure faults of episodes."""
+"""Wrappers that complete theta, set the reward, and cure faults of episodes."""
 
 from sb3_yann.wrappers.episodes import SeededGlobals, TimeLimitIsNoTermination
 from sb3_yann.wrappers.stage_cost import StageCost
@@ -9,10 +9,8 @@ from sb3_yann.wrappers.theta import (
     PreviousInput,
     SetPoint,
 )
-from sb3_yann.wrappers.units import Deviations
 
 __all__ = [
-    "Deviations",
     "MeasuredDisturbance",
     "ObserveDisturbance",
     "PastInputs",

@@ -13,7 +13,7 @@ from sb3_yann._validation import Array, check_number, check_type
 from sb3_yann.compare import EXCESS_ROOM
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import Bounds, bound_excess
-from sb3_yann.control.mpc.plant_units import InputUnits
+from sb3_yann.units import ActionUnits
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
 
 
@@ -33,10 +33,10 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
     problem : LinearMPC
     violation_cost : float, default 0
         Added to the cost of a step that reports ``info["violation"]``.
-    observation : AffineObservation, {"deviation", "absolute"} or mapping, optional
-        What the env shows, or its map to theta: as in :class:`YannPolicy`. By default it is theta,
-        or absolute where the env takes absolute inputs and the problem has ``absolute=True``. The
-        cost counts absolute inputs, and those in [-1, 1], as the problem does.
+    observation : AffineObservation or mapping, optional
+        The map from what the env shows to theta: as in :class:`YannPolicy`. By default it is theta,
+        in plant units where the problem's model has an operating point. Actions in [-1, 1] count as
+        the inputs that they stand for.
 
     Examples
     --------
@@ -52,21 +52,20 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
         env: Env,
         problem: LinearMPC,
         violation_cost: float = 0.0,
-        observation: Callable[[ArrayLike], Array] | str | Mapping[str, ArrayLike] | None = None,
+        observation: Callable[[ArrayLike], Array] | Mapping[str, ArrayLike] | None = None,
     ) -> None:
         space = require_vector(env, "observation_space")
         super().__init__(env)
         check_type("problem", problem, LinearMPC, "a LinearMPC, such as that of the policy")
         self.inputs = require_vector(env, "action_space")
         names = problem.layout.names
-        units = InputUnits.of(problem, self.inputs.low, self.inputs.high)
-        self.units = units or InputUnits("deviation", np.ones(1), np.zeros(1))
-        if observation is None and problem.absolute and self.units.kind == "absolute":
-            observation = "absolute"
+        units = ActionUnits.of(problem, self.inputs.low, self.inputs.high)
+        u_ss = problem.model.u_ss
+        self.units = units or ActionUnits("plant", np.ones_like(u_ss), u_ss.copy())
         if observation is not None and not callable(observation):
             from sb3_yann.policy.observations import as_observation  # loads PyTorch
 
-            observation = as_observation(observation, problem, self.units)
+            observation = as_observation(observation, problem)
         self.seen: Callable[[ArrayLike], Array] = observation or _as_it_is
         shape = np.shape(self.seen(np.zeros(space.shape)))
         if shape != (problem.n_theta,):
@@ -89,16 +88,16 @@ class StageCost(gym.Wrapper[Vector, Vector, Vector, Vector]):
                 f"The env's reset returned an observation of shape {shape}, and its "
                 f"observation_space has {told}: return a vector, such as np.ravel(observation)."
             )
-        self.theta = self.seen(observation)
+        self.theta = self.problem.units.to_deviations(self.seen(observation))
         return observation, info
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Step; the reward is the one of this wrapper."""
         u = np.clip(np.asarray(action, np.float64), self.inputs.low, self.inputs.high)
         u = self.units.input(u)
-        cost = float(self.problem.stage_cost(self.theta, u))
+        cost = float(self.problem.deviations.stage_cost(self.theta, u))
         observation, _, terminated, truncated, info = self.env.step(action)
-        after = self.seen(observation)
+        after = self.problem.units.to_deviations(self.seen(observation))
         states = np.array([self.theta, after])
         excess = bound_excess(self.problem, states, u[None], bounds=self.bounds)
         info = {**info, "excess": float(excess.largest), "penalty": float(excess.penalty)}

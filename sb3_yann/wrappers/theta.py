@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, NonFiniteWarning, check_int, check_vector
 from sb3_yann.control import DisturbanceObserver
+from sb3_yann.units import Units
 from sb3_yann.wrappers.appending import Appending, joined
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
-from sb3_yann.wrappers.units import Deviations
 
 AWrapper = TypeVar("AWrapper", bound="gym.Wrapper[Any, Any, Any, Any]")
 Schedule = Callable[[int], ArrayLike]
@@ -32,8 +32,8 @@ class PreviousInput(Appending):
     env : gymnasium.Env, with one-dimensional Box spaces
     initial : array_like, shape (m,), optional
         What counts as the previous input at the start of an episode, as the env takes it: zeros by
-        default, the operating point of an env that takes deviations. One whose bounds leave zero
-        out, or begin or end there, needs it.
+        default. An env with an operating point needs it: ``model.u_ss``. So does one whose bounds
+        leave zero out, or begin or end there.
 
     Examples
     --------
@@ -64,9 +64,9 @@ class PastInputs(Appending):
     delays : sequence of int, length m
         For each input, how many of its past values are appended, newest first.
     initial : array_like, shape (m,), optional
-        What was on its way at the start of an episode, as the env takes it: zeros by default, the
-        operating point of an env that takes deviations. One whose bounds leave zero out, or begin
-        or end there, needs it: ``model.u_ss`` of an env in the plant's own units.
+        What was on its way at the start of an episode, as the env takes it: zeros by default.
+        An env with an operating point needs it: ``model.u_ss``. So does one whose bounds leave zero
+        out, or begin or end there.
 
     Examples
     --------
@@ -106,8 +106,8 @@ class PastInputs(Appending):
 def _as_initial(initial: ArrayLike | None, bounds: spaces.Box, needed: NDArray[np.bool_]) -> Array:
     """Return the inputs (m,) before an episode, by default zero.
 
-    Raise where inputs that are ``needed`` (m,) were hardly zero. Bounds that leave zero out are
-    those of absolute values, and so are those that begin there.
+    Raise where inputs that are ``needed`` (m,) were hardly zero: their bounds leave zero out, or
+    begin there.
     """
     if initial is None and np.any(needed & ((bounds.low >= 0) | (bounds.high <= 0))):
         raise ValueError(
@@ -193,10 +193,8 @@ class SetPoint(Appending):
 class MeasuredDisturbance(Appending):
     """Appends a disturbance d (d,) that the env measures and reports in ``info``.
 
-    Over :class:`Deviations` it counts from the operating point as well: ``d_ss`` is taken off.
-
-    An entry that is no finite number is named, and the last one that was holds: at first 0, the
-    operating point, or the nearest bound to it. :class:`ObserveDisturbance` comes after it.
+    An entry that is no finite number is named, and the last one that was holds: at first 0, or the
+    nearest bound to it. :class:`ObserveDisturbance` comes after it.
 
     Parameters
     ----------
@@ -224,7 +222,6 @@ class MeasuredDisturbance(Appending):
                 "The env is in ObserveDisturbance already, whose observer would take the measured "
                 "disturbance for an unknown one. Wrap it in MeasuredDisturbance first."
             )
-        self.d_ss: Array = _operating_disturbance(env, self.low)
         if not isinstance(key, str):
             raise TypeError(f"key = {key!r} must be a str, the entry of info that holds d.")
         self.key = key
@@ -241,7 +238,7 @@ class MeasuredDisturbance(Appending):
         if d.shape != self.low.shape:
             raise ValueError(f"info[{self.key!r}] has shape {d.shape}, expected {self.low.shape}.")
         failing = ~np.isfinite(d)
-        self.held = np.where(failing, self.held, d - self.d_ss)
+        self.held = np.where(failing, self.held, d)
         if np.any(failing & ~self.failing):  # once, for a sensor that stays so
             warnings.warn(
                 f"info[{self.key!r}] = {d.tolist()} is not finite: {self.held.tolist()} holds "
@@ -260,12 +257,6 @@ def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
             return env
         env = env.env
     return None
-
-
-def _operating_disturbance(env: Env, low: Array) -> Array:
-    """Return what measured disturbances (d,) count from: d_ss of a `Deviations` below."""
-    units = _below(env, Deviations)
-    return units.d_ss if units is not None and units.d_ss.shape == low.shape else np.zeros_like(low)
 
 
 def _require_told(observer: DisturbanceObserver, measured: MeasuredDisturbance | None) -> None:
@@ -287,22 +278,10 @@ def _require_told(observer: DisturbanceObserver, measured: MeasuredDisturbance |
         )
 
 
-def _require_deviations(env: Env, u_ss: Array) -> None:
-    """Raise where an env takes absolute inputs: an operating point (m,) is inside, zero is not."""
-    space = require_vector(env, "action_space")
-    low, high = space.low, space.high
-    if low.shape == u_ss.shape and np.any(
-        ((low >= 0) | (high <= 0)) & (low < u_ss) & (u_ss < high) & (u_ss != 0)
-    ):
-        raise ValueError(
-            f"The env takes inputs from {low.tolist()} to {high.tolist()}, which are absolute: the "
-            f"operating point is u_ss = {u_ss.tolist()}, and the observer counts from it. Wrap the "
-            "plant in Deviations(env, mpc.model) before."
-        )
-
-
 class ObserveDisturbance(Appending):
     """Puts the estimated state in place of the measurement, and appends the disturbance d (d,).
+
+    All of it is in plant units where the observer's model has an operating point.
 
     The first entries of the env's observation are the measured outputs y (q,) of the observer; what
     other wrappers have appended to them, such as a reference, stays where it is. Measured
@@ -332,7 +311,6 @@ class ObserveDisturbance(Appending):
     ) -> None:
         if not isinstance(observer, DisturbanceObserver):
             raise TypeError(f"observer = {observer!r} must be a DisturbanceObserver.")
-        _require_deviations(env, observer.model.u_ss)
         self.measured: Any = _below(env, MeasuredDisturbance)
         _require_told(observer, self.measured)
         if np.size(low) == np.size(high) == observer.model.n_disturbances:
@@ -344,15 +322,24 @@ class ObserveDisturbance(Appending):
                 f"{observer.n_estimated} disturbances."
             )
         self.observer = copy.deepcopy(observer)
+        model = observer.model
+        told = [*range(observer.n_told)]
+        estimated = [*range(observer.n_told, model.n_disturbances)]
+        # The observer computes with deviations: what counts from where.
+        self.inner = Units(np.concatenate([observer.C @ model.x_ss, model.d_ss[told]]), model.u_ss)
+        self.outer = Units(np.concatenate([model.x_ss, model.d_ss[estimated]]), model.u_ss)
         self.load: Array | None = None
         self.failing: NDArray[np.bool_] = np.zeros(observer.n_measured, dtype=bool)
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         observer = self.observer
         measured, rest = np.split(observation.copy(), [observer.n_measured])
+        measured = self.inner.to_deviations(measured) if self.inner.shifted else measured
+        u = None if u is None else self.inner.input_to_deviations(u)
         failing = ~np.isfinite(measured)
         if np.any(failing & ~self.failing):  # once, for a sensor that stays so
-            at = f"The measurement {measured.tolist()} is not finite: the observer predicts it."
+            shown = observation[: len(measured)].tolist()
+            at = f"The measurement {shown} is not finite: the observer predicts it."
             warnings.warn(at, NonFiniteWarning, stacklevel=4)
         self.failing = failing
         if failing.any():
@@ -363,5 +350,7 @@ class ObserveDisturbance(Appending):
         else:
             x_hat, d_hat = observer.update(measured, u, self.load)
         if self.measured is not None:  # acts until the next sample
-            self.load = self.measured.held
+            told = observer.n_measured
+            self.load = self.measured.held - self.inner.theta_ss[told:]
+        x_hat, d_hat = np.split(self.outer.to_plant(np.append(x_hat, d_hat)), [len(x_hat)])
         return joined(x_hat, rest, np.clip(d_hat, self.low, self.high))

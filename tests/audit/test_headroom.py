@@ -275,7 +275,7 @@ def test_a_simulator_may_fail_where_no_plan_should_go(fails) -> None:
 
 
 def test_what_it_cannot_use_is_named() -> None:
-    with pytest.raises(ValueError, match=r"The env shows \(4,\).*Deviations"):
+    with pytest.raises(ValueError, match=r"The env shows \(4,\).*PastInputs"):
         headroom(heater(), "CSTR-v0")
     with pytest.raises(TypeError, match="mpc = 3"):
         headroom(3, "CSTR-v0")  # type: ignore[arg-type]

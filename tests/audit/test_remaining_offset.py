@@ -8,10 +8,11 @@ import pytest
 from sb3_yann import DisturbanceBounds, LinearModel, LinearMPC, Tracking
 from sb3_yann.audit.offset import remaining_offset
 
-MOTOR = LinearModel([[0.8]], [[0.5]], dt=1.0, x_ss=[1500], state_names=["speed"], units=["rpm", ""])
+MOTOR = LinearModel([[0.8]], [[0.5]], dt=1.0, state_names=["speed"], units=["rpm", ""])
 
 
 def motor(**changes) -> LinearMPC:
+    """Return it in deviations, as what is looked at here."""
     given = {"Q": [[1.0]], "R": [[0.1]], "horizon": 2, "u_min": -900, "u_max": 900}
     box = {"theta_min": -900, "theta_max": 900, "tracking": Tracking([0], -900, 900)}
     return LinearMPC(changes.pop("model", MOTOR), **{**given, **box, **changes})

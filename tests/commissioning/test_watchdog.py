@@ -186,8 +186,11 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
 
 def test_an_alarm_calls_sensors_by_their_names_and_shows_what_they_read() -> None:
     plain = problem()
-    model = replace(plain.model.named(["place", "speed"], ["force"]), x_ss=[100, 0])
-    twin = PlantTwin.fit(replace(plain, model=model), log(6, 0.002))
+    x_ss = np.array([100.0, 0.0])
+    model = replace(plain.model.named(["place", "speed"], ["force"]), x_ss=x_ss)
+    box = {"theta_min": plain.theta_min + x_ss, "theta_max": plain.theta_max + x_ss}
+    mpc = replace(plain, model=model, **box)
+    twin = PlantTwin.fit(mpc, [(x + x_ss, u) for x, u in log(6, 0.002)])
     rng, u = np.random.default_rng(0), np.zeros(1)
     x = 1e-3 * rng.standard_normal((12, 2))
     x[6:, 0] = x[5, 0]

@@ -20,7 +20,7 @@ from deployed import (
     policy_of,
     with_faults,
 )
-from sample_laws import solved
+from sample_laws import reactor_in_plant_units, solved
 from sb3_yann import Checks, Controller, LinearModel, LinearMPC, export
 from sb3_yann.deployment.code import index_bytes, insensitive
 from sb3_yann.deployment.controller import MODES, Status
@@ -187,18 +187,20 @@ def test_inputs_without_bounds(tmp_path):
 
 def test_float_beside_a_huge_operating_point_is_refused(tmp_path):
     model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1, x_ss=[1e8, 0], u_ss=[0])
-    bounds = {"x_min": [-5, -2], "x_max": [5, 2], "u_min": -1, "u_max": 1}
+    bounds = {"x_min": [1e8 - 5, -2], "x_max": [1e8 + 5, 2], "u_min": -1, "u_max": 1}
     law = LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, **bounds).explicit()
     with pytest.raises(ValueError, match="Pass precision='double'"):
-        export(law, tmp_path / "plant.c", absolute=True, precision="float")
+        export(law, tmp_path / "plant.c", precision="float")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_header_tells_deviations_from_what_the_plant_shows(tmp_path):
-    law = solved("reactor").explicit()
-    for absolute, shown in ((False, ["T, 0 at rest", "U, -55 to 55"]), (True, ["T, 475 at rest"])):
-        export(law, tmp_path / "plant.c", absolute=absolute)
-        export(law, tmp_path / "plant.st", absolute=absolute)
+def test_a_header_tells_plant_units(tmp_path):
+    for problem, shown in (
+        (solved("reactor"), ["T, 0 at rest", "U, -55 to 55"]),
+        (reactor_in_plant_units(), ["T, 475 at rest", "U, 0 to 110"]),
+    ):
+        export(problem.explicit(), tmp_path / "plant.c")
+        export(problem.explicit(), tmp_path / "plant.st")
         for suffix in ("h", "st"):
             text = (tmp_path / f"plant.{suffix}").read_text()
             assert all(each in text for each in shown)

@@ -19,7 +19,7 @@ import general_problems
 import sb3_yann._archive
 import sb3_yann.deployment.controller
 from deployed import CASES, box, disturbed, in_float64, observations, policy_of
-from sample_laws import solved
+from sample_laws import reactor_in_plant_units, solved
 from sb3_yann import (
     AffineObservation,
     Checks,
@@ -74,19 +74,16 @@ def test_what_is_not_finite_counts_as_in_the_policy(name, tmp_path):
     assert np.max(np.abs(controller.evaluate(obs) - predicted) / scale) < 1e-6
 
 
-def test_a_law_alone_and_in_the_plants_own_units(tmp_path):
+def test_a_law_alone_is_in_plant_units(tmp_path):
     law = solved("reactor").explicit()
     theta = np.random.default_rng(0).uniform(-1, 1, (1000, 4)) * [2, 2, 2, 40]
     assert np.allclose(controller_of(law, tmp_path).evaluate(theta), law(theta), atol=1e-10)
-    absolute = controller_of(law, tmp_path, absolute=True)
+    law = reactor_in_plant_units().explicit()
+    controller = controller_of(law, tmp_path)
     shown = theta + law.theta_ss
-    assert np.allclose(absolute.evaluate(shown), law.plant_input(shown), atol=1e-9)
-    assert absolute.obs_names == ("C_A", "C_B", "C_S", "T")
-    assert absolute.action_names == ("U",)
-    policy = policy_of("reactor")
-    by_policy = controller_of(policy, tmp_path, absolute=True).evaluate(shown)
-    wanted = controller_of(policy, tmp_path).evaluate(theta) + 55
-    assert np.allclose(by_policy, wanted, atol=1e-9)
+    assert np.allclose(controller.evaluate(shown), law.plant_input(shown), atol=1e-9)
+    assert controller.obs_names == ("C_A", "C_B", "C_S", "T")
+    assert controller.action_names == ("U",)
 
 
 def test_a_problem_is_its_law_within_its_rates(tmp_path):
@@ -429,7 +426,7 @@ def heated() -> LinearMPC:
     model = LinearModel([[0.85]], [[0.1]], dt=30, x_ss=[60], u_ss=[12], state_names=["temperature"])
     mpc = LinearMPC(
         model, Q=[[1]], R=[[0.05]], horizon=3, u_min=0, u_max=30, theta_min=40, theta_max=80,
-        tracking=Tracking([0], 50, 70), absolute=True,
+        tracking=Tracking([0], 50, 70),
     )  # fmt: skip
     return offset_free(mpc)[0]
 
@@ -458,7 +455,7 @@ def test_an_export_without_its_observer_is_refused_or_says_so(suffix, kind, tmp_
     if kind == "law":
         given = given.explicit()
     if kind == "model":
-        space = spaces.Box(-100, 100, (3,)), spaces.Box(-12, 18, (1,))
+        space = spaces.Box(-100, 100, (3,)), spaces.Box(0, 30, (1,))
         policy = {"policy_kwargs": {"problem": given}}
         given = DDPG("YannPolicy", Silent(*space), **policy, device="cpu")
     with pytest.raises(ValueError, match='observer="caller"'):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,7 +14,6 @@ import unit_samples as units
 from sb3_yann import YannPolicy
 from sb3_yann.evaluation import Trajectories, evaluate
 from sb3_yann.rollout import EnvPool, maker
-from sb3_yann.wrappers import Deviations
 from sb3_yann_envs import problems
 
 SEEDS = range(3)
@@ -260,15 +261,14 @@ def test_something_that_is_no_policy_is_named() -> None:
         evaluate(3, "CSTR-v0", SEEDS)  # type: ignore[arg-type]
 
 
-def test_a_law_in_deviations_is_not_played_on_an_absolute_env() -> None:
-    mpc, env = units.absolute_mpc(), units.plant("absolute", "absolute")
-    for law in (mpc.explicit(), mpc.online()):
-        with pytest.raises(ValueError, match=r"absolute inputs, from \[38.*plant_input"):
-            evaluate(law, env, SEEDS)
-        evaluate(law, units.plant("deviation", "deviation"), SEEDS)
-    costs = evaluate(mpc.explicit().plant_input, env, SEEDS).costs
-    wrapped = evaluate(mpc.explicit(), Deviations(env, mpc.model), SEEDS).costs
-    np.testing.assert_allclose(costs, wrapped, rtol=1e-9)
+def test_a_law_is_played_in_plant_units() -> None:
+    mpc, make = units.plant_mpc(), partial(units.plant, "plant", "plant")
+    own = partial(units.plant, "deviation", "deviation")
+    expected = evaluate(mpc.deviations.explicit(), own, SEEDS).costs
+    for law in (mpc.explicit(), mpc.online(), mpc.explicit().plant_input):
+        np.testing.assert_allclose(evaluate(law, make, SEEDS).costs, expected, rtol=1e-9)
+    with pytest.raises(ValueError, match=r"takes deviations, from \[-2.*u_ss = \[40.0\]"):
+        evaluate(mpc.explicit(), own, SEEDS)
 
 
 def test_a_problem_is_not_its_law() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sample_laws import reactor_in_plant_units
 from sb3_yann import LinearModel, LinearMPC, SoftBounds, Tracking
 from sb3_yann.evaluation import Trajectories, evaluate
 from sb3_yann.evaluation.plots import (
@@ -29,14 +30,14 @@ def tank(**options) -> LinearMPC:
         [[0.9]], [[0.5]], 2.0, [12], [40], state_names=["level"], input_names=["flow"],
         units={"level": "m", "flow": "L/s"},
     )  # fmt: skip
-    given = {"x_min": -3, "x_max": 3, "theta_min": -4, "theta_max": 4}
-    limits = {"u_min": -1, "u_max": 1, "horizon": 2}
+    given = {"x_min": 9, "x_max": 15, "theta_min": 8, "theta_max": 16}
+    limits = {"u_min": 39, "u_max": 41, "horizon": 2}
     return LinearMPC(model, Q=[[1]], R=[[1]], **{**given, **limits, **options})
 
 
 def episodes(count: int, size: int = 1, steps: int = 5) -> Trajectories:
-    x = [np.full((steps + 1, size), k / count) for k in range(count)]
-    u = [np.full((steps, 1), -k / count) for k in range(count)]
+    x = [np.full((steps + 1, size), 12 + k / count) for k in range(count)]
+    u = [np.full((steps, 1), 40 - k / count) for k in range(count)]
     none = np.zeros(count, int)
     return Trajectories(np.ones(count), none, tuple(x), tuple(u), none.astype(bool))
 
@@ -79,7 +80,7 @@ def test_episodes_that_have_ended_count_no_more() -> None:
 
 
 def test_limits_are_drawn_near_the_data_and_named_where_they_are_far() -> None:
-    axes = plot_loop(tank(x_max=1.2), {"MPC": episodes(4)}, "level")
+    axes = plot_loop(tank(x_max=13.2), {"MPC": episodes(4)}, "level")
     drawn = [line.get_ydata()[0] for line in axes.lines if len(set(line.get_ydata())) == 1]
     assert 13.2 in drawn and 9.0 not in drawn
     assert [text.get_text() for text in axes.texts] == ["limit: 9"]
@@ -88,16 +89,16 @@ def test_limits_are_drawn_near_the_data_and_named_where_they_are_far() -> None:
 
 
 def test_a_soft_limit_is_called_one() -> None:
-    soft = tank(x_max=0.5, soft=SoftBounds(x=1.0, penalty=10.0))
+    soft = tank(x_max=12.5, soft=SoftBounds(x=1.0, penalty=10.0))
     labels = plot_loop(soft, {"MPC": episodes(4)}, "level").get_legend_handles_labels()[1]
     assert "soft limit" in labels
 
 
 def test_a_set_point_is_a_line_of_its_own_without_the_last_one() -> None:
-    mpc = tank(tracking=Tracking([0], -2, 2))
+    mpc = tank(tracking=Tracking([0], 10, 14))
     played = episodes(2, size=2)
     for x in played.observations:
-        x[:, 1], x[-1, 1] = 1.0, 9.0
+        x[:, 1], x[-1, 1] = 13.0, 21.0
     axes = plot_loop(mpc, {"MPC": played}, "level")
     (line,) = (each for each in axes.lines if each.get_label() == "set-point")
     assert set(line.get_ydata()) == {13.0}
@@ -126,7 +127,7 @@ def test_what_is_no_quantity_and_no_episodes_are_refused() -> None:
 
 
 def test_the_surface_is_the_law_in_plant_units() -> None:
-    mpc = problems.cstr()
+    mpc = reactor_in_plant_units()
     axes = plot_surface(mpc, mpc.explicit(), entries=("C_B", "T"))
     (mesh,) = axes.collections
     corners = mesh.get_coordinates()
@@ -139,7 +140,7 @@ def test_the_surface_is_the_law_in_plant_units() -> None:
 
 
 def test_a_surface_is_drawn_in_the_frame_that_is_given() -> None:
-    mpc = problems.cstr()
+    mpc = reactor_in_plant_units()
     axes = plot_surface(mpc, mpc.explicit(), entries=("C_B", "T"), frame=([0.5, 470], [1, 480]))
     assert axes.get_xlim() == pytest.approx((0.5, 1), abs=0.01)
     assert axes.get_ylim() == pytest.approx((470, 480), abs=0.1)

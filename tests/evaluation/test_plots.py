@@ -43,16 +43,16 @@ def tank() -> LinearMPC:
         np.eye(2) / 2, [[1], [0]], 0.5, [12, 3], [40], state_names=["level", "T"],
         input_names=["flow"], units={"T": "K", "flow": "L/s"},
     )  # fmt: skip
-    box = {"theta_min": -5, "theta_max": 5, "u_min": -1, "u_max": 1}
-    return LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracking=Tracking([0], -1, 1), **box)
+    box = {"theta_min": [7, -2], "theta_max": [17, 8], "u_min": 39, "u_max": 41}
+    return LinearMPC(model, Q=np.eye(2), R=[[1]], horizon=1, tracking=Tracking([0], 11, 13), **box)
 
 
 @pytest.mark.parametrize(
     ("options", "labels", "values"),
     [
-        ({}, ["level", "T (K)", "flow (L/s)"], [13, 4, 40]),
+        ({}, ["level", "T (K)", "flow (L/s)"], [1, 1, 0]),
         (
-            {"entries": [1, 2], "labels": {2: "wanted"}, "absolute": True},
+            {"entries": [1, 2], "labels": {2: "wanted"}},
             ["T (K)", "wanted", "flow (L/s)"],
             [1, 1, 0],
         ),
@@ -72,7 +72,7 @@ def test_a_picture_is_in_the_units_of_the_plant_with_its_names(
     assert [panel.lines[0].get_ydata()[0] for panel in panels] == values
     if not options:
         set_point = panels[0].lines[1]
-        assert set(set_point.get_ydata()) == {13} and set_point.get_linestyle() == "--"
+        assert set(set_point.get_ydata()) == {1} and set_point.get_linestyle() == "--"
         assert panels[2].lines[0].get_xdata()[1] == 0.5
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -21,6 +23,7 @@ from sb3_yann import (
     NoActionNoise,
     OutputBounds,
     SoftBounds,
+    report,
 )
 from sb3_yann.compare import Scores, Tolerance, less_safe, no_worse, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import BoundNames, excess_of_episodes
@@ -128,8 +131,26 @@ def test_the_guard_never_accepts_a_faster_policy_than_the_bounds_let(kind: str) 
     log = evaluate(model, make, range(20, 24))
     assert guard.decisions[0].verdict == "rejected"
     named = {"hard states": "speed exceeds its bound by", "hard outputs": "y[0] exceeds its bound"}
-    assert named.get(kind, "more than with the MPC") in guard.decisions[0].reason
+    named["soft states"] = "more than with the MPC: speed exceeds its soft bound by"
+    reason = guard.decisions[0].reason
+    assert named[kind] in reason and (kind == "hard outputs") != ("m/s" in reason)
     assert max(np.abs(each[:, 1]).max() for each in log.observations) < LIMIT * 1.01
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_page_to_sign_fails_and_names_the_bound_its_excess_and_the_unit(
+    kind: str, tmp_path: Path
+) -> None:
+    mpc, make = carriage(kind)
+    options = {"problem": mpc, "networks": "shared"}
+    model = DDPG("YannPolicy", make(), policy_kwargs=options, device="cpu", seed=0)
+    push(model.policy)
+    page = report(model, tmp_path / "page.html", env=make, seeds=range(20, 24)).read_text()
+    failed = [row for row in re.findall("<tr>.*?</tr>", page, re.DOTALL) if ">failed<" in row]
+    says = {"hard outputs": r"y\[0\] exceeds its bound by [\d.]+ with",
+            "hard states": r"speed exceeds its bound by [\d.]+ m/s with",
+            "soft states": r"speed exceeds its soft bound by [\d.]+ m/s with"}  # fmt: skip
+    assert any(re.search(says[kind], row) for row in failed)
 
 
 def test_stage_cost_tells_the_excess_and_the_penalty() -> None:

@@ -15,8 +15,6 @@ from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import sb3_yann
-import sb3_yann.wrappers
 from policy_samples import (
     actions,
     build,
@@ -72,41 +70,20 @@ def heater_mpc(u_min: float, u_max: float) -> LinearMPC:
     return LinearMPC(model, u_min=u_min, u_max=u_max, **weights)
 
 
-def absolute_mpc() -> LinearMPC:
-    """Return one with bounds that the plant shows, which are taken as deviations."""
-    with pytest.warns(UserWarning, match="pass absolute=True"):
-        return heater_mpc(0, 10)
-
-
-def test_an_env_with_absolute_inputs_is_told_the_wrapper_that_fits() -> None:
-    kwargs = {"problem": heater_mpc(-3, 7)}
-    with pytest.raises(ValueError, match=r"takes absolute inputs.*RescaleAction") as caught:
-        DDPG(YannPolicy, Heater(), policy_kwargs=kwargs)
-    line = str(caught.value).partition("env = ")[2].removesuffix(".")
-    env = eval(line, {"gymnasium": gym, "numpy": np, "env": Heater()})
-    model = DDPG(YannPolicy, env, policy_kwargs=kwargs)
-    theta, _ = env.reset(options={})
-    reached = env.step(model.predict(theta)[0])[0]
-    expected = 0.9 * theta + 0.2 * kwargs["problem"].explicit()(theta)
-    assert reached == pytest.approx(expected, abs=1e-6)
-
-
-def test_bounds_that_are_not_deviations_are_warned_of() -> None:
-    kwargs = {"problem": absolute_mpc()}
-    with pytest.warns(UserWarning, match=r"u_min = \[-3.0\] and u_max = \[7.0\], and wrap"):
-        DDPG(YannPolicy, Heater(), policy_kwargs=kwargs)
-
-
-def test_the_wrapper_that_the_warning_names_is_the_cure() -> None:
-    mistaken = absolute_mpc()
-    with pytest.warns(UserWarning, match="wrap the env") as caught:
-        DDPG(YannPolicy, Heater(), policy_kwargs={"problem": mistaken})
-    mpc, line = heater_mpc(-3, 7), str(caught[0].message).partition("wrap the env: ")[2]
-    env = eval(line.partition(". If")[0], {"sb3_yann": sb3_yann, "mpc": mpc, "env": Heater()})
-    theta, _ = env.reset(seed=0)
+def test_an_env_in_plant_units_is_driven_as_the_problem_says() -> None:
+    mpc = heater_mpc(0, 10)
+    env = Heater()
     model = DDPG(YannPolicy, env, policy_kwargs={"problem": mpc})
+    theta, _ = env.reset(seed=0)
     reached = env.step(model.predict(theta)[0])[0]
-    assert reached == pytest.approx(mpc.model.step(theta, mpc.explicit()(theta)), abs=1e-6)
+    own = mpc.deviations.model.step(theta, mpc.explicit()(theta))
+    assert reached == pytest.approx(own, abs=1e-6)
+
+
+def test_an_env_that_takes_deviations_is_told_so() -> None:
+    env = gym.wrappers.RescaleAction(Heater(), np.float32(-3), np.float32(7))
+    with pytest.raises(ValueError, match=r"takes deviations from u_ss = \[3.0\].*leave x_ss"):
+        DDPG(YannPolicy, env, policy_kwargs={"problem": heater_mpc(0, 10)})
 
 
 def test_a_law_without_input_bounds_is_no_policy() -> None:

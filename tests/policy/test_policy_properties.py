@@ -257,7 +257,7 @@ def test_no_step_of_a_training_leaves_the_action_space(
         return
     m = mpc.model.n_inputs
     own = {"problem": mpc, "critic_warmup": 0, "actor_lr_mult": 10.0, **kind}
-    own |= {"net_arch": {"pi": [4, 3], "qf": [4, 3]}, "observation": "deviation"}
+    own |= {"net_arch": {"pi": [4, 3], "qf": [4, 3]}}
     envs = [Strict(mpc, dtype, scaled) for _ in range(n_envs)]
     venv = gym_vec(envs)
     model = algorithm(

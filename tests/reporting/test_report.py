@@ -161,9 +161,8 @@ def test_a_sensor_that_fails_is_the_operating_point_to_the_mpc_too() -> None:
 
 
 def test_timing_leaves_what_the_policy_has_looked_at_as_it_was() -> None:
-    mpc, env = unit_samples.absolute_mpc(), unit_samples.plant("absolute", "normalized")
-    kwargs = {"problem": mpc, "observation": "deviation"}
-    model = DDPG("YannPolicy", env, policy_kwargs=kwargs, device="cpu")
+    mpc, env = unit_samples.plant_mpc(), unit_samples.plant("plant", "normalized")
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": mpc}, device="cpu")
     evidence_parts.cost_part(subject_of(model))
     assert not model.policy.first_obs_checked
 
@@ -278,14 +277,14 @@ def test_a_policy_that_is_the_mpc_costs_the_same(tmp_path) -> None:
     assert "nothing has been learnt there" in text
 
 
-@pytest.mark.parametrize("shows", ["absolute", "normalized"])
+@pytest.mark.parametrize("shows", ["plant", "normalized"])
 def test_the_mpc_is_played_through_the_policy_s_own_maps(shows, tmp_path) -> None:
-    mpc, env = unit_samples.absolute_mpc(), partial(unit_samples.plant, shows, "normalized")
+    mpc, env = unit_samples.plant_mpc(), partial(unit_samples.plant, shows, "normalized")
     kwargs = {"problem": mpc, "observation": unit_samples.SAYS[shows]}
     model = DDPG("YannPolicy", env(), policy_kwargs=kwargs, device="cpu")
     text = Outline(report(model, tmp_path / "r.html", env=env, seeds=range(3))).text
     law = mpc.explicit()
-    same = evaluate(law, partial(unit_samples.plant, "deviation", "deviation"), range(3))
+    same = evaluate(law, partial(unit_samples.plant, "plant", "plant"), range(3))
     assert "From these starts the policy costs what the MPC costs." in text
     assert f"mean cost {same.costs.mean():.5g}" in text
     assert "temperature 340 360 hard" in text and "u[0] 38 45 hard" in text

@@ -44,9 +44,7 @@ def cases() -> dict[str, Case]:
 
     found = {name: Case(lambda n=name: deployed.policy_of(n)) for name in deployed.CASES}
     found["no bounds of the inputs"] = Case(unbounded)
-    found["an MPC with rates, absolute"] = Case(
-        lambda: general_problems.solved("servo with rates"), {"absolute": True}
-    )
+    found["an MPC with rates"] = Case(lambda: general_problems.solved("servo with rates"))
     found["networks that overflow"] = Case(
         lambda: deployed.disturbed(sample_laws.solved("reactor"), size=1e25, activation_fn=nn.ReLU),
         tested=False,

@@ -13,6 +13,7 @@ from stable_baselines3 import DDPG
 from sample_plants import LinearPlant, two_input_mpc
 from sb3_yann import (
     ActionRepeat,
+    AffineObservation,
     CostAudit,
     CostMismatchWarning,
     NoActionNoise,
@@ -41,9 +42,10 @@ def plant(mpc=MPC, steps: int = 20) -> gym.Env:
 def audited(env, mpc=MPC, steps: int = 100, policy=None, learn: int = 110, **kwargs) -> CostAudit:
     """Return what an audit finds in an env, with any warning that is not its own an error.
 
-    The env is said to show deviations: else the policy itself would object to some wrappers.
+    What the env shows is said: else the policy itself would object to some wrappers.
     """
-    options = {"problem": mpc, "observation": "deviation", **(policy or {})}
+    given = AffineObservation.identity(mpc.n_theta)
+    options = {"problem": mpc, "observation": given, **(policy or {})}
     model = DDPG(YannPolicy, env, policy_kwargs=options, seed=0, gradient_steps=0, buffer_size=500)
     audit = CostAudit(steps, **kwargs)
     with warnings.catch_warnings():

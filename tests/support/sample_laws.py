@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.control import PiecewiseAffine
-from sb3_yann_envs import problems
+from sb3_yann_envs import cstr, problems
 
 Array = NDArray[np.float64]
 
@@ -52,6 +52,20 @@ PROBLEMS: dict[str, Callable[[], LinearMPC]] = {
     "asymmetric bounds": _asymmetric_bounds,
     "two inputs": _two_inputs,
 }
+
+
+@cache
+def reactor_in_plant_units() -> LinearMPC:
+    """Return the reactor's MPC with its operating point."""
+    mpc, x, u = problems.cstr(), cstr.X_SS, cstr.U_SS
+    return replace(
+        mpc,
+        model=replace(mpc.model, x_ss=x, u_ss=u),
+        u_min=mpc.u_min + u,
+        u_max=mpc.u_max + u,
+        theta_min=mpc.theta_min + x,
+        theta_max=mpc.theta_max + x,
+    )
 
 
 @cache

@@ -1,4 +1,4 @@
-"""A linear plant in its own units, absolute or normalized, and the MPC of it."""
+"""A linear plant in its own units, or in others, and the MPC of it."""
 
 from __future__ import annotations
 
@@ -16,28 +16,17 @@ LIMITS = {"x_min": [340, 0], "x_max": [360, 4], "u_min": 38, "u_max": 45}
 CENTER, SCALE = np.array([345.0, 2.0]), np.array([10.0, 2.0])
 
 
-def absolute_mpc() -> LinearMPC:
-    return LinearMPC(MODEL, Q=np.eye(2), R=[[0.1]], horizon=3, gamma=0.99, absolute=True, **LIMITS)
-
-
-def deviation_mpc() -> LinearMPC:
-    """Return the same problem, as one that was stated in deviations."""
-    x, u = np.array([LIMITS["x_min"], LIMITS["x_max"]]) - X_SS, np.array([38, 45]) - U_SS[0]
-    bounds = {"x_min": x[0], "x_max": x[1], "u_min": u[0], "u_max": u[1]}
-    return LinearMPC(MODEL, Q=np.eye(2), R=[[0.1]], horizon=3, gamma=0.99, **bounds)
+def plant_mpc() -> LinearMPC:
+    return LinearMPC(MODEL, Q=np.eye(2), R=[[0.1]], horizon=3, gamma=0.99, **LIMITS)
 
 
 SHOWS = {
     "deviation": lambda x: x,
-    "absolute": lambda x: x + X_SS,
+    "plant": lambda x: x + X_SS,
     "normalized": lambda x: (x + X_SS - CENTER) / SCALE,
 }
-SAYS = {
-    "deviation": "deviation",
-    "absolute": "absolute",
-    "normalized": {"center": CENTER.tolist(), "scale": SCALE.tolist()},
-}
-TAKES = {"deviation": (-2.0, 5.0, 0.0), "absolute": (38.0, 45.0, 40.0), "normalized": (-1, 1, None)}
+SAYS = {"plant": None, "normalized": {"center": CENTER.tolist(), "scale": SCALE.tolist()}}
+TAKES = {"deviation": (-2.0, 5.0, 0.0), "plant": (38.0, 45.0, 40.0), "normalized": (-1, 1, None)}
 
 
 class OwnUnits(gym.Env):

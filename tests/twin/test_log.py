@@ -67,28 +67,24 @@ def test_the_parts_of_theta_come_from_beside_the_states_or_with_them() -> None:
 
 
 @pytest.mark.parametrize("previous", [None, [[0.2]]])
-def test_an_absolute_log_is_read_from_the_operating_point_on(previous) -> None:
+def test_a_log_is_in_plant_units(previous) -> None:
     model = LinearModel([[0.9]], [[1.0]], 1.0, E=[[0.5]], x_ss=[300.0], u_ss=[40.0])
     mpc = LinearMPC(
-        model, Q=[[1]], R=[[1]], horizon=2, u_min=-1, u_max=1, theta_min=-5, theta_max=5,
-        tracking=Tracking([0], -1, 1), disturbances=DisturbanceBounds(-1, 1),
+        model, Q=[[1]], R=[[1]], horizon=2, u_min=39, u_max=41, theta_min=295, theta_max=305,
+        tracking=Tracking([0], 299, 301), disturbances=DisturbanceBounds(-1, 1),
         rate=RateLimits(-0.5, 0.5),
     )  # fmt: skip
     rng, u = np.random.default_rng(0), np.linspace(-0.3, 0.3, 7)[:, None]
     x, r, d = (rng.uniform(-1, 1, (8, 1)) for _ in range(3))
-    (expected,) = as_episodes(mpc, [(x, u)], [r], [d], previous)
+    (expected,) = as_episodes(mpc.deviations, [(x, u)], [r], [d], previous)
     shown = None if previous is None else [[40.2]]
-    own = [(x + 300, u + 40)]
-    (found,) = as_episodes(mpc, own, [r + 300], [d], shown, absolute=True)
-    whole = [(expected.thetas + mpc.theta_ss, u + 40)]
-    (same,) = as_episodes(mpc, whole, absolute=True)
+    (found,) = as_episodes(mpc, [(x + 300, u + 40)], [r + 300], [d], shown)
+    (same,) = as_episodes(mpc, [(expected.thetas + mpc.theta_ss, u + 40)])
     for each in (found, same):
         np.testing.assert_allclose(each.thetas, expected.thetas, atol=1e-12)
         np.testing.assert_allclose(each.actions, expected.actions, atol=1e-12)
-    with pytest.raises(ValueError, match=r"action 0 is 39.7 .* -1 and 1 .* needs absolute=True"):
-        as_episodes(mpc, own, [r + 300], [d], shown)
-    with pytest.raises(ValueError, match=r"action 0 is 42.7 in row 0, beyond the bounds 39 and 41"):
-        as_episodes(mpc, [(x + 300, u + 43)], [r + 300], [d], absolute=True)
+    with pytest.raises(ValueError, match=r"action 0 is -0.3 .* 39 and 41 .* is in plant units"):
+        as_episodes(mpc, [(x, u)], [r], [d])
 
 
 def test_inputs_that_round_beyond_their_bounds_are_clipped() -> None:
@@ -135,7 +131,7 @@ def loaded() -> LinearMPC:
     return LinearMPC(
         LinearModel([[0.9]], [[1.0]], 1.0, E=[[0.5, 0.2]], d_ss=[7.0, 8.0]), Q=[[1]], R=[[1]],
         horizon=2, u_min=-1, u_max=1, theta_min=-5, theta_max=5, tracking=Tracking([0], -1, 1),
-        disturbances=DisturbanceBounds(-1, 1), rate=RateLimits(-0.5, 0.5),
+        disturbances=DisturbanceBounds([6, 7], [8, 9]), rate=RateLimits(-0.5, 0.5),
     )  # fmt: skip
 
 
@@ -153,7 +149,7 @@ def test_an_observer_s_disturbances_are_not_known_where_they_are_not_given() -> 
 
 def test_disturbances_are_taken_off_their_own_operating_point() -> None:
     x, u = np.zeros((8, 1)), np.zeros((7, 1))
-    (episode,) = as_episodes(loaded(), [(x, u)], [0.0], [[7.5, 7.8]], absolute=True)
+    (episode,) = as_episodes(loaded(), [(x, u)], [0.0], [[7.5, 7.8]])
     np.testing.assert_allclose(episode.thetas[:, 2:4], np.tile([0.5, -0.2], (8, 1)))
 
 

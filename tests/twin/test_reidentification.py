@@ -18,8 +18,8 @@ PUMP, LEAK = 0.07, 0.02
 def tank() -> LinearMPC:
     return LinearMPC(
         LinearModel([[0.9]], [[0.1]], dt=1.0, x_ss=[5.0], u_ss=[3.0]),
-        Q=[[1.0]], R=[[0.1]], horizon=3, u_min=-2, u_max=2, theta_min=-3, theta_max=3,
-        tracking=Tracking([0], -1, 1), outputs=OutputBounds([[2.0]], -5, 5),
+        Q=[[1.0]], R=[[0.1]], horizon=3, u_min=1, u_max=5, theta_min=2, theta_max=8,
+        tracking=Tracking([0], 4, 6), outputs=OutputBounds([[2.0]], 5, 15),
         terminal=Terminal(set="invariant"),
     )  # fmt: skip
 
@@ -27,15 +27,16 @@ def tank() -> LinearMPC:
 def worn_log(
     mpc: LinearMPC, pump: float = PUMP, leak: float = LEAK, noise: float = 1e-3
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return episodes of a tracking MPC on the tank, as the tank's own MPC sees them."""
+    """Return episodes of a tracking MPC on the tank."""
     rng, found = np.random.default_rng(0), []
-    x_0, u_0 = mpc.model.x_ss - 5.0, mpc.model.u_ss - 3.0
+    law = mpc.explicit().plant_input
     for _ in range(6):
-        theta, inputs = [np.array([rng.uniform(-1, 1), rng.uniform(-1, 1)])], []
+        theta, inputs = [5 + np.array([rng.uniform(-1, 1), rng.uniform(-1, 1)])], []
         for _ in range(40):
             x, r = theta[-1]
-            inputs.append(u_0 + mpc.explicit()([x - x_0[0], r - x_0[0]]))
-            x = 0.9 * x + pump * inputs[-1][0] - leak + noise * rng.standard_normal()
+            inputs.append(law([x, r]))
+            moved = pump * (inputs[-1][0] - 3) - leak + noise * rng.standard_normal()
+            x = 5 + 0.9 * (x - 5) + moved
             theta.append(np.array([x, r]))
         found.append((np.array(theta), np.array(inputs)))
     return found
@@ -65,7 +66,7 @@ def test_with_set_points_the_operating_point_is_where_the_plant_rests_today() ->
     np.testing.assert_allclose(found.model.x_ss, [5.0], atol=1e-9)  # so that r stays what it is
     moved = found.model.u_ss - mpc.model.u_ss
     np.testing.assert_allclose(moved, [LEAK / PUMP], rtol=0.05)
-    np.testing.assert_allclose(found.u_max, 2 - moved)
+    np.testing.assert_allclose(found.deviations.u_max, 2 - moved)
     assert found.layout == mpc.layout
     assert len(found.terminal.set[1]) > 0
     for (old, _), (new, _) in zip(worn_log(mpc), worn_log(found), strict=True):
@@ -76,10 +77,10 @@ def test_with_set_points_the_operating_point_is_where_the_plant_rests_today() ->
 def test_bounds_that_were_given_as_the_plant_shows_them_are_shown_so() -> None:
     mpc = LinearMPC(
         tank().model, Q=[[1.0]], R=[[0.1]], horizon=3, u_min=1, u_max=5, theta_min=2, theta_max=8,
-        tracking=Tracking([0], 4, 6), absolute=True,
+        tracking=Tracking([0], 4, 6),
     )  # fmt: skip
     found = PlantTwin.fit(mpc, worn_log(mpc)).reidentified()
-    assert "u_min=[1], u_max=[5], r_min=[4], r_max=[6], absolute=True" in repr(found)
+    assert "u_min=[1], u_max=[5], r_min=[4], r_max=[6]" in repr(found)
 
 
 def test_where_the_model_is_right_the_mpc_is_the_given_one() -> None:
@@ -98,4 +99,5 @@ def test_a_worn_plant_s_set_points_lie_within_the_limits_of_its_twin() -> None:
     reached, asked = (np.array([theta[:, k] for theta, _ in rows]) for k in (0, 1))
     assert asked.max() > reached.max() + 0.25 * np.ptp(reached)  # the log alone does not show it
     found = PlantTwin.fit(mpc, rows)
-    assert not found.limits.violated(np.column_stack([asked[:, 0], asked[:, 0]])).any()
+    at = mpc.units.to_deviations(np.column_stack([asked[:, 0], asked[:, 0]]))
+    assert not found.limits.violated(at).any()

@@ -123,7 +123,7 @@ def refuse_or_doubt(mpc, episodes) -> None:
     try:
         found = PlantTwin.fit(mpc, episodes)
     except ValueError as refused:
-        assert "in the problem's units?" in str(refused)
+        assert "A log is in plant units where" in str(refused)
     else:
         assert not found.trusted and "Compare units" in " ".join(found.trust.advice)
 

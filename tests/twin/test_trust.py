@@ -216,10 +216,12 @@ def test_every_other_piece_of_a_record_is_independent() -> None:
 
 
 def test_a_reading_a_thousand_times_as_far_off_as_most_is_named_with_its_value() -> None:
+    own, x_ss = problem(), [10.0, 20.0]
     mpc = dataclasses.replace(
-        problem(), model=LinearModel(problem().model.A, problem().model.B, 0.1, x_ss=[10.0, 20.0])
-    )
-    logs = tuple(random_episode(mpc, 30, seed) for seed in range(3))
+        own, model=LinearModel(own.model.A, own.model.B, 0.1, x_ss=x_ss),
+        theta_min=own.theta_min + x_ss, theta_max=own.theta_max + x_ss,
+    )  # fmt: skip
+    logs = tuple(random_episode(own, 30, seed) for seed in range(3))
     rng = np.random.default_rng(0)
     left = [0.01 * rng.choice([-1.0, 1.0], (30, 2)) for _ in logs]
     for size, named in ((9.9, False), (10.1, True)):

@@ -55,8 +55,9 @@ def require_state_shown(env: Any, observation_given: bool) -> None:
         if not observation_given and (undo := _other_observation(layer)):
             raise ValueError(
                 f"{name} shows other numbers than the state that the law takes. Say what they "
-                f"mean: policy_kwargs={{'observation': {undo}}}, or 'deviation' where the model is "
-                "one of what is shown. A law without a policy takes the env without the wrapper."
+                f"mean: policy_kwargs={{'observation': {undo}}}, or AffineObservation.identity(n) "
+                "where the model is one of what is shown. A law without a policy takes the env "
+                "without the wrapper."
             )
         if not observation_given and (
             late := _library_names(layer) & {"DelayObservation", "StickyAction"}

@@ -49,7 +49,8 @@ class Bounds:
 
     @classmethod
     def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
-        """Return those of a problem, and of its states (n,) besides."""
+        """Return those of a problem, and of its states (n,) besides, in deviations."""
+        problem = problem.deviations
         outputs, n = problem.outputs, problem.model.n_states
         size = (problem.theta_max - problem.theta_min)[:n] / 2
         # Without a box the size of a bound is the unit: one that is fixed would be hidden.
@@ -91,11 +92,14 @@ class BoundNames(NamedTuple):
     names, units : tuple of str
     half : tuple of float
         Half-widths.
+    soft : tuple of bool
+        Which are soft.
     """
 
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     half: tuple[float, ...] = ()
+    soft: tuple[bool, ...] = ()
 
     @classmethod
     def of(cls, problem: MPCProblem) -> BoundNames:
@@ -113,7 +117,8 @@ class BoundNames(NamedTuple):
             found += [(f"the change of {name} in a step", unit) for name, unit in of_inputs]
             half += [*problem.u_half]
         called, measured = zip(*found, strict=True)
-        return cls(called, measured, tuple(map(float, half)))
+        soft = np.append(bounds.softness > 0, np.zeros(len(half) - len(bounds.half), dtype=bool))
+        return cls(called, measured, tuple(map(float, half)), tuple(soft.tolist()))
 
     def in_words(self, worst: float, largest: float) -> str:
         """Return which bound is exceeded most, and by how much in its unit; empty for none."""
@@ -121,7 +126,8 @@ class BoundNames(NamedTuple):
             return ""
         k = int(worst)
         by = f"{largest * self.half[k]:.3g} {self.units[k]}".strip()
-        return f"{self.names[k]} exceeds its bound by {by}"
+        kind = "soft bound" if self.soft[k] else "bound"
+        return f"{self.names[k]} exceeds its {kind} by {by}"
 
 
 class BoundExcess(NamedTuple):
@@ -137,7 +143,8 @@ class BoundExcess(NamedTuple):
         What soft bounds cost, summed over the steps: ``penalty (s + s^2)`` of the largest
         violation s of the states' bounds at a step, and of the outputs'.
     worst : ndarray, shape (...,)
-        Number of the hard bound that ``largest`` is of, as in `BoundNames`; -1 where there is none.
+        Number of the bound that ``largest`` is of, as in `BoundNames`; where no hard bound is
+        exceeded, of the soft one that ``any_bound`` is of, and -1 where none is.
     """
 
     largest: Array
@@ -177,6 +184,7 @@ def bound_excess(
     >>> float(bound_excess(mpc, np.array([[4.0, 2], [6.0, 2]]), np.zeros((1, 1))).largest)
     0.2
     """
+    problem = problem.deviations
     bounds = Bounds.of(problem) if bounds is None else bounds
     with np.errstate(invalid="ignore", over="ignore"):
         parts = [
@@ -202,14 +210,16 @@ def bound_excess(
             units = bounds.half[soft] / bounds.softness[soft]
             s = np.max(over[..., :first][..., soft] * units, axis=-1)
             penalty = penalty + problem.soft.penalty * np.sum(s + s**2, axis=0)
-    of_hard = np.max(np.where(hard, over, 0.0), axis=0)
-    largest = of_hard.max(axis=-1)
+    of_any = np.max(over, axis=0)
+    of_hard = np.where(hard, of_any, 0.0)
+    largest, any_bound = of_hard.max(axis=-1), of_any.max(axis=-1)
+    worst = np.argmax(np.where(largest[..., None] > 0, of_hard, of_any), axis=-1)
     return BoundExcess(
         largest=largest,
         summed=np.sum(over[..., hard], axis=(0, -1)),
-        any_bound=np.max(over, axis=(0, -1), initial=0.0),
+        any_bound=any_bound,
         penalty=penalty,
-        worst=np.where(largest > 0, np.argmax(of_hard, axis=-1), -1.0),
+        worst=np.where(any_bound > 0, worst, -1.0),
     )
 
 

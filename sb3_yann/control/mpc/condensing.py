@@ -101,9 +101,10 @@ class _Rows:
 def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
     """Return the program in ``(u_0, ..., u_{N-1})`` and slacks, and what each row bounds.
 
-    Where the model's modes grow too much over the horizon for float64, the variables are
-    ``v_k = u_k - K theta_k`` instead, for a gain K that stabilizes: what is predicted then decays.
-    ``feedback`` of the program is that K. The change of variables is exact: the law is the same.
+    All of it is in deviations. Where the model's modes grow too much over the horizon for float64,
+    the variables are ``v_k = u_k - K theta_k`` instead, for a gain K that stabilizes: what is
+    predicted then decays. ``feedback`` of the program is that K. The change of variables is exact:
+    the law is the same.
 
     Raises
     ------
@@ -111,6 +112,7 @@ def condense(problem: MPCProblem) -> tuple[ParametricQP, tuple[str, ...]]:
         If digits are lost all the same. The law without constraints must be that of the Riccati
         recursion, which loses none, to 1e-8 of the input range.
     """
+    problem = problem.deviations
     plain = _condensed(problem, None) if _growth(problem) <= GROWTH else None
     if plain is not None and not _error(problem, plain[0]) > OFF / 100:
         return plain

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,7 +24,6 @@ from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability, simulation
 from sb3_yann.control.mpc import value as quadratic_value
 from sb3_yann.control.mpc._arguments import Given
-from sb3_yann.control.mpc.absolute import Boxes
 from sb3_yann.control.mpc.choice import LAWS, Law, choose
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.groups import (
@@ -40,6 +39,7 @@ from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.terminal_set import invariant_set
 from sb3_yann.control.online import OnlineLaw
+from sb3_yann.units import warn_of_absolute
 
 if TYPE_CHECKING:
     from sb3_yann.control.linearization.simulator import Maker
@@ -49,7 +49,7 @@ G = TypeVar("G")
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class LinearMPC(MPCProblem):
-    r"""The linear MPC problem, in deviations from the model's operating point.
+    r"""The linear MPC problem, in plant units where the model has an operating point.
 
     .. math::
         \min_{u_0 \ldots u_{N-1}} \sum_{k=0}^{N-1} \gamma^k (e_k' Q e_k + v_k' R v_k
@@ -63,6 +63,11 @@ class LinearMPC(MPCProblem):
     The parameter of the law is ``theta = [x, r, d, u_prev]``, with the parts that the problem uses
     (:attr:`layout`): r with ``tracking``, d where the model has an E, ``u_prev`` with a bound or a
     weight on the rate. r and d are constant over the horizon.
+
+    The formula is one of deviations from the model's operating point. Bounds, theta and inputs are
+    what the plant shows and takes, at every method; of a model without an operating point they are
+    the same. Laws and networks alone take deviations: :attr:`deviations` is the problem they solve,
+    and :meth:`PiecewiseAffine.plant_input` the law in plant units.
 
     `dataclasses.replace` changes some arguments. It keeps the stored ``terminal``: replace that by
     None too, to have it solved anew.
@@ -101,9 +106,8 @@ class LinearMPC(MPCProblem):
         Which bounds may be broken. The penalty is no part of :meth:`stage_cost`.
     terminal : Terminal, optional
         The terminal cost, by default the Riccati solution, and the terminal set.
-    absolute : bool, default False
-        Bounds and boxes are as the plant shows them. Theta and what is stored stay deviations.
-        `dataclasses.replace` of such a problem takes absolute values too, and returns another one.
+    absolute : bool, optional
+        Does nothing, and is deprecated: the model's operating point tells.
 
     Raises
     ------
@@ -118,12 +122,6 @@ class LinearMPC(MPCProblem):
     >>> mpc.explicit()([-5.0, 0.0])
     array([1.])
     """
-
-    # `dataclasses.replace` hands what is stored to the constructor. By this field that learns that
-    # these are deviations of an absolute problem, and only what was replaced is absolute.
-    _stored: LinearMPC | None = field(  # type: ignore[assignment]
-        default=property(lambda self: self if self.absolute else None), compare=False, repr=False
-    )
 
     def __init__(  # noqa: PLR0913 (the user's arguments)
         self,
@@ -146,22 +144,18 @@ class LinearMPC(MPCProblem):
         outputs: OutputBounds | None = None,
         soft: SoftBounds | None = None,
         terminal: Terminal | None = None,
-        absolute: bool = False,
-        _stored: LinearMPC | None = None,
+        absolute: bool | None = None,
     ) -> None:
         if isinstance(model, Identified):
             model = model.model
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
-        sides = (x_min, x_max), (u_min, u_max), (theta_min, theta_max)
-        absolute = True if _stored is not None else absolute
-        given = Boxes(*sides, tracking, disturbances, outputs).seen_from(model, absolute, _stored)
-        tracking, disturbances, outputs = given.tracking, given.disturbances, given.outputs
+        warn_of_absolute(absolute)
         n, m = model.n_states, model.n_inputs
         horizon, gamma = arguments.as_horizon(horizon), check.check_discount(gamma)
         infeasible = check.check_choice("infeasible", infeasible, INFEASIBLE)
         Q, R = check_symmetric("Q", Q, n), check_symmetric("R", R, m)
-        x, u = check_bounds("x", *given.x, n), check_bounds("u", *given.u, m)
+        x, u = check_bounds("x", x_min, x_max, n), check_bounds("u", u_min, u_max, m)
         tracking = _as_group("tracking", tracking, Tracking).sized(n)
         d = _as_group("disturbances", disturbances, DisturbanceBounds).sized(model.n_disturbances)
         rate = _as_group("rate", rate, RateLimits).sized(m)
@@ -172,7 +166,7 @@ class LinearMPC(MPCProblem):
         rest = [(tracking.r_min, tracking.r_max), (d.d_min, d.d_max)]
         rest += [u] if layout.n_previous else []
         fallback = arguments.softened_box(x, soft.x)
-        theta = arguments.theta_box(layout, given.theta, fallback, rest)
+        theta = arguments.theta_box(layout, (theta_min, theta_max), fallback, rest)
         states = theta[0][:n], theta[1][:n]
         ranges = [
             Range("x", *x, model.x_ss), Range("theta", *states, model.x_ss),
@@ -180,7 +174,7 @@ class LinearMPC(MPCProblem):
             Range("r", tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
             Range("y", outputs.y_min, outputs.y_max, outputs.C @ model.x_ss),
         ]  # fmt: skip
-        warn_of_misread_bounds(model, ranges, layout.has_constants, absolute)
+        warn_of_misread_bounds(model, ranges, layout.has_constants)
         arguments.warn_of_unused_softness(soft.x, x, states)
         arguments.warn_of_drift(model, *states)
         checked = (
@@ -189,7 +183,7 @@ class LinearMPC(MPCProblem):
         )  # fmt: skip
         completed = _completed(MPCProblem(*checked, terminal))
         if soft.penalty is None:
-            penalty = _default_penalty(MPCProblem(*checked, completed))
+            penalty = _default_penalty(MPCProblem(*checked, completed).deviations)
             checked = (*checked[:-1], replace(soft, penalty=penalty))
         super().__init__(*checked, completed)
         if not np.any(model.B):
@@ -197,7 +191,6 @@ class LinearMPC(MPCProblem):
                 "B of the model is zero: no input does anything, so there is nothing to control. "
                 "Look for the inputs' effect in the model's units and sampling time."
             )
-        self._store(absolute=bool(absolute))
 
     @classmethod
     def from_env(
@@ -230,7 +223,7 @@ class LinearMPC(MPCProblem):
         with contextlib.closing(borrow(env)) as borrowed:
             shown = borrowed.env.observation_space
             action = borrowed.env.action_space
-        limits = {"u_min": action.low, "u_max": action.high, "absolute": True}
+        limits = {"u_min": action.low, "u_max": action.high}
         if shown.shape == (model.n_states,):
             low = np.asarray(shown.low, np.float64)
             high = np.asarray(shown.high, np.float64)
@@ -242,20 +235,21 @@ class LinearMPC(MPCProblem):
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the next theta on the model; theta is (n_theta,) or (batch, n_theta)."""
         A, B = self.prediction
-        return np.asarray(to_float("theta", theta) @ A.T + to_float("u", u) @ B.T)
+        at = self.units.to_deviations(to_float("theta", theta))
+        v = self.units.input_to_deviations(to_float("u", u))
+        return self.units.to_plant(at @ A.T + v @ B.T)
 
     def simulate(self, theta0: ArrayLike, steps: int) -> tuple[Array, Array]:
         """Return thetas (steps + 1, n_theta) and inputs (steps, m) of the law on its own model.
 
-        All of them count from the operating point: add ``theta_ss`` and ``model.u_ss`` for what the
-        plant shows and takes. Absolute values in place of theta0 are refused where they are told.
+        A theta0 in deviations, where the plant has others, is refused.
         """
         return simulation.simulate(self, self.law(), theta0, steps)
 
     def is_reachable(self, r: Given = None, d: Given = None) -> NDArray[np.bool_]:
         """Tell whether the steady state for r (p,) and d (d,) lies within the bounds of x, u and y.
 
-        Both may be batches; None is zero. Soft bounds count too.
+        Both may be batches; None is the operating point. Soft bounds count too.
         """
         return reachability.is_reachable(self, r, d)
 
@@ -274,8 +268,10 @@ class LinearMPC(MPCProblem):
 
     def stage_cost(self, theta: ArrayLike, u: ArrayLike) -> Array:
         """Return the stage cost, without penalties, at theta (..., n_theta) and u (..., m)."""
-        at, v, errors = to_float("theta", theta), to_float("u", u), self.error_system
-        z, v = at @ errors.to_error.T, v - at @ errors.to_input.T
+        errors = self.error_system
+        at = self.units.to_deviations(to_float("theta", theta))
+        v = self.units.input_to_deviations(to_float("u", u)) - at @ errors.to_input.T
+        z = at @ errors.to_error.T
         cost = np.sum((z @ errors.Q) * z, axis=-1) + np.sum((v @ errors.R) * v, axis=-1)
         if errors.cross is not None:
             cost = cost + 2 * np.sum((z @ errors.cross) * v, axis=-1)
@@ -284,8 +280,9 @@ class LinearMPC(MPCProblem):
     def value_matrix(self, gamma: float) -> Array:
         """Return P (n_theta, n_theta): ``theta' P theta`` is the cost of the law from theta on.
 
-        It is exact for any ``gamma``, while the linear plant stays in the region of the law that
-        holds the origin and r and d are constant; where both discounts agree, no cost is smaller.
+        Theta stands for deviations. It is exact for any ``gamma``, while the linear plant stays in
+        the region of the law that holds the origin and r and d are constant; where both discounts
+        agree, no cost is smaller.
 
         Raises
         ------
@@ -293,7 +290,7 @@ class LinearMPC(MPCProblem):
             If the law is unstable under this discount, or does not rest at the origin.
         """
         gamma = check.check_discount(gamma)  # before the law, which may take long
-        return quadratic_value.value_matrix(self, self.law(), gamma)
+        return quadratic_value.value_matrix(self.deviations, self.law(), gamma)
 
     def state_action_matrix(self, gamma: float) -> Array:
         """Return M (n_theta + m, n_theta + m): ``[theta; u]' M [theta; u]`` is the cost of u now.
@@ -301,7 +298,7 @@ class LinearMPC(MPCProblem):
         The law follows. It holds where :meth:`value_matrix` does, and raises its errors.
         """
         gamma = check.check_discount(gamma)
-        return quadratic_value.state_action_matrix(self, self.law(), gamma)
+        return quadratic_value.state_action_matrix(self.deviations, self.law(), gamma)
 
     def explicit(
         self,
@@ -344,7 +341,7 @@ class LinearMPC(MPCProblem):
         """Return the explicit law, solved within a budget unless it is there."""
         if solver not in self._laws:
             load_kernels()
-            limits = self.u_min, self.u_max
+            limits = self.deviations.u_min, self.deviations.u_max
             with BudgetTimer(budget) as timer:
                 program = self.condensed()
                 law = solve_explicit(program, *limits, self.infeasible, solver, timer)
@@ -372,8 +369,9 @@ class LinearMPC(MPCProblem):
     @cached_property
     def _online(self) -> OnlineLaw:
         program = self.condensed()
-        require_sane_sizes(program, self.u_min, self.u_max)
-        law = OnlineLaw.of(program, self.u_min, self.u_max, self.infeasible)
+        limits = self.deviations.u_min, self.deviations.u_max
+        require_sane_sizes(program, *limits)
+        law = OnlineLaw.of(program, *limits, self.infeasible)
         return law.on_plant(self.model, self.theta_ss)
 
     @cached_property
@@ -381,7 +379,7 @@ class LinearMPC(MPCProblem):
         return {}
 
     def condensed(self) -> ParametricQP:
-        """Return the program in ``U = (u_0, ..., u_{N-1})`` and the slacks of soft bounds."""
+        """Return the program in ``U = (u_0, ..., u_{N-1})`` and the slacks, in deviations."""
         return condense(self)[0]
 
     def report(self, samples: int = 500, seed: int = 0) -> str:
@@ -391,20 +389,16 @@ class LinearMPC(MPCProblem):
         return report(self, self.law(), samples, seed)
 
 
-def derived(problem: LinearMPC, **changes: Any) -> LinearMPC:
-    """Return a problem with changes, in deviations, which counts as stated in the same values."""
-    found = replace(problem, _stored=None, **changes)
-    found._store(absolute=problem.absolute)
-    return found
-
-
 def _as_group(name: str, value: G | None, kind: type[G]) -> G:
     """Return a group of arguments; None is one that says nothing."""
     return check.check_options(name, kind() if value is None else value, kind)
 
 
 def _completed(problem: MPCProblem) -> Terminal:
-    """Return the terminal cost and set of a problem, solved where they are left to it."""
+    """Return the terminal cost and set of a problem, solved where they are left to it.
+
+    The set is in the units of the problem.
+    """
     errors = problem.error_system
     cost: Any = problem.terminal.cost
     half_spaces: Any = problem.terminal.set
@@ -419,7 +413,8 @@ def _completed(problem: MPCProblem) -> Terminal:
     if np.shape(cost) == np.shape(errors.Q):
         _require_weighted_inputs(problem, cost)
     if isinstance(half_spaces, str):
-        half_spaces = invariant_set(problem, cost)
+        F, g = invariant_set(problem.deviations, cost)
+        half_spaces = F, g + F @ problem.theta_ss
     n, size = problem.model.n_states, problem.n_theta
     F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
     if F.shape[1] != size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import check_positive_vector, check_type
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.groups import DisturbanceBounds, Terminal
-from sb3_yann.control.mpc.linear_mpc import LinearMPC, derived
+from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.control.observer import DisturbanceObserver
 
 SHARE = 0.05
@@ -73,7 +74,7 @@ def offset_free(
     model = LinearModel(**{**vars(old), **own})
     terminal = Terminal(mpc.terminal.cost, set="invariant" if len(mpc.terminal.set[1]) else None)
     states = mpc.layout.state
-    found = derived(
+    found = replace(
         mpc,
         model=model,
         disturbances=DisturbanceBounds(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,10 @@ from sb3_yann.control.mpc.groups import (
 )
 from sb3_yann.control.mpc.steady_state import SteadyStates, steady_states
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
+from sb3_yann.units import Units, fields_in_deviations
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,8 +40,9 @@ class MPCProblem(ReadOnlyArrays):
         Infinite where there is no bound.
     tracking, disturbances, rate, outputs, soft, terminal : Tracking, DisturbanceBounds, ...
         Never None, and in the sizes of the model.
-    absolute : bool
-        Whether they were given as the plant shows them; all here are deviations.
+
+    All of it is in plant units where the model has an operating point, and in the model's own
+    coordinates where it has none.
     """
 
     model: LinearModel
@@ -57,12 +63,22 @@ class MPCProblem(ReadOnlyArrays):
     outputs: OutputBounds
     soft: SoftBounds
     terminal: Terminal
-    absolute: bool = field(default=False, init=False, compare=False)
+
+    @cached_property
+    def units(self) -> Units:
+        """The operating point, and the way from plant units to deviations and back."""
+        return Units(self.theta_ss, self.model.u_ss)
 
     @property
-    def deviations(self) -> MPCProblem:
+    def deviations(self) -> Self:
         """The same problem in deviations from its operating point, as laws and networks take it."""
-        return self
+        return self._in_deviations if self.units.shifted else self
+
+    @cached_property
+    def _in_deviations(self) -> Self:
+        found = object.__new__(type(self))
+        MPCProblem.__init__(found, **fields_in_deviations(self))
+        return found
 
     @property
     def has_rate_bounds(self) -> bool:
@@ -81,10 +97,7 @@ class MPCProblem(ReadOnlyArrays):
 
     @cached_property
     def theta_ss(self) -> Array:
-        """Theta at the operating point as the plant shows it (n_theta,): x_ss, C x_ss, d_ss, u_ss.
-
-        Theta itself is what the plant shows less this.
-        """
+        """Theta at the operating point in plant units (n_theta,): x_ss, C x_ss, d_ss, u_ss."""
         model = self.model
         parts = model.x_ss, self.tracking.C @ model.x_ss, model.d_ss
         return np.concatenate([*parts, model.u_ss[: self.layout.n_previous]])
@@ -115,16 +128,19 @@ class MPCProblem(ReadOnlyArrays):
     @cached_property
     def theta_half(self) -> Array:
         """The half-widths of the box of theta (n_theta,), 1 where it is unbounded."""
-        return half_widths(self.theta_min, self.theta_max)
+        return half_widths(self.deviations.theta_min, self.deviations.theta_max)
 
     @cached_property
     def u_half(self) -> Array:
         """The half-widths of the input range (m,), 1 where it is unbounded."""
-        return half_widths(self.u_min, self.u_max)
+        return half_widths(self.deviations.u_min, self.deviations.u_max)
 
     @cached_property
     def prediction(self) -> tuple[Array, Array]:
-        """A_bar (n_theta, n_theta) and B_bar (n_theta, m): ``theta+ = A_bar theta + B_bar u``."""
+        """A_bar (n_theta, n_theta), B_bar (n_theta, m): ``theta+ = A_bar theta + B_bar u``.
+
+        In deviations.
+        """
         parts, model = self.layout, self.model
         A, B = np.eye(parts.size), np.zeros((parts.size, model.n_inputs))
         A[parts.state, parts.state], A[parts.state, parts.disturbance] = model.A, model.E
@@ -135,8 +151,9 @@ class MPCProblem(ReadOnlyArrays):
 
     @cached_property
     def steady_states(self) -> SteadyStates:
-        """The map from r and d to the steady state, within bounds or not."""
-        x_unit = np.maximum(np.abs(self.theta_min), np.abs(self.theta_max))[self.layout.state]
+        """The map from r and d to the steady state, within bounds or not, in deviations."""
+        own = self.deviations
+        x_unit = np.maximum(np.abs(own.theta_min), np.abs(own.theta_max))[self.layout.state]
         x_unit = np.where(np.isfinite(x_unit), x_unit, 1.0)
         return steady_states(self.model, self.tracking.C, self.Q, self.R, x_unit, self.u_half)
 
@@ -148,7 +165,7 @@ class MPCProblem(ReadOnlyArrays):
 
     @property
     def stage_matrix(self) -> Array:
-        """W (n_theta + m, n_theta + m): the stage cost is ``[theta; u]' W [theta; u]``."""
+        """W (n_theta + m, n_theta + m): ``[theta; u]' W [theta; u]`` is the cost of deviations."""
         return self.error_system.stage_matrix
 
     def __hash__(self) -> int:
@@ -160,20 +177,15 @@ class MPCProblem(ReadOnlyArrays):
         sizes = f"states={self.model.n_states}, inputs={self.model.n_inputs}"
         options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
         tracking, d, rate, outputs = self.tracking, self.disturbances, self.rate, self.outputs
-        model, whole = self.model, int(self.absolute)  # as they were given
-        bounds: dict[str, tuple[Array, Array, Array]] = {
-            "x": (self.x_min, self.x_max, model.x_ss),
-            "u": (self.u_min, self.u_max, model.u_ss),
-            "r": (tracking.r_min, tracking.r_max, tracking.C @ model.x_ss),
-            "d": (d.d_min, d.d_max, model.d_ss),
-            "du": (rate.du_min, rate.du_max, 0 * model.u_ss),
-            "y": (outputs.y_min, outputs.y_max, outputs.C @ model.x_ss),
+        bounds = {
+            "x": (self.x_min, self.x_max),
+            "u": (self.u_min, self.u_max),
+            "r": (tracking.r_min, tracking.r_max),
+            "d": (d.d_min, d.d_max),
+            "du": (rate.du_min, rate.du_max),
+            "y": (outputs.y_min, outputs.y_max),
         }
-        told = [
-            _bounds_in_words(name, low + whole * point, high + whole * point)
-            for name, (low, high, point) in bounds.items()
-        ]
-        told.append("absolute=True" if whole else "")
+        told = [_bounds_in_words(name, *sides) for name, sides in bounds.items()]
         return f"{type(self).__name__}({', '.join([sizes, options, *filter(None, told)])})"
 
 

@@ -22,10 +22,11 @@ def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
     """Return the room to the upper and lower bounds of x, u and y, negative for violations."""
     constant = _constants(problem, r, d)
     x, u = constant @ problem.steady_states.x.T, constant @ problem.steady_states.u.T
-    outputs = problem.outputs
+    own = problem.deviations
+    outputs = own.outputs
     value = np.concatenate([x, u, x @ outputs.C.T], axis=-1)
-    low = np.concatenate([problem.x_min, problem.u_min, outputs.y_min])
-    high = np.concatenate([problem.x_max, problem.u_max, outputs.y_max])
+    low = np.concatenate([own.x_min, own.u_min, outputs.y_min])
+    high = np.concatenate([own.x_max, own.u_max, outputs.y_max])
     room = np.concatenate([high - value, value - low], axis=-1)
     bound = np.abs(np.concatenate([high, low]))
     return np.asarray(room + TOLERANCE * np.where(np.isfinite(bound), bound, 0.0))
@@ -39,7 +40,8 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
             f"r and d make {len(constant)} points, and steady_state takes one: r (p,) and d (d,)."
         )
     room = margins(problem, r, d)
-    x, u = problem.steady_states.x @ constant, problem.steady_states.u @ constant
+    x = problem.units.to_plant(problem.steady_states.x @ constant)
+    u = problem.units.input_to_plant(problem.steady_states.u @ constant)
     if np.any(room < 0):
         sizes = {"x": len(x), "u": len(u), "y": len(problem.outputs.C)}
         names = [(name, f"[{i}]") for name, size in sizes.items() for i in range(size)]
@@ -50,8 +52,9 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
         ]
         broken = ", ".join(side for side, left in zip(sides, room, strict=True) if left < 0)
         p = len(problem.tracking.C)
+        shown = constant + problem.theta_ss[problem.layout.constant]
         raise ValueError(
-            f"The reference r = {constant[:p].tolist()} with d = {constant[p:].tolist()} is not "
+            f"The reference r = {shown[:p].tolist()} with d = {shown[p:].tolist()} is not "
             f"reachable: its steady state is x_s = {x.tolist()}, u_s = {u.tolist()}, and {broken}. "
             "Ask is_reachable(r, d) first, or choose a reference nearer to the operating point."
         )
@@ -59,12 +62,13 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
 
 
 def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:
-    """Return [r; d], of shape (p + d,) or (batch, p + d)."""
+    """Return [r; d] in deviations, of shape (p + d,) or (batch, p + d)."""
     p, n_d = len(problem.tracking.C), problem.model.n_disturbances
+    rests = np.split(problem.theta_ss[problem.layout.constant], [p])
     parts = []
-    for name, value, size in (("r", r, p), ("d", d, n_d)):
-        array = to_float(name, np.zeros(size) if value is None else value)
+    for name, value, size, rest in zip("rd", (r, d), (p, n_d), rests, strict=True):
+        array = to_float(name, rest if value is None else value)
         shape: tuple[int | str, ...] = ("batch", size) if array.ndim == 2 else (size,)
-        parts.append(check_array(name, array, shape))
+        parts.append(check_array(name, array, shape) - rest)
     rows = np.broadcast_shapes(parts[0].shape[:-1], parts[1].shape[:-1])
     return np.concatenate([np.broadcast_to(a, (*rows, a.shape[-1])) for a in parts], axis=-1)

@@ -34,11 +34,12 @@ def report(problem: MPCProblem, law: Law, samples: int = 500, seed: int = 0) -> 
         Of the draws.
     """
     rng = np.random.default_rng(seed)
-    points = rng.uniform(problem.theta_min, problem.theta_max, (samples, problem.n_theta))
+    own = problem.deviations
+    points = rng.uniform(own.theta_min, own.theta_max, (samples, problem.n_theta))
     feasible = points[law.in_domain(points)]
     size = chain(_size(problem, law), _offset(problem))
-    parts = _parameters(problem), size, _shares(problem, law, points, feasible)
-    return "\n".join(chain(*parts, _active(problem, feasible), _values(problem, law, feasible)))
+    parts = _parameters(problem), size, _shares(own, law, points, feasible)
+    return "\n".join(chain(*parts, _active(own, feasible), _values(problem, law, feasible)))
 
 
 def _parameters(problem: MPCProblem) -> Iterator[str]:
@@ -47,12 +48,12 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
         "d": "disturbance, constant over the horizon",
         "u_prev": "input of the step before",
     }
-    points, rests = problem.theta_ss, np.any(problem.theta_ss)
-    how = "as the plant shows them; theta counts from what is in brackets" if rests else "in theta"
+    points, rests = problem.theta_ss, problem.units.shifted
+    how = "in plant units; the operating point is in brackets" if rests else "in theta"
     yield f"Parameters of the law, {problem.n_theta}, {how}:"
     labels, names = problem.labels(units=True), problem.layout.names
     width = max(10, *map(len, labels))
-    low, high = problem.theta_min + points, problem.theta_max + points
+    low, high = problem.theta_min, problem.theta_max
     shown = [f"[{each:.4g}]" if rests else "" for each in points]
     room = max(10, *(len(each) + 1 for each in shown)) if rests else 0
     for i, (label, name) in enumerate(zip(labels, names, strict=True)):
@@ -132,12 +133,13 @@ def _active(problem: MPCProblem, feasible: Array) -> Iterator[str]:
 
 def _values(problem: MPCProblem, law: Law, feasible: Array) -> Iterator[str]:
     inputs = ", ".join(labels_of(problem.model)[1])
-    u, u_ss = inputs if problem.model.input_names else "u", problem.model.u_ss
+    u = inputs if problem.model.input_names else "u"
+    units = problem.units
     # In parentheses: rich would take names in brackets for its markup.
     yield f"The law at a few parameters ({', '.join(problem.labels())}):"
     for theta in np.vstack([np.zeros((1, problem.n_theta)), feasible[:3]]):
         where = "" if law.in_domain(theta) else " (not feasible)"
-        shown, taken = _numbers(theta + problem.theta_ss), _numbers(law(theta) + u_ss)
+        shown, taken = _numbers(units.to_plant(theta)), _numbers(units.input_to_plant(law(theta)))
         yield f"  {shown} -> {u} = {taken}{where}"
 
 

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, check_array, check_int
-from sb3_yann.control.model.labels import labels_of
 from sb3_yann.control.mpc.choice import Law
-from sb3_yann.control.mpc.plant_units import misread_state
+from sb3_yann.control.mpc.misread_bounds import misread_in_words
 from sb3_yann.control.mpc.problem import MPCProblem
 
 
@@ -22,19 +21,15 @@ def simulate(problem: MPCProblem, law: Law, theta0: ArrayLike, steps: int) -> tu
     theta0, steps : array_like, shape (n_theta,), and int
         The start, and the number of inputs.
     """
-    theta = check_array("theta0", theta0, (problem.n_theta,))
-    i = misread_state(problem, theta[None])
-    if i is not None:
-        raise ValueError(
-            f"theta0 = {theta.tolist()} holds {labels_of(problem.model)[0][i]} as the plant shows "
-            f"it, and theta counts from the operating point, {problem.model.x_ss[i]:g}. Pass "
-            "theta0 - mpc.theta_ss."
-        )
+    shown = check_array("theta0", theta0, (problem.n_theta,))
+    if words := misread_in_words(problem, shown[None]):
+        raise ValueError(f"theta0 = {shown.tolist()}: {words}")
     count = check_int("steps", steps, hint="It counts the inputs that are played.")
     A, B = problem.prediction
+    theta = problem.units.to_deviations(shown)
     thetas, inputs = np.empty((count + 1, len(theta))), np.empty((count, problem.model.n_inputs))
     thetas[0] = theta
     for k in range(count):
         inputs[k] = law(thetas[k])
         thetas[k + 1] = A @ thetas[k] + B @ inputs[k]
-    return thetas, inputs
+    return problem.units.to_plant(thetas), problem.units.input_to_plant(inputs)

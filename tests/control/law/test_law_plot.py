@@ -103,7 +103,7 @@ def test_a_law_that_is_solved_online_has_no_regions_to_draw() -> None:
 
 def test_a_law_of_one_parameter_is_a_line_over_it() -> None:
     tank = LinearModel([[0.9]], [[0.5]], 1, [12], [3], state_names=["level"], units={"level": "cm"})
-    bounds = {"x_min": 0, "x_max": 20, "u_min": 2, "u_max": 4, "absolute": True}
+    bounds = {"x_min": 0, "x_max": 20, "u_min": 2, "u_max": 4}
     law = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **bounds).explicit()
     axes = law.plot()
     x, u = axes.lines[0].get_data()

@@ -24,7 +24,7 @@ def reactor() -> LinearMPC:
         units={"temperature": "K"},
     )  # fmt: skip
     return LinearMPC(
-        model, Q=np.eye(2), R=[[0.1]], horizon=3, absolute=True,
+        model, Q=np.eye(2), R=[[0.1]], horizon=3,
         x_min=[0, 340], x_max=[4, 360], u_min=35, u_max=46,
         tracking=Tracking([1], 345, 355), disturbances=DisturbanceBounds(6, 8),
         rate=RateLimits(-2, 2),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC, OutputBounds, RateLimits, SoftBounds
-from sb3_yann.control.mpc.bound_excess import bound_excess, excess_of_episodes
+from sb3_yann.control.mpc.bound_excess import BoundNames, bound_excess, excess_of_episodes
 
 TANK = LinearModel(np.diag([0.9, 0.8]), np.eye(2), dt=1.0)
 BOX: Any = {"theta_min": [-4, -50], "theta_max": [4, 50]}
@@ -86,3 +86,18 @@ def test_a_bound_with_an_open_side_has_no_hidden_unit(scale: float) -> None:
     mpc = LinearMPC(model, Q=[[1]], R=[[1]], horizon=2, u_max=1, x_max=2 * scale)
     found = bound_excess(mpc, np.array([[0.0], [3 * scale]]), np.zeros((1, 1)))
     np.testing.assert_allclose(found.largest, 0.5, atol=1e-5)
+
+
+def test_a_hard_bound_is_named_before_a_soft_one_that_is_exceeded_by_more() -> None:
+    soft = SoftBounds(x=[1, 0], penalty=1)
+    mpc = tank(x_min=[-2, -10], x_max=[2, 10], soft=soft)
+    names = BoundNames.of(mpc)
+    for states, words in (
+        ([0, 15], "x[1] exceeds its bound by 5"),
+        ([4, 15], "x[1] exceeds its bound by 5"),
+        ([-4, 0], "x[0] exceeds its soft bound by 2"),
+        ([0, 0], ""),
+    ):
+        found = excess_of_episodes(mpc, [episode([[0, 0], states])])
+        size = found.largest[0] or found.any_bound[0]
+        assert names.in_words(np.asarray(found.worst)[0], size) == words

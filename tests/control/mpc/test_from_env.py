@@ -31,7 +31,7 @@ def test_the_bounds_are_those_of_the_spaces_as_the_plant_shows_them() -> None:
     np.testing.assert_allclose([mpc.model.A[0, 0], mpc.model.B[0, 0]], [0.9, 0.05], atol=1e-6)
     by_hand = LinearMPC(
         mpc.model, Q=[[1]], R=[[0.01]], horizon=3, u_min=20, u_max=60, theta_min=300,
-        theta_max=400, absolute=True,
+        theta_max=400,
     )  # fmt: skip
     assert mpc == by_hand
     law = mpc.explicit()

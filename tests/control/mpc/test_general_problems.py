@@ -124,7 +124,7 @@ def test_the_law_reaches_beyond_a_soft_bound_without_being_told() -> None:
 
 
 def test_an_input_that_may_not_rest_is_warned_of() -> None:
-    with pytest.warns(UserWarning, match=r"leave out u\[0\] = 0, .* absolute=True, or take u_ss"):
+    with pytest.warns(UserWarning, match=r"leave out u\[0\] = 0, .* give the model its x_ss"):
         servo(tracking=None, u_min=0.2)
 
 

@@ -83,12 +83,12 @@ def test_a_number_of_samples_below_one_is_an_error() -> None:
 def test_boxes_and_points_are_as_the_plant_shows_them_where_it_does_not_rest_at_zero() -> None:
     model = LinearModel([[0.9]], [[0.1]], 2.5, x_ss=[300.0], u_ss=[40.0], state_names=["T"])
     mpc = LinearMPC(
-        model, Q=[[1]], R=[[1]], horizon=3, u_min=-2, u_max=3, theta_min=-5, theta_max=7,
-        tracking=Tracking([0], -1, 2),
+        model, Q=[[1]], R=[[1]], horizon=3, u_min=38, u_max=43, theta_min=295, theta_max=307,
+        tracking=Tracking([0], 299, 302),
     )  # fmt: skip
     lines = mpc.report(samples=20).splitlines()
     assert lines[0] == (
-        "Parameters of the law, 2, as the plant shows them; theta counts from what is in brackets:"
+        "Parameters of the law, 2, in plant units; the operating point is in brackets:"
     )
     assert lines[1].split() == "T 295 to 307 [300] state 0".split()
     assert lines[2].split()[-9:] == "299 to 302 [300] reference of tracked output 0".split()
@@ -96,7 +96,8 @@ def test_boxes_and_points_are_as_the_plant_shows_them_where_it_does_not_rest_at_
     at = next(i for i, line in enumerate(lines) if line.startswith("The law at a few parameters"))
     assert lines[at + 1] == "  [300, 300] -> u = [40]"
     rng, law = np.random.default_rng(0), mpc.explicit()
-    points = rng.uniform(mpc.theta_min, mpc.theta_max, (20, 2))
+    own = mpc.deviations
+    points = rng.uniform(own.theta_min, own.theta_max, (20, 2))
     for line, theta in zip(lines[at + 2 :], points, strict=False):
         shown = ", ".join(f"{each:.4g}" for each in theta + 300)
         assert line == f"  [{shown}] -> u = [{law(theta)[0] + 40:.4g}]"

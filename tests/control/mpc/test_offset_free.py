@@ -16,6 +16,7 @@ from sb3_yann import (
     LinearMPC,
     PiecewiseAffine,
     Terminal,
+    Tracking,
     offset_free,
 )
 
@@ -48,7 +49,12 @@ def test_the_observer_takes_all_noises_for_equal_in_half_widths() -> None:
 def test_names_and_operating_point_stay_and_a_terminal_set_is_solved_anew() -> None:
     model = dataclasses.replace(MPC.model, x_ss=[3.0, 4.0], u_ss=[5.0])
     named = model.named(["a", "b"], ["c"], {"a": "K"})
-    mpc, _ = offset_free(dataclasses.replace(MPC, model=named))
+    shift = named.x_ss
+    box = {"x_min": MPC.x_min + shift, "x_max": MPC.x_max + shift, "u_min": MPC.u_min + 5}
+    box |= {"theta_min": MPC.theta_min[:2] + shift, "theta_max": MPC.theta_max[:2] + shift}
+    box |= {"tracking": Tracking([0], MPC.tracking.r_min + 3, MPC.tracking.r_max + 3)}
+    given = dataclasses.replace(MPC, model=named, **box, u_max=MPC.u_max + 5)
+    mpc, _ = offset_free(given)
     assert (mpc.model.state_names, mpc.model.input_names) == (("a", "b"), ("c",))
     assert mpc.model.units == ("K", "", "")
     assert [*mpc.model.x_ss, *mpc.model.u_ss] == [3, 4, 5]
@@ -58,10 +64,9 @@ def test_names_and_operating_point_stay_and_a_terminal_set_is_solved_anew() -> N
 
 def test_bounds_that_were_given_as_the_plant_shows_them_are_shown_so() -> None:
     tank = LinearModel([[0.5]], [[1.0]], 1, x_ss=[3], u_ss=[1.5])
-    box = {"x_min": 2, "x_max": 4, "u_min": 1, "u_max": 2, "absolute": True}
+    box = {"x_min": 2, "x_max": 4, "u_min": 1, "u_max": 2}
     mpc, _ = offset_free(LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **box))
     assert "x_min=[2], x_max=[4], u_min=[1], u_max=[2]" in repr(mpc)
-    assert "absolute=True" in repr(mpc) and "absolute" not in repr(offset_free(MPC)[0])
 
 
 def test_the_notes_of_the_model_stay_and_its_drift_is_made_up_for() -> None:

@@ -54,10 +54,10 @@ def test_a_problem_names_its_bounds() -> None:
     assert "r_min=[" in repr(servo())
 
 
-def test_a_start_as_the_plant_shows_it_is_refused() -> None:
+def test_a_start_in_deviations_is_refused() -> None:
     hot = LinearModel([[0.9]], [[0.5]], 1, x_ss=[350], u_ss=[40], state_names=["temperature"])
-    limits = {"x_min": 330, "x_max": 370, "u_min": 20, "u_max": 60, "absolute": True}
+    limits = {"x_min": 330, "x_max": 370, "u_min": 20, "u_max": 60}
     mpc = LinearMPC(hot, Q=[[1]], R=[[1]], horizon=2, **limits)
-    with pytest.raises(ValueError, match=r"holds temperature as the plant shows it.*theta_ss"):
-        mpc.simulate([352.0], 5)
-    assert mpc.simulate([352.0] - mpc.theta_ss, 5)[0][0] == 2
+    with pytest.raises(ValueError, match=r"temperature = 2 is shown.*this is a deviation"):
+        mpc.simulate([2.0], 5)
+    assert mpc.simulate([352.0], 5)[0][0] == 352

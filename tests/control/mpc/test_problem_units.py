@@ -1,4 +1,4 @@
-"""Bounds as the plant shows them give the same problem as deviations."""
+"""A problem in plant units solves the same problem as its deviations, about zero."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from sb3_yann import (
     OutputBounds,
     RateLimits,
     SoftBounds,
+    Terminal,
     Tracking,
 )
 
@@ -24,13 +25,14 @@ X_SS, U_SS, D_SS = np.array([350.0, 2.0]), np.array([10.0]), np.array([5.0])
 MODEL = LinearModel(
     [[0.9, 0.2], [0, 0.7]], [[0], [1]], 1.0, X_SS, U_SS, E=[[0.1], [0.0]], d_ss=D_SS
 )
+OWN = LinearModel(MODEL.A, MODEL.B, 1.0, E=MODEL.E)
 WEIGHTS: dict[str, Any] = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "rate": RateLimits(-0.5, 0.5)}
 SOFT = SoftBounds(x=[1, 0], penalty=100)
 
 
 def deviations() -> LinearMPC:
     return LinearMPC(
-        MODEL, **WEIGHTS, x_min=[-20, -1], x_max=[20, 3], u_min=-2, u_max=5,
+        OWN, **WEIGHTS, x_min=[-20, -1], x_max=[20, 3], u_min=-2, u_max=5,
         tracking=Tracking([0], -5, 5), disturbances=DisturbanceBounds(-1, 2),
         outputs=OutputBounds([[1, 1]], y_max=30), soft=SOFT,
     )  # fmt: skip
@@ -40,17 +42,50 @@ def shown() -> LinearMPC:
     return LinearMPC(
         MODEL, **WEIGHTS, x_min=[330, 1], x_max=[370, 5], u_min=8, u_max=15,
         tracking=Tracking([0], 345, 355), disturbances=DisturbanceBounds(4, 7),
-        outputs=OutputBounds([[1, 1]], y_max=382), soft=SOFT, absolute=True,
+        outputs=OutputBounds([[1, 1]], y_max=382), soft=SOFT,
     )  # fmt: skip
 
 
-def test_absolute_bounds_make_the_same_problem() -> None:
-    assert shown() == deviations()
+def test_the_deviations_of_a_problem_are_the_problem_about_zero() -> None:
+    assert shown().deviations == deviations()
+    assert deviations().deviations == deviations()
+
+
+def test_a_terminal_set_is_in_plant_units_too() -> None:
+    mpc = dataclasses.replace(shown(), terminal=Terminal(set="invariant"))
+    own = dataclasses.replace(deviations(), terminal=Terminal(set="invariant"))
+    F, g = mpc.terminal.set
+    np.testing.assert_allclose(g - F @ mpc.theta_ss, own.terminal.set[1])
+    given = dataclasses.replace(mpc, terminal=Terminal(set=([[1.0, 0], [-1, 0]], [355, -345])))
+    np.testing.assert_allclose(given.deviations.terminal.set[1], [5, 5])
+
+
+def test_what_a_problem_tells_is_in_plant_units() -> None:
+    mpc, own, rng = shown(), deviations(), np.random.default_rng(0)
+    theta = rng.uniform(own.theta_min, own.theta_max, (20, own.n_theta))
+    u = rng.uniform(own.u_min, own.u_max, (20, 1))
+    at = theta + mpc.theta_ss
+    np.testing.assert_allclose(mpc.stage_cost(at, u + U_SS), own.stage_cost(theta, u))
+    np.testing.assert_allclose(mpc.predict(at, u + U_SS), own.predict(theta, u) + mpc.theta_ss)
+    np.testing.assert_allclose(mpc.explicit().plant_input(at), own.explicit()(theta) + U_SS)
+    thetas, inputs = mpc.simulate(at[0], 5)
+    expected = own.simulate(theta[0], 5)
+    np.testing.assert_allclose(thetas, expected[0] + mpc.theta_ss)
+    np.testing.assert_allclose(inputs, expected[1] + U_SS)
+    x, v = mpc.steady_state([352.0], [5.5])
+    expected = own.steady_state([2.0], [0.5])
+    np.testing.assert_allclose(x, expected[0] + X_SS)
+    np.testing.assert_allclose(v, expected[1] + U_SS)
+    assert mpc.is_reachable([[350.0], [1e4]]).tolist() == [True, False]
+    with pytest.raises(ValueError, match=r"r = \[10000.0\] with d = \[5.0\] is not reachable"):
+        mpc.steady_state([1e4])
+    with pytest.raises(ValueError, match=r"x\[0\] = 1 is shown.*this is a deviation"):
+        mpc.simulate([1.0, 0, 0, 0, 0], 2)
 
 
 def test_a_changed_copy_of_it_is_not_shifted_again() -> None:
     again = dataclasses.replace(shown(), horizon=3)
-    assert again == dataclasses.replace(deviations(), horizon=3)
+    assert again.deviations == dataclasses.replace(deviations(), horizon=3)
 
 
 COPIES = [
@@ -63,7 +98,7 @@ COPIES = [
 
 
 @pytest.mark.parametrize("copied", COPIES)
-def test_what_is_replaced_in_an_absolute_problem_is_absolute_and_the_rest_stays(copied) -> None:
+def test_what_is_replaced_is_in_plant_units_and_the_rest_stays(copied) -> None:
     mpc = copied(shown())
     tracking = dataclasses.replace(mpc.tracking, r_max=352)
     loads = dataclasses.replace(mpc.disturbances, d_min=3.5)
@@ -74,51 +109,38 @@ def test_what_is_replaced_in_an_absolute_problem_is_absolute_and_the_rest_stays(
     )  # fmt: skip
     expected = LinearMPC(
         MODEL, **WEIGHTS, x_min=[330, 1], x_max=[365, 4.5], u_min=9, u_max=15,
-        theta_min=[335, 1.5], theta_max=shown().theta_max[:2] + X_SS,
+        theta_min=[335, 1.5], theta_max=shown().theta_max[:2],
         tracking=Tracking([0], 345, 352), disturbances=DisturbanceBounds(3.5, 7),
-        outputs=OutputBounds([[1, 1]], y_max=377), soft=SOFT, absolute=True,
+        outputs=OutputBounds([[1, 1]], y_max=377), soft=SOFT,
     )  # fmt: skip
-    assert found.absolute
     assert found == expected
     assert dataclasses.replace(found) == found
 
 
-def test_absolute_bounds_stay_where_they_are_when_the_operating_point_moves() -> None:
+def test_bounds_stay_where_they_are_when_the_operating_point_moves() -> None:
     moved = dataclasses.replace(MODEL, x_ss=[345.0, 2.5], u_ss=[11.0], d_ss=[4.5])
     found = dataclasses.replace(shown(), model=moved)
-    np.testing.assert_allclose(found.x_min + moved.x_ss, [330, 1])
-    np.testing.assert_allclose(found.u_max + moved.u_ss, [15])
-    np.testing.assert_allclose(found.tracking.r_max + 345, [355])
-    np.testing.assert_allclose(found.disturbances.d_min + moved.d_ss, [4])
-    np.testing.assert_allclose(found.outputs.y_max + 347.5, [382])
-
-
-def test_bounds_that_are_in_the_wrong_order_once_they_are_alike_are_refused() -> None:
-    mpc = shown()
-    with pytest.raises(ValueError, match="r_min must lie below r_max"):
-        dataclasses.replace(mpc, tracking=dataclasses.replace(mpc.tracking, r_max=340))
-    plain = deviations()
-    with pytest.raises(ValueError, match="r_min must lie below r_max"):
-        dataclasses.replace(plain, tracking=dataclasses.replace(plain.tracking, r_max=-7))
-
-
-def test_a_problem_in_deviations_does_not_become_absolute_by_a_flag() -> None:
-    for mpc in (shown(), deviations()):
-        with pytest.raises(ValueError, match="absolute"):
-            dataclasses.replace(mpc, absolute=not mpc.absolute)
+    assert found.x_min.tolist() == [330, 1] and found.outputs.y_max.tolist() == [382]
+    own = found.deviations
+    np.testing.assert_allclose(own.x_min + moved.x_ss, [330, 1])
+    np.testing.assert_allclose(own.u_max + moved.u_ss, [15])
+    np.testing.assert_allclose(own.tracking.r_max + 345, [355])
+    np.testing.assert_allclose(own.disturbances.d_min + moved.d_ss, [4])
+    np.testing.assert_allclose(own.outputs.y_max + 347.5, [382])
 
 
 def test_a_box_of_theta_and_what_is_not_given() -> None:
     mpc = LinearMPC(
         MODEL, **WEIGHTS, theta_min=[300, 0], theta_max=[400, 4], u_min=8, u_max=15,
-        disturbances=DisturbanceBounds(4, 7), absolute=True,
+        disturbances=DisturbanceBounds(4, 7),
     )  # fmt: skip
-    assert mpc.theta_min[:2].tolist() == [-50, -2]
+    assert mpc.theta_min[:2].tolist() == [300, 0]
+    assert mpc.deviations.theta_min[:2].tolist() == [-50, -2]
     assert np.all(np.isinf(mpc.x_max))
 
 
 def test_the_report_calls_states_by_their_names() -> None:
-    mpc = dataclasses.replace(deviations(), model=MODEL.named(["T", "c"], units={"T": "K"}))
+    mpc = dataclasses.replace(shown(), model=MODEL.named(["T", "c"], units={"T": "K"}))
     text = mpc.report(samples=50)
     for line in (
         "T (K)                     310 to 390        [350]     state 0",
@@ -129,7 +151,7 @@ def test_the_report_calls_states_by_their_names() -> None:
         "  [350, 2, 350, 5, 10] -> u = [10]",
     ):
         assert line in text
-    assert "x[0] " in deviations().report(samples=50).splitlines()[1]
+    assert "x[0] " in shown().report(samples=50).splitlines()[1]
 
 
 def test_what_limits_the_plan_is_called_by_its_name() -> None:
@@ -144,36 +166,29 @@ def test_what_limits_the_plan_is_called_by_its_name() -> None:
 def test_a_problem_shows_its_bounds_as_they_were_given() -> None:
     text = repr(shown())
     assert "x_min=[330, 1], x_max=[370, 5], u_min=[8], u_max=[15], r_min=[345]" in text
-    assert "du_max=[0.5]" in text and "y_max=[382]" in text and "absolute=True" in text
-    assert "x_min=[-20, -1]" in repr(deviations()) and "absolute" not in repr(deviations())
+    assert "du_max=[0.5]" in text and "y_max=[382]" in text
 
 
-def test_absolute_is_a_flag() -> None:
-    with pytest.raises(TypeError, match="absolute = 1 must be True or False"):
-        LinearMPC(MODEL, Q=np.eye(2), R=[[1]], horizon=2, absolute=1)  # type: ignore[arg-type]
+@pytest.mark.parametrize("absolute", [True, False])
+def test_absolute_does_nothing_and_warns(absolute: bool) -> None:
+    given: dict[str, Any] = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 8, "u_max": 15}
+    with pytest.warns(DeprecationWarning, match="absolute= does nothing"):
+        found = LinearMPC(MODEL, **given, absolute=absolute)
+    assert found == LinearMPC(MODEL, **given)
 
 
-@pytest.mark.parametrize(
-    ("absolute", "low", "high", "message"),
-    [
-        (True, 4, 10, r"u_min = 4 and u_max = 10 leave out u\[0\] = 3, .*Linearize where"),
-        (False, 4, 10, r"u_min = 4 and u_max = 10 leave out u\[0\] = 0, .*absolute=True"),
-    ],
-)
-def test_an_input_that_cannot_rest_is_told_in_the_units_that_were_given(
-    absolute: bool, low: float, high: float, message: str
-) -> None:
+def test_an_input_that_cannot_rest_is_told() -> None:
     tank = LinearModel([[0.9]], [[0.5]], dt=1, x_ss=[12], u_ss=[3])
-    box = {"theta_min": -20, "theta_max": 20, "u_min": low, "u_max": high}
-    with pytest.warns(UserWarning, match=message):
-        LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, absolute=absolute, **box)
+    box = {"theta_min": 0, "theta_max": 20, "u_min": 4, "u_max": 10}
+    with pytest.warns(UserWarning, match=r"u_min = 4 and u_max = 10 leave out u\[0\] = 3, .*Line"):
+        LinearMPC(tank, Q=[[1]], R=[[1]], horizon=2, **box)
 
 
 def test_a_box_that_leaves_out_the_operating_point_is_told() -> None:
     tanks = LinearModel(
         np.eye(2) / 2, [[1], [1]], 1, x_ss=[12, 1], u_ss=[3], state_names=["h", "c"]
     )
-    given = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 0, "u_max": 9, "absolute": True}
+    given = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 0, "u_max": 9}
     with pytest.warns(UserWarning) as told:
         LinearMPC(tanks, x_min=[0, 5], x_max=[3, 20], **given)  # swapped
     assert [str(each.message)[:60] for each in told] == [
@@ -182,52 +197,9 @@ def test_a_box_that_leaves_out_the_operating_point_is_told() -> None:
     ]
 
 
-REACTOR = LinearModel(np.eye(2) / 2, [[1], [1]], 1, x_ss=[300, 0], u_ss=[40])
-PLAIN: dict[str, Any] = {"Q": np.eye(2), "R": [[1]], "horizon": 2}
-WIDE: dict[str, Any] = {"x_min": [-100, -5], "x_max": [100, 5], "u_min": -40, "u_max": 60}
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"x_min": [250, -5], "x_max": [350, 5]}, "x_min = 250 and x_max = 350 of entry 0 are"),
-        (
-            {"x_min": -np.inf, "x_max": np.inf, "theta_min": [250, -5], "theta_max": [350, 5]},
-            "theta_min = 250 and theta_max = 350 of entry 0",
-        ),
-        ({"outputs": OutputBounds([[1, 1]], 250, 350)}, "y_min = 250 and y_max = 350 of entry 0"),
-        (
-            {"x_min": [0, -5], "x_max": [400, 5], "u_min": 0, "u_max": 100},
-            "x_min = 0 and x_max = 400 of entry 0",
-        ),
-        (
-            {"x_min": [-200, -5], "x_max": [400, 5], "u_min": -20, "u_max": 100,
-             "tracking": Tracking([0], 280, 320)},
-            "r_min = 280 and r_max = 320 of entry 0",
-        ),
-    ],
-)  # fmt: skip
-def test_absolute_bounds_without_the_flag_are_told(given: dict[str, Any], message: str) -> None:
-    with pytest.warns(UserWarning, match=rf"{message}.*the operating point, .*pass absolute=True"):
-        LinearMPC(REACTOR, **PLAIN, **{**WIDE, **given})
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        {},
-        {"tracking": Tracking([0], 280, 320)},  # the other bounds are deviations
-        {"u_min": 0, "u_max": 95},  # it rests at its limit
-        {"x_min": [5, -5], "x_max": [90, 5], "tracking": Tracking([0], 10, 80)},
-    ],
-)
-def test_deviations_that_may_well_be_meant_are_not_told(given: dict[str, Any]) -> None:
-    LinearMPC(REACTOR, **PLAIN, **{**WIDE, **given})  # a warning would be an error
-
-
-def test_deviations_with_the_flag_are_told_with_what_to_pass() -> None:
+def test_deviations_are_told_with_what_to_pass() -> None:
     plant = LinearModel([[0.9]], [[1.0]], 1, x_ss=[1500], u_ss=[3])
-    box: dict[str, Any] = {"x_min": 0, "x_max": 3000, "u_min": 0, "u_max": 6, "absolute": True}
+    box: dict[str, Any] = {"x_min": 0, "x_max": 3000, "u_min": 0, "u_max": 6}
     given = {"Q": [[1]], "R": [[1]], "horizon": 2, **box}
     with pytest.warns(UserWarning, match=r"r_min = -900 and .* pass r_min = 600 and r_max = 2400"):
         LinearMPC(plant, **given, tracking=Tracking([0], -900, 900))
@@ -235,28 +207,20 @@ def test_deviations_with_the_flag_are_told_with_what_to_pass() -> None:
     LinearMPC(plant, **given, tracking=Tracking([0], 1600, 2400))  # beside it, as may be
 
 
-def test_an_absolute_column_is_not_taken_for_a_batch() -> None:
+def test_a_column_is_not_taken_for_a_batch() -> None:
     tanks = LinearModel(np.eye(2) / 2, [[1], [1]], 1, x_ss=[12, 1], u_ss=[3])
-    given = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 0, "u_max": 9, "absolute": True}
+    given = {"Q": np.eye(2), "R": [[1]], "horizon": 2, "u_min": 0, "u_max": 9}
     law = LinearMPC(tanks, x_min=[0, 0], x_max=[20, 3], **given).online()
     with pytest.raises(ValueError, match=r"shown has shape \(2, 1\), expected \(2,\) or"):
         law.plant_input([[12.0], [1.0]])
 
 
-def test_absolute_inputs_that_pass_for_deviations_are_named_beside_disturbances() -> None:
-    with pytest.warns(UserWarning, match=r"leave out u\[0\] = 0.*absolute=True"):
-        LinearMPC(
-            MODEL, **WEIGHTS, theta_min=[-20, -1], theta_max=[20, 3], u_min=8, u_max=15,
-            disturbances=DisturbanceBounds(4, 7),
-        )  # fmt: skip
-
-
 def test_a_bound_at_the_operating_point_is_zero_and_no_minus_zero() -> None:
     mpc = LinearMPC(
         MODEL, **WEIGHTS, theta_min=[350, 0], theta_max=[400, 2], u_min=10, u_max=15,
-        x_min=[350, -np.inf], x_max=[np.inf, 2], absolute=True,
+        x_min=[350, -np.inf], x_max=[np.inf, 2],
         tracking=Tracking([0], 350, 355), disturbances=DisturbanceBounds(4, 5),
-    )  # fmt: skip
+    ).deviations  # fmt: skip
     for ours, expected in (
         (mpc.u_min, [0]), (mpc.u_max, [5]), (mpc.x_min, [0, -np.inf]), (mpc.x_max, [np.inf, 0]),
         (mpc.theta_min[:2], [0, -2]), (mpc.theta_max[:2], [50, 0]),
@@ -266,10 +230,10 @@ def test_a_bound_at_the_operating_point_is_zero_and_no_minus_zero() -> None:
 
 
 def test_a_bound_that_is_not_given_stays_none_of_one_side_alone() -> None:
-    common = {"theta_min": [300, 0], "theta_max": [400, 4], "absolute": True,
+    common = {"theta_min": [300, 0], "theta_max": [400, 4],
               "disturbances": DisturbanceBounds(4, 7)}  # fmt: skip
-    low = LinearMPC(MODEL, **WEIGHTS, **common, u_min=8, x_min=[340, 1])
+    low = LinearMPC(MODEL, **WEIGHTS, **common, u_min=8, x_min=[340, 1]).deviations
     assert low.u_min.tolist() == [-2] and np.isinf(low.u_max) and np.isinf(low.x_max).all()
-    high = LinearMPC(MODEL, **WEIGHTS, **common, u_max=15, x_max=[360, 3])
+    high = LinearMPC(MODEL, **WEIGHTS, **common, u_max=15, x_max=[360, 3]).deviations
     assert high.u_max.tolist() == [5] and np.isinf(high.u_min) and np.isinf(high.x_min).all()
     assert high.x_max.tolist() == [10, 1]

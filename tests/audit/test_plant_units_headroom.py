@@ -9,21 +9,23 @@ from gymnasium.wrappers import TimeLimit
 
 import unit_samples as units
 from sb3_yann import LinearModel, LinearMPC, PlantTwin, Tracking, headroom
+from sb3_yann.audit.in_deviations import in_deviations
 from sb3_yann.audit.plants import lack_of_fit
-from sb3_yann.wrappers import Deviations, SetPoint, StageCost
+from sb3_yann.wrappers import SetPoint, StageCost
 
-MPC = units.absolute_mpc()
+MPC = units.plant_mpc()
 
 
 def tracking() -> LinearMPC:
     """Return an MPC of the same plant whose temperature follows a set-point."""
-    design = {"Q": np.diag([1, 0]), "R": [[0.1]], "horizon": 3, "absolute": True}
+    design = {"Q": np.diag([1, 0]), "R": [[0.1]], "horizon": 3}
     return LinearMPC(units.MODEL, **design, **units.LIMITS, tracking=Tracking([0], 349, 351))
 
 
 def test_a_plant_in_its_own_units_has_the_headroom_of_its_deviations() -> None:
-    plain = headroom(MPC, Deviations(units.plant("absolute", "absolute"), MPC), n_starts=3)
-    shown = StageCost(units.plant("absolute", "absolute"), MPC)
+    make = in_deviations(lambda: units.plant("plant", "plant"), MPC)
+    plain = headroom(MPC.deviations, make, n_starts=3)
+    shown = StageCost(units.plant("plant", "plant"), MPC)
     found = headroom(MPC, shown, n_starts=3)
     np.testing.assert_allclose(found.mpc_costs, plain.mpc_costs, rtol=1e-9)
     np.testing.assert_allclose(found.best_costs, plain.best_costs, rtol=1e-6)
@@ -31,20 +33,20 @@ def test_a_plant_in_its_own_units_has_the_headroom_of_its_deviations() -> None:
 
 
 @pytest.mark.parametrize(
-    ("takes", "mpc", "message"),
+    ("shows", "takes", "message"),
     [
-        ("absolute", units.deviation_mpc(), r"absolute inputs, from \[38.*Wrap.*Deviations"),
-        ("normalized", MPC, r"normalized inputs, from \[-1.*RescaleAction"),
-        ("deviation", MPC, "shows state 'temperature' = 350.*Deviations"),
+        ("plant", "normalized", r"normalized inputs, from \[-1.*RescaleAction"),
+        ("deviation", "deviation", r"takes deviations, from \[-2.*plant units"),
+        ("deviation", "plant", "temperature = .* is shown.* this is a deviation"),
     ],
 )
-def test_units_that_nobody_can_tell_are_refused(takes, mpc, message) -> None:
+def test_other_units_are_refused(shows, takes, message) -> None:
     with pytest.raises(ValueError, match=message):
-        headroom(mpc, units.plant("absolute", takes), n_starts=2)
+        headroom(MPC, units.plant(shows, takes), n_starts=2)
 
 
 class Settable(units.OwnUnits):
-    """It bends upwards, and can be put into an absolute state."""
+    """It bends upwards, and can be put into a state."""
 
     def reset(self, *, seed=None, options=None):
         shown, info = super().reset(seed=seed)
@@ -67,7 +69,7 @@ class Deaf(Settable):
 
 
 def bent(cls: type[Settable] = Settable) -> gym.Env:
-    return TimeLimit(cls("absolute", "absolute"), 20)
+    return TimeLimit(cls("plant", "plant"), 20)
 
 
 def put(env: gym.Env, x: np.ndarray) -> None:
@@ -86,10 +88,9 @@ def no_twin(monkeypatch) -> None:
     monkeypatch.setattr(PlantTwin, "fit", fit)
 
 
-@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: Deviations(env, MPC)])
 @pytest.mark.usefixtures("no_twin")
-def test_a_plant_is_put_into_absolute_states_where_its_wrappers_show_deviations(wrap) -> None:
-    assert headroom(MPC, wrap(bent()), n_starts=2).total > 0
+def test_a_plant_is_put_into_its_own_states() -> None:
+    assert headroom(MPC, bent(), n_starts=2).total > 0
 
 
 @pytest.mark.usefixtures("no_twin")
@@ -113,9 +114,12 @@ def test_what_puts_no_state_is_named() -> None:
 
 
 @pytest.mark.parametrize("low", [-1, 353])
-def test_set_points_in_other_units_than_the_env_s_are_named(low) -> None:
-    plant = SetPoint(units.plant("absolute", "absolute"), low, low + 2)
-    with pytest.raises(ValueError, match=r"set-point of temperature is .*, and the MPC was solved"):
+def test_set_points_that_are_not_the_problem_s_are_named(low) -> None:
+    plant = SetPoint(units.plant("plant", "plant"), low, low + 2)
+    with pytest.raises(
+        ValueError,
+        match=r"set-point of temperature (= -.* is a deviation|is 35.*, and the MPC was solved)",
+    ):
         headroom(tracking(), plant, n_starts=2)
 
 
@@ -141,7 +145,7 @@ class Acid(gym.Env):
 
 def neutral() -> LinearMPC:
     model = LinearModel([[0.95]], [[0.05]], 1, [7], [50], state_names=["pH"])
-    limits = {"x_min": 0, "x_max": 14, "u_min": 0, "u_max": 100, "absolute": True}
+    limits = {"x_min": 0, "x_max": 14, "u_min": 0, "u_max": 100}
     return LinearMPC(model, Q=[[1]], R=[[0.01]], horizon=3, **limits)
 
 
@@ -153,7 +157,7 @@ def test_nothing_found_with_plans_of_a_poor_twin_is_not_called_little() -> None:
 
 
 def test_what_neighbors_share_is_told_from_noise() -> None:
-    mpc, rng = MPC, np.random.default_rng(0)
+    mpc, rng = MPC.deviations, np.random.default_rng(0)
 
     class Model:
         def step(self, theta, u, rows):

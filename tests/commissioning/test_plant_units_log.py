@@ -17,16 +17,16 @@ X_SS, U_SS = np.array([20.0, 3.0]), np.array([7.0])
 
 
 @cache
-def absolute_problem() -> LinearMPC:
+def plant_problem() -> LinearMPC:
     cart = problem()
     return LinearMPC(
         LinearModel(cart.model.A, cart.model.B, DT, x_ss=X_SS, u_ss=U_SS),
         Q=cart.Q, R=cart.R, horizon=3, u_min=6, u_max=8,
-        theta_min=X_SS - 3, theta_max=X_SS + 3, absolute=True,
+        theta_min=X_SS - 3, theta_max=X_SS + 3,
     )  # fmt: skip
 
 
-class AbsoluteCart(gym.Env):
+class OwnCart(gym.Env):
     """The cart of the other tests, about another origin."""
 
     def __init__(self) -> None:
@@ -45,16 +45,16 @@ class AbsoluteCart(gym.Env):
 
 @pytest.mark.slow
 def test_a_log_in_the_plants_units_improves_a_policy_that_acts_in_them(tmp_path) -> None:
-    mpc = absolute_problem()
-    law = mpc.explicit().plant_input
-    log = evaluate(law, AbsoluteCart, range(5))
-    twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)], absolute=True)
+    mpc = plant_problem()
+    law = mpc.explicit()
+    log = evaluate(law, OwnCart, range(5))
+    twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions, strict=True)])
     assert twin.trusted
-    model = DDPG("YannPolicy", AbsoluteCart(), policy_kwargs={"problem": mpc}, seed=0)
+    model = DDPG("YannPolicy", OwnCart(), policy_kwargs={"problem": mpc}, seed=0)
     found = improve(model, twin, updates=1000, n_starts=10)
     assert found.accepted and str(found).startswith("Accepted: -")
     model.save(tmp_path / "model")
-    again = DDPG.load(tmp_path / "model", env=AbsoluteCart())
-    ours, before = (evaluate(each, AbsoluteCart, range(100, 120)) for each in (again, law))
+    again = DDPG.load(tmp_path / "model", env=OwnCart())
+    ours, before = (evaluate(each, OwnCart, range(100, 120)) for each in (again, law))
     assert ours.costs.mean() < 0.97 * before.costs.mean()
     assert np.all(ours.costs < before.costs)

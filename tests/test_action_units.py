@@ -1,0 +1,92 @@
+"""Plant units and deviations: what an env takes follows from its bounds; deviations are named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sb3_yann import LinearModel, LinearMPC
+from sb3_yann.control.mpc.misread_bounds import misread_entry
+from sb3_yann.units import ActionUnits
+
+MODEL = LinearModel(np.eye(2) / 2, np.eye(2), 1.0, x_ss=[1, 0], u_ss=[300, -2])
+MPC = LinearMPC(
+    MODEL, Q=np.eye(2), R=np.eye(2), horizon=1, x_min=[-1, -2], x_max=[3, 2], u_min=[299, -5],
+    u_max=[302, 3],
+)  # fmt: skip
+BOUNDS = {"plant": ([299, -5], [302, 3]), "normalized": ([-1, -1], [1, 1])}
+
+
+def test_a_bound_on_one_side_is_compared_on_that_side() -> None:
+    mpc = replace(MPC, u_min=[300, -5], u_max=[np.inf, np.inf])
+    above = np.array([np.inf, np.inf])
+    found = ActionUnits.of(mpc, np.array([300.0, -5]), above)
+    assert found is not None and found.kind == "plant"
+    assert ActionUnits.of(mpc, np.array([-5.0, -3]), above) is None
+    assert ActionUnits.of(mpc, np.array([300.0, -5]), np.array([1e6, np.inf])) is None
+
+
+@pytest.mark.parametrize("kind", BOUNDS)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_bounds_tell_what_an_env_takes(kind: str, dtype: type) -> None:
+    low, high = (np.array(side, dtype) for side in BOUNDS[kind])
+    units, own = ActionUnits.of(MPC, low, high), MPC.deviations
+    assert units is not None and units.kind == kind
+    np.testing.assert_allclose(units.input([low, high]), [own.u_min, own.u_max], atol=1e-12)
+    u = np.random.default_rng(0).uniform(own.u_min, own.u_max, (9, 2))
+    np.testing.assert_allclose(units.input(units.action(u)), u, atol=1e-12)
+
+
+def test_bounds_rounded_to_float32_still_fit() -> None:
+    mpc = replace(MPC, u_min=[300 - 1 / 3, -5], u_max=[300 + 2 / 3, 3])
+    low, high = np.float32([300 - 1 / 3, -5]), np.float32([300 + 2 / 3, 3])
+    units = ActionUnits.of(mpc, low, high)
+    assert units is not None and units.kind == "plant"
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [([299, -5], [302, 3.1]), ([299, -3], [302, 5]), ([-1, -1], [1, 2]), ([299], [302]),
+     ([-1, -3], [2, 5])],
+    ids=["a bound of its own", "one of each", "half normalized", "one input", "deviations"],
+)  # fmt: skip
+def test_other_bounds_tell_nothing(low: list[float], high: list[float]) -> None:
+    assert ActionUnits.of(MPC, np.array(low, float), np.array(high, float)) is None
+
+
+@pytest.mark.parametrize(("beyond", "fits"), [(1.9e-6, True), (2.1e-6, False)])
+def test_bounds_may_be_two_millionths_of_a_half_width_off(beyond: float, fits: bool) -> None:
+    half = np.array([1.5, 4.0])
+    for kind, (low, high) in BOUNDS.items():
+        size = half if kind != "normalized" else np.ones(2)
+        for sign in (1, -1):
+            moved = np.array(low, float) + sign * beyond * size
+            found = ActionUnits.of(MPC, moved, np.array(high, float))
+            assert (found is not None) == fits and (found is None or found.kind == kind)
+
+
+COLD = LinearMPC(
+    replace(MODEL, x_ss=[1, -30]), Q=np.eye(2), R=np.eye(2), horizon=1, x_min=[-1, -32],
+    x_max=[3, -28], u_min=[299, -5], u_max=[302, 3],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "shown", [[0, 0], [2.5, 9], [1, 0]], ids=["inside", "outside anyway", "at rest"]
+)
+def test_plant_units_are_not_taken_for_deviations(shown: list[float]) -> None:
+    assert misread_entry(MPC, np.array([shown])) is None
+
+
+def test_the_state_that_lies_at_zero_is_found() -> None:
+    assert misread_entry(COLD, np.array([[0.2, -0.5], [-0.2, 1]])) == 1
+    assert misread_entry(COLD, np.array([[1.2, -30.5]])) is None
+    assert misread_entry(COLD, np.zeros((0, 2))) is None
+
+
+def test_nine_rows_of_ten_must_speak_for_a_deviation() -> None:
+    deviation, plant = [0.2, -0.5], [1.2, -30.5]
+    assert misread_entry(COLD, np.array([deviation] * 9 + [plant])) == 1
+    assert misread_entry(COLD, np.array([deviation] * 8 + [plant] * 2)) is None
