@@ -170,7 +170,9 @@ class Trial:
         From the starts that begin as the log does it must gain in each, and none may cost much
         more: in one without a form, and in one with a memory where the log shows hidden dynamics.
         """
-        said = self._objection(self.twin.second_opinion, act, "a second model")
+        said = ""
+        if self.twin.heeds_second_opinion:
+            said = self._objection(self.twin.second_opinion, act, "a second model")
         if said or self.twin.hidden_dynamics is None:
             return said
         return self._objection(self.twin.hidden_dynamics, act, "a model with hidden dynamics")

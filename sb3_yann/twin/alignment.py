@@ -36,6 +36,8 @@ SLOPE_TOLERANCE = 0.1
 """How far from one the slope of an input on the law may be: sensors' noise lowers it."""
 LEAST_GAIN = 0.6
 """A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
+ROUNDING = 1e-9
+"""Of a half-width: an input that moves by less stands still."""
 LEAST_ROWS = 20
 """Rows of a regression on the law, at least."""
 CONFIRM = "If its units were checked, and the plant or its controller is so: units_confirmed=True."
@@ -263,6 +265,7 @@ def _against_states(log: _Log, logged: Array, proven: NDArray[np.bool_]) -> Iter
 
 def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
     """Yield where the law gives the inputs once one state is taken times a factor, plus a zero."""
+    proven = proven | _held(log)
     if np.all(proven):
         return
     names = labels_of(log.problem.model)[0]
@@ -293,6 +296,15 @@ def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
                 f"The MPC gives the logged inputs where {names[i]} is {factor:.4g} times what is "
                 f"logged, {shift[i]:+.4g}: is it in other units, or has it another zero? {CONFIRM}"
             )
+
+
+def _held(log: _Log) -> NDArray[np.bool_]:
+    """Return which inputs (m,) mostly stand still between their bounds: no law of moving states."""
+    u, problem = [each.actions for each in log.episodes], log.problem.deviations
+    still = [np.abs(np.diff(each, axis=0)) <= ROUNDING * problem.u_half for each in u]
+    inside = [(each[1:] > problem.u_min) & (each[1:] < problem.u_max) for each in u]
+    pairs = zip(still, inside, strict=True)
+    return np.asarray(np.mean(np.concatenate([a & b for a, b in pairs]), axis=0) > 0.5)
 
 
 def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from sb3_yann._validation import check_bool, check_int
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.twin.env import TwinEnv
 from sb3_yann.twin.gaussian_process import GaussianProcess
 from sb3_yann.twin.hidden_dynamics import HiddenDynamics
@@ -26,12 +27,15 @@ from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.sampling import cut_at_gaps
 from sb3_yann.twin.selection import (
+    AHEAD,
     FOLDS,
     MORE_THAN_A_POLYNOMIAL,
     NETWORK,
+    ROWS,
     Networks,
     candidates,
     choose,
+    errors_on,
     fitted,
     networks_may_help,
 )
@@ -53,6 +57,8 @@ if TYPE_CHECKING:
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
 KINDS = ("none", "linear", "quadratic", "cubic", "network")
+HEEDED = 2.0
+"""A second opinion that errs by more times as much has no say."""
 SHORT = 0.1
 """The least length of a second opinion, relative to the largest values in the log."""
 
@@ -300,15 +306,27 @@ class PlantTwin:
 
     @cached_property
     def second_opinion(self) -> Dynamics:
-        """A model of the log whose residual has no form: away from the data it is zero.
+        """A model of the log of another form than the twin's members.
 
-        All members of a twin are of one form. Where an input follows the state as in a closed loop
-        without excitation, they may agree on what is wrong, and where the plant is not smooth.
+        Where an input follows the state as in a closed loop without excitation, members of one form
+        may agree on what is wrong, and where the plant is not smooth. For a polynomial it is a
+        network; for a network, and on a short log, a Gaussian process, which away from the data is
+        zero.
         """
         problem, coordinates = self.problem, self.dynamics.coordinates
+        if self.kind != NETWORK and sum(map(len, self.episodes)) >= ROWS:
+            members = fit_ensemble(coordinates, [self.episodes], seed=0, ahead=AHEAD)
+            return Dynamics(problem, coordinates, tuple(members))
         process = GaussianProcess(problem.layout.has_constants, shortest=SHORT)
         residual = fitted(problem, coordinates, self.episodes, [process])
         return Dynamics(problem, coordinates, tuple(residual))
+
+    @cached_property
+    def heeds_second_opinion(self) -> bool:
+        """Whether that predicts the log's own free runs at most twice as badly as the twin."""
+        pair = [self.dynamics.members[0], self.second_opinion.members[0]]
+        ours, other = errors_on(self.dynamics.coordinates, self.episodes, pair)
+        return bool(other <= HEEDED * ours)
 
     @cached_property
     def hidden_dynamics(self) -> HiddenDynamics | None:

@@ -28,7 +28,7 @@ MORE_THAN_A_POLYNOMIAL = 20.0
 NETWORK = "network"
 AHEAD = 20
 """Steps of the windows that networks are fitted to."""
-ROWS, LACKS = 300, 0.05
+ROWS, LACKS = 300, 0.01
 """Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
 episodes err by so much of the mean."""
 NAMES = ("none", *DEGREES, "gaussian process", NETWORK)
@@ -279,6 +279,20 @@ def choose(
     runs = held_out(problem, coordinates, log, choices)
     freedom = [each.freedom for each in choices[first:]]
     return runs, first + runs.from_number(first).choose(freedom)
+
+
+def errors_on(
+    coordinates: Coordinates, episodes: Sequence[Episode], residuals: Sequence[Residual]
+) -> Array:
+    """Return the errors (residuals,) of free runs over episodes, the geometric mean over lengths.
+
+    In units of how far the states move.
+    """
+    longest = min(LONGEST, int(np.median([*map(len, episodes)])))
+    horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
+    problem = coordinates.row.problem
+    found = [_errors(problem, coordinates, each, residuals, horizons) for each in episodes]
+    return np.asarray(np.exp(np.log(np.nanmean(found, axis=0) + 1e-24).mean(axis=1) / 2))
 
 
 def _errors(
