@@ -16,7 +16,7 @@ import torch as th
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG, TD3
 
-from improvement_samples import FEW, Counted, Plain, Spring, bits, model_of, quick
+from improvement_samples import FEW, Counted, Elsewhere, Plain, Spring, bits, model_of, quick
 from sb3_yann import (
     LinearMPC,
     NoActionNoise,
@@ -30,7 +30,7 @@ from sb3_yann.audit.finding import CostMismatchWarning
 from sb3_yann.evaluation import evaluate
 from sb3_yann.improvement import Check, Improvement
 from sb3_yann.wrappers import SetPoint
-from twin_samples import log, observed_env, offset_free_problem, problem
+from twin_samples import Calm, observed_env, offset_free_problem, problem
 from weights import is_mpc
 
 UNSEEN = range(900, 930)
@@ -92,10 +92,10 @@ def test_its_steps_are_counted_and_its_envs_closed() -> None:
     assert found.steps == Counted.steps > 0
     assert f"{found.steps:,} steps of the simulator" in str(found)
     assert Counted.closed == Counted.made - made
-    assert found.episodes * 30 + 30 == found.steps  # the first episode is played twice
+    assert 20 * (found.episodes + 1) == found.steps  # the first episode is played twice
 
 
-@pytest.mark.parametrize("share", [1.0, 0.99, 0.5, 0.05, 0.004])
+@pytest.mark.parametrize("share", [1.0, 0.99, 0.3, 0.004])
 def test_it_takes_no_step_more_than_it_may(share) -> None:
     whole = pickle.loads(better())[1].steps
     most = max(int(share * whole), 1)
@@ -229,8 +229,10 @@ def test_lines_say_what_is_done_and_read_well_in_a_file(capsys) -> None:
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize("where", ["imitate", "confirm", "refit_critic"])
-@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+@pytest.mark.parametrize(
+    ("where", "error"),
+    [("imitate", KeyboardInterrupt), ("confirm", MemoryError), ("refit_critic", KeyboardInterrupt)],
+)
 def test_what_is_cut_off_leaves_the_model_as_it_was(monkeypatch, where, error) -> None:
     def cut(*_):
         raise error
@@ -253,7 +255,7 @@ def test_a_reward_of_its_own_is_named_at_the_caller_s_line() -> None:
             return shown, float(self.x[0] ** 3 + self.t % 2), *rest
 
     with pytest.warns(CostMismatchWarning) as caught:
-        improve(model_of(Own), Own, max_steps=2000, **FEW)
+        improve(model_of(Own), Own, max_steps=1300, **FEW)
     assert caught[0].filename == __file__
 
 
@@ -281,12 +283,13 @@ def test_set_points_are_followed_for_less() -> None:
     assert found.accepted and found.change < -0.02
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::sb3_yann.audit.finding.CostMismatchWarning")
 def test_an_observer_is_a_part_of_the_model() -> None:
-    mpc, _ = offset_free_problem()
-    model = DDPG(YannPolicy, observed_env(), device="cpu", policy_kwargs={"problem": mpc})
+    mpc, make = offset_free_problem()[0], lambda: observed_env(Calm(20))
+    model = DDPG(YannPolicy, make(), device="cpu", policy_kwargs={"problem": mpc})
     before = bits(model)
-    found = improve(model, observed_env, n_starts=4, rounds=1, updates=100)
+    found = improve(model, make, n_starts=4, rounds=1, updates=100)
     assert found.steps > 0 and found.checks
     assert found.accepted != (bits(model) == before)
 
@@ -372,9 +375,16 @@ def test_what_is_no_simulator_or_no_model_is_refused() -> None:
 # ------------------------------------------------------------------------------------ in a twin
 
 
+ENOUGH = {"n_starts": 10, "rounds": 2, "updates": 300}
+
+
 @cache
-def cart(episodes: int = 5) -> PlantTwin:
-    return PlantTwin.fit(problem(), log(episodes), residuals=["none", "linear", "quadratic"])
+def twin_of(make=Spring, episodes: int = 5) -> PlantTwin:
+    """Return the twin of episodes of a plant's MPC."""
+    mpc = make().observation_space.problem
+    played = evaluate(mpc.explicit(), make, range(episodes))
+    pairs = [*zip(played.observations, played.actions, strict=True)]
+    return PlantTwin.fit(mpc, pairs, residuals=["none", "linear", "quadratic", "cubic"])
 
 
 def reactor(seeds: range) -> PlantTwin:
@@ -409,16 +419,30 @@ def test_on_the_reactor_a_log_of_five_episodes_is_enough(tmp_path) -> None:
     again.learn(20, callback=NoActionNoise())
 
 
-def test_a_twin_s_policy_gains_on_the_plant_or_nothing_is_changed(capsys) -> None:
-    model = DDPG(YannPolicy, gym.wrappers.TimeLimit(Spring(), 30), device="cpu", seed=0)
-    before = bits(model)
-    found = improve(model, cart(), progress_bar=True, **FEW)
-    assert found.where == "the twin" and found.source == repr(cart())
-    assert found.accepted != (bits(model) == before)
-    assert "in the twin" in capsys.readouterr().out
-    again = DDPG(YannPolicy, Spring(), device="cpu", seed=0)
-    assert improve(again, cart(), **FEW).checks == found.checks
+def test_a_policy_of_a_twin_gains_on_the_plant(capsys) -> None:
+    model = model_of()
+    found = improve(model, twin_of(), progress_bar=True, **ENOUGH)
+    assert found.accepted and found.where == "the twin" and found.source == repr(twin_of())
+    assert found.change < -0.01 and found.episodes == 5 and found.steps == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "in the twin" in lines[0] and "no worse anywhere" in lines[-1]
+    assert relative(model).mean() < 0.995 and relative(model).max() < 1.01
+    again = model_of()
+    assert improve(again, twin_of(), **ENOUGH).checks == found.checks
     assert bits(again) == bits(model)
+
+
+@pytest.mark.parametrize("source", ["simulator", "twin"])
+def test_in_plant_units_it_finds_the_same(source) -> None:
+    if source == "twin":
+        plain, found = (
+            improve(model_of(make), twin_of(make), **ENOUGH) for make in (Spring, Elsewhere)
+        )
+    else:
+        plain = pickle.loads(better())[1]
+        found = improve(model_of(Elsewhere), Elsewhere, **FEW)
+    assert plain.accepted and found.accepted
+    assert found.change == pytest.approx(plain.change, rel=0.05)
 
 
 def test_what_no_check_lets_through_changes_nothing(monkeypatch) -> None:
@@ -427,7 +451,7 @@ def test_what_no_check_lets_through_changes_nothing(monkeypatch) -> None:
     monkeypatch.setattr(trial, "MARGIN", -1.0)  # no start can pass
     model = model_of()
     before = bits(model)
-    found = improve(model, cart(), **FEW)
+    found = improve(model, twin_of(), **FEW)
     assert not found.accepted and found.change == 0 and bits(model) == before
     assert not any(each.accepted for each in found.checks)
 
@@ -436,21 +460,21 @@ def test_a_twin_that_is_not_trusted_is_refused() -> None:
     model = model_of()
     before = bits(model)
     with pytest.raises(UntrustedTwinError, match="There is one episode"):
-        improve(model, cart(1))
+        improve(model, twin_of(episodes=1))
     with pytest.raises(ValueError, match=r"Fit the twin with model\.policy\.problem"):
-        improve(DDPG("YannPolicy", "CSTR-v0", device="cpu"), cart())
+        improve(DDPG("YannPolicy", "CSTR-v0", device="cpu"), twin_of())
     assert bits(model) == before
 
 
 def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
     from sb3_yann.improvement import critic
 
-    for name, value in {"SAMPLES": 1000, "STEPS": 60, "UPDATES": 200}.items():
+    for name, value in {"SAMPLES": 1000, "STEPS": 60, "UPDATES": 1000}.items():
         monkeypatch.setattr(critic, name, value)
     model, rng = model_of(), np.random.default_rng(5)
-    at = cart().starts.draw_logged(500, rng)
+    at = twin_of().starts.draw_logged(500, rng)
     u = np.clip(problem().explicit()(at) + 0.1 * rng.standard_normal((500, 1)), -1, 1)
-    returns = -critic._costs(model.policy, cart(), model.actor.mu, at, u)
+    returns = -critic._costs(model.policy, twin_of(), model.actor.mu, at, u)
     known = np.isfinite(returns)
 
     def error() -> float:
@@ -460,8 +484,8 @@ def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
             return float(np.abs(off[known]).mean())
 
     before = error()
-    critic.refit_critic(model.policy, cart(), seed=0)
-    assert error() < 0.5 * before
+    critic.refit_critic(model.policy, twin_of(), seed=0)
+    assert error() < 0.8 * before
     same = model.critic_target.state_dict()
     assert all(th.equal(each, same[name]) for name, each in model.critic.state_dict().items())
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_yann import YannPolicy
+from sb3_yann import LinearModel, LinearMPC, YannPolicy
 from sb3_yann.improvement import critic, imitation, model
 from sb3_yann.twin.ensemble import fit_ensemble
+from sb3_yann_envs import ProblemBox
 from twin_samples import DT, Cart, problem
 
-FEW = {"n_starts": 8, "rounds": 2, "updates": 300}
+FEW = {"n_starts": 6, "rounds": 1, "updates": 200}
 
 
 def quick(patch: pytest.MonkeyPatch) -> None:
@@ -31,7 +33,7 @@ class Spring(Cart):
 
     stiffness = 0.2
 
-    def __init__(self, steps: int = 30) -> None:
+    def __init__(self, steps: int = 20) -> None:
         super().__init__(steps)
 
     def after(self, place: float, speed: float, u: float) -> tuple[float, float]:
@@ -52,6 +54,39 @@ class Plain(Spring):
 
     def after(self, place: float, speed: float, u: float) -> tuple[float, float]:
         return place + DT * speed, 0.95 * speed + DT * u
+
+
+POINT, PUSH = np.array([5.0, 0.3]), np.array([2.0])
+"""Where the cart rests elsewhere, in plant units: its state and its input."""
+
+
+@cache
+def moved() -> LinearMPC:
+    """Return the cart's MPC at an operating point."""
+    plain = problem()
+    model = LinearModel(plain.model.A, plain.model.B, DT, x_ss=POINT, u_ss=PUSH)
+    return LinearMPC(
+        model, Q=plain.Q, R=plain.R, horizon=3, u_min=PUSH - 1, u_max=PUSH + 1,
+        theta_min=POINT - 3, theta_max=POINT + 3,
+    )  # fmt: skip
+
+
+class Elsewhere(Spring):
+    """The spring at that operating point: it shows and takes plant units."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        low, high = np.float32(POINT - 3), np.float32(POINT + 3)
+        self.observation_space = ProblemBox(low, high, problem=moved())
+        self.action_space = gym.spaces.Box(np.float32(PUSH - 1), np.float32(PUSH + 1))
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return (self.x + POINT).astype(np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        _, *rest = super().step(np.asarray(action, float) - PUSH)
+        return (self.x + POINT).astype(np.float32), *rest
 
 
 class Counted(Spring):
