@@ -58,6 +58,11 @@ class Pairs:
         ours = mpc if act is None else self.simulator.play(controller_of(act), seeds)
         known = np.isfinite(mpc.costs)  # where the MPC's own cost is none, nothing is compared
         self.seeds += [seed for seed, finite in zip(seeds, known, strict=True) if finite]
+        if not self.seeds:
+            raise ValueError(
+                f"The MPC's own cost is finite in none of {len(seeds)} episodes of the simulator: "
+                "there is nothing to compare with."
+            )
         self.mpc = np.append(self.mpc, mpc.costs[known])
         self.policy = np.append(self.policy, ours.costs[known])
         self.unsafe_of_mpc = np.concatenate([self.unsafe_of_mpc, mpc.unsafe()[known]])
@@ -94,7 +99,8 @@ class Pairs:
         problem, count = self.simulator.problem, len(self.seeds)
         mean = max(float(np.abs(self.mpc).mean()), 1e-300)
         relative = self.relative
-        error = float(relative.std(ddof=1) / np.sqrt(count)) if count > 1 else np.inf
+        with np.errstate(invalid="ignore"):  # a cost may be infinite
+            error = float(relative.std(ddof=1) / np.sqrt(count)) if count > 1 else np.inf
         average = float(relative.mean())
         room = float(special.stdtrit(max(count - 1, 1), 1 - level)) * error
         less = less_safe(self.unsafe, self.unsafe_of_mpc)
@@ -152,7 +158,7 @@ def confirm(act: Inputs, simulator: Simulator, number: int) -> tuple[Check, Pair
     for look, count in enumerate(LOOKS, start=1):
         pairs.play(act, simulator.new_seeds(count - len(pairs.seeds)))
         found = pairs.check(number, RULE.significance / (look * (look + 1)), final=True)
-        if found.accepted and count >= ENOUGH:
+        if found.accepted and len(pairs.seeds) >= ENOUGH:
             break
         if not found.accepted and pairs.is_hopeless:
             break

@@ -27,7 +27,7 @@ from sb3_yann.improvement.trial import Check, Trial
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.checkpoint import all_or_nothing
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin, require_yann_policy
-from sb3_yann.rollout import Source, maker, name_of
+from sb3_yann.rollout import Source, maker, name_of, preserve_rng
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.trust import Trust
 
@@ -228,14 +228,15 @@ def improve(
     check_bool("confine", confine)
     check_bool("progress_bar", progress_bar)
     if isinstance(model, LinearMPC):
-        model = DDPG(
-            YannPolicy,
-            twin.env() if isinstance(twin, PlantTwin) else maker(twin)(),
-            gamma=min(model.gamma, 0.99),
-            seed=seed,
-            device="cpu",
-            policy_kwargs={"problem": model, "networks": "shared"},
-        )
+        with preserve_rng():  # a seed of Stable-Baselines3 is a global one
+            model = DDPG(
+                YannPolicy,
+                twin.env() if isinstance(twin, PlantTwin) else maker(twin)(),
+                gamma=min(model.gamma, 0.99),
+                seed=seed,
+                device="cpu",
+                policy_kwargs={"problem": model, "networks": "shared"},
+            )
     policy = require_yann_policy(model.policy, "improve")
     if isinstance(twin, PlantTwin):
         require_problem_of_twin(policy, twin.problem)
@@ -413,6 +414,7 @@ class _Work:
         before: Check | None = None
         note, accepted = "", False
         try:
+            simulator.begin()
             self.say(f"{len(simulator.episodes)} episodes of the MPC, half with random inputs")
             trial = Pairs(simulator)
             known = self.act() if self.has_learnt else None

@@ -31,8 +31,21 @@ class OutOfStepsError(Exception):
     """The simulator would take more steps than it may."""
 
 
+class _Counted(gym.Wrapper[Any, Any, Any, Any]):
+    """Counts each step before it is taken, of which there may be no more."""
+
+    def __init__(self, env: gym.Env[Any, Any], simulator: Simulator) -> None:
+        super().__init__(env)
+        self.simulator = simulator
+
+    def step(self, action: Any) -> Any:
+        """Step the env."""
+        self.simulator.count()
+        return self.env.step(action)
+
+
 class Simulator:
-    """Episodes of a simulator of a problem's plant.
+    """Episodes of a simulator of a problem's plant; none before :meth:`begin`.
 
     Parameters
     ----------
@@ -64,25 +77,28 @@ class Simulator:
         self.problem, self.seed, self.max_steps = problem, seed, max_steps
         self.steps = self.played = 0
         make = in_deviations(maker(env, "twin"), problem)
-        self.envs = EnvPool(make)
+        self.envs = EnvPool(lambda: _Counted(make(), self))
         with self.envs.acquire(1) as (one,):
-            self.row, unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
+            self.row, self.unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
             require_spaces(problem, one)
         self.next_seed, self.longest = FIRST + APART * seed, 0
         self.episodes: list[Episode] = []
+
+    def begin(self) -> None:
+        """Play the first episodes, of the MPC with and without random inputs; check the env."""
+        problem = self.problem
         first = self.new_seeds(1)
         played = self.play(of_law(problem), first)
         require_repeated(problem, self.envs, first[0], played.costs[0])
-        self.steps += self.longest
         each = EPISODES // 2
         while each < MOST // 2 and 2 * each * self.longest < SHORT:
             each += EPISODES // 4
         logged = self.play(of_law(problem), self.new_seeds(each - 1))
         require_theta_shown(problem, logged.steps()[0])
-        warn_of_order(problem, *logged.steps(), stacklevel=4)
-        if not unaware:
-            warn_of_own_reward(problem, logged, stacklevel=4)
-        excited = self.play(Excited(problem, seed, PUSH, OFTEN), self.new_seeds(each))
+        warn_of_order(problem, *logged.steps(), stacklevel=5)
+        if not self.unaware:
+            warn_of_own_reward(problem, logged, stacklevel=5)
+        excited = self.play(Excited(problem, self.seed, PUSH, OFTEN), self.new_seeds(each))
         for some in (played, logged, excited):
             self.learn(some)
         if not self.episodes:
@@ -90,6 +106,12 @@ class Simulator:
                 f"None of {2 * each} episodes of the MPC in the simulator has {SHORTEST} steps "
                 "that are all finite: there is nothing to learn from."
             )
+
+    def count(self) -> None:
+        """Count a step before it is taken; OutOfStepsError where none is left."""
+        if self.steps == self.max_steps:
+            raise OutOfStepsError
+        self.steps += 1
 
     def new_seeds(self, count: int) -> range:
         """Return seeds of episodes that nothing has seen."""
@@ -102,7 +124,6 @@ class Simulator:
         if self.max_steps is not None and self.steps + self.longest * len(seeds) > self.max_steps:
             raise OutOfStepsError
         played = rollout(controller, self.envs, seeds, problem=self.problem)
-        self.steps += int(played.lengths.sum())
         self.played += len(seeds)
         self.longest = max(self.longest, int(played.lengths.max(initial=0)))
         return played

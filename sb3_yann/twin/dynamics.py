@@ -132,11 +132,10 @@ class Dynamics:
 
     def _each(self, method: str, z: Array) -> Array:
         """Return what the members say of z (members, batch, k), or all of them of one (1, ...)."""
+        z = np.broadcast_to(z, (len(self.members), *z.shape[1:]))
         if self._stack is not None:
             return np.asarray(getattr(self._stack, method)(z))
-        pairs = zip(
-            self.members, np.broadcast_to(z, (len(self.members), *z.shape[1:])), strict=True
-        )
+        pairs = zip(self.members, z, strict=True)
         return np.array([getattr(member, method)(rows) for member, rows in pairs])
 
     def step(self, theta: Array, u: Array) -> Array:

@@ -17,6 +17,7 @@ HIDDEN = 48  # units in each of two hidden layers
 BATCH = 256  # rows in a step of Adam
 WINDOWS = 32  # windows of a log in a step of Adam
 RATE = 5e-3  # of Adam at first, for single steps; it falls to zero
+ROUNDING = 1e-6  # of float32 observations, in how far the states move
 RIDGE = 1e-6  # of the linear part, relative to the variance of what it is fitted to
 
 
@@ -82,7 +83,7 @@ def fit_ensemble(
     seed : int
         Of the weights and the batches.
     ahead : int, default 1
-        Steps of a window, at most those of an episode.
+        Steps of a window, at most those of the longest episode of any log.
     updates : int, default 3000
         Steps of Adam for single steps; before windows half as many, and for them a fifth.
     """
@@ -90,7 +91,8 @@ def fit_ensemble(
     rows = [[coordinates.regression(each) for each in log] for log in logs]
     pairs = [[np.concatenate(part) for part in zip(*each, strict=True)] for each in rows]
     # Single steps of a simulator are known to many digits, those of a log are not.
-    networks = _Networks(pairs, generator, th.float64 if ahead == 1 else th.float32)
+    dtype = th.float64 if ahead == 1 else th.float32
+    networks = _Networks(pairs, ROUNDING * coordinates.units, generator, dtype)
     networks.fit_steps(pairs, updates if ahead == 1 else updates // 2)
     if ahead > 1:
         networks.fit_windows(coordinates, logs, ahead, updates // 5)
@@ -104,17 +106,21 @@ class _Networks:
     ----------
     pairs : list of [z (rows, k), y (rows, n)]
         What each member is fitted to.
+    least : ndarray, shape (n,)
+        What is smaller in y is rounding.
     generator : torch.Generator
     dtype : torch.dtype
     """
 
-    def __init__(self, pairs: list[list[Array]], generator: th.Generator, dtype: th.dtype) -> None:
+    def __init__(
+        self, pairs: list[list[Array]], least: Array, generator: th.Generator, dtype: th.dtype
+    ) -> None:
         self.generator, self.dtype, count = generator, dtype, len(pairs)
         k, n = pairs[0][0].shape[1], pairs[0][1].shape[1]
         self.center = self.tensor([z.mean(0, keepdims=True) for z, _ in pairs])
         self.width = self.tensor([np.maximum(z.std(0, keepdims=True), 1e-9) for z, _ in pairs])
         linear, units = zip(*(_least_squares(*each) for each in pairs), strict=True)
-        self.unit = self.tensor(units)
+        self.unit = self.tensor(np.maximum(units, least))
 
         def drawn(rows: int, columns: int) -> th.Tensor:
             shape = (count, rows, columns)
@@ -127,7 +133,8 @@ class _Networks:
         self.weights = [drawn(k, HIDDEN), zeros(1, HIDDEN), drawn(HIDDEN, HIDDEN)]
         mean = self.tensor([y.mean(0, keepdims=True) for _, y in pairs])
         self.weights += [zeros(1, HIDDEN), zeros(HIDDEN, n), mean / self.unit]
-        self.weights.append(self.tensor(linear))  # of z that is not standardized
+        # Scaled as all else: a step of Adam is small beside what it changes, whatever its unit.
+        self.weights.append(self.tensor(linear) * self.width.mT / self.unit)
         for each in self.weights:
             each.requires_grad_()
 
@@ -138,8 +145,9 @@ class _Networks:
     def __call__(self, z: th.Tensor) -> th.Tensor:
         """Return what the networks make of z (members, batch, k)."""
         W1, b1, W2, b2, W3, b3, L = self.weights
-        first = th.tanh((z - self.center) / self.width @ W1 + b1)
-        out: th.Tensor = (th.tanh(first @ W2 + b2) @ W3 + b3) * self.unit + (z - self.center) @ L
+        z = (z - self.center) / self.width
+        first = th.tanh(z @ W1 + b1)
+        out: th.Tensor = (th.tanh(first @ W2 + b2) @ W3 + b3 + z @ L) * self.unit
         return out
 
     def fit_steps(self, pairs: list[list[Array]], updates: int) -> None:
@@ -153,8 +161,8 @@ class _Networks:
         self, coordinates: Coordinates, logs: Sequence[Sequence[Episode]], ahead: int, updates: int
     ) -> None:
         """Fit them to windows of the logs, along which they go on from their own predictions."""
-        row, longest = coordinates.row, max(len(each) for log in logs for each in log)
-        ahead = min(ahead, longest)
+        row = coordinates.row
+        ahead = min(ahead, *(max(map(len, log)) for log in logs))  # each log has such a window
         n = row.problem.model.n_states
         windows = []
         for log in logs:
@@ -194,7 +202,7 @@ class _Networks:
         """Return them in scaled coordinates, one by one."""
         with th.no_grad():
             W1, b1, W2, b2, W3, b3, L = self.weights
-            first = W1 / self.width.swapaxes(1, 2)
+            first, L = W1 / self.width.mT, L * self.unit / self.width.mT
             b1 = b1 - self.center @ first
             b3 = b3 * self.unit - self.center @ L
             parts = [first, b1, W2, b2, W3 * self.unit, b3, L]
@@ -209,7 +217,7 @@ def _least_squares(z: Array, y: Array) -> tuple[Array, Array]:
     linear = np.linalg.solve(about.T @ about + ridge * np.eye(z.shape[1]), about.T @ y)
     left = y - about @ linear
     size = np.sqrt(np.mean(left**2, axis=0, keepdims=True))
-    return linear, np.maximum(size, 1e-9 * np.abs(y).max(initial=1e-300))
+    return linear, size
 
 
 def _same_length(parts: list[Array]) -> Array:

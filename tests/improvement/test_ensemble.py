@@ -1,0 +1,147 @@
+"""An ensemble of networks learns what a linear model leaves of a plant's steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_yann.twin.dynamics import Coordinates, Dynamics
+from sb3_yann.twin.ensemble import NetworkResidual, fit_ensemble
+from sb3_yann.twin.log import Episode
+from twin_samples import log, observed, problem
+
+
+def episodes(count: int, noise: float = 0.0, first: int = 0) -> list[Episode]:
+    """Return the cart's episodes, with inputs that are random by half."""
+    rng, law = np.random.default_rng(first), problem().explicit()
+
+    def act(x: np.ndarray) -> np.ndarray:
+        return np.clip(law(x) + rng.uniform(-0.5, 0.5, 1), -1, 1)
+
+    return [Episode(*each) for each in log(count, noise, first, act)]
+
+
+@cache
+def coordinates(noise: float = 0.0) -> Coordinates:
+    return Coordinates.of(problem(), episodes(8, noise))
+
+
+@cache
+def fitted(updates: int = 800) -> tuple[NetworkResidual, ...]:
+    logs = [episodes(8), episodes(8)[:5]]
+    return tuple(fit_ensemble(coordinates(), logs, seed=3, updates=updates))
+
+
+def weights(residuals: tuple[NetworkResidual, ...]) -> list[np.ndarray]:
+    return [part for each in residuals for part in each.weights]
+
+
+def test_it_learns_a_nonlinear_map_that_it_predicts_where_it_has_not_seen_it() -> None:
+    unseen = episodes(5, first=50)
+    z, y = map(np.concatenate, zip(*map(coordinates().regression, unseen), strict=True))
+    about = np.hstack([z, np.ones((len(z), 1))])
+    linear = y - about @ np.linalg.lstsq(about, y, rcond=None)[0]
+    for residual in fitted():
+        error = residual.predict(z) - y
+        assert np.mean(error[:, 1] ** 2) < 0.05 * np.mean(linear[:, 1] ** 2)
+        assert np.abs(error[:, 0]).max() < 1e-3 * coordinates().units[0]  # the model has it
+
+
+def test_members_are_fitted_to_logs_of_their_own() -> None:
+    one, other = fitted()
+    assert not np.allclose(one.weights[4], other.weights[4])
+
+
+@pytest.mark.parametrize("batch", [1, 30])
+def test_its_slopes_are_those_of_differences(batch) -> None:
+    residual, rng = fitted()[0], np.random.default_rng(0)
+    z = rng.uniform(-1, 1, (batch, 3))
+    found, step = residual.jacobian(z), 1e-6
+    for j, e in enumerate(step * np.eye(3)):
+        slope = (residual.predict(z + e) - residual.predict(z - e)) / (2 * step)
+        np.testing.assert_allclose(found[..., j], slope, rtol=1e-6, atol=1e-9)
+
+
+def test_a_stack_is_the_members_one_by_one() -> None:
+    members, rng = fitted(), np.random.default_rng(1)
+    stack, z = NetworkResidual.stack(members), rng.uniform(-1, 1, (2, 7, 3))
+    for at in (z, z[:1]):  # rows of each, or the same for both
+        rows = np.broadcast_to(at, z.shape)
+        for name in ("predict", "jacobian"):
+            single = [getattr(m, name)(r) for m, r in zip(members, rows, strict=True)]
+            np.testing.assert_allclose(getattr(stack, name)(at), single, rtol=1e-12, atol=1e-14)
+
+
+def test_a_seed_repeats_it_and_no_global_random_state_moves() -> None:
+    th.manual_seed(5)
+    first = fit_ensemble(coordinates(), [episodes(8)], seed=1, ahead=5, updates=50)
+    drawn = th.rand(1)
+    th.manual_seed(5)
+    assert th.equal(drawn, th.rand(1))
+    again = fit_ensemble(coordinates(), [episodes(8)], seed=1, ahead=5, updates=50)
+    other = fit_ensemble(coordinates(), [episodes(8)], seed=2, ahead=5, updates=50)
+    for a, b in zip(weights(first), weights(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(first[0].weights[0], other[0].weights[0])
+
+
+def test_windows_do_not_take_noise_of_the_sensors_for_dynamics() -> None:
+    noise, unseen = 0.05, episodes(5, first=50)
+    seen, box = episodes(8, noise), coordinates(noise)
+    errors = []
+    for ahead in (1, 20):
+        members = fit_ensemble(box, [seen], seed=0, ahead=ahead, updates=1000)
+        dynamics = Dynamics(problem(), box, tuple(members))
+        runs = [dynamics.replay(e, np.array([0, 20, 40]), 20)[0, :, -1] for e in unseen]
+        actual = [e.thetas[[20, 40, 60]] for e in unseen]
+        errors.append(np.sqrt(np.mean((np.array(runs) - actual) ** 2)))
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_episodes_that_are_shorter_than_a_window_are_left_out_of_windows_only() -> None:
+    seen = episodes(4)
+    short = [Episode(e.thetas[:9], e.actions[:8]) for e in seen]
+    for log_ in (short, [*short, seen[0]]):
+        (found,) = fit_ensemble(coordinates(), [log_], seed=0, ahead=20, updates=50)
+        assert all(np.isfinite(part).all() for part in found.weights)
+    # Each of the members has short ones of its own, and one that has nothing else.
+    both = fit_ensemble(coordinates(), [short, seen], seed=0, ahead=20, updates=50)
+    assert all(np.isfinite(part).all() for part in weights(tuple(both)))
+
+
+def test_a_plant_that_its_linear_model_describes_leaves_nothing_to_learn() -> None:
+    exact = []
+    for each in episodes(3):
+        thetas = [each.thetas[0]]
+        for u in each.actions:
+            thetas.append(problem().predict(thetas[-1], u))
+        exact.append(Episode(np.array(thetas), each.actions))
+    box = Coordinates.of(problem(), exact)
+    (found,) = fit_ensemble(box, [exact], seed=0, updates=50)
+    z, y = map(np.concatenate, zip(*map(box.regression, exact), strict=True))
+    assert np.abs(y).max() < 1e-12
+    assert np.abs(found.predict(z)).max() < 1e-8
+
+
+def test_beyond_the_data_it_stays_what_it_is_at_their_edge() -> None:
+    dynamics = Dynamics(problem(), coordinates(), fitted())
+    edge = np.array([[[coordinates().high[0], 0.3]]])
+    u = np.zeros((1, 1, 1))
+    far = edge + np.array([50.0, 0.0])
+    np.testing.assert_allclose(dynamics.residual(far, u), dynamics.residual(edge, u))
+    np.testing.assert_allclose(dynamics.jacobians(far, u)[0][:, 0, 1, 0], 0.0, atol=1e-15)
+
+
+def test_with_an_observer_it_is_fitted_to_what_the_plant_did() -> None:
+    twin = observed()
+    box = twin.dynamics.coordinates
+    (found,) = fit_ensemble(box, [twin.episodes], seed=0, ahead=5, updates=400)
+    learnt = replace(twin.dynamics, members=(found,))
+    one = twin.episodes[0]
+    rows = learnt.step(one.thetas[None, :-1], one.actions[None])[0]
+    error = (rows - one.thetas[1:])[:, box.row.state] / box.units
+    assert np.sqrt(np.mean(error**2)) < 0.02

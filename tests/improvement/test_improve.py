@@ -1,0 +1,546 @@
+"""A policy that is improved is better on the plant, or stays what it was."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import pickle
+from contextlib import closing
+from functools import cache, partial
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3 import DDPG, TD3
+
+from improvement_samples import FEW, Counted, Elsewhere, Plain, Spring, bits, model_of, quick
+from sb3_yann import (
+    LinearMPC,
+    NoActionNoise,
+    PlantTwin,
+    Tracking,
+    UntrustedTwinError,
+    YannPolicy,
+    improve,
+)
+from sb3_yann.audit.finding import CostMismatchWarning
+from sb3_yann.evaluation import evaluate
+from sb3_yann.improvement import Check, Improvement
+from sb3_yann.wrappers import SetPoint
+from twin_samples import Calm, observed_env, offset_free_problem, problem
+from weights import is_mpc
+
+UNSEEN = range(900, 930)
+module = importlib.import_module("sb3_yann.improvement.improve")
+
+
+@pytest.fixture(autouse=True)
+def brisk(monkeypatch) -> None:
+    quick(monkeypatch)
+
+
+@cache
+def mpc_cost() -> np.ndarray:
+    return evaluate(problem().explicit(), Spring, UNSEEN).costs
+
+
+def relative(model) -> np.ndarray:
+    """Return what unseen episodes cost, relative to the MPC."""
+    return evaluate(model, Spring, UNSEEN).costs / mpc_cost()
+
+
+@cache
+def better() -> bytes:
+    """Return a model that was improved, pickled."""
+    with pytest.MonkeyPatch.context() as patch:
+        quick(patch)
+        model = model_of()
+        found = improve(model, Spring, **FEW)
+    return pickle.dumps((bits(model), found, model.policy.state_dict()))
+
+
+# ------------------------------------------------------------------------------- in a simulator
+
+
+@pytest.mark.parametrize("kind", [DDPG, TD3])
+def test_a_policy_gains_on_starts_that_it_has_not_seen(kind, tmp_path) -> None:
+    model = model_of(kind=kind)
+    found = improve(model, Spring, **FEW)
+    assert found.accepted and found.where == "the simulator" and found.model is model
+    assert found.change < -0.01 and found.checks[-1].final
+    assert relative(model).mean() < 0.99 and relative(model).max() < 1.005
+    target, own = model.actor_target.state_dict(), model.actor.state_dict()
+    assert all(th.equal(target[name], each) for name, each in own.items())
+    model.save(tmp_path / "model")
+    again = kind.load(tmp_path / "model", env=Spring(), device="cpu")
+    theta = np.float32([0.5, -0.2])
+    np.testing.assert_array_equal(again.predict(theta)[0], model.predict(theta)[0])
+    (kept,) = again.improvements
+    assert kept.report() == found.report() and kept.model is None
+    assert kept.settings == {**FEW, "confine": True, "seed": 0} and kept.policy == found.policy
+    again.learn(15, callback=NoActionNoise())
+
+
+def test_its_steps_are_counted_and_its_envs_closed() -> None:
+    Counted.forget()
+    model = model_of(Counted)
+    made = Counted.made
+    found = improve(model, Counted, **FEW)
+    assert found.steps == Counted.steps > 0
+    assert f"{found.steps:,} steps of the simulator" in str(found)
+    assert Counted.closed == Counted.made - made
+    assert 20 * (found.episodes + 1) == found.steps  # the first episode is played twice
+
+
+@pytest.mark.parametrize("share", [1.0, 0.99, 0.3, 0.004])
+def test_it_takes_no_step_more_than_it_may(share) -> None:
+    whole = pickle.loads(better())[1].steps
+    most = max(int(share * whole), 1)
+    Counted.forget()
+    model = model_of(Counted)
+    before, made = bits(model), Counted.made
+    found = improve(model, Counted, max_steps=most, **FEW)
+    assert found.steps == Counted.steps <= most
+    assert Counted.closed == Counted.made - made
+    assert found.accepted == (share == 1.0)
+    if not found.accepted:
+        assert bits(model) == before and found.change == 0.0
+        assert f"max_steps = {most:,} are too few to go on" in found.reason
+        assert "The model is as it was" in found.report()
+
+
+def test_where_there_is_nothing_to_gain_the_model_stays_bit_for_bit() -> None:
+    model = model_of(Plain)
+    before = bits(model)
+    found = improve(model, Plain, **FEW)
+    assert not found.accepted and found.change == 0.0 and is_mpc(model)
+    assert found.reason.startswith("Nothing better was found: plans gain ")
+    assert bits(model) == before
+
+
+@pytest.mark.parametrize("share", [0.3, -0.3])
+def test_whatever_is_taught_nothing_worse_is_accepted(monkeypatch, share) -> None:
+    def wrong(layer, problem, rows, inputs, rng, updates):
+        for each in layer.network.weights():
+            with th.no_grad():
+                each.add_(share)
+
+    monkeypatch.setattr("sb3_yann.improvement.imitation.fit_layer", wrong)
+    model = model_of()
+    before = bits(model)
+    found = improve(model, Spring, **FEW)
+    assert not found.accepted and found.reason and bits(model) == before
+
+
+class Limited(Spring):
+    """Says that whoever leaves the MPC breaks a limit, from some starts."""
+
+    def reset(self, *, seed=None, options=None):
+        self.bad = seed is not None and seed % 7 == 0
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        left = np.abs(problem().explicit()(self.x.astype(np.float32)) - action).max() > 1e-3
+        *rest, info = super().step(action)
+        return *rest, {**info, "violation": bool(self.bad and left)}
+
+
+def test_a_policy_that_breaks_a_limit_is_refused_whatever_it_gains() -> None:
+    model = model_of(Limited)
+    before = bits(model)
+    found = improve(model, Limited, **FEW)
+    assert not found.accepted and bits(model) == before
+    assert "starts with violations" in found.reason
+
+
+def test_what_was_learnt_before_is_kept_or_bettered() -> None:
+    before, first, state = pickle.loads(better())
+    model = model_of()
+    model.policy.load_state_dict(state)
+    assert bits(model) == before
+    kept = relative(model).mean()
+    second = improve(model, Spring, seed=1, **FEW)
+    assert first.before is None and second.before is not None
+    assert second.before.accepted and second.before.change < -0.01
+    assert relative(model).mean() <= kept + 0.002
+    if not second.accepted:
+        assert bits(model) == before
+
+
+def test_a_seed_repeats_it_and_no_global_random_state_moves() -> None:
+    np.random.seed(3)  # noqa: NPY002
+    th.manual_seed(3)
+    model = model_of()
+    np.random.seed(3)  # noqa: NPY002
+    th.manual_seed(3)
+    found = improve(model, Spring, **FEW)
+    drawn = np.random.rand(), float(th.rand(1))  # noqa: NPY002
+    np.random.seed(3)  # noqa: NPY002
+    th.manual_seed(3)
+    assert drawn == (np.random.rand(), float(th.rand(1)))  # noqa: NPY002
+    weights, before, _ = pickle.loads(better())
+    assert bits(model) == weights and found.policy == before.policy
+    assert found.checks == before.checks
+
+
+def test_an_mpc_gets_a_model_with_one_network_and_moves_no_random_state(tmp_path) -> None:
+    np.random.seed(3)  # noqa: NPY002
+    th.manual_seed(3)
+    found = improve(problem(), Spring, **FEW)
+    drawn = np.random.rand(), float(th.rand(1))  # noqa: NPY002
+    np.random.seed(3)  # noqa: NPY002
+    th.manual_seed(3)
+    assert drawn == (np.random.rand(), float(th.rand(1)))  # noqa: NPY002
+    assert isinstance(found.model, DDPG) and found.model.policy.problem == problem()
+    assert found.accepted and relative(found.model).mean() < 0.99
+    assert found.export(tmp_path / "controller.npz").paths
+    assert len(found.model.actor.mu.network.first.nodes) == 1
+
+
+def test_a_largest_correction_is_kept() -> None:
+    model = model_of(max_correction=0.05)
+    improve(model, Spring, **FEW)
+    theta = np.random.default_rng(0).uniform(-2, 2, (50, 2)).astype(np.float32)
+    apart = np.abs(model.predict(theta)[0] - problem().explicit()(theta))
+    assert apart.max() <= 0.05 * 2 + 1e-6
+
+
+def test_a_given_env_is_copied_and_left_where_it_is() -> None:
+    env = Spring()
+    env.reset(seed=5)
+    x = env.x.copy()
+    found = improve(model_of(), env, **FEW)
+    np.testing.assert_array_equal(env.x, x)
+    assert env.t == 0 and found.accepted
+
+
+def test_lines_say_what_is_done_and_read_well_in_a_file(capsys) -> None:
+    improve(model_of(), Spring, progress_bar=True, **FEW)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) >= 3 and all(line.startswith("[") for line in lines)
+    assert not any("\r" in line or "\x1b" in line for line in lines)
+    assert "episodes of the MPC, half with random inputs" in lines[0]
+    assert "the model promises" in lines[1] and "the simulator shows" in lines[1]
+    assert "confirmation on" in lines[-1] and lines[-1].endswith("accepted")
+    improve(model_of(Plain), Plain, **FEW)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("where", "error"),
+    [("imitate", KeyboardInterrupt), ("confirm", MemoryError), ("refit_critic", KeyboardInterrupt)],
+)
+def test_what_is_cut_off_leaves_the_model_as_it_was(monkeypatch, where, error) -> None:
+    def cut(*_):
+        raise error
+
+    monkeypatch.setattr(module, where, cut)
+    Counted.forget()
+    model = model_of(Counted)
+    before, made = bits(model), Counted.made
+    with pytest.raises(error):
+        improve(model, Counted, **FEW)
+    assert bits(model) == before and is_mpc(model)
+    assert not hasattr(model, "improvements")
+    assert Counted.closed == Counted.made - made
+
+
+def test_a_reward_of_its_own_is_named_at_the_caller_s_line() -> None:
+    class Own(Spring):
+        def step(self, action):
+            shown, _, *rest = super().step(action)
+            return shown, float(self.x[0] ** 3 + self.t % 2), *rest
+
+    with pytest.warns(CostMismatchWarning) as caught:
+        improve(model_of(Own), Own, max_steps=1300, **FEW)
+    assert caught[0].filename == __file__
+
+
+def tracking() -> LinearMPC:
+    return LinearMPC(
+        problem().model, Q=np.diag([1.0, 0.0]), R=[[0.1]], horizon=3, gamma=0.95,
+        u_min=-1, u_max=1, theta_min=[-3, -3], theta_max=[3, 3], tracking=Tracking([0], -1, 1),
+    )  # fmt: skip
+
+
+class Stiff(Spring):
+    """Rests beside its set-points under the MPC."""
+
+    stiffness = 0.8
+
+
+def followed() -> gym.Env:
+    return TimeLimit(SetPoint(Stiff(1000), -1, 1, hold=30), 30)
+
+
+def test_set_points_are_followed_for_less() -> None:
+    mpc = tracking()
+    model = DDPG(YannPolicy, followed(), device="cpu", policy_kwargs={"problem": mpc})
+    found = improve(model, followed, **FEW)
+    assert found.accepted and found.change < -0.02
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::sb3_yann.audit.finding.CostMismatchWarning")
+def test_an_observer_is_a_part_of_the_model() -> None:
+    mpc, make = offset_free_problem()[0], lambda: observed_env(Calm(20))
+    model = DDPG(YannPolicy, make(), device="cpu", policy_kwargs={"problem": mpc})
+    before = bits(model)
+    found = improve(model, make, n_starts=4, rounds=1, updates=100)
+    assert found.steps > 0 and found.checks
+    assert found.accepted != (bits(model) == before)
+
+
+class Short(Spring):
+    """Ends at once."""
+
+    def __init__(self) -> None:
+        super().__init__(steps=3)
+
+
+class Strange(Spring):
+    """Shows one value more."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = gym.spaces.Box(-3, 3, (3,), np.float32)
+
+
+class Unseeded(Spring):
+    """Draws its starts from elsewhere."""
+
+    def reset(self, *, seed=None, options=None):
+        found = super().reset(seed=seed)
+        self.x = np.random.default_rng().uniform(-1, 1, 2)
+        return self.x.astype(np.float32), found[1]
+
+
+@pytest.mark.parametrize(
+    ("make", "what"),
+    [
+        (Unseeded, r"the env does not repeat it.*wrap it in sb3_yann.wrappers.SeededGlobals"),
+        (
+            Short,
+            r"None of \d+ episodes of the MPC in the simulator has \d+ steps that are all",
+        ),
+        (Strange, r"The simulator shows \(3,\) and takes \(1,\); theta of the model's problem has"),
+    ],
+)
+def test_a_simulator_that_will_not_do_is_named(make, what) -> None:
+    model = model_of()
+    before = bits(model)
+    with pytest.raises(ValueError, match=what):
+        improve(model, make, **FEW)
+    assert bits(model) == before
+
+
+class Rare(Spring):
+    """Shows nothing that is finite from some starts."""
+
+    def reset(self, *, seed=None, options=None):
+        self.bad = seed is not None and seed % 4 == 0
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        shown, *rest = super().step(action)
+        return (np.full(2, np.nan, np.float32) if self.bad else shown), *rest
+
+
+def test_starts_from_which_the_mpc_itself_is_lost_count_for_nothing() -> None:
+    found = improve(model_of(Rare), Rare, **FEW)
+    assert found.accepted and found.change < -0.01
+
+
+def test_what_is_no_simulator_or_no_model_is_refused() -> None:
+    model = model_of()
+    with pytest.raises(TypeError, match="or a function that makes one"):
+        improve(model, [Spring(), Spring()])
+    with closing(gym.make_vec("CSTR-v0", num_envs=2)) as several:
+        with pytest.raises(TypeError, match="a single gymnasium"):
+            improve(model, several)
+    with pytest.raises(TypeError, match=r"made None. It must return a gymnasium.Env"):
+        improve(model, lambda: None)
+    with pytest.raises(TypeError, match="twin = 3 must be a PlantTwin; or a simulator"):
+        improve(model, 3)
+    with pytest.raises(TypeError, match="improve needs a YannPolicy"):
+        improve(DDPG("MlpPolicy", Spring(), device="cpu"), Spring)
+    for name in ("n_starts", "rounds", "updates", "max_steps"):
+        with pytest.raises(ValueError, match=name):
+            improve(model, Spring, **{name: 0})
+
+
+# ------------------------------------------------------------------------------------ in a twin
+
+
+ENOUGH = {"n_starts": 10, "rounds": 2, "updates": 300}
+
+
+@cache
+def twin_of(make=Spring, episodes: int = 5) -> PlantTwin:
+    """Return the twin of episodes of a plant's MPC."""
+    mpc = make().observation_space.problem
+    played = evaluate(mpc.explicit(), make, range(episodes))
+    pairs = [*zip(played.observations, played.actions, strict=True)]
+    return PlantTwin.fit(mpc, pairs, residuals=["none", "linear", "quadratic", "cubic"])
+
+
+def reactor(seeds: range) -> PlantTwin:
+    """Return the reactor's twin from episodes of its MPC."""
+    mpc = DDPG("YannPolicy", "CSTR-v0", device="cpu").policy.problem
+    played = evaluate(mpc.explicit(), "CSTR-v0", seeds)
+    kinds = ["none", "linear", "quadratic", "cubic"]
+    pairs = [*zip(played.observations, played.actions, strict=True)]
+    return PlantTwin.fit(mpc, pairs, residuals=kinds)
+
+
+@pytest.mark.slow
+def test_on_the_reactor_a_log_of_five_episodes_is_enough(tmp_path) -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", device="cpu", seed=0, learning_starts=0)
+    twin = reactor(range(5))
+    found = improve(model, twin, n_starts=20, updates=1000)
+    assert found.accepted and found.change < -0.01 and found.where == "the twin"
+    assert found.steps == 0 and found.episodes == 5
+    assert "of the MPC's stage cost in the twin" in str(found)
+    plain = DDPG("YannPolicy", "CSTR-v0", device="cpu")
+    ours, mpc = (evaluate(each, "CSTR-v0", range(500, 530)) for each in (model, plain))
+    assert np.mean(ours.costs) < 0.99 * np.mean(mpc.costs)
+    assert ours.violations.sum() == 0
+    low, high = twin.starts.shown  # beyond what the log shows the MPC acts
+    far = np.float32((low + high) / 2 + 0.8 * (high - low) * np.eye(4))
+    np.testing.assert_array_equal(model.predict(far)[0], plain.predict(far)[0])
+    model.save(tmp_path / "model")
+    again = DDPG.load(tmp_path / "model", env=gym.make("CSTR-v0"))
+    theta = np.float32([0.01, 0.1, -0.1, 1.0])
+    np.testing.assert_array_equal(again.predict(theta)[0], model.predict(theta)[0])
+    assert again.improvements[-1].report() == found.report()
+    again.learn(20, callback=NoActionNoise())
+
+
+def test_a_policy_of_a_twin_gains_on_the_plant(capsys) -> None:
+    model = model_of()
+    found = improve(model, twin_of(), progress_bar=True, **ENOUGH)
+    assert found.accepted and found.where == "the twin" and found.source == repr(twin_of())
+    assert found.change < -0.01 and found.episodes == 5 and found.steps == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "in the twin" in lines[0] and "no worse anywhere" in lines[-1]
+    assert relative(model).mean() < 0.995 and relative(model).max() < 1.01
+    again = model_of()
+    assert improve(again, twin_of(), **ENOUGH).checks == found.checks
+    assert bits(again) == bits(model)
+
+
+@pytest.mark.parametrize("source", ["simulator", "twin"])
+def test_in_plant_units_it_finds_the_same(source) -> None:
+    if source == "twin":
+        plain, found = (
+            improve(model_of(make), twin_of(make), **ENOUGH) for make in (Spring, Elsewhere)
+        )
+    else:
+        plain = pickle.loads(better())[1]
+        found = improve(model_of(Elsewhere), Elsewhere, **FEW)
+    assert plain.accepted and found.accepted
+    assert found.change == pytest.approx(plain.change, rel=0.05)
+
+
+def test_what_no_check_lets_through_changes_nothing(monkeypatch) -> None:
+    from sb3_yann.improvement import trial
+
+    monkeypatch.setattr(trial, "MARGIN", -1.0)  # no start can pass
+    model = model_of()
+    before = bits(model)
+    found = improve(model, twin_of(), **FEW)
+    assert not found.accepted and found.change == 0 and bits(model) == before
+    assert not any(each.accepted for each in found.checks)
+
+
+def test_a_twin_that_is_not_trusted_is_refused() -> None:
+    model = model_of()
+    before = bits(model)
+    with pytest.raises(UntrustedTwinError, match="There is one episode"):
+        improve(model, twin_of(episodes=1))
+    with pytest.raises(ValueError, match=r"Fit the twin with model\.policy\.problem"):
+        improve(DDPG("YannPolicy", "CSTR-v0", device="cpu"), twin_of())
+    assert bits(model) == before
+
+
+def test_the_critic_is_refitted_to_the_returns_of_the_twin(monkeypatch) -> None:
+    from sb3_yann.improvement import critic
+
+    for name, value in {"SAMPLES": 1000, "STEPS": 60, "UPDATES": 1000}.items():
+        monkeypatch.setattr(critic, name, value)
+    model, rng = model_of(), np.random.default_rng(5)
+    at = twin_of().starts.draw_logged(500, rng)
+    u = np.clip(problem().explicit()(at) + 0.1 * rng.standard_normal((500, 1)), -1, 1)
+    returns = -critic._costs(model.policy, twin_of(), model.actor.mu, at, u)
+    known = np.isfinite(returns)
+
+    def error() -> float:
+        with th.no_grad():
+            points = th.as_tensor(np.hstack([at, u]))
+            off = model.critic.values(points)[0].numpy()[:, 0] - returns
+            return float(np.abs(off[known]).mean())
+
+    before = error()
+    critic.refit_critic(model.policy, twin_of(), seed=0)
+    assert error() < 0.8 * before
+    same = model.critic_target.state_dict()
+    assert all(th.equal(each, same[name]) for name, each in model.critic.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("ratio", "error", "least"), [(0.9, 0.0, 2e-3), (0.4, 0.0, 2e-4), (0.4, 0.18, 0.018)]
+)
+def test_a_twin_must_promise_more_the_more_its_costs_err(ratio, error, least) -> None:
+    trust = SimpleNamespace(error_ratio=ratio, cost_error=error)
+    assert module.least_gain(trust) == pytest.approx(least)
+
+
+# -------------------------------------------------------------------------------------- in words
+
+
+def test_a_report_says_what_was_accepted_or_why_nothing_was() -> None:
+    passed = Check(1, True, "", -0.021, 0.0004, True, -0.015, 0.003)
+    refused = Check(2, False, "2 starts with violations", -0.03, 0.0, False)
+    said = "-1.50 % (± 0.30) {}, +0.04 % from the worst start. 1 of 2 checks passed."
+    found = Improvement((refused, passed), -0.021, accepted=True)
+    assert found.reason == "" and str(found) == found.report()
+    assert found.report() == (
+        "Accepted: -2.10 % of the MPC's stage cost in the twin, "
+        + said.format("on episodes like the log's")
+    )
+    there = Improvement((refused, passed), -0.021, accepted=True, where="the simulator", steps=5000)
+    assert there.report() == (
+        "Accepted: -2.10 % of the MPC's stage cost in the simulator, "
+        + said.format("of an episode's own on average")
+        + " 5,000 steps of the simulator."
+    )
+    assert Improvement((refused,), 0.0, accepted=False).report() == (
+        "Nothing better was found: 2 starts with violations. The model is as it was. "
+        "0 of 1 checks passed."
+    )
+    small = Check(1, True, "", -4e-4, 0.0, True)
+    assert "a gain of 0.04 % in the twin is too small, or not sure" in str(
+        Improvement((small,), 0.0, accepted=False)
+    )
+    assert Improvement((), 0.0, False).reason == "Nothing better was found: no gain in the twin."
+
+
+def test_what_a_final_check_says_is_the_reason() -> None:
+    refused = partial(Check, change=0.01, worst=0.0, safe=True)
+    checks = (
+        refused(1, False, "early"),
+        refused(2, False, "the last word", final=True),
+        refused(3, True, ""),
+    )
+    assert "the last word" in Improvement(checks, 0.0, False).reason
+    assert "no steps left" in Improvement(checks, 0.0, False, note="no steps left").reason
+
+
+def test_a_copy_of_a_model_is_not_shared() -> None:
+    model = model_of()
+    other = copy.deepcopy(model.policy)
+    assert improve(model, Spring, **FEW).accepted
+    assert other.actor.mu.network.is_zero()

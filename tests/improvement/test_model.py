@@ -1,0 +1,152 @@
+"""Episodes in a learnt model are those of its steps, and members that disagree have a price."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import numpy as np
+import pytest
+
+from sb3_yann.audit.closed_loops import of_law
+from sb3_yann.audit.plants import TwinPlant
+from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.improvement import model as module
+from sb3_yann.improvement.model import Disagreement, Model, Scenarios, SimulatorModel
+from sb3_yann.twin.ensemble import fit_ensemble
+from sb3_yann.twin.log import Episode
+from twin_samples import log, observed, problem, rated
+
+
+@cache
+def learnt() -> SimulatorModel:
+    """Return a model of a few episodes of the cart, of which one is short."""
+    seen = [Episode(*each) for each in log(4)]
+    seen[1] = Episode(seen[1].thetas[:31], seen[1].actions[:30])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "fit_ensemble", partial(fit_ensemble, updates=200))
+        return SimulatorModel.fit(problem(), seen, None, seed=0)
+
+
+def scenarios(found: Model, each: bool) -> Scenarios:
+    rng = np.random.default_rng(0)
+    return Scenarios.like(found, found.episodes[:4], rng, each)
+
+
+def by_hand(found: Scenarios) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows (T + 1, k, size) and inputs of the law, step by step and one by one."""
+    dynamics, law = found.model.dynamics, found.model.problem.law()
+    bounds = found.model.problem.deviations.u_min, found.model.problem.deviations.u_max
+    row, rows, inputs = dynamics.row, [], []
+    for i, start in enumerate(found.starts):
+        at, one, us = start.copy(), [], []
+        for given in found.given[:, i]:
+            at[row.given] = given
+            us.append(np.clip(law(row.shown(at)), *bounds))
+            every = [np.tile(v, (len(dynamics.members), 1, 1)) for v in (at, us[-1])]
+            after = dynamics.step(*every)[:, 0]
+            one.append(at)
+            at = after.mean(axis=0) if found.members is None else after[found.members[i]]
+        rows.append([*one, at])
+        inputs.append(us)
+    return np.swapaxes(rows, 0, 1), np.swapaxes(inputs, 0, 1)
+
+
+@pytest.mark.parametrize("each", [False, True])
+@pytest.mark.parametrize("make", [learnt, rated, observed])
+def test_an_episode_is_a_loop_of_the_members_steps(make, each) -> None:
+    found = scenarios(make(), each)
+    mpc, row = found.model.problem, found.model.dynamics.row
+    played, (rows, inputs) = found.play(of_law(mpc)), by_hand(found)
+    thetas = row.shown(rows)
+    np.testing.assert_allclose(played.thetas, thetas, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(played.inputs, inputs, rtol=1e-9, atol=1e-12)
+    excess = bound_excess(mpc, thetas, inputs)
+    costs = mpc.stage_cost(thetas[:-1], inputs).sum(axis=0) + excess.penalty
+    np.testing.assert_allclose(played.costs, costs)
+    assert played.unsafe.shape == (len(found), 9) and not played.unsafe[:, :4].any()
+
+
+def test_half_of_them_begin_as_their_episode_did_and_the_others_in_its_box() -> None:
+    found = scenarios(learnt(), each=False)
+    first = np.array([each.thetas[0] for each in learnt().episodes])
+    np.testing.assert_array_equal(found.starts[::2], first[::2])
+    moved, box = found.starts[1::2], learnt().starts
+    assert np.all((moved >= box.low) & (moved <= box.high))
+    assert not np.any(moved == first[1::2])
+    again = scenarios(learnt(), each=False)
+    np.testing.assert_array_equal(found.starts, again.starts)
+    assert found.given.shape == (60, 4, 0)  # as long as the longest
+
+
+def test_references_are_those_of_the_episodes_and_stay_after_their_end() -> None:
+    found, model = scenarios(observed(), each=True), observed()
+    part = model.dynamics.row.given
+    for i, each in enumerate(model.episodes[:4]):
+        np.testing.assert_array_equal(found.given[:, i], each.thetas[: len(each), part])
+    assert np.array_equal(found.members, np.arange(4) % len(model.dynamics.members))
+
+
+def test_an_input_beyond_its_bounds_is_clipped_and_one_that_is_none_is_zero() -> None:
+    found = scenarios(learnt(), each=False)
+
+    def act(t, theta, rows):
+        return np.where(rows[:, None] == 0, np.nan, 7.0)
+
+    played = found.play(act)
+    assert np.all(played.inputs[:, 0] == 0) and np.all(played.inputs[:, 1:] == 1)
+
+
+def test_what_is_not_finite_is_lost_and_has_no_cost() -> None:
+    found = scenarios(learnt(), each=False)
+    found.starts[2] = np.nan
+    played = found.play(of_law(problem()))
+    assert np.isinf(played.costs[2]) and played.unsafe[2, 2] == 1
+    assert np.isfinite(played.costs[[0, 1, 3]]).all() and not played.unsafe[[0, 1, 3], 2].any()
+
+
+@pytest.mark.parametrize("members", [None, [0, 1, 0]])
+@pytest.mark.parametrize("make", [learnt, rated, observed])
+def test_slopes_of_a_plant_are_those_of_its_steps(make, members) -> None:
+    found, rng = make(), np.random.default_rng(2)
+    mpc, numbers, size = found.problem, np.arange(3), 1e-6
+    plant = TwinPlant(found.dynamics, members)
+    half = 0.2 * mpc.theta_half
+    theta = half * rng.uniform(-1, 1, (4, 3, mpc.n_theta))
+    u = rng.uniform(-0.5, 0.5, (4, 3, 1))
+    A, B = plant.jacobians(theta, u, numbers)
+    for t in range(4):
+        for j, e in enumerate(size * np.eye(mpc.n_theta)):
+            ends = [plant.step(theta[t] + s * e, u[t], numbers) for s in (1, -1)]
+            np.testing.assert_allclose(A[t, ..., j], (ends[0] - ends[1]) / 2e-6, atol=1e-5)
+        ends = [plant.step(theta[t], u[t] + s * size, numbers) for s in (1, -1)]
+        np.testing.assert_allclose(B[t, ..., 0], (ends[0] - ends[1]) / 2e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [learnt, rated])
+def test_the_price_of_doubt_is_that_of_what_sets_members_apart(make) -> None:
+    dynamics, rng = make().dynamics, np.random.default_rng(3)
+    doubt, n = Disagreement(dynamics, weight=2.5), dynamics.problem.n_theta
+    thetas, u = rng.uniform(-0.8, 0.8, (5, 3, n)), rng.uniform(-0.9, 0.9, (5, 3, 1))
+    state = dynamics.row.state
+    every = [np.tile(v.reshape(1, 15, -1), (len(dynamics.members), 1, 1)) for v in (thetas, u)]
+    after = dynamics.step(*every)[..., state] / dynamics.coordinates.units
+    price = 2.5 * after.var(axis=0).sum(axis=-1).reshape(5, 3)
+    np.testing.assert_allclose(doubt.costs(thetas, u), price, rtol=1e-6)
+    gradient, curvature = doubt.slopes(thetas, u)
+    assert gradient.shape == (5, 3, n + 1) and curvature.shape == (5, 3, n + 1, n + 1)
+    step = 1e-5
+    for j, e in enumerate(step * np.eye(n + 1)):
+        ends = [doubt.costs(thetas + s * e[:n], u + s * e[n:]) for s in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(gradient[..., j], slope, rtol=1e-4, atol=1e-6 * price.max())
+    np.testing.assert_allclose(curvature, np.swapaxes(curvature, -1, -2))
+    assert np.linalg.eigvalsh(curvature).min() > -1e-9 * np.abs(curvature).max()
+
+
+def test_members_that_agree_cost_nothing() -> None:
+    dynamics = learnt().dynamics
+    same = type(dynamics)(problem(), dynamics.coordinates, (dynamics.members[0],) * 2)
+    at = np.full((3, 2, 2), 0.4), np.full((3, 2, 1), 0.2)
+    doubt = Disagreement(same, weight=1e6)
+    assert not doubt.costs(*at).any()
+    assert not any(each.any() for each in doubt.slopes(*at))
