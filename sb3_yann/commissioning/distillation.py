@@ -35,13 +35,13 @@ def law_today(twin: PlantTwin) -> Callable[[Array], Array] | None:
         _choose_law(today, twin.problem)
     except (ValueError, ExplicitLimitError, ExplicitSolutionError):
         return None  # no steady state, no Riccati solution, too large, or too badly conditioned
-    layout, before, law = today.layout, twin.problem.model, law_of(today)
-    x, u = today.model.x_ss - before.x_ss, today.model.u_ss - before.u_ss
-    shift = np.zeros(layout.size)
-    shift[layout.state] = x
-    if layout.n_previous:
-        shift[layout.previous] = u
-    return lambda rows: law(rows - shift) + u
+    law, own, its = law_of(today), twin.problem.units, today.units
+
+    def act(rows: Array) -> Array:
+        u = law(its.to_deviations(own.to_plant(rows)))
+        return own.input_to_deviations(its.input_to_plant(u))
+
+    return act
 
 
 def _choose_law(today: LinearMPC, before: LinearMPC) -> None:
