@@ -208,8 +208,8 @@ class Log:
             content = list(rows)
         if twice := [name for name in wanted if wanted.count(name) > 1]:
             raise ValueError(
-                f"Column {twice[0]!r} is named twice. Of states, inputs and disturbances each is one "
-                "column."
+                f"Column {twice[0]!r} is named twice. Each state, input and disturbance has a "
+                "column of its own."
             )
         if longer := [k for k, row in enumerate(content) if rows.restkey in row]:
             raise ValueError(
