@@ -42,6 +42,7 @@ _NAMES = {
     "sb3_yann.reporting": "report",
     "sb3_yann.simulated_episodes": "SimulatedEpisodes",
     "sb3_yann.twin": "PlantTwin UntrustedTwinError",
+    "sb3_yann.wrappers": "PlantEnv",
     "sb3_yann_envs": "ActionRepeat",
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -49,6 +49,7 @@ from sb3_yann.reporting import report as report
 from sb3_yann.simulated_episodes import SimulatedEpisodes as SimulatedEpisodes
 from sb3_yann.twin import PlantTwin as PlantTwin
 from sb3_yann.twin import UntrustedTwinError as UntrustedTwinError
+from sb3_yann.wrappers import PlantEnv as PlantEnv
 from sb3_yann_envs import ActionRepeat as ActionRepeat
 
 __version__: str

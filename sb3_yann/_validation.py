@@ -85,16 +85,14 @@ def check_bounds(
     lower: ArrayLike | None,
     upper: ArrayLike | None,
     size: int,
-    *,
-    ordered: bool = True,
 ) -> tuple[Array, Array]:
-    """Return bounds of shape ``(size,)``, where ``ordered`` the lower below the upper.
+    """Return bounds of shape ``(size,)``, the lower below the upper.
 
     A scalar is for all entries; None and infinity are no bound. A finite one has at most 1e100.
     """
     low = _bound(f"{name}_min", lower, size, -np.inf)
     high = _bound(f"{name}_max", upper, size, np.inf)
-    if ordered and np.any(low >= high):
+    if np.any(low >= high):
         i = int(np.argmax(low >= high))
         given = f"{name}_min = {low[i]:g} and {name}_max = {high[i]:g}"
         raise ValueError(f"{name}_min must lie below {name}_max, but entry {i} has {given}.")

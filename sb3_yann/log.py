@@ -188,8 +188,8 @@ class Log:
         Raises
         ------
         ValueError
-            For a column that is not there, or a row that holds no number where it should. Rows
-            without any reading end an episode.
+            For a column that is not there or there twice, a row that holds no number where it
+            should, or one that is longer than the header. Rows without any reading end an episode.
         """
         for name, given in (("states", states), ("inputs", inputs)):
             if isinstance(given, str) or not given:
@@ -201,7 +201,21 @@ class Log:
             named = [*wanted, *(each for each in (episode, time) if each is not None)]
             if missing := [name for name in named if name not in header]:
                 raise ValueError(f"{path} has no column {missing[0]!r}; it has {list(header)}.")
+            if twice := [name for name in named if header.count(name) > 1]:
+                raise ValueError(
+                    f"{path} has several columns {twice[0]!r}: give each its own name."
+                )
             content = list(rows)
+        if twice := [name for name in wanted if wanted.count(name) > 1]:
+            raise ValueError(
+                f"Column {twice[0]!r} is named twice. Each state, input and disturbance has a "
+                "column of its own."
+            )
+        if longer := [k for k, row in enumerate(content) if rows.restkey in row]:
+            raise ValueError(
+                f"{path}, row {longer[0] + 2} has more entries than the header has names. Numbers "
+                f"with a decimal comma need another delimiter than {delimiter!r}, and a point."
+            )
         table = np.array(
             [[_number(path, k, row, name) for name in wanted] for k, row in enumerate(content)]
         )

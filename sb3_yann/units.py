@@ -88,7 +88,7 @@ def fields_in_deviations(problem: Any) -> dict[str, Any]:
     return {
         **{name: getattr(problem, name) for name in problem.__dataclass_fields__},
         **own,
-        "model": type(model)(**{**vars(model), "x_ss": None, "u_ss": None, "d_ss": None}),
+        "model": model.about_zero(),
         "terminal": terminal,
         "tracking": replace(tracking, r_min=tracking.r_min - r_ss, r_max=tracking.r_max - r_ss),
         "outputs": replace(outputs, y_min=outputs.y_min - y_ss, y_max=outputs.y_max - y_ss),

@@ -137,6 +137,21 @@ def test_a_csv_file_that_does_not_fit_is_named(tmp_path) -> None:
         Log.from_csv(path, states=["level"], inputs=["valve"], dt=10)
 
 
+@pytest.mark.parametrize(
+    ("text", "states", "said"),
+    [
+        ("level,level,valve\n1,2,3\n4,5,6\n", ["level"], "several columns 'level'"),
+        ("level,valve\n1,2\n3,4\n", ["level", "valve"], "'valve' is named twice"),
+        ("level,valve\n1,2\n1,5,2,3\n", ["level"], "row 3 has more entries than the header"),
+    ],
+)
+def test_a_csv_file_whose_columns_are_not_certain_is_refused(tmp_path, text, states, said) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=said):
+        Log.from_csv(path, states=states, inputs=["valve"], dt=10)
+
+
 def test_identify_takes_a_log_with_its_names(tmp_path) -> None:
     rng = np.random.default_rng(0)
     u = rng.normal(size=80)

@@ -78,7 +78,7 @@ def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> Non
 
 @pytest.mark.slow
 def test_an_environment_of_gymnasium_takes_twelve_lines() -> None:
-    code = blocks(page("docs/own_plant.md"))[1]
+    code = blocks(page("docs/own_plant.md"))[2]
     assert len(code.splitlines()) <= 14
     names = run_code("docs/own_plant.md", code)
     model, mpc = names["model"], names["mpc"]
@@ -86,6 +86,14 @@ def test_an_environment_of_gymnasium_takes_twelve_lines() -> None:
     action = model.policy.actor_target.mu(torch.as_tensor(theta)[None])  # type: ignore[attr-defined]
     wanted = mpc.law()(theta) / mpc.u_half  # type: ignore[attr-defined]
     np.testing.assert_allclose(action.detach().numpy()[0], wanted, atol=0.02)
+
+
+def test_equations_are_an_env_in_a_line() -> None:
+    names = run_code("docs/own_plant.md", blocks(page("docs/own_plant.md"))[1])
+    model, mpc = names["model"], names["mpc"]
+    action = model.predict(np.array([20.0]))[0]  # type: ignore[attr-defined]
+    wanted = mpc.law().plant_input([20.0])  # type: ignore[attr-defined]
+    np.testing.assert_allclose(action, wanted, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["environments"])

@@ -53,15 +53,15 @@ def of_law(problem: LinearMPC) -> Controller:
 
 
 def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:
-    """Return an MPC with another model and operating point, in the units of the problem."""
-    law, layout = other.online(), problem.layout
-    u = other.model.u_ss - problem.model.u_ss
-    point = np.zeros(problem.n_theta)
-    point[layout.state] = other.model.x_ss - problem.model.x_ss
-    point[layout.reference] = problem.tracking.C @ point[layout.state]
-    point[layout.previous] = u[: layout.n_previous]
+    """Return an MPC with another model and operating point, as a law of the problem's theta."""
+    law, own, its = other.online(), problem.units, other.units
     limits = problem.deviations.u_min, problem.deviations.u_max
-    return lambda t, theta, rows: np.clip(u + law(np.nan_to_num(theta) - point), *limits)
+
+    def act(t: int, theta: Array, rows: Rows) -> Array:
+        u = law(its.to_deviations(own.to_plant(np.nan_to_num(theta))))
+        return np.clip(own.input_to_deviations(its.input_to_plant(u)), *limits)
+
+    return act
 
 
 class Excited:

@@ -25,6 +25,7 @@ from sb3_yann.audit.closed_loops import (
 )
 from sb3_yann.audit.gains import LITTLE, UNKNOWN, WORTH, Headroom, gain, verdict_of
 from sb3_yann.audit.in_deviations import in_deviations, require_theta_shown
+from sb3_yann.audit.input_signs import warn_of_signs
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.offset import remaining_offset
 from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
@@ -186,6 +187,7 @@ class _Search:
             warn_of_order(self.mpc, *base.steps(), stacklevel=4)
             with closing(self.make()) as env:
                 unaware = below_set_points(env)
+                warn_of_signs(self.mpc, env, self.seeds, base, stacklevel=4)
             if not unaware:
                 warn_of_own_reward(self.mpc, base, stacklevel=4)
 

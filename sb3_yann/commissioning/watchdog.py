@@ -190,8 +190,8 @@ class Watchdog:
         unsure = np.hypot(bands.error, episode.tracks.doubts[0])  # what is not familiar counts
         moving = np.abs(episode.moved) > MOVED * stands * unsure
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
-            model = self.dynamics.problem.model
-            name, shown = model.state_names, episode.reading[i] + model.x_ss[i]
+            problem = self.dynamics.problem
+            name, shown = problem.model.state_names, problem.units.to_plant(episode.reading)[i]
             said = f"{name[i] if name else f'reading {i}'} has been {shown:.6g}"
             said += f" for {stands[i]} samples"
             return episode.alarm("frozen sensor", f"{said}; the twin moves or the sensor is noisy")
@@ -212,7 +212,7 @@ class Watchdog:
         stuck = self._stuck(episode)
         if stuck is not None:
             j, value = stuck
-            value += model.u_ss[j]
+            value += self.dynamics.problem.units.u_ss[j]
             return episode.alarm(
                 "actuator", f"{said}: as if {name_of(model, 'input', j)} stuck at {value:.4g}"
             )

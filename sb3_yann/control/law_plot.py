@@ -75,7 +75,7 @@ def plot_law(
     if law.n_theta == 1:
         return _draw_line(law, axes, labels)
     across, up = _entries(entries, law)
-    zero = np.zeros(law.n_theta) if law.theta_ss is None else law.theta_ss
+    zero = law.units.theta_ss
     point = zero if at is None else check_array("at", at, (law.n_theta,))
     polygons = slices(law, (across, up), point - zero)
     axes = axes_or_new(axes, 7.4, 4.4)
@@ -158,11 +158,9 @@ def _draw_line(law: Any, axes: Axes | None, labels: Sequence[str] | None) -> Axe
             "bounded theta_min and theta_max."
         )
     m = law.n_inputs
-    zero = 0.0 if law.theta_ss is None else law.theta_ss[0]
-    rest = np.zeros(m)
+    zero, rest = law.units.theta_ss[0], law.units.u_ss
     inputs = [f"u[{k}]" for k in range(m)]
     if law.model is not None:
-        rest = law.model.u_ss
         inputs = with_units(law.model)[1]
     ends = np.unique(np.clip(law.b / law.A[:, 0], low, high)[law.A[:, 0] != 0])
     theta = np.unique(np.concatenate([np.linspace(low, high, 401), ends]))
@@ -203,11 +201,10 @@ def _constant_inputs(law: Any) -> Name:
     m = law.n_inputs
     names = [f"u[{k}]" for k in range(m)]
     units = [""] * m
-    rest = np.zeros(m)
+    rest = law.units.u_ss
     if law.model is not None:
         names = labels_of(law.model)[1]
         units = law.model.units[law.model.n_states :] or units
-        rest = law.model.u_ss
     size = np.abs(law.gains).max(axis=(0, 2)) + 1e-300
     digits = 12 - np.ceil(np.log10(half_widths(law.u_min, law.u_max) + np.abs(rest))).astype(int)
 

@@ -145,32 +145,31 @@ class _Surface:
             raise ValueError(
                 f"output = {output} must be an input, from 0 to {problem.model.n_inputs - 1}."
             )
-        rest = problem.theta_ss
-        low, high = problem.deviations.theta_min[chosen], problem.deviations.theta_max[chosen]
+        low, high = problem.theta_min[chosen], problem.theta_max[chosen]
         if frame is not None:
-            low, high = (check_array("frame", each, (2,)) - rest[chosen] for each in frame)
+            low, high = (check_array("frame", each, (2,)) for each in frame)
         if not np.all(np.isfinite([low, high])) or np.any(low >= high):
             names = [problem.labels()[i] for i in chosen]
             raise ValueError(
                 f"There is no frame to draw {names} in: the box goes from {low.tolist()} to "
-                f"{high.tolist()}, about the operating point. Pass frame=(lower left, upper right)."
+                f"{high.tolist()}. Pass frame=(lower left, upper right)."
             )
-        fixed = rest if at is None else check_array("at", at, (problem.n_theta,))
+        fixed = problem.theta_ss if at is None else check_array("at", at, (problem.n_theta,))
         law = problem.law()
         points = 121 if isinstance(law, PiecewiseAffine) else 41  # a program for each of them
-        steps = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
-        self.theta = np.tile(fixed - rest, (points**2, 1))
-        self.theta[:, chosen] = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
+        self.grid = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
+        shown = np.tile(fixed, (points**2, 1))
+        shown[:, chosen] = np.stack(np.meshgrid(*self.grid), axis=-1).reshape(-1, 2)
+        self.theta = problem.units.to_deviations(shown)
         self.inside = law.in_domain(self.theta).astype(float).reshape(points, points)
-        self.grid = [each + rest[i] for each, i in zip(steps, chosen, strict=True)]
         self.labels = [problem.labels(units=True)[i] for i in chosen]
         self.problem, self.output = problem, output
         self.name = with_units(problem.model)[1][output]
 
     def values(self, policy: Any) -> Array:
         """Return the input of a policy on the grid."""
-        u = inputs_of(self.problem, policy, self.theta)[:, self.output]
-        return np.reshape(u + self.problem.model.u_ss[self.output], self.inside.shape)
+        u = self.problem.units.input_to_plant(inputs_of(self.problem, policy, self.theta))
+        return np.reshape(u[:, self.output], self.inside.shape)
 
     def draw(self, axes: Axes, u: Array, scale: tuple[float, float]) -> Any:
         """Draw values in colors of a scale, and the border of where the MPC has a solution."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -471,19 +472,23 @@ class Player:
     def scores(self, played: Trajectories) -> Scores:
         """Return what the episodes cost and break, and the regions that they come through."""
         policy, layer = self.policy, self.policy.actor.mu
-        thetas = [policy.theta(normalized(self.model, each)) for each in played.observations]
+        thetas = [self.theta(each) for each in played.observations]
         inputs = [policy.inputs(each) for each in played.actions]
-        pairs = zip((each.double().cpu().numpy() for each in thetas), inputs, strict=True)
-        excess = excess_of_episodes(policy.problem, pairs)
+        excess = excess_of_episodes(policy.problem, zip(thetas, inputs, strict=True))
         far: Any = 0
         if self.max_input_step is not None:
             moved = [np.abs(np.diff(each, axis=0)) for each in played.actions]
             far = [np.any(each > self.max_input_step, axis=1).sum() for each in moved]
         visits = np.zeros((len(played.costs), layer.n_networks), dtype=bool)
         for visited, theta in zip(visits, thetas, strict=True):
-            visited[layer.regions(theta[:-1])] = True
+            visited[layer.regions(th.as_tensor(theta[:-1]))] = True
         unsafe = replace(played, excess=excess).unsafe(far)
         return Scores(played.costs + excess.penalty, unsafe, visits)
+
+    def theta(self, observations: NDArray[Any]) -> Array:
+        """Return theta in deviations (steps, n_theta) of what the simulator shows."""
+        seen = self.policy.theta(normalized(self.model, observations))
+        return np.asarray(seen.double().cpu().numpy())
 
     def close(self) -> None:
         """Close the envs that were made; one that was given is the caller's."""

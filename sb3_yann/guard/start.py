@@ -14,6 +14,8 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 
+from sb3_yann.audit.input_signs import warn_of_signs
+from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, Scores, Starts
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import BoundNames
@@ -21,7 +23,7 @@ from sb3_yann.guard.decide import GuardSettings, Player, Unplayable, try_before_
 from sb3_yann.guard.state import Decision, Evidence, GuardState
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin
-from sb3_yann.rollout import Trajectories
+from sb3_yann.rollout import Trajectories, preserve_rng
 
 
 def first_evidence(
@@ -83,6 +85,7 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
             "ignores its seed. What the guard accepts is compared from this start only.",
             stacklevel=2,
         )
+    _warn_of_misreading(player, seeds, mpc)
     if settings.rule.max_input_step is not None:
         moved = [np.abs(np.diff(each, axis=0)) for each in mpc.actions if len(each) > 1]
         most = np.max([each.max(axis=0) for each in moved], axis=0) if moved else np.inf
@@ -90,6 +93,21 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
         rounding = COST_ROUNDING * (space.high - space.low)
         player.max_input_step = np.asarray(settings.rule.max_input_step * most + rounding)
     return player.scores(mpc)
+
+
+def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories) -> None:
+    """Warn where the simulator is the model with states in another order, or a sign of inputs."""
+    policy = player.policy
+    thetas = [player.theta(each) for each in mpc.observations]
+    inputs = [policy.inputs(each) for each in mpc.actions]
+    before = np.concatenate([each[:-1] for each in thetas])
+    after = np.concatenate([each[1:] for each in thetas])
+    warn_of_order(policy.problem, before, np.concatenate(inputs), after, stacklevel=2)
+    with preserve_rng(), player.envs.acquire(1) as (env,):
+        maps = {"theta": player.theta, "inputs": policy.inputs}
+        warn_of_signs(policy.problem, env, seeds, mpc, **maps, stacklevel=2)
+    if player.interrupted:  # and a simulator has made of it what it can
+        raise KeyboardInterrupt
 
 
 def _all_alike(played: Trajectories) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch as th
@@ -115,6 +115,17 @@ def as_gamma(gamma: float | None, algorithm: BaseAlgorithm | None) -> float:
         "a VecNormalize. Let the algorithm build it, in the same thread: DDPG(YannPolicy, env). "
         "For a policy that stands alone, or else, pass the discount: policy_kwargs={'gamma': ...}; "
         "its observations must then not be normalized."
+    )
+
+
+def refuse_another_gamma(algorithm: BaseAlgorithm, gamma: float) -> NoReturn:
+    """Raise ValueError for a discount that is not the one which the critic was built for."""
+    now = algorithm.gamma  # type: ignore[attr-defined]
+    name = type(algorithm).__name__
+    raise ValueError(
+        f"gamma of the {name} was set to {now} after its policy was built for {gamma}: the critic "
+        f"is exact for that one alone. Build the {name} with gamma={now}, or load it with "
+        f"custom_objects={{'gamma': {now}}}."
     )
 
 

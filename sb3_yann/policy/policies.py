@@ -176,6 +176,7 @@ class YannPolicy(KeepsPrecision, TD3Policy):
             self.saved_kwargs["observation"] = self.observation
         self.first_obs_checked = False  # at the first observation
         self.gamma = check_discount(checks.as_gamma(gamma, algorithm))
+        self.gamma_given = gamma is not None
         self.lr_mult = {
             "actor": check_range("actor_lr_mult", actor_lr_mult, 0, np.inf, "[)"),
             "critic": check_range("critic_lr_mult", critic_lr_mult, 0, np.inf, "[)"),
@@ -211,10 +212,15 @@ class YannPolicy(KeepsPrecision, TD3Policy):
             require_state_shown(algorithm.get_env(), self.observation_given)
 
     def _meets_another_env(self) -> None:
-        """Do the same where `set_env` has given the algorithm another env since."""
+        """Do the same where `set_env` has given the algorithm another env since.
+
+        A discount that was changed since is refused.
+        """
         algorithm = None if self._algorithm is None else self._algorithm()
         if algorithm is None or algorithm.policy is not self:
             return
+        if not self.gamma_given and algorithm.gamma != self.gamma:
+            checks.refuse_another_gamma(algorithm, self.gamma)
         env = algorithm.get_env()
         if env is not None and (self._met is None or self._met() is not env):
             self._meets(algorithm)

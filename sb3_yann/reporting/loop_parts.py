@@ -223,9 +223,10 @@ def _pictures(subject: Subject) -> list[Html]:
         return found
     plane = subject.steepest_plane
     entries = [*plane]
-    low, high = problem.deviations.theta_min[entries], problem.deviations.theta_max[entries]
+    low, high = problem.theta_min[entries], problem.theta_max[entries]
     if loops is not None:
-        visited = np.concatenate([x[:, entries] for x in loops[POLICY].observations])
+        shown = subject.shown_loops[POLICY].observations
+        visited = np.concatenate([x[:, entries] for x in shown])
         visited = visited[np.isfinite(visited).all(axis=1)]
         room = 0.05 * np.ptp(visited, axis=0)
         low, high = visited.min(axis=0) - room, visited.max(axis=0) + room
@@ -238,7 +239,6 @@ def _pictures(subject: Subject) -> list[Html]:
         "parameters are at the operating point. A black line, if there is one, surrounds where "
         "the MPC has a solution."
     )
-    shift = problem.theta_ss[entries]
-    options = {"entries": plane, "frame": (low + shift, high + shift)}
+    options = {"entries": plane, "frame": (low, high)}
     draw = partial(surfaces_figure, problem, subject.law, policy, **options)  # type: ignore[arg-type]
     return [*found, picture(draw, caption)]

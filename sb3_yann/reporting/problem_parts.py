@@ -85,7 +85,7 @@ def constraints_part(subject: Subject) -> Part:
         share = 100 * acting[key] / max(len(solvable), 1)
         row = [name, number(low), number(high), kind, f"{share:.1f} %"]
         rounding = 1e-6 * (high - low if np.isfinite(high - low) else 1.0)
-        for episodes in loops.values():
+        for episodes in subject.shown_loops.values():
             values = np.concatenate([series(x, u) for x, u in _pairs(episodes)])
             beyond = int(np.sum((values < low - rounding) | (values > high + rounding)))
             row += [f"{number(np.nanmin(values))} to {number(np.nanmax(values))}", str(beyond)]
@@ -154,34 +154,36 @@ def _pairs(episodes: Trajectories) -> Iterator[tuple[Array, Array]]:
 
 
 def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, float, float, str, Any]]:
-    """Yield label, key, bounds, kind, and the values in an episode, of what is bounded."""
-    model, bounds, C = problem.model, problem.deviations, problem.outputs.C
+    """Yield label, key, bounds, kind, and the values in an episode, of what is bounded.
+
+    All of it is in plant units.
+    """
+    model, C = problem.model, problem.outputs.C
     labels, names = with_units(model), labels_of(model)
     outputs, previous = [f"y[{i}]" for i in range(len(C))], problem.layout.previous
-    y_min, y_max = bounds.outputs.y_min, bounds.outputs.y_max
-    hard, none = np.zeros(model.n_inputs, bool), np.zeros(model.n_inputs)
+    y_min, y_max = problem.outputs.y_min, problem.outputs.y_max
+    hard = np.zeros(model.n_inputs, bool)
     groups: list[tuple[Any, ...]] = [
-        (labels[1], names[1], bounds.u_min, bounds.u_max, model.u_ss, hard, lambda x, u: u),
-        (labels[0], names[0], bounds.x_min, bounds.x_max, model.x_ss, problem.soft.x > 0,
-         lambda x, u: x),
-        (outputs, outputs, y_min, y_max, C @ model.x_ss, problem.soft.y > 0,
+        (labels[1], names[1], problem.u_min, problem.u_max, hard, lambda x, u: u),
+        (labels[0], names[0], problem.x_min, problem.x_max, problem.soft.x > 0, lambda x, u: x),
+        (outputs, outputs, y_min, y_max, problem.soft.y > 0,
          lambda x, u: x[:, : C.shape[1]] @ C.T),
     ]  # fmt: skip
     if problem.has_rate_bounds:
         called = [f"change of {each} in a step" for each in labels[1]]
         keys = [f"the rate of {each}" for each in names[1]]
         limits = problem.rate.du_min, problem.rate.du_max
-        groups.append((called, keys, *limits, none, hard, lambda x, u: u - x[:-1, previous]))
-    for called, keys, low, high, rest, is_soft, values in groups:
+        groups.append((called, keys, *limits, hard, lambda x, u: u - x[:-1, previous]))
+    for called, keys, low, high, is_soft, values in groups:
         for k in range(len(called)):
             if not np.isfinite([low[k], high[k]]).any():
                 continue
 
-            def series(x: Array, u: Array, k: int = k, rest: Any = rest, of: Any = values) -> Array:
-                return np.asarray(of(x, u)[:, k] + rest[k])
+            def series(x: Array, u: Array, k: int = k, of: Any = values) -> Array:
+                return np.asarray(of(x, u)[:, k])
 
             kind = "soft" if is_soft[k] else "hard"
-            yield called[k], keys[k], low[k] + rest[k], high[k] + rest[k], kind, series
+            yield called[k], keys[k], low[k], high[k], kind, series
 
 
 # ---- The law ----

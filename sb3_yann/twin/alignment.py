@@ -377,12 +377,13 @@ def _resting(log: _Log, fit: _Effects) -> Iterator[str]:
     A, names = log.problem.model.A, labels_of(log.problem.model)[0]
     rest = np.linalg.lstsq(np.eye(len(A)) - A, fit.drift, rcond=1e-3)[0]
     x_ss = log.problem.model.x_ss
+    shown = log.problem.units.to_plant(rest)
     away = np.abs(rest / log.coordinates.units)
     if np.max(away) > 5:  # beyond the log: a state that hardly returns, or noise
         return
     for i in np.flatnonzero(away > 0.5):
         yield (
-            f"Without inputs the logged plant rests at {names[i]} = {rest[i] + x_ss[i]:.4g}, the "
+            f"Without inputs the logged plant rests at {names[i]} = {shown[i]:.4g}, the "
             f"problem's at {x_ss[i]:.4g}: compare units and operating point of states and inputs. "
             f"{CONFIRM}"
         )

@@ -204,7 +204,8 @@ def spikes(problem: LinearMPC, episodes: tuple[Episode, ...], left: list[Array])
     if not largest[episode, state] > SPIKE:
         return []
     row = int(np.argmax(np.abs(left[episode][:, state]))) + 1
-    read = episodes[int(episode)].thetas[row, state] + problem.model.x_ss[state]
+    reading = episodes[int(episode)].thetas[row, problem.layout.state]
+    read = problem.units.to_plant(reading)[state]
     name = name_of(problem.model, "state", int(state))
     return [f"Look at where {name} is about {read:.6g}: no other step has moved it so far."]
 
@@ -227,7 +228,7 @@ def _frozen(dynamics: Dynamics, episodes: tuple[Episode, ...]) -> list[str]:
     driven = [row.features(e.thetas[:-1], e.actions)[:, model.n_states :] for e in episodes]
     states = [each.thetas[:, row.state] for each in episodes]
     found = frozen_rows(states, driven)
-    return words_for(found, labels_of(model)[0], [x + model.x_ss for x in states])
+    return words_for(found, labels_of(model)[0], [*map(dynamics.problem.units.to_plant, states)])
 
 
 def judge(

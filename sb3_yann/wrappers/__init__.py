@@ -1,6 +1,7 @@
 """Wrappers that complete theta, set the reward, and cure faults of episodes."""
 
 from sb3_yann.wrappers.episodes import SeededGlobals, TimeLimitIsNoTermination
+from sb3_yann.wrappers.plant_env import PlantEnv
 from sb3_yann.wrappers.stage_cost import StageCost
 from sb3_yann.wrappers.theta import (
     MeasuredDisturbance,
@@ -14,6 +15,7 @@ __all__ = [
     "MeasuredDisturbance",
     "ObserveDisturbance",
     "PastInputs",
+    "PlantEnv",
     "PreviousInput",
     "SeededGlobals",
     "SetPoint",

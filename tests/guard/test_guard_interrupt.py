@@ -86,7 +86,7 @@ def test_in_a_trial_what_stood_before_it_is_left(at) -> None:
 
 def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_policy() -> None:
     def act():
-        if len(plays) == 2:  # the MPC has played them twice
+        if len(plays) == 3:  # the MPC has played them twice, and one input was pushed
             try:
                 ctrl_c()
             except KeyboardInterrupt:
@@ -101,14 +101,14 @@ def test_a_simulator_that_makes_another_error_of_it_is_not_taken_for_a_bad_polic
 def test_a_simulator_that_swallows_it_ends_the_training_all_the_same() -> None:
     def act():
         plays.append(1)
-        if len(plays) == 3:  # the candidate's turn
+        if len(plays) == 4:  # the candidate's turn
             with suppress(KeyboardInterrupt):
                 ctrl_c()
 
     plays: list[int] = []
     model, guard = build(gradient_steps=0), make_guard(partial(CutOff, FIRST, act))
     interrupted(model, 4 * STEPS, At([1], better), guard)
-    assert is_mpc(model) and len(plays) == 3
+    assert is_mpc(model) and len(plays) == 4
 
 
 def test_where_the_end_of_training_fails_the_accepted_policy_is_left(monkeypatch) -> None:

@@ -251,3 +251,19 @@ def test_whole_numbers_are_no_state_unless_the_user_says_what_they_mean() -> Non
     seen = AffineObservation(0.01 * np.eye(4))
     policy = make_policy(box, act, problem="CSTR-v0", observation=seen)
     np.testing.assert_allclose(policy.theta([[3, -1, 2, 5]]), [[0.03, -0.01, 0.02, 0.05]])
+
+
+def test_a_discount_that_is_set_after_the_policy_was_built_is_refused(tmp_path) -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", gamma=0.95, device="cpu", learning_starts=0)
+    model.save(tmp_path / "model")
+    observation = np.zeros(4, np.float32)
+    model.gamma = 0.8
+    for act in (lambda: model.learn(2), lambda: model.predict(observation)):
+        with pytest.raises(ValueError, match=r"gamma of the DDPG was set to 0\.8 after its policy"):
+            act()
+    loaded = DDPG.load(tmp_path / "model", custom_objects={"gamma": 0.8})
+    assert loaded.policy.gamma == 0.8
+    loaded.predict(observation)
+    own = DDPG("YannPolicy", "CSTR-v0", policy_kwargs={"gamma": 0.9}, device="cpu")
+    own.gamma = 0.8  # the policy's own was chosen
+    own.predict(observation)

@@ -42,6 +42,10 @@ class Plant(LinearSystem):
         given = {"state_names": state_names, "input_names": input_names, "units": units}
         return type(self)(**{**vars(self), **given})
 
+    def about_zero(self) -> Self:
+        """Return the model without an operating point: what it describes are deviations."""
+        return type(self)(**{**vars(self), "x_ss": None, "u_ss": None, "d_ss": None})
+
     def to_statespace(self) -> Any:
         """Return a discrete `control.StateSpace` from [u, d] to x, all in deviations.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,6 +26,10 @@ from sb3_yann.units import Units, fields_in_deviations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+
+OF_OLD_PICKLES = "absolute", "theta_ss", "_online"
+"""What a problem of 0.1 held besides, or had computed from its operating point."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,6 +67,16 @@ class MPCProblem(ReadOnlyArrays):
     outputs: OutputBounds
     soft: SoftBounds
     terminal: Terminal
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy or a pickle; one of 0.1 is in deviations, whatever its model says."""
+        if "absolute" in state:
+            model = state["model"].about_zero()
+            state = {name: value for name, value in state.items() if name not in OF_OLD_PICKLES}
+            rest = np.zeros(layout_of(model, state["tracking"], state["rate"]).size)
+            laws = {name: law.on_plant(model, rest) for name, law in state.get("_laws", {}).items()}
+            state |= {"model": model, "_laws": laws}
+        super().__setstate__(state)
 
     @cached_property
     def units(self) -> Units:

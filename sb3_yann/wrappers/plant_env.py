@@ -1,0 +1,152 @@
+"""An env from the equations of a plant, in plant units, with all that its MPC's theta holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+from numpy.typing import ArrayLike
+
+from sb3_yann._validation import Array, check_bounds, check_int, check_type
+from sb3_yann.control import LinearMPC
+from sb3_yann.wrappers.stage_cost import StageCost
+from sb3_yann.wrappers.theta import PreviousInput, SetPoint
+
+Slope = Callable[[Array, Array], ArrayLike]
+
+
+class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
+    """The equations ``dx/dt = f(x, u)`` as an env in plant units.
+
+    The reward is minus the stage cost of the MPC. It shows the state, and the set-point and the
+    previous input where the MPC's theta has them. The inputs are held for a sample,
+    ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps`` equal steps.
+    ``reset(options={"state": x})`` begins in a state. Where the state is no longer finite an
+    episode terminates, in the last one that was, with ``info["violation"]``.
+
+    Parameters
+    ----------
+    f : callable
+        From a state (n,) and an input (m,), in plant units, to dx/dt (n,).
+    mpc : LinearMPC
+        Without disturbances: those are the env's own, see :class:`MeasuredDisturbance`.
+    start_low, start_high : array_like, shape (n,), or float, optional
+        The box that episodes begin in; by default half as wide as that of theta, about the
+        operating point.
+    max_episode_steps : int, default 100
+    hold : int, optional
+        Steps after which another set-point is drawn, as of :class:`SetPoint`.
+    substeps : int, default 10
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is of no use, or nothing tells where episodes begin.
+
+    Examples
+    --------
+    >>> from sb3_yann import LinearModel
+    >>> f = lambda x, u: (u - x**0.5) / 4
+    >>> tank = LinearModel.from_dynamics(f, x_ss=[4], u_ss=[2], dt=1)
+    >>> limits = {"u_min": 0, "u_max": 5, "theta_min": 0, "theta_max": 9}
+    >>> mpc = LinearMPC(tank, Q=[[1]], R=[[1]], horizon=3, **limits)
+    >>> env = PlantEnv(f, mpc)
+    >>> env.reset(options={"state": [4]})[0], env.step([2])[0].round(6), env.action_space.high
+    (array([4.]), array([4.]), array([5.]))
+    """
+
+    def __init__(
+        self,
+        f: Slope,
+        mpc: LinearMPC,
+        *,
+        start_low: ArrayLike | None = None,
+        start_high: ArrayLike | None = None,
+        max_episode_steps: int = 100,
+        hold: int | None = None,
+        substeps: int = 10,
+    ) -> None:
+        if not callable(f):
+            raise TypeError(f"f = {f!r} must be a function (x, u) -> dx/dt.")
+        check_type("mpc", mpc, LinearMPC, "a LinearMPC")
+        layout, x_ss, n = mpc.layout, mpc.model.x_ss, mpc.model.n_states
+        if layout.n_disturbances:
+            raise ValueError(
+                "The MPC has disturbances, and f(x, u) has none: write an env that tells them, and "
+                "wrap it in MeasuredDisturbance and StageCost."
+            )
+        half = (mpc.theta_max - mpc.theta_min)[layout.state] / 4
+        low = np.maximum(x_ss - half, mpc.theta_min[layout.state])
+        high = np.minimum(x_ss + half, mpc.theta_max[layout.state])
+        lowest = low if start_low is None else start_low
+        highest = high if start_high is None else start_high
+        start = check_bounds("start", lowest, highest, n)
+        if not np.all(np.isfinite(start)):
+            raise ValueError(
+                "The MPC's box of states is not bounded, so nothing tells where episodes begin: "
+                "pass start_low and start_high."
+            )
+        check_int("substeps", substeps)
+        env: Any = Equations(f, mpc, start, substeps)
+        if layout.n_references:
+            env = SetPoint(env, mpc.tracking.r_min, mpc.tracking.r_max, hold=hold)
+        if layout.n_previous:
+            env = PreviousInput(env, mpc.model.u_ss)
+        limit = check_int("max_episode_steps", max_episode_steps)
+        super().__init__(TimeLimit(StageCost(env, mpc), limit))
+
+
+class Equations(gym.Env[Array, Array]):
+    """A plant that shows its state and takes its inputs."""
+
+    def __init__(self, f: Slope, mpc: LinearMPC, start: tuple[Array, Array], substeps: int) -> None:
+        self.f, self.start, self.substeps, self.dt = f, start, substeps, mpc.model.dt
+        self.observation_space = spaces.Box(-np.inf, np.inf, (mpc.model.n_states,), np.float64)
+        self.action_space = spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
+        self.state: Array = mpc.model.x_ss
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin in the box of starts, or in ``options["state"]``."""
+        super().reset(seed=seed)
+        self.state = self.np_random.uniform(*self.start)
+        if options and "state" in options:
+            given = np.asarray(options["state"], np.float64)
+            if given.shape != self.state.shape or not np.all(np.isfinite(given)):
+                wanted = f"{len(self.state)} finite numbers"
+                raise ValueError(f"options['state'] = {options['state']!r} must be {wanted}.")
+            self.state = given
+        return self.state.copy(), {"state": self.state.copy()}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Hold the inputs, clipped to their bounds, for a sample."""
+        box: Any = self.action_space
+        u = np.clip(np.asarray(action, np.float64), box.low, box.high)
+        with np.errstate(all="ignore"):
+            reached = self._advance(u)
+        lost = not np.all(np.isfinite(reached))
+        if not lost:
+            self.state = reached
+        info = {"state": self.state.copy(), **({"violation": True} if lost else {})}
+        return self.state.copy(), 0.0, lost, False, info
+
+    def _advance(self, u: Array) -> Array:
+        """Return the state one sample later."""
+        x, h = self.state, self.dt / self.substeps
+        for _ in range(self.substeps):
+            k1 = self._slope(x, u)
+            k2 = self._slope(x + h / 2 * k1, u)
+            k3 = self._slope(x + h / 2 * k2, u)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self._slope(x + h * k3, u))
+        return x
+
+    def _slope(self, x: Array, u: Array) -> Array:
+        slope = np.asarray(self.f(x, u), np.float64)
+        if slope.shape != x.shape:
+            raise ValueError(f"f(x, u) has shape {slope.shape}, expected dx/dt, {x.shape}.")
+        return slope

@@ -1,0 +1,105 @@
+"""An env from equations is a plant in its own units, with all that the MPC's theta holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG
+
+from sb3_yann import (
+    CostAudit,
+    DisturbanceBounds,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    PlantEnv,
+    PlantTwin,
+    RateLimits,
+    Tracking,
+    headroom,
+)
+from sb3_yann.evaluation import evaluate
+
+
+def slope(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return how a tank of 350 cm fills: its outflow goes with the root of the level."""
+    return (u - 2 * np.sqrt(np.maximum(x, 0) / 350)) * 5
+
+
+TANK = LinearModel.from_dynamics(slope, x_ss=[350], u_ss=[2], dt=1.0).named(["level"], ["flow"])
+BOX: dict[str, Any] = {"u_min": 0, "u_max": 5, "theta_min": 300, "theta_max": 400}
+WEIGHTS: dict[str, Any] = {"Q": [[1]], "R": [[1]], "horizon": 3, "gamma": 0.99}
+
+
+def full() -> LinearMPC:
+    """Return an MPC whose theta has a set-point and the previous input."""
+    return LinearMPC(
+        TANK, **WEIGHTS, **BOX, tracking=Tracking([0], 340, 360), rate=RateLimits(-1, 1)
+    )
+
+
+def test_it_rests_where_the_model_does_and_begins_in_its_box() -> None:
+    env = PlantEnv(slope, LinearMPC(TANK, **WEIGHTS, **BOX))
+    env.reset(options={"state": [350.0]})
+    x, reward, *ends, info = env.step(np.array([2.0]))
+    assert x == pytest.approx([350]) and reward == pytest.approx(0) and ends == [False, False]
+    assert info["state"].tolist() == x.tolist()
+    starts = np.array([env.reset(seed=k)[0] for k in range(50)])
+    assert 325 <= starts.min() < 335 and 365 < starts.max() <= 375
+
+
+def test_it_is_integrated_exactly() -> None:
+    env = PlantEnv(lambda x, u: (u - x) / 7, LinearMPC(
+        LinearModel.from_dynamics(lambda x, u: (u - x) / 7, [3], [3], dt=2.0), **WEIGHTS,
+        u_min=0, u_max=9, theta_min=0, theta_max=9,
+    ))  # fmt: skip
+    env.reset(options={"state": [5.0]})
+    assert env.step(np.array([1.0]))[0] == pytest.approx([1 + 4 * np.exp(-2 / 7)], abs=1e-8)
+
+
+def test_a_policy_on_it_is_the_mpc_and_its_reward_minus_the_cost() -> None:
+    mpc = full()
+    env = PlantEnv(slope, mpc, hold=20)
+    assert env.reset(seed=0)[0].shape == (3,) and env.reset(seed=0)[0][2] == 2
+    model, audit = (
+        DDPG("YannPolicy", env, policy_kwargs={"problem": mpc}, device="cpu"),
+        CostAudit(),
+    )
+    ours, law = (evaluate(each, lambda: PlantEnv(slope, mpc), range(4)) for each in (
+        model, mpc.explicit()))  # fmt: skip
+    np.testing.assert_allclose(ours.costs, law.costs, rtol=1e-4)
+    assert law.lengths.tolist() == [100] * 4
+    model.learn(120, callback=[NoActionNoise(), audit])
+    assert audit.finding.matches
+
+
+def test_plans_are_made_in_its_own_states(monkeypatch) -> None:
+    monkeypatch.setattr(PlantTwin, "fit", None)  # no twin is needed
+    found = headroom(full(), lambda: PlantEnv(slope, full(), max_episode_steps=30), n_starts=2)
+    assert found.total >= 0
+
+
+def test_a_plant_that_runs_away_terminates_in_its_last_finite_state() -> None:
+    env = PlantEnv(lambda x, u: x * np.inf, LinearMPC(TANK, **WEIGHTS, **BOX))
+    x, _ = env.reset(seed=0)
+    reached, _, terminated, _, info = env.step(np.array([2.0]))
+    assert reached.tolist() == x.tolist() and terminated and info["violation"]
+
+
+def test_what_is_of_no_use_is_named() -> None:
+    plain = LinearMPC(TANK, **WEIGHTS, **BOX)
+    with pytest.raises(TypeError, match="f = 3 must be a function"):
+        PlantEnv(3, plain)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"f\(x, u\) has shape \(2,\), expected dx/dt, \(1,\)"):
+        env = PlantEnv(lambda x, u: [1, 2], plain)
+        env.reset()
+        env.step(np.array([2.0]))
+    loaded = LinearModel(TANK.A, TANK.B, 1.0, TANK.x_ss, TANK.u_ss, E=[[1.0]])
+    with pytest.raises(ValueError, match="The MPC has disturbances"):
+        PlantEnv(slope, LinearMPC(loaded, **WEIGHTS, **BOX, disturbances=DisturbanceBounds(-1, 1)))
+    with pytest.raises(ValueError, match="pass start_low and start_high"):
+        PlantEnv(slope, LinearMPC(TANK, **WEIGHTS, u_min=0, u_max=5))
+    with pytest.raises(ValueError, match=r"options\['state'\] = \[1, 2\] must be 1 finite"):
+        PlantEnv(slope, plain).reset(options={"state": [1, 2]})
