@@ -70,6 +70,8 @@ class Improvement:
         Fingerprint of the policy's weights when it ended.
     model : DDPG or TD3, optional
         With the policy; not in the model's zip.
+    note : str
+        What ended the search before a final check; empty where nothing did.
 
     Examples
     --------
