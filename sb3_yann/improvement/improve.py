@@ -208,7 +208,7 @@ def improve(
     >>> from sb3_yann_envs import problems
     >>> mpc = problems.cstr()
     >>> log = evaluate(mpc.explicit(), "CSTR-v0", seeds=range(5))  # a plant's own episodes
-    >>> twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions)])
+    >>> twin = PlantTwin.fit(mpc, [*zip(log.observations, log.actions)], residuals=["cubic"])
     >>> improve(mpc, twin, n_starts=20, updates=1000).change < -0.005
     True
 

@@ -23,6 +23,8 @@ from sb3_yann_envs import ProblemBox
 
 DT = 0.1
 
+POLYNOMIALS = ("none", "linear", "quadratic", "cubic")  # a fit of networks takes seconds
+
 
 @cache
 def problem() -> LinearMPC:
@@ -84,7 +86,7 @@ def random_episode(mpc: LinearMPC, steps: int = 12, seed: int = 0) -> Episode:
 @cache
 def twin(episodes: int = 5) -> PlantTwin:
     """Return the cart's twin."""
-    return PlantTwin.fit(problem(), log(episodes))
+    return PlantTwin.fit(problem(), log(episodes), residuals=POLYNOMIALS)
 
 
 def mean_cost(act: Any, seeds: range = range(900, 940)) -> np.ndarray:
@@ -106,7 +108,7 @@ def rated() -> PlantTwin:
         plain.model, Q=plain.Q, R=plain.R, horizon=3, u_min=-1, u_max=1, theta_min=[-3, -3],
         theta_max=[3, 3], rate=RateLimits(-0.3, 0.3),
     )  # fmt: skip
-    return PlantTwin.fit(mpc, log(4))
+    return PlantTwin.fit(mpc, log(4), residuals=POLYNOMIALS)
 
 
 D_MAX = 0.02
@@ -184,4 +186,6 @@ def observed_log(episodes: int = 5, plant: Any = None) -> list[Any]:
 def observed() -> PlantTwin:
     """Return the twin of the cart and its observer."""
     mpc, observer = offset_free_problem()
-    return PlantTwin.fit(mpc, [each[:2] for each in observed_log()], observer=observer)
+    return PlantTwin.fit(
+        mpc, [each[:2] for each in observed_log()], observer=observer, residuals=POLYNOMIALS
+    )
