@@ -71,10 +71,20 @@ class Teacher:
 
     @property
     def gain(self) -> float:
-        """What plans gain, as a fraction of what the scenarios cost with the MPC."""
+        """What plans gain on average: see :meth:`saved`."""
+        return self.saved(self.best)
+
+    def saved(self, costs: Array) -> float:
+        """Return what costs (k,) are below the MPC's on average, relative to its cost of each.
+
+        Scenarios that cost the MPC less than the median count relative to that.
+        """
         finite = np.isfinite(self.mpc.costs)
-        whole = max(float(np.abs(self.mpc.costs[finite]).sum()), 1e-300)
-        return float(np.sum((self.mpc.costs - self.best)[finite])) / whole
+        mpc = self.mpc.costs[finite]
+        if not len(mpc):
+            return 0.0
+        own = np.maximum(np.abs(mpc), max(float(np.median(np.abs(mpc))), 1e-300))
+        return float(np.mean((mpc - costs[finite]) / own))
 
     def show(self, begins: NDArray[np.int64] | None = None, act: Inputs | None = None) -> None:
         """Plan the scenarios, from the steps ``begins`` (k,) on, until which a policy acts.
@@ -162,25 +172,22 @@ def imitate(layer: LawLayer, teacher: Teacher, updates: int) -> float:
     Then the policy plays these episodes in the model, and learns more where it does worse than
     plans: from their starts, and from where it had got to (S. Ross, G. Gordon and D. Bagnell, *A
     reduction of imitation learning and structured prediction to no-regret online learning*, AISTATS
-    2011). The layer ends with the fit that cost the least. Return what it gains in the model, as a
-    fraction of the MPC's cost.
+    2011). The layer ends with the fit that cost the least. Return what it saves in the model: see
+    :meth:`Teacher.saved`.
     """
-    mpc, best = teacher.mpc, copy.deepcopy(layer.state_dict())
-    finite = np.isfinite(mpc.costs)
-    whole = max(float(np.abs(mpc.costs[finite]).sum()), 1e-300)
-    least = np.inf
+    most, best = -np.inf, copy.deepcopy(layer.state_dict())
     for fit in range(FITS):
         teacher.teach(layer, updates if fit == 0 else updates // 2)
         act = policy_of(layer, teacher.problem)
         played = teacher.scenarios.play(controller_of(act))
-        change = float(np.sum((played.costs - mpc.costs)[finite])) / whole
-        if change < least:
-            least, best = change, copy.deepcopy(layer.state_dict())
-        if -least >= (1 - NEAR) * teacher.gain or fit == FITS - 1:
+        saved = teacher.saved(played.costs)
+        if saved > most:
+            most, best = saved, copy.deepcopy(layer.state_dict())
+        if most >= (1 - NEAR) * teacher.gain or fit == FITS - 1:
             break
         teacher.show(teacher.hardest(played), act)
     layer.load_state_dict(best)
-    return -least
+    return most
 
 
 def fit_layer(

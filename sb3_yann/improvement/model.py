@@ -173,9 +173,7 @@ class Scenarios:
     given: Array
 
     @classmethod
-    def like(
-        cls, model: Model, episodes: Sequence[Episode], rng: np.random.Generator, each: bool
-    ) -> Scenarios:
+    def like(cls, model: Model, episodes: Sequence[Episode], rng: np.random.Generator) -> Scenarios:
         """Return scenarios like some episodes, with their references and disturbances.
 
         Every other one begins as its episode did, the others in the box of all beginnings.
@@ -188,16 +186,13 @@ class Scenarios:
             One for each scenario.
         rng : numpy.random.Generator
             Of the starts in the box.
-        each : bool
-            Whether the members take turns; else their mean acts.
         """
         row, steps, n = model.dynamics.row, max(map(len, episodes)), model.problem.model.n_states
         thetas = row.shown(np.array([each.thetas[0] for each in episodes])).copy()
         moved = thetas[1::2, :n]
         thetas[1::2, :n] = rng.uniform(model.starts.low, model.starts.high, moved.shape)
         given = [e.thetas[np.minimum(np.arange(steps), len(e)), row.given] for e in episodes]
-        members = np.arange(len(episodes)) % len(model.dynamics.members) if each else None
-        return cls(model, members, row.begin(thetas), np.stack(given, axis=1))
+        return cls(model, None, row.begin(thetas), np.stack(given, axis=1))
 
     @cached_property
     def plant(self) -> TwinPlant:

@@ -251,6 +251,12 @@ class Trial:
         more = AROUND * rare * np.abs(self.mpc[0]) * ~self.known
         return np.asarray(MARGIN * self.mean + more)
 
+    def scenarios(self) -> Scenarios:
+        """Return the starts, in each of which another member acts."""
+        numbers = np.arange(self.starts.shape[1])
+        members = numbers % len(self.starts)
+        return Scenarios(self.twin, members, self.starts[members, numbers], self.given)
+
     def hard(self, played: Outcome) -> Scenarios | None:
         """Return the scenarios that a policy loses, or nearly, the worst first; None where none."""
         loses = (played[0] - self.mpc[0]) / np.maximum(NEARLY * self.room(), 1e-300)

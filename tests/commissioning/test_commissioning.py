@@ -14,7 +14,7 @@ import torch as th
 from stable_baselines3 import DDPG
 
 from sb3_yann import Commissioning, Improvement, YannPolicy
-from sb3_yann.commissioning import Check, commissioning
+from sb3_yann.commissioning import commissioning
 from sb3_yann.commissioning.comparison import (
     Costs,
     is_confirmed,
@@ -25,6 +25,7 @@ from sb3_yann.commissioning.comparison import (
 )
 from sb3_yann.commissioning.plant import Plant
 from sb3_yann.commissioning.watchdog import Alarm
+from sb3_yann.improvement import Check
 from sb3_yann.rollout import one_env
 from twin_samples import Cart, problem
 from weights import is_mpc

@@ -93,7 +93,7 @@ def test_the_second_opinion_knows_the_log_and_nothing_beyond() -> None:
     theta, u = twin.episodes[0].thetas, twin.episodes[0].actions
     second, given = twin.second_opinion, np.concatenate(problem().prediction, axis=1)
     there = second.step(theta[None, :-1], u[None])[0]
-    assert np.abs(there - theta[1:]).max() < 1e-3
+    assert np.abs(there - theta[1:]).max() < 5e-3
     linear = np.hstack([theta[:-1], u]) @ given.T
     assert np.abs(linear - theta[1:]).max() > 1e-2
     # A slow cart far away under full force: the log has no such row, the MPC brakes there.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache, partial
 
 import numpy as np
@@ -27,9 +28,11 @@ def learnt() -> SimulatorModel:
         return SimulatorModel.fit(problem(), seen, None, seed=0)
 
 
-def scenarios(found: Model, each: bool) -> Scenarios:
+def scenarios(found: Model, each: bool = False) -> Scenarios:
     rng = np.random.default_rng(0)
-    return Scenarios.like(found, found.episodes[:4], rng, each)
+    like = Scenarios.like(found, found.episodes[:4], rng)
+    members = np.arange(4) % len(found.dynamics.members) if each else None
+    return dataclasses.replace(like, members=members)
 
 
 def by_hand(found: Scenarios) -> tuple[np.ndarray, np.ndarray]:
@@ -67,13 +70,13 @@ def test_an_episode_is_a_loop_of_the_members_steps(make, each) -> None:
 
 
 def test_half_of_them_begin_as_their_episode_did_and_the_others_in_its_box() -> None:
-    found = scenarios(learnt(), each=False)
+    found = scenarios(learnt())
     first = np.array([each.thetas[0] for each in learnt().episodes])
     np.testing.assert_array_equal(found.starts[::2], first[::2])
     moved, box = found.starts[1::2], learnt().starts
     assert np.all((moved >= box.low) & (moved <= box.high))
     assert not np.any(moved == first[1::2])
-    again = scenarios(learnt(), each=False)
+    again = scenarios(learnt())
     np.testing.assert_array_equal(found.starts, again.starts)
     assert found.given.shape == (60, 4, 0)  # as long as the longest
 
@@ -87,7 +90,7 @@ def test_references_are_those_of_the_episodes_and_stay_after_their_end() -> None
 
 
 def test_an_input_beyond_its_bounds_is_clipped_and_one_that_is_none_is_zero() -> None:
-    found = scenarios(learnt(), each=False)
+    found = scenarios(learnt())
 
     def act(t, theta, rows):
         return np.where(rows[:, None] == 0, np.nan, 7.0)
@@ -97,7 +100,7 @@ def test_an_input_beyond_its_bounds_is_clipped_and_one_that_is_none_is_zero() ->
 
 
 def test_what_is_not_finite_is_lost_and_has_no_cost() -> None:
-    found = scenarios(learnt(), each=False)
+    found = scenarios(learnt())
     found.starts[2] = np.nan
     played = found.play(of_law(problem()))
     assert np.isinf(played.costs[2]) and played.unsafe[2, 2] == 1
