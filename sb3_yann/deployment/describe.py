@@ -119,9 +119,12 @@ def describe(
 def _unconfirmed(given: Exportable) -> str:
     """Return whether a model has learnt what nothing has confirmed; empty if not, and of others."""
     policy = given.policy if isinstance(given, BaseAlgorithm) else None
-    if not isinstance(policy, YannPolicy) or getattr(given, "improvements", ()):
-        return ""
-    if not ActorCheckpoint.of(policy).has_learned():
+    improved = bool(getattr(given, "improvements", False))
+    if (
+        improved
+        or not isinstance(policy, YannPolicy)
+        or not ActorCheckpoint.of(policy).has_learned()
+    ):
         return ""
     state = getattr(given, "guard_state", None)
     if state is None:
