@@ -26,8 +26,8 @@ class DisturbanceObserver:
     disturbances than measured outputs, E must describe the disturbance.
 
     What it takes and returns are deviations, as of a law: :class:`ObserveDisturbance` shows plant
-    units. Where the model says which of its disturbances are ``estimated``, the others are measured, and
-    :meth:`update` is told them. Else it estimates all of them.
+    units. Where the model says which of its disturbances are ``estimated``, the others are
+    measured, and :meth:`update` is told them. Else it estimates all of them.
 
     Parameters
     ----------
