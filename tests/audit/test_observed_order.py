@@ -126,9 +126,9 @@ def test_a_guard_tells_other_units_of_an_env(shown, words: str) -> None:
 
 def test_a_cost_audit_tells_it_too() -> None:
     options = {"problem": IN_PLANT_UNITS}
-    env = StageCost(Tanks(lambda x: x - TANKS.x_ss), IN_PLANT_UNITS)
+    env = StageCost(Tanks(lambda x: x * [100, 1]), IN_PLANT_UNITS)
     model = DDPG("YannPolicy", env, policy_kwargs=options, seed=0, learning_starts=10**6)
-    with pytest.warns(UserWarning, match="seems to show deviations"):
+    with pytest.warns(UserWarning, match="seems to show h times 100"):
         model.learn(60, callback=[NoActionNoise(), CostAudit(steps=50)])
 
 
