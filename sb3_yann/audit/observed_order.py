@@ -33,9 +33,15 @@ Reading = Callable[[Array], Array]
 def warn_of_order(
     problem: LinearMPC, theta: Array, u: Array, following: Array, stacklevel: int
 ) -> None:
-    """Warn where the model predicts the steps of an env in another reading of its states alone.
+    """Warn where the model predicts the steps of an env in another reading of its states alone."""
+    if words := misread_in_words(problem, theta, u, following):
+        warnings.warn(words, stacklevel=stacklevel)
 
-    That is another order of them, deviations from the operating point, or other units.
+
+def misread_in_words(problem: LinearMPC, theta: Array, u: Array, following: Array) -> str:
+    """Return in which other reading alone the model predicts the steps of an env; empty for none.
+
+    That is another order of the states, deviations from the operating point, or other units.
 
     Parameters
     ----------
@@ -43,24 +49,21 @@ def warn_of_order(
         Whose theta the env is to show.
     theta, u, following : ndarray, shapes (steps, n_theta), (steps, m) and (steps, n_theta)
         Steps of the env, in deviations.
-    stacklevel : int
-        Of the warning.
     """
     known = np.isfinite(theta).all(axis=1) & np.isfinite(following).all(axis=1)
     steps = theta[known], u[known], following[known]
     if np.count_nonzero(known) < FEWEST * problem.model.n_states:
-        return
+        return ""
     shown = _left_open(problem, lambda x: x, *steps)
     if not shown > WRONG:
-        return
+        return ""
     for reading, what, cure in _readings(problem):
         if (left := _left_open(problem, reading, *steps)) < RIGHT:
-            warnings.warn(
+            return (
                 f"The env seems to show {what}: so the model predicts {100 * (1 - left):.0f} % of "
-                f"a step, and {100 * max(1 - shown, 0):.0f} % as it is. {cure}",
-                stacklevel=stacklevel,
+                f"a step, and {100 * max(1 - shown, 0):.0f} % as it is. {cure}"
             )
-            return
+    return ""
 
 
 def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from stable_baselines3 import DDPG
 
-from sb3_yann import CostAudit, ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, headroom
+from sb3_yann import (
+    CostAudit,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    headroom,
+    report,
+)
 from sb3_yann.audit.closed_loops import of_law
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.rollout import rollout
@@ -122,6 +130,15 @@ def test_a_guard_tells_other_units_of_an_env(shown, words: str) -> None:
         guarded(lambda: StageCost(Tanks(shown), IN_PLANT_UNITS))
     told = [str(each.message) for each in found if "seems to show" in str(each.message)]
     assert len(told) == bool(words) and all(words in each for each in told)
+
+
+@pytest.mark.parametrize("factor", [1, 100])
+def test_the_page_to_sign_fails_where_units_are_others(factor: int, tmp_path) -> None:
+    env = Tanks(lambda x: x * [factor, 1])
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": IN_PLANT_UNITS}, seed=0)
+    page = report(model, tmp_path / "page.html", env=env, seeds=range(4)).read_text()
+    failed = [row for row in page.split("<tr>") if ">failed<" in row]
+    assert any("seems to show h times 100" in row for row in failed) == (factor == 100)
 
 
 def test_a_cost_audit_tells_it_too() -> None:
