@@ -19,6 +19,7 @@ from sb3_yann.audit.finding import (
     SteadyOffsetWarning,
     judged,
 )
+from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.offset import steady_offset
 from sb3_yann.audit.sample import FEWEST, Sample
 from sb3_yann.policy.observations import require_frozen
@@ -64,7 +65,7 @@ class CostAudit(BaseCallback):
     """
 
     model: OffPolicyAlgorithm
-    reward_alone = False  # a guard does not ask where outputs rest
+    reward_alone = False  # a guard has asked for the rest itself
 
     def __init__(
         self, steps: int = 100, tolerance: float = 1e-3, strict: bool = False, verbose: int = 0
@@ -129,6 +130,9 @@ class CostAudit(BaseCallback):
         if lost.any():
             cause = not_finite(lost, records, cause)
         beside = self._resting_beside(sample) if enough else ""
+        if not self.reward_alone:
+            steps = sample.theta, sample.u, sample.following
+            warn_of_order(self.policy.problem, *steps, stacklevel=2)
         self.finding = judged(sample, cause, self.training_env, beside)
         if beside:
             warnings.warn(beside, SteadyOffsetWarning, stacklevel=2)

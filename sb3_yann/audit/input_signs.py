@@ -73,7 +73,7 @@ def warn_of_signs(
                 f"{name} moves the env against the sign of the model's B: {np.median(gains):.2g} "
                 f"times as far in a step, from {len(gains)} starts. The MPC steers the wrong way. "
                 "Look at the sign and the order of the actions, and at B.",
-                stacklevel=stacklevel + 1,
+                stacklevel=stacklevel,
             )
 
 

@@ -25,8 +25,9 @@ class DisturbanceObserver:
     Disturbance models for offset-free model-predictive control, AIChE J. 49, 2003). With fewer
     disturbances than measured outputs, E must describe the disturbance.
 
-    Where the model says which of its disturbances are ``estimated``, the others are measured, and
-    :meth:`update` is told them. Else it estimates all of them.
+    What it takes and returns are deviations, as of a law: :class:`ObserveDisturbance` shows plant
+    units. Where the model says which of its disturbances are ``estimated``, the others are
+    measured, and :meth:`update` is told them. Else it estimates all of them.
 
     Parameters
     ----------

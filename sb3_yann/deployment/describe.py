@@ -16,6 +16,7 @@ from sb3_yann.deployment.code import scale_within
 from sb3_yann.deployment.controller import FORMAT
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import FADE_END, FADE_START, LawLayer
+from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import AffineFeatures, keeps_entries
 from sb3_yann.policy.policies import YannPolicy
 
@@ -62,6 +63,7 @@ def describe(
             "your code runs the observer and passes what it estimates: export(..., "
             'observer="caller").'
         )
+    note = " ".join(filter(None, [note, _unconfirmed(given)]))
     if isinstance(policy, YannPolicy):
         layer = policy.actor.mu
         law = _explicit(layer.base_law)
@@ -112,6 +114,27 @@ def describe(
         "action_names": np.array([*input_names]),
         "note": note,
     }
+
+
+def _unconfirmed(given: Exportable) -> str:
+    """Return whether a model has learnt what nothing has confirmed; empty if not, and of others."""
+    policy = given.policy if isinstance(given, BaseAlgorithm) else None
+    improved = bool(getattr(given, "improvements", False))
+    if (
+        improved
+        or not isinstance(policy, YannPolicy)
+        or not ActorCheckpoint.of(policy).has_learned()
+    ):
+        return ""
+    state = getattr(given, "guard_state", None)
+    if state is None:
+        return "Neither a guard nor improve has confirmed this policy."
+    if state.accepted.is_actor_of(policy):
+        return ""
+    return (
+        "The guard has not accepted this policy: it is a candidate, or was changed since. "
+        "restore_accepted(model) gives the accepted one."
+    )
 
 
 def _signal_maps(policy: Any, law: PiecewiseAffine) -> tuple[Array, Array, Array, Array]:

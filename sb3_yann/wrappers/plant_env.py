@@ -12,9 +12,9 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array, check_bounds, check_int, check_type
-from sb3_yann.control import LinearMPC
+from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.wrappers.stage_cost import StageCost
-from sb3_yann.wrappers.theta import PreviousInput, SetPoint
+from sb3_yann.wrappers.theta import ObserveDisturbance, PreviousInput, SetPoint
 
 Slope = Callable[[Array, Array], ArrayLike]
 
@@ -33,13 +33,15 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     f : callable
         From a state (n,) and an input (m,), in plant units, to dx/dt (n,).
     mpc : LinearMPC
-        Without disturbances: those are the env's own, see :class:`MeasuredDisturbance`.
+        Without measured disturbances: those are the env's own, see :class:`MeasuredDisturbance`.
     start_low, start_high : array_like, shape (n,), or float, optional
         The box that episodes begin in; by default half as wide as that of theta, about the
         operating point.
     max_episode_steps : int, default 100
     hold : int, optional
         Steps after which another set-point is drawn, as of :class:`SetPoint`.
+    observer : DisturbanceObserver, optional
+        What estimates the disturbances of the MPC, as :func:`offset_free` returns it.
     substeps : int, default 10
 
     Raises
@@ -68,16 +70,18 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         start_high: ArrayLike | None = None,
         max_episode_steps: int = 100,
         hold: int | None = None,
+        observer: DisturbanceObserver | None = None,
         substeps: int = 10,
     ) -> None:
         if not callable(f):
             raise TypeError(f"f = {f!r} must be a function (x, u) -> dx/dt.")
         check_type("mpc", mpc, LinearMPC, "a LinearMPC")
         layout, x_ss, n = mpc.layout, mpc.model.x_ss, mpc.model.n_states
-        if layout.n_disturbances:
+        if layout.n_disturbances and observer is None:
             raise ValueError(
-                "The MPC has disturbances, and f(x, u) has none: write an env that tells them, and "
-                "wrap it in MeasuredDisturbance and StageCost."
+                "The MPC has disturbances, and f(x, u) has none. If they are estimated, pass the "
+                "observer. Else write an env that tells them, and wrap it in MeasuredDisturbance "
+                "and StageCost."
             )
         half = (mpc.theta_max - mpc.theta_min)[layout.state] / 4
         low = np.maximum(x_ss - half, mpc.theta_min[layout.state])
@@ -94,6 +98,8 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         env: Any = Equations(f, mpc, start, substeps)
         if layout.n_references:
             env = SetPoint(env, mpc.tracking.r_min, mpc.tracking.r_max, hold=hold)
+        if observer is not None:
+            env = ObserveDisturbance(env, observer, mpc.disturbances.d_min, mpc.disturbances.d_max)
         if layout.n_previous:
             env = PreviousInput(env, mpc.model.u_ss)
         limit = check_int("max_episode_steps", max_episode_steps)

@@ -7,11 +7,21 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG
 
-from sb3_yann import LinearModel, LinearMPC, headroom
+from sb3_yann import (
+    CostAudit,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    headroom,
+    report,
+)
 from sb3_yann.audit.closed_loops import of_law
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.rollout import rollout
+from sb3_yann.wrappers import StageCost
 from sb3_yann_envs import problems
 
 A = np.array([[0.9, 0.3, 0.0], [0.0, 0.7, 0.2], [0.1, 0.0, 0.5]])
@@ -58,13 +68,85 @@ def test_another_order_is_told_with_what_to_show(order: list[int]) -> None:
     (message,) = told(Shuffled(order))
     back = [order.index(i) for i in range(3)]
     names = [MODEL.state_names[i] for i in order]
-    assert f"in the order {names}: so the model predicts 100 %" in message
+    assert f"in the order {names}, which is not the MPC's, ['a', 'b', 'c']: so the" in message
     assert f"Show x[{back}] of what the plant shows" in message
     assert not told(
         gym.wrappers.TransformObservation(
             Shuffled(order), lambda x: x[back], Shuffled.observation_space
         )
     )
+
+
+TANKS = LinearModel(
+    np.diag([0.9, 0.8]), [[0.5], [0.3]], dt=1.0, x_ss=[12, 330], u_ss=[3], state_names=["h", "T"]
+)
+IN_PLANT_UNITS = LinearMPC(
+    TANKS, Q=np.eye(2), R=[[1]], horizon=2, x_min=[0, 300], x_max=[20, 360], u_min=0, u_max=10
+)
+
+
+class Tanks(gym.Env):
+    """The model, which shows its states as somebody writes them down."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Box(0, 10, (1,), np.float32)
+
+    def __init__(self, shown) -> None:
+        self.shown = shown
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.t = self.np_random.uniform([8, 325], [16, 335]), 0
+        return self.shown(self.x), {}
+
+    def step(self, action):
+        self.x = TANKS.x_ss + TANKS.A @ (self.x - TANKS.x_ss) + TANKS.B @ (action - TANKS.u_ss)
+        self.t += 1
+        return self.shown(self.x), 0.0, False, self.t == 20, {}
+
+
+def guarded(make) -> None:
+    options = {"problem": IN_PLANT_UNITS}
+    model = DDPG("YannPolicy", make(), policy_kwargs=options, seed=0, learning_starts=10**6)
+    guard = ImprovementGuard(make, n_eval_episodes=4, n_new_starts=2, n_final_starts=2)
+    model.learn(20, callback=[NoActionNoise(), guard])
+
+
+@pytest.mark.parametrize(
+    ("shown", "words"),
+    [
+        (lambda x: x - TANKS.x_ss, "deviations from the operating point"),
+        (lambda x: x * [100, 1], "h times 100:"),
+        (lambda x: x - [0, 273.15], "T plus -273.15:"),
+        (lambda x: 1.8 * (x - [0, 273.15]) + [0, 32], ""),
+        (lambda x: x[::-1], "['T', 'h']"),
+        (lambda x: x * 1.1 + 0.1, ""),
+        (lambda x: x, ""),
+    ],
+)
+def test_a_guard_tells_other_units_of_an_env(shown, words: str) -> None:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        guarded(lambda: StageCost(Tanks(shown), IN_PLANT_UNITS))
+    told = [str(each.message) for each in found if "seems to show" in str(each.message)]
+    assert len(told) == bool(words) and all(words in each for each in told)
+
+
+@pytest.mark.parametrize("factor", [1, 100])
+def test_the_page_to_sign_fails_where_units_are_others(factor: int, tmp_path) -> None:
+    env = Tanks(lambda x: x * [factor, 1])
+    model = DDPG("YannPolicy", env, policy_kwargs={"problem": IN_PLANT_UNITS}, seed=0)
+    page = report(model, tmp_path / "page.html", env=env, seeds=range(4)).read_text()
+    failed = [row for row in page.split("<tr>") if ">failed<" in row]
+    assert any("seems to show h times 100" in row for row in failed) == (factor == 100)
+
+
+def test_a_cost_audit_tells_it_too() -> None:
+    options = {"problem": IN_PLANT_UNITS}
+    env = StageCost(Tanks(lambda x: x * [100, 1]), IN_PLANT_UNITS)
+    model = DDPG("YannPolicy", env, policy_kwargs=options, seed=0, learning_starts=10**6)
+    with pytest.warns(UserWarning, match="seems to show h times 100"):
+        model.learn(60, callback=[NoActionNoise(), CostAudit(steps=50)])
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 3.0])

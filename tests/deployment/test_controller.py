@@ -25,11 +25,14 @@ from sb3_yann import (
     Checks,
     Controller,
     DisturbanceBounds,
+    ImprovementGuard,
     LinearModel,
     LinearMPC,
+    NoActionNoise,
     Tracking,
     export,
     offset_free,
+    restore_accepted,
 )
 from sb3_yann._archive import write_arrays
 from sb3_yann.deployment.code import insensitive
@@ -490,3 +493,28 @@ def test_a_disturbance_that_may_be_measured_or_not_comes_from_the_caller(tmp_pat
     assert (read.note, written.note) == ("", "") and "NOTE" not in repr(read) + str(written)
     with pytest.raises(ValueError, match="observer = 'me' must be one of"):
         export(mpc, tmp_path / "law.npz", observer="me")
+
+
+def test_a_policy_that_nothing_has_confirmed_says_so_in_its_files(tmp_path) -> None:
+    model = DDPG("YannPolicy", "CSTR-v0", seed=0, device="cpu", learning_starts=10**6)
+
+    def note() -> str:
+        written = export(model, tmp_path / "plant.c")
+        assert (written.note in texts(tmp_path)) and ("NOTE" in str(written)) == bool(written.note)
+        return written.note
+
+    assert note() == ""  # the MPC
+    learnt = last_layer(model.policy)
+    with th.no_grad():
+        learnt[..., -1] += 0.1
+    assert note() == "Neither a guard nor improve has confirmed this policy."
+    with th.no_grad():
+        learnt[..., -1] -= 0.1
+    guard = ImprovementGuard("CSTR-v0", n_eval_episodes=2, n_final_starts=2)
+    model.learn(2, callback=[NoActionNoise(), guard])
+    assert note() == ""
+    with th.no_grad():
+        learnt[..., -1] += 0.1
+    assert note().startswith("The guard has not accepted this policy")
+    restore_accepted(model)
+    assert note() == ""

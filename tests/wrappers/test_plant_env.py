@@ -19,6 +19,7 @@ from sb3_yann import (
     RateLimits,
     Tracking,
     headroom,
+    offset_free,
 )
 from sb3_yann.evaluation import evaluate
 
@@ -73,6 +74,21 @@ def test_a_policy_on_it_is_the_mpc_and_its_reward_minus_the_cost() -> None:
     assert law.lengths.tolist() == [100] * 4
     model.learn(120, callback=[NoActionNoise(), audit])
     assert audit.finding.matches
+
+
+def test_an_observer_takes_the_offset_of_another_plant() -> None:
+    """Here the pump gives a tenth more than the model says."""
+    mpc, observer = offset_free(full())
+    worn = lambda x, u: slope(x, 1.1 * u)  # noqa: E731
+    apart = []
+    for each, options in ((full(), {}), (mpc, {"observer": observer})):
+        env = PlantEnv(worn, each, **options)
+        theta, _ = env.reset(seed=2)
+        assert theta.shape == (each.n_theta,)
+        for _ in range(60):
+            theta = env.step(each.explicit().plant_input(theta))[0]
+        apart.append(abs(theta[0] - theta[1]))
+    assert apart[1] < 0.1 * apart[0]
 
 
 def test_plans_are_made_in_its_own_states(monkeypatch) -> None:
