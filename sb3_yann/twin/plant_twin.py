@@ -309,17 +309,17 @@ class PlantTwin:
         """A model of the log of another form than the twin's members.
 
         Where an input follows the state as in a closed loop without excitation, members of one form
-        may agree on what is wrong, and where the plant is not smooth. For a polynomial it is a
-        network; for a network, and on a short log, a Gaussian process, which away from the data is
-        zero.
+        may agree on what is wrong, and where the plant is not smooth. It is a Gaussian process,
+        which away from the data is zero, or a network where the twin is none and that predicts the
+        log's own free runs better.
         """
         problem, coordinates = self.problem, self.dynamics.coordinates
-        if self.kind != NETWORK and sum(map(len, self.episodes)) >= ROWS:
-            members = fit_ensemble(coordinates, [self.episodes], seed=0, ahead=AHEAD)
-            return Dynamics(problem, coordinates, tuple(members))
         process = GaussianProcess(problem.layout.has_constants, shortest=SHORT)
-        residual = fitted(problem, coordinates, self.episodes, [process])
-        return Dynamics(problem, coordinates, tuple(residual))
+        found = fitted(problem, coordinates, self.episodes, [process])
+        if self.kind != NETWORK and sum(map(len, self.episodes)) >= ROWS:
+            found += fit_ensemble(coordinates, [self.episodes], seed=0, ahead=AHEAD)
+        best = int(np.argmin(errors_on(coordinates, self.episodes, found)))
+        return Dynamics(problem, coordinates, (found[best],))
 
     @cached_property
     def heeds_second_opinion(self) -> bool:
