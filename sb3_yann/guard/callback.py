@@ -327,6 +327,7 @@ class ImprovementGuard(BaseCallback):
     def _on_step(self) -> bool:
         if self._audit is not None and self._audit.finding is None:
             self._audit.on_step()
+            self._compare_rewards()
         dones, state = self.locals["dones"], self.state
         state.episodes += int(np.sum(dones))
         self._warn_of_an_endless_episode(dones)
@@ -336,6 +337,17 @@ class ImprovementGuard(BaseCallback):
             self._try_candidate()
         self._save_accepted()
         return True
+
+    def _compare_rewards(self) -> None:
+        """Warn where the training env pays the MPC's cost, and the guard's env something else."""
+        found = None if self._audit is None else self._audit.finding
+        if found is not None and found.matches and not self.player.pays_cost:
+            warnings.warn(
+                f"The training env pays minus the cost of the MPC, and the guard's env "
+                f"{self.settings.env} pays something else, by which policies are compared. Give "
+                "the guard the env of the training, with the same StageCost.",
+                stacklevel=2,
+            )
 
     def _try_candidate(self) -> None:
         """Accept the present policy, whole or in part, or refuse it.

@@ -432,8 +432,9 @@ def _scores_if_passed(
 class Player:
     """Plays checkpoints in the guard's simulator; the policy stays as it is.
 
-    Inputs may move by ``max_input_step`` (m,) from one sample to the next. Once Ctrl-C has restored
-    the accepted policy, it is ``interrupted``, and restores nothing else.
+    Inputs may move by ``max_input_step`` (m,) from one sample to the next. Whether its env
+    ``pays_cost`` of the problem, as the policy scales it, is known once the MPC has played. Once
+    Ctrl-C has restored the accepted policy, it is ``interrupted``, and restores nothing else.
     """
 
     def __init__(
@@ -441,6 +442,7 @@ class Player:
     ) -> None:
         self.model, self.policy, self.mpc, self.envs = model, policy, mpc, EnvPool(env)
         self.max_input_step: Array | None = None
+        self.pays_cost = True
         self.interrupted = False
 
     def __call__(self, checkpoint: ActorCheckpoint, seeds: Sequence[int]) -> Scores:

@@ -25,6 +25,9 @@ from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin
 from sb3_yann.rollout import Trajectories, preserve_rng
 
+SAME = 0.01
+"""Of the mean cost: a reward that differs by more is another one."""
+
 
 def first_evidence(
     player: Player, settings: GuardSettings, known: GuardState | None
@@ -96,13 +99,22 @@ def _first_scores(player: Player, settings: GuardSettings, seeds: Sequence[int])
 
 
 def _warn_of_misreading(player: Player, seeds: Sequence[int], mpc: Trajectories) -> None:
-    """Warn where the simulator is the model with states in another order, or a sign of inputs."""
+    """Warn where the simulator is the model with states in another order, or a sign of inputs.
+
+    Note whether it pays the problem's cost.
+    """
     policy = player.policy
     thetas = [player.theta(each) for each in mpc.observations]
     inputs = [policy.inputs(each) for each in mpc.actions]
     before = np.concatenate([each[:-1] for each in thetas])
     after = np.concatenate([each[1:] for each in thetas])
     warn_of_order(policy.problem, before, np.concatenate(inputs), after, stacklevel=2)
+    options, rewards = policy.critic_options, np.concatenate(mpc.own_rewards)
+    cost = policy.problem.deviations.stage_cost(before, np.concatenate(inputs))
+    error = np.abs(options.reward_scale * cost + rewards - options.reward_offset)
+    error = error[np.isfinite(error)]  # steps that violate may cost more
+    error = error if len(error) else np.zeros(1)
+    player.pays_cost = not np.mean(error) > SAME * options.reward_scale * np.mean(cost)
     with preserve_rng(), player.envs.acquire(1) as (env,):
         maps = {"theta": player.theta, "inputs": policy.inputs}
         warn_of_signs(policy.problem, env, seeds, mpc, **maps, stacklevel=2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -217,3 +218,18 @@ def test_an_mpc_that_rides_its_bound_is_no_veto_and_no_excuse() -> None:
     tolerance = AcceptanceRule().tolerance(own.costs)
     assert no_worse(cheaper, own, own, tolerance).accepted
     assert no_worse(beyond, own, own, tolerance).breaks_limit
+
+
+@pytest.mark.parametrize("weight", [0.05, 0.4])
+def test_a_guard_s_env_that_pays_another_cost_than_training_is_told(weight: float) -> None:
+    mpc, make = carriage("hard states")
+    paid = replace(mpc, R=[[weight]])
+    model = DDPG("YannPolicy", make(), policy_kwargs={"problem": mpc}, device="cpu", seed=0,
+                 learning_starts=10**6)  # fmt: skip
+    other = {"n_eval_episodes": 4, "n_final_starts": 2}
+    guard = ImprovementGuard(lambda: TimeLimit(StageCost(Carriage(), paid), 12), **other)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        model.learn(120, callback=[NoActionNoise(), guard])
+    told = [each for each in found if "pays something else" in str(each.message)]
+    assert len(told) == (weight != mpc.R[0, 0])
