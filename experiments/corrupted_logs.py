@@ -15,7 +15,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import DDPG
 
 from examples import quadruple_tank as tank
 from experiments import plants
@@ -224,10 +223,10 @@ def fitted(mpc: LinearMPC, episodes: Log, n_members: int = 1) -> PlantTwin | Non
 
 def improved(mpc: LinearMPC, make: Any, twin: PlantTwin) -> float | None:
     """Return the change of the cost on the plant, in %; None where nothing is accepted."""
-    model = DDPG("YannPolicy", twin.env(), policy_kwargs={"problem": mpc}, device="cpu", seed=0)
-    if not improve(model, twin, n_starts=20).accepted:
+    found = improve(mpc, twin, n_starts=20)
+    if not found.accepted:
         return None
-    act = lambda theta: model.predict(theta.astype(np.float32), deterministic=True)[0]  # noqa: E731
+    act = lambda theta: found.model.predict(theta.astype(np.float32), deterministic=True)[0]  # noqa: E731
     costs = [
         sum(np.sum(mpc.stage_cost(t[:-1], u)) for t, u in (play(each, mpc, make(), 9000 + i)
             for i in range(60))) for each in (act, mpc.law())

@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3 import DDPG
 
 from experiments.markdown import number, quote, spread, table
 from experiments.optimum import cstr_optimum
 from experiments.plants import CASES
 from experiments.runner import RESULTS, Outcome, Run, load_all, run_all
-from sb3_yann import LinearMPC, PlantTwin, YannPolicy, headroom, improve
+from sb3_yann import LinearMPC, PlantTwin, headroom, improve
 from sb3_yann.evaluation import evaluate
+from sb3_yann.rollout import Trajectories
 from sb3_yann.wrappers import StageCost
 from sb3_yann_envs import problems
 
@@ -38,6 +38,8 @@ HEADER = (
     "worst episode, %",
     "changed",
     "violations",
+    "steps of the simulator",
+    "largest move, variation",
     "seconds",
 )
 
@@ -62,10 +64,15 @@ LOG_HEADER = (
 )
 
 
-def costs_on(mpc: LinearMPC, make: Callable[[], Any], policy: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return stage costs and steps beyond a limit of the tested episodes."""
-    played = evaluate(policy, lambda: StageCost(make(), mpc, violation_cost=0.0), TESTS)
-    return played.costs, played.violations
+def costs_on(mpc: LinearMPC, make: Callable[[], Any], policy: Any) -> Trajectories:
+    """Return the tested episodes, whose costs are stage costs."""
+    return evaluate(policy, lambda: StageCost(make(), mpc, violation_cost=0.0), TESTS)
+
+
+def moves_of(played: Trajectories) -> tuple[float, float]:
+    """Return the largest step of an input from sample to sample, and the mean of all steps."""
+    steps = np.concatenate([np.abs(np.diff(each, axis=0)) for each in played.actions])
+    return float(steps.max()), float(steps.mean())
 
 
 def execute(run: Run) -> Outcome:
@@ -81,20 +88,15 @@ def execute(run: Run) -> Outcome:
         violations = np.zeros(costs.shape)
         seconds = time.perf_counter() - started
     else:
-        model = DDPG(
-            YannPolicy,
-            case.make(),
-            gamma=min(case.mpc.gamma, 0.99),
-            seed=run.seed,
-            device="cpu",
-            policy_kwargs={"problem": case.mpc},
-        )
-        result = improve(model, case.make, seed=run.seed)
+        result = improve(case.mpc, case.make, seed=run.seed)
         seconds = time.perf_counter() - started
-        played = [costs_on(case.mpc, case.make, each) for each in (case.mpc.explicit(), model)]
-        costs = np.array([each[0] for each in played])
-        violations = np.array([each[1] for each in played])
-        extra["accepted"] = float(result.accepted)
+        both = (case.mpc.explicit(), result.model)
+        played = [costs_on(case.mpc, case.make, each) for each in both]
+        costs = np.array([each.costs for each in played])
+        violations = np.array([each.violations for each in played])
+        moves = np.array([moves_of(each) for each in played])
+        extra |= {"accepted": float(result.accepted), "steps": float(result.steps)}
+        extra |= {"step": moves[1, 0] / moves[0, 0], "variation": moves[1, 1] / moves[0, 1]}
     return _untrained([0, 1], costs, violations, extra, seconds)
 
 
@@ -109,8 +111,7 @@ def _from_a_log(run: Run) -> Outcome:
         twin = PlantTwin.fit(mpc, reactor_log(*LOGS[run.learner], run.seed), seed=run.seed)
         trusted = twin.trusted
     if run.learner in LOGS and trusted:
-        policy = DDPG(YannPolicy, "CSTR-v0", device="cpu", policy_kwargs={"problem": mpc})
-        improve(policy, twin, seed=run.seed)
+        policy = improve(mpc, twin, seed=run.seed).model
     seconds = time.perf_counter() - started
     before = evaluate(law, "CSTR-v0", TESTS)
     after = evaluate(policy, "CSTR-v0", TESTS)
@@ -185,10 +186,18 @@ def rows(outcomes: Mapping[Run, Outcome]) -> list[list[str]]:
                 f"{worst:+.2f}",
                 f"{sum(bool(each.extra['accepted']) for each in ours)} of {len(ours)}",
                 f"{more}",
+                f"{_median(ours, 'steps'):,.0f}",
+                ", ".join(
+                    f"{np.median([e.extra[k] for e in ours]):.2f}" for k in ("step", "variation")
+                ),
                 f"{np.median([each.seconds for each in ours]):.0f}",
             ]
         )
     return found
+
+
+def _median(outcomes: Sequence[Outcome], name: str) -> float:
+    return float(np.median([each.extra[name] for each in outcomes]))
 
 
 def log_rows(outcomes: Mapping[Run, Outcome]) -> list[list[str]]:
