@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_yann.audit.closed_loops import Excited, of_law, require_repeated
 from sb3_yann.audit.in_deviations import in_deviations, require_theta_shown
+from sb3_yann.audit.input_signs import warn_of_signs
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
 from sb3_yann.control import LinearMPC
@@ -93,9 +94,12 @@ class Simulator:
         each = EPISODES // 2
         while each < MOST // 2 and 2 * each * self.longest < SHORT:
             each += EPISODES // 4
-        logged = self.play(of_law(problem), self.new_seeds(each - 1))
+        seeds = self.new_seeds(each - 1)
+        logged = self.play(of_law(problem), seeds)
         require_theta_shown(problem, logged.steps()[0])
         warn_of_order(problem, *logged.steps(), stacklevel=5)
+        with self.envs.acquire(1) as (one,):
+            warn_of_signs(problem, one, seeds, logged, stacklevel=5)
         if not self.unaware:
             warn_of_own_reward(problem, logged, stacklevel=5)
         excited = self.play(Excited(problem, self.seed, PUSH, OFTEN), self.new_seeds(each))
