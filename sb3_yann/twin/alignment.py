@@ -38,6 +38,8 @@ LEAST_GAIN = 0.6
 """A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
 ROUNDING = 1e-9
 """Of a half-width: an input that moves by less stands still."""
+MOVING = 1e-3
+"""Of a standard deviation: a state that moves by more in a step moves."""
 LEAST_ROWS = 20
 """Rows of a regression on the law, at least."""
 CONFIRM = "If its units were checked, and the plant or its controller is so: units_confirmed=True."
@@ -299,12 +301,19 @@ def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _held(log: _Log) -> NDArray[np.bool_]:
-    """Return which inputs (m,) mostly stand still between their bounds: no law of moving states."""
-    u, problem = [each.actions for each in log.episodes], log.problem.deviations
-    still = [np.abs(np.diff(each, axis=0)) <= ROUNDING * problem.u_half for each in u]
-    inside = [(each[1:] > problem.u_min) & (each[1:] < problem.u_max) for each in u]
-    pairs = zip(still, inside, strict=True)
-    return np.asarray(np.mean(np.concatenate([a & b for a, b in pairs]), axis=0) > 0.5)
+    """Return which inputs (m,) mostly stand still inside of their bounds while the states move.
+
+    No law of the states makes them.
+    """
+    problem, units, state = log.problem.deviations, log.coordinates.units, log.coordinates.row.state
+    held, moves = [], []
+    for each in log.episodes:
+        u, x = each.actions, each.thetas[:-1, state]
+        still = np.abs(np.diff(u, axis=0)) <= ROUNDING * problem.u_half
+        held.append(still & (u[1:] > problem.u_min) & (u[1:] < problem.u_max))
+        moves.append(np.any(np.abs(np.diff(x, axis=0)) > MOVING * units, axis=1))
+    moving = np.concatenate(moves)
+    return np.asarray(np.concatenate(held)[moving].mean(axis=0) > 0.5) & bool(moving.any())
 
 
 def _against_plant(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC, PlantTwin
+from sb3_yann.twin import alignment
 
 GAINS = np.array([1.5, 0.7])
 SELECT = ["none", "linear"]
@@ -123,15 +124,17 @@ def room() -> LinearMPC:
     )
 
 
-def heated(gain: float, dither: float, open_loop: bool = False) -> list:
+def heated(
+    gain: float, dither: float, open_loop: bool = False, steps: int = 40, hold: int = 4
+) -> list:
     """Return episodes of a room whose heater has so many times the model's gain."""
     rng, law, found = np.random.default_rng(5), room().explicit(), []
     held = np.zeros(1)
     for _ in range(6):
         states, inputs = [rng.uniform(-2, 2, 2)], []
-        for k in range(40):
+        for k in range(steps):
             drawn = rng.normal(size=1)
-            held = drawn if k % 4 == 0 else held
+            held = drawn if k % hold == 0 else held
             wanted = 0.5 * held if open_loop else law(states[-1]) + dither * drawn
             inputs.append(np.clip(wanted, -2, 2))
             states.append(room().model.A @ states[-1] + gain * room().model.B @ inputs[-1])
@@ -160,6 +163,23 @@ def test_a_state_with_another_zero_and_scale_is_not_the_one_that_the_mpc_saw() -
     twin = heated_twin([(x * [1.8, 1] + [0.5, 0], u) for x, u in heated(1.0, 0.2)])
     assert "The MPC gives the logged inputs where x[0] is" in twin.report()
     assert not twin.trusted
+
+
+def test_an_mpc_that_has_settled_still_shows_a_state_in_other_units() -> None:
+    twin = heated_twin([(x * [1, 0.4], u) for x, u in heated(1.0, 0.0, steps=200)])
+    assert "The MPC gives the logged inputs where x[1] is 2.5 times" in twin.report()
+    assert not twin.trusted
+
+
+def test_inputs_that_are_held_while_the_states_move_are_no_law_s() -> None:
+    def held(episodes: list) -> bool:
+        twin = heated_twin(episodes)
+        log = alignment._Log(room(), twin.dynamics.coordinates, twin.episodes, False)
+        return bool(alignment._held(log)[0])
+
+    assert held(heated(1.0, 0.0, open_loop=True, steps=200, hold=40))
+    assert not held(heated(1.0, 0.0, steps=200))  # at rest nothing moves
+    assert not held([(x, 0 * u + 2) for x, u in heated(1.0, 0.0)])  # on its bound
 
 
 def test_a_gain_that_only_an_open_loop_shows_counts_once_the_units_are_confirmed() -> None:
