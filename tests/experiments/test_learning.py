@@ -28,6 +28,7 @@ pytest.importorskip("scipy", minversion="1.15")  # of the extra `paper`
 def outcome(costs, violations=((0, 0), (0, 0)), accepted=True, seconds=1.0) -> Outcome:
     none = np.zeros(0)
     extra = {"accepted": np.array(accepted), "trusted": np.array(accepted)}
+    extra |= {"steps": 1000 * seconds, "step": 1.5, "variation": 0.25}
     return Outcome([0, 1], costs, np.array(violations), none, none, none, extra, seconds)
 
 
@@ -56,6 +57,8 @@ def test_a_row_holds_medians_ranges_and_what_was_lost() -> None:
         "worst episode, %": "+20.00",
         "changed": "2 of 3",
         "violations": "2",
+        "steps of the simulator": "5,000",
+        "largest move, variation": "1.50, 0.25",
         "seconds": "5",
     }
 
@@ -103,7 +106,11 @@ def test_a_run_compares_with_the_mpc_on_the_same_episodes(monkeypatch) -> None:
     monkeypatch.setattr(learning, "TESTS", range(2000, 2004))
     plans = execute(Run("pH", PLANNED, 40, 0))
     law = CASES["pH"]().mpc.explicit()
-    costs, violations = learning.costs_on(CASES["pH"]().mpc, CASES["pH"]().make, law)
-    np.testing.assert_allclose(plans.test_costs[0], costs, rtol=1e-6)
-    assert not violations.any()
-    assert plans.test_costs[1].mean() < 0.8 * costs.mean()
+    played = learning.costs_on(CASES["pH"]().mpc, CASES["pH"]().make, law)
+    np.testing.assert_allclose(plans.test_costs[0], played.costs, rtol=1e-6)
+    assert not played.violations.any()
+    assert plans.test_costs[1].mean() < 0.8 * played.costs.mean()
+    steps = [np.abs(np.diff(each, axis=0)) for each in played.actions]
+    largest, mean = learning.moves_of(played)
+    assert largest == max(each.max() for each in steps)
+    assert mean == pytest.approx(np.concatenate(steps).mean())
