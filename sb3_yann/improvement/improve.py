@@ -158,7 +158,8 @@ def improve(
 
     *In a twin* the members take turns in planning. A policy is accepted if it is no worse than the
     MPC from new starts on every member, and gains twice the standard error on episodes that go on
-    as those of the log. The twin's second opinion, a model without a form, must see a gain as well.
+    as those of the log. The twin's second opinion, a model of another form, must see a gain as
+    well, where it predicts the log nearly as well.
     What is refused is taught; then half and a quarter of the correction are tried. Beyond what the
     log shows the MPC acts alone: no member of the twin knows the plant there.
 
