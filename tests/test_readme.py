@@ -42,6 +42,7 @@ def run_code(name: str, code: str) -> dict[str, object]:
     shortened = shortened.replace(
         "improve(model, twin)", "improve(model, twin, rounds=1, n_starts=5, updates=50)"
     )
+    shortened = shortened.replace("updates=500", "rounds=1, updates=50")
     # A number that nothing here knows would train in full.
     steps = re.findall(r"\.learn\(\s*(?:total_timesteps\s*=\s*)?([^\s,)]*)", shortened)
     assert set(steps) <= {"500"}, f"{name}: learn is called with {steps}"

@@ -94,7 +94,7 @@ class Commissioning:
     >>> from stable_baselines3 import DDPG
     >>> from sb3_yann import Commissioning
     >>> model = DDPG("YannPolicy", "CSTR-v0", device="cpu")
-    >>> first = Commissioning(model, "CSTR-v0", batch=2, updates=500).run(batches=1)[0]
+    >>> first = Commissioning(model, "CSTR-v0", batch=2, rounds=1, updates=100).run(batches=1)[0]
     >>> first.acted, first.episodes
     ('MPC', 2)
     """

@@ -17,6 +17,11 @@ DT, FRICTION = 0.05, 2.4
 TESTS = range(900, 930)
 
 
+@pytest.fixture(autouse=True)
+def no_networks() -> None:
+    """Here a log may have them."""
+
+
 def motor() -> LinearMPC:
     """A motor's angle and speed; the model knows no dry friction."""
     model = LinearModel.from_continuous([[0, 1], [0, -1.5]], [[0], [2.0]], dt=DT)

@@ -1,0 +1,13 @@
+"""Twins here are of polynomials: a fit of networks takes seconds, and every batch fits a twin."""
+
+from __future__ import annotations
+
+import pytest
+
+from sb3_yann.twin import selection
+
+
+@pytest.fixture(autouse=True)
+def no_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no log be long enough for them, but where a test asks for nothing else."""
+    monkeypatch.setattr(selection, "ROWS", 10**9)
