@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.commissioning.familiarity import Familiarity
 from sb3_yann.twin.dynamics import Dynamics, law_of
+from sb3_yann.twin.ensemble import NetworkResidual, fit_ensemble
 from sb3_yann.twin.log import Episode, pieces
 from sb3_yann.twin.plant_twin import PlantTwin
-from sb3_yann.twin.selection import fitted
+from sb3_yann.twin.residuals import Residual
+from sb3_yann.twin.selection import AHEAD, fitted
 from sb3_yann.twin.trust import costs_of
 
 GAINS = np.array([1.0, 0.2, 0.05, 0.02])
@@ -145,7 +147,7 @@ class Bands:
         count = min(FOLDS, len(log))
         parts = [(log[k::count], [e for i, e in enumerate(log) if i % count != k])
                  for k in range(count)]  # fmt: skip
-        models = [_fitted(twin, kept) for _, kept in parts]
+        models = _fitted(twin, [kept for _, kept in parts])
         pairs = zip(models, parts, strict=True)
         left = [_one_step(model, e) for model, (out, _) in pairs for e in out]
         error, lag = _errors(left)
@@ -192,12 +194,15 @@ def _cost_ratio(tracks: Tracks, offset: float) -> float:
     return (tracks.cost - mean) / scale
 
 
-def _fitted(twin: PlantTwin, episodes: list[Episode]) -> Dynamics:
-    """Return the twin with a first member that knows these episodes only."""
+def _fitted(twin: PlantTwin, logs: list[list[Episode]]) -> list[Dynamics]:
+    """Return the twin with a first member that knows one of the logs only, for each of them."""
     first, *others = twin.dynamics.members
     coordinates = twin.dynamics.coordinates
-    (made,) = fitted(twin.problem, coordinates, episodes, [copy.copy(first)])
-    return Dynamics(twin.problem, coordinates, (made, *others))
+    if isinstance(first, NetworkResidual):
+        made: list[Residual] = [*fit_ensemble(coordinates, logs, seed=0, ahead=AHEAD)]
+    else:
+        made = [fitted(twin.problem, coordinates, e, [copy.copy(first)])[0] for e in logs]
+    return [Dynamics(twin.problem, coordinates, (each, *others)) for each in made]
 
 
 def _one_step(dynamics: Dynamics, episode: Episode) -> Array:

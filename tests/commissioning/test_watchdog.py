@@ -11,6 +11,7 @@ import pytest
 
 from sb3_yann import PlantTwin
 from sb3_yann.commissioning.watchdog import Alarm, Watchdog
+from sb3_yann.twin.dynamics import law_of
 from twin_samples import DT, log, problem
 
 NOISE = 0.0003
@@ -199,3 +200,13 @@ def test_an_alarm_calls_sensors_by_their_names_and_shows_what_they_read() -> Non
     theta, u, after = drive(2)[0]
     alarm = barks(Watchdog.of(twin), [(theta, u, after + np.array([0.2, 0.0]))])[1]
     assert "place is off the twin's prediction" in alarm.message
+
+
+def test_a_watchdog_of_a_network_is_quiet_on_the_plant_of_its_log() -> None:
+    found = PlantTwin.fit(problem(), log(8), residuals=["network"], n_members=2)
+    dog, law = Watchdog.of(found), law_of(problem())
+    (x, u), *_ = log(1)
+    dog.start(x[0], law)
+    for before, act, after in zip(x[:-1], u, x[1:], strict=True):
+        dog.watch(before, act, after)
+    assert dog.quiet
