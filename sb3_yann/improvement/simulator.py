@@ -107,8 +107,9 @@ class Simulator:
             self.learn(some)
         if not self.episodes:
             raise ValueError(
-                f"None of {2 * each} episodes of the MPC in the simulator has {SHORTEST} steps "
-                "that are all finite: there is nothing to learn from."
+                f"None of {2 * each} episodes of the MPC in the simulator is finite in all of its "
+                f"rows, {SHORTEST} steps or more: there is nothing to learn from. An episode with "
+                "a reading that is no finite number is left out."
             )
 
     def count(self) -> None:
