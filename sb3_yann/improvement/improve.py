@@ -150,19 +150,19 @@ def improve(
     *In a simulator* the model is an ensemble of small networks on top of the MPC's own, fitted to
     twenty to sixty episodes of the MPC, half of them with random inputs on top. Each round plays
     the policy from ten starts, and fits the model anew to what that showed, until the simulator
-    shows what the model promised. The best policy is then confirmed on new starts, in pairs with the MPC:
-    after 10, 20, 40 and 80 of them a paired test says whether it surely gains 0.1 %, with an error
-    of 5 % over all looks. Its worst 5 % of the starts must be no worse by 1 %, and on none of them
-    may a bound be exceeded by more than with the MPC: forty starts leave up to 7 % of all unseen,
-    at 95 %. What it loses is taught, and it is tried again on other starts, three times; then half
-    of the correction.
+    shows what the model promised. The best policy is then confirmed on new starts, in pairs with
+    the MPC: after 10, 20, 40 and 80 of them a paired test says whether it surely gains 0.1 %, with
+    an error of 5 % over all looks. Its worst 5 % of the starts must be no worse by 1 %, and on none
+    of them may a bound be exceeded by more than with the MPC: forty starts leave up to 7 % of all
+    unseen, at 95 %. What it loses is taught, and it is tried again on other starts, three times;
+    then half of the correction.
 
     *In a twin* the members take turns in planning. A policy is accepted if it is no worse than the
     MPC from new starts on every member, and gains twice the standard error on episodes that go on
     as those of the log. The twin's second opinion, a model of another form, must see a gain as
-    well, where it predicts the log nearly as well.
-    What is refused is taught; then half and a quarter of the correction are tried. Beyond what the
-    log shows the MPC acts alone: no member of the twin knows the plant there.
+    well, where it predicts the log nearly as well. What is refused is taught; then half and a
+    quarter of the correction are tried. Beyond what the log shows the MPC acts alone: no member of
+    the twin knows the plant there.
 
     The model ends with the policy that was accepted and a critic that is refitted to it, else as it
     was. It saves and goes on learning as any other.

@@ -325,7 +325,7 @@ class Unseeded(Spring):
         (Unseeded, r"the env does not repeat it.*wrap it in sb3_yann.wrappers.SeededGlobals"),
         (
             Short,
-            r"None of \d+ episodes of the MPC in the simulator has \d+ steps that are all",
+            r"None of \d+ episodes of the MPC in the simulator is finite in all of its",
         ),
         (Strange, r"The simulator shows \(3,\) and takes \(1,\); theta of the model's problem has"),
     ],
