@@ -392,7 +392,8 @@ class Starts:
         above_mpc = is_above(policy.costs, self.mpc.costs)
         if self.is_lost(policy):
             first = self.hardest(policy)[0]
-            breaks, words = False, self.tolerance.exceeded(policy, int(first), self.mpc)
+            breaks = False
+            words = self.tolerance.exceeded(policy, int(first), self.mpc)
             also = f": {words}" if words else ""
             if self.less_safe(policy).any():
                 breaks = policy.breaks_more_than(self.mpc, self.tolerance.excess_room)

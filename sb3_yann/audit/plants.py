@@ -76,7 +76,8 @@ class TwinPlant:
 
     def step(self, theta: Array, u: Array, rows: Rows) -> Array:
         """Return the next theta (k, n_theta); an estimated d stays, as in an env's plan."""
-        row, after = self.dynamics.row, self.advance(self.dynamics.row.begin(theta), u, rows)
+        row = self.dynamics.row
+        after = self.advance(row.begin(theta), u, rows)
         found, parts = row.shown(after).copy(), self.dynamics.problem.layout
         if row.observer is not None:
             found[:, parts.state] = after[:, row.state]

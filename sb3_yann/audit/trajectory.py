@@ -194,7 +194,8 @@ def _backward(
     curved = np.broadcast_to(W, (len(inputs), len(rows), *W.shape))
     if task.doubt is not None:
         slope, more = task.doubt.slopes(thetas[:-1], inputs)
-        slopes, curved = slopes + slope, curved + more
+        slopes = slopes + slope
+        curved = curved + more
     gradient, curvature = task.penalty(thetas[1:])
     limits = task.limits(thetas[:-1])
     low, high = (each - inputs for each in limits)

@@ -109,7 +109,8 @@ def compare(
         more = more - (starts[0] - starts[1])
     found = PairedMean.of(more)
     mpc = mean - found.mean
-    error, chance = found.error, found.chance
+    error = found.error
+    chance = found.chance
     return Costs(mean, predicted, promised, mpc, error, pairs, pays_own, longer, chance)
 
 

@@ -191,7 +191,8 @@ class Watchdog:
         moving = np.abs(episode.moved) > MOVED * stands * unsure
         for i in np.flatnonzero((stands >= FROZEN) & (noisy | moving)):
             problem = self.dynamics.problem
-            name, shown = problem.model.state_names, problem.units.to_plant(episode.reading)[i]
+            name = problem.model.state_names
+            shown = problem.units.to_plant(episode.reading)[i]
             said = f"{name[i] if name else f'reading {i}'} has been {shown:.6g}"
             said += f" for {stands[i]} samples"
             return episode.alarm("frozen sensor", f"{said}; the twin moves or the sensor is noisy")

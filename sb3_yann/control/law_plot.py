@@ -158,7 +158,8 @@ def _draw_line(law: Any, axes: Axes | None, labels: Sequence[str] | None) -> Axe
             "bounded theta_min and theta_max."
         )
     m = law.n_inputs
-    zero, rest = law.units.theta_ss[0], law.units.u_ss
+    zero = law.units.theta_ss[0]
+    rest = law.units.u_ss
     inputs = [f"u[{k}]" for k in range(m)]
     if law.model is not None:
         inputs = with_units(law.model)[1]

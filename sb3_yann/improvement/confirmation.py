@@ -12,17 +12,15 @@ from sb3_yann._validation import Array
 from sb3_yann.audit.closed_loops import of_law
 from sb3_yann.compare import (
     UNSAFE,
-    AcceptanceRule,
     less_safe,
     tail_average,
 )
 from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.improvement.imitation import Inputs, controller_of
 from sb3_yann.improvement.simulator import Simulator
-from sb3_yann.improvement.trial import Check
+from sb3_yann.improvement.trial import RULE, Check
 from sb3_yann.twin.log import Episode
 
-RULE = AcceptanceRule()
 FIRST_LOOK = 10  # pairs of a trial between rounds
 LOOKS = (10, 20, 40, 80)  # pairs after which it is decided, or more are played
 ENOUGH = 40  # pairs that an acceptance takes: the worst 5 % of the starts are two of them
@@ -138,7 +136,9 @@ class Pairs:
         return bool(relative.mean() - error > -RULE.least_gain / 2)
 
 
-def confirm(act: Inputs, simulator: Simulator, number: int) -> tuple[Check, Pairs]:
+def confirm(
+    act: Inputs, simulator: Simulator, number: int, significance: float = RULE.significance
+) -> tuple[Check, Pairs]:
     """Play pairs from new starts until they tell; return the last look, and all pairs.
 
     Looks come after 10, 20, 40 and 80 pairs. The j-th one may err with a probability of
@@ -153,13 +153,18 @@ def confirm(act: Inputs, simulator: Simulator, number: int) -> tuple[Check, Pair
         It plays them.
     number : int
         Of the check.
+    significance : float
+        Probability that a policy that is no better is accepted.
     """
     pairs = Pairs(simulator)
     for look, count in enumerate(LOOKS, start=1):
         pairs.play(act, simulator.new_seeds(count - len(pairs.seeds)))
-        found = pairs.check(number, RULE.significance / (look * (look + 1)), final=True)
+        found = pairs.check(number, significance / (look * (look + 1)), final=True)
         if found.accepted and len(pairs.seeds) >= ENOUGH:
             break
         if not found.accepted and pairs.is_hopeless:
             break
+    if found.accepted and len(pairs.seeds) < ENOUGH:
+        few = f"{len(pairs.seeds)} pairs whose costs are finite are too few"
+        found = replace(found, accepted=False, reason=few)
     return found, pairs

@@ -18,12 +18,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_yann._validation import check_bool, check_int
 from sb3_yann.control import LinearMPC
 from sb3_yann.deployment.exporting import Exported, export
-from sb3_yann.improvement.confirmation import FIRST_LOOK, RULE, Pairs, confirm
+from sb3_yann.improvement.confirmation import FIRST_LOOK, Pairs, confirm
 from sb3_yann.improvement.critic import refit_critic
 from sb3_yann.improvement.imitation import Teacher, imitate, policy_of
 from sb3_yann.improvement.model import Model, Scenarios, SimulatorModel
 from sb3_yann.improvement.simulator import OutOfStepsError, Simulator
-from sb3_yann.improvement.trial import Check, Trial
+from sb3_yann.improvement.trial import RULE, Check, Trial
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.checkpoint import all_or_nothing
 from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin, require_yann_policy
@@ -152,10 +152,10 @@ def improve(
     the policy from ten starts, and fits the model anew to what that showed, until the simulator
     shows what the model promised. The best policy is then confirmed on new starts, in pairs with
     the MPC: after 10, 20, 40 and 80 of them a paired test says whether it surely gains 0.1 %, with
-    an error of 5 % over all looks. Its worst 5 % of the starts must be no worse by 1 %, and on none
-    of them may a bound be exceeded by more than with the MPC: forty starts leave up to 7 % of all
-    unseen, at 95 %. What it loses is taught, and it is tried again on other starts, three times;
-    then half of the correction.
+    an error of 5 % over all looks and tries. Its worst 5 % of the starts must be no worse by 1 %,
+    and on none of them may a bound be exceeded by more than with the MPC: forty starts leave up to
+    7 % of all unseen, at 95 %. What it loses is taught, and it is tried again on other starts,
+    three times; then half of the correction.
 
     *In a twin* the members take turns in planning. A policy is accepted if it is no worse than the
     MPC from new starts on every member, and gains twice the standard error on episodes that go on
@@ -491,7 +491,8 @@ class _Work:
         for attempt in range(TRIES + 1):
             if attempt == TRIES:
                 self.scale(RETREATS[0], self.weights())
-            found, pairs = confirm(self.act(), simulator, len(self.checks) + 1)
+            share = RULE.significance / (TRIES + 1)  # all tries together err with no more
+            found, pairs = confirm(self.act(), simulator, len(self.checks) + 1, share)
             if found.accepted and not found.change < best:
                 found = replace(found, accepted=False, reason="the model's own policy is as good")
             self.checks.append(found)

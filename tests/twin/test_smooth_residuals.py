@@ -91,8 +91,8 @@ def test_of_the_likelihood_the_slope_is_that_of_differences() -> None:
 
 @pytest.mark.parametrize("kind", [*KINDS, "network"])
 def test_a_twin_has_it_where_it_is_asked_for_and_again_by_its_seed(kind) -> None:
-    one, again = (PlantTwin.fit(problem(), log(5), residuals=[kind], seed=4) for _ in range(2))
-    assert one.kind.startswith(kind) and np.isfinite(one.trust.cost_error)
+    one, again = (PlantTwin.fit(problem(), log(3), residuals=[kind], seed=4) for _ in range(2))
+    assert one.kind.startswith(kind) and one.trust.cost_error < 0.25
     theta, u = np.random.default_rng(0).uniform(-1, 1, (5, 9, 2)), np.zeros((5, 9, 1))
     np.testing.assert_array_equal(one.dynamics.step(theta, u), again.dynamics.step(theta, u))
     far = np.abs(one.dynamics.residual(1e6 * theta, u)).max()
