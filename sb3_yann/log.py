@@ -59,7 +59,7 @@ class Episode:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Log:
     """Episodes of one plant, with the names of what was logged.
 
@@ -77,8 +77,10 @@ class Log:
     Examples
     --------
     >>> log = Log.from_arrays([[0.0], [1.0], [1.5]], [[1.0], [1.0]], dt=0.5)
-    >>> len(log), log.episodes[0].states.shape
-    (1, (3, 1))
+    >>> log
+    Log(1 episode, 2 steps of dt = 0.5; 1 state, 1 input)
+    >>> log.episodes[0].states.shape
+    (3, 1)
     """
 
     episodes: tuple[Episode, ...]
@@ -91,6 +93,23 @@ class Log:
     def __len__(self) -> int:
         """Return the number of episodes."""
         return len(self.episodes)
+
+    def __repr__(self) -> str:
+        """Return how much there is of what."""
+        names = self.state_names, self.input_names, self.disturbance_names
+        columns = [
+            f"{size} {what}{'s' * (size > 1)}{' (' * bool(of)}{', '.join(of)}{')' * bool(of)}"
+            for size, what, of in zip(
+                self.sizes, ("state", "input", "disturbance"), names, strict=True
+            )
+            if size
+        ]
+        steps = sum(len(each) for each in self.episodes)
+        lost = f"; {self.lost_steps} steps of another length left out" if self.lost_steps else ""
+        return (
+            f"Log({len(self)} episode{'s' * (len(self) > 1)}, {steps:,} steps of dt = {self.dt:g}; "
+            f"{', '.join(columns)}{lost})"
+        )
 
     def __iter__(self) -> Iterator[tuple[Array, Array]]:
         """Yield states (T + 1, n) and inputs (T, m) of each episode."""

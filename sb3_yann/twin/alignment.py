@@ -32,6 +32,8 @@ CLEARLY_BETTER = 0.25
 """Another reading of a log counts where it leaves less than so much of the squared error."""
 EXACT_SHARE = 4e-4
 """A regression that leaves less of an input's variance explains all of it: 2 % of its deviation."""
+DITHERED_SHARE = 0.7
+"""The most of an input's variance that a dither on top of the law may be."""
 SLOPE_TOLERANCE = 0.1
 """How far from one the slope of an input on the law may be: sensors' noise lowers it."""
 LEAST_GAIN = 0.6
@@ -40,6 +42,8 @@ ROUNDING = 1e-9
 """Of a half-width: an input that moves by less stands still."""
 MOVING = 1e-3
 """Of a standard deviation: a state that moves by more in a step moves."""
+PACES = 1, 2, 3, 4, 5
+"""So many samples of the model may lie between two rows."""
 LEAST_ROWS = 20
 """Rows of a regression on the law, at least."""
 CONFIRM = "If its units were checked, and the plant or its controller is so: units_confirmed=True."
@@ -80,9 +84,10 @@ def objections(
     for s in (-1, 1):
         clearly = np.diagonal(readings[s].left) < CLEARLY_BETTER * logged - 1e-9
         proven &= ~(clearly & np.diagonal(_is_one(readings[s]) & readings[s].alone))
+    found = [] if units_confirmed else [*_other_pace(log)]
     if np.all(proven & (logged < EXACT_SHARE)):
-        return []
-    found = [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
+        return found
+    found += [*_against_law(log, readings, proven), *_against_states(log, logged, proven)]
     if not found and not units_confirmed:
         found += _other_units(log, proven)
     return found or [*_against_plant(log, proven)]
@@ -118,7 +123,7 @@ class _OnLaw:
     @property
     def alone(self) -> NDArray[np.bool_]:
         """Where the law explains an input, and theta adds nothing to it, (m, m)."""
-        made = (self.left < self.left_of_rows + EXACT_SHARE) & (self.left < 0.5)
+        made = (self.left < self.left_of_rows + EXACT_SHARE) & (self.left < DITHERED_SHARE)
         return (made & self.unique[:, None]) | (self.left < EXACT_SHARE)
 
 
@@ -298,6 +303,33 @@ def _other_units(log: _Log, proven: NDArray[np.bool_]) -> Iterator[str]:
                 f"The MPC gives the logged inputs where {names[i]} is {factor:.4g} times what is "
                 f"logged, {shift[i]:+.4g}: is it in other units, or has it another zero? {CONFIRM}"
             )
+
+
+def _other_pace(log: _Log) -> Iterator[str]:
+    """Yield where the states move as the model's do in several samples: rows are missing.
+
+    The gains are left open, and the zeros: a plant may have others.
+    """
+    row, model, unit = log.coordinates.row, log.problem.model, log.coordinates.units
+    z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes])
+    after = np.concatenate([e.thetas[1:, row.state] for e in log.episodes])
+    x, n, m = z[:, : model.n_states], model.n_states, model.n_inputs
+    A, power, driven = model.A, np.eye(n), np.zeros((n, m))
+    left = []
+    for _ in PACES:
+        driven, power = driven + power @ model.B, A @ power
+        rest = (after - x @ power.T) / unit
+        rest -= rest.mean(axis=0)
+        u = (z[:, -m:] - z[:, -m:].mean(axis=0))[:, None] * (driven / unit[:, None])
+        gains = np.linalg.lstsq(u.reshape(-1, m), rest.ravel(), rcond=1e-9)[0]
+        left.append(np.var(rest - u @ gains, axis=0) + ROUNDING)
+    ratio = np.array(left) / left[0]
+    best = int(np.argmin(ratio.mean(axis=1)))
+    if ratio[best].min() < CLEARLY_BETTER and ratio[best].max() < 1.5:
+        yield (
+            f"From row to row the states move as the model's do in {PACES[best]} samples: are "
+            f"rows missing, or is dt = {model.dt:g} another plant's? {CONFIRM}"
+        )
 
 
 def _held(log: _Log) -> NDArray[np.bool_]:
