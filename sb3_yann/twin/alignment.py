@@ -314,10 +314,11 @@ def _other_pace(log: _Log) -> Iterator[str]:
     z = np.concatenate([row.features(e.thetas[:-1], e.actions) for e in log.episodes])
     after = np.concatenate([e.thetas[1:, row.state] for e in log.episodes])
     x, n, m = z[:, : model.n_states], model.n_states, model.n_inputs
-    A, power, driven = model.A, np.eye(n), np.zeros((n, m))
+    power: Array = np.eye(n)
+    driven: Array = np.zeros((n, m))
     left = []
     for _ in PACES:
-        driven, power = driven + power @ model.B, A @ power
+        driven, power = driven + power @ model.B, model.A @ power
         rest = (after - x @ power.T) / unit
         rest -= rest.mean(axis=0)
         u = (z[:, -m:] - z[:, -m:].mean(axis=0))[:, None] * (driven / unit[:, None])
