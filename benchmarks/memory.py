@@ -1,4 +1,4 @@
-"""Bytes of laws, actors and optimizers."""
+"""Bytes of laws and actors."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import torch as th
 from torch import nn
 
 from benchmarks import peers
 from benchmarks.evaluation import LITERAL_WIDTH
-from benchmarks.networks import BATCH, fill, learner
+from benchmarks.networks import learner
 from benchmarks.problems import Problem
 from benchmarks.records import Bench, Figure
 from sb3_yann import YannPolicy
@@ -23,25 +22,18 @@ def memory(bench: Bench, problem: Problem) -> None:
     """Count the bytes of what there is at one problem."""
     law = problem.law
     law(problem.points(1)[0])  # what compiled code takes is made when it is first needed
-    found = {"law, regions and gains": sum(arrays(law.__dict__, nested=False))}
-    found["law, with what finds its regions"] = sum(arrays(law.__dict__))
+    found = {"law, with what finds its regions": sum(arrays(law.__dict__))}
     for name, policy in (("ours", YannPolicy), (peers.MLP, "MlpPolicy")):
-        model = learner(problem, policy)
-        fill(model, problem)
-        model.train(1, BATCH)
-        found[f"actor, {name}"] = module_bytes(model.actor)
-        found[f"actor's optimizer, {name}"] = optimizer_bytes(model.actor.optimizer)
-        found[f"critic, {name}"] = module_bytes(model.critic)
+        found[f"actor, {name}"] = module_bytes(learner(problem, policy).actor)
     network = f"{peers.LITERAL}, {LITERAL_WIDTH} nodes a region"
     found[network] = peers.literal_bytes(law, LITERAL_WIDTH)
-    found[f"{peers.LITERAL}, 16 nodes a region"] = peers.literal_bytes(law, 16)
     bench.figures.add(
         Figure(SECTION, name, str(problem.regions), np.array([float(value)]), "bytes")
         for name, value in found.items()
     )
 
 
-def arrays(values: Mapping[str, Any], nested: bool = True) -> Iterable[int]:
+def arrays(values: Mapping[str, Any]) -> Iterable[int]:
     """Yield the bytes of the arrays of an object, each once, with those of what it holds."""
     seen: set[int] = set()
     waiting: list[Any] = [*values.values()]
@@ -51,18 +43,12 @@ def arrays(values: Mapping[str, Any], nested: bool = True) -> Iterable[int]:
             if id(each) not in seen:
                 yield each.nbytes
             seen.add(id(each))
-        elif nested and isinstance(each, (tuple, list)):
+        elif isinstance(each, (tuple, list)):
             waiting += each
-        elif nested and type(each).__module__.startswith("sb3_yann"):
+        elif type(each).__module__.startswith("sb3_yann"):
             waiting += vars(each).values()
 
 
 def module_bytes(module: nn.Module) -> int:
     """Return the bytes of all parameters and buffers."""
     return sum(each.nbytes for each in (*module.parameters(), *module.buffers()))
-
-
-def optimizer_bytes(optimizer: th.optim.Optimizer) -> int:
-    """Return the bytes of an optimizer's state."""
-    states = (value for state in optimizer.state.values() for value in state.values())
-    return sum(value.nbytes for value in states if isinstance(value, th.Tensor))

@@ -44,8 +44,8 @@ class Figure:
         """The median."""
         return float(np.median(self.samples))
 
-    def shown(self, base: Figure | None = None) -> str:
-        """Return median, quartiles and, with a base, how many times that it is."""
+    def shown(self, base: Figure | None = None, *, spread: bool = True) -> str:
+        """Return the median, and its quartiles or, with a base, how many times that it is."""
         if self.kind == "text":
             return self.text
         if self.kind == "count":
@@ -54,9 +54,8 @@ class Figure:
             return f"{self.middle:.1e}"
         if self.kind == "bytes":
             return size(self.middle)
-        own = _spread(self.samples)
         if base is None or base.kind != "time" or not base.name.startswith(OURS):
-            return own
+            return _spread(self.samples) if spread else seconds(self.middle)
         return f"{seconds(self.middle)}: {times(quartiles(ratios(self.samples, base.samples))[1])}"
 
 
@@ -83,7 +82,7 @@ class Figures:
         """Return the sections in the order in which they came."""
         return list(dict.fromkeys(each.section for each in self._all.values()))
 
-    def rows(self, section: str) -> Iterator[tuple[str, list[str]]]:
+    def rows(self, section: str, *, spread: bool = True) -> Iterator[tuple[str, list[str]]]:
         """Yield the name and the cells of each row of a section; the first row is the base."""
         own = self.of(section)
         columns = self.columns(section)
@@ -93,7 +92,7 @@ class Figures:
             for column in columns:
                 figure = self.get(section, name, column)
                 base = None if name.startswith(OURS) else self.get(section, names[0], column)
-                cells.append(figure.shown(base) if figure else "")
+                cells.append(figure.shown(base, spread=spread) if figure else "")
             yield name, cells
 
     def columns(self, section: str) -> list[str]:

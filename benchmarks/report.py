@@ -11,7 +11,18 @@ from pathlib import Path
 import numpy as np
 
 import sb3_yann
-from benchmarks import evaluation, exactness, networks, offline, online, peers, simulators
+from benchmarks import (
+    deployment,
+    evaluation,
+    exactness,
+    large,
+    memory,
+    networks,
+    offline,
+    online,
+    peers,
+    suite,
+)
 from benchmarks.problems import PROBLEMS, SMALLEST
 from benchmarks.records import Bench, Figure, Figures, heading, times
 from benchmarks.sections import TITLES
@@ -19,25 +30,29 @@ from benchmarks.timing import ratios
 from experiments.markdown import table
 
 PACKAGES = ("numpy", "numba", "scipy", "torch", "stable-baselines3", "ppopt", "daqp", "osqp")
-NOTES = {
+ON_THE_PAGE = {
+    evaluation.ONE: "",
+    evaluation.MANY: "",
+    networks.PREDICT: "",
+    networks.TRAIN: "`model.train(1)` with a full replay buffer, no network at zero any more.",
     offline.SECTION: "ppopt's times are those of its solver alone, ours hold the check of every "
-    "region as well. An algorithm that found another number of regions would have ended the run.",
+    "region as well. All find the same number of regions.",
     exactness.SECTION: "A third to a fifth of the points are random in the box, the others on "
-    "faces of every dimension of all regions in turn, down to the vertices. Region by region they "
-    "are looked for by a plain scan.",
-    networks.TRAIN: "`model.train(1)` with a full replay buffer: critic, actor and both targets; "
-    "every network has moved away from zero.",
-    online.TRAIN: "As above, with a shared network. The law has been evaluated at all observations "
-    "of the buffer before, as a policy does that has acted there.",
-    online.EXACT: "Points are random, in the middle of the box, half as wide. The plan is solved "
-    "for again, with the constraints that the law holds to be active, and its optimality checked.",
-    evaluation.ONE: "All functions run on the same points, in the feasible part of the box; each "
-    "one's answer was compared with ours before. daqp and osqp are set up once. The literal "
-    f"network has {evaluation.LITERAL_WIDTH} nodes a region, ours 16 and 16 in training.",
+    "faces of every dimension of all regions. A plain scan looks for them, region by region.",
+    memory.SECTION: "",
+    suite.SECTION: "",
+    large.SECTION: "",
+    online.LAW: "",
+    online.TRAIN: "With a shared network, at observations that the law has met before.",
+    online.EXACT: "The plan is solved for again, and its optimality checked.",
+    deployment.SECTION: "",
+    deployment.SMALL: "",
 }
+"""The sections of the page, and what each has to say; `make bench` prints all."""
 LEGEND = (
-    "Medians of the repeats, of the first row with its quartiles; after the colon how many times "
-    "the first row's time that is, turn by turn."
+    "What is compared was measured in turns, after a warm-up, and its answers were compared first. "
+    "Cells are medians; after a colon, how many times the first row's time that is, turn by turn. "
+    "`make bench` prints the quartiles as well, and more sections."
 )
 
 
@@ -72,7 +87,8 @@ def _quoted(figures: Figures) -> Iterator[tuple[str, list[str]]]:
     )
     own = [figures.get(evaluation.ONE, "ours", size) for size in sizes]
     if any(own):
-        yield "law, one point, in numpy", [each.shown() if each else "" for each in own]
+        cells = [each.shown(spread=False) if each else "" for each in own]
+        yield "law, one point, in numpy", cells
     for section, peer, name in lines:
         cells = []
         for size in sizes:
@@ -100,8 +116,7 @@ def how_it_was_made(bench: Bench, command: str) -> str:
         f"## How this was made\n\nMade with `{command}` on {machine()}, one thread, "
         f"Python {platform.python_version()}, sb3-yann {sb3_yann.__version__}, {versions()}. "
         f"The process had a processor in {100 * share:.0f} % of the time of the measurements."
-        f"{busy} What is compared was measured in turns, after a warm-up.\n\n"
-        + table(("regions", "half-spaces", "problem"), rows, texts=0)
+        f"{busy} {LEGEND}\n\n" + table(("regions", "half-spaces", "problem"), rows, texts=0)
     )
 
 
@@ -128,10 +143,9 @@ def versions() -> str:
 
 def _sections(figures: Figures) -> Iterator[str]:
     for section in figures.sections():
-        note = NOTES.get(section, "")
-        timed = any(each.kind == "time" for each in figures.of(section))
-        legend = LEGEND if timed and section not in (simulators.SECTION,) else ""
-        rows = [[name, *cells] for name, cells in figures.rows(section)]
+        if section not in ON_THE_PAGE:
+            continue
+        rows = [[name, *cells] for name, cells in figures.rows(section, spread=False)]
         header = ["", *map(heading, figures.columns(section))]
-        text = "\n\n".join(part for part in (note, legend, table(header, rows)) if part)
-        yield f"## {TITLES[section]}\n\n{text}"
+        parts = (f"## {TITLES[section]}", ON_THE_PAGE[section], table(header, rows))
+        yield "\n\n".join(part for part in parts if part)

@@ -30,12 +30,8 @@ class Row:
     seeds : int
     median, low, high : float
         Of the seeds' mean costs over all test starts.
-    change : float or None
-        The median against the MPC's mean, in percent of it.
     closed : float or None
         Share of the gap from the MPC to the optimum that is closed, in percent.
-    below, above : int or None
-        Seeds whose mean is below and above the MPC's.
     worst, worst_share : float or None
         Largest cost above the MPC's over all seeds and starts; and in percent of the MPC's mean.
     excess : float or None
@@ -49,10 +45,7 @@ class Row:
     median: float
     low: float
     high: float
-    change: float | None
     closed: float | None
-    below: int | None
-    above: int | None
     worst: float | None
     worst_share: float | None
     excess: float | None
@@ -85,12 +78,9 @@ def _row(learner: str, runs: list[Outcome], levels: Mapping[str, Array]) -> Row:
     final = np.array([run.test_costs[-1] for run in runs])
     means = final.mean(axis=1)
     median = float(np.median(means))
-    change = closed = worst = worst_share = below = above = excess = None
+    closed = worst = worst_share = excess = None
     if MPC in levels:
         base = float(levels[MPC].mean())
-        change = 100 * (median - base) / base
-        below = int((means < base).sum())
-        above = int((means > base).sum())
         worst = float((final - levels[MPC]).max())
         worst_share = 100 * worst / base
         gap = base - float(levels[OPTIMUM].mean()) if OPTIMUM in levels else 0.0
@@ -104,10 +94,7 @@ def _row(learner: str, runs: list[Outcome], levels: Mapping[str, Array]) -> Row:
         median=median,
         low=float(means.min()),
         high=float(means.max()),
-        change=change,
         closed=closed,
-        below=below,
-        above=above,
         worst=worst,
         worst_share=worst_share,
         excess=excess,

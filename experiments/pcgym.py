@@ -20,7 +20,7 @@ from gymnasium.wrappers import RescaleAction, RescaleObservation
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 
-from experiments.markdown import number, quote, table
+from experiments.markdown import number, quote, spread, table
 from experiments.measures import MPC, OURS, REIDENTIFIED
 from experiments.pcgym_nmpc import NonlinearMPC
 from experiments.pcgym_vector import registered
@@ -63,12 +63,9 @@ HEADER = (
     "plant",
     "controller",
     "training steps",
-    "PC-Gym's cost",
-    "against offset-free, %",
+    "cost against offset-free, %",
     "worst episode, %",
-    "stage cost against offset-free, %",
     "ms a step",
-    "seeds",
 )
 BEGIN = "<!-- plants: begin -->\n"
 END = "<!-- plants: end -->"
@@ -297,21 +294,13 @@ def _row(
     plant: str, name: str, steps: int, tests: Sequence[tuple[Outcome, int]], base: Outcome
 ) -> tuple[str, ...]:
     """Return the row of a controller after so many steps."""
-    cells = []
-    for costs, ours in (
-        ([each.test_costs[k] for each, k in tests], base.test_costs[0]),
-        ([each.extra["stage_costs"][k] for each, k in tests], base.extra["stage_costs"][0]),
-    ):
-        means = np.array([each.mean() for each in costs])
-        change = 100 * (means / ours.mean() - 1)
-        spread = f" ({change.min():+.2f} to {change.max():+.2f})" if len(change) > 1 else ""
-        worst = max(100 * ((each - ours) / ours.mean()).max() for each in costs)
-        median = f"{np.median(change):+.2f}{spread}"
-        cells.append((number(float(np.median(means)), 3), median, f"{worst:+.2f}"))
+    ours = base.test_costs[0]
+    costs = [each.test_costs[k] for each, k in tests]
+    change = np.array([100 * (each.mean() / ours.mean() - 1) for each in costs])
+    worst = max(100 * ((each - ours) / ours.mean()).max() for each in costs)
+    shown = spread(change) if len(change) > 1 else f"{change[0]:+.2f}"
     ms = np.median([each.extra["ms"][k] for each, k in tests])
-    first, second = cells
-    shown = f"{steps:,}" if steps else ""
-    return plant, name, shown, *first, second[1], number(ms, 2), f"{len(tests)}"
+    return plant, name, f"{steps:,}" if steps else "", shown, f"{worst:+.2f}", number(ms, 2)
 
 
 def write_report(outcomes: Mapping[Run, Outcome], folder: Path) -> list[Path]:

@@ -39,9 +39,9 @@ def run_code(name: str, code: str) -> dict[str, object]:
     shortened = shortened.replace(
         'improve(model, "CSTR-v0")', 'improve(model, "CSTR-v0", rounds=1, n_starts=5, updates=50)'
     )
-    shortened = shortened.replace(
-        "improve(model, twin)", "improve(model, twin, rounds=1, n_starts=5, updates=50)"
-    )
+    for twin in ("model, twin", "mpc, PlantTwin.fit(mpc, log)"):
+        short = f"improve({twin}, rounds=1, n_starts=5, updates=50)"
+        shortened = shortened.replace(f"improve({twin})", short)
     shortened = shortened.replace("updates=500", "rounds=1, updates=50")
     # A number that nothing here knows would train in full.
     steps = re.findall(r"\.learn\(\s*(?:total_timesteps\s*=\s*)?([^\s,)]*)", shortened)
@@ -57,31 +57,52 @@ def anchors(text: str) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
+def write_log() -> None:
+    """Write the log that the README reads: a tank under a valve at random, with gaps in time."""
+    rng = np.random.default_rng(0)
+    plant = LinearModel([[0.9, 0], [0.1, 0.8]], [[0.5], [1.0]], 10)
+    x, rows = np.zeros(2), ["time,level,T,valve"]
+    for k in range(300):
+        valve = rng.uniform(-0.5, 0.5)
+        rows.append(f"{10 * k + 500 * (k // 60)},{x[0] + 2.5},{x[1] + 35},{valve + 0.5}")
+        x = plant.step(x, [valve]) + rng.normal(0, 1e-3, 2)
+    Path("log.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
 @pytest.mark.slow
 def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    names = run("README.md")
+    train, simulate, from_log = blocks(README)
+    names = run_code("README.md", train + simulate)
     assert (tmp_path / "guard.csv").exists() and (tmp_path / "cstr.zip").exists()
     state = np.zeros(2, np.float32)
     model, mpc = names["model"], names["mpc"]
     np.testing.assert_allclose(model.predict(state)[0], mpc.explicit()(state), atol=1e-5)
+    write_log()
+    run_code("README.md", from_log)
+    assert (tmp_path / "controller.c").exists()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    "export guard improve policy tutorial".split(),
-)
+@pytest.mark.parametrize("name", ["export", "guard", "improve", "policy"])
 def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     run(f"docs/{name}.md")
 
 
 @pytest.mark.slow
+def test_the_code_of_the_tutorial_runs(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    first = page("docs/tutorial.md").partition("## Your own plant")[0]
+    run_code("docs/tutorial.md", "\n".join(blocks(first)))
+    assert (tmp_path / "cstr.zip").exists() and (tmp_path / "guard.png").exists()
+
+
+@pytest.mark.slow
 def test_an_environment_of_gymnasium_takes_twelve_lines() -> None:
-    code = blocks(page("docs/own_plant.md"))[2]
+    code = blocks(page("docs/tutorial.md"))[-1]
     assert len(code.splitlines()) <= 14
-    names = run_code("docs/own_plant.md", code)
+    names = run_code("docs/tutorial.md", code)
     model, mpc = names["model"], names["mpc"]
     theta = 0.02 * mpc.theta_max  # type: ignore[attr-defined]
     action = model.policy.actor_target.mu(torch.as_tensor(theta)[None])  # type: ignore[attr-defined]
@@ -89,22 +110,24 @@ def test_an_environment_of_gymnasium_takes_twelve_lines() -> None:
     np.testing.assert_allclose(action.detach().numpy()[0], wanted, atol=0.02)
 
 
-def test_equations_are_an_env_in_a_line() -> None:
-    names = run_code("docs/own_plant.md", blocks(page("docs/own_plant.md"))[1])
+def test_a_log_and_equations_of_ones_own_make_an_mpc_and_an_env() -> None:
+    own = page("docs/tutorial.md").partition("## Your own plant")[2]
+    from_log, equations, _ = blocks(own)
+    np.testing.assert_allclose(run_code("docs/tutorial.md", from_log)["plant"].A, 0.9, atol=0.01)
+    names = run_code("docs/tutorial.md", equations)
     model, mpc = names["model"], names["mpc"]
     action = model.predict(np.array([20.0]))[0]  # type: ignore[attr-defined]
     wanted = mpc.law().plant_input([20.0])  # type: ignore[attr-defined]
     np.testing.assert_allclose(action, wanted, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["environments"])
-def test_the_code_in_a_page_that_does_not_train_runs(name) -> None:
-    run(f"docs/{name}.md")
+def test_the_code_in_the_page_of_environments_runs() -> None:
+    run("docs/environments.md")
 
 
 def test_every_page_with_code_is_run_by_a_test() -> None:
     found = {path.stem for path in PAGES if blocks(path.read_text(encoding="utf-8"))}
-    known = "README environments export guard improve mpc own_plant policy tutorial".split()
+    known = "README environments export guard improve mpc policy tutorial".split()
     assert found == {*known}
 
 
