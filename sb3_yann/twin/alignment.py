@@ -38,6 +38,8 @@ SLOPE_TOLERANCE = 0.1
 """How far from one the slope of an input on the law may be: sensors' noise lowers it."""
 LEAST_GAIN = 0.6
 """A gain below so many times the model's, or above the inverse, must be confirmed by the user."""
+RUN, MUCH_BETTER = 10, 0.8
+"""Steps of a run of the model; share of its squared error that a unit's factor leaves at most."""
 ROUNDING = 1e-9
 """Of a half-width: an input that moves by less stands still."""
 MOVING = 1e-3
@@ -400,6 +402,8 @@ def _against_gains(
         error = STANDARD_ERRORS * float(np.sqrt(max(variance, 0.0)) * fit.factors[j])
         measured = f"{gain:.3g} ± {error:.2g} times"
         far = not LEAST_GAIN < gain < 1 / LEAST_GAIN and abs(gain - 1) > error
+        # Units make runs of the model better; where they do not, the gain is curvature.
+        far = far and _error_of_runs(log, j, gain) < MUCH_BETTER * _error_of_runs(log, j, 1.0)
         if gain + error < 0 and gain < -0.1:
             yield (
                 f"The logged {names[j]} moves the plant against the sign of the model's B "
@@ -410,6 +414,23 @@ def _against_gains(
                 f"The logged {names[j]} moves the plant {measured} as much as the model says: "
                 f"is it in other units, or a row off? {CONFIRM}"
             )
+
+
+def _error_of_runs(log: _Log, j: int, gain: float) -> float:
+    """Return how far runs of the given model vary from the log, with input j times a gain."""
+    row, errors = log.coordinates.row, []
+    linear = row.linear.copy()
+    linear[:, row.size + j] *= gain
+    for each in log.episodes:
+        starts = np.arange(0, max(len(each) - RUN, 1), RUN)
+        steps = min(RUN, len(each))
+        rows = each.thetas[starts].copy()
+        for k in range(steps):
+            rows[:, row.given] = each.thetas[starts + k][:, row.given]
+            rows = np.hstack([rows, each.actions[starts + k]]) @ linear.T
+            row.clip(rows)
+        errors.append((rows - each.thetas[starts + steps])[:, row.state] / log.coordinates.units)
+    return float(np.var(np.concatenate(errors), axis=0).sum())
 
 
 def _resting(log: _Log, fit: _Effects) -> Iterator[str]:

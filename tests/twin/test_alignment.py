@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
-from sb3_yann import LinearModel, LinearMPC, PlantTwin
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, identify
 from sb3_yann.twin import alignment
 
 GAINS = np.array([1.5, 0.7])
@@ -198,3 +198,34 @@ def test_a_gain_that_only_an_open_loop_shows_counts_once_the_units_are_confirmed
     assert not heated_twin(log).trusted
     assert heated_twin(log, units_confirmed=True).trusted
     assert heated_twin(heated(1.4, 0.0, open_loop=True)).trusted
+
+
+def tank() -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return level and temperature of a tank whose power acts over the level, both controlled."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(6):
+        level, warm = rng.uniform(0.1, 1.0), rng.uniform(30, 70)
+        level_set, warm_set, more = rng.uniform([0.1, 30, -10], [1.0, 80, 10])
+        states, inputs = [(level, warm)], []
+        for _ in range(150):
+            q = np.clip(0.5 * np.sqrt(level) + 0.8 * (level_set - level), 0, 1.2)
+            power = np.clip(q * (warm_set - 20) + level * (warm_set - warm) + more, 0, 80)
+            for _ in range(5):
+                level = max(0.1, level + 0.1 * (q - 0.5 * np.sqrt(level)))
+                warm += 0.1 * (q * (20 - warm) + power) / level
+            states.append((level, warm))
+            inputs.append((q, power))
+        found.append((np.array(states), np.array(inputs)))
+    return found
+
+
+def test_a_gain_that_depends_on_the_level_is_no_unit() -> None:
+    log = tank()
+    problem = LinearMPC(
+        identify(*zip(*log, strict=True), dt=10.0).model, Q=np.diag([10, 0.1]),
+        R=np.diag([1, 1e-3]), horizon=5, u_min=0, u_max=[1.2, 200], x_min=[0.05, 0], x_max=[4, 300],
+    )  # fmt: skip
+    of = partial(PlantTwin.fit, problem, residuals=["none", "quadratic"])
+    assert of(log).trusted
+    other = of([(x, u * [1, 2]) for x, u in log])
+    assert "The logged u[1] moves the plant" in other.report() and not other.trusted
