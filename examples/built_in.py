@@ -4,6 +4,7 @@ python examples/built_in.py [--episodes 30] [--seed 0]
 """
 
 import argparse
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -12,7 +13,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from sb3_yann import CostAudit, ImprovementGuard, LinearModel, LinearMPC, NoActionNoise, YannPolicy
-from sb3_yann.evaluation import evaluate, save_trajectories, summary_table
+from sb3_yann.evaluation import evaluate, plots, summary_table
 
 TEST_SEEDS = range(2000, 2050)  # starts that training never sees
 
@@ -52,14 +53,8 @@ def main() -> None:
     plant = LinearModel.from_env(make_env, x_ss=[0, 0], u_ss=[0])
     console.print(plant.report())
     cost = {"Q": np.diag([1.0, 0.1]), "R": [[0.001]]}  # what Gymnasium's documentation says
-    limits = {
-        "x_min": [-2, -8],
-        "x_max": [2, 8],
-        "u_min": -2,
-        "u_max": 2,
-        "infeasible": "zero_input",
-    }
-    mpc = LinearMPC(plant, **cost, horizon=2, **limits)
+    limits = {"x_min": [-2, -8], "x_max": [2, 8], "u_min": -2, "u_max": 2}
+    mpc = LinearMPC(plant, **cost, horizon=2, **limits, infeasible="zero_input")
 
     model = DDPG(YannPolicy, make_env(), seed=arguments.seed, policy_kwargs={"problem": mpc})
     before = evaluate(model, make_env, TEST_SEEDS)
@@ -70,8 +65,9 @@ def main() -> None:
 
     console.print(summary_table("Cost of 50 unseen starts, Pendulum-v1", before, after))
     runs = {"before (linear MPC)": before, "after training": after}
-    names = {0: "angle [rad]", 1: "speed [rad/s]"}, ["torque [N m]"]
-    console.print(f"Picture: {save_trajectories('out/built_in.png', runs, *names, 0.05, 's')}")
+    Path("out").mkdir(exist_ok=True)
+    plots.loops_figure(mpc, runs, time_unit="s").savefig("out/built_in.png")
+    console.print("Picture: out/built_in.png")
 
 
 if __name__ == "__main__":

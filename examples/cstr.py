@@ -12,8 +12,8 @@ from rich.console import Console
 from stable_baselines3 import DDPG
 
 from sb3_yann import ControlDiagnostics, ImprovementGuard, NoActionNoise, YannPolicy
-from sb3_yann.evaluation import comparison_table, evaluate, save_plant_trajectories
-from sb3_yann_envs.cstr import TEMPERATURE_LIMIT, X_SS
+from sb3_yann.evaluation import comparison_table, evaluate, plots
+from sb3_yann_envs.cstr import TEMPERATURE_LIMIT
 
 STEPS = 400  # of one episode
 TEST_SEEDS = range(1000, 1010)  # starts that training never sees
@@ -46,16 +46,12 @@ def main() -> None:
         f"The guard accepted {taken} of {len(guard.decisions)} candidates, whole or in part; "
         "each decision is in out/guard.csv."
     )
-    picture = save_plant_trajectories(
-        "out/cstr.png",
-        {"before (linear MPC)": before, "after training": after},
-        model.policy.problem,
-        "h",
-        entries=[3, 0],
-        labels={3: f"T - {X_SS[3]:g} K", 0: "C_A - steady state (mol/L)"},
-        limits={3: (TEMPERATURE_LIMIT - X_SS[3], f"limit, {TEMPERATURE_LIMIT:g} K")},
+    runs = {"before (linear MPC)": before, "after training": after}
+    figure = plots.loops_figure(
+        model.policy.problem, runs, quantities=["T", "C_A", "U"], time_unit="h"
     )
-    console.print(f"Trajectories: {picture}    Curves: tensorboard --logdir out/tensorboard")
+    figure.savefig("out/cstr.png")
+    console.print("Trajectories: out/cstr.png    Curves: tensorboard --logdir out/tensorboard")
 
 
 if __name__ == "__main__":

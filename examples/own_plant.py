@@ -16,7 +16,7 @@ from stable_baselines3 import DDPG
 from quadruple_tank import DT, FULL, MAX_VOLTAGE, QuadrupleTank, write_log
 from sb3_yann import CostAudit, ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import DisturbanceBounds, LinearModel, LinearMPC, Tracking
-from sb3_yann.evaluation import evaluate, save_plant_trajectories, summary_table
+from sb3_yann.evaluation import evaluate, plots, summary_table
 from sb3_yann.wrappers import MeasuredDisturbance, SetPoint, StageCost
 
 STEPS, HOLD = 60, 20  # of one episode, and until the set-points change
@@ -70,9 +70,9 @@ def main() -> None:
     console.print(summary_table("Cost of 50 unseen set-point sequences", before, after))
     both = {"before (linear MPC)": mpc.explicit(), "after training": model}
     runs = {name: evaluate(policy, make, TEST_SEEDS[:1]) for name, policy in both.items()}
-    shown = {"entries": [0, 1, 6], "labels": {6: "side flow (cm³/s)"}}
-    path = save_plant_trajectories("out/own_plant.png", runs, mpc, "s", **shown)
-    console.print(f"Picture: {path}    The guard's decisions: out/own_plant.csv")
+    figure = plots.loops_figure(mpc, runs, quantities=[0, 1, 6, 7, 8], time_unit="s")
+    figure.savefig("out/own_plant.png")
+    console.print("Picture: out/own_plant.png    The guard's decisions: out/own_plant.csv")
 
 
 if __name__ == "__main__":

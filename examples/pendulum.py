@@ -12,7 +12,7 @@ from rich.console import Console
 from stable_baselines3 import DDPG, TD3
 
 from sb3_yann import ControlDiagnostics, ImprovementGuard, NoActionNoise, YannPolicy
-from sb3_yann.evaluation import comparison_table, evaluate, save_plant_trajectories
+from sb3_yann.evaluation import comparison_table, evaluate, plots
 
 STEPS = 200  # of one episode
 TEST_SEEDS = range(1000, 1010)  # starts that training never sees
@@ -47,8 +47,8 @@ def main() -> None:
 
     console.print(comparison_table("Cost of ten test episodes, ClippedPendulum-v0", before, after))
     runs = {"before (linear MPC)": before, "after training": after}
-    picture = save_plant_trajectories("out/pendulum.png", runs, model.policy.problem, "s")
-    console.print(f"Trajectories: {picture}")
+    plots.loops_figure(model.policy.problem, runs, time_unit="s").savefig("out/pendulum.png")
+    console.print("Trajectories: out/pendulum.png")
 
 
 if __name__ == "__main__":

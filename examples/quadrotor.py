@@ -18,7 +18,7 @@ from stable_baselines3 import DDPG
 from quadrotor_plant import DT, MAX_THRUST, STARTS, Quadrotor, derivative
 from sb3_yann import ImprovementGuard, NoActionNoise, YannPolicy
 from sb3_yann.control import LinearModel, LinearMPC, SoftBounds
-from sb3_yann.evaluation import evaluate, save_plant_trajectories, summary_table
+from sb3_yann.evaluation import evaluate, plots, summary_table
 from sb3_yann.wrappers import StageCost
 
 STEPS = 100  # of one episode: 5 s
@@ -70,8 +70,9 @@ def main() -> None:
     console.print(f"The guard accepted {taken} of {len(guard.decisions)} candidates.")
     both = {"before (linear MPC)": mpc.online(), "after training": model}
     runs = {name: evaluate(each, make, TEST_SEEDS[:1]) for name, each in both.items()}
-    path = save_plant_trajectories("out/quadrotor.png", runs, mpc, "s", entries=[0, 2, 4])
-    console.print(f"Picture: {path}    The guard's decisions: out/quadrotor.csv")
+    figure = plots.loops_figure(mpc, runs, quantities=[0, 2, 4], time_unit="s")
+    figure.savefig("out/quadrotor.png")
+    console.print("Picture: out/quadrotor.png    The guard's decisions: out/quadrotor.csv")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Pictures of closed loops, decisions, fits, headroom and twins; those of laws are imported.
+"""Pictures of closed loops, decisions, headroom and twins; those of laws are imported.
 
 Each takes matplotlib's Axes, or makes a new figure, and returns the Axes; a ``..._figure`` returns
 the figure.
@@ -7,8 +7,6 @@ the figure.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,10 +21,9 @@ from sb3_yann._drawing import (
     legend_above,
     legend_beside,
     new_figure,
-    save_figure,
 )
-from sb3_yann._validation import Array, check_array, check_int, check_type, to_float
-from sb3_yann.control import LinearModel, LinearMPC
+from sb3_yann._validation import Array, check_type, to_float
+from sb3_yann.control import LinearMPC
 from sb3_yann.control.model.labels import with_units
 from sb3_yann.evaluation.law_plots import (
     Quantity,
@@ -49,13 +46,11 @@ if TYPE_CHECKING:
 __all__ = [
     "RegionUse",
     "decisions_figure",
-    "fit_figure",
     "headroom_figure",
     "loops_figure",
     "plot_changes",
     "plot_costs",
     "plot_decisions",
-    "plot_fit",
     "plot_free_runs",
     "plot_headroom",
     "plot_loop",
@@ -63,8 +58,6 @@ __all__ = [
     "plot_surface",
     "plot_visits",
     "regions_figure",
-    "save_plant_trajectories",
-    "save_trajectories",
     "surfaces_figure",
     "twin_figure",
     "use_figure",
@@ -73,155 +66,19 @@ Runs = Mapping[str, Trajectories]
 MAX_LINES = 6  # so many episodes are drawn one by one; of more, the median and bands
 
 
-# ---- Every episode, saved as a picture ----
-
-
-def save_trajectories(
-    path: str | PathLike[str],
-    runs: Runs,
-    states: Mapping[int, str],
-    inputs: Sequence[str],
-    dt: float,
-    time_unit: str,
-    limits: Mapping[int, tuple[float, str]] | None = None,
-    references: Mapping[int, int] | None = None,
-) -> Path:
-    """Save a picture of states and all inputs over time, a color for each run; return its path.
-
-    Parameters
-    ----------
-    path : path-like
-        Folders are made as needed. Without a suffix it gets ``.png``.
-    runs : mapping of str to Trajectories
-        Every episode of every run is drawn.
-    states : mapping of int to str
-        The entries of the observation to draw, with their labels.
-    inputs : sequence of str
-        Labels of the inputs.
-    dt : float
-        Sampling time, in ``time_unit``.
-    time_unit : str
-        For the label of the axis.
-    limits : mapping of int to (float, str), optional
-        A limit of an entry of the observation, and its label.
-    references : mapping of int to int, optional
-        The entry of the observation that is the set-point of another, drawn as a dashed line.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from sb3_yann.evaluation import evaluate
-    >>> runs = {"no input": evaluate(lambda _: [0.0], "CSTR-v0", [0])}
-    >>> folder = tempfile.mkdtemp()
-    >>> save_trajectories(f"{folder}/run.png", runs, {0: "level"}, ["flow"], 1.0, "s").name
-    'run.png'
-    """
-    figure, references = new_figure(8, 2.4 * (len(states) + len(inputs))), references or {}
-    panels = figure.subplots(len(states) + len(inputs), 1, sharex=True, squeeze=False)[:, 0]
-    for number, (name, episodes) in enumerate(_check_runs(runs).items()):
-        style = {"color": COLORS[number % len(COLORS)], "alpha": 0.7, "linewidth": 1.2}
-        for k, (x, u) in enumerate(zip(episodes.observations, episodes.actions, strict=True)):
-            style["label"] = name if k == 0 else "_nolegend_"
-            time = dt * np.arange(len(x))
-            for panel, i in zip(panels, states, strict=False):
-                panel.plot(time, x[:, i], **style)
-                if i in references and number == 0:  # the same in every run
-                    r = x[:, references[i]].copy()
-                    r[-1] = r[-2:][0]  # the last one belongs to a step that is not taken
-                    panel.step(time, r, "k--", where="post", linewidth=1.0)
-            for panel, series in zip(panels[len(states) :], u.T, strict=True):
-                panel.step(time[:-1], series, where="post", **style)
-    for panel, i in zip(panels, states, strict=False):
-        if limits and i in limits:
-            panel.axhline(limits[i][0], color="black", linestyle="--", label=limits[i][1])
-            panel.legend(loc="best")
-    for panel, label in zip(panels, [*states.values(), *inputs], strict=True):
-        panel.set_ylabel(label)
-        panel.grid(alpha=0.3)
-    panels[0].legend(loc="best")
-    panels[-1].set_xlabel(f"time ({time_unit})")
-    return save_figure(figure, path, dpi=120)
-
-
-def save_plant_trajectories(
-    path: str | PathLike[str],
-    runs: Runs,
-    problem: LinearMPC,
-    time_unit: str,
-    entries: Sequence[int] | None = None,
-    labels: Mapping[int, str] | None = None,
-    limits: Mapping[int, tuple[float, str]] | None = None,
-) -> Path:
-    """Save a picture of theta and inputs, with the model's names; return its path.
-
-    A state with a set-point shows it as a dashed line.
-
-    Parameters
-    ----------
-    path : path-like
-        Folders are made as needed. Without a suffix it gets ``.png``.
-    runs : mapping of str to Trajectories
-        Their observations are theta.
-    problem : LinearMPC
-        Its model has the operating point, the sampling time, names and units.
-    time_unit : str
-        For the label of the axis.
-    entries : sequence of int, optional
-        The entries of theta to draw; all states by default.
-    labels : mapping of int to str, optional
-        Labels of entries that the model has no name for.
-    limits : mapping of int to (float, str), optional
-        A limit of an entry, in plant units, and its label.
-
-    Raises
-    ------
-    ValueError
-        If observations or actions have another size than theta and the inputs.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> import gymnasium
-    >>> from sb3_yann.evaluation import evaluate
-    >>> runs = {"no input": evaluate(lambda _: [0.0], "CSTR-v0", [0])}
-    >>> mpc = gymnasium.make("CSTR-v0").observation_space.problem
-    >>> folder = tempfile.mkdtemp()
-    >>> save_plant_trajectories(f"{folder}/run.png", runs, mpc, "h", entries=[3]).name
-    'run.png'
-    """
-    check_type("problem", problem, LinearMPC, "a LinearMPC")
-    shown = [*range(problem.model.n_states)] if entries is None else [*entries]
-    names = dict(enumerate(problem.labels(units=True))) | dict(labels or {})
-    references = {i: r for i, r in problem.set_points.items() if i in shown}
-    return save_trajectories(
-        path,
-        _of_theta(problem, runs),
-        {i: names[i] for i in shown},
-        with_units(problem.model)[1],
-        problem.model.dt,
-        time_unit,
-        limits,
-        references,
-    )
-
-
-def _check_runs(runs: Runs) -> dict[str, Trajectories]:
-    """Return runs by their names, else raise TypeError."""
+def _check_runs(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
+    """Return episodes by their names, else say what they are instead of episodes of theta."""
     check_type("runs", runs, Mapping, "a mapping of names to episodes: {'MPC': evaluate(...)}")
-    return {name: as_played(f"runs[{name!r}]", each) for name, each in runs.items()}
-
-
-def _of_theta(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
-    """Return episodes by their names; ValueError where they are not of theta."""
-    found = _check_runs(runs)
+    found = {name: as_played(f"runs[{name!r}]", each) for name, each in runs.items()}
+    if not found or not all(len(each.costs) for each in found.values()):
+        raise ValueError("There are no episodes to draw: pass {name: evaluate(...)} of some seeds.")
     n, m = problem.n_theta, problem.model.n_inputs
     for name, episodes in found.items():
-        for x, u in zip(episodes.observations, episodes.actions, strict=True):
+        for x, u in episodes.pairs:
             if x.shape[1:] != (n,) or u.shape[1:] != (m,):
                 raise ValueError(
                     f"An episode of {name!r} has observations {x.shape} and actions {u.shape}, but "
-                    f"theta has {n} entries and there are {m} inputs. Draw what the env shows by "
-                    "save_trajectories."
+                    f"theta has {n} entries and there are {m} inputs."
                 )
     return found
 
@@ -271,7 +128,7 @@ def plot_loop(
     'U (kJ/(h m² K))'
     """
     entry = entry_of(problem, quantity, inputs=True)
-    runs = _to_draw(problem, runs)
+    runs = _check_runs(problem, runs)
     axes = axes_or_new(axes, 6.4, 3.0)
     _draw_loops([axes], problem, [runs], entry, time_unit)
     legend_above(axes, columns=1 if len(runs) > 2 else 2)
@@ -309,7 +166,7 @@ def loops_figure(
     >>> len(loops_figure(mpc, runs, time_unit="s").axes)
     3
     """
-    runs = _to_draw(problem, runs)
+    runs = _check_runs(problem, runs)
     if quantities is None:
         n = problem.n_theta
         quantities = [*range(problem.model.n_states), *range(n, n + problem.model.n_inputs)]
@@ -342,12 +199,6 @@ def loops_figure(
         [*found.values()], [*found], loc="outside upper left", ncols=columns, frameon=False
     )
     return figure
-
-
-def _to_draw(problem: LinearMPC, runs: Runs) -> dict[str, Trajectories]:
-    if not runs or not all(len(each.costs) for each in runs.values()):
-        raise ValueError("There are no episodes to draw: pass {name: evaluate(...)} of some seeds.")
-    return _of_theta(problem, runs)
 
 
 def _draw_loops(
@@ -533,121 +384,6 @@ def _range_of_costs(costs: Array, accepted: Array, mpc: Array) -> tuple[float, f
 
 
 decisions_figure = as_figure(plot_decisions)
-
-
-# ---- An identified model along a log ----
-
-
-def plot_fit(
-    model: LinearModel,
-    states: ArrayLike,
-    actions: ArrayLike,
-    axes: Axes | None = None,
-    *,
-    disturbances: ArrayLike | None = None,
-    state: int = 0,
-    time_unit: str = "",
-) -> Axes:
-    """Draw one measured state, the model's free run from the first row, and ten steps ahead.
-
-    The legend has the fit, ``100 (1 - |x - predicted| / |x - mean|)`` in percent.
-
-    Parameters
-    ----------
-    model : LinearModel
-        As of :func:`identify`: ``found.model``.
-    states : array_like, shape (T + 1, n)
-        An episode in plant units, best one that the fit has not seen.
-    actions : array_like, shape (T, m)
-        In plant units.
-    axes : matplotlib Axes, optional
-        Where to draw; a new figure's by default.
-    disturbances : array_like, shape (T, d), optional
-        As measured.
-    state : int, default 0
-        Which one.
-    time_unit : str, optional
-        Of ``model.dt``, for the label.
-
-    Examples
-    --------
-    >>> model = LinearModel([[0.5]], [[1.0]], dt=1)
-    >>> axes = plot_fit(model, [[0.0], [1.0], [1.5]], [[1.0], [1.0]])
-    >>> axes.get_legend_handles_labels()[1]
-    ['measured', 'free run, fit 100.0 %', '10 steps ahead, fit 100.0 %']
-    """
-    x = check_array("states", states, ("T + 1", model.n_states))
-    u = check_array("actions", actions, (len(x) - 1, model.n_inputs)) - model.u_ss
-    d = np.zeros((len(u), model.n_disturbances)) + model.d_ss
-    if disturbances is not None:
-        d = check_array("disturbances", disturbances, d.shape)
-    if check_int("state", state, 0) >= model.n_states:
-        raise ValueError(f"state = {state} must be below {model.n_states}, the number of states.")
-    pushed = u @ model.B.T + (d - model.d_ss) @ model.E.T
-    axes = axes_or_new(axes, 7.0, 3.2)
-    time, measured = model.dt * np.arange(len(x)), x[:, state]
-    axes.plot(time, measured, color="black", linewidth=1.0, label="measured")
-    span = float(np.ptp(measured)) or 1.0
-    moved = np.linalg.norm(measured[1:] - measured[1:].mean())
-    for ahead, name, color, line in (
-        (len(x), "free run", COLORS[1], "-"),
-        (10, "10 steps ahead", COLORS[0], "--"),
-    ):
-        predicted = measured.copy()
-        z = x - model.x_ss
-        free = z[0]
-        for end in range(1, len(x)):
-            start = max(0, end - ahead)
-            if start:  # a run of its own from each measured state
-                free = z[start]
-                for k in range(start, end - 1):
-                    free = free @ model.A.T + pushed[k]
-            free = free @ model.A.T + pushed[end - 1]
-            predicted[end] = free[state] + model.x_ss[state]
-        missed = np.linalg.norm(measured[1:] - predicted[1:])
-        fit = 100 * (1 - missed / moved) if moved > 0 else np.nan
-        label = f"{name}, fit {fit:.1f} %"
-        axes.plot(time, predicted, line, color=color, linewidth=1.2, label=label)
-        if ahead == len(x):
-            is_near = bool(np.all(np.abs(predicted - measured) <= 0.3 * span))
-    axes.set_ylim(measured.min() - span, measured.max() + span)
-    if is_near:
-        axes.autoscale(axis="y")
-    axes.set(xlabel=f"time ({time_unit})" if time_unit else "time")
-    axes.set_ylabel(with_units(model)[0][state])
-    axes.grid(alpha=0.3)
-    legend_above(axes)
-    return axes
-
-
-def fit_figure(
-    model: LinearModel,
-    states: ArrayLike,
-    actions: ArrayLike,
-    *,
-    disturbances: ArrayLike | None = None,
-    time_unit: str = "",
-) -> Figure:
-    """Return a figure of :func:`plot_fit` for each state, with its arguments.
-
-    Parameters
-    ----------
-    model, states, actions, disturbances, time_unit
-        As of :func:`plot_fit`.
-
-    Examples
-    --------
-    >>> model = LinearModel([[0.5]], [[1.0]], dt=1)
-    >>> len(fit_figure(model, [[0.0], [1.0], [1.5]], [[1.0], [1.0]]).axes)
-    1
-    """
-    figure = new_figure(7.0, 2.1 * model.n_states + 0.4)
-    panels = figure.subplots(model.n_states, 1, sharex=True, squeeze=False)[:, 0]
-    own: dict[str, Any] = {"disturbances": disturbances, "time_unit": time_unit}
-    for i, panel in enumerate(panels):
-        plot_fit(model, states, actions, panel, state=i, **own)
-        panel.label_outer()
-    return figure
 
 
 # ---- Headroom, and what a twin is worth ----

@@ -1,4 +1,4 @@
-"""Closed loops, surfaces, and what a policy does in each region: the numbers that are drawn."""
+"""Tables, closed loops, surfaces, and what a policy does in each region: what is drawn."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ import pytest
 
 from sample_laws import reactor_in_plant_units
 from sb3_yann import LinearModel, LinearMPC, SoftBounds, Tracking
-from sb3_yann.evaluation import Trajectories, evaluate
+from sb3_yann.evaluation import Trajectories, comparison_table, evaluate
 from sb3_yann.evaluation.plots import (
     RegionUse,
-    fit_figure,
     loops_figure,
     plot_changes,
-    plot_fit,
     plot_loop,
     plot_regions,
     plot_surface,
@@ -40,6 +38,14 @@ def episodes(count: int, size: int = 1, steps: int = 5) -> Trajectories:
     u = [np.full((steps, 1), 40 - k / count) for k in range(count)]
     none = np.zeros(count, int)
     return Trajectories(np.ones(count), none, tuple(x), tuple(u), none.astype(bool))
+
+
+def test_the_table_shows_losses_as_well_as_gains() -> None:
+    before, after = episodes(2), episodes(2)
+    before.costs[:] = 10.0, 20.0
+    after.costs[:] = 9.0, 27.0
+    text = str(comparison_table("costs", before, after))
+    assert all(each in text for each in ("-1.00", "+7.00", "+3.00 (+20.0 %)"))
 
 
 def test_few_episodes_are_lines_in_plant_units() -> None:
@@ -198,19 +204,3 @@ def test_a_color_stands_for_the_constraints_that_act() -> None:
     assert regions_figure(mpc).axes[0].get_xlabel() == "C_A (mol/L)"
     with pytest.raises(ValueError, match="by"):
         plot_regions(mpc, by="color")
-
-
-def test_the_fit_of_the_true_model_is_whole_and_of_a_wrong_one_is_not() -> None:
-    rng = np.random.default_rng(0)
-    x, u = np.zeros((41, 1)), rng.normal(size=(40, 1))
-    for k in range(40):
-        x[k + 1] = 0.8 * x[k] + 0.5 * u[k]
-    true = LinearModel([[0.8]], [[0.5]], 1, [3], [7])
-    free = plot_fit(true, x + 3, u + 7).lines[1]
-    np.testing.assert_allclose(free.get_ydata(), x[:, 0] + 3, atol=1e-12)
-    assert free.get_label() == "free run, fit 100.0 %"
-    wrong = LinearModel([[0.5]], [[0.5]], 1, [3], [7])
-    assert "100.0" not in plot_fit(wrong, x + 3, u + 7).lines[1].get_label()
-    assert len(fit_figure(true, x + 3, u + 7).axes) == 1
-    with pytest.raises(ValueError, match="state = 1 must be below 1"):
-        plot_fit(true, x, u, state=1)
