@@ -68,7 +68,7 @@ class SimulatedEpisodes(BaseCallback):
         Probability that a step test begins at a sample: an action drawn evenly from all of the
         action space, and held. A law on a bound goes on there whatever noise is added; this moves
         it away.
-    longest : int, default 15
+    max_hold_steps : int, default 15
         A step test lasts 1 to so many samples, drawn evenly.
     noise : float, default 0.1
         Standard deviation of normal noise on each action in [-1, 1] between step tests.
@@ -97,18 +97,18 @@ class SimulatedEpisodes(BaseCallback):
         env: Source,
         per_episode: int = 10,
         step_tests: float = 0.03,
-        longest: int = 15,
+        max_hold_steps: int = 15,
         noise: float = 0.1,
         seed: int = 2_000_000,
     ) -> None:
         super().__init__()
         check_int("per_episode", per_episode)
         check_range("step_tests", step_tests, 0, 1)
-        check_int("longest", longest)
+        check_int("max_hold_steps", max_hold_steps)
         check_range("noise", noise, 0, np.inf)
         check_int("seed", seed, 0)
         self.env, self.per_episode, self.seed = as_source(env), per_episode, seed
-        self.step_tests, self.longest, self.noise = step_tests, longest, noise
+        self.step_tests, self.max_hold_steps, self.noise = step_tests, max_hold_steps, noise
         # Single envs, whose steps are the training env's: copies that step as one may round.
         given = isinstance(self.env, gym.Env)
         self._pool = EnvPool(self.env if given else lambda: make_env(self.env))
@@ -221,7 +221,7 @@ class _Exploration:
     def __call__(self, action: Array) -> Array:
         """Return an action in [-1, 1], shape (m,)."""
         if self.left == 0 and self.rng.random() < self.settings.step_tests:
-            self.left = int(self.rng.integers(1, self.settings.longest + 1))
+            self.left = int(self.rng.integers(1, self.settings.max_hold_steps + 1))
             self.held = self.rng.uniform(-1, 1, action.shape)
         if self.left > 0:
             self.left -= 1

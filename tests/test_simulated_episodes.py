@@ -192,7 +192,9 @@ def test_noise_stays_within_the_action_space() -> None:
 
 def test_step_tests_hold_an_action_from_all_of_the_space_for_one_to_so_many_samples() -> None:
     rng = np.random.default_rng(0)
-    explore = _Exploration(SimulatedEpisodes(Slide, step_tests=0.1, longest=4, noise=0.01), rng)
+    explore = _Exploration(
+        SimulatedEpisodes(Slide, step_tests=0.1, max_hold_steps=4, noise=0.01), rng
+    )
     acted = np.array([explore(np.array([0.9, -0.9])) for _ in range(20_000)])
     tested = np.abs(acted - [0.9, -0.9]).max(1) > 0.1
     assert tested.mean() == pytest.approx(2.5 / (2.5 + 9), abs=0.02)  # after 9 of noise
@@ -208,7 +210,7 @@ def test_step_tests_hold_an_action_from_all_of_the_space_for_one_to_so_many_samp
     [
         ({"per_episode": 0}, ValueError, "per_episode = 0 must be"),
         ({"step_tests": 1.5}, ValueError, "step_tests = 1.5 must be"),
-        ({"longest": 0}, ValueError, "longest = 0 must be"),
+        ({"max_hold_steps": 0}, ValueError, "max_hold_steps = 0 must be"),
         ({"noise": -1}, ValueError, "noise = -1 must be"),
         ({"noise": np.nan}, ValueError, "noise = nan must be"),
         ({"seed": -1}, ValueError, "seed = -1 must be"),

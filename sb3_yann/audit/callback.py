@@ -17,7 +17,7 @@ from sb3_yann.audit.finding import (
     CostMismatchError,
     CostMismatchWarning,
     SteadyOffsetWarning,
-    judged,
+    make_finding,
 )
 from sb3_yann.audit.observed_order import warn_of_order
 from sb3_yann.audit.offset import steady_offset
@@ -125,7 +125,7 @@ class CostAudit(BaseCallback):
         if not enough and not lost.any():
             return
         cause = self._of_the_vec_normalize()
-        if cause is None and enough and not sample.is_the_problem_s_cost(self.tolerance):
+        if cause is None and enough and not sample.matches_stage_cost(self.tolerance):
             cause = likely_cause(sample, self.tolerance)
         if lost.any():
             cause = not_finite(lost, records, cause)
@@ -133,7 +133,7 @@ class CostAudit(BaseCallback):
         if not self.reward_alone:
             steps = sample.theta, sample.u, sample.following
             warn_of_order(self.policy.problem, *steps, stacklevel=2)
-        self.finding = judged(sample, cause, self.training_env, beside)
+        self.finding = make_finding(sample, cause, self.training_env, beside)
         if beside:
             warnings.warn(beside, SteadyOffsetWarning, stacklevel=2)
         if cause is not None:

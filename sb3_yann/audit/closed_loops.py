@@ -7,7 +7,7 @@ import copy
 import numpy as np
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.beginnings import beginnings
+from sb3_yann.audit.initial_guesses import initial_guesses
 from sb3_yann.audit.plants import Plant
 from sb3_yann.audit.task import Task
 from sb3_yann.audit.trajectory import Plans, Policy, follow, planned
@@ -187,7 +187,7 @@ class Planning:
         law = law_of(problem)
         policies: list[Policy] = [lambda _, at: law(at)]
         if rows[0] not in self.plans:
-            policies = beginnings(self.plant, self.task, starts, left, rows)
+            policies = initial_guesses(self.plant, self.task, starts, left, rows)
         found = planned(self.plant, self.task, policies, starts, left, rows)
         for k, row in enumerate(rows):
             constants = starts[k, problem.layout.constant].copy()

@@ -75,7 +75,7 @@ class CostFinding:
     rest: str = ""
 
 
-def judged(sample: Sample, cause: Cause | None, venv: VecEnv, rest: str = "") -> CostFinding:
+def make_finding(sample: Sample, cause: Cause | None, venv: VecEnv, rest: str = "") -> CostFinding:
     """Return what a cause of a mismatch says, or that there is none.
 
     Parameters

@@ -85,7 +85,7 @@ class Sample:
         index = np.clip(index, 0, len(values) - 1)
         return values[index], inside & (self.episode[index] == self.episode)
 
-    def is_the_problem_s_cost(self, tolerance: float) -> bool:
+    def matches_stage_cost(self, tolerance: float) -> bool:
         """Tell whether every counted reward is what the problem says."""
         cost, error = np.abs(self.cost), np.abs(self.implied - self.cost)
         allowed = tolerance * np.maximum(cost, cost[self.counted].mean()) + self.rounded

@@ -15,6 +15,7 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import check_bool, check_int, check_range
+from sb3_yann.commissioning.accepted_policy import AcceptedPolicy
 from sb3_yann.commissioning.comparison import (
     Costs,
     compare,
@@ -23,8 +24,7 @@ from sb3_yann.commissioning.comparison import (
     is_kept,
     why_taken_back,
 )
-from sb3_yann.commissioning.incumbent import Incumbent
-from sb3_yann.commissioning.journal import Batch, Journal, Outlook, Verdict
+from sb3_yann.commissioning.journal import Batch, CommissioningState, Journal, Verdict
 from sb3_yann.commissioning.plant import Plant, PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Watchdog
@@ -113,7 +113,7 @@ class Commissioning:
         seed: int = 0,
         verbose: int = 0,
     ) -> None:
-        self.incumbent = Incumbent(model)
+        self.incumbent = AcceptedPolicy(model)
         self.policy = self.incumbent.policy
         if not (isinstance(plant_env, str | gym.Env) or callable(plant_env)):
             raise TypeError(
@@ -135,7 +135,7 @@ class Commissioning:
         # A model that was saved meanwhile has the bound of then.
         self.largest: float = record.events[0].get("largest", bound) if record.events else bound
         begin = {**self._settings, "largest": self.largest}
-        self.journal = Journal(record, begin, Outlook(self._first_bound))
+        self.journal = Journal(record, begin, CommissioningState(self._first_bound))
         self._restore(self.journal.outlook)
 
     @property
@@ -225,7 +225,9 @@ class Commissioning:
                 costs = compare(journal, plant, self.twin, None)
                 self.twin = self.watchdog = None
                 first = len(journal.episodes)
-                outlook = Outlook(self._first_bound, first=first, anew=number, tried=before.tried)
+                outlook = CommissioningState(
+                    self._first_bound, first=first, anew=number, tried=before.tried
+                )
                 self.incumbent.give_back()
                 verdict: Verdict = "begins anew"
                 reason = "Two episodes in a row had an alarm."
@@ -254,7 +256,7 @@ class Commissioning:
         if self.verbose:
             print(self.report().splitlines()[-1])
 
-    def _learn(self, plant: Plant, number: int) -> tuple[Costs, Outlook, Verdict, str]:
+    def _learn(self, plant: Plant, number: int) -> tuple[Costs, CommissioningState, Verdict, str]:
         """Fit the twin anew, and improve the policy in it if the plant has confirmed it."""
         before, numbers, seed = self.twin, self.journal.log, self.seed + number
         twin = self._fit(numbers, seed) if len(numbers) > 1 else None
@@ -287,8 +289,8 @@ class Commissioning:
         return costs, outlook, verdict, f"{said}{found}"
 
     def _improve(
-        self, twin: PlantTwin, outlook: Outlook, seed: int
-    ) -> tuple[Outlook, Verdict, str]:
+        self, twin: PlantTwin, outlook: CommissioningState, seed: int
+    ) -> tuple[CommissioningState, Verdict, str]:
         """Improve the policy in its twin; what the plant confirmed stays if nothing is found."""
         bound, outlook = self.journal.outlook.max_correction, replace(outlook, tried=True)
         self.incumbent.take_candidate()
@@ -350,7 +352,7 @@ class Commissioning:
             "problem": hashlib.sha256(numbers).hexdigest()[:16],
         }
 
-    def _restore(self, outlook: Outlook) -> None:
+    def _restore(self, outlook: CommissioningState) -> None:
         """Restore the accepted policy, the twin and its watchdog as a record left them."""
         if not self.journal.batches:
             return

@@ -58,7 +58,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Outlook:
+class CommissioningState:
     """What holds after a batch.
 
     Attributes
@@ -105,11 +105,13 @@ class Journal:
     record : Record
     settings : dict
         What must be the same to go on.
-    outlook : Outlook
+    outlook : CommissioningState
         What holds before the first batch.
     """
 
-    def __init__(self, record: Record, settings: dict[str, Any], outlook: Outlook) -> None:
+    def __init__(
+        self, record: Record, settings: dict[str, Any], outlook: CommissioningState
+    ) -> None:
         self.record, self.outlook = record, outlook
         self.episodes: list[PlantEpisode] = []
         self.by_policy: list[bool] = []
@@ -196,7 +198,7 @@ class Journal:
         self.record.append({**about, **as_event(played)})
         self._add(played, by_policy)
 
-    def close(self, batch: Batch, outlook: Outlook) -> None:
+    def close(self, batch: Batch, outlook: CommissioningState) -> None:
         """Add the decision that ends a batch."""
         said = {  # NaN is not JSON
             k: None if isinstance(v, float) and not math.isfinite(v) else v
@@ -217,7 +219,7 @@ class Journal:
             named = {each.name: event[each.name] for each in fields(Batch)}
             costs = {k: math.nan for k, each in named.items() if each is None}
             # Records of before there was `tried`: nothing waited where they went on.
-            outlook = Outlook(**{"tried": True, **event["from_here"]})
+            outlook = CommissioningState(**{"tried": True, **event["from_here"]})
             self._close(Batch(**{**named, **costs}), outlook)
 
     def _begin(self, acts: str) -> None:
@@ -228,7 +230,7 @@ class Journal:
         self.episodes.append(played)
         self.by_policy.append(by_policy)
 
-    def _close(self, batch: Batch, outlook: Outlook) -> None:
+    def _close(self, batch: Batch, outlook: CommissioningState) -> None:
         self.batches.append(batch)
         self.outlook, self._first_of_batch, self._cut_off = outlook, len(self.episodes), 0
 

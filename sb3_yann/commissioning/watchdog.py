@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sb3_yann._validation import Array, check_array
-from sb3_yann.commissioning.bands import GAINS, Act, Bands, Tracks
+from sb3_yann.commissioning.control_limits import GAINS, Act, ControlLimits, EwmaCharts
 from sb3_yann.control.model.labels import name_of
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.plant_twin import PlantTwin
@@ -61,7 +61,7 @@ class Watchdog:
     ----------
     dynamics : Dynamics
         The twin's members.
-    bands : Bands
+    bands : ControlLimits
         How far all may go while all is well.
     alarm : Alarm or None
         The first one of this episode.
@@ -84,7 +84,7 @@ class Watchdog:
     """
 
     dynamics: Dynamics
-    bands: Bands
+    bands: ControlLimits
     alarm: Alarm | None = None
     _episode: _Episode | None = field(default=None, init=False)
 
@@ -101,7 +101,7 @@ class Watchdog:
         """
         if not isinstance(twin, PlantTwin):
             raise TypeError(f"twin = {twin!r} must be a PlantTwin.")
-        return cls(twin.dynamics, Bands.of(twin))
+        return cls(twin.dynamics, ControlLimits.of(twin))
 
     def __repr__(self) -> str:
         """Say whether it is quiet."""
@@ -137,7 +137,7 @@ class Watchdog:
         problem = self.dynamics.problem
         first = check_array("theta", theta, (problem.n_theta,))
         first = self.dynamics.row.begin(first)
-        tracks = Tracks(self.dynamics, self.bands.familiarity, first, act)
+        tracks = EwmaCharts(self.dynamics, self.bands.predictive_variance, first, act)
         self.alarm, self._episode = None, _Episode(tracks, first)
 
     def watch(self, theta: Array, u: Array, after: Array, violation: bool = False) -> Alarm | None:
@@ -257,7 +257,7 @@ class Watchdog:
 class _Episode:
     """What is remembered within an episode."""
 
-    def __init__(self, tracks: Tracks, row: Array) -> None:
+    def __init__(self, tracks: EwmaCharts, row: Array) -> None:
         self.tracks, self.row, n = tracks, row, tracks.dynamics.problem.model.n_states
         self.stands, self.moved = np.zeros(n, np.int64), np.zeros(n)
         self.last: deque[tuple[Array, Array, Array]] = deque(maxlen=WINDOW)

@@ -80,12 +80,12 @@ class DisturbanceObserver:
         self.A = np.block([[model.A, E], [np.zeros((d, n)), np.eye(d)]])
         self.B = np.vstack([model.B, np.zeros((d, model.n_inputs))])
         self.E = np.vstack([model.E[:, known], np.zeros((d, len(known)))])
-        self.seen = np.hstack([self.C, np.zeros((q, d))])
-        moves = check_positive_vector("state_noise", state_noise, n, STANDARD)
-        drifts = check_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD)
-        errors = check_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
+        self.C_aug = np.hstack([self.C, np.zeros((q, d))])
+        w_std = check_positive_vector("state_noise", state_noise, n, STANDARD)
+        d_std = check_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD)
+        v_std = check_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
         if gain is None:
-            self.gain = self._kalman_gain(moves, drifts, errors)
+            self.gain = self._kalman_gain(w_std, d_std, v_std)
         else:
             self.gain = check_array("gain", gain, (n + d, q))
         radius = self._radius(self.gain)
@@ -107,7 +107,7 @@ class DisturbanceObserver:
         return len(self.A) - self.model.n_states
 
     @property
-    def n_told(self) -> int:
+    def n_known(self) -> int:
         """Number of measured disturbances, which :meth:`update` is told."""
         return int(self.E.shape[1])
 
@@ -134,12 +134,12 @@ class DisturbanceObserver:
         """
         now = check_array("y", y, (self.n_measured,))
         predicted = self._after(u, d)
-        self.estimate = predicted + self.gain @ (now - self.seen @ predicted)
+        self.estimate = predicted + self.gain @ (now - self.C_aug @ predicted)
         return self.x_hat, self.d_hat
 
     def expected(self, u: ArrayLike, d: ArrayLike | None = None) -> Array:
         """Return the outputs y (q,) that the estimate makes expect after u (m,) and measured d."""
-        return np.asarray(self.seen @ self._after(u, d))
+        return np.asarray(self.C_aug @ self._after(u, d))
 
     @cached_property
     def _smallest(self) -> Array:
@@ -147,37 +147,37 @@ class DisturbanceObserver:
         return np.asarray(np.linalg.pinv(self.C))
 
     def _after(self, u: ArrayLike, d: ArrayLike | None) -> Array:
-        if (d is None) != (self.n_told == 0):
+        if (d is None) != (self.n_known == 0):
             raise ValueError(
-                f"d = {d!r}, but the observer is told {self.n_told} measured disturbances: those "
+                f"d = {d!r}, but the observer is told {self.n_known} measured disturbances: those "
                 "of its model that are not `estimated`. Pass what acted together with u."
             )
         moved = self.A @ self.estimate + self.B @ check_array("u", u, (self.model.n_inputs,))
         return np.asarray(
-            moved if d is None else moved + self.E @ check_array("d", d, (self.n_told,))
+            moved if d is None else moved + self.E @ check_array("d", d, (self.n_known,))
         )
 
-    def _kalman_gain(self, moves: Array, drifts: Array, errors: Array) -> Array:
+    def _kalman_gain(self, w_std: Array, d_std: Array, v_std: Array) -> Array:
         """Return the steady-state gain of the filter from the standard deviations."""
         try:
             with np.errstate(all="ignore"):
-                Q, R = np.diag(np.append(moves, drifts) ** 2), np.diag(errors**2)
-                P = linalg.solve_discrete_are(self.A.T, self.seen.T, Q, R)
-                spread = self.seen @ P @ self.seen.T + R
-                gain = np.asarray(np.linalg.solve(spread, self.seen @ P).T)
+                Q, R = np.diag(np.append(w_std, d_std) ** 2), np.diag(v_std**2)
+                P = linalg.solve_discrete_are(self.A.T, self.C_aug.T, Q, R)
+                spread = self.C_aug @ P @ self.C_aug.T + R
+                gain = np.asarray(np.linalg.solve(spread, self.C_aug @ P).T)
             if self._radius(gain) < 1:
                 return gain
         except ValueError:  # a LinAlgError is one
             pass
         raise ValueError(
-            f"state_noise = {moves.tolist()}, disturbance_noise = {drifts.tolist()} and "
-            f"measurement_noise = {errors.tolist()} are too far apart, or too large, for a Kalman "
+            f"state_noise = {w_std.tolist()}, disturbance_noise = {d_std.tolist()} and "
+            f"measurement_noise = {v_std.tolist()} are too far apart, or too large, for a Kalman "
             "filter: rounding hides its gain. Only their ratios matter: keep these below 1e6."
         )
 
     def _radius(self, gain: Array) -> float:
         """Return by which factor the error of the estimate changes in a sample, in the end."""
-        return lqr.spectral_radius((np.eye(len(self.A)) - gain @ self.seen) @ self.A)
+        return lqr.spectral_radius((np.eye(len(self.A)) - gain @ self.C_aug) @ self.A)
 
 
 def _require_observable(model: LinearModel, E: Array, C: Array) -> None:

@@ -95,7 +95,7 @@ class Teacher:
         pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
         planning = Planning(self.scenarios.plant, self.task, self.steps, pause)
         first = np.zeros(len(self.scenarios), dtype=np.int64) if begins is None else begins
-        later = _Later(planning, first, act or self.problem.law())
+        later = SwitchedController(planning, first, act or self.problem.law())
         shown = self.scenarios.play(later)
         safe = ~less_safe(shown.unsafe, self.mpc.unsafe).any(axis=1)
         taught = (first >= 0) & safe & (shown.costs <= self.mpc.costs)
@@ -134,7 +134,7 @@ class Teacher:
         return begins
 
 
-class _Later:
+class SwitchedController:
     """A controller from a step of each episode on.
 
     Parameters

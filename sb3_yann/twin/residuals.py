@@ -30,7 +30,7 @@ class Residual(Protocol):
         """Return its derivatives (batch, n, k)."""
 
 
-class Nothing:
+class ZeroResidual:
     """The linear model as it is."""
 
     def __init__(self, n: int) -> None:
@@ -200,7 +200,7 @@ def as_polynomials(members: Sequence[Any], k: int) -> tuple[Any, Any, Array] | N
     ``weights[:, k + i]`` (members, n). A constant one comes last, if there is one.
     """
     none, first = np.empty(0, np.int64), members[0]
-    if all(isinstance(each, Nothing) for each in members):
+    if all(isinstance(each, ZeroResidual) for each in members):
         return none, none, np.zeros((len(members), k, first.n))
     if not all(isinstance(each, Polynomial) for each in members):
         return None

@@ -58,9 +58,9 @@ class RowLayout:
                 f"observer has {its} states, inputs and disturbances, the problem {own}. Give the "
                 "observer of this problem's disturbances, all of them."
             )
-        if observer.n_told:
+        if observer.n_known:
             raise ValueError(
-                f"The observer is told {observer.n_told} measured disturbances. A twin or a "
+                f"The observer is told {observer.n_known} measured disturbances. A twin or a "
                 "simulator of an observer with both kinds of disturbances is not there yet: "
                 "train and compare in the env itself, as ImprovementGuard does."
             )
@@ -122,7 +122,7 @@ class RowLayout:
         found[:size, :size], found[:size, self.size :] = np.split(theta, [size], axis=1)
         found[: parts.n_states] = found[parts.disturbance] = 0.0
         found[self.state, self.state], found[self.state, self.size :] = model.A, model.B
-        blind = np.eye(len(observer.gain)) - observer.gain @ observer.seen
+        blind = np.eye(len(observer.gain)) - observer.gain @ observer.C_aug
         z = np.zeros((len(blind), found.shape[1]))
         before = blind @ observer.A
         z[:, parts.state], z[:, self._raw] = before[:, :n], before[:, n:]
@@ -216,7 +216,7 @@ class RowLayout:
         found = [z]
         for after, u in zip(x[1:], actions, strict=True):
             z = observer.A @ z + observer.B @ u
-            found.append(z := z + observer.gain @ (observer.C @ after - observer.seen @ z))
+            found.append(z := z + observer.gain @ (observer.C @ after - observer.C_aug @ z))
         estimates = np.array(found)
         rows = np.concatenate([thetas, x, estimates[:, n:]], axis=1)
         rows[:, parts.state] = estimates[:, :n]

@@ -17,7 +17,7 @@ from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import NetworkResidual, fit_ensemble
 from sb3_yann.twin.gaussian_process import GaussianProcess
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Nothing, Polynomial, Regressor, Residual
+from sb3_yann.twin.residuals import Polynomial, Regressor, Residual, ZeroResidual
 
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
@@ -67,7 +67,7 @@ def candidates(problem: LinearMPC, kinds: Sequence[Any]) -> list[Candidate]:
 def _of_a_kind(problem: LinearMPC, kind: Any) -> Iterator[Candidate]:
     offset = problem.layout.has_constants
     if kind == "none":
-        yield Candidate("none", partial(Nothing, problem.model.n_states), -np.inf)
+        yield Candidate("none", partial(ZeroResidual, problem.model.n_states), -np.inf)
     elif isinstance(kind, str) and kind in DEGREES:
         for shrinkage, factor in product(SHRINKAGES, INPUT_FACTORS):
             name = f"{kind}, shrinkage {shrinkage:g} ({shrinkage * factor:g} of inputs)"
@@ -117,7 +117,7 @@ def fitted(
             if key not in moments:
                 moments[key] = residual.moments(z_all, y_all)
             residual.solve(*moments[key])
-        elif not isinstance(residual, Nothing):
+        elif not isinstance(residual, ZeroResidual):
             residual.fit(z_all, y_all)
     return list(made)
 

@@ -155,7 +155,9 @@ def costs_of_each(
     return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
 
 
-def standing_still(coordinates: Coordinates, episodes: tuple[Episode, ...], horizons: Any) -> Array:
+def persistence_error(
+    coordinates: Coordinates, episodes: tuple[Episode, ...], horizons: Any
+) -> Array:
     """Return the error (h,) of the prediction, so many steps ahead, that the state stays."""
     states, found = [e.thetas[:, coordinates.row.state] for e in episodes], []
     for h in horizons:
@@ -328,7 +330,7 @@ def evidence(
     runs, chosen, costs = found
     problem = dynamics.problem
     coordinates, row = dynamics.coordinates, dynamics.row
-    standing = standing_still(coordinates, log, runs.horizons)
+    standing = persistence_error(coordinates, log, runs.horizons)
     inputs = excitation(problem, log)
     shares = beyond_the_box(problem, log) * (not follows_law(problem, log))
     beyond = float(shares.max()), problem.labels()[int(np.argmax(shares))]

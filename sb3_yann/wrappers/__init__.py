@@ -1,6 +1,6 @@
 """Wrappers that complete theta, set the reward, and cure faults of episodes."""
 
-from sb3_yann.wrappers.episodes import SeededGlobals, TimeLimitIsNoTermination
+from sb3_yann.wrappers.episodes import SeededGlobals, TruncateAtTimeLimit
 from sb3_yann.wrappers.plant_env import PlantEnv
 from sb3_yann.wrappers.stage_cost import StageCost
 from sb3_yann.wrappers.theta import (
@@ -20,5 +20,5 @@ __all__ = [
     "SeededGlobals",
     "SetPoint",
     "StageCost",
-    "TimeLimitIsNoTermination",
+    "TruncateAtTimeLimit",
 ]

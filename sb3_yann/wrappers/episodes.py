@@ -16,7 +16,7 @@ from sb3_yann._validation import check_int
 Any_Env = gym.Env[Any, Any]
 
 
-class TimeLimitIsNoTermination(gym.Wrapper[Any, Any, Any, Any]):
+class TruncateAtTimeLimit(gym.Wrapper[Any, Any, Any, Any]):
     """Turns ``terminated`` after a fixed number of steps into ``truncated``: a time limit.
 
     After ``terminated`` the learner counts no further cost. At a time limit the plant goes on.
@@ -34,7 +34,7 @@ class TimeLimitIsNoTermination(gym.Wrapper[Any, Any, Any, Any]):
     ...     def step(self, action):
     ...         observation, reward, *_ = self.env.step(action)
     ...         return observation, reward, True, False, {}
-    >>> env = TimeLimitIsNoTermination(Ends(gym.make("CSTR-v0")), steps=1)
+    >>> env = TruncateAtTimeLimit(Ends(gym.make("CSTR-v0")), steps=1)
     >>> _ = env.reset(seed=0)
     >>> env.step(np.zeros(1, np.float32))[2:4]
     (False, True)

@@ -262,7 +262,7 @@ def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
 def _require_told(observer: DisturbanceObserver, measured: MeasuredDisturbance | None) -> None:
     """Raise unless an observer knows which disturbances the env measures, and comes after them."""
     shown = 0 if measured is None else len(measured.low)
-    model, told = observer.model, observer.n_told
+    model, told = observer.model, observer.n_known
     if shown != told:
         raise ValueError(
             f"The env measures {shown} disturbances (MeasuredDisturbance), but the observer is "
@@ -323,8 +323,8 @@ class ObserveDisturbance(Appending):
             )
         self.observer = copy.deepcopy(observer)
         model = observer.model
-        told = [*range(observer.n_told)]
-        estimated = [*range(observer.n_told, model.n_disturbances)]
+        told = [*range(observer.n_known)]
+        estimated = [*range(observer.n_known, model.n_disturbances)]
         # The observer computes with deviations: what counts from where.
         self.inner = Units(np.concatenate([observer.C @ model.x_ss, model.d_ss[told]]), model.u_ss)
         self.outer = Units(np.concatenate([model.x_ss, model.d_ss[estimated]]), model.u_ss)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_yann.commissioning.journal import Batch, Journal, Outlook
+from sb3_yann.commissioning.journal import Batch, CommissioningState, Journal
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.commissioning.watchdog import Alarm
@@ -21,7 +21,7 @@ ERRORS = (ValueError, OSError)
 
 
 def journal(path: Path) -> Journal:
-    return Journal(Record(path), SETTINGS, Outlook(0.1))
+    return Journal(Record(path), SETTINGS, CommissioningState(0.1))
 
 
 @pytest.fixture
@@ -151,7 +151,10 @@ def test_a_model_is_on_the_disk_before_the_line_that_names_it(path: Path, monkey
 
 
 def test_where_a_record_of_before_goes_on_nothing_waits_to_be_tried(path: Path) -> None:
-    batch, outlook = Batch(1, 2, 0, "MPC", 0.0, 1.0, 1.0, 1.0, "stays", ""), asdict(Outlook(0.1))
+    batch, outlook = (
+        Batch(1, 2, 0, "MPC", 0.0, 1.0, 1.0, 1.0, "stays", ""),
+        asdict(CommissioningState(0.1)),
+    )
     del outlook["tried"]
     Record(path).append({"event": "batch", **asdict(batch), "from_here": outlook})
     assert journal(path).outlook.tried

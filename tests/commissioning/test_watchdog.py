@@ -165,9 +165,9 @@ def test_a_twin_that_runs_away_is_no_error() -> None:
 
 
 def test_where_the_log_tells_little_the_band_is_wider() -> None:
-    familiarity = watchdog().bands.familiarity
-    near = familiarity.doubt(np.array([0.3, 0.0]), np.array([0.0]))
-    far = familiarity.doubt(np.array([2.8, 2.5]), np.array([0.0]))
+    predictive_variance = watchdog().bands.predictive_variance
+    near = predictive_variance.doubt(np.array([0.3, 0.0]), np.array([0.0]))
+    far = predictive_variance.doubt(np.array([2.8, 2.5]), np.array([0.0]))
     assert np.all(far > 10 * near)
 
 

@@ -30,8 +30,8 @@ def test_the_kalman_gain_is_the_limit_of_the_time_varying_filter() -> None:
     P = np.eye(3)
     for _ in range(500):
         P = observer.A @ P @ observer.A.T + np.diag([0.01, 0.04, 0.09])
-        K = P @ observer.seen.T / (observer.seen @ P @ observer.seen.T + 0.25)
-        P = P - K @ observer.seen @ P
+        K = P @ observer.C_aug.T / (observer.C_aug @ P @ observer.C_aug.T + 0.25)
+        P = P - K @ observer.C_aug @ P
     np.testing.assert_allclose(observer.gain, K, rtol=1e-9)
 
 

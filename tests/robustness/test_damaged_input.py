@@ -24,7 +24,7 @@ import yaml
 from sb3_yann import Checks, Controller, ImprovementGuard, LinearModel, LinearMPC, export
 from sb3_yann._archive import digest_of, read_arrays, write_arrays
 from sb3_yann.cli import main as command_line
-from sb3_yann.commissioning.journal import Journal, Outlook
+from sb3_yann.commissioning.journal import CommissioningState, Journal
 from sb3_yann.commissioning.plant import PlantEpisode
 from sb3_yann.commissioning.record import Record
 from sb3_yann.policy.actor_critic import as_critic_options
@@ -178,7 +178,7 @@ def _changed(array: Any, rng: np.random.Generator) -> Any:
 def _record(folder: Path) -> Target:
     """Return a target of damaged records of a commissioning."""
     path, settings = folder / "plant.jsonl", {"batch": 2}
-    journal = Journal(Record(path), settings, Outlook(0.1))
+    journal = Journal(Record(path), settings, CommissioningState(0.1))
     for _ in range(3):
         journal.begin(False)
         rows = np.ones((3, 2)), np.ones((2, 1))
@@ -190,7 +190,7 @@ def _record(folder: Path) -> Target:
         found = Record(path)
         if found.events != events[: len(found.events)]:
             raise Wrong("other events were read")
-        Journal(found, settings, Outlook(0.1))
+        Journal(found, settings, CommissioningState(0.1))
         return "the same" if len(found.events) == len(events) else "cut off"
 
     return Target(attempt)

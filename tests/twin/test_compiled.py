@@ -15,7 +15,7 @@ from sb3_yann.improvement.imitation import policy_of
 from sb3_yann.networks import SharedYannLayer, YannLayer
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.twin.dynamics import Dynamics
-from sb3_yann.twin.residuals import Nothing, Polynomial
+from sb3_yann.twin.residuals import Polynomial, ZeroResidual
 from twin_samples import log, problem, rated, twin
 
 
@@ -91,7 +91,7 @@ def test_the_linear_model_alone_and_rows_that_are_not_finite(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     given = twin()
-    dynamics = Dynamics(problem(), given.dynamics.coordinates, (Nothing(2), Nothing(2)))
+    dynamics = Dynamics(problem(), given.dynamics.coordinates, (ZeroResidual(2), ZeroResidual(2)))
     theta, u = np.random.default_rng(0).normal(size=(2, 3, 2)), np.ones((2, 3, 1))
     theta[1, 2, 0] = np.nan
     ours = dynamics.step(theta, u), given.dynamics.step(theta[[0, 0, 0, 1, 1]], u[[0] * 5])

@@ -9,7 +9,7 @@ from general_problems import solved
 from sb3_yann import LinearMPC
 from sb3_yann.twin.dynamics import MARGIN, Coordinates, Dynamics, law_of
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Nothing, Polynomial, Regressor
+from sb3_yann.twin.residuals import Polynomial, Regressor, ZeroResidual
 from twin_samples import random_episode as episode
 
 
@@ -160,7 +160,7 @@ def test_the_linear_model_repeats_its_own_log_at_its_own_cost() -> None:
     mpc = solved("servo")
     thetas, inputs = mpc.simulate([2.0, -1.0, 0.5], 15)
     log = Episode(thetas, inputs)
-    alone = Dynamics(mpc, Coordinates.of(mpc, [log]), (Nothing(2),))
+    alone = Dynamics(mpc, Coordinates.of(mpc, [log]), (ZeroResidual(2),))
     np.testing.assert_allclose(alone.replay(log, np.array([0]), 15)[0, 0], thetas[:, :2])
     cost = mpc.stage_cost(thetas[:-1], inputs).sum()
     np.testing.assert_allclose(alone.replay_in_closed_loop(log), [cost])
@@ -171,7 +171,7 @@ def test_all_members_answer_one_block_of_rows_whatever_their_kind() -> None:
     thetas, inputs = mpc.simulate([2.0, -1.0, 0.5], 15)
     box = Coordinates.of(mpc, [Episode(thetas, inputs)])
     for member in (
-        Nothing(2),
+        ZeroResidual(2),
         bent(mpc, 1)[0].members[0],
         Regressor(Slope).fit(np.eye(3), np.eye(3, 2)),
     ):

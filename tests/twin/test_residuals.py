@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sb3_yann.twin.residuals import Monomials, Nothing, Polynomial, Regressor, as_polynomials
+from sb3_yann.twin.residuals import Monomials, Polynomial, Regressor, ZeroResidual, as_polynomials
 
 
 def data(n: int = 400, k: int = 3):
@@ -118,13 +118,13 @@ def test_the_arrays_for_compiled_code_are_the_polynomials(degree, offset) -> Non
 
 
 def test_nothing_is_a_polynomial_without_weights_and_a_regressor_is_none() -> None:
-    parents, variables, weights = as_polynomials([Nothing(2), Nothing(2)], 3)
+    parents, variables, weights = as_polynomials([ZeroResidual(2), ZeroResidual(2)], 3)
     assert len(parents) == len(variables) == 0
     np.testing.assert_array_equal(weights, np.zeros((2, 3, 2)))
     z, y = data()
     for mixed in ([Regressor(Least)], [Polynomial(1, 1.0).fit(z, y), Regressor(Least)]):
         assert as_polynomials(mixed, 3) is None
-    nothing = Nothing(2)
+    nothing = ZeroResidual(2)
     assert nothing.predict(z).shape == (400, 2) and nothing.jacobian(z).shape == (400, 2, 3)
 
 

@@ -10,7 +10,7 @@ import pytest
 from general_problems import solved
 from sb3_yann.twin.dynamics import Coordinates
 from sb3_yann.twin.log import Episode
-from sb3_yann.twin.residuals import Monomials, Nothing, Polynomial
+from sb3_yann.twin.residuals import Monomials, Polynomial, ZeroResidual
 from sb3_yann.twin.selection import (
     Candidate,
     FreeRuns,
@@ -69,7 +69,7 @@ def test_residuals_are_fitted_to_what_the_model_leaves_of_each_step() -> None:
     mpc = solved("servo with all of it")
     log = [episode(mpc, seed=seed) for seed in range(4)]
     box = Coordinates.of(mpc, log[1:])  # the first one lies outside of it in part
-    made = [Polynomial(2, 1e-3), Polynomial(2, 1e-1), Polynomial(1, 1e-2, True), Nothing(2)]
+    made = [Polynomial(2, 1e-3), Polynomial(2, 1e-1), Polynomial(1, 1e-2, True), ZeroResidual(2)]
     z, y = [], []
     for each in log:
         theta, u = each.thetas[:-1], each.actions
@@ -135,7 +135,7 @@ class Counts:
     seen: list[int]
 
     def __init__(self) -> None:
-        self.predict, self.jacobian = Nothing(2).predict, Nothing(2).jacobian
+        self.predict, self.jacobian = ZeroResidual(2).predict, ZeroResidual(2).jacobian
 
     def fit(self, z: Any, y: Any) -> Counts:
         self.seen.append(len(z))
@@ -228,6 +228,6 @@ def test_those_before_the_first_are_compared_and_never_chosen() -> None:
 
 
 def test_residuals_of_a_kind_and_degree_are_stepped_as_one() -> None:
-    made = [Nothing(2), Polynomial(1, 1.0), Polynomial(2, 1.0), Polynomial(1, 2.0), Counts()]
-    made += [Counts(), Nothing(2)]
+    made = [ZeroResidual(2), Polynomial(1, 1.0), Polynomial(2, 1.0), Polynomial(1, 2.0), Counts()]
+    made += [Counts(), ZeroResidual(2)]
     assert _alike(made) == [[0], [1, 3], [2], [4], [5], [6]]

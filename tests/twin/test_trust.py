@@ -15,7 +15,7 @@ from sb3_yann.evaluation.plots import twin_figure
 from sb3_yann.twin import trust as trusts
 from sb3_yann.twin.log import Episode, as_episodes, records
 from sb3_yann.twin.report import report
-from sb3_yann.twin.residuals import Nothing
+from sb3_yann.twin.residuals import ZeroResidual
 from sb3_yann.twin.selection import Candidate, FreeRuns
 from twin_samples import log, problem, random_episode, twin
 
@@ -57,7 +57,7 @@ def test_every_episode_is_left_out_of_the_fit_that_predicts_it() -> None:
     rows: list[int] = []
 
     class Counts:
-        predict, jacobian = Nothing(2).predict, Nothing(2).jacobian
+        predict, jacobian = ZeroResidual(2).predict, ZeroResidual(2).jacobian
 
         def fit(self, z, y):
             rows.append(len(z))
@@ -182,7 +182,7 @@ def test_the_report_shows_these_numbers() -> None:
 def test_standing_still_errs_by_how_far_the_states_move_in_units_of_the_log() -> None:
     logs = [random_episode(problem(), steps, seed) for seed, steps in enumerate((20, 14))]
     box = dataclasses.replace(twin().dynamics.coordinates, units=np.array([2.0, 5.0]))
-    found = trusts.standing_still(box, (*logs,), [1, 5, 14])
+    found = trusts.persistence_error(box, (*logs,), [1, 5, 14])
     for h, error in zip((1, 5, 14), found, strict=True):
         squares = [
             ((each.thetas[i + h, k] - each.thetas[i, k]) / (2.0, 5.0)[k]) ** 2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.random.mtrand import get_bit_generator
 
-from sb3_yann.wrappers import SeededGlobals, TimeLimitIsNoTermination
+from sb3_yann.wrappers import SeededGlobals, TruncateAtTimeLimit
 
 
 class Walk(gym.Env):
@@ -92,11 +92,11 @@ def ends(env: gym.Env) -> list[tuple[bool, bool]]:
 
 
 def test_the_end_at_the_limit_is_truncation_and_an_earlier_one_is_not() -> None:
-    late, early = (TimeLimitIsNoTermination(Walk(last), 5) for last in (5, 3))
+    late, early = (TruncateAtTimeLimit(Walk(last), 5) for last in (5, 3))
     assert ends(late) == ends(late) == [(False, False)] * 4 + [(False, True)]
     assert ends(early)[2] == (True, False)
 
 
 def test_a_limit_must_be_a_number_of_steps() -> None:
     with pytest.raises(ValueError, match="steps = 0 must be a whole number of at least 1"):
-        TimeLimitIsNoTermination(Walk(), 0)
+        TruncateAtTimeLimit(Walk(), 0)

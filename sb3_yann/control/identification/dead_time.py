@@ -10,7 +10,12 @@ from scipy.special import fdtrc
 
 from sb3_yann._validation import Array
 from sb3_yann.control.identification.least_squares import Regression
-from sb3_yann.control.identification.residuals import bent, features, leftover, without
+from sb3_yann.control.identification.residuals import (
+    curvature_test,
+    features,
+    leftover,
+    project_out,
+)
 from sb3_yann.control.linear_system import names
 from sb3_yann.log import Episode
 
@@ -57,10 +62,10 @@ def found_delays(episodes: list[Episode], n_inputs: int) -> list[int]:
     centered = now - np.mean(now, axis=0)
     plain = np.column_stack([np.ones(steps), centered])
     basis = np.column_stack([plain, features(centered)])
-    whole = without(basis, np.hstack([target, *past]))  # lag after lag, input by input
+    whole = project_out(basis, np.hstack([target, *past]))  # lag after lag, input by input
     # Below it, all is rounding, or curvature of higher order.
     floor = 1e-10 * np.var(target, axis=0) + np.finfo(float).tiny
-    floor += CURVED * np.mean(without(plain, target) ** 2, axis=0)
+    floor += CURVED * np.mean(project_out(plain, target) ** 2, axis=0)
     gram = whole.T @ whole / steps
     for _ in range(2 if n_inputs > 1 else 1):
         for j in range(n_inputs):
@@ -246,7 +251,7 @@ def _delays(
 ) -> list[tuple[int, float]]:
     """Return each input's lag of largest partial correlation with the residuals, 0 for none."""
     best = [(0, 0.0)] * (sizes[1] + sizes[2])
-    straight = np.sqrt(1 - bent(found, episodes)[0])  # curvature is no delay
+    straight = np.sqrt(1 - curvature_test(found, episodes)[0])  # curvature is no delay
     episodes = _first(episodes)
     for lag in range(1, MAX_DELAY + 1):
         longer = [episode for episode in episodes if len(episode) > lag]

@@ -38,7 +38,7 @@ def features(regressors: Array) -> Array:
     return np.hstack([main[:, first] * main[:, second], main**3])
 
 
-def bent(found: Regression, episodes: list[Episode]) -> tuple[Array, Array]:
+def curvature_test(found: Regression, episodes: list[Episode]) -> tuple[Array, Array]:
     """Return the share (n,) of each residual's variance that curvature explains, and what is left.
 
     The shares are corrected for the number of features, and zero where chance explains them. What
@@ -48,8 +48,8 @@ def bent(found: Regression, episodes: list[Episode]) -> tuple[Array, Array]:
     reached = np.concatenate([episode.states[1:] for episode in episodes])
     residuals = reached - found.predict(now + found.center)
     known, added = np.column_stack([np.ones(len(now)), now]), features(now)
-    before = without(known, residuals)
-    after = without(np.column_stack([known, added]), residuals)
+    before = project_out(known, residuals)
+    after = project_out(np.column_stack([known, added]), residuals)
     q, free = added.shape[1], len(now) - known.shape[1] - added.shape[1]
     size, rest = np.sum(before**2, axis=0), np.sum(after**2, axis=0)
     real = size > 1e-20 * np.sum(reached**2, axis=0)
@@ -62,7 +62,7 @@ def bent(found: Regression, episodes: list[Episode]) -> tuple[Array, Array]:
     return np.asarray(np.where(sure & (share > SHARE), share, 0.0)), after
 
 
-def without(basis: Array, values: Array) -> Array:
+def project_out(basis: Array, values: Array) -> Array:
     """Return what a least-squares fit by the basis leaves of the values."""
     scale = np.linalg.norm(basis, axis=0)
     left, sizes, _ = np.linalg.svd(basis / np.where(scale > 0, scale, 1.0), full_matrices=False)
@@ -153,7 +153,7 @@ def leftover(episodes: list[Episode], delays: Sequence[int] = ()) -> Leftover:
     steps = len(now)
     center = now.mean(axis=0)
     plain = np.column_stack([np.ones(steps), now - center])
-    target_left = without(plain, target)
+    target_left = project_out(plain, target)
     # Below it, all is rounding.
     floor = 1e-9 * np.mean(target_left**2, axis=0) + 1e-20 * np.mean(target**2, axis=0)
     floor += np.finfo(float).tiny
@@ -230,7 +230,7 @@ def quality_notes(
 
 def _residual_notes(found: Regression, fitted: list[Episode], n: int) -> list[str]:
     """Return notes on what the residuals hold beside white noise: curvature, or colour."""
-    share, rest = bent(found, fitted)
+    share, rest = curvature_test(found, fitted)
     share, own = share[:n], found.autocorrelation[:n]
     colored = np.abs(own) > 3 / np.sqrt(found.steps)
     left, notes = leftover(fitted), list[str]()

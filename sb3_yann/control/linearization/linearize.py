@@ -229,7 +229,7 @@ def _ends_at_its_limit(env: Any, action: Array) -> list[str]:
         f"Episodes terminate after {ends[0]} steps whatever happens: that is a time limit, but "
         "terminated=True tells the learner that nothing costs anything afterwards. Return "
         "truncated=True there, or wrap the environment in "
-        f"sb3_yann.wrappers.TimeLimitIsNoTermination(env, {ends[0]})."
+        f"sb3_yann.wrappers.TruncateAtTimeLimit(env, {ends[0]})."
     ]
 
 

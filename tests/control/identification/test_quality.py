@@ -10,7 +10,13 @@ import pytest
 from scipy import stats
 
 from sb3_yann.control.identification.least_squares import Regression, neighbors, regress
-from sb3_yann.control.identification.residuals import bent, features, listed, quality_notes, without
+from sb3_yann.control.identification.residuals import (
+    curvature_test,
+    features,
+    listed,
+    quality_notes,
+    without,
+)
 from sb3_yann.log import Episode
 
 
@@ -89,7 +95,7 @@ def explained(found: Regression, episodes: list[Episode]) -> tuple[np.ndarray, .
 
 def test_what_curvature_explains_is_the_adjusted_share_of_an_f_test() -> None:
     logs = [log(160, curved=0.5), log(140, curved=0.5, seed=1)]
-    share, after = bent(fit(*logs), logs)
+    share, after = curvature_test(fit(*logs), logs)
     expected, chance, rest = explained(fit(*logs), logs)
     np.testing.assert_allclose(after, rest, atol=1e-10)
     assert share[1] == pytest.approx(expected[1]) and expected[1] > 0.5
@@ -104,7 +110,7 @@ def test_curvature_is_named_from_a_tenth_on_and_where_chance_does_not_explain_it
         expected, chance, _ = explained(found, [episode])
         sure, much = chance[1] < 1e-3, expected[1] > 0.1
         seen.add((bool(sure), bool(much)))
-        named = bent(found, [episode])[0][1]
+        named = curvature_test(found, [episode])[0][1]
         assert named == pytest.approx(expected[1] if sure and much else 0.0)
     assert len(seen) == 4
 
@@ -198,10 +204,10 @@ def test_what_curvature_explains_is_no_noise() -> None:
         episode = log(curved=curved)
         text = told(fit(episode), episode, autocorrelation=colour)
         assert ("are correlated" in text) == noisy
-        share = bent(fit(episode), [episode])[0]
+        share = curvature_test(fit(episode), [episode])[0]
         percent = f"explain {listed(100 * share)} % of the residuals' variance"
         assert (percent in text) == (curved > 0)
-    assert share[1] > 0.5 > bent(fit(log(curved=0.25)), [log(curved=0.25)])[0][1] > 0.1
+    assert share[1] > 0.5 > curvature_test(fit(log(curved=0.25)), [log(curved=0.25)])[0][1] > 0.1
 
 
 def test_of_a_memory_of_inputs_nothing_is_told() -> None:

@@ -219,7 +219,7 @@ def faults(*given: Any, **more: Any) -> str:
 
 def test_a_termination_after_the_same_number_of_steps_is_a_time_limit() -> None:
     assert "Episodes terminate after 30 steps whatever happens" in faults(30)
-    assert "TimeLimitIsNoTermination(env, 30)" in faults(30)
+    assert "TruncateAtTimeLimit(env, 30)" in faults(30)
     assert "after 2 steps" in faults(2) and faults(1) == ""
     assert "after 400 steps" in faults(400) and faults(401) == ""
     assert faults(None) == "" and faults(30, cut=20) == "" and faults(20, cut=30) != ""

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from sb3_yann import LinearModel, LinearMPC
 from sb3_yann.control.linearization.simulator import noise_of, to_vector
-from sb3_yann.wrappers import SeededGlobals, TimeLimitIsNoTermination
+from sb3_yann.wrappers import SeededGlobals, TruncateAtTimeLimit
 from sb3_yann_envs import cstr
 
 
@@ -222,7 +222,7 @@ def test_an_environment_that_ignores_its_seed_is_named_and_cured() -> None:
 def test_a_time_limit_that_terminates_is_named_and_cured() -> None:
     with pytest.warns(UserWarning, match=r"after 30 steps whatever.*NoTermination\(env, 30\)"):
         LinearModel.from_env(Careless(limit=30))
-    LinearModel.from_env(TimeLimitIsNoTermination(Careless(limit=30), 30))  # nothing warns
+    LinearModel.from_env(TruncateAtTimeLimit(Careless(limit=30), 30))  # nothing warns
 
 
 @pytest.mark.parametrize("limits", [(30, 20), (20, 30)])

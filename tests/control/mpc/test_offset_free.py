@@ -109,7 +109,7 @@ def test_nothing_calls_an_estimated_disturbance_measured() -> None:
 def test_measured_disturbances_stay_before_the_estimated_ones() -> None:
     mpc, observer = offset_free(solved("servo with a disturbance"), [0.3, 0.4])
     assert (mpc.model.estimated, mpc.model.measured) == ((1, 2), (0,))
-    assert (observer.n_estimated, observer.n_told) == (2, 1)
+    assert (observer.n_estimated, observer.n_known) == (2, 1)
     given = solved("servo with a disturbance")
     np.testing.assert_array_equal(mpc.model.E, np.hstack([given.model.E, np.eye(2)]))
     assert mpc.disturbances.d_max.tolist() == [*given.disturbances.d_max, 0.3, 0.4]

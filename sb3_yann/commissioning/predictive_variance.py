@@ -22,7 +22,7 @@ LEAST = 0.1
 
 
 @dataclass(frozen=True)
-class Familiarity:
+class PredictiveVariance:
     """How far the residual may be from the twin's, at a point that the log tells little about.
 
     The standard deviation of a Bayesian cubic regression on the log. Its prior is as wide as what
@@ -56,7 +56,7 @@ class Familiarity:
     @classmethod
     def of(
         cls, twin: PlantTwin, episodes: Sequence[Episode], error: Array, white: Array
-    ) -> Familiarity:
+    ) -> PredictiveVariance:
         """Return that of some episodes of a twin.
 
         Parameters

@@ -19,7 +19,7 @@ from sb3_yann.policy.policies import require_yann_policy
 from sb3_yann.rollout import preserve_rng
 
 
-class Incumbent:
+class AcceptedPolicy:
     """A model's policy, its bound, and the MPC that it can always return to.
 
     A policy that the model has learnt before is nobody's yet: it waits as ``candidate``, and the

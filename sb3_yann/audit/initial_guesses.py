@@ -23,7 +23,9 @@ WEIGHTS = 0.1, 10.0
 Law = Callable[[Array], Array]
 
 
-def beginnings(plant: Plant, task: Task, starts: Array, steps: int, rows: Rows) -> list[Policy]:
+def initial_guesses(
+    plant: Plant, task: Task, starts: Array, steps: int, rows: Rows
+) -> list[Policy]:
     """Return the policies whose trajectories plans may begin with; the first one is the MPC.
 
     Two have inputs on their bounds for a while, then the MPC. The last one is, for each start, the

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.commissioning.familiarity import Familiarity
+from sb3_yann.commissioning.predictive_variance import PredictiveVariance
 from sb3_yann.twin.dynamics import Dynamics, law_of
 from sb3_yann.twin.ensemble import NetworkResidual, fit_ensemble
 from sb3_yann.twin.log import Episode, pieces
@@ -38,7 +38,7 @@ Act = Callable[[Array], Array]
 
 
 @dataclass
-class Tracks:
+class EwmaCharts:
     """Runs of the twin beside the plant, in one episode.
 
     For each gain an observer follows the readings, and its innovations are averaged with the same
@@ -49,7 +49,7 @@ class Tracks:
     ----------
     dynamics : Dynamics
         The first member is the observers' model.
-    familiarity : Familiarity
+    predictive_variance : PredictiveVariance
     theta : ndarray, shape (size,)
         The first row.
     act : callable
@@ -57,7 +57,7 @@ class Tracks:
     """
 
     dynamics: Dynamics
-    familiarity: Familiarity
+    predictive_variance: PredictiveVariance
     theta: Array
     act: Act
     steps: int = field(default=0, init=False)
@@ -98,18 +98,18 @@ class Tracks:
         self.rows[:, :-1, state] += gains * innovations
         self.charts += GAINS[:, None] * (innovations[0] - self.charts)
         # What is not known passes through the same filters as the innovations.
-        self._gathered += self.familiarity.doubt(theta, u)
+        self._gathered += self.predictive_variance.doubt(theta, u)
         self.doubts += GAINS[:, None] * (self._gathered - self.doubts)
         self._gathered *= 1.0 - gains
 
 
 @dataclass(frozen=True)
-class Bands:
+class ControlLimits:
     """How far charts and costs may go while all is well, from episodes left out of the fit.
 
     Attributes
     ----------
-    familiarity : Familiarity
+    predictive_variance : PredictiveVariance
     error : ndarray, shape (n,)
         Root mean squares of one-step errors.
     spread, most : ndarray, shape (gains, n)
@@ -124,7 +124,7 @@ class Bands:
         By how much the largest ratio is exceeded only where something is wrong.
     """
 
-    familiarity: Familiarity
+    predictive_variance: PredictiveVariance
     error: Array
     spread: Array
     most: Array
@@ -135,7 +135,7 @@ class Bands:
     factor: float
 
     @classmethod
-    def of(cls, twin: PlantTwin) -> Bands:
+    def of(cls, twin: PlantTwin) -> ControlLimits:
         """Return those of a twin's own log."""
         whole = len(twin.episodes)
         log = [*(twin.episodes if whole >= FEWEST else pieces(twin.episodes, FEWEST))]
@@ -156,13 +156,13 @@ class Bands:
         offset = COST_FLOOR * float(np.mean([costs_of(twin.problem, e) for e in log]))
         found = []
         for model, (out, kept) in zip(models, parts, strict=True):
-            known = Familiarity.of(twin, kept, error, white)
+            known = PredictiveVariance.of(twin, kept, error, white)
             found += [_played(model, known, each, offset) for each in out]
         charts, doubts, ratios = (np.concatenate(each) for each in zip(*found, strict=True))
         spread = np.sqrt(np.mean(charts**2, axis=0)) + 1e-9 * error
         most = np.fmax.reduce(np.abs(charts) / np.hypot(spread, doubts), axis=0)
         return cls(
-            familiarity=Familiarity.of(twin, log, error, white),
+            predictive_variance=PredictiveVariance.of(twin, log, error, white),
             error=error,
             spread=spread,
             most=np.maximum(most, LEAST_RATIO),
@@ -173,7 +173,7 @@ class Bands:
             factor=FACTOR + FACTOR_OF_FEW / whole,
         )
 
-    def ratios(self, tracks: Tracks) -> Array:
+    def ratios(self, tracks: EwmaCharts) -> Array:
         """Return charts (gains, n) in units of their bands: beyond 1 something is wrong.
 
         A slow observer of an unstable plant may run away; its charts are left out.
@@ -182,12 +182,12 @@ class Bands:
         ratios = tracks.charts / band
         return np.where(np.isnan(ratios), 0.0, ratios)
 
-    def cost_ratio(self, tracks: Tracks) -> float:
+    def cost_ratio(self, tracks: EwmaCharts) -> float:
         """Return by how much the plant has cost more than the twin, in units of the band."""
         return _cost_ratio(tracks, self.cost_offset) / (self.factor * self.cost_most)
 
 
-def _cost_ratio(tracks: Tracks, offset: float) -> float:
+def _cost_ratio(tracks: EwmaCharts, offset: float) -> float:
     low, high = float(tracks.costs.min()), float(tracks.costs.max())
     mean = (low + high) / 2
     scale = COST_ERROR * (abs(mean) + offset) + (high - low) / 2
@@ -221,7 +221,7 @@ def _errors(left: list[Array]) -> tuple[Array, Array]:
 
 
 def _played(
-    dynamics: Dynamics, familiarity: Familiarity, episode: Episode, offset: float
+    dynamics: Dynamics, predictive_variance: PredictiveVariance, episode: Episode, offset: float
 ) -> tuple[Array, Array, Array]:
     """Return charts and doubts (T, gains, n) and cost ratios (T,) of a logged episode.
 
@@ -229,7 +229,7 @@ def _played(
     """
     law = law_of(dynamics.problem)
     changes = episode.actions - law(dynamics.row.shown(episode.thetas[:-1]))
-    tracks = Tracks(dynamics, familiarity, episode.thetas[0], law)
+    tracks = EwmaCharts(dynamics, predictive_variance, episode.thetas[0], law)
     charts, doubts, ratios = [], [], []
     for theta, after, u, change in zip(
         episode.thetas[:-1], episode.thetas[1:], episode.actions, changes, strict=True
