@@ -177,7 +177,6 @@ def test_the_design_side_loads_neither_torch_nor_stable_baselines3(code: str) ->
     [
         "import sb3_yann; from stable_baselines3 import DDPG",
         "from stable_baselines3 import DDPG; import sb3_yann",
-        "import sb3_yann.policy; from stable_baselines3 import DDPG",
         "import importlib.util, sb3_yann; importlib.util.find_spec('stable_baselines3'); "
         "from stable_baselines3.ddpg import DDPG",
     ],

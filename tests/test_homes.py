@@ -39,7 +39,7 @@ def home(kind: str, folder: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="a home of its own kind")
-@pytest.mark.parametrize("kind", ["missing", "read-only"])
+@pytest.mark.parametrize("kind", ["missing", pytest.param("read-only", marks=pytest.mark.nightly)])
 def test_it_works_without_a_home(kind: str, tmp_path: Path) -> None:
     bare = BARE if os.geteuid() == 0 else []
     if bare and not shutil.which(bare[0]):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from sb3_yann import LinearModel
+from sb3_yann.twin import selection
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -70,7 +71,7 @@ def write_log() -> None:
 
 
 @pytest.mark.slow
-def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
+def test_the_code_in_the_readme_runs(tmp_path, monkeypatch, no_networks) -> None:
     monkeypatch.chdir(tmp_path)
     train, simulate, from_log = blocks(README)
     names = run_code("README.md", train + simulate)
@@ -83,9 +84,15 @@ def test_the_code_in_the_readme_runs(tmp_path, monkeypatch) -> None:
     assert (tmp_path / "controller.c").exists()
 
 
+@pytest.fixture
+def no_networks(monkeypatch) -> None:
+    """Let a twin be of polynomials: a fit of networks takes seconds, and the tests of twins do."""
+    monkeypatch.setattr(selection, "ROWS", 10**9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["export", "guard", "improve", "policy"])
-def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> None:
+def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch, no_networks) -> None:
     monkeypatch.chdir(tmp_path)
     run(f"docs/{name}.md")
 

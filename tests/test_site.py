@@ -16,7 +16,7 @@ PICTURES = sorted((DOCS / "pictures").glob("*.png"))
 MOST_BYTES = 60_000
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(find_spec("myst_parser") is None, reason="Sphinx is not installed: make docs")
 def test_the_site_builds_without_a_warning_and_loads_nothing(tmp_path) -> None:
     options = ["--quiet", "--fail-on-warning", "--keep-going", "-d", tmp_path / "trees"]

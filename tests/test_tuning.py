@@ -62,7 +62,7 @@ def test_other_policies_keep_the_zoos_space():
     assert "one_minus_gamma" in trial.params and "critic_widths" not in trial.params
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_two_workers_on_one_study_keep_the_entrys_problem(tmp_path):
     (tmp_path / "my_problem.py").write_text(PROBLEM)
     (tmp_path / "entry.yml").write_text(ENTRY)

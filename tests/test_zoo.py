@@ -142,7 +142,7 @@ class Run:
     scope="module",
     params=[
         pytest.param(("ddpg", "CSTR-v0"), id="ddpg-CSTR", marks=pytest.mark.slow),
-        pytest.param(("td3", "ClippedPendulum-v0"), id="td3-pendulum", marks=pytest.mark.slow),
+        pytest.param(("td3", "ClippedPendulum-v0"), id="td3-pendulum", marks=pytest.mark.nightly),
     ],
 )
 def run(request, tmp_path_factory) -> Run:

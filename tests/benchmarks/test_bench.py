@@ -12,7 +12,7 @@ from fresh_process import run_module
 from sb3_yann.control import PiecewiseAffine
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_quick_form_runs_to_its_report(tmp_path) -> None:
     run_module(tmp_path, "benchmarks", "--quick")
     folder = tmp_path / "out" / "bench-quick"

@@ -307,7 +307,7 @@ def sanitizers(folder) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("precision", ["double", pytest.param("float", marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", HOSTILE_CASES)
 def test_hostile_readings_break_no_rule_of_c_and_no_bound(name, precision, tmp_path):
     flags, policy = sanitizers(tmp_path), policy_of(name)

@@ -36,8 +36,11 @@ PRINTED = {
 }
 
 
+NIGHTLY = [pytest.param(name, marks=pytest.mark.nightly) for name in PRINTED if name != "cstr"]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRINTED)
+@pytest.mark.parametrize("name", ["cstr", *NIGHTLY])
 def test_the_example_runs_to_its_picture(name, tmp_path) -> None:
     done = subprocess.run(
         [sys.executable, EXAMPLES / f"{name}.py", "--episodes", "1"],
@@ -78,7 +81,7 @@ def test_a_log_becomes_a_report_and_a_better_controller(tmp_path) -> None:
     assert (tmp_path / "out" / "from_a_log.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cloned_policy_forgets_and_a_yann_policy_does_not(tmp_path) -> None:
     done = subprocess.run(
         [sys.executable, EXAMPLES / "cloned_policy.py", "--episodes", "1"],

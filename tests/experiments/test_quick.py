@@ -9,7 +9,7 @@ import pytest
 from fresh_process import run_module
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_quick_form_runs_to_its_report_and_does_nothing_twice(tmp_path) -> None:
     assert "9 of 9 runs" in run_module(tmp_path, "experiments", "--quick")
     folder = tmp_path / "out" / "paper-quick"

@@ -104,7 +104,7 @@ def test_outcomes_of_other_settings_are_not_used(results, monkeypatch) -> None:
     assert not load_all(RUNS, results)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_dask_gives_the_same_with_one_thread_each(results) -> None:
     distributed = pytest.importorskip("distributed")  # of the extra `paper`
     with distributed.LocalCluster(

@@ -54,7 +54,7 @@ def quick_cloning(monkeypatch) -> None:
     monkeypatch.setattr(yardsticks, "CLONING_SEEDS", range(500, 502))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", BUILDERS)
 @pytest.mark.parametrize("env_id", ENVS)
 def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_cloning) -> None:
@@ -78,7 +78,7 @@ def test_each_learns_and_its_policy_stays_within_the_bounds(env_id, name, quick_
     np.testing.assert_allclose(one, after[0], rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["ddpg", "residual", "cloned"])
 def test_equal_seeds_give_equal_results(name, quick_cloning) -> None:
     def trained(seed: int) -> np.ndarray:
@@ -115,7 +115,7 @@ def test_without_noise_the_residual_executes_the_mpc_until_the_actor_moves(env_i
     assert np.any(executed[101:] != expected[101:])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("env_id", ENVS)
 def test_residual_noise_is_a_fraction_of_half_the_input_range(env_id) -> None:
     env = recorder(env_id)
@@ -138,7 +138,7 @@ def test_the_residual_reaches_every_input_from_any_other() -> None:
     assert residual(state, np.array([-4.0])) == -2.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["quiet residual", "cloned"])
 def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
     env = gym.make("ClippedPendulum-v0")
@@ -154,7 +154,7 @@ def test_the_actor_waits_for_its_critic(name, quick_cloning) -> None:
     assert np.any(learner.policy.predict(states)[0] != before)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("env_id", ENVS)
 def test_a_cloned_actor_is_close_to_the_mpc_from_other_starts(env_id) -> None:
     env = recorder(env_id)
@@ -202,7 +202,7 @@ def test_lqr_is_linear_inside_and_clipped_outside(problem) -> None:
     np.testing.assert_array_equal(law(states[0]), actions[0])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_best_is_kept_of_what_ddpg_was_after_any_episode() -> None:
     starts = range(700, 703)
     learner = best_of_ddpg(lambda: gym.make("ClippedPendulum-v0"), 0, starts)

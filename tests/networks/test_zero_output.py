@@ -180,9 +180,10 @@ def test_relu_network_keeps_the_gradient_of_relu_away_from_zero() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pinned", [False, True])
-@pytest.mark.parametrize("hidden", [(16,), (16, 16)])
-@pytest.mark.parametrize("activation", ["tanh", "softsign", "sin"])
+@pytest.mark.parametrize(
+    ("activation", "hidden", "pinned"),
+    [("tanh", (16,), False), ("softsign", (16, 16), True), ("sin", (16,), True)],
+)
 def test_network_learns_an_even_nonlinear_function(
     activation: str, hidden: tuple[int, ...], pinned: bool
 ) -> None:

@@ -27,7 +27,7 @@ def test_two_trainings_with_one_seed_are_the_same(n_envs, tmp_path) -> None:
     assert found[0] == found[1]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_so_they_are_in_fresh_processes_with_machine_code_that_is_new_or_kept(tmp_path) -> None:
     kept = tmp_path / "code"
     outputs = []

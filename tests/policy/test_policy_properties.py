@@ -244,7 +244,7 @@ class Strict(gym.Env):
         return seen, reward, False, self.steps == 10, {}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @examples(10)
 @given(
     problems(), ALGORITHMS, KINDS, st.sampled_from([1, 2]),

@@ -40,7 +40,7 @@ def test_problems_of_each_kind_are_solved_and_right(name: str) -> None:
     assert_right(examine(name, 40))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("part", range(10))
 def test_the_suite_is_solved_and_right(part: int) -> None:
     for name in names(large=False)[part::10]:

@@ -14,8 +14,8 @@ from sb3_yann.control.identification.residuals import (
     curvature_test,
     features,
     listed,
+    project_out,
     quality_notes,
-    without,
 )
 from sb3_yann.log import Episode
 
@@ -139,7 +139,7 @@ def test_without_a_basis_nothing_of_it_is_left() -> None:
     basis, values = rng.standard_normal((50, 3)), rng.standard_normal((50, 2))
     same = np.column_stack([1e6 * basis[:, 0], basis[:, 1:], basis[:, 0] + basis[:, 1], 0 * values])
     expected = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
-    np.testing.assert_allclose(without(same, values), expected, atol=1e-12)
+    np.testing.assert_allclose(project_out(same, values), expected, atol=1e-12)
 
 
 def told(found: Regression, episode: Episode, tested: int = 40, **changes: object) -> str:
