@@ -24,8 +24,8 @@ import sb3_yann_envs
 __version__ = "0.1.0"
 
 _NAMES = {
-    "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning Headroom "
-    "SteadyOffsetWarning headroom",
+    "sb3_yann.audit": "CostAudit CostFinding CostMismatchError CostMismatchWarning "
+    "SteadyOffsetWarning",
     "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
     "sb3_yann.commissioning": "Batch Commissioning",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
@@ -34,7 +34,7 @@ _NAMES = {
     "sb3_yann.deployment.checks": "Checks",
     "sb3_yann.deployment.controller": "Controller",
     "sb3_yann.deployment.exporting": "Exported export",
-    "sb3_yann.improvement": "Improvement improve",
+    "sb3_yann.improvement": "Headroom Improvement headroom improve",
     "sb3_yann.log": "Log",
     "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "

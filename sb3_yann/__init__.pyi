@@ -2,9 +2,7 @@ from sb3_yann.audit import CostAudit as CostAudit
 from sb3_yann.audit import CostFinding as CostFinding
 from sb3_yann.audit import CostMismatchError as CostMismatchError
 from sb3_yann.audit import CostMismatchWarning as CostMismatchWarning
-from sb3_yann.audit import Headroom as Headroom
 from sb3_yann.audit import SteadyOffsetWarning as SteadyOffsetWarning
-from sb3_yann.audit import headroom as headroom
 from sb3_yann.callbacks import ControlDiagnostics as ControlDiagnostics
 from sb3_yann.callbacks import NoActionNoise as NoActionNoise
 from sb3_yann.commissioning import Batch as Batch
@@ -35,7 +33,9 @@ from sb3_yann.guard import Decision as Decision
 from sb3_yann.guard import ImprovementGuard as ImprovementGuard
 from sb3_yann.guard import StepSize as StepSize
 from sb3_yann.guard import restore_accepted as restore_accepted
+from sb3_yann.improvement import Headroom as Headroom
 from sb3_yann.improvement import Improvement as Improvement
+from sb3_yann.improvement import headroom as headroom
 from sb3_yann.improvement import improve as improve
 from sb3_yann.log import Log as Log
 from sb3_yann.policy import AffineObservation as AffineObservation

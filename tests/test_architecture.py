@@ -25,6 +25,7 @@ FLOORS = [
     {"sb3_yann.evaluation"},
     {"sb3_yann.networks"},
     {"sb3_yann.twin"},
+    {"sb3_yann.plan"},
     {"sb3_yann.policy"},
     {"sb3_yann.callbacks", "sb3_yann.simulated_episodes", "sb3_yann.wrappers"},
     {"sb3_yann.audit"},

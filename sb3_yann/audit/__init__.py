@@ -7,15 +7,11 @@ from sb3_yann.audit.finding import (
     CostMismatchWarning,
     SteadyOffsetWarning,
 )
-from sb3_yann.audit.gains import Headroom
-from sb3_yann.audit.headroom import headroom
 
 __all__ = [
     "CostAudit",
     "CostFinding",
     "CostMismatchError",
     "CostMismatchWarning",
-    "Headroom",
     "SteadyOffsetWarning",
-    "headroom",
 ]

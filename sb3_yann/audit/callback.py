@@ -19,7 +19,7 @@ from sb3_yann.audit.finding import (
     SteadyOffsetWarning,
     make_finding,
 )
-from sb3_yann.audit.observed_order import warn_of_order
+from sb3_yann.audit.meaning import warn_of_order
 from sb3_yann.audit.offset import steady_offset
 from sb3_yann.audit.sample import FEWEST, Sample
 from sb3_yann.policy.observations import require_frozen

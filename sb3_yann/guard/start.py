@@ -14,8 +14,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 
-from sb3_yann.audit.input_signs import warn_of_signs
-from sb3_yann.audit.observed_order import warn_of_order
+from sb3_yann.audit.meaning import warn_of_order, warn_of_signs
 from sb3_yann.compare import COST_ROUNDING, EXCESS_ROOM, Scores, Starts
 from sb3_yann.control import LinearMPC
 from sb3_yann.control.mpc.bound_excess import BoundNames

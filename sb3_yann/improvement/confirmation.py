@@ -9,7 +9,6 @@ import numpy as np
 from scipy import special
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.closed_loops import of_law
 from sb3_yann.compare import (
     UNSAFE,
     less_safe,
@@ -17,7 +16,7 @@ from sb3_yann.compare import (
 )
 from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.improvement.imitation import Inputs, controller_of
-from sb3_yann.improvement.simulator import Simulator
+from sb3_yann.improvement.simulator import Simulator, of_law
 from sb3_yann.improvement.trial import RULE, Check
 from sb3_yann.twin.log import Episode
 

@@ -11,14 +11,13 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.closed_loops import PAUSE, Planning, of_law
-from sb3_yann.audit.task import WEIGHT, Task
-from sb3_yann.audit.trajectory import Plans, follow
 from sb3_yann.compare import less_safe
 from sb3_yann.control import LinearMPC
-from sb3_yann.improvement.model import DOUBT, Disagreement, Imagined, Scenarios
+from sb3_yann.improvement.model import Imagined, Scenarios, task_of
+from sb3_yann.improvement.simulator import of_law
 from sb3_yann.networks import RowAdam
 from sb3_yann.networks.yann import LawLayer
+from sb3_yann.plan import PAUSE, Planning, Plans, follow
 from sb3_yann.rollout import Controller, Rows
 
 Inputs = Callable[[Array], Array]
@@ -61,11 +60,7 @@ class Teacher:
         self.steps = len(self.mpc.inputs)
         finite = self.mpc.costs[np.isfinite(self.mpc.costs)]
         unit = max(float(np.abs(finite).mean()) / self.steps, 1e-300) if len(finite) else 1.0
-        doubt = None
-        if scenarios.members is None and model.dynamics.row.observer is None:
-            doubt = Disagreement(model.dynamics, DOUBT * unit)
-        end, limits = value_at_end(problem), model.limits
-        self.task = Task(problem, limits.low, limits.high, end, WEIGHT * unit, doubt)
+        self.task = task_of(model, unit, priced=scenarios.members is None)
         self.thetas: list[Array] = []
         self.inputs: list[Array] = []
 
@@ -243,11 +238,3 @@ def controller_of(act: Inputs) -> Controller:
         return act(np.where(finite, theta, 0.0))
 
     return controller
-
-
-def value_at_end(problem: LinearMPC) -> Array:
-    """Return the undiscounted value of the law, or one discounted a little where there is none."""
-    try:
-        return problem.value_matrix(1.0)
-    except ValueError:
-        return problem.value_matrix(0.99)

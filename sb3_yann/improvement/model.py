@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.plants import TwinPlant
 from sb3_yann.compare import unsafe_columns
 from sb3_yann.control import DisturbanceObserver, LinearMPC
 from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.plan import WEIGHT, Task, TwinPlant, value_at_end
 from sb3_yann.rollout import Controller
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import fit_ensemble
@@ -23,6 +23,8 @@ from sb3_yann.twin.log import Episode
 from sb3_yann.twin.starts import Starts
 
 MEMBERS = 2  # networks of a model of a simulator, which repeats its steps
+NOISE = 0.01  # standard deviations of the states: what errs less in a step has no noise
+LACKING = 0.5  # share of the errors of neighboring steps that is not alike: more is noise
 DOUBT = 10.0  # mean costs of a step for members that differ by a standard deviation of a state
 
 
@@ -88,6 +90,28 @@ class SimulatorModel:
         """Where it holds, and the problem's own bounds of the states."""
         return Limits.of(self.problem, self.dynamics.coordinates, self.starts)
 
+    def lacks(self) -> tuple[bool, bool]:
+        """Return whether it errs in a step, and whether that is more than noise.
+
+        Noise of a step says nothing about that of the nearest one, half of whose squared difference
+        is its variance. What a model lacks is alike in both.
+        """
+        from scipy.spatial import cKDTree
+
+        row, units = self.dynamics.row, self.dynamics.coordinates.units
+        rows = np.concatenate([each.thetas[:-1] for each in self.episodes])
+        inputs = np.concatenate([each.actions for each in self.episodes])
+        after = np.concatenate([each.thetas[1:, row.state] for each in self.episodes])
+        predicted = TwinPlant(self.dynamics).advance(rows, inputs, np.arange(len(rows)))
+        errors = (after - predicted[:, row.state]) / units
+        points = row.features(rows, inputs)
+        points = points / np.maximum(points.std(axis=0), 1e-9)
+        other = cKDTree(points).query(points, k=2)[1][:, 1]
+        apart = float(np.mean((errors - errors[other]) ** 2)) / 2
+        whole = float(np.mean(errors**2))
+        errs = whole > NOISE**2
+        return errs, errs and apart < LACKING * whole
+
 
 @dataclass(frozen=True, eq=False)
 class Disagreement:
@@ -132,6 +156,25 @@ class Disagreement:
         residual = self.dynamics.residual(*flat)
         apart = (residual - residual.mean(axis=0)) / self._units
         return np.asarray(np.moveaxis(apart, 0, 1).reshape(*thetas.shape[:2], -1))
+
+
+def task_of(model: Model, unit: float, priced: bool = True) -> Task:
+    """Return what plans in a model are to minimize.
+
+    Parameters
+    ----------
+    model : Model
+        Its limits bound the states.
+    unit : float
+        A typical cost of a step.
+    priced : bool, default True
+        Whether the members' disagreement has a price; with an observer it has none.
+    """
+    doubt = None
+    if priced and model.dynamics.row.observer is None:
+        doubt = Disagreement(model.dynamics, DOUBT * unit)
+    end, limits = value_at_end(model.problem), model.limits
+    return Task(model.problem, limits.low, limits.high, end, WEIGHT * unit, doubt)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_yann.audit.closed_loops import Excited, of_law, require_repeated
+from sb3_yann._validation import Array
 from sb3_yann.audit.in_deviations import in_deviations, require_theta_shown
-from sb3_yann.audit.input_signs import warn_of_signs
-from sb3_yann.audit.observed_order import warn_of_order
-from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
+from sb3_yann.audit.meaning import (
+    below_set_points,
+    warn_of_order,
+    warn_of_own_reward,
+    warn_of_signs,
+)
 from sb3_yann.control import LinearMPC
-from sb3_yann.rollout import Controller, EnvPool, Source, Trajectories, maker, rollout
+from sb3_yann.rollout import Controller, EnvPool, Rows, Source, Trajectories, maker, rollout
+from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.log import SHORTEST, Episode
 from sb3_yann.twin.observers import observer_of
 from sb3_yann.twin.row_layout import RowLayout
@@ -26,6 +30,8 @@ SHORT = 1_500  # steps that they have at least: of short episodes there are more
 MOST = 60  # of such episodes, at most
 PUSH = 0.5  # half-widths by which inputs are moved at random, at most
 OFTEN = 0.7  # share of the time in which they are
+HELD = 5  # steps for which they stay
+CALLER = 6  # stack level of whoever calls `improve` or `headroom`, for warnings
 
 
 class OutOfStepsError(Exception):
@@ -40,9 +46,15 @@ class _Counted(gym.Wrapper[Any, Any, Any, Any]):
         self.simulator = simulator
 
     def step(self, action: Any) -> Any:
-        """Step the env."""
+        """Step the env; where it fails off the MPC's ways, the episode ends with NaN."""
         self.simulator.count()
-        return self.env.step(action)
+        try:
+            return self.env.step(action)
+        except Exception:  # whatever a simulator raises in a state that it cannot be in
+            if self.simulator.strict:
+                raise
+            space: Any = self.env.observation_space
+            return np.full(space.shape, np.nan), np.nan, True, False, {}
 
 
 class Simulator:
@@ -82,28 +94,17 @@ class Simulator:
         with self.envs.acquire(1) as (one,):
             self.row, self.unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
             require_spaces(problem, one)
+            self.name = str(getattr(one.spec, "id", type(one.unwrapped).__name__))
         self.next_seed, self.longest = FIRST + APART * seed, 0
         self.episodes: list[Episode] = []
+        self.strict = True
 
     def begin(self) -> None:
         """Play the first episodes, of the MPC with and without random inputs; check the env."""
-        problem = self.problem
-        first = self.new_seeds(1)
-        played = self.play(of_law(problem), first)
-        require_repeated(problem, self.envs, first[0], played.costs[0])
-        each = EPISODES // 2
-        while each < MOST // 2 and 2 * each * self.longest < SHORT:
-            each += EPISODES // 4
-        seeds = self.new_seeds(each - 1)
-        logged = self.play(of_law(problem), seeds)
-        require_theta_shown(problem, logged.steps()[0])
-        warn_of_order(problem, *logged.steps(), stacklevel=5)
-        with self.envs.acquire(1) as (one,):
-            warn_of_signs(problem, one, seeds, logged, stacklevel=5)
-        if not self.unaware:
-            warn_of_own_reward(problem, logged, stacklevel=5)
-        excited = self.play(Excited(problem, self.seed, PUSH, OFTEN), self.new_seeds(each))
-        for some in (played, logged, excited):
+        played = self.play(of_law(self.problem), self.new_seeds(1))
+        each = self.usual // 2
+        logged = self.watch(self.new_seeds(each - 1))
+        for some in (played, logged, self.excite(each)):
             self.learn(some)
         if not self.episodes:
             raise ValueError(
@@ -111,6 +112,37 @@ class Simulator:
                 f"rows, {SHORTEST} steps or more: there is nothing to learn from. An episode with "
                 "a reading that is no finite number is left out."
             )
+
+    @property
+    def usual(self) -> int:
+        """How many episodes a first model is fitted to."""
+        count = EPISODES
+        while count < MOST and count * self.longest < SHORT:
+            count += EPISODES // 2
+        return count
+
+    def watch(self, seeds: Sequence[int], checked: bool = True) -> Trajectories:
+        """Return episodes of the MPC; see that the env repeats them, and shows the problem's theta.
+
+        Warn where it means something else by it, acts the other way, or has its own reward.
+        """
+        problem = self.problem
+        played = self.play(of_law(problem), seeds)
+        require_theta_shown(problem, played.steps()[0])
+        require_repeated(problem, self.envs, seeds[0], played.costs[0])
+        if not checked:
+            return played
+        warn_of_order(problem, *played.steps(), stacklevel=CALLER)
+        with self.envs.acquire(1) as (one,):
+            warn_of_signs(problem, one, seeds, played, stacklevel=CALLER)
+        if not self.unaware:
+            warn_of_own_reward(problem, played, stacklevel=CALLER)
+        return played
+
+    def excite(self, count: int) -> Trajectories:
+        """Return so many episodes of the MPC with random inputs on top, from new starts."""
+        seeds = self.new_seeds(count)
+        return self.play(Excited(self.problem, self.seed), seeds, strict=False)
 
     def count(self) -> None:
         """Count a step before it is taken; OutOfStepsError where none is left."""
@@ -124,11 +156,18 @@ class Simulator:
         self.next_seed += count
         return range(first, self.next_seed)
 
-    def play(self, controller: Controller, seeds: Sequence[int]) -> Trajectories:
-        """Return episodes; OutOfStepsError where they might take more steps than are left."""
+    def play(
+        self, controller: Controller, seeds: Sequence[int], strict: bool = True
+    ) -> Trajectories:
+        """Return episodes; OutOfStepsError where they might take more steps than are left.
+
+        Unless it is ``strict``, an episode in which the env fails ends there.
+        """
         if self.max_steps is not None and self.steps + self.longest * len(seeds) > self.max_steps:
             raise OutOfStepsError
+        self.strict = strict
         played = rollout(controller, self.envs, seeds, problem=self.problem)
+        self.strict = True
         self.played += len(seeds)
         self.longest = max(self.longest, int(played.lengths.max(initial=0)))
         return played
@@ -137,6 +176,8 @@ class Simulator:
         """Take episodes into the model's data, and return them; None where one is of no use."""
         found: list[Episode | None] = []
         for thetas, inputs in played.pairs:
+            if not np.isfinite(thetas[-1]).all():  # where an env has failed
+                thetas, inputs = thetas[:-1], inputs[:-1]
             finite = np.isfinite(thetas).all() and np.isfinite(inputs).all()
             usable = len(inputs) >= SHORTEST and bool(finite)
             found.append(Episode(*self.row.recovered(thetas, inputs)) if usable else None)
@@ -153,8 +194,70 @@ def require_spaces(problem: LinearMPC, env: gym.Env[Any, Any]) -> None:
     shape, actions = env.observation_space.shape, env.action_space.shape
     if shape != (problem.n_theta,) or actions != (problem.model.n_inputs,):
         raise ValueError(
-            f"The simulator shows {shape} and takes {actions}; theta of the model's problem has "
-            f"{problem.n_theta} entries {problem.layout.names}, and there are "
-            f"{problem.model.n_inputs} inputs. Give the env that the model is trained in, or one "
-            "that is wrapped like it."
+            f"The env shows {shape} and takes {actions}; theta of the MPC has {problem.n_theta} "
+            f"entries {problem.layout.names}, and there are {problem.model.n_inputs} inputs. Wrap "
+            "the env so that it shows theta: see PastInputs and ObserveDisturbance in "
+            "sb3_yann.wrappers."
         )
+
+
+def require_repeated(problem: LinearMPC, env: Source | EnvPool, seed: int, cost: float) -> None:
+    """Raise unless the MPC's episode from a seed costs the same again.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta the env shows.
+    env : gymnasium.Env, str, callable or EnvPool
+        It plays the episode.
+    seed : int
+        Of the episode.
+    cost : float
+        What it cost; what is not finite is not compared.
+    """
+    again = rollout(of_law(problem), env, [seed], problem=problem).costs[0]
+    if np.isfinite(cost) and not np.isclose(again, cost, rtol=1e-6, atol=0):
+        raise ValueError(
+            f"The MPC's episode from the seed {seed} cost {cost:.6g}, then {again:.6g}: the env "
+            "does not repeat it. All that is random must come from reset(seed=...). If it draws "
+            "from numpy's global generator, wrap it in sb3_yann.wrappers.SeededGlobals."
+        )
+
+
+def of_law(problem: LinearMPC) -> Controller:
+    """Return the MPC itself."""
+    law = law_of(problem)
+    return lambda t, theta, rows: np.nan_to_num(law(theta))
+
+
+class Excited:
+    """The MPC with inputs that are moved at random, each for some steps.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+    seed : int
+    push : float, default 0.5
+        Half-widths by which they are moved at most.
+    often : float, default 0.7
+        Share of the time in which they are.
+    """
+
+    def __init__(
+        self, problem: LinearMPC, seed: int, push: float = PUSH, often: float = OFTEN
+    ) -> None:
+        self.problem, self.rng, self.law = problem, np.random.default_rng(seed), of_law(problem)
+        self.push, self.often = push, often
+        self.moved: Array = np.zeros((0, 0))
+
+    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
+        """Return the inputs (r, m)."""
+        problem = self.problem
+        if t == 0:
+            self.moved = np.zeros((len(rows), problem.model.n_inputs))
+        if t % HELD == 0:  # one draw for each episode, also for those that are over
+            self.moved = self.push * problem.u_half * self.rng.uniform(-1, 1, self.moved.shape)
+            if self.often < 1:
+                self.moved *= self.rng.random((len(self.moved), 1)) < self.often
+        u = self.law(t, theta, rows) + self.moved[rows]
+        return np.asarray(np.clip(u, problem.deviations.u_min, problem.deviations.u_max))

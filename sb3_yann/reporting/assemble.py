@@ -13,8 +13,8 @@ from typing import Any
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._archive import atomic_write
-from sb3_yann.audit import Headroom
 from sb3_yann.guard import ImprovementGuard
+from sb3_yann.improvement import Headroom
 from sb3_yann.policy.policies import require_problem_of_twin, require_yann_policy
 from sb3_yann.reporting.evidence_parts import (
     again_part,

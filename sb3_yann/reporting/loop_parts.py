@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from sb3_yann._validation import Array
-from sb3_yann.audit.observed_order import misread_in_words
+from sb3_yann.audit.meaning import misread_in_words
 from sb3_yann.compare import INPUT_STEP, less_safe
 from sb3_yann.control.model.labels import with_units
 from sb3_yann.evaluation.law_plots import inputs_of, surfaces_figure, use_figure

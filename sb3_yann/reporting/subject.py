@@ -11,13 +11,13 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import Array
-from sb3_yann.audit import Headroom
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.control.mpc.choice import Law
 from sb3_yann.guard import ImprovementGuard
 from sb3_yann.guard.state import GuardState
+from sb3_yann.improvement import Headroom
 from sb3_yann.improvement.improve import Improvement, fingerprint
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import YannPolicy

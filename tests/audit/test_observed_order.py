@@ -18,8 +18,8 @@ from sb3_yann import (
     headroom,
     report,
 )
-from sb3_yann.audit.closed_loops import of_law
-from sb3_yann.audit.observed_order import warn_of_order
+from sb3_yann.audit.meaning import warn_of_order
+from sb3_yann.improvement.simulator import of_law
 from sb3_yann.rollout import rollout
 from sb3_yann.wrappers import StageCost
 from sb3_yann_envs import problems

@@ -12,8 +12,8 @@ import pytest
 from stable_baselines3 import DDPG
 
 from sb3_yann import CostMismatchWarning, LinearModel, LinearMPC, Tracking, headroom, improve
-from sb3_yann.audit.closed_loops import of_law
-from sb3_yann.audit.own_reward import below_set_points, warn_of_own_reward
+from sb3_yann.audit.meaning import below_set_points, warn_of_own_reward
+from sb3_yann.improvement.simulator import of_law
 from sb3_yann.rollout import Trajectories, as_reward, rollout
 from sb3_yann.wrappers import SetPoint, StageCost
 from sb3_yann_envs import problems

@@ -327,7 +327,7 @@ class Unseeded(Spring):
             Short,
             r"None of \d+ episodes of the MPC in the simulator is finite in all of its",
         ),
-        (Strange, r"The simulator shows \(3,\) and takes \(1,\); theta of the model's problem has"),
+        (Strange, r"The env shows \(3,\) and takes \(1,\); theta of the MPC has"),
     ],
 )
 def test_a_simulator_that_will_not_do_is_named(make, what) -> None:

@@ -8,13 +8,15 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from sb3_yann.audit.closed_loops import of_law
-from sb3_yann.audit.plants import TwinPlant
 from sb3_yann.control.mpc.bound_excess import bound_excess
 from sb3_yann.improvement import model as module
 from sb3_yann.improvement.model import Disagreement, Model, Scenarios, SimulatorModel
+from sb3_yann.improvement.simulator import of_law
+from sb3_yann.plan import TwinPlant
+from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.twin.log import Episode
+from sb3_yann.twin.residuals import ZeroResidual
 from twin_samples import log, observed, problem, rated
 
 
@@ -153,3 +155,23 @@ def test_members_that_agree_cost_nothing() -> None:
     doubt = Disagreement(same, weight=1e6)
     assert not doubt.costs(*at).any()
     assert not any(each.any() for each in doubt.slopes(*at))
+
+
+@pytest.mark.parametrize(
+    ("noise", "bend", "lacks"),
+    [(0.0, 0.0, (False, False)), (0.1, 0.0, (True, False)), (0.0, 0.3, (True, True))],
+)
+def test_what_a_model_lacks_is_told_from_noise(noise, bend, lacks) -> None:
+    mpc, rng = problem(), np.random.default_rng(0)
+    episodes = []
+    for _ in range(20):
+        theta, u = rng.uniform(-1, 1, (41, mpc.n_theta)), rng.uniform(-1, 1, (40, 1))
+        rows = [theta[0]]
+        for each in u:
+            after = mpc.deviations.predict(rows[-1], each)
+            rows.append(after + noise * rng.standard_normal(after.shape) + bend * np.sin(rows[-1]))
+        episodes.append(Episode(np.array(rows), u))
+    box = Coordinates.of(mpc, episodes)
+    none = ZeroResidual(mpc.model.n_states)
+    found = SimulatorModel(mpc, tuple(episodes), Dynamics(mpc, box, (none, none)))
+    assert found.lacks() == lacks

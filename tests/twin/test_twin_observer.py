@@ -20,7 +20,7 @@ from sb3_yann import (
     PlantTwin,
     YannPolicy,
 )
-from sb3_yann.audit.plants import TwinPlant
+from sb3_yann.plan import TwinPlant
 from sb3_yann.twin.dynamics import Dynamics
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.observers import (

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel, LinearMPC, RateLimits, Terminal, Tracking
-from sb3_yann.audit.task import WEIGHT, Task
-from sb3_yann.audit.trajectory import planned
+from sb3_yann.plan import WEIGHT, Task, planned
 
 STEPS = 30
 

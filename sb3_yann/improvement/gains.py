@@ -24,11 +24,7 @@ ADVICE = {
     "under an ImprovementGuard.",
 }
 UNKNOWN = "not known"
-"""The verdict where what was found may be chance, and where nothing was found in a poor twin."""
-SETTABLE = (
-    'Where the env repeats its steps, let reset(options={"state": x}) put it into a state, or pass '
-    "set_state and get_state: plans are made in the env itself then."
-)
+"""The verdict where what was found may be chance, and where nothing was found in a poor model."""
 
 
 @dataclass(frozen=True)
@@ -48,19 +44,23 @@ class Headroom:
     verdict : str
         What to do: one of "do not bother", "add ObserveDisturbance first", "re-identify", "learn";
         "not known" where what was found is worth it but may be chance, and where nothing was found
-        with plans that were made in a poor twin.
+        with plans that were made in a poor model.
     source : str
         Where it was found.
     d_max : ndarray, shape (n,), optional
         Of :func:`offset_free`, where its default is less than the disturbances of this plant.
     lost : float, optional
-        By how much plans cost more than the MPC when they were played, relative to it, where a twin
-        in which they were made of the env's episodes is so poor.
+        By how much plans cost more than the MPC when they were first played, relative to it, where
+        the model of the env's episodes is poor.
     rest : str, optional
         How far from its set-points the MPC comes to rest though an observer gains nothing, and why.
     observer_played, reidentified_played : ndarray, shape (starts,), optional
         What the MPC with an observer and the re-identified one cost when they were played, losses
         included; None where they were not.
+    steps : int
+        Of the env, all that were taken.
+    note : str
+        What was left out; empty where nothing was.
 
     Examples
     --------
@@ -84,6 +84,8 @@ class Headroom:
     rest: str = ""
     observer_played: Array | None = None
     reidentified_played: Array | None = None
+    steps: int = 0
+    note: str = ""
 
     @property
     def total(self) -> float:
@@ -116,6 +118,7 @@ class Headroom:
             f"An MPC with a re-identified model{self._as_played(self.reidentified_played)}",
             f"Verdict: {self.verdict}; {self._advice()}",
             *([self._with_d_max(self.rest)] if self.rest else []),
+            *([f"{self.steps:,} steps of the env. {self.note}".strip()] if self.steps else []),
         ]
         return "\n".join(lines)
 
@@ -140,8 +143,8 @@ class Headroom:
         poor = ""
         if self.lost is not None:
             poor = (
-                "plans were made in a twin of its episodes that is not the plant: when played, "
-                f"they cost {_more(self.lost)} the MPC. {SETTABLE}"
+                "plans were made in a model of its episodes that is not the plant: when played, "
+                f"they cost {_more(self.lost)} the MPC. Take more starts: n_starts=."
             )
         if self.verdict == UNKNOWN:
             return f"nothing was found, but {poor}"

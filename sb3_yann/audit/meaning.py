@@ -1,0 +1,282 @@
+"""What an env means: the order and units of its states, the signs of its inputs, its reward."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import combinations, permutations
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.audit.finding import CostMismatchWarning
+from sb3_yann.control import LinearMPC
+from sb3_yann.control.model.labels import labels_of
+from sb3_yann.rollout import Trajectories
+from sb3_yann.wrappers import SetPoint
+
+WRONG, RIGHT = 0.5, 0.05
+"""Share of the states' movement in a step that the model leaves open: more in the order shown, and
+less in another one, or in other units. No noise and no wrong model does that."""
+STEPS_PER_STATE = 10
+"""Steps for each state that must be seen."""
+MOST = 5
+"""States of which all orders are tried; of more, two are exchanged."""
+UNITS = (
+    *((factor, 0.0) for factor in (1000.0, 100.0, 60.0, 10.0, 0.1, 1 / 60, 0.01, 0.001)),
+    *((1.0, shift) for shift in (-273.15, 273.15)),
+    *((1.8, 32.0), (1 / 1.8, -32 / 1.8)),
+)
+"""Units that are mistaken for each other: factors, and what is added."""
+Reading = Callable[[Array], Array]
+"""From what is shown (steps, n), in plant units, to what it may mean."""
+SIGN_STARTS = 5
+"""Starts from which each input is pushed; it must act against the model from all of them."""
+LEAST_EFFECT = 1e-3
+"""Of the states' standard deviation: an effect that is smaller may be rounding."""
+Mask = NDArray[np.bool_]
+EXPLAINED = 0.95
+"""Share of the rewards' variance from which on they are taken for minus the stage cost."""
+FEWEST_REWARDS = 10
+"""Steps that must be seen."""
+
+
+def warn_of_order(
+    problem: LinearMPC, theta: Array, u: Array, following: Array, stacklevel: int
+) -> None:
+    """Warn where the model predicts the steps of an env in another reading of its states alone."""
+    if words := misread_in_words(problem, theta, u, following):
+        warnings.warn(words, stacklevel=stacklevel)
+
+
+def misread_in_words(problem: LinearMPC, theta: Array, u: Array, following: Array) -> str:
+    """Return in which other reading alone the model predicts the steps of an env; empty for none.
+
+    That is another order of the states, deviations from the operating point, or other units.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta the env is to show.
+    theta, u, following : ndarray, shapes (steps, n_theta), (steps, m) and (steps, n_theta)
+        Steps of the env, in deviations.
+    """
+    known = np.isfinite(theta).all(axis=1) & np.isfinite(following).all(axis=1)
+    steps = theta[known], u[known], following[known]
+    if np.count_nonzero(known) < STEPS_PER_STATE * problem.model.n_states:
+        return ""
+    shown = _left_open(problem, lambda x: x, *steps)
+    if not shown > WRONG:
+        return ""
+    for reading, what, cure in _readings(problem):
+        if (left := _left_open(problem, reading, *steps)) < RIGHT:
+            return (
+                f"The env seems to show {what}: so the model predicts {100 * (1 - left):.0f} % of "
+                f"a step, and {100 * max(1 - shown, 0):.0f} % as it is. {cure}"
+            )
+    return ""
+
+
+def _readings(problem: LinearMPC) -> Iterator[tuple[Reading, str, str]]:
+    """Yield what the states that are shown may mean, in words, and what to do."""
+    names, n = labels_of(problem.model)[0], problem.model.n_states
+    for order in _orders(n):
+        back = np.argsort(order).tolist()
+        yield (
+            partial(_taken, back),
+            f"the states in the order {[names[i] for i in order]}, which is not the MPC's, {names}",
+            f"Show x[{back}] of what the plant shows, with gymnasium.wrappers."
+            "TransformObservation.",
+        )
+    if np.any(problem.model.x_ss):
+        yield (
+            lambda x: x + problem.model.x_ss,
+            "deviations from the operating point, and the MPC is in plant units",
+            "Show what the plant shows, or leave x_ss and u_ss out of the model.",
+        )
+    every = [(name, np.arange(n) == i) for i, name in enumerate(names)]
+    if n > 1:
+        every.append(("all states", np.ones(n, dtype=bool)))
+    for name, which in every:
+        for factor, shift in UNITS:
+            factors, shifts = np.where(which, factor, 1.0), np.where(which, shift, 0.0)
+            what = f"{name} times {factor:.3g}" if factor != 1 else name
+            acts = f" It may also be that inputs act {factor:.3g} times as far as in the model."
+            yield (
+                partial(_rescaled, factors, shifts),
+                f"{what} plus {shift:.5g}" if shift else what,
+                "Show it in the model's units, or pass policy_kwargs={'observation': ...}."
+                + acts * (shift == 0),
+            )
+
+
+def _taken(order: list[int], x: Array) -> Array:
+    return x[:, order]
+
+
+def _rescaled(factors: Array, shifts: Array, x: Array) -> Array:
+    return np.asarray((x - shifts) / factors)
+
+
+def _orders(n: int) -> Iterator[list[int]]:
+    """Yield other orders: what each entry that is shown may be."""
+    if n <= MOST:
+        yield from (list(each) for each in [*permutations(range(n))][1:])
+        return
+    for i, j in combinations(range(n), 2):
+        order = list(range(n))
+        order[i], order[j] = j, i
+        yield order
+
+
+def _left_open(
+    problem: LinearMPC, reading: Reading, theta: Array, u: Array, following: Array
+) -> float:
+    """Return the share of the states' movement that the model leaves open, 1 where none moves."""
+    at, after, states, x_ss = (
+        theta.copy(),
+        following.copy(),
+        problem.layout.state,
+        problem.model.x_ss,
+    )
+    at[:, states] = reading(theta[:, states] + x_ss) - x_ss
+    after[:, states] = reading(following[:, states] + x_ss) - x_ss
+    error = (after - problem.deviations.predict(at, u))[:, states]
+    moved = np.sum((after - at)[:, states] ** 2, axis=0)
+    moving = moved > 0
+    if not moving.any():
+        return 1.0
+    return float(np.max(np.sum(error**2, axis=0)[moving] / moved[moving]))
+
+
+def warn_of_signs(
+    problem: LinearMPC,
+    env: gym.Env[Any, Any],
+    seeds: Sequence[int],
+    played: Trajectories,
+    *,
+    theta: Callable[[Array], Array] = np.asarray,
+    inputs: Callable[[Array], Array] = np.asarray,
+    stacklevel: int,
+) -> None:
+    """Warn where an input moves the states against the model, in the first step of some starts.
+
+    Two steps from one start differ by that input alone: neither noise that the seed repeats, nor
+    what is not linear in the states, gets in. It costs a step of the env for each input and start.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose model says what an input does.
+    env : gymnasium.Env
+        Repeats an episode from its seed.
+    seeds, played : sequence of int, and Trajectories
+        Starts, and the episodes of the MPC from there.
+    theta, inputs : callable
+        From what the env shows (steps, k) to theta, and from actions (steps, m) to inputs.
+    stacklevel : int
+        Of the warning.
+    """
+    names, B, states = labels_of(problem.model)[1], problem.model.B, problem.layout.state
+    shown = np.concatenate([theta(each)[:, states] for each in played.observations])
+    spread = np.std(shown[np.isfinite(shown).all(axis=1)], axis=0)
+    weight = np.divide(1, spread, out=np.zeros_like(spread), where=spread > 0)
+    starts = [i for i in range(len(seeds)) if len(played.actions[i])][:SIGN_STARTS]
+    for j, name in enumerate(names):
+        gains = []
+        for i in starts:
+            action = played.actions[i][0]
+            pushed = _push(env, action, j)
+            try:
+                env.reset(seed=seeds[i])
+                after = np.array([played.observations[i][1], env.step(pushed)[0]])
+            except Exception:  # of a brittle simulator: what it says under the MPC counts
+                return
+            effect = weight * np.diff(theta(after)[:, states], axis=0)[0]
+            expected = weight * B[:, j] * np.diff(inputs(np.array([action, pushed])), axis=0)[0, j]
+            size = float(expected @ expected)
+            if size > 0 and np.linalg.norm(effect) > LEAST_EFFECT:
+                gains.append(float(effect @ expected) / size)
+        if len(gains) == len(starts) > 0 and max(gains) < 0:
+            warnings.warn(
+                f"{name} moves the env against the sign of the model's B: {np.median(gains):.2g} "
+                f"times as far in a step, from {len(gains)} starts. The MPC steers the wrong way. "
+                "Look at the sign and the order of the actions, and at B.",
+                stacklevel=stacklevel,
+            )
+
+
+def _push(env: gym.Env[Any, Any], action: Array, j: int) -> Array:
+    """Return an action whose entry j is half the way to the bound that is farther away."""
+    space: Any = env.action_space
+    low, high = np.clip([space.low[j], space.high[j]], action[j] - 1e3, action[j] + 1e3)
+    far = high if high - action[j] > action[j] - low else low
+    pushed = np.array(action, dtype=space.dtype)
+    pushed[j] = (action[j] + far) / 2
+    return pushed
+
+
+def below_set_points(env: gym.Env[Any, Any]) -> bool:
+    """Tell whether a wrapper draws set-points, of which the env's reward knows nothing."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, SetPoint):
+            return True
+        env = env.env
+    return False
+
+
+def warn_of_own_reward(problem: LinearMPC, played: Trajectories, stacklevel: int) -> None:
+    """Warn where rewards are not minus the stage cost, times a constant and up to one.
+
+    The constant may be each episode's own: it ranks no controllers. The cost may be that of the
+    state before the step or after it. Rewards that are all zero are none.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose stage cost counts.
+    played : Trajectories
+        Of thetas, inputs and rewards.
+    stacklevel : int
+        Of the warning.
+    """
+    thetas, inputs, rewards = played.padded()
+    costs = [problem.deviations.stage_cost(at, inputs) for at in (thetas[:-1], thetas[1:])]
+    known: Mask = np.asarray(np.all(np.isfinite([rewards, *costs]), axis=0), dtype=np.bool_)
+    if np.count_nonzero(known) < FEWEST_REWARDS or not np.any(rewards[known]):
+        return
+    share = max(_explained(-cost, rewards, known) for cost in costs)
+    if share < EXPLAINED:
+        warnings.warn(
+            f"The env has a reward of its own, and it is ignored: the MPC's stage cost explains "
+            f"{100 * share:.0f} % of it over {np.count_nonzero(known)} steps of the MPC. What "
+            "counts here is the MPC's stage cost. If the reward is what you want, state it in Q "
+            "and R of the MPC, or learn under an ImprovementGuard or a Commissioning, which go by "
+            "the reward; else wrap the env in sb3_yann.wrappers.StageCost(env, mpc).",
+            CostMismatchWarning,
+            stacklevel=stacklevel,
+        )
+
+
+def _explained(gain: Array, rewards: Array, known: Mask) -> float:
+    """Return the share of the rewards' variance within episodes that a gain explains, 0 to 1.
+
+    It is 1 where the gain does not vary, which says nothing, and 0 where rewards fall as it rises.
+    """
+    x, y = (_centered(each, known) for each in (gain, rewards))
+    size = np.sqrt(np.sum(x**2) * np.sum(y**2))
+    if np.abs(x).max() <= 1e-9 * np.abs(gain[known]).max():
+        return 1.0
+    correlation = float(x @ y / size) if size > 0 else 0.0
+    return max(correlation, 0.0) ** 2
+
+
+def _centered(values: Array, known: Mask) -> Array:
+    """Return the known values (steps,) less the mean of their episodes, the columns."""
+    kept = np.where(known, values, 0.0)
+    mean = kept.sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.asarray((values - mean)[known])

@@ -1,0 +1,367 @@
+"""What a nearly optimal controller would gain over the MPC, and of what kind that is."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array, check_bool, check_int
+from sb3_yann.audit.offset import remaining_offset
+from sb3_yann.compare import less_safe
+from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, offset_free
+from sb3_yann.control.mpc.offset_free import SHARE
+from sb3_yann.improvement.gains import LITTLE, UNKNOWN, Headroom, gain, verdict_of
+from sb3_yann.improvement.model import SimulatorModel, task_of
+from sb3_yann.improvement.simulator import OutOfStepsError, Simulator
+from sb3_yann.plan import PAUSE, Planning, TwinPlant
+from sb3_yann.rollout import Controller, Rows, Source, Trajectories, maker
+from sb3_yann.twin.dynamics import Coordinates
+from sb3_yann.twin.log import as_episodes
+from sb3_yann.twin.plant_twin import PlantTwin
+from sb3_yann.twin.reidentification import reidentified
+
+SURE = 2.0
+"""Standard errors that a gain on a random plant must exceed."""
+ROUNDS = 4
+"""How often a model is fitted and planned in, at most."""
+KEPT = 1e-3
+"""A plan is played anew where the plant broke its promise by so much of the MPC's mean cost."""
+
+
+def headroom(
+    mpc: LinearMPC,
+    env_or_twin: Source | PlantTwin,
+    *,
+    n_starts: int = 30,
+    seed: int = 0,
+    max_steps: int | None = None,
+    progress_bar: bool = False,
+    set_state: Any = None,
+    get_state: Any = None,
+) -> Headroom:
+    """Return what a nearly optimal controller would gain over an MPC, and why.
+
+    From the same starts are played: the MPC; the MPC with a disturbance observer; an MPC whose
+    model is re-identified from the MPC's episodes; and plans, optimized by differential dynamic
+    programming, on which feedback keeps the plant. Plans begin their search at the MPC's runs, with
+    inputs on their bounds for a while, and at the cheapest runs of unconstrained laws with other
+    weights. They know neither noise nor the references to come: a
+    change makes a new plan. All costs are those of episodes that were played, so the gain can be
+    had; more may be there to be found. A part of it needs to know the plant, and none of a
+    controller's robustness is in it: take it for a bound of what learning can bring.
+
+    Plans are those of :func:`improve`, made in the same model: networks on top of the MPC's own,
+    fitted to all that was played, and to ten to thirty episodes with random inputs. Where the plant
+    does not do what a plan promised, the model is fitted anew and planned in once more. A plant
+    that repeats its steps has the best controller of each start. A random one has the best on
+    average, for the best of each start would be luck.
+
+    Parameters
+    ----------
+    mpc : LinearMPC
+        Its stage cost is what counts. A :class:`CostMismatchWarning` says where the env's own
+        reward is another one.
+    env_or_twin : gymnasium.Env, str, callable or PlantTwin
+        A simulator that shows theta of the MPC and takes its inputs, in plant units where the MPC's
+        model has an operating point. It plays the same episode again from the same
+        seed and inputs, and is copied. Or a twin of the MPC's plant, each of
+        whose members has its share of the starts.
+    n_starts : int, default 30
+        Starts, from ``seed`` on.
+    seed : int, default 0
+        Of the first start.
+    max_steps : int, optional
+        Of the env, for everything. Where they do not suffice, the rest is left out.
+    progress_bar : bool, default False
+        Whether to print a line for each part that is done.
+    set_state, get_state : callable, optional
+        Not needed any more, and not called: nothing is put into a state.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the env shows something else than theta, or does not repeat an episode; if a twin cannot
+        be trusted; if ``max_steps`` are too few for the MPC's own episodes.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from sb3_yann import headroom
+    >>> mpc = gym.make("CSTR-v0").observation_space.problem
+    >>> found = headroom(mpc, "CSTR-v0", n_starts=2)
+    >>> 0.01 < found.total < 0.05, found.verdict in ("learn", "do not bother")
+    (True, False)
+    """
+    if not isinstance(mpc, LinearMPC):
+        raise TypeError(f"mpc = {mpc!r} must be a LinearMPC.")
+    check_int("n_starts", n_starts, 2)
+    check_int("seed", seed, 0)
+    if max_steps is not None:
+        check_int("max_steps", max_steps)
+    check_bool("progress_bar", progress_bar)
+    search = _Search(mpc, env_or_twin, range(seed, seed + n_starts), max_steps, progress_bar)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OnlineLawWarning)
+        return search.found()
+
+
+class _Search:
+    """What is played, one controller after the other.
+
+    Parameters
+    ----------
+    mpc : LinearMPC
+    given : gymnasium.Env, str, callable or PlantTwin
+    seeds : range
+    max_steps : int, optional
+    shown : bool
+        Whether to say what is done.
+    """
+
+    def __init__(
+        self,
+        mpc: LinearMPC,
+        given: Source | PlantTwin,
+        seeds: range,
+        max_steps: int | None,
+        shown: bool,
+    ) -> None:
+        self.mpc, self.seeds, self.shown, self.begun = mpc, seeds, shown, time.monotonic()
+        self.twin = given if isinstance(given, PlantTwin) else None
+        if self.twin is not None:
+            self.twin.require_trust()
+            other = self.twin.problem
+            if other.layout != mpc.layout or not np.array_equal(
+                other.deviations.u_min, mpc.deviations.u_min
+            ):
+                raise ValueError(
+                    "The twin is that of another MPC's plant: fit it with PlantTwin.fit(mpc, "
+                    "episodes)."
+                )
+        source = given.env if isinstance(given, PlantTwin) else maker(given)
+        self.simulator = Simulator(mpc, source, seeds[0], max_steps)
+        self.source = "the twin" if self.twin is not None else self.simulator.name
+        self.random = self.poor = False
+        self.d_max: Array | None = None
+        self.played: dict[str, Array] = {}  # costs of each controller, losses included
+        self.fair: dict[str, Array] = {}  # the MPC's where a bound is broken by more
+        self.runs: list[Array] | None = None  # of the MPC with an observer
+
+    def found(self) -> Headroom:
+        """Play all of it, and return the figures."""
+        note = ""
+        try:
+            self.play_mpc()
+            for stage in (self.observe, self.reidentify, self.plan):
+                stage()
+        except OutOfStepsError:
+            if not hasattr(self, "base"):
+                raise ValueError(
+                    f"max_steps = {self.simulator.max_steps:,} are too few for "
+                    f"{len(self.seeds)} episodes of the MPC."
+                ) from None
+            note = f"max_steps = {self.simulator.max_steps:,} were too few to go on."
+        finally:
+            self.simulator.close()
+        return self.figures(note)
+
+    def say(self, text: str) -> None:
+        """Print a line with the time, the steps so far, and the gain that was found."""
+        if self.shown:
+            taken = f"[{time.monotonic() - self.begun:5.0f} s {self.simulator.steps:>9,} steps]"
+            gained = f"{0.0 - 100 * gain(self.base.costs, self.best):+.2f} %"
+            print(f"{taken} {text}; the best so far: {gained}", flush=True)
+
+    @property
+    def best(self) -> Array:
+        """Costs of the best controller of each start, or on average where the plant is random."""
+        every = [self.base.costs, *self.fair.values()]
+        return min(every, key=np.mean) if self.random else np.min(every, axis=0)
+
+    def add(self, name: str, loops: Trajectories) -> None:
+        """Take what was played from all starts into account."""
+        self.played[name] = loops.costs
+        self.fair[name] = np.where(loops.no_worse(self.base), loops.costs, self.base.costs)
+        self.simulator.learn(loops)
+
+    def play_mpc(self) -> None:
+        """Play the MPC, and see that the env repeats an episode."""
+        played = self.simulator.watch(self.seeds, checked=self.twin is None)
+        if not np.all(np.isfinite(played.costs)):
+            i = int(np.flatnonzero(~np.isfinite(played.costs))[0])
+            raise ValueError(
+                f"The MPC's episode from the seed {self.seeds[i]} costs {played.costs[i]}: what "
+                "the env shows must be finite numbers."
+            )
+        self.base = played
+        self.simulator.learn(played)
+        self.say(f"{len(self.seeds)} episodes of the MPC")
+
+    def observe(self) -> None:
+        """Play the same MPC with an observer, unless it has one or measures disturbances."""
+        mpc = self.mpc
+        if mpc.layout.n_disturbances:
+            return
+        thetas, inputs, following = self.base.steps()
+        beyond = np.abs(following - mpc.deviations.predict(thetas, inputs)).max(axis=0)[
+            mpc.layout.state
+        ]
+        unit = mpc.theta_half[mpc.layout.state]
+        try:
+            largest = np.maximum(2 * beyond, 1e-6 * unit)
+            pair = offset_free(mpc, largest)
+        except ValueError:  # a disturbance that no input can hold
+            return
+        if np.any(largest > SHARE * unit):  # the default would cut off what was found here
+            self.d_max = np.maximum(largest, SHARE * unit)
+        loops = self.simulator.play(Observing(mpc, *pair), self.seeds)
+        self.runs = [x for x, _ in loops.pairs]
+        self.add("observer", loops)
+        self.say("the MPC with a disturbance observer")
+
+    def reidentify(self) -> None:
+        """Play the MPC with a model that its own episodes, or the twin's log, tell."""
+        try:
+            if self.twin is not None:
+                other = self.twin.reidentified()
+            else:
+                log = as_episodes(self.mpc.deviations, self.base.pairs)
+                other = reidentified(self.mpc, Coordinates.of(self.mpc, log), log)
+        except ValueError:  # a model without a steady state or a Riccati solution
+            return
+        if other is not self.mpc:
+            self.add("model", self.simulator.play(of_model(self.mpc, other), self.seeds))
+            self.say("the MPC with a re-identified model")
+
+    def plan(self) -> None:
+        """Play plans: those of a twin, or of a model that learns from what was played."""
+        base, simulator = self.base, self.simulator
+        unit = max(float(np.abs(base.costs).sum() / base.lengths.sum()), 1e-300)
+        if self.twin is not None:
+            twin, count = self.twin, len(self.twin.dynamics.members)
+            acting = TwinPlant(twin.dynamics, [seed % count for seed in self.seeds])
+            self.add("plan", simulator.play(self._planning(twin, acting, unit), self.seeds))
+            self.say("plans in the twin")
+            return
+        some = max(simulator.usual // 2, simulator.usual - len(base.costs))
+        simulator.learn(simulator.excite(some))
+        self.say(f"{some} episodes with random inputs")
+        todo: NDArray[np.intp] = np.arange(len(base.costs))
+        latest = base.costs.copy()
+        for number in range(ROUNDS):
+            began = time.monotonic()
+            model = SimulatorModel.fit(self.mpc, simulator.episodes, simulator.row.observer, number)
+            planning = self._planning(model, TwinPlant(model.dynamics), unit)
+            loops = simulator.play(planning, [self.seeds[i] for i in todo], strict=False)
+            self.random, self.poor = model.lacks()
+            if number == 0:
+                self.played["plan"] = loops.costs
+            safe = ~less_safe(loops.unsafe(), base.unsafe()[todo]).any(axis=1)
+            latest[todo] = np.where(safe, loops.costs, base.costs[todo])
+            self.fair[f"plan {number}"] = latest.copy()
+            simulator.learn(loops)
+            dearer = loops.costs - planning.promised(len(todo))
+            todo = todo[~(safe & (dearer <= KEPT * np.abs(base.costs).mean()))]
+            left = (ROUNDS - 1 - number) * (time.monotonic() - began) * bool(len(todo))
+            self.say(
+                f"plans, round {number + 1} of at most {ROUNDS}, at most {left:.0f} s left: "
+                f"{len(loops.costs) - len(todo)} of {len(loops.costs)} kept what they promised"
+            )
+            if not len(todo) or (number and self.random and not self.poor):  # noise is not learnt
+                break
+
+    def _planning(self, model: Any, plant: TwinPlant, unit: float) -> Planning:
+        pause = PAUSE if self.simulator.row.observer is not None else 0
+        task = task_of(model, unit, priced=self.twin is None)
+        return Planning(plant, task, int(self.base.lengths.max()), pause)
+
+    def figures(self, note: str) -> Headroom:
+        """Return the figures."""
+        base = self.base.costs
+        observer, model = (_whole(self.fair.get(name), base) for name in ("observer", "model"))
+        best = self.best
+        total, offset, known = (gain(base, each) for each in (best, observer, model))
+        offset, known = min(offset, total), min(known, total)
+        parts = offset, max(0.0, known - offset), total - max(offset, known)
+        whole = Headroom(base, observer, model, best, *parts, "", self.source, self.d_max)
+        verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
+        lost = -gain(base, self.played["plan"]) if self.poor else 0.0
+        if lost > 0 and verdict_of(*parts) == "do not bother":
+            verdict = UNKNOWN
+        return dataclasses.replace(
+            whole,
+            verdict=verdict,
+            lost=lost if lost > 0 else None,
+            rest=self._rest() if offset < LITTLE else "",
+            observer_played=self.played.get("observer"),
+            reidentified_played=self.played.get("model"),
+            steps=self.simulator.steps,
+            note=note,
+        )
+
+    def _rest(self) -> str:
+        """Return what is said of an offset that remains though an observer gains nothing."""
+        runs = [x for x, _ in self.base.pairs]
+        if self.runs is None:
+            return remaining_offset(self.mpc, runs, None)
+        dearer = -gain(self.base.costs, self.played["observer"])
+        return remaining_offset(self.mpc, runs, self.runs, dearer)
+
+
+def _whole(costs: Array | None, ours: Array) -> Array:
+    """Return the costs of a controller, or the MPC's where those are not worse on average."""
+    return ours if costs is None or not costs.mean() < ours.mean() else costs
+
+
+def of_model(problem: LinearMPC, other: LinearMPC) -> Controller:
+    """Return an MPC with another model and operating point, as a law of the problem's theta."""
+    law, own, its = other.online(), problem.units, other.units
+    limits = problem.deviations.u_min, problem.deviations.u_max
+
+    def act(t: int, theta: Array, rows: Rows) -> Array:
+        u = law(its.to_deviations(own.to_plant(np.nan_to_num(theta))))
+        return np.clip(own.input_to_deviations(its.input_to_plant(u)), *limits)
+
+    return act
+
+
+class Observing:
+    """The offset-free MPC, with an observer for each episode.
+
+    Parameters
+    ----------
+    problem : LinearMPC
+        Whose theta the env shows.
+    other : LinearMPC
+        The same with disturbances.
+    observer : DisturbanceObserver
+        Of all states.
+    """
+
+    def __init__(self, problem: LinearMPC, other: LinearMPC, observer: DisturbanceObserver) -> None:
+        self.problem, self.other, self.observer = problem, other, observer
+        self.observers: list[DisturbanceObserver] = []
+        self.u: Array = np.zeros((0, 0))
+
+    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
+        """Return the inputs (r, m)."""
+        layout, bounds = self.problem.layout, self.other.deviations.disturbances
+        x = theta[:, layout.state]
+        if t == 0:
+            self.observers = [copy.copy(self.observer) for _ in x]
+            self.u = np.zeros((len(x), self.other.model.n_inputs))
+            found = [each.reset(y) for each, y in zip(self.observers, x, strict=True)]
+        else:
+            pairs = zip(rows, x, strict=True)
+            found = [self.observers[i].update(y, self.u[i]) for i, y in pairs]
+        x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
+        d = np.clip(d_hat, bounds.d_min, bounds.d_max)
+        parts = x_hat, theta[:, layout.reference], d, theta[:, layout.previous]
+        self.u[rows] = self.other.online()(np.concatenate(parts, axis=1))
+        return self.u[rows]

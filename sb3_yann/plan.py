@@ -1,0 +1,589 @@
+"""The planner: nearly optimal trajectories of many starts at once, and feedback that keeps them.
+
+Control-limited differential dynamic programming with Gauss-Newton curvature (Y. Tassa, N. Mansard
+and E. Todorov, ICRA 2014). A bound of several inputs that is met once stays active in its step.
+Plans are made in the members of a model; :class:`Planning` plays them on a plant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_yann._validation import Array
+from sb3_yann.control import LinearMPC, lqr
+from sb3_yann.control.mpc.bound_excess import Bounds
+from sb3_yann.rollout import Rows
+from sb3_yann.twin.dynamics import Dynamics, law_of
+
+Mask = NDArray[np.bool_]
+Policy = Callable[[int, Array], Array]  # step and thetas (k, n_theta) -> inputs (k, m)
+
+SIZES = (1.0, 0.5, 0.2, 0.05)
+"""Parts of a correction that are tried, the first first."""
+SETTLED = 1e-5
+"""A start is done when a correction saves less than this part of its cost."""
+ROUNDS, RACE = 40, 4
+"""Corrections at most; after how many the best of several beginnings goes on."""
+SOFT = 1e-2
+"""Bounds count so much less at first: stiff ones would end a search where it meets them."""
+DAMPED, PATIENCE = 10.0, 5
+"""Factor of the damping where no correction helps; how often in a row, at most."""
+INSIDE, WEIGHT = 1e-3, 1e4
+"""How far inside of the bounds plans stay, in half-widths; what one half-width beyond that costs in
+a step, in mean costs of a step."""
+BURSTS = 25
+"""Some searches begin with all inputs on a bound, for this part of the episode."""
+WEIGHTS = 0.1, 10.0
+"""Factors of weights of the MPC, for laws that are tried instead of it."""
+CHANGED = 0.05
+"""A reference or disturbance that has moved by so many half-widths is planned for anew."""
+PAUSE = 10
+"""Steps after a plan for which an estimated disturbance makes no new one."""
+Law = Callable[[Array], Array]
+
+
+class Plant(Protocol):
+    """What a plan may ask of a plant. The rows are numbers of starts."""
+
+    def step(self, theta: Array, u: Array, rows: Rows) -> Array:
+        """Return the next theta (k, n_theta) from theta and u (k, m); r and d stay."""
+
+    def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return the derivatives of the step at theta (T, k, n_theta) and u (T, k, m)."""
+
+
+class TwinPlant:
+    """The members of a twin, one for each start, or their mean.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        The twin's.
+    members : sequence of int, optional
+        Which acts after each start; by default the mean of all does.
+    """
+
+    def __init__(self, dynamics: Dynamics, members: Iterable[int] | None = None) -> None:
+        self.dynamics, self.members = dynamics, None if members is None else [*members]
+        self._known: dict[bytes, Dynamics] = {}
+
+    def _acting(self, rows: Rows) -> Dynamics:
+        if self.members is None:
+            return self.dynamics
+        key, every = rows.tobytes(), self.dynamics
+        if key not in self._known:
+            chosen = tuple(every.members[self.members[row]] for row in rows)
+            self._known[key] = Dynamics(every.problem, every.coordinates, chosen)
+        return self._known[key]
+
+    def advance(self, theta: Array, u: Array, rows: Rows) -> Array:
+        """Return the next rows of the twin (k, size), with what an observer remembers."""
+        acting = self._acting(rows)
+        if self.members is not None:
+            return np.asarray(acting.step(theta[:, None], u[:, None])[:, 0])
+        every = (len(acting.members), 1, 1)
+        after = acting.step(np.tile(theta, every), np.tile(u, every))
+        return np.asarray(after.mean(axis=0))
+
+    def step(self, theta: Array, u: Array, rows: Rows) -> Array:
+        """Return the next theta (k, n_theta); an estimated d stays, as in an env's plan."""
+        row = self.dynamics.row
+        after = self.advance(row.begin(theta), u, rows)
+        found, parts = row.shown(after).copy(), self.dynamics.problem.layout
+        if row.observer is not None:
+            found[:, parts.state] = after[:, row.state]
+            found[:, parts.disturbance] = theta[:, parts.disturbance]
+        return found
+
+    def _slopes(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return the derivatives of rows at theta (T, k, size) and u (T, k, m)."""
+        acting, (steps, k) = self._acting(rows), theta.shape[:2]
+        if self.members is not None:
+            swapped = np.swapaxes(theta, 0, 1), np.swapaxes(u, 0, 1)
+            A, B = (np.swapaxes(each, 0, 1) for each in acting.jacobians(*swapped))
+            return A, B
+        flat = (each.reshape(1, steps * k, -1) for each in (theta, u))
+        means = (each.mean(axis=0) for each in acting.jacobians(*flat))
+        A, B = (each.reshape(steps, k, *each.shape[1:]) for each in means)
+        return A, B
+
+    def jacobians(self, theta: Array, u: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return the derivatives, (T, k, n_theta, n_theta) and (T, k, n_theta, m)."""
+        row, parts = self.dynamics.row, self.dynamics.problem.layout
+        A, B = self._slopes(row.begin(theta), u, rows)
+        if row.observer is None:
+            return A, B
+        number, n = np.arange(parts.size), parts.size
+        to = np.where(number < parts.n_states, number + row.state.start, number)
+        of_x, B = A[..., to, :], B[..., to, :]
+        found = of_x[..., :n].copy()
+        found[..., parts.state] += of_x[..., row.state]
+        found[..., parts.disturbance, :] = np.eye(n)[parts.disturbance]
+        B = B.copy()
+        B[..., parts.disturbance, :] = 0.0
+        return found, B
+
+
+class Doubt(Protocol):
+    """A price on what a model does not know, a sum of squares."""
+
+    def costs(self, thetas: Array, inputs: Array) -> Array:
+        """Return what steps cost (T, k), at thetas (T, k, n_theta) and inputs (T, k, m)."""
+
+    def slopes(self, thetas: Array, inputs: Array) -> tuple[Array, Array]:
+        """Return gradients (T, k, n_theta + m) and Gauss-Newton curvatures of that."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a trajectory is to minimize: stage costs, the value at the end, what is beyond bounds.
+
+    Attributes
+    ----------
+    problem : LinearMPC
+        Its stage cost; its bounds of states, outputs, inputs and rates, soft ones too.
+    low, high : ndarray, shape (n,)
+        Bounds of the states besides, infinite where there are none.
+    end : ndarray, shape (n_theta, n_theta)
+        ``theta' end theta`` is the cost of what comes after the last step.
+    weight : float
+        What one half-width beyond a bound costs in a step, `WEIGHT` typical stage costs.
+    doubt : Doubt, optional
+        What a plan pays where the members of a model disagree.
+    """
+
+    problem: LinearMPC
+    low: Array
+    high: Array
+    end: Array
+    weight: float
+    doubt: Doubt | None = None
+
+    @cached_property
+    def _bounds(self) -> Bounds:
+        return Bounds.of(self.problem, self.low, self.high)
+
+    def costs(self, thetas: Array, inputs: Array) -> Array:
+        """Return the costs (k,) of thetas (T + 1, k, n_theta) and inputs (T, k, m); inf for NaN."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            stage = self.problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0)
+            end = np.sum((thetas[-1] @ self.end) * thetas[-1], axis=-1)
+            outside = np.sum(self._bounds.beyond(thetas[1:], -INSIDE) ** 2, axis=(0, 2))
+            total = stage + end + self.weight * outside
+            if self.doubt is not None:
+                total = total + self.doubt.costs(thetas[:-1], inputs).sum(axis=0)
+        return np.where(np.isfinite(total), total, np.inf)
+
+    def limits(self, thetas: Array) -> tuple[Array, Array]:
+        """Return the bounds (..., m) of the inputs at thetas (..., n_theta)."""
+        problem = self.problem
+        low, high = (np.broadcast_to(each, (*thetas.shape[:-1], len(each)))
+                     for each in (problem.deviations.u_min, problem.deviations.u_max))  # fmt: skip
+        if problem.has_rate_bounds:
+            before = thetas[..., problem.layout.previous]
+            low = np.maximum(low, before + problem.rate.du_min)
+            high = np.maximum(np.minimum(high, before + problem.rate.du_max), low)
+        return low, high
+
+    def penalty(self, thetas: Array) -> tuple[Array, Array]:
+        """Return gradient (..., n) and curvature (..., n, n) of what is beyond bounds."""
+        over, weight = self._bounds.beyond(thetas, -INSIDE), 2 * self.weight
+        scaled = self._bounds.C / self._bounds.half[:, None]
+        active = (over != 0).astype(float)
+        curvature = np.einsum("ki,...k,kj->...ij", scaled, active, scaled)
+        return weight * over @ scaled, weight * curvature
+
+
+def roll_out(
+    plant: Plant, task: Task, policy: Policy, starts: Array, steps: int, rows: Rows
+) -> tuple[Array, Array]:
+    """Return thetas (steps + 1, k, n_theta) and inputs (steps, k, m) of a policy within bounds.
+
+    Parameters
+    ----------
+    plant, task : Plant and Task
+        What is tried, and what it is to cost.
+    policy : callable
+        From the step and thetas (k, n_theta) to inputs (k, m).
+    starts : ndarray, shape (k, n_theta)
+        Where the runs begin.
+    steps : int
+        How long they are.
+    rows : ndarray of int, shape (k,)
+        Numbers of the starts, as the plant knows them.
+    """
+    thetas = np.empty((steps + 1, *starts.shape))
+    inputs = np.empty((steps, len(starts), task.problem.model.n_inputs))
+    thetas[0] = starts
+    for t in range(steps):
+        inputs[t] = np.clip(np.nan_to_num(policy(t, thetas[t])), *task.limits(thetas[t]))
+        thetas[t + 1] = plant.step(thetas[t], inputs[t], rows)
+    return thetas, inputs
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Trajectories and feedback of k starts.
+
+    Attributes
+    ----------
+    thetas, inputs : ndarray, shapes (T + 1, k, n_theta) and (T, k, m)
+    gains : ndarray, shape (T, k, m, n_theta)
+    costs : ndarray, shape (k,)
+        With what is beyond bounds.
+    """
+
+    thetas: Array
+    inputs: Array
+    gains: Array
+    costs: Array
+
+    def of(self, chosen: Rows | Mask) -> Plans:
+        """Return some of the starts."""
+        return Plans(
+            self.thetas[:, chosen],
+            self.inputs[:, chosen],
+            self.gains[:, chosen],
+            self.costs[chosen],
+        )
+
+
+def follow(plans: Plans, t: int, theta: Array) -> Array:
+    """Return the inputs (k, m) of plans at a step, from theta (k, n_theta)."""
+    away = theta - plans.thetas[t]
+    return np.asarray(plans.inputs[t] + (plans.gains[t] @ away[..., None])[..., 0])
+
+
+def planned(
+    plant: Plant, task: Task, policies: list[Policy], starts: Array, steps: int, rows: Rows
+) -> Plans:
+    """Return the best plan of each start that the policies' trajectories lead to.
+
+    Parameters
+    ----------
+    plant, task : Plant and Task
+        What is tried, and what it is to cost.
+    policies : list of callables
+        Where the search begins.
+    starts : ndarray, shape (k, n_theta)
+        Where the plans begin.
+    steps : int
+        Length T of the plans.
+    rows : ndarray of int, shape (k,)
+        Numbers of the starts, as the plant knows them.
+    """
+    found, every = [], np.arange(len(starts))
+    soft = dataclasses.replace(task, weight=SOFT * task.weight)
+    for policy in policies:
+        thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
+        gains = np.zeros((*inputs.shape, starts.shape[1]))
+        first = Plans(thetas, inputs, gains, soft.costs(thetas, inputs))
+        found.append(improved(plant, soft, first, rows, RACE if len(policies) > 1 else ROUNDS))
+    best = np.argmin([each.costs for each in found], axis=0)
+    names = "thetas", "inputs", "gains"
+    kept = {k: np.stack([getattr(each, k) for each in found], 1)[:, best, every] for k in names}
+    costs = np.array([each.costs for each in found])[best, every]
+    plans = improved(plant, soft, Plans(**kept, costs=costs), rows, ROUNDS)
+    hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
+    plans = improved(plant, task, hard, rows, ROUNDS)
+    # The last search may have been damped, and its feedback with it.
+    _, gains = _backward(plant, task, plans, rows, np.zeros(len(rows)))
+    return dataclasses.replace(plans, gains=gains)
+
+
+def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) -> Plans:
+    """Return plans that no correction improves, or those after so many rounds.
+
+    Parameters
+    ----------
+    plant, task : Plant and Task
+        What is tried, and what it is to cost.
+    plans : Plans
+        Where the search begins.
+    rows : ndarray of int, shape (k,)
+        Numbers of the starts, as the plant knows them.
+    rounds : int
+        How many corrections there are at most.
+    """
+    plans = Plans(*(each.copy() for each in vars(plans).values()))
+    k = len(rows)
+    damping: Array = np.zeros(k)
+    active: Rows = np.flatnonzero(np.isfinite(plans.costs))
+    if not len(active):
+        return plans
+    failed: Rows = np.zeros(k, dtype=np.intp)
+    for _ in range(rounds):
+        old = plans.of(active)
+        corrections, gains = _backward(plant, task, old, rows[active], damping[active])
+        plans.gains[:, active] = gains
+        waiting: Rows = np.arange(len(active))
+        for size in SIZES:
+            moved = Plans(old.thetas, old.inputs + size * corrections, gains, old.costs)
+            now, some = active[waiting], moved.of(waiting)
+            given = partial(follow, some), some.thetas[0], len(some.inputs), rows[now]
+            thetas, inputs = roll_out(plant, task, *given)
+            costs = task.costs(thetas, inputs)
+            better = costs < some.costs
+            won = now[better]
+            plans.thetas[:, won], plans.inputs[:, won] = thetas[:, better], inputs[:, better]
+            plans.costs[won] = costs[better]
+            waiting = waiting[~better]
+            if not len(waiting):
+                break
+        lost = np.isin(np.arange(len(active)), waiting)
+        failed[active] = np.where(lost, failed[active] + 1, 0)
+        more = np.maximum(DAMPED * damping[active], 1.0)
+        damping[active] = np.where(lost, more, damping[active] / DAMPED)
+        little = old.costs - plans.costs[active] <= SETTLED * np.abs(old.costs)
+        done = np.where(lost, failed[active] >= PATIENCE, little)
+        active = np.asarray(active[~done])
+        if not len(active):
+            break
+    return plans
+
+
+def _backward(
+    plant: Plant, task: Task, plans: Plans, rows: Rows, damping: Array
+) -> tuple[Array, Array]:
+    """Return corrections (T, k, m) and gains (T, k, m, n_theta)."""
+    problem, thetas, inputs = task.problem, plans.thetas, plans.inputs
+    size, states = problem.n_theta, problem.layout.state
+    A, B = plant.jacobians(thetas[:-1], inputs, rows)
+    F = np.concatenate([A, B], axis=-1)
+    W = 2 * problem.stage_matrix
+    slopes = np.concatenate([thetas[:-1], inputs], axis=-1) @ W
+    curved = np.broadcast_to(W, (len(inputs), len(rows), *W.shape))
+    if task.doubt is not None:
+        slope, more = task.doubt.slopes(thetas[:-1], inputs)
+        slopes = slopes + slope
+        curved = curved + more
+    gradient, curvature = task.penalty(thetas[1:])
+    limits = task.limits(thetas[:-1])
+    low, high = (each - inputs for each in limits)
+    # A bound of the rate moves with the previous input.
+    moving = np.stack(
+        [limits[0] > problem.deviations.u_min, limits[1] < problem.deviations.u_max], axis=1
+    )
+    v, V = 2 * thetas[-1] @ task.end, np.tile(2 * task.end, (len(rows), 1, 1))
+    corrections, gains = np.empty_like(inputs), np.empty_like(plans.gains)
+    damped = damping[:, None, None] * W[size:, size:]
+    for t in reversed(range(len(inputs))):
+        v[:, states] += gradient[t]
+        V[:, states, states] += curvature[t]
+        Ft = F[t].swapaxes(1, 2)
+        q = slopes[t] + (Ft @ v[..., None])[..., 0]
+        H = curved[t] + Ft @ V @ F[t]
+        qx, qu = q[:, :size], q[:, size:]
+        Hxx, Hux, Huu = H[:, :size, :size], H[:, size:, :size], H[:, size:, size:]
+        move = _bounded_step(Huu + damped, qu, low[t], high[t])
+        K = _feedback(Huu + damped, Hux, move <= low[t], move >= high[t], moving[t])
+        Kt = K.swapaxes(1, 2)
+        v = qx + (Kt @ (qu + (Huu @ move[..., None])[..., 0])[..., None])[..., 0]
+        v += (Hux.swapaxes(1, 2) @ move[..., None])[..., 0]
+        V = Hxx + Kt @ Huu @ K + Kt @ Hux + Hux.swapaxes(1, 2) @ K
+        V = (V + V.swapaxes(1, 2)) / 2
+        corrections[t], gains[t] = move, K
+    return corrections, gains
+
+
+def _bounded_step(H: Array, g: Array, low: Array, high: Array) -> Array:
+    """Return the minimizers (k, m) of ``u'Hu / 2 + g'u`` in a box, for H (k, m, m), g (k, m).
+
+    Projected Newton steps: an input on its bound is held there while the slope presses it on.
+    """
+    move: Array = np.clip(np.zeros_like(g), low, high)
+    for _ in range(2 * g.shape[1] + 1):
+        slope = g + (H @ move[..., None])[..., 0]
+        held = ((move <= low) & (slope > 0)) | ((move >= high) & (slope < 0))
+        step = np.linalg.solve(_reduced(H, held), np.where(held, 0.0, slope)[..., None])[..., 0]
+        before, move = move, np.clip(move - step, low, high)
+        if np.array_equal(before, move):
+            break
+    return move
+
+
+def _feedback(H: Array, G: Array, at_low: Mask, at_high: Mask, moving: Mask) -> Array:
+    """Return the gains (k, m, n_theta) of the minimizers in a box whose sides may move.
+
+    Parameters
+    ----------
+    H, G : ndarray, shapes (k, m, m) and (k, m, n_theta)
+        Curvature; how the gradient changes with theta.
+    at_low, at_high : ndarray of bool, shape (k, m)
+        Inputs on a bound.
+    moving : ndarray of bool, shape (2, k, m)
+        Whether the lower and the upper bound move with the previous input, theta's last entries.
+    """
+    held, m = at_low | at_high, H.shape[1]
+    fixed: Array = np.zeros_like(G)
+    row, j = np.nonzero((at_low & moving[0]) | (at_high & moving[1]))
+    fixed[row, j, G.shape[2] - m + j] = 1.0
+    right = np.where(held[:, :, None], fixed, -G - H @ fixed)
+    return np.asarray(np.linalg.solve(_reduced(H, held), right))
+
+
+def _reduced(H: Array, held: Mask) -> Array:
+    """Return H (k, m, m) with the rows and columns of inputs that are held replaced by ones."""
+    free = ~held[:, :, None] & ~held[:, None, :]
+    return np.where(free, H, held[:, :, None] * np.eye(H.shape[1]))
+
+
+def initial_guesses(
+    plant: Plant, task: Task, starts: Array, steps: int, rows: Rows
+) -> list[Policy]:
+    """Return the policies whose trajectories plans may begin with; the first one is the MPC.
+
+    Two have inputs on their bounds for a while, then the MPC. The last one is, for each start, the
+    cheapest of these and of unconstrained laws with other weights, after such a push or without: an
+    MPC that leaves a pendulum hanging shows no plan that it can swing. There is none where the MPC
+    is as cheap.
+
+    Parameters
+    ----------
+    plant, task : Plant and Task
+        What is tried, and what it is to cost.
+    starts : ndarray, shape (k, n_theta)
+        Where the plans begin.
+    steps : int
+        Their length.
+    rows : ndarray of int, shape (k,)
+        Numbers of the starts, as the plant knows them.
+    """
+    problem, until = task.problem, steps // BURSTS
+    none = partial(_pushed, problem.deviations.u_min, 0)
+    pushes = [
+        none,
+        *(partial(_pushed, u, until) for u in (problem.deviations.u_min, problem.deviations.u_max)),
+    ]
+    first = [push(law_of(problem)) for push in pushes]
+
+    def played(policy: Policy) -> tuple[Array, Array]:
+        thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
+        return task.costs(thetas, inputs), inputs
+
+    least, best = played(first[0])
+    cheaper: NDArray[np.bool_] = np.zeros(len(starts), dtype=bool)
+    others = [push(partial(_linear, K)) for K in _gains(problem) for push in pushes]
+    for policy in (*first[1:], *others):
+        costs, inputs = played(policy)
+        won = costs < least
+        best[:, won], least, cheaper = inputs[:, won], np.minimum(costs, least), cheaper | won
+    return [*first, lambda t, theta: best[t]] if cheaper.any() else first
+
+
+def _pushed(u: Array, until: int, law: Law) -> Policy:
+    """Return a policy with inputs u (m,) for some steps, those of a law after them."""
+    return lambda t, theta: np.tile(u, (len(theta), 1)) if t < until else law(theta)
+
+
+def _linear(K: Array, theta: Array) -> Array:
+    return theta @ K.T
+
+
+def _gains(problem: LinearMPC) -> Iterator[Array]:
+    """Yield gains (m, n_theta) of unconstrained laws: with another weight of one error, or all."""
+    errors, size = problem.error_system, len(problem.error_system.Q)
+    for chosen in (*np.eye(size, dtype=bool), np.ones(size, dtype=bool)):
+        for factor in WEIGHTS:
+            scale = np.where(chosen, np.sqrt(factor), 1.0)
+            Q = scale[:, None] * errors.Q * scale
+            cross = None if errors.cross is None else scale[:, None] * errors.cross
+            if np.array_equal(Q, errors.Q):
+                continue
+            try:
+                P = lqr.riccati(errors.model, Q, errors.R, problem.gamma, cross)
+            except ValueError:  # no stabilizing solution with these weights
+                continue
+            K = lqr.gain(errors.model, errors.R, P, problem.gamma, cross)
+            yield errors.to_input - K @ errors.to_error
+
+
+class Planning:
+    """Plans for the rest of the episode, anew where a reference or disturbance changes.
+
+    Nothing is known of changes before they come. Feedback keeps the plant on its plan.
+
+    Parameters
+    ----------
+    plant, task : Plant and Task
+        What the plans are made with.
+    steps : int
+        Length of an episode.
+    pause : int, default 0
+        Steps after a plan for which a disturbance makes no new one: an observer's estimate moves at
+        every step until it has settled.
+
+    Attributes
+    ----------
+    plans : dict of int to (int, Plans, ndarray)
+        The present one of each episode, the step at which it was made, and the reference and
+        disturbance of then.
+    """
+
+    def __init__(self, plant: Plant, task: Task, steps: int, pause: int = 0) -> None:
+        self.plant, self.task, self.steps, self.pause = plant, task, steps, pause
+        self.plans: dict[int, tuple[int, Plans, Array]] = {}
+        self._kept: dict[int, float] = {}  # what plans that are over have promised
+
+    def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
+        """Return the inputs (r, m)."""
+        problem, constant = self.task.problem, self.task.problem.layout.constant
+        known = np.isin(rows, [*self.plans])
+        changed = np.zeros(len(rows), dtype=bool)
+        for k in np.flatnonzero(known):
+            planned_at, _, constants = self.plans[rows[k]]
+            away = np.abs(theta[k, constant] - constants) / problem.theta_half[constant]
+            moved = ~(away <= CHANGED)
+            if t < planned_at + self.pause:  # an estimated disturbance may still settle
+                moved[problem.layout.reference.stop - problem.layout.reference.start :] = False
+            changed[k] = moved.any()
+        for chosen in (~known, changed):
+            if chosen.any() and t < self.steps:
+                self._plan(t, theta[chosen], rows[chosen])
+        u = np.zeros((len(rows), problem.model.n_inputs))
+        for k, row in enumerate(rows):
+            if row in self.plans:
+                planned_at, plan, _ = self.plans[row]
+                at = min(t, self.steps - 1) - planned_at
+                u[k] = np.nan_to_num(follow(plan, at, theta[k : k + 1])[0])
+        return np.clip(u, *self.task.limits(theta))
+
+    def _plan(self, t: int, starts: Array, rows: Rows) -> None:
+        problem, left = self.task.problem, self.steps - t
+        law = law_of(problem)
+        policies: list[Policy] = [lambda _, at: law(at)]
+        if rows[0] not in self.plans:
+            policies = initial_guesses(self.plant, self.task, starts, left, rows)
+        found = planned(self.plant, self.task, policies, starts, left, rows)
+        for k, row in enumerate(rows):
+            self._kept[row] = self._promised(row, t)
+            constants = starts[k, problem.layout.constant].copy()
+            self.plans[row] = t, found.of(np.array([k])), constants
+
+    def promised(self, count: int) -> Array:
+        """Return what the plans of so many episodes said that these would cost."""
+        return np.array([self._promised(row, self.steps) for row in range(count)])
+
+    def _promised(self, row: int, until: int) -> float:
+        """Return what the plans of an episode say that it costs until a step."""
+        if row not in self.plans:
+            return 0.0
+        begun, plan, _ = self.plans[row]
+        thetas, inputs = plan.thetas[: until - begun], plan.inputs[: until - begun]
+        costs = self.task.problem.deviations.stage_cost(thetas, inputs)
+        return self._kept[row] + float(np.sum(costs))
+
+
+def value_at_end(problem: LinearMPC) -> Array:
+    """Return the undiscounted value of the law, or one discounted a little where there is none."""
+    try:
+        return problem.value_matrix(1.0)
+    except ValueError:
+        return problem.value_matrix(0.99)
