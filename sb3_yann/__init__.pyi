@@ -12,8 +12,10 @@ from sb3_yann.control import DisturbanceObserver as DisturbanceObserver
 from sb3_yann.control import ExplicitLimitError as ExplicitLimitError
 from sb3_yann.control import ExplicitSolutionError as ExplicitSolutionError
 from sb3_yann.control import Identified as Identified
+from sb3_yann.control import LinearCost as LinearCost
 from sb3_yann.control import LinearModel as LinearModel
 from sb3_yann.control import LinearMPC as LinearMPC
+from sb3_yann.control import MixedBounds as MixedBounds
 from sb3_yann.control import OnlineLaw as OnlineLaw
 from sb3_yann.control import OnlineLawWarning as OnlineLawWarning
 from sb3_yann.control import OutputBounds as OutputBounds

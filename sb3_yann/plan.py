@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, lqr
 from sb3_yann.control.mpc.bound_excess import Bounds
+from sb3_yann.control.mpc.value import Value
 from sb3_yann.rollout import Rows
 from sb3_yann.twin.dynamics import Dynamics, law_of
 
@@ -157,6 +158,8 @@ class Task:
         What one half-width beyond a bound costs in a step, `WEIGHT` typical stage costs.
     doubt : Doubt, optional
         What a plan pays where the members of a model disagree.
+    end_slope : ndarray, shape (n_theta,), optional
+        What that cost is linear in, where there are prices.
     """
 
     problem: LinearMPC
@@ -165,6 +168,7 @@ class Task:
     end: Array
     weight: float
     doubt: Doubt | None = None
+    end_slope: Array | float = 0.0
 
     @cached_property
     def _bounds(self) -> Bounds:
@@ -174,7 +178,7 @@ class Task:
         """Return the costs (k,) of thetas (T + 1, k, n_theta) and inputs (T, k, m); inf for NaN."""
         with np.errstate(over="ignore", invalid="ignore"):
             stage = self.problem.deviations.stage_cost(thetas[:-1], inputs).sum(axis=0)
-            end = np.sum((thetas[-1] @ self.end) * thetas[-1], axis=-1)
+            end = np.sum((thetas[-1] @ self.end + self.end_slope) * thetas[-1], axis=-1)
             outside = np.sum(self._bounds.beyond(thetas[1:], -INSIDE) ** 2, axis=(0, 2))
             total = stage + end + self.weight * outside
             if self.doubt is not None:
@@ -183,13 +187,14 @@ class Task:
 
     def limits(self, thetas: Array) -> tuple[Array, Array]:
         """Return the bounds (..., m) of the inputs at thetas (..., n_theta)."""
-        problem = self.problem
-        low, high = (np.broadcast_to(each, (*thetas.shape[:-1], len(each)))
-                     for each in (problem.deviations.u_min, problem.deviations.u_max))  # fmt: skip
+        problem = self.problem.deviations
+        low, high = (np.broadcast_to(each, (*thetas.shape[:-1], problem.model.n_inputs))
+                     for each in problem.limits_at("u", thetas))  # fmt: skip
         if problem.has_rate_bounds:
             before = thetas[..., problem.layout.previous]
-            low = np.maximum(low, before + problem.rate.du_min)
-            high = np.maximum(np.minimum(high, before + problem.rate.du_max), low)
+            du_min, du_max = problem.limits_at("du", thetas)
+            low = np.maximum(low, before + du_min)
+            high = np.maximum(np.minimum(high, before + du_max), low)
         return low, high
 
     def penalty(self, thetas: Array) -> tuple[Array, Array]:
@@ -358,7 +363,7 @@ def _backward(
     A, B = plant.jacobians(thetas[:-1], inputs, rows)
     F = np.concatenate([A, B], axis=-1)
     W = 2 * problem.stage_matrix
-    slopes = np.concatenate([thetas[:-1], inputs], axis=-1) @ W
+    slopes = np.concatenate([thetas[:-1], inputs], axis=-1) @ W + problem.stage_slope
     curved = np.broadcast_to(W, (len(inputs), len(rows), *W.shape))
     if task.doubt is not None:
         slope, more = task.doubt.slopes(thetas[:-1], inputs)
@@ -371,7 +376,8 @@ def _backward(
     moving = np.stack(
         [limits[0] > problem.deviations.u_min, limits[1] < problem.deviations.u_max], axis=1
     )
-    v, V = 2 * thetas[-1] @ task.end, np.tile(2 * task.end, (len(rows), 1, 1))
+    moving &= problem.has_rate_bounds
+    v, V = 2 * thetas[-1] @ task.end + task.end_slope, np.tile(2 * task.end, (len(rows), 1, 1))
     corrections, gains = np.empty_like(inputs), np.empty_like(plans.gains)
     damped = damping[:, None, None] * W[size:, size:]
     for t in reversed(range(len(inputs))):
@@ -581,9 +587,9 @@ class Planning:
         return self._kept[row] + float(np.sum(costs))
 
 
-def value_at_end(problem: LinearMPC) -> Array:
+def value_at_end(problem: LinearMPC) -> Value:
     """Return the undiscounted value of the law, or one discounted a little where there is none."""
     try:
-        return problem.value_matrix(1.0)
+        return problem.value_terms(1.0)
     except ValueError:
-        return problem.value_matrix(0.99)
+        return problem.value_terms(0.99)

@@ -69,7 +69,10 @@ def fields_in_deviations(problem: Any) -> dict[str, Any]:
     outputs = problem.outputs
     disturbances = problem.disturbances
     terminal = problem.terminal
+    mixed, price = problem.mixed, problem.price
     r_ss, y_ss = tracking.C @ model.x_ss, outputs.C @ model.x_ss
+    mixed_ss = mixed.F @ model.x_ss + mixed.G @ model.u_ss
+    spent = price.x @ model.x_ss + price.u @ model.u_ss
     shifted = {
         "x_min": problem.x_min - model.x_ss,
         "x_max": problem.x_max - model.x_ss,
@@ -96,6 +99,11 @@ def fields_in_deviations(problem: Any) -> dict[str, Any]:
             disturbances,
             d_min=disturbances.d_min - model.d_ss,
             d_max=disturbances.d_max - model.d_ss,
+        ),
+        "mixed": replace(mixed, low=mixed.low - mixed_ss, high=mixed.high - mixed_ss),
+        "price": replace(price, constant=price.constant + spent),
+        "parametric_bounds": replace(
+            problem.parametric_bounds, rest=np.zeros(len(problem.parametric_bounds.names))
         ),
     }
 

@@ -82,11 +82,13 @@ def rests_beside(problem: LinearMPC, theta: Array, begins: NDArray[np.bool_]) ->
     begins : ndarray of bool, shape (steps,)
         Where one begins.
     """
-    C, unit, r = _outputs(problem), problem.theta_half, theta[:, problem.layout.reference]
+    C, unit = _outputs(problem), problem.theta_half
+    references = problem.layout.now[: problem.layout.n_references]
+    r = theta[:, references]
     errors = theta[:, problem.layout.state] @ C.T
     half = np.abs(C) @ unit[problem.layout.state]
     if r.shape[1]:
-        errors, half = errors - r, unit[problem.layout.reference]
+        errors, half = errors - r, unit[references]
     changed = begins | np.r_[True, np.any(r[1:] != r[:-1], axis=1)]
     parts = np.split(errors, np.flatnonzero(changed)[1:])
     found = [_rest(part) for part in parts if len(part) >= SHORTEST]

@@ -9,6 +9,8 @@ from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.choice import OnlineLawWarning
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
+    LinearCost,
+    MixedBounds,
     OutputBounds,
     RateLimits,
     SoftBounds,
@@ -27,8 +29,10 @@ __all__ = [
     "ExplicitLimitError",
     "ExplicitSolutionError",
     "Identified",
+    "LinearCost",
     "LinearMPC",
     "LinearModel",
+    "MixedBounds",
     "OnlineLaw",
     "OnlineLawWarning",
     "OutputBounds",

@@ -272,7 +272,10 @@ class OnlineLaw(PlantLaw):
         steps = (len(self.c) - self.n_slacks) // self.n_inputs
         before = steps * np.array([[0], [finite[0].sum()]])
         known = finite & (self.n_input_rows == steps * finite.sum())
-        return np.where(known, before + np.cumsum(finite, axis=1) - 1, -1)
+        rows = np.where(known, before + np.cumsum(finite, axis=1) - 1, -1)
+        K = np.asarray(self.feedback)
+        still = [np.all(self.S[row] == S, axis=1) for row, S in zip(rows, (-K, K), strict=True)]
+        return np.where(still, rows, -1)  # not those that change at run time
 
     def _gain(self, active: Integers) -> Array:
         """Return the gain (m, n) of an active set; of a steep program from its KKT equations."""

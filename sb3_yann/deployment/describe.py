@@ -83,11 +83,7 @@ def describe(
     states[: len(state_names)] = True
     labels = [*state_names, *(f"theta[{i}]" for i in range(len(state_names), n))]
     if problem is not None:
-        labels, first = [*problem.labels()], problem.layout.disturbance.start
-        for i in range(problem.model.n_disturbances):
-            who = "observer" if i in problem.model.estimated else "sensor or observer"
-            verb = "estimated by" if i in problem.model.estimated else "from"
-            labels[first + i] += f" ({verb} the caller's {who})"
+        labels = _with_sources(problem)
 
     matrix, offset, scale, shift = _signal_maps(policy, law)
     watched = states
@@ -114,6 +110,17 @@ def describe(
         "action_names": np.array([*input_names]),
         "note": note,
     }
+
+
+def _with_sources(problem: LinearMPC) -> list[str]:
+    """Return the names of theta's entries, with who tells a disturbance."""
+    labels, layout = [*problem.labels()], problem.layout
+    for i, name in enumerate(layout.names):
+        if layout.disturbance.start <= i < layout.disturbance.stop:
+            is_estimated = int(name[:-1].partition("[")[2]) in problem.model.estimated
+            who = "observer" if is_estimated else "sensor or observer"
+            labels[i] += f" ({'estimated by' if is_estimated else 'from'} the caller's {who})"
+    return labels
 
 
 def _unconfirmed(given: Exportable) -> str:

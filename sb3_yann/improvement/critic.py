@@ -50,7 +50,7 @@ def _costs(policy: YannPolicy, twin: Model, layer: LawLayer, at: Array, u: Array
         rows, inputs = dynamics.roll_out(policy_of(layer, problem), first, STEPS)
         thetas = shown(rows)
         stage = problem.deviations.stage_cost(thetas[:-1], inputs)
-        end = np.sum((thetas[-1] @ problem.value_matrix(gamma)) * thetas[-1], axis=-1)
+        end = problem.value_terms(gamma).at(thetas[-1])
         later = np.tensordot(gamma ** np.arange(STEPS), stage, axes=1) + gamma**STEPS * end
         # What leaves the log is not known, and may be many times as dear as all the rest.
         later = np.where(twin.limits.violated(rows).any(axis=0), np.nan, later)

@@ -174,7 +174,8 @@ def task_of(model: Model, unit: float, priced: bool = True) -> Task:
     if priced and model.dynamics.row.observer is None:
         doubt = Disagreement(model.dynamics, DOUBT * unit)
     end, limits = value_at_end(model.problem), model.limits
-    return Task(model.problem, limits.low, limits.high, end, WEIGHT * unit, doubt)
+    box = limits.low, limits.high
+    return Task(model.problem, *box, end.P, WEIGHT * unit, doubt, end.slope)
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,6 +63,27 @@ class Ranges:
         """The inputs at action 0, (m,)."""
         return (self.u_max + self.u_min) / 2
 
+    def scale(self, size: int) -> Array:
+        """Return what networks multiply theta by, (size,): zero for ones that follow it."""
+        return np.append(1 / self.theta_half, np.zeros(size - len(self.theta_half)))
+
+
+def with_one(points: th.Tensor, n: int) -> th.Tensor:
+    """Return rows ``[theta, 1, a]`` for rows ``[theta, a]`` with theta (batch, n)."""
+    return th.cat([points[:, :n], points.new_ones(len(points), 1), points[:, n:]], dim=1)
+
+
+class KeepsOne(nn.Module):
+    """The prediction of ``[theta, 1]`` by a model of theta."""
+
+    def __init__(self, model: PredictionModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, theta: th.Tensor, u: th.Tensor) -> th.Tensor:
+        """Return the predicted next one, (batch, n + 1)."""
+        return th.cat([self.model(theta[:, :-1], u), theta[:, -1:]], dim=1)
+
 
 class LinearPrediction(nn.Module):
     """``(theta, u) -> A theta + B u``, from :attr:`LinearMPC.prediction`.
@@ -122,7 +143,8 @@ class QuadraticStateActionValue(nn.Module):
     Parameters
     ----------
     M : ndarray, shape (n + m, n + m)
-        From :meth:`LinearMPC.state_action_matrix`.
+        From :meth:`LinearMPC.state_action_matrix`. With a row and a column more, it is the form of
+        ``[theta; 1; u]``.
     ranges : Ranges
     hidden : tuple of int, default (64, 64)
     activation : callable, default torch.tanh
@@ -150,19 +172,23 @@ class QuadraticStateActionValue(nn.Module):
         pinned: bool = True,
     ) -> None:
         super().__init__()
-        n, m = len(ranges.theta_half), len(ranges.u_min)
+        m = len(ranges.u_min)
+        n = len(M) - m
         self.quadratic = QuadraticForm(M)
+        self.n_before_one = len(ranges.theta_half) if n > len(ranges.theta_half) else 0
         register_constants(
             self,
             to_input=np.concatenate([np.ones(n), ranges.u_half]),
             middle=np.concatenate([np.zeros(n), ranges.u_middle]),
-            network_scale=1 / np.concatenate([ranges.theta_half, ranges.u_half]),
+            network_scale=np.concatenate([ranges.scale(n), 1 / ranges.u_half]),
         )
         kept = th.tensor([pinned])
         self.network = ZeroOutputNetwork(n + m, 1, hidden, activation=activation, pinned=kept)
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
+        if self.n_before_one:
+            theta_and_action = with_one(theta_and_action, self.n_before_one)
         z = theta_and_action * self.to_input + self.middle
         learnt = self.network((z * self.network_scale).float())
         q: th.Tensor = learnt - self.quadratic(z).float()
@@ -180,7 +206,8 @@ class AfterstateValue(nn.Module):
     W : ndarray, shape (n + m, n + m)
         The stage cost is ``[theta; u]' W [theta; u]``.
     P : ndarray, shape (n, n)
-        V is ``theta' P theta`` at first.
+        V is ``theta' P theta`` at first. With a row and a column more, W and P are forms of
+        ``[theta; 1; u]`` and ``[theta; 1]``: costs have linear terms.
     model : callable
         ``(theta, u) -> next theta``, of float64 tensors in physical units. A module is copied,
         moved and saved with this one, but not trained.
@@ -221,7 +248,12 @@ class AfterstateValue(nn.Module):
         super().__init__()
         known = 0.0 if scale is None else check_positive("scale", scale)  # 0: not known yet
         import_module("sb3_yann.networks._kernels.afterstate_value")  # see YannLayer
+        n, m = len(ranges.theta_half), len(ranges.u_min)
         self.model = untrained(model) if isinstance(model, nn.Module) else model
+        require_prediction(self.model, n, m)
+        self.n_before_one = n if len(P) > n else 0
+        if self.n_before_one:
+            self.model = _keeping_one(self.model)
         self.gamma = gamma
         self.quadratic = QuadraticForm(P)
         register_constants(
@@ -229,13 +261,11 @@ class AfterstateValue(nn.Module):
             W=W,
             to_input=ranges.u_half,
             middle=ranges.u_middle,
-            network_scale=1 / ranges.theta_half,
+            network_scale=ranges.scale(len(P)),
             value_scale=np.array(known),
         )
-        n, m = len(ranges.theta_half), len(ranges.u_min)
-        require_prediction(self.model, n, m)
         kept = th.tensor([pinned])
-        self.network = ZeroOutputNetwork(n, 1, hidden, activation=activation, pinned=kept)
+        self.network = ZeroOutputNetwork(len(P), 1, hidden, activation=activation, pinned=kept)
         self._constants: tuple[Array, Array, Array, Array]
         self._constants_of: tuple[list[Any], tuple[th.Tensor, ...]] = ([], ())
 
@@ -288,6 +318,7 @@ class AfterstateValue(nn.Module):
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
+        theta_and_action = self._completed(theta_and_action)
         if self.compiles and theta_and_action.device.type == "cpu":
             return self._compiled(theta_and_action, self._weights())
         theta, u = self._theta_and_input(theta_and_action)
@@ -297,7 +328,12 @@ class AfterstateValue(nn.Module):
     @th.no_grad()
     def mean_stage_cost(self, theta_and_action: th.Tensor) -> float:
         """Return the mean of the stage cost's absolute values, over rows ``[theta, a]``."""
-        return float(self._stage_cost(*self._theta_and_input(theta_and_action)).abs().mean())
+        points = self._completed(theta_and_action)
+        return float(self._stage_cost(*self._theta_and_input(points)).abs().mean())
+
+    def _completed(self, theta_and_action: th.Tensor) -> th.Tensor:
+        n = self.n_before_one
+        return with_one(theta_and_action, n) if n else theta_and_action
 
     def _theta_and_input(self, theta_and_action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         theta, action = th.tensor_split(theta_and_action.double(), [len(self.network_scale)], 1)
@@ -309,7 +345,8 @@ class AfterstateValue(nn.Module):
 
     def compiled_with_fixed_weights(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q where :attr:`compiles`, with a gradient by the rows, but not by the weights."""
-        return self._compiled(theta_and_action, tuple(each.detach() for each in self._weights()))
+        weights = tuple(each.detach() for each in self._weights())
+        return self._compiled(self._completed(theta_and_action), weights)
 
     def _weights(self) -> tuple[th.Tensor, ...]:
         modules: Any = self._modules  # an attribute of a module takes a microsecond to find
@@ -324,9 +361,21 @@ class AfterstateValue(nn.Module):
 
     def value(self, theta: th.Tensor) -> th.Tensor:
         """Return V, the discounted cost to go in float64, shape (batch, 1), for (batch, n)."""
+        if theta.shape[1] == self.n_before_one:
+            theta = with_one(theta, self.n_before_one)
         learnt: th.Tensor = self.network((theta * self.network_scale).float())
         total: th.Tensor = self.quadratic(theta) + self.scale * learnt.double()
         return total
+
+
+def _keeping_one(model: PredictionModel) -> PredictionModel:
+    """Return the prediction of ``[theta, 1]``; a linear one stays one, which is compiled."""
+    if not isinstance(model, LinearPrediction):
+        return KeepsOne(model)
+    A, B = model.A.T.numpy(), model.B.T.numpy()
+    one = np.zeros((len(A) + 1, len(A) + 1))
+    one[:-1, :-1], one[-1, -1] = A, 1.0
+    return LinearPrediction(one, np.vstack([B, np.zeros((1, B.shape[1]))]))
 
 
 def require_prediction(model: PredictionModel, n: int, m: int) -> None:

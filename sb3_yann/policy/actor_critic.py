@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.td3.policies import Actor
@@ -18,6 +19,7 @@ from torch import nn
 
 from sb3_yann import networks
 from sb3_yann._validation import (
+    Array,
     NonFiniteWarning,
     check_choice,
     check_number,
@@ -26,6 +28,7 @@ from sb3_yann._validation import (
 )
 from sb3_yann.control import LinearMPC, PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
+from sb3_yann.control.mpc.value import Value
 from sb3_yann.networks import AfterstateValue, SharedYannLayer, YannLayer
 from sb3_yann.networks.value import PredictionModel
 from sb3_yann.networks.yann import LawLayer
@@ -359,14 +362,27 @@ def layer_for(law: Law, networks: str | None) -> Any:
 def _initial_value(
     problem: LinearMPC, gamma: float, options: CriticOptions, common: dict[str, Any]
 ) -> nn.Module:
+    is_priced = problem.price.counts
     if options.kind == "state_action":
-        M = problem.state_action_matrix(gamma)
+        terms = problem.state_action_terms(gamma)
+        M = _with_one(terms, problem.n_theta) if is_priced else terms.P
         return networks.QuadraticStateActionValue(M, **common)
     model = options.prediction_model
     if model is None:
         model = networks.LinearPrediction(*problem.prediction)
-    W, P, scale = problem.stage_matrix, problem.value_matrix(gamma), options.value_scale
-    return AfterstateValue(W, P, model, gamma, scale=scale, **common)
+    W, terms = problem.stage_matrix, problem.value_terms(gamma)
+    P = terms.form if is_priced else terms.P
+    if is_priced:
+        stage = Value(W, problem.stage_slope, problem.deviations.price.constant)
+        W = _with_one(stage, problem.n_theta)
+    return AfterstateValue(W, P, model, gamma, scale=options.value_scale, **common)
+
+
+def _with_one(terms: Value, n: int) -> Array:
+    """Return the form of ``[theta; 1; u]``, with theta (n,), of terms of ``[theta; u]``."""
+    last = len(terms.P)
+    order = [*range(n), last, *range(n, last)]
+    return terms.form[np.ix_(order, order)]
 
 
 EPS = 1e-8

@@ -185,7 +185,8 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         self.critic_warmup = check_int("critic_warmup", critic_warmup, 0, "It counts updates.")
         self.max_correction = _as_correction(max_correction)
         if pin_equilibrium is None:
-            pin_equilibrium = not self.problem.layout.has_constants
+            priced = self.problem.price.counts  # it does not rest at the operating point
+            pin_equilibrium = not (self.problem.layout.has_constants or priced)
         self.pin_equilibrium = check_bool("pin_equilibrium", pin_equilibrium)
         self.law, self.networks = check_choice("law", law, LAWS), networks
         shared = layer_for(self.problem.law(law), networks) is SharedYannLayer

@@ -38,8 +38,12 @@ def plant_part(subject: Subject) -> Part:
         ["weight of the inputs, R", _matrix(problem.R)],
         ["discount of the MPC, gamma", number(problem.gamma)],
         ["where the MPC has no solution", problem.infeasible.replace("_", " ")],
+        ["samples for which a move is held", ", ".join(map(str, problem.blocks))],
         ["penalty of a unit of a broken soft bound", number(soft) if soft else "no soft bounds"],
     ]
+    prices = [*zip([*states, *inputs], [*problem.price.x, *problem.price.u], strict=True)]
+    if problem.price.counts:
+        facts.append(["prices in a sample", ", ".join(f"{k}: {number(p)}" for k, p in prices if p)])
     content = join(
         [
             paragraph("All values are in the plant's units unless a line says otherwise."),
@@ -174,6 +178,12 @@ def _bounds(problem: LinearMPC) -> Iterator[tuple[str, str, float, float, str, A
         keys = [f"the rate of {each}" for each in names[1]]
         limits = problem.rate.du_min, problem.rate.du_max
         groups.append((called, keys, *limits, hard, lambda x, u: u - x[:-1, previous]))
+    mixed = problem.mixed
+    combined = [f"mixed[{i}]" for i in range(len(mixed.F))]
+    groups.append(
+        (combined, combined, mixed.low, mixed.high, mixed.soft > 0,
+         lambda x, u: x[:-1, : mixed.F.shape[1]] @ mixed.F.T + u @ mixed.G.T)
+    )  # fmt: skip
     for called, keys, low, high, is_soft, values in groups:
         for k in range(len(called)):
             if not np.isfinite([low[k], high[k]]).any():

@@ -220,11 +220,12 @@ def _theta(
     point = problem.theta_ss
     theta = np.zeros((len(x), layout.size))
     theta[:, layout.state] = x
-    for name, part in (("references", layout.reference), ("disturbances", layout.disturbance)):
-        size = part.stop - part.start
+    p = layout.n_references
+    for name, part in (("references", slice(0, p)), ("disturbances", slice(p, None))):
+        size = len(layout.now[part])
         if given[name] is None:
             if size and observed and name == "disturbances":
-                theta[:, part] = np.nan
+                theta[:, layout.disturbance] = np.nan
             elif size:
                 raise ValueError(
                     f"The problem's theta holds {size} {name}: pass {name}=, shape (T + 1, "
@@ -239,7 +240,10 @@ def _theta(
             raise ValueError(
                 f"episode {i}: {name} have shape {values.shape}, expected ({len(x)}, {size})."
             )
-        theta[:, part] = values - point[part]
+        values = np.broadcast_to(values - point[layout.now[part]], (len(x), size))
+        for ahead in reversed(range(max(layout.previews) + 1)):  # what came is what was foreseen
+            rows = np.minimum(np.arange(len(x)) + ahead, len(x) - 1)
+            theta[:, layout.sample(ahead)[part]] = values[rows]
     if layout.n_previous:
         first = point[layout.previous].copy()
         if given["previous"] is not None:

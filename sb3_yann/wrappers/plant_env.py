@@ -22,11 +22,11 @@ Slope = Callable[[Array, Array], ArrayLike]
 class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
     """The equations ``dx/dt = f(x, u)`` as an env in plant units.
 
-    The reward is minus the stage cost of the MPC. It shows the state, and the set-point and the
-    previous input where the MPC's theta has them. The inputs are held for a sample,
-    ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps`` equal steps.
-    ``reset(options={"state": x})`` begins in a state. Where the state is no longer finite an
-    episode terminates, in the last one that was, with ``info["violation"]``.
+    The reward is minus the stage cost of the MPC. It shows the state, and what else theta holds:
+    set-points and bounds that change, drawn at random, and the previous input. The inputs are held
+    for a sample, ``mpc.model.dt``, in which the classical Runge-Kutta method takes ``substeps``
+    equal steps. ``reset(options={"state": x})`` begins in a state. Where the state is no longer
+    finite an episode terminates, in the last one that was, with ``info["violation"]``.
 
     Parameters
     ----------
@@ -97,9 +97,13 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         check_int("substeps", substeps)
         env: Any = Equations(f, mpc, start, substeps)
         if layout.n_references:
-            env = SetPoint(env, mpc.tracking.r_min, mpc.tracking.r_max, hold=hold)
+            r = mpc.tracking
+            env = SetPoint(env, r.r_min, r.r_max, hold=hold, preview=r.preview)
         if observer is not None:
             env = ObserveDisturbance(env, observer, mpc.disturbances.d_min, mpc.disturbances.d_max)
+        if layout.bounds:
+            part = layout.limits
+            env = SetPoint(env, mpc.theta_min[part], mpc.theta_max[part], hold=hold)
         if layout.n_previous:
             env = PreviousInput(env, mpc.model.u_ss)
         limit = check_int("max_episode_steps", max_episode_steps)

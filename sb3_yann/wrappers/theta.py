@@ -130,6 +130,8 @@ class SetPoint(Appending):
         Steps after which another one is drawn. The default is one reference for each episode.
     schedule : callable, optional
         ``schedule(step) -> r`` replaces the random reference after so many steps of an episode.
+    preview : int, default 0
+        Appends the references of so many samples ahead as well, as `Tracking(preview=)` has them.
 
     Examples
     --------
@@ -148,8 +150,10 @@ class SetPoint(Appending):
         *,
         hold: int | None = None,
         schedule: Schedule | None = None,
+        preview: int = 0,
     ) -> None:
-        super().__init__(env, low, high)
+        self.preview = check_int("preview", preview, 0, "It counts samples ahead.")
+        super().__init__(env, *_repeated(low, high, preview + 1))
         if not np.all(np.isfinite([self.low, self.high])):
             raise ValueError(
                 f"low = {self.low.tolist()} and high = {self.high.tolist()} must be finite: "
@@ -159,6 +163,8 @@ class SetPoint(Appending):
             check_int("hold", hold, hint="It counts steps; None is one reference in each episode.")
         self.hold, self.schedule, self.steps = hold, schedule, 0
         self.reference: Array = np.zeros(len(self.low))
+        self._last: Array = self.reference
+        self._ahead = [self._last]
         self._own: np.random.Generator | None = None
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:
@@ -172,22 +178,37 @@ class SetPoint(Appending):
 
     def _observe(self, observation: Vector, u: Array | None, info: dict[str, Any]) -> Vector:
         self.steps = 0 if u is None else self.steps + 1
-        scheduled, held = self.schedule is not None, self.hold and self.steps % self.hold == 0
-        if u is None or scheduled or held:
-            self.reference = self._next()
+        if u is None:
+            self._ahead = []
+        else:
+            self._ahead.pop(0)
+        for step in range(self.steps + len(self._ahead), self.steps + self.preview + 1):
+            changes = (
+                step == 0 or self.schedule is not None or (self.hold and step % self.hold == 0)
+            )
+            self._last = self._next(step) if changes else self._last
+            self._ahead.append(self._last)
+        self.reference = np.concatenate(self._ahead)
         return joined(observation, self.reference)
 
-    def _next(self) -> Array:
+    def _next(self, step: int) -> Array:
+        p = len(self.low) // (self.preview + 1)
+        low, high = self.low[:p], self.high[:p]
         if self.schedule is None:
             generator = self.np_random if self._own is None else self._own
-            return np.asarray(generator.uniform(self.low, self.high))
-        r = np.atleast_1d(np.array(self.schedule(self.steps), np.float64))
-        if r.shape != self.low.shape or not np.all((self.low <= r) & (r <= self.high)):
+            return np.asarray(generator.uniform(low, high))
+        r = np.atleast_1d(np.array(self.schedule(step), np.float64))
+        if r.shape != low.shape or not np.all((low <= r) & (r <= high)):
             raise ValueError(
-                f"schedule({self.steps}) = {r.tolist()} must have shape {self.low.shape} and lie "
-                f"between low = {self.low.tolist()} and high = {self.high.tolist()}."
+                f"schedule({step}) = {r.tolist()} must have shape {low.shape} and lie "
+                f"between low = {low.tolist()} and high = {high.tolist()}."
             )
         return r
+
+
+def _repeated(low: ArrayLike, high: ArrayLike, count: int) -> tuple[Array, Array]:
+    low, high = (np.tile(np.array(side, np.float64, ndmin=1), count) for side in (low, high))
+    return low, high
 
 
 class MeasuredDisturbance(Appending):
@@ -203,6 +224,9 @@ class MeasuredDisturbance(Appending):
         The box of disturbances, ``d_min`` and ``d_max`` of the problem.
     key : str, default "disturbance"
         The entry of ``info``, after reset and after each step, that holds d.
+    preview : int, default 0
+        That entry holds the disturbances of so many samples ahead as well, (preview + 1, d), as
+        `DisturbanceBounds(preview=)` has them.
 
     Examples
     --------
@@ -215,8 +239,17 @@ class MeasuredDisturbance(Appending):
     0.25
     """
 
-    def __init__(self, env: Env, low: ArrayLike, high: ArrayLike, key: str = "disturbance") -> None:
-        super().__init__(env, low, high)
+    def __init__(
+        self,
+        env: Env,
+        low: ArrayLike,
+        high: ArrayLike,
+        key: str = "disturbance",
+        preview: int = 0,
+    ) -> None:
+        check_int("preview", preview, 0, "It counts samples ahead.")
+        super().__init__(env, *_repeated(low, high, preview + 1))
+        self.n_loads = len(self.low) // (preview + 1)
         if _below(env, ObserveDisturbance) is not None:
             raise ValueError(
                 "The env is in ObserveDisturbance already, whose observer would take the measured "
@@ -235,6 +268,8 @@ class MeasuredDisturbance(Appending):
                 "holds the measured disturbance as key."
             )
         d = np.atleast_1d(np.asarray(info[self.key], np.float64))
+        if d.ndim == 2 and d.shape[1] == self.n_loads:
+            d = d.ravel()
         if d.shape != self.low.shape:
             raise ValueError(f"info[{self.key!r}] has shape {d.shape}, expected {self.low.shape}.")
         failing = ~np.isfinite(d)
@@ -261,7 +296,7 @@ def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
 
 def _require_told(observer: DisturbanceObserver, measured: MeasuredDisturbance | None) -> None:
     """Raise unless an observer knows which disturbances the env measures, and comes after them."""
-    shown = 0 if measured is None else len(measured.low)
+    shown = 0 if measured is None else measured.n_loads
     model, told = observer.model, observer.n_known
     if shown != told:
         raise ValueError(
@@ -351,6 +386,6 @@ class ObserveDisturbance(Appending):
             x_hat, d_hat = observer.update(measured, u, self.load)
         if self.measured is not None:  # acts until the next sample
             told = observer.n_measured
-            self.load = self.measured.held - self.inner.theta_ss[told:]
+            self.load = self.measured.held[: observer.n_known] - self.inner.theta_ss[told:]
         x_hat, d_hat = np.split(self.outer.to_plant(np.append(x_hat, d_hat)), [len(x_hat)])
         return joined(x_hat, rest, np.clip(d_hat, self.low, self.high))

@@ -26,6 +26,63 @@ def as_horizon(value: int) -> int:
     return check_int("horizon", value)
 
 
+def as_control_horizon(
+    value: int | Sequence[int] | None, horizon: int
+) -> int | tuple[int, ...] | None:
+    """Return the number of samples in which inputs move, or the lengths of their blocks."""
+    if value is None:
+        return None
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
+        moves = check_int("control_horizon", value)
+        if moves > horizon:
+            raise ValueError(
+                f"control_horizon = {moves} must be at most the horizon, {horizon}: inputs move in "
+                "so many of its samples."
+            )
+        return moves
+    if isinstance(value, (str, bool)) or not isinstance(value, (Sequence, np.ndarray)):
+        raise TypeError(
+            f"control_horizon = {value!r} must be a number of samples, or a list of the lengths of "
+            "blocks."
+        )
+    blocks = tuple(check_int("control_horizon", each) for each in value)
+    if sum(blocks) != horizon:
+        raise ValueError(
+            f"The blocks control_horizon = {[*blocks]} make {sum(blocks)} samples, and the horizon "
+            f"is {horizon}: they must sum up to it."
+        )
+    return blocks
+
+
+def require_preview_within(model: LinearModel, horizon: int, reference: int, load: int) -> None:
+    """Raise where a preview is longer than the horizon, or nothing measures what it foresees."""
+    for name, ahead in (("Tracking", reference), ("DisturbanceBounds", load)):
+        if ahead > horizon:
+            raise ValueError(
+                f"{name}.preview = {ahead} must be at most the horizon, {horizon}: the law looks "
+                "no further."
+            )
+    measured = model.n_disturbances - len(model.estimated)
+    if load and sorted(model.estimated) != [*range(measured, model.n_disturbances)]:
+        raise ValueError(
+            f"estimated = {[*model.estimated]}: with a preview, theta holds the measured "
+            "disturbances before the estimated ones. Sort the columns of E so."
+        )
+    if load and not measured:
+        raise ValueError(
+            "DisturbanceBounds.preview is of measured disturbances, and all are estimated."
+        )
+
+
+def constant_box(layout: ThetaLayout, r: Bounds, d: Bounds) -> list[Bounds]:
+    """Return the boxes of r and d with their previews."""
+    loads = layout.n_disturbances - layout.n_estimated
+    ahead_r, ahead_d = layout.previews
+    found = [(np.tile(r[0], ahead_r + 1), np.tile(r[1], ahead_r + 1))]
+    low, high = (np.concatenate([np.tile(s[:loads], ahead_d + 1), s[loads:]]) for s in d)
+    return [*found, (low, high)]
+
+
 def as_softness(name: str, given: Array, bounds: Bounds) -> Array:
     """Return the unit of violation (size,) of soft bounds; one number is for all that are there."""
     size, bounded, units = len(bounds[0]), np.isfinite(bounds).any(axis=0), given

@@ -36,6 +36,8 @@ class Bounds:
         Where theta has the states.
     used : ndarray of bool, shape (n + q,)
         Which states and outputs these are.
+    moves : pair of ndarray, shape (k, n_theta)
+        How low and high change with theta, where they do at run time.
     """
 
     C: Array
@@ -46,6 +48,7 @@ class Bounds:
     of_states: NDArray[np.bool_]
     states: slice
     used: NDArray[np.bool_]
+    moves: tuple[Array, Array]
 
     @classmethod
     def of(cls, problem: MPCProblem, low: ArrayLike = -np.inf, high: ArrayLike = np.inf) -> Bounds:
@@ -62,6 +65,8 @@ class Bounds:
         highest = np.concatenate([np.minimum(problem.x_max, high), outputs.y_max])
         half = np.concatenate([size, np.abs(outputs.C) @ size])
         softness = np.concatenate([problem.soft.x, problem.soft.y])
+        of_x, of_y = problem.moved_by("x"), problem.moved_by("y")
+        moves = [np.vstack(each) for each in zip(of_x, of_y, strict=True)]
         used = np.isfinite(lowest) | np.isfinite(highest)
         return cls(
             C=C[used],
@@ -72,6 +77,7 @@ class Bounds:
             of_states=(np.arange(len(used)) < n)[used],
             states=problem.layout.state,
             used=used,
+            moves=(moves[0][used], moves[1][used]),
         )
 
     def beyond(self, thetas: Array, room: float = 0.0) -> Array:
@@ -80,12 +86,22 @@ class Bounds:
         Room and result are in half-widths; below a lower bound it is negative.
         """
         y = thetas[..., self.states] @ self.C.T
-        above = np.maximum((y - self.high) / self.half - room, 0)
-        return np.asarray(above - np.maximum((self.low - y) / self.half - room, 0))
+        low, high = self.low, self.high
+        if any(map(np.any, self.moves)):
+            low = low + thetas @ self.moves[0].T
+            high = high + thetas @ self.moves[1].T
+        above = np.maximum((y - high) / self.half - room, 0)
+        return np.asarray(above - np.maximum((low - y) / self.half - room, 0))
+
+
+def mixed_half(problem: MPCProblem) -> Array:
+    """Return what the rows (k,) of MixedBounds come to in half-widths of states and inputs."""
+    mixed, size = problem.mixed, problem.theta_half[problem.layout.state]
+    return np.asarray(np.abs(mixed.F) @ size + np.abs(mixed.G) @ problem.u_half)
 
 
 class BoundNames(NamedTuple):
-    """What the bounds of a problem are called: those of `Bounds`, the inputs', and their rates'.
+    """What the bounds of a problem are called: of `Bounds`, of inputs, of rates, and mixed ones.
 
     Attributes
     ----------
@@ -116,8 +132,12 @@ class BoundNames(NamedTuple):
         if problem.layout.n_previous:
             found += [(f"the change of {name} in a step", unit) for name, unit in of_inputs]
             half += [*problem.u_half]
-        called, measured = zip(*found, strict=True)
+        mixed = problem.mixed
         soft = np.append(bounds.softness > 0, np.zeros(len(half) - len(bounds.half), dtype=bool))
+        soft = np.append(soft, mixed.soft > 0)
+        found += [(f"mixed[{i}]", "") for i in range(len(mixed.F))]
+        half += [*mixed_half(problem)]
+        called, measured = zip(*found, strict=True)
         return cls(called, measured, tuple(map(float, half)), tuple(soft.tolist()))
 
     def in_words(self, worst: float, largest: float) -> str:
@@ -161,7 +181,7 @@ def bound_excess(
     taken: ArrayLike = True,
     bounds: Bounds | None = None,
 ) -> BoundExcess:
-    """Return by how much trajectories exceed the bounds of states, outputs, inputs and rates.
+    """Return by how much trajectories exceed the bounds of their problem, those of rates too.
 
     What is not finite exceeds by inf. The state that a trajectory begins in is nobody's doing.
 
@@ -187,14 +207,18 @@ def bound_excess(
     problem = problem.deviations
     bounds = Bounds.of(problem) if bounds is None else bounds
     with np.errstate(invalid="ignore", over="ignore"):
-        parts = [
-            np.abs(bounds.beyond(thetas[1:])),
-            np.maximum(inputs - problem.u_max, problem.u_min - inputs) / problem.u_half,
-        ]
+        parts = [np.abs(bounds.beyond(thetas[1:]))]
+        groups = [("u", inputs, problem.u_half)]
         if problem.layout.n_previous:
             moved = inputs - thetas[:-1][..., problem.layout.previous]
-            rate = problem.rate
-            parts.append(np.maximum(moved - rate.du_max, rate.du_min - moved) / problem.u_half)
+            groups.append(("du", moved, problem.u_half))
+        if len(problem.mixed.F):
+            x = thetas[:-1][..., problem.layout.state]
+            made = x @ problem.mixed.F.T + inputs @ problem.mixed.G.T
+            groups.append(("mixed", made, mixed_half(problem)))
+        for kind, values, half in groups:
+            low, high = problem.limits_at(kind, thetas[:-1])
+            parts.append(np.maximum(values - high, low - values) / half)
         over = np.concatenate(parts, axis=-1)
     counts = ~(over <= ROUNDING) & np.asarray(taken)[..., None]
     nothing = np.zeros(thetas.shape[1:-1])
@@ -202,13 +226,19 @@ def bound_excess(
         return BoundExcess(nothing, nothing, nothing, nothing, nothing - 1)
     over = np.where(counts, np.where(np.isnan(over), np.inf, over), 0.0)
     first = len(bounds.half)
-    hard = np.append(bounds.softness <= 0, np.ones(over.shape[-1] - first, dtype=bool))
+    count = over.shape[-1]
+    softness, half, own = np.zeros(count), np.ones(count), np.zeros((3, count), dtype=bool)
+    softness[:first], half[:first] = bounds.softness, bounds.half
+    own[0, :first], own[1, :first] = bounds.of_states, ~bounds.of_states
+    if len(problem.mixed.F):
+        last = np.arange(count - len(problem.mixed.F), count)
+        softness[last], half[last], own[2, last] = problem.mixed.soft, mixed_half(problem), True
+    hard = softness <= 0
     penalty = nothing
-    for part in (bounds.of_states, ~bounds.of_states):  # each of them shares a slack
-        soft = part & (bounds.softness > 0)
+    for part in own:  # each of them shares a slack
+        soft = part & ~hard
         if np.any(soft):
-            units = bounds.half[soft] / bounds.softness[soft]
-            s = np.max(over[..., :first][..., soft] * units, axis=-1)
+            s = np.max(over[..., soft] * (half[soft] / softness[soft]), axis=-1)
             penalty = penalty + problem.soft.penalty * np.sum(s + s**2, axis=0)
     of_any = np.max(over, axis=0)
     of_hard = np.where(hard, of_any, 0.0)

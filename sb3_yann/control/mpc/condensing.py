@@ -13,7 +13,6 @@ from sb3_yann._validation import Array
 from sb3_yann.control import lqr
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.model.labels import labels_of
-from sb3_yann.control.mpc._arguments import Bounds
 from sb3_yann.control.mpc.problem import MPCProblem
 
 GROWTH = 1e3
@@ -26,36 +25,41 @@ OFF = 1e-8
 
 
 class _Prediction:
-    """``theta_k = powers[k] theta + forced[k] V`` for k = 0 ... N, where ``u_k = K theta_k + v_k``.
+    """``theta_k = powers[k] theta + forced[k] V`` for k = 0 ... N.
 
-    ``feedback`` is K (m, n_theta). Without any the variables V are the inputs.
+    The input of a block that begins at step s is ``u = K theta_s + v``. ``feedback`` is K
+    (m, n_theta). Without any the variables V are the inputs.
     """
 
     def __init__(self, problem: MPCProblem, feedback: Array | None) -> None:
         A, B = problem.prediction
-        n, m, N = problem.n_theta, problem.model.n_inputs, problem.horizon
-        self.feedback = np.zeros((m, n)) if feedback is None else feedback
-        A = A + B @ self.feedback
+        n, m = problem.n_theta, problem.model.n_inputs
+        K = np.zeros((m, n)) if feedback is None else feedback
         self.powers: list[Array] = [np.eye(n)]
-        self.forced: list[Array] = [np.zeros((n, N * m))]
-        for k in range(N):
-            self.powers.append(A @ self.powers[-1])
-            reach = A @ self.forced[-1]
-            reach[:, k * m : (k + 1) * m] += B
-            self.forced.append(reach)
+        self.forced: list[Array] = [np.zeros((n, len(problem.blocks) * m))]
+        self.inputs: list[tuple[Array, Array]] = []  # rows of V and theta that make up u_k
+        self.previous = problem.layout.previous
+        for block, length in enumerate(problem.blocks):
+            rows = K @ self.forced[-1]
+            rows[:, block * m : (block + 1) * m] += np.eye(m)
+            held = rows, K @ self.powers[-1]
+            for _ in range(length):
+                self.inputs.append(held)
+                self.powers.append(A @ self.powers[-1] + B @ held[1])
+                self.forced.append(A @ self.forced[-1] + B @ held[0])
+        self.starts = np.cumsum((0, *problem.blocks[:-1]))
 
-    def inputs(self, k: int) -> tuple[Array, Array]:
-        """Return rows (m, N m) and (m, n_theta) for ``u_k = rows V + rows theta``."""
-        m = len(self.feedback)
-        rows = self.feedback @ self.forced[k]
-        rows[:, k * m : (k + 1) * m] += np.eye(m)
-        return rows, self.feedback @ self.powers[k]
+    def of(self, rows: Array, k: int) -> tuple[Array, Array]:
+        """Return what makes up ``rows theta_k``."""
+        return rows @ self.forced[k], rows @ self.powers[k]
 
-    def rate(self, problem: MPCProblem, k: int) -> tuple[Array, Array]:
-        """Return rows (m, N m) and (m, n_theta) for ``u_k - u_{k-1} = rows V + rows theta``."""
-        inputs, start = self.inputs(k)
-        before = problem.layout.previous
-        return inputs - self.forced[k][before], start - self.powers[k][before]
+    def rate(self, k: int) -> tuple[Array, Array]:
+        """Return what makes up ``u_k - u_{k-1}``."""
+        inputs, start = self.inputs[k]
+        return inputs - self.forced[k][self.previous], start - self.powers[k][self.previous]
+
+
+Limits = tuple[Array, Array, Array, Array]
 
 
 class _Rows:
@@ -83,12 +87,16 @@ class _Rows:
         self.names += [names] * len(w) if isinstance(names, str) else names
 
     def add_bounds(
-        self, names: Sequence[str], G: Array, bounds: Bounds, S: Array, *softness: Any
+        self, names: Sequence[str], made: tuple[Array, Array], limits: Limits, *softness: Any
     ) -> None:
-        """Add rows for ``low <= G U + S theta <= high``, with a name for each."""
+        """Add rows for ``low <= G U + S theta <= high``, with a name for each.
+
+        Limits are low and high, and how these change with theta.
+        """
         upper, lower = ([f"{name} at its {k} bound" for name in names] for k in ("upper", "lower"))
-        self.add(upper, G, bounds[1], -S, *softness)
-        self.add(lower, -G, -bounds[0], S, *softness)
+        (G, S), (low, high, low_moves, high_moves) = made, limits
+        self.add(upper, G, high, high_moves - S, *softness)
+        self.add(lower, -G, -low, S - low_moves, *softness)
 
     def stacked(self) -> tuple[Array, Array, Array, tuple[str, ...]]:
         """Return G, w, S and the names of the rows that bound something."""
@@ -146,7 +154,7 @@ def _stabilizing_feedback(problem: MPCProblem) -> Array:
     weights, where Q leaves a mode on the unit circle without one. Where no gain stabilizes, as a
     mode grows that no input reaches, it is the one whose loop grows least.
     """
-    errors, box = problem.error_system, problem.theta_half[problem.layout.state]
+    errors, box = problem.settled.error_system, problem.theta_half[problem.layout.state]
     model, gamma = errors.model, problem.gamma
     unit = np.concatenate([box, problem.u_half])[: len(errors.Q)] ** -2.0
     plain = np.diag(unit), np.diag(problem.u_half**-2.0), None
@@ -159,7 +167,8 @@ def _stabilizing_feedback(problem: MPCProblem) -> Array:
             P = lqr.riccati(model, Q, R, discount, cross)
             gains.append(lqr.gain(model, R, P, discount, cross))
     gain = min(reversed(gains), key=lambda K: lqr.spectral_radius(model.A - model.B @ K))
-    return np.asarray(errors.to_input - gain @ errors.to_error)
+    every = np.eye(problem.n_theta)
+    return np.asarray((errors.to_input - gain @ errors.to_error) @ every[problem.layout.settles])
 
 
 def _error(problem: MPCProblem, program: ParametricQP) -> float:
@@ -169,7 +178,7 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     as many times more is rounding. It is nan where the program has no unique minimum: the laws say
     so.
     """
-    errors, gamma = problem.error_system, problem.gamma
+    errors, gamma = problem.settled.error_system, problem.gamma
     A = errors.model.A
     B = errors.model.B
     P = problem.terminal.cost
@@ -177,7 +186,10 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     weight = np.block([[errors.Q, cross], [cross.T, errors.R]])
     count, m = len(program.c) - program.n_slacks, problem.model.n_inputs
     try:
-        for _ in range(problem.horizon):
+        for length in reversed(problem.blocks):
+            if length > 1:
+                gain, P = _held(A, B, weight, P, gamma, length)
+                continue
             gain = lqr.gain(errors.model, errors.R, P, gamma, errors.cross)
             # As a sum of squares: of a large terminal cost a difference would leave rounding.
             law = np.vstack([np.eye(len(A)), -gain])
@@ -190,82 +202,130 @@ def _error(problem: MPCProblem, program: ParametricQP) -> float:
     if program.feedback is not None:
         own = own + program.feedback
     exact = errors.to_input - gain @ errors.to_error
-    unit = problem.theta_half / problem.u_half[:, None]
+    own = own @ problem.layout.lift
+    unit = problem.settled.theta_half / problem.u_half[:, None]
     asked = max(1.0, float(np.abs(exact * unit).max()))
     return float(np.nan_to_num(np.abs(own - exact) * unit, nan=np.inf).max()) / asked
 
 
+def _held(
+    A: Array, B: Array, weight: Array, P: Array, gamma: float, length: int
+) -> tuple[Array, Array]:
+    """Return the gain of an input that is held, and the cost with it.
+
+    Parameters
+    ----------
+    A, B, weight, P : ndarray
+        The model, the stage cost ``[z; v]' weight [z; v]``, and the cost at the end.
+    gamma, length : float, and int
+        The discount, and for how many samples.
+    """
+    n, m = B.shape
+    step = np.block([[A, B], [np.zeros((m, n)), np.eye(m)]])
+    total = linalg.block_diag(P, np.zeros((m, m)))
+    for _ in range(length):
+        total = weight + gamma * step.T @ total @ step
+    gain = linalg.cho_solve(linalg.cho_factor(total[n:, n:]), total[n:, :n])
+    law = np.vstack([np.eye(n), -gain])
+    return gain, law.T @ total @ law
+
+
 def _condensed(problem: MPCProblem, feedback: Array | None) -> tuple[ParametricQP, tuple[str, ...]]:
-    """Return the program in ``v_k = u_k - feedback theta_k``, and what each row bounds."""
+    """Return the program in ``v = u - feedback theta`` of each block, and what each row bounds."""
     prediction = _Prediction(problem, feedback)
-    slacks = [kind for kind in "xy" if np.any(getattr(problem.soft, kind))]
-    H, F = _cost(problem, prediction)
-    G, w, S, names = _constraints(problem, prediction, slacks)
+    softness = {"x": problem.soft.x, "y": problem.soft.y, "mixed": problem.mixed.soft}
+    slacks = [kind for kind, units in softness.items() if np.any(units)]
+    H, F, c = _cost(problem, prediction)
+    G, w, S, names = _constraints(problem, prediction, slacks, softness)
     penalty, H = np.full(len(slacks), problem.soft.penalty), (H + H.T) / 2
-    c = np.concatenate([np.zeros(len(H)), penalty])
+    c = np.concatenate([c, penalty])
     if slacks:
         H = linalg.block_diag(H, np.diag(2 * penalty))
         F = np.vstack([F, np.zeros((len(slacks), problem.n_theta))])
     box = problem.theta_min, problem.theta_max
-    bounded = np.isfinite([problem.u_min, problem.u_max]).sum() * problem.horizon
+    bounded = np.isfinite([problem.u_min, problem.u_max]).sum() * len(problem.blocks)
     program = ParametricQP(
         H, F, c, G, w, S, *box, n_slacks=len(slacks), n_input_rows=int(bounded), feedback=feedback
     )
     return program, names
 
 
-def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array]:
-    """Return H and F of ``1/2 V'HV + (F theta)'V``, whence the factors 2."""
-    N, gamma, errors = problem.horizon, problem.gamma, problem.error_system
-    to_error, states = errors.to_error, errors.to_error[: problem.model.n_states]
-    size = N * problem.model.n_inputs
+def _cost(problem: MPCProblem, prediction: _Prediction) -> tuple[Array, Array, Array]:
+    """Return H, F and c of ``1/2 V'HV + (F theta + c)'V``, whence the factors 2."""
+    N, gamma, steady = problem.horizon, problem.gamma, problem.steady_states
+    layout, settled = problem.layout, problem.settled
+    every = np.eye(problem.n_theta)
+    state = every[layout.state]
+    to_input, states = steady.u @ every[layout.now], state - steady.x @ every[layout.now]
+    to_error = settled.error_system.to_error @ every[layout.settles]
+    price = problem.price
+    size = len(problem.blocks) * problem.model.n_inputs
     H: Array = np.zeros((size, size))
     F: Array = np.zeros((size, problem.n_theta))
+    c: Array = np.zeros(size)
     for k in range(N):
-        inputs, start = prediction.inputs(k)
+        inputs, start = prediction.inputs[k]
         weighted = 2 * gamma**k * inputs.T @ problem.R
-        H, F = H + weighted @ inputs, F + weighted @ (start - errors.to_input)
+        H, F = H + weighted @ inputs, F + weighted @ (start - to_input @ prediction.powers[k])
     for k in range(1, N + 1):
-        coordinates = to_error if k == N else states
         weight = gamma**k * (problem.terminal.cost if k == N else problem.Q)
-        forced, free = coordinates @ prediction.forced[k], coordinates @ prediction.powers[k]
+        forced, free = prediction.of(to_error if k == N else states, k)
         weighted = 2 * forced.T @ weight
         H, F = H + weighted @ forced, F + weighted @ free
-    if np.any(problem.rate.R_du):
-        for k in range(N):
-            inputs, start = prediction.rate(problem, k)
-            weighted = 2 * gamma**k * inputs.T @ problem.rate.R_du
-            H, F = H + weighted @ inputs, F + weighted @ start
-    return H, F
+    for k in prediction.starts if np.any(problem.rate.R_du) else ():
+        inputs, start = prediction.rate(k)
+        weighted = 2 * gamma**k * inputs.T @ problem.rate.R_du
+        H, F = H + weighted @ inputs, F + weighted @ start
+    for k in range(N) if price.counts else ():
+        spent = price.u @ prediction.inputs[k][0] + price.x @ (state @ prediction.forced[k])
+        c = c + gamma**k * spent
+    return H, F, c
 
 
 def _constraints(
-    problem: MPCProblem, prediction: _Prediction, slacks: list[str]
+    problem: MPCProblem,
+    prediction: _Prediction,
+    slacks: list[str],
+    softness: dict[str, Array],
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
-    n, m, N = problem.n_theta, problem.model.n_inputs, problem.horizon
+    N, blocks = problem.horizon, len(problem.blocks)
     rows = _Rows(slacks)
     called, inputs = labels_of(problem.model)
-    limits = np.tile(problem.u_min, N), np.tile(problem.u_max, N)
-    moved, free = (np.vstack(each) for each in zip(*map(prediction.inputs, range(N)), strict=True))
-    rows.add_bounds(inputs * N, moved, limits, free)
+    limits: dict[str, Limits] = {
+        kind: (*each, *problem.moved_by(kind)) for kind, each in problem.limits.items()
+    }
+    first = zip(*(prediction.inputs[k] for k in prediction.starts), strict=True)
+    moved, free = (np.vstack(each) for each in first)
+    low, high, low_moves, high_moves = limits["u"]
+    of_blocks = np.tile(low, blocks), np.tile(high, blocks)
+    moving = np.tile(low_moves, (blocks, 1)), np.tile(high_moves, (blocks, 1))
+    rows.add_bounds(inputs * blocks, (moved, free), (*of_blocks, *moving))
 
-    states, rate = slice(0, problem.model.n_states), problem.rate
-    x = problem.x_min, problem.x_max
+    state = np.eye(problem.n_theta)[problem.layout.state]
     for k in range(1, N + 1):
-        forced, powers = prediction.forced[k][states], prediction.powers[k][states]
-        rows.add_bounds(called, forced, x, powers, problem.soft.x, "x")
+        rows.add_bounds(called, prediction.of(state, k), limits["x"], softness["x"], "x")
     last, upper = problem.terminal.set
-    rows.add("the terminal set", last @ prediction.forced[N], upper, -last @ prediction.powers[N])
-    for k in range(N) if problem.layout.n_previous else ():
-        change, start = prediction.rate(problem, k)
-        rates = [f"the rate of {each}" for each in inputs]
-        rows.add_bounds(rates, change, (rate.du_min, rate.du_max), start)
-    C, y = problem.outputs.C, (problem.outputs.y_min, problem.outputs.y_max)
+    G, S = prediction.of(last, N)
+    rows.add("the terminal set", G, upper, -S)
+    for k in prediction.starts if problem.layout.n_previous else ():
+        rows.add_bounds(
+            [f"the rate of {each}" for each in inputs], prediction.rate(k), limits["du"]
+        )
+    C = problem.outputs.C @ state
     for k in range(1, N + 1) if len(C) else ():
-        forced, powers = prediction.forced[k][states], prediction.powers[k][states]
         outputs = [f"y[{i}]" for i in range(len(C))]
-        rows.add_bounds(outputs, C @ forced, y, C @ powers, problem.soft.y, "y")
+        rows.add_bounds(outputs, prediction.of(C, k), limits["y"], softness["y"], "y")
+    mixed = problem.mixed
+    for k, used in mixed.at_steps(N) if len(mixed.F) else ():
+        G, S = prediction.of((mixed.F @ state)[used], k)
+        if k < N:
+            inputs_k, start = prediction.inputs[k]
+            G, S = G + mixed.G[used] @ inputs_k, S + mixed.G[used] @ start
+        names = [f"mixed[{i}]" for i in np.flatnonzero(used)]
+        low, high, low_moves, high_moves = (each[used] for each in limits["mixed"])
+        own = low, high, low_moves, high_moves
+        rows.add_bounds(names, (G, S), own, softness["mixed"][used], "mixed")
     for kind in slacks:
-        none = np.zeros((1, N * m)), np.zeros(1), np.zeros((1, n))
+        none = np.zeros((1, moved.shape[1])), np.zeros(1), np.zeros((1, problem.n_theta))
         rows.add(f"no violation of the soft bounds of {kind}", *none, np.ones(1), kind)
     return rows.stacked()

@@ -17,8 +17,9 @@ from sb3_yann.control.mpc.theta_layout import ThetaLayout
 class ErrorSystem(ReadOnlyArrays):
     """The problem in ``z = to_error theta`` and ``v = u - to_input theta``: ``z+ = A z + B v``.
 
-    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate has a weight. The constant r and
-    d, modes on the unit circle that no Riccati equation without discount allows, are gone.
+    z is ``x - x_s``, followed by ``u_prev - u_s`` where the rate has a weight, and by what r and d
+    of a preview differ from the last of them, whose steady state x_s and u_s are. The constant r
+    and d, modes on the unit circle that no Riccati equation without discount allows, are gone.
 
     Attributes
     ----------
@@ -26,56 +27,76 @@ class ErrorSystem(ReadOnlyArrays):
     to_error : ndarray, shape (n_z, n_theta)
     to_input : ndarray, shape (m, n_theta)
         ``u_s = to_input theta``.
+    to_theta : ndarray, shape (n_theta, n_z)
+        To a theta with this z, whose last r and d are zero.
     Q : ndarray, shape (n_z, n_z)
     R : ndarray, shape (m, m)
     cross : ndarray, shape (n_z, m), or None
         The stage cost is ``z'Qz + 2 z' cross v + v'Rv``.
+    stage_matrix : ndarray, shape (n_theta + m, n_theta + m)
+        W: it is ``[theta; u]' W [theta; u]`` too.
     """
 
     model: LinearModel
     to_error: Array
     to_input: Array
+    to_theta: Array
     Q: Array
     R: Array
     cross: Array | None
-
-    @property
-    def stage_matrix(self) -> Array:
-        """W (n_theta + m, n_theta + m): the stage cost is ``[theta; u]' W [theta; u]``."""
-        weight = linalg.block_diag(self.Q, self.R)
-        if self.cross is not None:
-            k = len(self.Q)
-            weight[:k, k:], weight[k:, :k] = self.cross, self.cross.T
-        zeros, eye = np.zeros((len(self.to_error), len(self.R))), np.eye(len(self.R))
-        coordinates = np.block([[self.to_error, zeros], [-self.to_input, eye]])
-        return np.asarray(coordinates.T @ weight @ coordinates)
+    stage_matrix: Array
 
 
 def error_system(
-    model: LinearModel, layout: ThetaLayout, steady: SteadyStates, Q: Array, R: Array, R_du: Array
+    model: LinearModel,
+    layout: ThetaLayout,
+    steady: SteadyStates,
+    prediction: tuple[Array, Array],
+    weights: tuple[Array, Array, Array],
 ) -> ErrorSystem:
     """Return the coordinates of a problem with weights Q (n, n), R (m, m) and R_du (m, m).
 
     The stage cost is ``e'Qe + v'Rv + (u - u_prev)'R_du(u - u_prev)``, with ``e = x - x_s`` and
-    ``v = u - u_s``.
+    ``v = u - u_s`` of the present r and d.
 
     Parameters
     ----------
-    model, layout, steady, Q, R, R_du : LinearModel, ThetaLayout, SteadyStates, ndarray
+    model, layout, steady, prediction : LinearModel, ThetaLayout, SteadyStates, pair of ndarray
         Of the problem.
+    weights : tuple of ndarray
+        Q, R and R_du.
     """
     n, m = model.B.shape
-    to_error, to_input = np.zeros((n, layout.size)), np.zeros((m, layout.size))
-    to_error[:, layout.state] = np.eye(n)
-    to_error[:, layout.constant] = -steady.x
-    to_input[:, layout.constant] = steady.u
-    if not np.any(R_du):
-        plain = LinearModel(model.A, model.B, model.dt)
-        return ErrorSystem(plain, to_error, to_input, Q, R, None)
-    # v_prev+ = v, and (v - v_prev)'R_du(v - v_prev) couples the two
-    previous = -to_input
-    previous[:, layout.previous] = np.eye(m)
-    A, B = linalg.block_diag(model.A, np.zeros((m, m))), np.vstack([model.B, np.eye(m)])
-    weights = linalg.block_diag(Q, R_du), R + R_du, np.vstack([np.zeros((n, m)), -R_du])
-    to_z = np.vstack([to_error, previous])
-    return ErrorSystem(LinearModel(A, B, model.dt), to_z, to_input, *weights)
+    every = np.eye(layout.size)
+    x, previous = every[layout.state], every[layout.previous]
+    is_rated = bool(np.any(weights[2]))
+    from_now = np.block([[x - steady.x @ every[layout.now], np.zeros((n, m))],
+                         [-steady.u @ every[layout.now], np.eye(m)]])  # fmt: skip
+    if is_rated:
+        from_now = np.vstack([from_now, np.hstack([-previous, np.eye(m)])])
+    weight = linalg.block_diag(*weights[: 2 + is_rated])
+    W = from_now.T @ weight @ from_now
+
+    to_input = steady.u @ every[layout.last]
+    changes = np.flatnonzero(layout.next != np.arange(layout.size))
+    final = layout.lift @ every[layout.settles]  # all r and d are the last ones
+    to_error = [x - steady.x @ every[layout.last]]
+    to_theta = [x]
+    if is_rated:
+        to_error.append(previous - to_input)
+        to_theta.append(previous)
+    to_error.append((every - final)[changes])
+    to_theta.append(every[changes])
+    E, T = np.vstack(to_error), np.vstack(to_theta).T
+    A, B = prediction
+    cross = T.T @ W[: layout.size, layout.size :]
+    return ErrorSystem(
+        model=LinearModel(E @ A @ T, E @ B, model.dt),
+        to_error=E,
+        to_input=to_input,
+        to_theta=T,
+        Q=T.T @ W[: layout.size, : layout.size] @ T,
+        R=W[layout.size :, layout.size :],
+        cross=cross if np.any(cross) else None,
+        stage_matrix=W,
+    )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann import _validation as check
 from sb3_yann._validation import (
@@ -44,6 +44,10 @@ def _bounds(name: str, lower: Given, upper: Given, size: int, missing: str) -> B
     return check_bounds(name, low, high, size)
 
 
+def _preview(name: str, value: int) -> int:
+    return check.check_int(f"{name}.preview", value, 0, "It counts samples ahead.")
+
+
 def _outputs(name: str, C: Outputs, symbol: str, lower: Given, upper: Given) -> dict[str, Array]:
     """Return the fields of a group of outputs ``C x`` with bounds."""
     rows = check.check_output_rows(name, C)
@@ -61,6 +65,9 @@ class Tracking(ReadOnlyArrays):
         The matrix of the tracked outputs, or the indices of the tracked states.
     r_min, r_max : array_like, shape (p,), or float, optional
         The box of references. The explicit law needs it bounded.
+    preview : int, default 0
+        How many samples ahead the reference is known. Theta holds it for the present sample and for
+        each of these; the last one stays.
 
     Examples
     --------
@@ -71,13 +78,18 @@ class Tracking(ReadOnlyArrays):
     C: Array
     r_min: Array
     r_max: Array
+    preview: int = 0
 
-    def __init__(self, C: Outputs = (), r_min: Given = None, r_max: Given = None) -> None:
-        self._store(**_outputs("Tracking.C", C, "r", r_min, r_max))
+    def __init__(
+        self, C: Outputs = (), r_min: Given = None, r_max: Given = None, preview: int = 0
+    ) -> None:
+        ahead = _preview("Tracking", preview)
+        self._store(**_outputs("Tracking.C", C, "r", r_min, r_max), preview=ahead)
 
     def sized(self, n_states: int) -> Tracking:
         """Return it with C as a matrix (p, n)."""
-        return Tracking(check.check_outputs("Tracking.C", self.C, n_states), self.r_min, self.r_max)
+        C = check.check_outputs("Tracking.C", self.C, n_states)
+        return Tracking(C, self.r_min, self.r_max, self.preview if len(C) else 0)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -118,6 +130,8 @@ class DisturbanceBounds(ReadOnlyArrays):
     ----------
     d_min, d_max : array_like, shape (d,), or float, optional
         The explicit law needs both finite.
+    preview : int, default 0
+        How many samples ahead the measured disturbances are known, as of :class:`Tracking`.
 
     Examples
     --------
@@ -127,15 +141,16 @@ class DisturbanceBounds(ReadOnlyArrays):
 
     d_min: Array
     d_max: Array
+    preview: int = 0
 
-    def __init__(self, d_min: Given = None, d_max: Given = None) -> None:
+    def __init__(self, d_min: Given = None, d_max: Given = None, preview: int = 0) -> None:
         low, high = _loose("d", d_min, d_max)
-        self._store(d_min=low, d_max=high)
+        self._store(d_min=low, d_max=high, preview=_preview("DisturbanceBounds", preview))
 
     def sized(self, n_disturbances: int) -> DisturbanceBounds:
         """Return it with bounds of shape (d,)."""
         bounds = _bounds("d", self.d_min, self.d_max, n_disturbances, "E of the model")
-        return DisturbanceBounds(*bounds)
+        return DisturbanceBounds(*bounds, self.preview if n_disturbances else 0)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -220,17 +235,209 @@ class SoftBounds(ReadOnlyArrays):
                     "unit, 0 where the bound is hard: no entry may be negative."
                 )
         soft = any(np.any(unit) for unit in units.values())
-        if penalty and not soft:
-            raise ValueError(f"SoftBounds.penalty = {penalty!r}, but nothing is soft: pass x or y.")
-        cost = 0.0 if not soft else None
-        if soft and penalty is not None:
-            cost = check.check_positive("SoftBounds.penalty", penalty)
-        self._store(**units, penalty=cost)
+        if penalty is not None and (soft or penalty):
+            penalty = check.check_positive("SoftBounds.penalty", penalty)
+        elif not soft:
+            penalty = 0.0
+        self._store(**units, penalty=penalty)
 
-    def sized(self, x: Bounds, y: Bounds) -> SoftBounds:
-        """Return it with an entry for each bound of the states and of the outputs."""
+    def sized(self, x: Bounds, y: Bounds, mixed: Array) -> SoftBounds:
+        """Return it with an entry for each bound of the states and of the outputs.
+
+        ``mixed`` are the units of :class:`MixedBounds`, which have the same penalty.
+        """
         units = as_softness("SoftBounds.x", self.x, x), as_softness("SoftBounds.y", self.y, y)
-        return SoftBounds(*units, self.penalty or None)
+        soft = any(np.any(unit) for unit in (*units, mixed))
+        if self.penalty and not soft:
+            raise ValueError(
+                f"SoftBounds.penalty = {self.penalty!r}, but nothing is soft: pass x or y, or "
+                "MixedBounds(soft=...)."
+            )
+        found = SoftBounds(*units, self.penalty or None)
+        if soft and not self.penalty:
+            found._store(penalty=None)  # the problem chooses it
+        return found
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class MixedBounds(ReadOnlyArrays):
+    """Bounds of combinations, ``low <= F x + G u <= high``, each row at every sample.
+
+    A row with inputs holds for x_k and u_k, k = 0 ... N-1; one of states alone for k = 1 ... N.
+
+    Parameters
+    ----------
+    F, G : array_like, shapes (k, n) and (k, m), optional
+        Zeros where left out.
+    low, high : array_like, shape (k,), or float, optional
+    soft : array_like, shape (k,), or float, default 0
+        The violation that counts as one unit, 0 where the bound is hard. Soft ones share a slack
+        over the horizon, at the penalty of :class:`SoftBounds`.
+
+    Examples
+    --------
+    >>> MixedBounds(G=[[1, 1]], high=1.5).sized(3, 2).F
+    array([[0., 0., 0.]])
+    """
+
+    F: Array
+    G: Array
+    low: Array
+    high: Array
+    soft: Array
+
+    def __init__(
+        self,
+        F: Given = None,
+        G: Given = None,
+        low: Given = None,
+        high: Given = None,
+        soft: ArrayLike = 0.0,
+    ) -> None:
+        parts = {}
+        for name, given in (("F", F), ("G", G)):
+            value = to_float(f"MixedBounds.{name}", np.zeros((0, 0)) if given is None else given)
+            parts[name] = check_array(f"MixedBounds.{name}", np.atleast_2d(value), ("k", "columns"))
+        lower, upper = _loose("MixedBounds", low, high)
+        units = to_float("MixedBounds.soft", soft)
+        if np.any(units < 0):
+            raise ValueError(f"MixedBounds.soft = {units.tolist()}: no entry may be negative.")
+        self._store(**parts, low=lower, high=upper, soft=units)
+
+    def sized(self, n_states: int, n_inputs: int) -> MixedBounds:
+        """Return it with F (k, n), G (k, m) and bounds and units of shape (k,)."""
+        count = max(len(self.F), len(self.G))
+        sides = zip(("F", "G"), (self.F, self.G), (n_states, n_inputs), strict=True)
+        F, G = (
+            check_array(f"MixedBounds.{name}", M, (count, size)) if len(M) else
+            np.zeros((count, size)) for name, M, size in sides
+        )  # fmt: skip
+        low, high = _bounds("MixedBounds", self.low, self.high, count, "row in F or G")
+        for k in np.flatnonzero(~np.any(np.hstack([F, G]), axis=1)):
+            raise ValueError(f"Row {k} of MixedBounds is zero in F and G: it bounds nothing.")
+        units = as_softness("MixedBounds.soft", self.soft, (low, high)) if count else self.soft
+        return MixedBounds(F, G, low, high, np.ravel(units)[:count])
+
+    def at_steps(self, horizon: int) -> list[tuple[int, NDArray[np.bool_]]]:
+        """Return which rows (k,) hold at which step, 0 ... N."""
+        acting = np.any(self.G, axis=1)
+        masks = {0: acting, horizon: ~acting}
+        return [(k, masks.get(k, np.ones_like(acting))) for k in range(horizon + 1)]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class LinearCost(ReadOnlyArrays):
+    """Prices in the stage cost, ``x' p + u' q`` of states and inputs as the plant shows them.
+
+    With a price the law need not rest at the operating point, and costs may be negative. The
+    terminal cost has none.
+
+    Parameters
+    ----------
+    x, u : array_like, shapes (n,) and (m,), or float, default 0
+        What a unit of each costs in a sample; negative where it earns.
+    constant : float, default 0
+        Added to each sample.
+
+    Examples
+    --------
+    >>> LinearCost(u=[0.5, 0]).sized(3, 2).x
+    array([0., 0., 0.])
+    """
+
+    x: Array
+    u: Array
+    constant: float
+
+    def __init__(self, x: ArrayLike = 0.0, u: ArrayLike = 0.0, constant: float = 0.0) -> None:
+        prices = {"x": to_float("LinearCost.x", x), "u": to_float("LinearCost.u", u)}
+        self._store(**prices, constant=check.check_number("LinearCost.constant", constant))
+
+    @property
+    def counts(self) -> bool:
+        """Whether anything has a price."""
+        return bool(np.any(self.x) or np.any(self.u) or self.constant)
+
+    def sized(self, n_states: int, n_inputs: int) -> LinearCost:
+        """Return it with prices of shapes (n,) and (m,)."""
+        sizes = ("x", self.x, n_states), ("u", self.u, n_inputs)
+        x, u = (
+            check_array(f"LinearCost.{name}", np.full(size, p) if p.ndim == 0 else p, (size,))
+            for name, p, size in sizes
+        )
+        return LinearCost(x, u, self.constant)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class ParametricBounds(ReadOnlyArrays):
+    """Bounds that change at run time and are entries of theta.
+
+    Parameters
+    ----------
+    names : sequence of str
+        "u_max" for all entries that are bounded, or "u_max[0]" for one; likewise x, y, du and
+        "_min". Those of MixedBounds are "mixed_min" and "mixed_max".
+    rest : array_like, shape (b,), optional
+        Their values in the problem, which are their widest.
+
+    Examples
+    --------
+    >>> ParametricBounds(["u_max"]).sized({"u": (np.zeros(2), np.ones(2))}).names
+    ('u_max[0]', 'u_max[1]')
+    """
+
+    names: tuple[str, ...]
+    rest: Array
+
+    def __init__(self, names: Sequence[str] = (), rest: Given = None) -> None:
+        if isinstance(names, str) or not all(isinstance(each, str) for each in names):
+            raise TypeError(f"parametric_bounds = {names!r} must be a list such as ['u_max'].")
+        self._store(
+            names=tuple(names), rest=np.zeros(0) if rest is None else to_float("rest", rest)
+        )
+
+    def sized(self, limits: Mapping[str, Bounds]) -> ParametricBounds:
+        """Return one entry for each bound, from the bounds of a problem by "x", "u", ..."""
+        found: dict[str, float] = {}
+        for given in self.names:
+            name, _, index = given.partition("[")
+            kind, _, side = name.rpartition("_")
+            if kind not in limits or side not in ("min", "max"):
+                known = ", ".join(f"{each}_min, {each}_max" for each in limits)
+                raise ValueError(f"parametric_bounds has {given!r}; known are {known}.")
+            values = limits[kind][side == "max"]
+            bounded = [f"{i}]" for i in np.flatnonzero(np.isfinite(values))]
+            chosen = [index] if index else bounded
+            if not chosen or not set(chosen) <= set(bounded):
+                raise ValueError(
+                    f"parametric_bounds has {given!r}, but {name} = {values.tolist()} is no bound "
+                    "there: give it its widest value."
+                )
+            found |= {f"{name}[{i}": float(values[int(i[:-1])]) for i in chosen}
+        return ParametricBounds([*found], [*found.values()])
+
+    def box(self, limits: Mapping[str, Bounds]) -> Bounds:
+        """Return how far each may move in: to the other side, a rate's to zero."""
+        sides = []
+        for name, rest in zip(self.names, self.rest, strict=True):
+            kind, i, upper = self.entry(name)
+            other = 0.0 if kind == "du" else float(limits[kind][not upper][i])
+            if not np.isfinite(other):
+                raise ValueError(
+                    f"parametric_bounds has {name!r}, but nothing says how far it moves in: give "
+                    f"{name.replace('max', 'min') if upper else name.replace('min', 'max')} a "
+                    "finite value."
+                )
+            sides.append(sorted((other, float(rest))))
+        low, high = np.array(sides, dtype=np.float64).reshape(-1, 2).T
+        return low, high
+
+    @staticmethod
+    def entry(name: str) -> tuple[str, int, bool]:
+        """Return the kind, the index, and whether it is an upper bound, of such as "u_max[0]"."""
+        side, _, index = name[:-1].partition("[")
+        kind, _, which = side.rpartition("_")
+        return kind, int(index), which == "max"
 
 
 @dataclass(frozen=True, eq=False, init=False)

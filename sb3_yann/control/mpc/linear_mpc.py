@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,13 +23,16 @@ from sb3_yann.control.model.identify import Identified
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc import _arguments as arguments
 from sb3_yann.control.mpc import reachability, simulation
-from sb3_yann.control.mpc import value as quadratic_value
+from sb3_yann.control.mpc import value as near_rest
 from sb3_yann.control.mpc._arguments import Given
 from sb3_yann.control.mpc.choice import LAWS, Law, choose
 from sb3_yann.control.mpc.condensing import condense
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
+    LinearCost,
+    MixedBounds,
     OutputBounds,
+    ParametricBounds,
     RateLimits,
     SoftBounds,
     Terminal,
@@ -38,6 +42,7 @@ from sb3_yann.control.mpc.misread_bounds import Range, warn_of_misread_bounds
 from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
 from sb3_yann.control.mpc.terminal_set import invariant_set
+from sb3_yann.control.mpc.value import Value
 from sb3_yann.control.online import OnlineLaw
 from sb3_yann.units import warn_of_absolute
 
@@ -53,16 +58,17 @@ class LinearMPC(MPCProblem):
 
     .. math::
         \min_{u_0 \ldots u_{N-1}} \sum_{k=0}^{N-1} \gamma^k (e_k' Q e_k + v_k' R v_k
-            + \Delta u_k' R_{du} \Delta u_k) + \gamma^N z_N' P z_N,
-            \quad x_{k+1} = A x_k + B u_k + E d
+            + \Delta u_k' R_{du} \Delta u_k + p' x_k + q' u_k) + \gamma^N z_N' P z_N,
+            \quad x_{k+1} = A x_k + B u_k + E d_k
 
     ``e = x - x_s`` and ``v = u - u_s`` are distances from the steady state of the reference r and
     the disturbance d, ``z = e``, or ``[e; u_prev - u_s]`` with a weight R_du. Bounds hold for u_k
     and ``delta u_k = u_k - u_{k-1}``, k = 0 ... N-1, and for x_k and the outputs, k = 1 ... N.
 
-    The parameter of the law is ``theta = [x, r, d, u_prev]``, with the parts that the problem uses
-    (:attr:`layout`): r with ``tracking``, d where the model has an E, ``u_prev`` with a bound or a
-    weight on the rate. r and d are constant over the horizon.
+    The parameter of the law is ``theta = [x, r, d, bounds, u_prev]``, with the parts that the
+    problem uses (:attr:`layout`): r with ``tracking``, d where the model has an E, bounds that
+    change at run time, ``u_prev`` with a bound or a weight on the rate. r and d are constant over
+    the horizon, but for what a preview tells; e and v count from the steady state of each sample.
 
     The formula is one of deviations from the model's operating point. Bounds, theta and inputs are
     what the plant shows and takes, at every method; of a model without an operating point they are
@@ -106,6 +112,16 @@ class LinearMPC(MPCProblem):
         Which bounds may be broken. The penalty is no part of :meth:`stage_cost`.
     terminal : Terminal, optional
         The terminal cost, by default the Riccati solution, and the terminal set.
+    mixed : MixedBounds, optional
+        Bounds of combinations of states and inputs.
+    price : LinearCost, optional
+        Linear terms p and q of the stage cost.
+    parametric_bounds : list of str, optional
+        Bounds that change at run time, such as ["u_max"]: they join theta. The problem's own are
+        the widest, and each may move in to the other side.
+    control_horizon : int or sequence of int, optional
+        The number of samples in which the inputs move, before they stay; or for how many samples
+        each move is held, which sum up to the horizon. The default is each sample.
     absolute : bool, optional
         Does nothing, and is deprecated: the model's operating point tells.
 
@@ -144,6 +160,10 @@ class LinearMPC(MPCProblem):
         outputs: OutputBounds | None = None,
         soft: SoftBounds | None = None,
         terminal: Terminal | None = None,
+        mixed: MixedBounds | None = None,
+        price: LinearCost | None = None,
+        parametric_bounds: ParametricBounds | Sequence[str] = (),
+        control_horizon: int | Sequence[int] | None = None,
         absolute: bool | None = None,
     ) -> None:
         if isinstance(model, Identified):
@@ -160,10 +180,25 @@ class LinearMPC(MPCProblem):
         d = _as_group("disturbances", disturbances, DisturbanceBounds).sized(model.n_disturbances)
         rate = _as_group("rate", rate, RateLimits).sized(m)
         outputs = _as_group("outputs", outputs, OutputBounds).sized(n)
-        soft = _as_group("soft", soft, SoftBounds).sized(x, (outputs.y_min, outputs.y_max))
+        mixed = _as_group("mixed", mixed, MixedBounds).sized(n, m)
+        y, du = (outputs.y_min, outputs.y_max), (rate.du_min, rate.du_max)
+        soft = _as_group("soft", soft, SoftBounds).sized(x, y, mixed.soft)
+        price = _as_group("price", price, LinearCost).sized(n, m)
         terminal = _as_group("terminal", terminal, Terminal)
-        layout = layout_of(model, tracking, rate)
-        rest = [(tracking.r_min, tracking.r_max), (d.d_min, d.d_max)]
+        if not isinstance(parametric_bounds, ParametricBounds):
+            parametric_bounds = ParametricBounds(parametric_bounds)
+        limits = {"x": x, "u": u, "y": y, "du": du, "mixed": (mixed.low, mixed.high)}
+        parametric_bounds = parametric_bounds.sized(limits)
+        extra: dict[str, Any] = {
+            "mixed": mixed,
+            "price": price,
+            "parametric_bounds": parametric_bounds,
+            "control_horizon": arguments.as_control_horizon(control_horizon, horizon),
+        }
+        arguments.require_preview_within(model, horizon, tracking.preview, d.preview)
+        layout = layout_of(model, tracking, rate, d.preview, parametric_bounds.names)
+        rest = arguments.constant_box(layout, (tracking.r_min, tracking.r_max), (d.d_min, d.d_max))
+        rest += [parametric_bounds.box(limits)]
         rest += [u] if layout.n_previous else []
         fallback = arguments.softened_box(x, soft.x)
         theta = arguments.theta_box(layout, (theta_min, theta_max), fallback, rest)
@@ -181,11 +216,11 @@ class LinearMPC(MPCProblem):
             model, Q, R, horizon, *x, *u, *theta, gamma, infeasible,
             tracking, d, rate, outputs, soft,
         )  # fmt: skip
-        completed = _completed(MPCProblem(*checked, terminal))
+        completed = _completed(MPCProblem(*checked, terminal, **extra))
         if soft.penalty is None:
-            penalty = _default_penalty(MPCProblem(*checked, completed).deviations)
-            checked = (*checked[:-1], replace(soft, penalty=penalty))
-        super().__init__(*checked, completed)
+            unfinished = MPCProblem(*checked, completed, **extra)
+            soft._store(penalty=_default_penalty(unfinished.deviations))
+        super().__init__(*checked, completed, **extra)
         if not np.any(model.B):
             raise ValueError(
                 "B of the model is zero: no input does anything, so there is nothing to control. "
@@ -275,6 +310,10 @@ class LinearMPC(MPCProblem):
         cost = np.sum((z @ errors.Q) * z, axis=-1) + np.sum((v @ errors.R) * v, axis=-1)
         if errors.cross is not None:
             cost = cost + 2 * np.sum((z @ errors.cross) * v, axis=-1)
+        if self.price.counts:
+            price = self.deviations.price
+            v = v + at @ errors.to_input.T
+            cost = cost + at[..., self.layout.state] @ price.x + v @ price.u + price.constant
         return np.asarray(cost)
 
     def value_matrix(self, gamma: float) -> Array:
@@ -282,23 +321,36 @@ class LinearMPC(MPCProblem):
 
         Theta stands for deviations. It is exact for any ``gamma``, while the linear plant stays in
         the region of the law that holds the origin and r and d are constant; where both discounts
-        agree, no cost is smaller.
+        agree, no cost is smaller. With a price it is a part of :meth:`value_terms`.
 
         Raises
         ------
         ValueError
             If the law is unstable under this discount, or does not rest at the origin.
         """
+        return self.value_terms(gamma).P
+
+    def value_terms(self, gamma: float) -> Value:
+        """Return P, slope and constant: the cost is ``theta' P theta + slope' theta + constant``.
+
+        Theta stands for deviations. Without a price there is P alone. With one it holds in the
+        region in which the model rests under the law, and needs a gamma below 1.
+        """
         gamma = check.check_discount(gamma)  # before the law, which may take long
-        return quadratic_value.value_matrix(self.deviations, self.law(), gamma)
+        return near_rest.value(self.deviations, self.law(), gamma)
 
     def state_action_matrix(self, gamma: float) -> Array:
         """Return M (n_theta + m, n_theta + m): ``[theta; u]' M [theta; u]`` is the cost of u now.
 
-        The law follows. It holds where :meth:`value_matrix` does, and raises its errors.
+        The law follows. It holds where :meth:`value_matrix` does, and raises its errors. A price
+        adds to it.
         """
+        return self.state_action_terms(gamma).P
+
+    def state_action_terms(self, gamma: float) -> Value:
+        """Return the terms of the same cost of ``[theta; u]``, as :meth:`value_terms` does."""
         gamma = check.check_discount(gamma)
-        return quadratic_value.state_action_matrix(self.deviations, self.law(), gamma)
+        return near_rest.state_action_value(self.deviations, self.law(), gamma)
 
     def explicit(
         self,
@@ -399,7 +451,7 @@ def _completed(problem: MPCProblem) -> Terminal:
 
     The set is in the units of the problem.
     """
-    errors = problem.error_system
+    errors = problem.settled.error_system
     cost: Any = problem.terminal.cost
     half_spaces: Any = problem.terminal.set
     if cost is None:
@@ -413,7 +465,8 @@ def _completed(problem: MPCProblem) -> Terminal:
     if np.shape(cost) == np.shape(errors.Q):
         _require_weighted_inputs(problem, cost)
     if isinstance(half_spaces, str):
-        F, g = invariant_set(problem.deviations, cost)
+        F, g = invariant_set(problem.deviations.settled, cost)
+        F = F @ np.eye(problem.n_theta)[problem.layout.settles]
         half_spaces = F, g + F @ problem.theta_ss
     n, size = problem.model.n_states, problem.n_theta
     F, g = half_spaces or (np.zeros((0, size)), np.zeros(0))
@@ -424,7 +477,7 @@ def _completed(problem: MPCProblem) -> Terminal:
 
 def _require_weighted_inputs(problem: MPCProblem, cost: Array | None = None) -> None:
     """Raise where an input costs nothing: not itself, not by its rate, not by what it moves."""
-    errors = problem.error_system
+    errors = problem.settled.error_system
     if np.linalg.eigvalsh(problem.R)[0] > 0:
         return  # where rounding hides it, the laws say so
     B = errors.model.B
@@ -454,9 +507,10 @@ def _default_penalty(problem: MPCProblem) -> float:
     u = np.where(np.isfinite(limits), limits, 0.0).max(axis=0)
     cost = problem.terminal.cost[:n, :n]
     total = x @ (np.abs(problem.Q) + np.abs(cost)) @ x + u @ np.abs(problem.R) @ u
-    y = np.abs([problem.outputs.y_min, problem.outputs.y_max])
-    y = np.where(np.isfinite(y), y, 0.0).max(axis=0)
-    units = [(problem.soft.x, x), (problem.soft.y, y)]
+    total += problem.horizon * (np.abs(problem.price.x) @ x + np.abs(problem.price.u) @ u)
+    sides = [np.abs(problem.limits[kind]) for kind in ("y", "mixed")]
+    y, mixed = (np.where(np.isfinite(each), each, 0.0).max(axis=0) for each in sides)
+    units = [(problem.soft.x, x), (problem.soft.y, y), (problem.mixed.soft, mixed)]
     parts = [unit[size > 0] / size[size > 0] for unit, size in units]
     wide = max(1.0, *(float(part.max(initial=0.0)) for part in parts))
     if not total > 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,10 @@ from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.error_coordinates import ErrorSystem, error_system
 from sb3_yann.control.mpc.groups import (
     DisturbanceBounds,
+    LinearCost,
+    MixedBounds,
     OutputBounds,
+    ParametricBounds,
     RateLimits,
     SoftBounds,
     Terminal,
@@ -42,8 +45,9 @@ class MPCProblem(ReadOnlyArrays):
     horizon, gamma, infeasible : int, float and str
     x_min, x_max, u_min, u_max, theta_min, theta_max : ndarray, shapes (n,), (m,) and (n_theta,)
         Infinite where there is no bound.
-    tracking, disturbances, rate, outputs, soft, terminal : Tracking, DisturbanceBounds, ...
-        Never None, and in the sizes of the model.
+    tracking, disturbances, rate, outputs, soft, terminal, mixed, price, parametric_bounds
+        Groups such as `Tracking`, never None, and in the sizes of the model.
+    control_horizon : int, tuple of int or None
 
     All of it is in plant units where the model has an operating point, and in the model's own
     coordinates where it has none.
@@ -67,9 +71,21 @@ class MPCProblem(ReadOnlyArrays):
     outputs: OutputBounds
     soft: SoftBounds
     terminal: Terminal
+    mixed: MixedBounds = field(default_factory=MixedBounds)
+    price: LinearCost = field(default_factory=LinearCost)
+    parametric_bounds: ParametricBounds = field(default_factory=ParametricBounds)
+    control_horizon: int | tuple[int, ...] | None = None
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or a pickle; one of 0.1 is in deviations, whatever its model says."""
+        if "mixed" not in state:  # groups of later versions
+            model = state["model"]
+            state = {
+                "mixed": MixedBounds().sized(model.n_states, model.n_inputs),
+                "price": LinearCost().sized(model.n_states, model.n_inputs),
+                "parametric_bounds": ParametricBounds(),
+                **{name: value for name, value in state.items() if name != "layout"},
+            }
         if "absolute" in state:
             model = state["model"].about_zero()
             state = {name: value for name, value in state.items() if name not in OF_OLD_PICKLES}
@@ -102,7 +118,70 @@ class MPCProblem(ReadOnlyArrays):
     @cached_property
     def layout(self) -> ThetaLayout:
         """What theta holds."""
-        return layout_of(self.model, self.tracking, self.rate)
+        ahead, bounds = self.disturbances.preview, self.parametric_bounds.names
+        return layout_of(self.model, self.tracking, self.rate, ahead, bounds)
+
+    @cached_property
+    def blocks(self) -> tuple[int, ...]:
+        """For how many samples each of the inputs that the program chooses is held."""
+        chosen = self.control_horizon
+        if chosen is None:
+            return (1,) * self.horizon
+        if isinstance(chosen, tuple):
+            return chosen
+        return (1,) * (chosen - 1) + (self.horizon - chosen + 1,)
+
+    @cached_property
+    def settled(self) -> MPCProblem:
+        """The problem without previews: what it is after the last r and d that are known."""
+        layout = self.layout
+        if layout.settled == layout:
+            return self
+        values = {each.name: getattr(self, each.name) for each in fields(MPCProblem)}
+        terminal = self.terminal
+        if isinstance(terminal.set, tuple) and terminal.set[0].shape[1] == layout.size:
+            terminal = replace(terminal, set=(terminal.set[0] @ layout.lift, terminal.set[1]))
+        values |= {
+            "tracking": replace(self.tracking, preview=0),
+            "disturbances": replace(self.disturbances, preview=0),
+            "terminal": terminal,
+            "theta_min": self.theta_min[layout.settles],
+            "theta_max": self.theta_max[layout.settles],
+        }
+        return MPCProblem(**values)
+
+    @cached_property
+    def limits(self) -> dict[str, tuple[Array, Array]]:
+        """The bounds of x, u, y, du, and of mixed rows."""
+        return {
+            "x": (self.x_min, self.x_max),
+            "u": (self.u_min, self.u_max),
+            "y": (self.outputs.y_min, self.outputs.y_max),
+            "du": (self.rate.du_min, self.rate.du_max),
+            "mixed": (self.mixed.low, self.mixed.high),
+        }
+
+    def moved_by(self, kind: str) -> tuple[Array, Array]:
+        """Return how lower and upper bounds of a kind change with theta, (k, n_theta) each.
+
+        They are those of `limits` where theta has them at rest.
+        """
+        low, high = (np.zeros((len(side), self.n_theta)) for side in self.limits[kind])
+        first = self.layout.limits.start
+        for at, name in enumerate(self.parametric_bounds.names, start=first):
+            of, i, upper = ParametricBounds.entry(name)
+            if of == kind:
+                (high if upper else low)[i, at] = 1.0
+        return low, high
+
+    def limits_at(self, kind: str, thetas: Array) -> tuple[Array, Array]:
+        """Return lower and upper bounds of a kind, such as "u", at thetas (..., n_theta)."""
+        low, high = self.limits[kind]
+        if not any(ParametricBounds.entry(name)[0] == kind for name in self.layout.bounds):
+            return low, high
+        moved = thetas - self.theta_ss
+        low_moves, high_moves = self.moved_by(kind)
+        return low + moved @ low_moves.T, high + moved @ high_moves.T
 
     @property
     def n_theta(self) -> int:
@@ -111,10 +190,14 @@ class MPCProblem(ReadOnlyArrays):
 
     @cached_property
     def theta_ss(self) -> Array:
-        """Theta at the operating point in plant units (n_theta,): x_ss, C x_ss, d_ss, u_ss."""
+        """Theta at the operating point in plant units (n_theta,): x_ss, C x_ss, d_ss, u_ss.
+
+        Bounds that change at run time are their widest there.
+        """
         model = self.model
         parts = model.x_ss, self.tracking.C @ model.x_ss, model.d_ss
-        return np.concatenate([*parts, model.u_ss[: self.layout.n_previous]])
+        rest = self.parametric_bounds.rest, model.u_ss[: self.layout.n_previous]
+        return np.asarray(self.layout.lift @ np.concatenate([*parts, *rest]))
 
     @property
     def set_points(self) -> dict[int, int]:
@@ -132,8 +215,11 @@ class MPCProblem(ReadOnlyArrays):
         states, inputs = with_units(model) if units else labels_of(model)
         if model.state_names or (units and model.units):
             found[self.layout.state] = states
+            p = self.layout.n_references
             for state, at in self.set_points.items():
-                found[at] = f"set-point of {states[state]}"
+                for k in range(self.layout.previews[0] + 1):
+                    later = f", {k} samples ahead" if k else ""
+                    found[at + k * p] = f"set-point of {states[state]}{later}"
         if model.input_names or (units and model.units):
             previous = inputs[: self.layout.n_previous]
             found[self.layout.previous] = [f"previous {each}" for each in previous]
@@ -156,8 +242,9 @@ class MPCProblem(ReadOnlyArrays):
         In deviations.
         """
         parts, model = self.layout, self.model
-        A, B = np.eye(parts.size), np.zeros((parts.size, model.n_inputs))
-        A[parts.state, parts.state], A[parts.state, parts.disturbance] = model.A, model.E
+        A, B = np.eye(parts.size)[parts.next], np.zeros((parts.size, model.n_inputs))
+        A[parts.state, parts.state] = model.A
+        A[parts.state, parts.now[parts.n_references :]] = model.E
         A[parts.previous, parts.previous] = 0.0
         B[parts.state] = model.B
         B[parts.previous] = np.eye(model.n_inputs)[: parts.n_previous]
@@ -175,12 +262,23 @@ class MPCProblem(ReadOnlyArrays):
     def error_system(self) -> ErrorSystem:
         """The coordinates about the steady state in which the cost is quadratic."""
         weights = self.Q, self.R, self.rate.R_du
-        return error_system(self.model, self.layout, self.steady_states, *weights)
+        return error_system(self.model, self.layout, self.steady_states, self.prediction, weights)
 
     @property
     def stage_matrix(self) -> Array:
-        """W (n_theta + m, n_theta + m): ``[theta; u]' W [theta; u]`` is the cost of deviations."""
+        """W (n_theta + m, n_theta + m): ``[theta; u]' W [theta; u]`` is the cost of deviations.
+
+        What a price costs comes on top: :attr:`stage_slope`.
+        """
         return self.error_system.stage_matrix
+
+    @cached_property
+    def stage_slope(self) -> Array:
+        """The price (n_theta + m,) of theta and u: ``[theta; u]' slope`` and price.constant."""
+        found = np.zeros(self.n_theta + self.model.n_inputs)
+        found[self.layout.state] = self.price.x
+        found[self.n_theta :] = self.price.u
+        return found
 
     def __hash__(self) -> int:
         """Return a hash that equal problems share."""
@@ -190,16 +288,14 @@ class MPCProblem(ReadOnlyArrays):
         """Name the sizes, the bounds and what else there is."""
         sizes = f"states={self.model.n_states}, inputs={self.model.n_inputs}"
         options = f"horizon={self.horizon}, gamma={self.gamma:g}, infeasible={self.infeasible!r}"
-        tracking, d, rate, outputs = self.tracking, self.disturbances, self.rate, self.outputs
-        bounds = {
-            "x": (self.x_min, self.x_max),
-            "u": (self.u_min, self.u_max),
-            "r": (tracking.r_min, tracking.r_max),
-            "d": (d.d_min, d.d_max),
-            "du": (rate.du_min, rate.du_max),
-            "y": (outputs.y_min, outputs.y_max),
-        }
+        if self.control_horizon is not None:
+            options += f", control_horizon={self.control_horizon}"
+        tracking, d, limits = self.tracking, self.disturbances, self.limits
+        r = (tracking.r_min, tracking.r_max), (d.d_min, d.d_max)
+        bounds = {"x": limits["x"], "u": limits["u"], "r": r[0], "d": r[1], **limits}
         told = [_bounds_in_words(name, *sides) for name, sides in bounds.items()]
+        if self.layout.bounds:
+            told.append(f"parametric_bounds={[*self.layout.bounds]}")
         return f"{type(self).__name__}({', '.join([sizes, options, *filter(None, told)])})"
 
 
@@ -213,7 +309,30 @@ def _bounds_in_words(name: str, lower: Array, upper: Array) -> str:
     )
 
 
-def layout_of(model: LinearModel, tracking: Tracking, rate: RateLimits) -> ThetaLayout:
-    """Return what theta holds in a problem with these parts."""
-    previous = model.n_inputs if np.any(rate.R_du) or rate.bounded else 0
-    return ThetaLayout(model.n_states, len(tracking.C), model.n_disturbances, previous)
+def layout_of(
+    model: LinearModel,
+    tracking: Tracking,
+    rate: RateLimits,
+    load_preview: int = 0,
+    bounds: tuple[str, ...] = (),
+) -> ThetaLayout:
+    """Return what theta holds in a problem with these parts.
+
+    Parameters
+    ----------
+    model, tracking, rate : LinearModel, Tracking, RateLimits
+        Of the problem.
+    load_preview : int, default 0
+        Of the measured disturbances.
+    bounds : tuple of str, optional
+        Those that change at run time.
+    """
+    return ThetaLayout(
+        model.n_states,
+        len(tracking.C),
+        model.n_disturbances,
+        n_previous=model.n_inputs if np.any(rate.R_du) or rate.bounded else 0,
+        n_estimated=len(model.estimated) if load_preview else 0,
+        previews=(tracking.preview, load_preview),
+        bounds=bounds,
+    )

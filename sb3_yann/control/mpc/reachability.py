@@ -11,6 +11,7 @@ from sb3_yann.control.mpc.problem import MPCProblem
 
 TOLERANCE = 1e-9
 """How far beyond a bound a steady state still counts as within, relative to the bound."""
+KINDS = "x", "u", "y", "mixed"
 
 
 def is_reachable(problem: MPCProblem, r: Given, d: Given) -> NDArray[np.bool_]:
@@ -19,14 +20,13 @@ def is_reachable(problem: MPCProblem, r: Given, d: Given) -> NDArray[np.bool_]:
 
 
 def margins(problem: MPCProblem, r: Given, d: Given) -> Array:
-    """Return the room to the upper and lower bounds of x, u and y, negative for violations."""
+    """Return the room to the upper and lower bounds of x, u, y and mixed ones, negative beyond."""
     constant = _constants(problem, r, d)
     x, u = constant @ problem.steady_states.x.T, constant @ problem.steady_states.u.T
     own = problem.deviations
-    outputs = own.outputs
-    value = np.concatenate([x, u, x @ outputs.C.T], axis=-1)
-    low = np.concatenate([own.x_min, own.u_min, outputs.y_min])
-    high = np.concatenate([own.x_max, own.u_max, outputs.y_max])
+    mixed = x @ own.mixed.F.T + u @ own.mixed.G.T
+    value = np.concatenate([x, u, x @ own.outputs.C.T, mixed], axis=-1)
+    low, high = (np.concatenate([own.limits[kind][k] for kind in KINDS]) for k in (0, 1))
     room = np.concatenate([high - value, value - low], axis=-1)
     bound = np.abs(np.concatenate([high, low]))
     return np.asarray(room + TOLERANCE * np.where(np.isfinite(bound), bound, 0.0))
@@ -43,7 +43,7 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
     x = problem.units.to_plant(problem.steady_states.x @ constant)
     u = problem.units.input_to_plant(problem.steady_states.u @ constant)
     if np.any(room < 0):
-        sizes = {"x": len(x), "u": len(u), "y": len(problem.outputs.C)}
+        sizes = {kind: len(problem.limits[kind][0]) for kind in KINDS}
         names = [(name, f"[{i}]") for name, size in sizes.items() for i in range(size)]
         sides = [
             f"{a}{i} {side} {a}_{end}{i}"
@@ -52,7 +52,7 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
         ]
         broken = ", ".join(side for side, left in zip(sides, room, strict=True) if left < 0)
         p = len(problem.tracking.C)
-        shown = constant + problem.theta_ss[problem.layout.constant]
+        shown = constant + problem.theta_ss[problem.layout.now]
         raise ValueError(
             f"The reference r = {shown[:p].tolist()} with d = {shown[p:].tolist()} is not "
             f"reachable: its steady state is x_s = {x.tolist()}, u_s = {u.tolist()}, and {broken}. "
@@ -64,7 +64,7 @@ def steady_state(problem: MPCProblem, r: Given, d: Given) -> tuple[Array, Array]
 def _constants(problem: MPCProblem, r: Given, d: Given) -> Array:
     """Return [r; d] in deviations, of shape (p + d,) or (batch, p + d)."""
     p, n_d = len(problem.tracking.C), problem.model.n_disturbances
-    rests = np.split(problem.theta_ss[problem.layout.constant], [p])
+    rests = np.split(problem.theta_ss[problem.layout.now], [p])
     parts = []
     for name, value, size, rest in zip("rd", (r, d), (p, n_d), rests, strict=True):
         array = to_float(name, rest if value is None else value)

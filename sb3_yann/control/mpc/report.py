@@ -17,6 +17,7 @@ from sb3_yann.control.mpc.reachability import is_reachable
 from sb3_yann.control.online import OnlineLaw
 
 LOOP_STEPS = 50  # of a closed loop on the model
+BOUND = "bound, which may move in, of entry"
 
 
 def report(problem: MPCProblem, law: Law, samples: int = 500, seed: int = 0) -> str:
@@ -58,7 +59,10 @@ def _parameters(problem: MPCProblem) -> Iterator[str]:
     room = max(10, *(len(each) + 1 for each in shown)) if rests else 0
     for i, (label, name) in enumerate(zip(labels, names, strict=True)):
         kind, index = name[:-1].split("[")
-        meaning = f"{shown[i]:<{room}}{meanings[kind]} {index}"
+        kind, _, ahead = (kind, "", "") if kind in meanings else kind.partition("_")
+        what = meanings.get(kind if ahead.isdigit() or not ahead else "", BOUND)
+        later = f", {ahead} samples ahead" if ahead.isdigit() else ""
+        meaning = f"{shown[i]:<{room}}{what} {index}{later}"
         if kind == "d" and int(index) in problem.model.estimated:
             meaning += ", which an observer estimates"
         yield f"  {label:<{width}} {low[i]:>10.4g} to {high[i]:<10.4g} {meaning}"
@@ -70,12 +74,23 @@ def _size(problem: MPCProblem, law: Law) -> Iterator[str]:
         yield f"The law is solved online, with {law.n_constraints} constraints."
     else:
         yield f"The law has {law.n_regions} regions and {law.n_halfspaces} half-spaces."
+    if len(problem.blocks) < problem.horizon:
+        yield f"Inputs are held over blocks of {', '.join(map(str, problem.blocks))} steps."
+    if problem.price.counts:
+        named = zip((*labels_of(problem.model)[0], *labels_of(problem.model)[1]),
+                    (*problem.price.x, *problem.price.u), strict=True)  # fmt: skip
+        yield f"Prices: {', '.join(f'{name} {price:g}' for name, price in named if price)}."
     rows = len(problem.terminal.set[1])
     yield f"The terminal set has {rows} half-spaces." if rows else "There is no terminal set."
     if problem.soft.penalty:
         states, outputs = labels_of(problem.model)[0], range(len(problem.soft.y))
-        names = [*states, *(f"y[{i}]" for i in outputs)]
-        units = np.concatenate([problem.soft.x, problem.soft.y])
+        mixed = problem.mixed.soft
+        names = [
+            *states,
+            *(f"y[{i}]" for i in outputs),
+            *(f"mixed[{i}]" for i in range(len(mixed))),
+        ]
+        units = np.concatenate([problem.soft.x, problem.soft.y, mixed])
         soft = [names[i] for i in np.flatnonzero(units)]
         yield f"Soft bounds: {', '.join(soft)}; a unit costs {problem.soft.penalty:g}."
 
@@ -92,7 +107,8 @@ def _shares(problem: MPCProblem, law: Law, points: Array, feasible: Array) -> It
     yield f"  {_percent(len(feasible), len(points))} are feasible;"
     if len(problem.tracking.C):
         parts = problem.layout
-        reachable = is_reachable(problem, points[:, parts.reference], points[:, parts.disturbance])
+        now = np.split(points[:, parts.now], [parts.n_references], axis=1)
+        reachable = is_reachable(problem, *now)
         yield f"  {_percent(reachable.sum(), len(points))} have a reachable steady state;"
     kept = _stay_feasible(problem, law, feasible).sum() if len(feasible) else 0
     kept_share = f"  of the feasible ones, {_percent(kept, len(feasible))} stay feasible"

@@ -18,6 +18,8 @@ Rows = tuple[Array, Array]  # half-spaces F theta <= g
 def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
     """Return F (rows, n_theta) and g (rows,): the maximal output admissible set F theta <= g.
 
+    The problem comes without previews.
+
     From a theta in it the law ``v = -K z``, with K the gain of the terminal cost, keeps all hard
     bounds of x, u, y and the rate for ever on the model, with r and d constant. The boxes of r, d
     and ``u_prev`` are taken for granted, that of the states is no bound. Steady states lie inside
@@ -50,7 +52,7 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
         )
     granted = _granted(problem, half)
     found = _remove_redundant((rows, bounds), granted)
-    if parts.has_constants:
+    if parts.constant.start < parts.constant.stop:
         moving = np.any(np.abs(steady) > 1e-12, axis=1)
         inside = (steady[moving], (1 - MARGIN) * bounds[moving])
         found = np.vstack([found[0], inside[0]]), np.concatenate([found[1], inside[1]])
@@ -81,29 +83,34 @@ def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -
 
 
 def _bounds(problem: MPCProblem, gain: Array) -> Rows:
-    """Return the hard bounds of x, u, y and the rate under ``u = gain theta``: rows and bounds."""
-    parts, size, outputs = problem.layout, problem.n_theta, problem.outputs
-    state = np.eye(size)[parts.state]
-    x, y = problem.soft.x == 0, problem.soft.y == 0  # those that are hard
-    values = [(gain, problem.u_min, problem.u_max)]
-    values.append((state[x], problem.x_min[x], problem.x_max[x]))
-    values.append(((outputs.C @ state)[y], outputs.y_min[y], outputs.y_max[y]))
+    """Return the hard bounds of x, u, y, the rate and mixed ones under ``u = gain theta``."""
+    parts, mixed = problem.layout, problem.mixed
+    every = np.eye(problem.n_theta)
+    state = every[parts.state]
+    values = {"u": gain, "x": state, "y": problem.outputs.C @ state}
     if parts.n_previous:
-        change = gain - np.eye(size)[parts.previous]
-        values.append((change, problem.rate.du_min, problem.rate.du_max))
-    rows = np.concatenate([sign * each for each, _, _ in values for sign in (1, -1)])
-    bounds = np.concatenate([side for _, low, high in values for side in (high, -low)])
-    bounded = np.isfinite(bounds)
-    return rows[bounded], bounds[bounded]
+        values["du"] = gain - every[parts.previous]
+    if len(mixed.F):
+        values["mixed"] = mixed.F @ state + mixed.G @ gain
+    softness = {"x": problem.soft.x, "y": problem.soft.y, "mixed": mixed.soft}
+    rows, bounds = [], []
+    for kind, value in values.items():
+        hard = softness.get(kind, np.zeros(len(value))) == 0
+        (low, high), (low_moves, high_moves) = problem.limits[kind], problem.moved_by(kind)
+        rows += [(value - high_moves)[hard], (low_moves - value)[hard]]
+        bounds += [high[hard], -low[hard]]
+    found, ends = np.concatenate(rows), np.concatenate(bounds)
+    bounded = np.isfinite(ends)
+    return found[bounded], ends[bounded]
 
 
 def _steady_projection(problem: MPCProblem, half: Array) -> Array:
     """Return the map from theta to the theta at rest under the same r and d, in units of half."""
     parts, steady = problem.layout, problem.steady_states
     at_rest = np.zeros((problem.n_theta, problem.n_theta))
-    at_rest[parts.state, parts.constant] = steady.x
+    at_rest[parts.state, parts.now] = steady.x
     at_rest[parts.constant, parts.constant] = np.eye(parts.constant.stop - parts.constant.start)
-    at_rest[parts.previous, parts.constant] = steady.u[: parts.n_previous]
+    at_rest[parts.previous, parts.now] = steady.u[: parts.n_previous]
     return np.asarray(at_rest / half[:, None] * half)
 
 

@@ -48,7 +48,7 @@ def test_softness_of_a_single_number_is_for_all_that_have_a_bound() -> None:
         with pytest.raises(ValueError, match=message):
             LinearMPC(PLANT, **WEIGHTS, x_min=[-1, -np.inf], theta_min=-5, theta_max=5, soft=soft)
     with pytest.raises(ValueError, match=r"nothing is soft"):
-        SoftBounds(0, penalty=5.0)
+        LinearMPC(PLANT, **WEIGHTS, x_min=-1, theta_min=-5, theta_max=5, soft=SoftBounds(0, 0, 5))
     assert SoftBounds(1).penalty is None  # the problem chooses it
     with pytest.raises(ValueError, match="no entry may be negative"):
         SoftBounds([0, -1e-9], penalty=1)

@@ -292,7 +292,11 @@ BAD: list[tuple[Callable[[], dict[str, Any]], type[Exception], str]] = [
         ValueError,
         "SoftBounds.penalty is missing, and nothing tells",
     ),
-    (lambda: SoftBounds(penalty=1), ValueError, "SoftBounds.penalty = 1, but nothing is soft"),
+    (
+        lambda: servo(soft=SoftBounds(penalty=1)),
+        ValueError,
+        "SoftBounds.penalty = 1.0, but nothing is soft",
+    ),
     (
         lambda: SoftBounds(1, penalty=-1),
         ValueError,

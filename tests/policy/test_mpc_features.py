@@ -1,0 +1,127 @@
+"""Policies of problems with each feature start exactly, with a critic that is theirs."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG
+
+from sb3_yann import LinearMPC, YannPolicy, export
+from sb3_yann.wrappers import MeasuredDisturbance, PreviousInput, SetPoint
+from sparse_qp import FEATURES, draw, problem
+
+
+class Shown(gym.Env[Any, Any]):
+    """An env that shows theta of a problem at random, in plant units."""
+
+    def __init__(self, mpc: LinearMPC) -> None:
+        self.mpc = mpc
+        self.observation_space = spaces.Box(-np.inf, np.inf, (mpc.n_theta,), np.float64)
+        self.action_space = spaces.Box(mpc.u_min, mpc.u_max, dtype=np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.np_random.uniform(self.mpc.theta_min, self.mpc.theta_max), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.reset()[0], 0.0, False, False, {}
+
+
+CASES = [*((name,) for name in FEATURES), FEATURES]
+
+
+@pytest.mark.parametrize("features", CASES)
+def test_a_policy_starts_as_the_law_and_its_critic_keeps_bellmans_equation(
+    features: tuple[str, ...],
+) -> None:
+    mpc = problem(draw(np.random.default_rng(11), features))
+    options = {"problem": mpc, "law": "online"}
+    env = Shown(mpc)
+    model = DDPG(YannPolicy, env, gamma=0.95, policy_kwargs=options, device="cpu")
+    law, rng = mpc.online(), np.random.default_rng(0)
+    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (60, mpc.n_theta)).astype(np.float32)
+    theta = theta[law.in_domain(mpc.units.to_deviations(theta))]
+    played = model.predict(theta, deterministic=True)[0]
+    assert np.abs((played - law.plant_input(theta)) / mpc.u_half).max() < 2e-6  # float32's room
+
+    own, (A, B) = mpc.deviations, mpc.prediction
+    rest = np.zeros(mpc.n_theta)
+    for _ in range(500):
+        rest = A @ rest + B @ law(rest)
+    near = rest + 1e-3 * rng.uniform(-1, 1, (30, mpc.n_theta)) * mpc.theta_half
+    near[:, own.layout.limits] = 0.0
+    u = law(near)
+    middle = (own.u_max + own.u_min) / 2
+
+    def q(at: Any, inputs: Any) -> Any:
+        actions = (inputs - middle) / own.u_half
+        points = th.as_tensor(np.hstack([at, actions]))
+        with th.no_grad():
+            return model.critic.values(points)[0].double().numpy()[:, 0]
+
+    following = near @ A.T + u @ B.T
+    costs = own.stage_cost(near, u)
+    residual = q(near, u) + costs - 0.95 * q(following, law(following))
+    assert np.abs(residual).max() < 1e-6 * max(np.abs(q(near, u)).max(), 1.0)
+
+
+def test_a_critic_with_prices_learns_compiled_and_not() -> None:
+    mpc = problem(draw(np.random.default_rng(11), ("price",)))
+    for critic in ({}, {"kind": "state_action"}):
+        options = {"problem": mpc, "law": "online", "critic": critic}
+        env = Shown(mpc)
+        model = DDPG(
+            YannPolicy, env, learning_starts=20, policy_kwargs=options, device="cpu", seed=0
+        )
+        before = [each.clone() for each in model.critic.parameters()]
+        model.learn(40)
+        assert any(
+            not th.equal(a, b) for a, b in zip(before, model.critic.parameters(), strict=True)
+        )
+    assert not model.policy.pin_equilibrium
+
+
+def test_wrappers_show_what_lies_ahead() -> None:
+    class Told(gym.Wrapper[Any, Any, Any, Any]):
+        steps = 0
+
+        def told(self) -> dict[str, Any]:
+            return {"disturbance": [[self.steps], [self.steps + 1]]}
+
+        def reset(self, **kwargs: Any) -> Any:
+            self.steps = 0
+            return self.env.reset(**kwargs)[0], self.told()
+
+        def step(self, action: Any) -> Any:
+            self.steps += 1
+            return (*self.env.step(action)[:4], self.told())
+
+    plant = Told(gym.make("CSTR-v0"))
+    env = SetPoint(plant, 0, 99, schedule=lambda step: 10 * step, preview=2)
+    both: Any = PreviousInput(MeasuredDisturbance(env, 0, 50, preview=1))
+    assert both.reset(seed=0)[0][4:].tolist() == [0, 10, 20, 0, 1, 0]
+    assert both.step(np.float32([0.5]))[0][4:].tolist() == [10, 20, 30, 1, 2, 0.5]
+
+    held: Any = SetPoint(gym.make("CSTR-v0"), 0, 1, hold=2, preview=3)
+    shown = [held.reset(seed=1)[0][4:]]
+    shown += [held.step(np.float32([0]))[0][4:] for _ in range(6)]
+    assert np.unique(shown).size == 5  # 10 samples, changed at each other one
+    for one, later in pairwise(shown):
+        assert one[1:].tolist() == later[:-1].tolist()
+
+
+@pytest.mark.slow
+def test_an_export_holds_theta_with_what_lies_ahead(tmp_path: Any) -> None:
+    mpc = problem(draw(np.random.default_rng(2), ("preview", "mixed", "price", "parametric")))
+    export(mpc, tmp_path / "ahead.c")
+    text = (tmp_path / "ahead.c").read_text()
+    for name in mpc.labels():
+        assert name in text, name
+    report = mpc.report(samples=20)
+    assert all(name in report for name in mpc.layout.names)
