@@ -164,7 +164,7 @@ class SetPoint(Appending):
         self.hold, self.schedule, self.steps = hold, schedule, 0
         self.reference: Array = np.zeros(len(self.low))
         self._last: Array = self.reference
-        self._ahead = [self._last]
+        self._ahead: list[Array] = [self._last]
         self._own: np.random.Generator | None = None
 
     def reset(self, **kwargs: Any) -> tuple[Vector, dict[str, Any]]:

@@ -119,6 +119,7 @@ def test_wrappers_show_what_lies_ahead() -> None:
 @pytest.mark.slow
 def test_an_export_holds_theta_with_what_lies_ahead(tmp_path: Any) -> None:
     mpc = problem(draw(np.random.default_rng(2), ("preview", "mixed", "price", "parametric")))
+    mpc.explicit()
     export(mpc, tmp_path / "ahead.c")
     text = (tmp_path / "ahead.c").read_text()
     for name in mpc.labels():
