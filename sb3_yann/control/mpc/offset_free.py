@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import check_positive_vector, check_type
+from sb3_yann._validation import check_outputs, check_positive_vector, check_type
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.groups import DisturbanceBounds, Terminal
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
@@ -19,14 +20,16 @@ SHARE = 0.05
 
 
 def offset_free(
-    mpc: LinearMPC, d_max: ArrayLike | None = None
+    mpc: LinearMPC,
+    d_max: ArrayLike | None = None,
+    measured: ArrayLike | Sequence[int] | None = None,
 ) -> tuple[LinearMPC, DisturbanceObserver]:
-    """Return the MPC with a disturbance of each state, and the observer that estimates it.
+    """Return the MPC with a disturbance of each measured state, and the observer that estimates it.
 
     Where the plant is not its model, the MPC settles beside its set-points. A constant disturbance
     in each state accounts for that: tracked outputs then settle without offset (Pannocchia and
-    Rawlings, AIChE J. 49, 2003). All states must be measured. The observer takes disturbances and
-    errors of measurements for equally large, in half-widths of the box of states.
+    Rawlings, AIChE J. 49, 2003). They must be measured. The observer takes disturbances and errors
+    of measurements for equally large, in half-widths of the box of states.
 
     Measured disturbances of the MPC stay, before the estimated ones: the observer is told them.
 
@@ -34,14 +37,18 @@ def offset_free(
     ----------
     mpc : LinearMPC
         Without estimated disturbances of its own.
-    d_max : array_like, shape (n,), optional
-        Largest disturbance, in units of the states per sample. The default is 5 % of the
-        half-widths of the box of states.
+    d_max : array_like, shape (q,), optional
+        Largest disturbance, in units of the measured states per sample. The default is 5 % of their
+        half-widths in the box of states.
+    measured : array_like, shape (q, n), or list of int, optional
+        The measured outputs, or the indices of the measured states. The default is all states. The
+        disturbances then act on these.
 
     Raises
     ------
     TypeError, ValueError
-        If the MPC has estimated disturbances already.
+        If the MPC has estimated disturbances already, tracks what is not measured, or the
+        measurements do not tell the disturbances.
 
     Examples
     --------
@@ -61,13 +68,21 @@ def offset_free(
             f"The MPC has {len(old.estimated)} estimated disturbances already: their observer is "
             "DisturbanceObserver(mpc.model)."
         )
+    C = np.eye(n) if measured is None else check_outputs("measured", measured, n)
+    q, tracked = len(C), mpc.tracking.C
+    if np.any(np.abs(tracked - tracked @ np.linalg.pinv(C) @ C) > 1e-9 * (1 + np.abs(tracked))):
+        raise ValueError(
+            "A tracked output is no combination of the measured ones: nothing tells its offset. "
+            "Measure what is tracked."
+        )
     unit = mpc.theta_half[mpc.layout.state]
-    largest = SHARE * unit if d_max is None else d_max
-    bound = check_positive_vector("d_max", largest, n, "In units of the states.")
-    known, of_both = mpc.disturbances, old.n_disturbances + n
+    shown = np.abs(C) @ unit
+    largest = SHARE * shown if d_max is None else d_max
+    bound = check_positive_vector("d_max", largest, q, "In units of the measured states.")
+    known, of_both = mpc.disturbances, old.n_disturbances + q
     own: dict[str, Any] = {
-        "E": np.hstack([old.E, np.eye(n)]),
-        "d_ss": np.concatenate([old.d_ss, np.zeros(n)]),
+        "E": np.hstack([old.E, np.linalg.pinv(C)]),
+        "d_ss": np.concatenate([old.d_ss, np.zeros(q)]),
         "estimated": range(old.n_disturbances, of_both),
         "drift": None,  # the disturbance makes up for it
     }
@@ -78,11 +93,13 @@ def offset_free(
         mpc,
         model=model,
         disturbances=DisturbanceBounds(
-            np.concatenate([known.d_min, -bound]), np.concatenate([known.d_max, bound])
+            np.concatenate([known.d_min, -bound]),
+            np.concatenate([known.d_max, bound]),
+            known.preview,
         ),
         terminal=terminal,
         theta_min=mpc.theta_min[states],
         theta_max=mpc.theta_max[states],
     )
-    noise = {"state_noise": unit, "disturbance_noise": unit, "measurement_noise": unit}
-    return found, DisturbanceObserver(model, **noise)
+    noise = {"state_noise": unit, "disturbance_noise": shown, "measurement_noise": shown}
+    return found, DisturbanceObserver(model, C, **noise)

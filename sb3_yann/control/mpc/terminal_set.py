@@ -41,7 +41,8 @@ def invariant_set(problem: MPCProblem, cost: Array) -> Rows:
             f"spectral radius of A - BK is {radius:.6g}. Use gamma=1, or the default terminal cost."
         )
     gain, half = errors.to_input - K @ errors.to_error, problem.theta_half
-    rows, bounds = _bounds(problem, gain)
+    rows, bounds = hard_rows(problem)
+    rows = rows @ np.vstack([np.eye(problem.n_theta), gain])
     A, B = problem.prediction
     rows, closed = rows * half, (A + B @ gain) * half / half[:, None]
     steady = rows @ _steady_projection(problem, half)
@@ -82,26 +83,30 @@ def _until_nothing_new(ahead: Rows, closed: Array, found: Rows, granted: Rows) -
     )
 
 
-def _bounds(problem: MPCProblem, gain: Array) -> Rows:
-    """Return the hard bounds of x, u, y, the rate and mixed ones under ``u = gain theta``."""
-    parts, mixed = problem.layout, problem.mixed
-    every = np.eye(problem.n_theta)
-    state = every[parts.state]
-    values = {"u": gain, "x": state, "y": problem.outputs.C @ state}
-    if parts.n_previous:
-        values["du"] = gain - every[parts.previous]
-    if len(mixed.F):
-        values["mixed"] = mixed.F @ state + mixed.G @ gain
+def hard_rows(problem: MPCProblem, kinds: tuple[str, ...] = ("u", "x", "y", "du", "mixed")) -> Rows:
+    """Return the hard bounds of these kinds: rows (k, n_theta + m) of [theta; u], and their ends.
+
+    They are of one sample. Bounds that change at run time are entries of theta.
+    """
+    n, m = problem.n_theta, problem.model.n_inputs
+    theta, u = np.split(np.eye(n + m), [n])
+    x, mixed = theta[problem.layout.state], problem.mixed
+    values = {"u": u, "x": x, "y": problem.outputs.C @ x, "mixed": mixed.F @ x + mixed.G @ u}
+    if problem.layout.n_previous:
+        values["du"] = u - theta[problem.layout.previous]
     softness = {"x": problem.soft.x, "y": problem.soft.y, "mixed": mixed.soft}
-    rows, bounds = [], []
-    for kind, value in values.items():
-        hard = softness.get(kind, np.zeros(len(value))) == 0
-        (low, high), (low_moves, high_moves) = problem.limits[kind], problem.moved_by(kind)
-        rows += [(value - high_moves)[hard], (low_moves - value)[hard]]
-        bounds += [high[hard], -low[hard]]
-    found, ends = np.concatenate(rows), np.concatenate(bounds)
-    bounded = np.isfinite(ends)
-    return found[bounded], ends[bounded]
+    rows, ends = [np.zeros((0, n + m))], [np.zeros(0)]
+    for kind in kinds:
+        if kind in values:
+            value = values[kind]
+            hard = softness.get(kind, np.zeros(len(value))) == 0
+            low_moves, high_moves = (each @ theta for each in problem.moved_by(kind))
+            low, high = problem.limits[kind]
+            rows += [(value - high_moves)[hard], (low_moves - value)[hard]]
+            ends += [high[hard], -low[hard]]
+    found, bounds = np.concatenate(rows), np.concatenate(ends)
+    bounded = np.isfinite(bounds)
+    return found[bounded], bounds[bounded]
 
 
 def _steady_projection(problem: MPCProblem, half: Array) -> Array:

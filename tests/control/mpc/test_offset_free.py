@@ -11,6 +11,7 @@ import pytest
 
 from general_problems import servo, solved
 from sb3_yann import (
+    DisturbanceBounds,
     DisturbanceObserver,
     LinearModel,
     LinearMPC,
@@ -129,3 +130,21 @@ def test_what_estimates_disturbances_already_or_is_no_mpc_is_named() -> None:
     for wrong in ([0.1, 0.0], [0.1, -1.0], [0.1]):
         with pytest.raises(ValueError, match="d_max"):
             offset_free(MPC, wrong)
+
+
+@pytest.mark.parametrize("measured", [None, [0]])
+def test_a_plant_with_a_load_that_is_measured_settles_without_offset(measured) -> None:
+    model = LinearModel([[0.9, 0.2], [0, 0.8]], [[0], [0.5]], 1.0, E=[[0.3], [0.1]])
+    preview = DisturbanceBounds(-1, 1, preview=2)
+    mpc, observer = offset_free(servo(model, disturbances=preview, horizon=5), measured=measured)
+    assert mpc.layout.names[2:6] == ("r[0]", "d[0]", "d_1[0]", "d_2[0]")
+    x, load, law = np.zeros(2), np.array([0.5]), mpc.online()
+    y = slice(0, 2 if measured is None else 1)
+    x_hat, d_hat = observer.reset(x[y])
+    for _ in range(300):
+        u = law(np.concatenate([x_hat, [0.7], np.tile(load, 3), d_hat]))
+        x = model.A @ [0.98 * x[0], x[1]] + 1.1 * model.B @ u + 0.8 * model.E @ load + [0.05, 0]
+        x_hat, d_hat = observer.update(x[y], u, load)
+    assert x[0] == pytest.approx(0.7, abs=1e-6)
+    with pytest.raises(ValueError, match="Measure what is tracked"):
+        offset_free(MPC, measured=[1])
