@@ -39,7 +39,7 @@ _NAMES = {
     "sb3_yann.log": "Log",
     "sb3_yann.guard": "AcceptanceRule Decision ImprovementGuard StepSize restore_accepted",
     "sb3_yann.policy": "AffineObservation CriticOptions NonFiniteWarning YannActor YannCritic "
-    "YannPolicy register_problem",
+    "YannPolicy register_problem retarget",
     "sb3_yann.reporting": "report",
     "sb3_yann.simulated_episodes": "SimulatedEpisodes",
     "sb3_yann.twin": "PlantTwin UntrustedTwinError",

@@ -47,6 +47,7 @@ from sb3_yann.policy import YannActor as YannActor
 from sb3_yann.policy import YannCritic as YannCritic
 from sb3_yann.policy import YannPolicy as YannPolicy
 from sb3_yann.policy import register_problem as register_problem
+from sb3_yann.policy import retarget as retarget
 from sb3_yann.reporting import report as report
 from sb3_yann.simulated_episodes import SimulatedEpisodes as SimulatedEpisodes
 from sb3_yann.twin import PlantTwin as PlantTwin

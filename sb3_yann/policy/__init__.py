@@ -5,6 +5,7 @@ from sb3_yann.policy.actor_critic import CriticOptions, YannActor, YannCritic
 from sb3_yann.policy.checks import register_problem
 from sb3_yann.policy.observations import AffineObservation
 from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.retarget import retarget
 
 __all__ = [
     "AffineObservation",
@@ -14,4 +15,5 @@ __all__ = [
     "YannCritic",
     "YannPolicy",
     "register_problem",
+    "retarget",
 ]

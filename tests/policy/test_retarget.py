@@ -1,0 +1,72 @@
+"""Another MPC for a model, with what a shared network has learnt."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG, TD3
+
+from sb3_yann import YannPolicy, retarget
+
+
+def learnt(algorithm: Any = DDPG, **options: Any) -> Any:
+    """A model whose network has moved, without learning."""
+    options = {"networks": "shared", "pin_equilibrium": False, **options}
+    model = algorithm(
+        YannPolicy, "CSTR-v0", policy_kwargs=options, device="cpu", gamma=0.98, batch_size=32
+    )
+    with th.no_grad():
+        for weight in model.actor.mu.network.weights():
+            weight.add_(0.1 * th.randn(weight.shape, generator=th.Generator().manual_seed(0)))
+    return model
+
+
+def correction(model: Any, theta: Any) -> Any:
+    """What the policy adds to its law, in units of the input."""
+    u, law = model.predict(theta)[0], model.policy.problem.online()(theta)
+    inside = np.abs(u) < model.policy.problem.u_max - 1e-3
+    return u - law, inside & (np.abs(law) < model.policy.problem.u_max - 1e-3)
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_a_shared_correction_stays_under_other_weights_and_bounds(algorithm: Any) -> None:
+    model = learnt(algorithm)
+    old = model.policy.problem
+    states = old.theta_max * np.array([0.5, 1, 2, 1])
+    bounds = {"x_min": -states, "x_max": states, "theta_min": -states, "theta_max": states}
+    mpc = replace(old, R=5 * old.R, **bounds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        other = retarget(model, mpc)
+    assert type(other) is type(model) and (other.gamma, other.batch_size) == (0.98, 32)
+    theta = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 4)) * old.theta_max
+    theta = theta.astype(np.float32)
+    (one, inside), (two, also) = correction(model, theta), correction(other, theta)
+    both = (inside & also).all(axis=1)
+    assert both.sum() > 20 and np.abs(one[both]).max() > 1e-3
+    assert np.abs(one - two)[both].max() < 1e-4
+    other.learn(20)
+
+
+def test_what_is_not_kept_is_named() -> None:
+    model = learnt(networks="per_region")
+    model.learn(150)
+    model.guard_state = object()
+    problem = model.policy.problem
+    with pytest.warns(UserWarning, match="not kept: the networks of single regions") as found:
+        other = retarget(model, replace(problem, R=3 * problem.R))
+    text = str(found[0].message)
+    assert all(word in text for word in ("the critic", "replay buffer", "guard's accepted"))
+    assert other.actor.mu.network.is_zero() and not hasattr(other, "guard_state")
+    with pytest.raises(ValueError, match="a correction needs the same entries"):
+        retarget(model, replace(problem, parametric_bounds=["u_max"]))
+    moved = replace(problem.model, x_ss=np.ones(4))
+    bounds = {"x_min": problem.x_min + 1, "x_max": problem.x_max + 1}
+    bounds |= {"theta_min": problem.theta_min + 1, "theta_max": problem.theta_max + 1}
+    with pytest.raises(ValueError, match="Keep x_ss and u_ss"):
+        retarget(model, replace(problem, model=moved, **bounds))
