@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sb3_yann import LinearModel, LinearMPC, RateLimits, Terminal, Tracking
-from sb3_yann.plan import WEIGHT, Task, planned
+from sb3_yann import LinearCost, LinearModel, LinearMPC, RateLimits, Terminal, Tracking
+from sb3_yann.plan import WEIGHT, Task, planned, value_at_end
 
 STEPS = 30
 
@@ -35,7 +35,8 @@ def cart(**changes) -> LinearMPC:
 def plan(mpc: LinearMPC, starts: np.ndarray):
     mpc.explicit()  # some take more effort than "auto" spends
     free = np.full(mpc.model.n_states, np.inf)
-    task = Task(mpc, -free, free, mpc.value_matrix(1.0), WEIGHT)
+    end = value_at_end(mpc)
+    task = Task(mpc, -free, free, end.P, WEIGHT, end_slope=end.slope)
     rows = np.arange(len(starts))
     return planned(
         Exact(mpc), task, [lambda _, x: np.zeros((len(x), len(mpc.R)))], starts, STEPS, rows
@@ -78,6 +79,25 @@ def test_two_inputs_of_which_one_is_on_its_bound() -> None:
     for start, reached in zip(starts, cost, strict=True):
         thetas, inputs = simulated(mpc, start)
         assert reached == pytest.approx(mpc.stage_cost(thetas[:-1], inputs).sum(), rel=1e-3)
+
+
+def test_a_price_is_planned_with() -> None:
+    mpc = cart(price=LinearCost(x=[0.2, 0.1], u=0.05), horizon=3)
+    start = np.array([0.3, 0.1])
+    found, end = plan(mpc, start[None]), value_at_end(mpc)
+
+    def cost(inputs: np.ndarray) -> float:
+        thetas = [start]
+        for u in inputs:
+            thetas.append(mpc.predict(thetas[-1], u))
+        return float(mpc.stage_cost(np.array(thetas[:-1]), inputs).sum() + end.at(thetas[-1]))
+
+    best = found.inputs[:, 0]
+    for k in (0, 5, STEPS - 1):
+        moved = 1e-3 * np.eye(STEPS)[:, [k]]
+        slope = (cost(best + moved) - cost(best - moved)) / 2e-3
+        assert abs(slope) < 1e-4
+    assert cost(best) < cost(simulated(mpc, start)[1])
 
 
 def test_a_reference_is_reached() -> None:
