@@ -1,8 +1,8 @@
 """Reinforcement learning that starts as a linear MPC: a Stable-Baselines3 plugin.
 
 Importing registers the environments ``CSTR-v0`` and ``ClippedPendulum-v0`` with Gymnasium, and the
-policy alias ``"YannPolicy"`` with TD3 and DDPG. Names are loaded at their first use (PEP 562), so
-that ``import sb3_yann.control`` loads neither PyTorch nor Stable-Baselines3.
+policy alias ``"YannPolicy"`` with TD3, DDPG, SAC, PPO and TQC. Names are loaded at their first use
+(PEP 562), so that ``import sb3_yann.control`` loads neither PyTorch nor Stable-Baselines3.
 
 Examples
 --------
@@ -64,11 +64,18 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_HOMES})
 
 
+_POLICIES = {"stable_baselines3": "sb3_yann.policy", "sb3_contrib": "sb3_yann.policy.tqc"}
+"""Packages whose algorithms have a policy of ours, and the module that registers its name."""
+
+
 class _AliasFinder(importlib.abc.MetaPathFinder):
-    """Registers the alias when Stable-Baselines3 is imported, however late."""
+    """Registers the alias when a package of algorithms is imported, however late."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
 
     def find_spec(self, name: str, *place: Any) -> Any:
-        if name != "stable_baselines3":
+        if name != self.package:
             return None
         others = (finder for finder in sys.meta_path if finder is not self)
         spec = next(filter(None, (finder.find_spec(name, *place) for finder in others)), None)
@@ -78,15 +85,16 @@ class _AliasFinder(importlib.abc.MetaPathFinder):
             def load_and_register(module: ModuleType) -> None:
                 load(module)
                 sys.meta_path.remove(self)
-                importlib.import_module("sb3_yann.policy")
+                importlib.import_module(_POLICIES[name])
 
             spec.loader.exec_module = load_and_register  # type: ignore[method-assign]
         return spec
 
 
-if "stable_baselines3" in sys.modules:
-    importlib.import_module("sb3_yann.policy")
-else:
-    sys.meta_path.insert(0, _AliasFinder())
+for _package, _module in _POLICIES.items():
+    if _package in sys.modules:
+        importlib.import_module(_module)
+    else:
+        sys.meta_path.insert(0, _AliasFinder(_package))
 
 sb3_yann_envs.register_envs()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_yann._validation import check_int, check_type
 from sb3_yann.policy.observations import require_frozen, require_same_statistics
-from sb3_yann.policy.policies import YannPolicy, require_yann_policy
+from sb3_yann.policy.policies import StartsAsMPC, require_yann_policy
 from sb3_yann.policy.sb3_hooks import watch_buffer
+from sb3_yann.policy.spread import Explores
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,21 +42,30 @@ class NoActionNoise(BaseCallback):
     model: OffPolicyAlgorithm
 
     def _init_callback(self) -> None:
+        if isinstance(self.model.policy, Explores):
+            warnings.warn(
+                f"NoActionNoise turns nothing off here: {type(self.model).__name__} adds no noise, "
+                "its policy draws its actions. policy_kwargs={'initial_std': ...} says how far "
+                "from the MPC's, and predict(..., deterministic=True) draws none.",
+                stacklevel=2,
+            )
         # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
         if not isinstance(self.model, OffPolicyAlgorithm):
+            if isinstance(self.model.policy, Explores):
+                return
             raise TypeError(
                 "NoActionNoise needs an off-policy algorithm, such as DDPG or TD3, not "
                 f"{type(self.model).__name__}."
             )
         self.model.action_noise = None
         self.model.learning_starts = 0
-        if isinstance(self.model.policy, YannPolicy):
+        if isinstance(self.model.policy, StartsAsMPC):
             watch_buffer(self.model)  # another one may have been loaded since
             require_same_statistics(self.model)
 
     def _on_rollout_start(self) -> None:
         normalize = self.model.get_vec_normalize_env()
-        if normalize is not None and isinstance(self.model.policy, YannPolicy):
+        if normalize is not None and isinstance(self.model.policy, StartsAsMPC):
             require_frozen(normalize)
 
     def _on_step(self) -> bool:
@@ -140,7 +151,8 @@ class ControlDiagnostics(BaseCallback):
         if "yann/violations" not in self.logger.name_to_value and self._recorded:
             self._forget()  # the logger was dumped
         observations = np.asarray(self.model._last_obs)  # still s_t: SB3 advances it later
-        actions = self.locals["buffer_actions"]  # in [-1, 1]
+        # In [-1, 1]; on-policy algorithms call them otherwise.
+        actions = self.locals.get("buffer_actions", self.locals["actions"])
         layer = self.policy.actor.mu
         with th.no_grad():
             theta = self.policy.theta(observations)
@@ -191,10 +203,10 @@ class ControlDiagnostics(BaseCallback):
             self.logger.record("yann/critic_error", found)
 
     def _value(self, observations: Any, actions: Any) -> NDArray[np.float32]:
-        """Return the first critic's Q, shape (batch,)."""
+        """Return the first critic's Q, shape (batch,), of quantiles their mean."""
         with th.no_grad():
             q = self.policy.critic.q1_forward(
                 th.as_tensor(observations, device=self.model.device),
                 th.as_tensor(actions, dtype=th.float32, device=self.model.device),
             )
-        return np.asarray(q.cpu().numpy()[:, 0])
+        return np.asarray(q.cpu().numpy().mean(axis=1))

@@ -241,24 +241,23 @@ def _model(path: str) -> Any:
 
     DDPG is TD3 with other defaults: what TD3 loads acts and learns as it was saved.
     """
-    from stable_baselines3 import TD3
     from stable_baselines3.common.save_util import load_from_zip_file
 
-    from sb3_yann import YannPolicy
+    from sb3_yann.policy.policies import StartsAsMPC
 
     if not Path(path).exists() and not Path(f"{path}.zip").exists():
         raise FileNotFoundError(f"There is no model {path}: model.save(path) writes one.")
     if not _is_model(path):
         raise ValueError(f"{path} is no model: pass a .zip file that model.save(path) has written.")
-    data = load_from_zip_file(path, device="cpu")[0] or {}  # TD3 fails at others' without a word
+    data = load_from_zip_file(path, device="cpu")[0] or {}  # a wrong algorithm fails without a word
     kind = data.get("policy_class")
-    if not (isinstance(kind, type) and issubclass(kind, YannPolicy)):
+    if not (isinstance(kind, type) and issubclass(kind, StartsAsMPC)):
         found = kind.__name__ if isinstance(kind, type) else "nothing that is known"
         raise ValueError(
             f"{path} holds {found} as its policy: sb3-yann needs a YannPolicy. Build the model as "
             'DDPG("YannPolicy", env), and save it by model.save(path).'
         )
-    return TD3.load(path, device="cpu")
+    return kind.ALGORITHMS[0].load(path, device="cpu")
 
 
 def _checks(path: str | None) -> Any:

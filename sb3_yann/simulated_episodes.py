@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_yann._validation import Array, check_int, check_range
+from sb3_yann._validation import Array, check_int, check_range, check_type
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.policy.observations import normalized
 from sb3_yann.policy.policies import require_yann_policy
@@ -120,6 +120,7 @@ class SimulatedEpisodes(BaseCallback):
 
     def _init_callback(self) -> None:
         self.policy = require_yann_policy(self.model.policy, "SimulatedEpisodes")
+        check_type("model", self.model, OffPolicyAlgorithm, "one with a replay buffer")
         if getattr(self.model.replay_buffer, "optimize_memory_usage", False):
             raise ValueError(
                 "optimize_memory_usage=True keeps the next observation as that of the next row, "

@@ -1,6 +1,6 @@
 """Search spaces for RL Zoo: ``--gym-packages sb3_yann.tuning`` puts them in the place of its own.
 
-The Zoo's spaces for DDPG and TD3 draw activations that are not zero at zero and networks that YANN
+The Zoo's spaces for DDPG, TD3, SAC and TQC draw activations that are not zero at zero and networks that YANN
 has not, and a trial loses the `policy_kwargs` of its entry, the problem with them. Trials of a
 `YannPolicy` have these spaces; others keep the Zoo's.
 """
@@ -24,7 +24,7 @@ _entry: ContextVar[Mapping[str, Any] | None] = ContextVar("entry", default=None)
 
 
 def sample(trial: Any) -> dict[str, Any]:
-    """Return hyperparameters of DDPG or TD3 with a YannPolicy, drawn by a trial of Optuna.
+    """Return hyperparameters of a model with a YannPolicy, drawn by a trial of Optuna.
 
     There is no exploration to tune, and no discount: it is the problem's. `policy_kwargs` has only
     what is drawn.
@@ -53,7 +53,7 @@ def sample(trial: Any) -> dict[str, Any]:
 
 
 def convert(params: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of DDPG or TD3 for the parameters of a trial, as a study keeps them."""
+    """Return the arguments of such a model for the parameters of a trial, as a study keeps them."""
     found = dict(params)
     widths = {"pi": WIDTHS[found.pop("widths")], "qf": WIDTHS[found.pop("critic_widths")]}
     policy_kwargs = {name: found.pop(name) for name in POLICY if name in found}
@@ -83,7 +83,7 @@ def _objective(theirs: Callable[..., float], self: Any, trial: Any) -> float:
 
 
 def _install() -> None:
-    for name in ("ddpg", "td3"):
+    for name in ("ddpg", "td3", "sac", "tqc"):
         for table, ours in (
             (hyperparams_opt.HYPERPARAMS_SAMPLER, _sample),
             (hyperparams_opt.HYPERPARAMS_CONVERTER, _convert),

@@ -97,6 +97,8 @@ class CostAudit(BaseCallback):
         normalize = self.model.get_vec_normalize_env()
         # The buffer holds what VecNormalize has not touched, and normalizes samples of it.
         rewards = self.locals["rewards"] if normalize is None else normalize.get_original_reward()
+        # On-policy algorithms call what the env took "clipped".
+        actions = self.locals.get("clipped_actions", self.locals["actions"])
         for i, records in enumerate(self._records):
             info, done = self.locals["infos"][i], bool(self.locals["dones"][i])
             following = info["terminal_observation"] if done else self.locals["new_obs"][i]
@@ -104,7 +106,7 @@ class CostAudit(BaseCallback):
                 {
                     "observation": np.array(self.model._last_obs[i]),  # type: ignore[index]
                     "following": np.array(following),  # copies: an env may write into its arrays
-                    "action": np.array(self.locals["actions"][i], dtype=np.float64),
+                    "action": np.array(actions[i], dtype=np.float64),
                     "reward": float(rewards[i]),
                     "step": len(records) + 1,
                     "violation": may_change_reward(info),

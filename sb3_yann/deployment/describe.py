@@ -18,9 +18,9 @@ from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import FADE_END, FADE_START, LawLayer
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import AffineFeatures, keeps_entries
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.policies import StartsAsMPC
 
-Exportable = BaseAlgorithm | YannPolicy | LinearMPC | PiecewiseAffine | OnlineLaw
+Exportable = BaseAlgorithm | StartsAsMPC | LinearMPC | PiecewiseAffine | OnlineLaw
 
 
 def describe(
@@ -46,14 +46,14 @@ def describe(
         If it cannot be exported: the message says why.
     """
     policy = given.policy if isinstance(given, BaseAlgorithm) else given
-    if not isinstance(policy, YannPolicy | LinearMPC | PiecewiseAffine | OnlineLaw):
+    if not isinstance(policy, StartsAsMPC | LinearMPC | PiecewiseAffine | OnlineLaw):
         raise TypeError(
             f"{type(given).__name__} cannot be exported: pass a model with a YannPolicy, a "
             "LinearMPC, or a law from LinearMPC.explicit()."
         )
     problem, note = None, ""
-    if isinstance(policy, YannPolicy | LinearMPC):
-        problem = policy.problem if isinstance(policy, YannPolicy) else policy
+    if isinstance(policy, StartsAsMPC | LinearMPC):
+        problem = policy.problem if isinstance(policy, StartsAsMPC) else policy
     model: Any = policy.model if problem is None else problem.model
     if model is not None:
         note = missing_observer(model)
@@ -64,7 +64,7 @@ def describe(
             'observer="caller").'
         )
     note = " ".join(filter(None, [note, _unconfirmed(given)]))
-    if isinstance(policy, YannPolicy):
+    if isinstance(policy, StartsAsMPC):
         layer = policy.actor.mu
         law = _explicit(layer.base_law)
         networks = _network_arrays(layer, law)
@@ -87,7 +87,7 @@ def describe(
 
     matrix, offset, scale, shift = _signal_maps(policy, law)
     watched = states
-    if isinstance(policy, YannPolicy):
+    if isinstance(policy, StartsAsMPC):
         if not keeps_entries(policy.actor.features_extractor):
             labels = [f"obs[{i}]" for i in range(matrix.shape[1])]
             shown = matrix != 0  # entries are watched that say what states are, and nothing else
@@ -129,7 +129,7 @@ def _unconfirmed(given: Exportable) -> str:
     improved = bool(getattr(given, "improvements", False))
     if (
         improved
-        or not isinstance(policy, YannPolicy)
+        or not isinstance(policy, StartsAsMPC)
         or not ActorCheckpoint.of(policy).has_learned()
     ):
         return ""
@@ -150,7 +150,7 @@ def _signal_maps(policy: Any, law: PiecewiseAffine) -> tuple[Array, Array, Array
     Theta is ``matrix @ obs + offset``, an action ``scale * y + shift`` for y in [-1, 1].
     """
     n = law.n_theta
-    if isinstance(policy, YannPolicy):
+    if isinstance(policy, StartsAsMPC):
         extractor = policy.actor.features_extractor
         box: Any = policy.action_space
         matrix, offset = np.eye(n), np.zeros(n)

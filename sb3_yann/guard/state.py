@@ -20,7 +20,7 @@ from sb3_yann._archive import atomic_write
 from sb3_yann._validation import Array, check_type
 from sb3_yann.compare import Scores, Starts, Verdict, is_above, no_worse
 from sb3_yann.policy.checkpoint import ActorCheckpoint
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.policies import StartsAsMPC
 
 Outcome = Literal["accepted", "accepted in part", "rejected"]
 MAX_PASSED = 20
@@ -211,7 +211,7 @@ def restore_accepted(model: BaseAlgorithm) -> None:
     """
     check_type("model", model, BaseAlgorithm, "a DDPG or TD3 model")
     state, policy = getattr(model, "guard_state", None), model.policy
-    if not isinstance(state, GuardState) or not isinstance(policy, YannPolicy):
+    if not isinstance(state, GuardState) or not isinstance(policy, StartsAsMPC):
         name = type(model).__name__
         raise ValueError(f"No ImprovementGuard has been at work on this {name}: pass one to learn.")
     state.accepted.restore(policy)
@@ -293,7 +293,7 @@ ADVICE = {
 """What helps against a reason for a refusal that holds such words: the first one that does."""
 
 
-def summary_of(state: GuardState, policy: YannPolicy) -> str:
+def summary_of(state: GuardState, policy: StartsAsMPC) -> str:
     """Return some lines for a reader: what is accepted, what was refused and why, what helps."""
     decisions, n_starts = state.decisions, len(state.settings["seeds"])
     cost = float(state.evidence.scores.costs[:n_starts].mean())

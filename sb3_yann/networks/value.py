@@ -150,6 +150,8 @@ class QuadraticStateActionValue(nn.Module):
     activation : callable, default torch.tanh
     pinned : bool, default True
         Whether the network's output at the equilibrium stays zero for good.
+    n_outputs : int, default 1
+        Columns of Q: quantiles of the return, all of them the same at first.
 
     Examples
     --------
@@ -170,6 +172,7 @@ class QuadraticStateActionValue(nn.Module):
         hidden: tuple[int, ...] = (64, 64),
         activation: Activation = th.tanh,
         pinned: bool = True,
+        n_outputs: int = 1,
     ) -> None:
         super().__init__()
         m = len(ranges.u_min)
@@ -183,7 +186,9 @@ class QuadraticStateActionValue(nn.Module):
             network_scale=np.concatenate([ranges.scale(n), 1 / ranges.u_half]),
         )
         kept = th.tensor([pinned])
-        self.network = ZeroOutputNetwork(n + m, 1, hidden, activation=activation, pinned=kept)
+        self.network = ZeroOutputNetwork(
+            n + m, n_outputs, hidden, activation=activation, pinned=kept
+        )
 
     def forward(self, theta_and_action: th.Tensor) -> th.Tensor:
         """Return Q, shape (batch, 1), for rows ``[theta, a]`` of shape (batch, n + m)."""
@@ -212,7 +217,7 @@ class AfterstateValue(nn.Module):
         ``(theta, u) -> next theta``, of float64 tensors in physical units. A module is copied,
         moved and saved with this one, but not trained.
     gamma : float
-    ranges, hidden, activation, pinned
+    ranges, hidden, activation, pinned, n_outputs
         As in :class:`QuadraticStateActionValue`.
     scale : float, optional
         The network's output is multiplied by it: its units are those of the cost-to-go. The default
@@ -244,6 +249,7 @@ class AfterstateValue(nn.Module):
         activation: Activation = th.tanh,
         pinned: bool = True,
         scale: float | None = None,
+        n_outputs: int = 1,
     ) -> None:
         super().__init__()
         known = 0.0 if scale is None else check_positive("scale", scale)  # 0: not known yet
@@ -265,7 +271,10 @@ class AfterstateValue(nn.Module):
             value_scale=np.array(known),
         )
         kept = th.tensor([pinned])
-        self.network = ZeroOutputNetwork(len(P), 1, hidden, activation=activation, pinned=kept)
+        self.n_outputs = n_outputs
+        self.network = ZeroOutputNetwork(
+            len(P), n_outputs, hidden, activation=activation, pinned=kept
+        )
         self._constants: tuple[Array, Array, Array, Array]
         self._constants_of: tuple[list[Any], tuple[th.Tensor, ...]] = ([], ())
 
@@ -289,6 +298,8 @@ class AfterstateValue(nn.Module):
         linear = isinstance(modules.get("model"), LinearPrediction)
         weight: Any = self._buffers["W"]
         if not linear or weight.dtype != th.float64 or len(weight) > largest:
+            return False
+        if self.n_outputs > 1:
             return False
         double: bool = modules["quadratic"].entries.dtype == th.float64
         return double and modules["network"].compiles

@@ -228,6 +228,8 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         Widths of each critic's network.
     activation_fn : type, default torch.nn.Tanh
     n_critics : int, default 2
+    n_outputs : int, default 1
+        Of each critic: quantiles of the return.
     **sb3_kwargs
         Other arguments of SB3's `ContinuousCritic`: spaces and features extractor.
 
@@ -249,6 +251,7 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         net_arch: list[int],
         activation_fn: type[nn.Module] = nn.Tanh,
         n_critics: int = 2,
+        n_outputs: int = 1,
         **sb3_kwargs: Any,
     ) -> None:
         sb3_kwargs |= {"activation_fn": activation_fn, "n_critics": n_critics}
@@ -263,6 +266,7 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
             ),
             "hidden": tuple(net_arch),
             "pinned": pin_equilibrium,
+            "n_outputs": n_outputs,
         }
         self.q_networks = []
         for i in range(n_critics):
@@ -275,11 +279,25 @@ class YannCritic(KeepsPrecision, SeesTheta, ContinuousCritic):
         """Return Q of each critic, all (batch, 1), in units of the env's reward."""
         theta = self.extract_features(obs, self.features_extractor)  # never trained
         points = th.cat([theta, actions], dim=1)
-        if self.scales_itself and th.is_grad_enabled():
+        if th.is_grad_enabled():
+            self._know_scale(points)
+        return self.values(points)
+
+    def _know_scale(self, points: th.Tensor) -> None:
+        if self.scales_itself:
             self.batch, first = points.detach(), cast("Any", self.q_networks[0])
             if not first.value_scale > 0:
                 self.scale_values(self.stage_cost_of_batch())
-        return self.values(points)
+
+    def know_scale(self, obs: th.Tensor, actions: th.Tensor) -> None:
+        """Take the factor of the networks from what is learnt from, where it is not known."""
+        self._know_scale(th.cat([self.extract_features(obs, self.features_extractor), actions], 1))
+
+    def state_value(self, obs: th.Tensor) -> th.Tensor:
+        """Return the first critic's value of states under the law, (batch, 1), in rewards."""
+        first: Any = self.q_networks[0]
+        theta = self.extract_features(obs, self.features_extractor)
+        return self._in_rewards(-first.value(theta.double()).float())
 
     def stage_cost_of_batch(self) -> float:
         """Return the mean stage cost of the latest points to learn from."""

@@ -12,7 +12,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.policies import StartsAsMPC
 
 Tensors = dict[str, th.Tensor]
 DIVERGED_SIZE = 1e9
@@ -28,7 +28,7 @@ class ActorCheckpoint:
     optimizer: dict[str, Any]
 
     @classmethod
-    def of(cls, policy: YannPolicy) -> ActorCheckpoint:
+    def of(cls, policy: StartsAsMPC) -> ActorCheckpoint:
         """Return a copy of the policy's present actor, its target and its optimizer."""
         return cls(
             _copied(policy.actor.state_dict()),
@@ -37,7 +37,7 @@ class ActorCheckpoint:
         )
 
     @classmethod
-    def of_mpc(cls, policy: YannPolicy) -> ActorCheckpoint:
+    def of_mpc(cls, policy: StartsAsMPC) -> ActorCheckpoint:
         """Return the MPC itself: the policy where it has learnt nothing, else as a new one."""
         if policy.actor.mu.network.is_zero():
             return cls.of(policy)
@@ -45,7 +45,7 @@ class ActorCheckpoint:
         optimizer = {**policy.actor.optimizer.state_dict(), "state": {}}
         return cls(actor, _copied(actor), _copied(optimizer))
 
-    def restore(self, policy: YannPolicy) -> None:
+    def restore(self, policy: StartsAsMPC) -> None:
         """Restore actor, target and optimizer, bit for bit."""
         policy.actor.load_state_dict(self.actor)
         policy.actor_target.load_state_dict(self.target)
@@ -83,7 +83,7 @@ class ActorCheckpoint:
                 return True
         return False
 
-    def is_actor_of(self, policy: YannPolicy) -> bool:
+    def is_actor_of(self, policy: StartsAsMPC) -> bool:
         """Return whether the policy's actor is still that of the checkpoint, bit for bit."""
         now = {name: value.cpu() for name, value in policy.actor.state_dict().items()}
         alike = all(th.equal(value, now[name]) for name, value in self.actor.items())
@@ -127,9 +127,9 @@ class ActorCheckpoint:
             # A parameter without moments has not been stepped yet: they are zero.
             known = ours.setdefault(key, {k: th.zeros_like(v) for k, v in state.items()})
             for entry, value in state.items():
-                if value.dim() > 0:
+                if value.dim() > 1:
                     known[entry][index] = value[index]
-                else:  # the number of steps, which all regions share
+                else:  # the number of steps, or a spread: all regions share it
                     known[entry].copy_(value)
         return mixed
 
@@ -155,7 +155,7 @@ class ActorCheckpoint:
 
 
 @contextmanager
-def all_or_nothing(policy: YannPolicy) -> Iterator[None]:
+def all_or_nothing(policy: StartsAsMPC) -> Iterator[None]:
     """Undo what happens to a policy's weights and optimizers, if an error or Ctrl-C cuts it off."""
     whole = whole_policy(policy)
     try:
@@ -165,14 +165,14 @@ def all_or_nothing(policy: YannPolicy) -> Iterator[None]:
         raise
 
 
-def whole_policy(policy: YannPolicy) -> tuple[Tensors, list[Any]]:
+def whole_policy(policy: StartsAsMPC) -> tuple[Tensors, list[Any]]:
     """Return a copy of a policy's weights, and of its optimizers' states."""
     optimizers = policy.actor.optimizer, policy.critic.optimizer
     weights = {name: each.clone() for name, each in policy.state_dict().items()}
     return weights, [copy.deepcopy(each.state_dict()) for each in optimizers]
 
 
-def restore_whole(policy: YannPolicy, whole: tuple[Tensors, list[Any]]) -> None:
+def restore_whole(policy: StartsAsMPC, whole: tuple[Tensors, list[Any]]) -> None:
     """Give a policy back what :func:`whole_policy` copied."""
     weights, states = whole
     policy.load_state_dict(weights)

@@ -11,7 +11,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import ArrayLike
-from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
@@ -95,12 +94,14 @@ SB3_KWARGS = (
 ).split()
 
 
-def require_plain_td3(algorithm: BaseAlgorithm | None) -> None:
-    """Raise unless the algorithm is TD3 or DDPG."""
-    if algorithm is not None and not isinstance(algorithm, TD3):
+def require_algorithm(algorithm: BaseAlgorithm | None, kinds: tuple[type, ...]) -> None:
+    """Raise unless an algorithm is one of those that train a policy."""
+    if algorithm is not None and not isinstance(algorithm, kinds):
         name = type(algorithm).__name__
+        what = " and ".join(each.__name__ for each in kinds)
         raise TypeError(
-            f"YannPolicy works with DDPG and TD3, such as DDPG(YannPolicy, env): not {name}."
+            f"This policy is one of {what}, not of {name}. By its name each algorithm that has one "
+            f'finds its own: {name}("YannPolicy", env).'
         )
 
 
@@ -108,8 +109,8 @@ def as_gamma(gamma: float | None, algorithm: BaseAlgorithm | None) -> float:
     """Return the discount that is given, else the algorithm's."""
     if gamma is not None:
         return gamma
-    if isinstance(algorithm, TD3):
-        return algorithm.gamma
+    if algorithm is not None:
+        return float(algorithm.gamma)  # type: ignore[attr-defined]
     raise ValueError(
         "YannPolicy does not find the DDPG or TD3 that builds it, and so neither its discount nor "
         "a VecNormalize. Let the algorithm build it, in the same thread: DDPG(YannPolicy, env). "
@@ -129,9 +130,12 @@ def refuse_another_gamma(algorithm: BaseAlgorithm, gamma: float) -> NoReturn:
     )
 
 
-def require_sb3_kwargs(given: dict[str, Any], own: list[str]) -> None:
-    """Raise unless all keywords that are not the policy's ``own`` are SB3's, and make sense."""
-    if unknown := [name for name in given if name not in SB3_KWARGS]:
+def require_sb3_kwargs(given: dict[str, Any], own: list[str], theirs: tuple[str, ...]) -> None:
+    """Raise unless all keywords that are not the policy's ``own`` are SB3's, and make sense.
+
+    ``theirs`` are those of SB3's policy that others have not.
+    """
+    if unknown := [name for name in given if name not in (*SB3_KWARGS, *theirs)]:
         raise TypeError(
             f"YannPolicy takes no {', '.join(map(repr, unknown))}. Its own policy_kwargs are "
             f"{', '.join(own)}; of SB3's it takes {', '.join(SB3_KWARGS)}. Options of the critic "

@@ -1,11 +1,11 @@
-"""The YANN policy for Stable-Baselines3's TD3 and DDPG."""
+"""The YANN policy for Stable-Baselines3's TD3 and DDPG, and what it shares with other policies."""
 
 from __future__ import annotations
 
 import inspect
 import weakref
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 import torch as th
@@ -57,76 +57,30 @@ from sb3_yann.policy.sb3_hooks import (
     watch_buffer,
 )
 
+NOT_OURS = "use_sde log_std_init use_expln clip_mean full_std squash_output ortho_init".split()
+"""Of the arguments of SB3's policies that draw actions: of how they do."""
+_AnyPolicy = TD3Policy if TYPE_CHECKING else object
 
-class YannPolicy(KeepsPrecision, TD3Policy):
-    """A TD3 or DDPG policy that starts as a linear MPC, exactly, with the critic that goes with it.
 
-    The actor is the law of the MPC plus networks that are zero at first. The critic is
-    the state-action value of the law on the linear model, plus such a network. Transitions and
-    gradients that are not finite are left out, with a :class:`NonFiniteWarning`; where an
-    observation or the actor's networks are not finite, the law acts.
+class StartsAsMPC(KeepsPrecision, _AnyPolicy):
+    """What every policy that starts as a linear MPC is besides its SB3 policy: see `YannPolicy`.
 
-    Pass ``target_policy_noise=0.0`` to TD3, else the critic learns the value of a noisy controller.
-
-    Parameters
+    Attributes
     ----------
-    observation_space : gymnasium.spaces.Box
-        The parameter theta of the law, shape (n_theta,), or what ``observation`` makes theta of.
-    action_space : gymnasium.spaces.Box, shape (m,)
-        Its bounds are ``u_min`` and ``u_max`` of the problem, or [-1, 1].
-    lr_schedule : callable
-        SB3's learning rate schedule.
-    problem : LinearMPC or str, optional
-        The MPC, the name of a registered one, or ``"module:attribute"``. The default is the
-        ``problem`` of the observation space, as our environments have it.
-    gamma : float, optional
-        Discount of the critic. The default is that of the algorithm that builds the policy.
-    net_arch : dict or list, optional
-        Widths of one or two hidden layers, for each network of the actor and for each critic:
-        ``{"pi": [16, 16], "qf": [64, 64]}`` by default, with [64, 64] for a shared network.
-    activation_fn : type, default torch.nn.Tanh
-        An activation that is 0 at 0.
-    actor_lr_mult, critic_lr_mult : float, default 0.1 and 1
-        Multiples of the algorithm's ``learning_rate`` for actor and critic; 0 freezes.
-    critic : str, CriticOptions or mapping, default "afterstate"
-        The kind of critic, or all of its options.
-    critic_warmup : int, default 2000
-        Updates of the critic before the first one of the actor, which is the MPC until then.
-    max_correction : float, optional
-        Bound on the distance from the MPC, as a fraction of the input range, 0 to 1: exact,
-        whatever is learnt. The default is none.
-    pin_equilibrium : bool, optional
-        Whether actor and critic keep their value at ``theta = 0`` for good: not where the model's
-        steady-state input is wrong. False for problems with references or disturbances, else True.
-    observation : AffineObservation or mapping, optional
-        The map from what the env shows to theta. A mapping has a ``center`` and a ``scale`` of
-        ``(theta - center) / scale``. By default the env shows theta, in plant units where the
-        problem's model has an operating point.
-    law : {"auto", "explicit", "online"}, default "auto"
-        The explicit law, or the one whose program is solved at each point: see
-        :meth:`LinearMPC.law`.
-    networks : {"per_region", "shared"}, optional
-        A network for each region of an explicit law, as in the paper, or one for all theta, which
-        keeps the policy as continuous as the law. The default is the first where there are regions.
-    **sb3_kwargs
-        ``n_critics``, ``optimizer_class`` and ``optimizer_kwargs``, as in SB3's `TD3Policy`. For
-        Adam, the actor of more than 32 regions has :class:`RowAdam`. Arguments for features must
-        keep their defaults: theta must reach the law as it is.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there is no problem, spaces or algorithm do not fit it, or a keyword is not known.
-
-    Examples
-    --------
-    >>> from stable_baselines3 import DDPG
-    >>> model = DDPG(YannPolicy, "CSTR-v0", policy_kwargs={"max_correction": 0.1}, device="cpu")
-    >>> theta = np.zeros(4, dtype=np.float32)
-    >>> bool(np.allclose(model.predict(theta)[0], model.policy.problem.explicit()(theta)))
-    True
+    ALGORITHMS : tuple of type
+        Which of SB3's algorithms train it.
+    OWN : tuple of str
+        Its keywords beside those of `YannPolicy`.
+    THEIRS : tuple of str
+        Keywords of its SB3 policy that others have not.
+    CRITIC : type
+        Of the critic.
     """
 
+    ALGORITHMS: ClassVar[tuple[type[BaseAlgorithm], ...]] = ()
+    OWN: ClassVar[tuple[str, ...]] = ()
+    THEIRS: ClassVar[tuple[str, ...]] = ()
+    CRITIC: ClassVar[type[YannCritic]] = YannCritic
     actor: YannActor
     actor_target: YannActor
     critic: YannCritic
@@ -155,9 +109,10 @@ class YannPolicy(KeepsPrecision, TD3Policy):
         **sb3_kwargs: Any,
     ) -> None:
         algorithm = sb3_hooks.algorithm_under_construction(lr_schedule)
-        checks.require_plain_td3(algorithm)
-        names = [*inspect.signature(YannPolicy).parameters]
-        checks.require_sb3_kwargs(sb3_kwargs, own=names[names.index("problem") : -1])
+        checks.require_algorithm(algorithm, self.ALGORITHMS)
+        names = [*inspect.signature(StartsAsMPC).parameters]
+        own = [*names[names.index("problem") : -1], *self.OWN]
+        checks.require_sb3_kwargs(sb3_kwargs, own, self.THEIRS)
         checks.require_box("observation_space", observation_space, observation is not None)
         checks.require_box("action_space", action_space)
         self.problem = resolve_problem(problem, observation_space)
@@ -232,14 +187,17 @@ class YannPolicy(KeepsPrecision, TD3Policy):
             super()._build(lr_schedule)
         chosen = {name: each for name, each in self.optimizer_kwargs.items() if name != "fused"}
         adam = self.optimizer_class is th.optim.Adam and chosen.keys() <= {"betas", "eps"}
-        if adam and (mu := self.actor.mu).n_networks > FEW:
+        if adam and type(self.actor) is YannActor and (mu := self.actor.mu).n_networks > FEW:
             # A step, and its gradients, of the regions in use alone.
             self.actor.optimizer = RowAdam(self.actor.parameters(), lr=lr_schedule(1), **chosen)
             mu.row_gradients = True
+        self._register_counters()
+        self._attach_hooks()
+
+    def _register_counters(self) -> None:
         # A buffer travels with the parameters: a model that is loaded goes on where it was.
         self.register_buffer("critic_updates", th.zeros((), dtype=th.int64))
         self.register_buffer("mean_stage_cost", th.zeros((), dtype=th.float64))
-        self._attach_hooks()
 
     def _attach_hooks(self) -> None:
         self.actor.optimizer.register_step_pre_hook(self._before_actor_step)
@@ -333,18 +291,22 @@ class YannPolicy(KeepsPrecision, TD3Policy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
         """Return an actor that equals the law, with networks that are zero."""
-        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return self._actor(YannActor, features_extractor)
+
+    def _actor(self, kind: Any, features_extractor: Any, **own: Any) -> Any:
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor) | own
+        kwargs = {name: each for name, each in kwargs.items() if name not in NOT_OURS}
         kwargs |= {"max_correction": self.max_correction, "pin_equilibrium": self.pin_equilibrium}
         kwargs |= {"law": self.law, "networks": self.networks}
         with single_precision():
-            return YannActor(self.problem, **kwargs).to(self.device)
+            return kind(self.problem, **kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannCritic:
         """Return a critic that is the law's value on the linear model, with networks of zero."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         options, pinned = self.critic_options, self.pin_equilibrium
         with single_precision():
-            critic = YannCritic(self.problem, self.gamma, options, pinned, **kwargs)
+            critic = self.CRITIC(self.problem, self.gamma, options, pinned, **kwargs)
         return critic.to(self.device)
 
     def limit_correction(self, max_correction: float | None) -> None:
@@ -406,9 +368,9 @@ def _as_correction(value: float | None) -> float | None:
     return check_range("max_correction", value, 0, 1, hint=hint)
 
 
-def require_yann_policy(policy: BasePolicy, who: str) -> YannPolicy:
+def require_yann_policy(policy: BasePolicy, who: str) -> StartsAsMPC:
     """Return the policy of a model, else raise TypeError in the name of a callback."""
-    if not isinstance(policy, YannPolicy):
+    if not isinstance(policy, StartsAsMPC):
         name = type(policy).__name__
         raise TypeError(
             f"{who} needs a YannPolicy; the policy of this model is {name}. Build it as "
@@ -417,13 +379,85 @@ def require_yann_policy(policy: BasePolicy, who: str) -> YannPolicy:
     return policy
 
 
-def require_problem_of_twin(policy: YannPolicy, problem: LinearMPC) -> None:
+def require_problem_of_twin(policy: StartsAsMPC, problem: LinearMPC) -> None:
     """Raise ValueError unless a twin's problem is the policy's."""
     if policy.problem != problem:
         raise ValueError(
             f"The twin is one of {problem!r}, the model's problem is {policy.problem!r}. Fit "
             "the twin with model.policy.problem."
         )
+
+
+class YannPolicy(StartsAsMPC, TD3Policy):
+    """A TD3 or DDPG policy that starts as a linear MPC, exactly, with the critic that goes with it.
+
+    The actor is the law of the MPC plus networks that are zero at first. The critic is
+    the state-action value of the law on the linear model, plus such a network. Transitions and
+    gradients that are not finite are left out, with a :class:`NonFiniteWarning`; where an
+    observation or the actor's networks are not finite, the law acts.
+
+    Pass ``target_policy_noise=0.0`` to TD3, else the critic learns the value of a noisy controller.
+
+    Parameters
+    ----------
+    observation_space : gymnasium.spaces.Box
+        The parameter theta of the law, shape (n_theta,), or what ``observation`` makes theta of.
+    action_space : gymnasium.spaces.Box, shape (m,)
+        Its bounds are ``u_min`` and ``u_max`` of the problem, or [-1, 1].
+    lr_schedule : callable
+        SB3's learning rate schedule.
+    problem : LinearMPC or str, optional
+        The MPC, the name of a registered one, or ``"module:attribute"``. The default is the
+        ``problem`` of the observation space, as our environments have it.
+    gamma : float, optional
+        Discount of the critic. The default is that of the algorithm that builds the policy.
+    net_arch : dict or list, optional
+        Widths of one or two hidden layers, for each network of the actor and for each critic:
+        ``{"pi": [16, 16], "qf": [64, 64]}`` by default, with [64, 64] for a shared network.
+    activation_fn : type, default torch.nn.Tanh
+        An activation that is 0 at 0.
+    actor_lr_mult, critic_lr_mult : float, default 0.1 and 1
+        Multiples of the algorithm's ``learning_rate`` for actor and critic; 0 freezes.
+    critic : str, CriticOptions or mapping, default "afterstate"
+        The kind of critic, or all of its options.
+    critic_warmup : int, default 2000
+        Updates of the critic before the first one of the actor, which is the MPC until then.
+    max_correction : float, optional
+        Bound on the distance from the MPC, as a fraction of the input range, 0 to 1: exact,
+        whatever is learnt. The default is none.
+    pin_equilibrium : bool, optional
+        Whether actor and critic keep their value at ``theta = 0`` for good: not where the model's
+        steady-state input is wrong. False for problems with references or disturbances, else True.
+    observation : AffineObservation or mapping, optional
+        The map from what the env shows to theta. A mapping has a ``center`` and a ``scale`` of
+        ``(theta - center) / scale``. By default the env shows theta, in plant units where the
+        problem's model has an operating point.
+    law : {"auto", "explicit", "online"}, default "auto"
+        The explicit law, or the one whose program is solved at each point: see
+        :meth:`LinearMPC.law`.
+    networks : {"per_region", "shared"}, optional
+        A network for each region of an explicit law, as in the paper, or one for all theta, which
+        keeps the policy as continuous as the law. The default is the first where there are regions.
+    **sb3_kwargs
+        ``n_critics``, ``optimizer_class`` and ``optimizer_kwargs``, as in SB3's `TD3Policy`. For
+        Adam, the actor of more than 32 regions has :class:`RowAdam`. Arguments for features must
+        keep their defaults: theta must reach the law as it is.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no problem, spaces or algorithm do not fit it, or a keyword is not known.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import DDPG
+    >>> model = DDPG(YannPolicy, "CSTR-v0", policy_kwargs={"max_correction": 0.1}, device="cpu")
+    >>> theta = np.zeros(4, dtype=np.float32)
+    >>> bool(np.allclose(model.predict(theta)[0], model.policy.problem.explicit()(theta)))
+    True
+    """
+
+    ALGORITHMS = (TD3,)
 
 
 # DDPG shares this table, so DDPG("YannPolicy", env) works as well.

@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._archive import atomic_write
 from sb3_yann.guard import ImprovementGuard
@@ -39,7 +39,7 @@ PARTS = (
 
 
 def report(
-    model: OffPolicyAlgorithm,
+    model: BaseAlgorithm,
     path: str | PathLike[str] = "report.html",
     *,
     env: Source | None = None,
@@ -59,7 +59,7 @@ def report(
 
     Parameters
     ----------
-    model : DDPG or TD3
+    model : DDPG, TD3, SAC, TQC or PPO
         With a :class:`YannPolicy`. The decisions of its guard travel with it.
     path : path-like, default "report.html"
         Folders are made as needed. The file is there as a whole or not at all.
@@ -115,7 +115,7 @@ def report(
 
 
 def _subject(
-    model: OffPolicyAlgorithm,
+    model: BaseAlgorithm,
     env: Source | None,
     guard: ImprovementGuard | None,
     twin: PlantTwin | None,
@@ -123,8 +123,8 @@ def _subject(
     seeds: Iterable[int],
 ) -> Subject:
     """Return what the report is about, checked."""
-    if not isinstance(model, OffPolicyAlgorithm):
-        raise TypeError(f"model = {model!r} must be a DDPG or TD3 model with a YannPolicy.")
+    if not isinstance(model, BaseAlgorithm):
+        raise TypeError(f"model = {model!r} must be an SB3 model with a YannPolicy.")
     policy = require_yann_policy(model.policy, "report")
     given = {"guard": (guard, ImprovementGuard), "twin": (twin, PlantTwin)}
     for name, (value, kind) in {**given, "headroom": (headroom, Headroom)}.items():

@@ -8,7 +8,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC, PiecewiseAffine
@@ -20,7 +20,7 @@ from sb3_yann.guard.state import GuardState
 from sb3_yann.improvement import Headroom
 from sb3_yann.improvement.improve import Improvement, fingerprint
 from sb3_yann.policy.observations import normalized
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.reporting.html import Html, tag
 from sb3_yann.rollout import Controller, Source, Trajectories, name_of, one_env, rollout
 from sb3_yann.twin import PlantTwin
@@ -65,7 +65,7 @@ class Subject:
 
     Attributes
     ----------
-    model, policy : OffPolicyAlgorithm and YannPolicy
+    model, policy : BaseAlgorithm and YannPolicy
     env : gymnasium.Env, str, callable or None
     guard : ImprovementGuard or None
     twin : PlantTwin or None
@@ -75,8 +75,8 @@ class Subject:
         Those of `report` that were given, by their names, in their order.
     """
 
-    model: OffPolicyAlgorithm
-    policy: YannPolicy
+    model: BaseAlgorithm
+    policy: StartsAsMPC
     env: Source | None
     guard: ImprovementGuard | None
     twin: PlantTwin | None

@@ -1,0 +1,199 @@
+"""SAC, TQC and PPO: the most likely action is the MPC's, and what is drawn around it is small."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from sb3_contrib import TQC
+from scipy import stats
+from stable_baselines3 import DDPG, PPO, SAC
+
+from policy_samples import scalar_mpc
+from sample_plants import LinearPlant, feasible_states
+from sb3_yann import (
+    ControlDiagnostics,
+    CostAudit,
+    ImprovementGuard,
+    LinearModel,
+    LinearMPC,
+    NoActionNoise,
+    YannPolicy,
+    export,
+)
+from sb3_yann.deployment.controller import Controller
+from sb3_yann.policy.spread import TruncatedNormal
+
+EXPLORING = pytest.mark.parametrize("algorithm", [SAC, TQC, PPO])
+SMALL = {PPO: {"n_steps": 32, "batch_size": 16}}
+
+
+def build(algorithm, env=None, **policy_kwargs):
+    if env is None:
+        env, policy_kwargs["problem"] = LinearPlant(scalar_mpc()), scalar_mpc()
+    given = {"simulator": True, **policy_kwargs}
+    small = SMALL.get(algorithm, {"learning_starts": 10})
+    return algorithm("YannPolicy", env, policy_kwargs=given, seed=0, device="cpu", **small)
+
+
+def twelve_states() -> LinearMPC:
+    """Four chains of three lags, too many for regions."""
+    A = np.kron(np.eye(4), [[0.9, 0.1, 0], [0, 0.8, 0.2], [0, 0, 0.7]])
+    B = np.kron(np.eye(4), [[0.0], [0.0], [0.3]])[:, :3]
+    return LinearMPC(
+        LinearModel(A, B, 1), Q=np.eye(12), R=0.1 * np.eye(3), horizon=8, gamma=0.98,
+        theta_min=-2, theta_max=2, u_min=-1, u_max=1,
+    )  # fmt: skip
+
+
+@EXPLORING
+@pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
+def test_the_deterministic_action_is_the_law_s_at_ten_thousand_points(algorithm, env_id) -> None:
+    model = build(algorithm, env_id)
+    mpc = model.policy.problem
+    theta = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (10_000, mpc.n_theta))
+    theta = theta.astype(np.float32)
+    law = mpc.explicit()(theta.astype(float))
+    actions, _ = model.predict(theta, deterministic=True)
+    assert np.max(np.abs(actions - law) / (mpc.u_max - mpc.u_min)) < 1e-6
+    bounds = np.minimum(law - mpc.u_min, mpc.u_max - law) / (mpc.u_max - mpc.u_min)
+    assert np.sum(bounds < 1e-9) > 1000  # it rides them
+
+
+@EXPLORING
+def test_so_it_is_with_twelve_states_and_a_law_that_is_solved_online(algorithm) -> None:
+    mpc = twelve_states()
+    model = build(algorithm, LinearPlant(mpc), problem=mpc, law="online")
+    states, expected = feasible_states(mpc, 200)
+    actions, _ = model.predict(states.astype(np.float32), deterministic=True)
+    assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-6
+
+
+def test_a_truncated_normal_is_scipy_s() -> None:
+    center = th.tensor([[-1.0, -0.9], [0.2, 0.99], [1.0, 0.0]])
+    log_std = th.tensor([-3.0, -0.5])
+    ours = TruncatedNormal(center, log_std)
+    m, s = center.numpy().astype(float), np.exp(log_std.numpy().astype(float))
+    theirs = stats.truncnorm((-1 - m) / s, (1 - m) / s, loc=m, scale=s)
+    assert np.allclose(ours.entropy(), theirs.entropy().sum(1), atol=1e-5)
+    for at in (center, th.full_like(center, -1.0), th.full_like(center, 1.0), -center):
+        assert np.allclose(ours.log_prob(at), theirs.logpdf(at.numpy()).sum(1), rtol=1e-5)
+    th.manual_seed(0)
+    drawn = TruncatedNormal(center.repeat(20_000, 1), log_std).sample().reshape(-1, 3, 2)
+    assert float(drawn.abs().max()) <= 1
+    assert np.allclose(drawn.mean(0), theirs.mean(), atol=0.01)
+    assert np.allclose(drawn.std(0), theirs.std(), atol=0.01)
+
+
+def test_what_is_drawn_has_a_gradient_by_center_and_spread() -> None:
+    center = th.tensor([[1.0], [0.0]], requires_grad=True)
+    log_std = th.tensor([-3.0], requires_grad=True)
+    actions = TruncatedNormal(center, log_std).sample()
+    actions.sum().backward()
+    assert bool((center.grad > 0).all())
+    assert float(log_std.grad.abs()) > 0
+
+
+@EXPLORING
+def test_log_probabilities_are_finite_where_the_law_rides_its_bounds(algorithm) -> None:
+    model = build(algorithm)
+    obs = th.tensor([[-50.0], [50.0], [0.0]])
+    actor = model.policy.actor
+    for at in (-1.0, 1.0):
+        assert bool(actor.distribution(obs).log_prob(th.full((3, 1), at)).isfinite().all())
+    assert actor(obs)[:2].flatten().tolist() == [1.0, -1.0]
+
+
+def test_critics_start_as_the_value_of_the_law() -> None:
+    models = {algorithm: build(algorithm) for algorithm in (SAC, TQC, PPO)}
+    plain = DDPG(YannPolicy, LinearPlant(scalar_mpc()), policy_kwargs={"problem": scalar_mpc()})
+    obs, actions = th.linspace(-3, 3, 7)[:, None], th.linspace(-1, 1, 7)[:, None]
+    with th.no_grad():
+        (expected,) = plain.critic(obs, actions)
+        for q in models[SAC].critic(obs, actions):
+            assert th.equal(q, expected)
+        quantiles = models[TQC].critic(obs, actions)
+        assert quantiles.shape == (7, 2, 25)
+        assert th.allclose(quantiles, expected[:, :, None].expand_as(quantiles), rtol=1e-5)
+        P = scalar_mpc().value_matrix(plain.gamma)
+        assert np.allclose(models[PPO].policy.predict_values(obs), -P * obs.numpy() ** 2)
+
+
+@EXPLORING
+def test_it_learns_and_a_saved_model_goes_on(algorithm, tmp_path) -> None:
+    model = build(algorithm, actor_lr_mult=1.0, critic_warmup=0).learn(96)
+    assert not model.policy.actor.mu.network.is_zero()
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", env=model.get_env(), device="cpu")
+    obs = np.linspace(-3, 3, 9, dtype=np.float32)[:, None]
+    for deterministic in (True, False):
+        th.manual_seed(1)
+        one = model.predict(obs, deterministic=deterministic)[0]
+        th.manual_seed(1)
+        assert np.array_equal(one, loaded.predict(obs, deterministic=deterministic)[0])
+    loaded.learn(64, reset_num_timesteps=False)
+    model.policy.save(tmp_path / "policy")
+    alone = type(model.policy).load(tmp_path / "policy")
+    assert np.array_equal(
+        alone.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0]
+    )
+
+
+@EXPLORING
+def test_a_guard_keeps_what_is_no_worse_and_the_export_is_the_deterministic_policy(
+    algorithm, tmp_path
+) -> None:
+    env = gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)
+    model = build(algorithm, env, problem=scalar_mpc(), actor_lr_mult=1.0, critic_warmup=0)
+    make = lambda: gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)  # noqa: E731
+    callbacks = [ImprovementGuard(make), ControlDiagnostics(), CostAudit(steps=20)]
+    model.learn(96, callback=callbacks)
+    assert callbacks[0].decisions
+    export(model, tmp_path / "law.npz")
+    controller = Controller.load(tmp_path / "law.npz")
+    obs = np.linspace(-3, 3, 9, dtype=np.float32)[:, None]
+    actions = model.predict(obs, deterministic=True)[0]
+    assert np.allclose([controller(each) for each in obs], actions, atol=1e-6)
+
+
+@EXPLORING
+def test_no_action_noise_explains_itself(algorithm) -> None:
+    with pytest.warns(UserWarning, match="turns nothing off here"):
+        build(algorithm).learn(32, callback=NoActionNoise())
+
+
+@EXPLORING
+def test_exploring_without_a_guard_on_what_may_be_a_plant_warns_once(algorithm) -> None:
+    with pytest.warns(UserWarning, match="That belongs into a simulator") as said:
+        build(algorithm, simulator=False).learn(64)
+    assert sum("That belongs" in str(each.message) for each in said) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        build(algorithm).learn(32)
+
+
+def test_entropy_starts_in_balance_and_what_the_user_gives_stays() -> None:
+    model = build(SAC, initial_std=0.05)
+    entropy = model.policy.actor.distribution(th.zeros(1, 1)).entropy()
+    assert model.target_entropy == pytest.approx(entropy.item(), abs=1e-3)
+    mpc, std = model.policy.problem, 0.1
+    curvature = mpc.state_action_matrix(model.gamma)[1, 1]
+    assert model.log_ent_coef.exp().item() == pytest.approx(2 * curvature * std**2, rel=1e-4)
+    own = {"policy_kwargs": {"problem": mpc}, "ent_coef": 0.3, "target_entropy": -2.0}
+    given = SAC("YannPolicy", LinearPlant(mpc), **own)
+    assert given.ent_coef_tensor.item() == pytest.approx(0.3)
+    assert given.target_entropy == -2
+
+
+@EXPLORING
+def test_the_policy_of_td3_and_state_dependent_noise_are_refused(algorithm) -> None:
+    env, kwargs = LinearPlant(scalar_mpc()), {"problem": scalar_mpc()}
+    with pytest.raises(TypeError, match=f'{algorithm.__name__}\\("YannPolicy", env\\)'):
+        algorithm(YannPolicy, env, policy_kwargs=kwargs)
+    with pytest.raises(ValueError, match="use_sde = True"):
+        algorithm("YannPolicy", env, policy_kwargs=kwargs, use_sde=True)
+    with pytest.raises(ValueError, match="initial_std = 0"):
+        build(algorithm, initial_std=0.0)
