@@ -1,8 +1,8 @@
 """Search spaces for RL Zoo: ``--gym-packages sb3_yann.tuning`` puts them in the place of its own.
 
-The Zoo's spaces for DDPG, TD3, SAC and TQC draw activations that are not zero at zero and networks that YANN
-has not, and a trial loses the `policy_kwargs` of its entry, the problem with them. Trials of a
-`YannPolicy` have these spaces; others keep the Zoo's.
+The Zoo's spaces for DDPG, TD3, SAC and TQC draw activations that are not zero at zero and networks
+that YANN has not, and a trial loses the `policy_kwargs` of its entry, the problem with them. Trials
+of a `YannPolicy` have these spaces; others keep the Zoo's.
 """
 
 from __future__ import annotations

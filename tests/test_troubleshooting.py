@@ -122,7 +122,7 @@ CASES: dict[str, Callable[[], object]] = {
     "The program will be solved online, at each point.": too_large,
     # The policy
     "YannPolicy has no problem: the observation space": lambda: DDPG(YannPolicy, Plant()),
-    "YannPolicy works with DDPG and TD3": lambda: SAC(
+    "This policy is one of TD3, not of": lambda: SAC(
         YannPolicy, Plant(), policy_kwargs={"problem": scalar_mpc()}
     ),
     "YannPolicy takes no 'learning_rate'.": lambda: model(learning_rate=1e-3),
