@@ -50,7 +50,7 @@ class NoActionNoise(BaseCallback):
                 stacklevel=2,
             )
         # Here, not at the first step: SB3 draws the first action before it calls `_on_step`.
-        if not isinstance(self.model, OffPolicyAlgorithm):
+        if not hasattr(self.model, "replay_buffer"):
             if isinstance(self.model.policy, Explores):
                 return
             raise TypeError(

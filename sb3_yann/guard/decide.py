@@ -31,7 +31,7 @@ from sb3_yann.control.mpc.bound_excess import excess_of_episodes
 from sb3_yann.guard.state import Decision, Evidence, Outcome
 from sb3_yann.policy.checkpoint import ActorCheckpoint
 from sb3_yann.policy.observations import normalized
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.policies import StartsAsMPC
 from sb3_yann.rollout import (
     EnvPool,
     Rows,
@@ -438,7 +438,7 @@ class Player:
     """
 
     def __init__(
-        self, model: OffPolicyAlgorithm, policy: YannPolicy, env: Source, mpc: ActorCheckpoint
+        self, model: OffPolicyAlgorithm, policy: StartsAsMPC, env: Source, mpc: ActorCheckpoint
     ) -> None:
         self.model, self.policy, self.mpc, self.envs = model, policy, mpc, EnvPool(env)
         self.max_input_step: Array | None = None

@@ -21,7 +21,7 @@ from sb3_yann.control.mpc.bound_excess import BoundNames
 from sb3_yann.guard.decide import GuardSettings, Player, Unplayable, try_before_training
 from sb3_yann.guard.state import Decision, Evidence, GuardState
 from sb3_yann.policy.checkpoint import ActorCheckpoint
-from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin
+from sb3_yann.policy.policies import StartsAsMPC, require_problem_of_twin
 from sb3_yann.rollout import Trajectories, preserve_rng
 
 SAME = 0.01
@@ -168,7 +168,7 @@ def check_alone(guard: BaseCallback) -> None:
         )
 
 
-def check_twin(policy: YannPolicy, problem: LinearMPC) -> None:
+def check_twin(policy: StartsAsMPC, problem: LinearMPC) -> None:
     """Raise ValueError unless a twin shows what the policy observes, theta of the same problem."""
     require_problem_of_twin(policy, problem)
     if policy.observation is not None:

@@ -11,14 +11,14 @@ from sb3_yann._validation import Array
 from sb3_yann.improvement.imitation import policy_of
 from sb3_yann.improvement.model import Model
 from sb3_yann.networks.yann import LawLayer
-from sb3_yann.policy.policies import YannPolicy
+from sb3_yann.policy.policies import StartsAsMPC
 
 SAMPLES, STEPS, BATCH, UPDATES, RATE = 1000, 100, 256, 200, 1e-3
 SPREAD = 0.1
 """Standard deviation of the first input, in half-widths: the critic must know its slope."""
 
 
-def refit_critic(policy: YannPolicy, twin: Model, seed: int) -> None:
+def refit_critic(policy: StartsAsMPC, twin: Model, seed: int) -> None:
     """Fit the critics to the returns of the policy in the twin, from inputs near its own."""
     problem, rng = policy.problem, np.random.default_rng([seed, 2])
     layer, half = copy.deepcopy(policy.actor.mu).cpu(), problem.u_half
@@ -39,7 +39,7 @@ def refit_critic(policy: YannPolicy, twin: Model, seed: int) -> None:
     policy.critic_target.load_state_dict(policy.critic.state_dict())
 
 
-def _costs(policy: YannPolicy, twin: Model, layer: LawLayer, at: Array, u: Array) -> Array:
+def _costs(policy: StartsAsMPC, twin: Model, layer: LawLayer, at: Array, u: Array) -> Array:
     """Return the discounted costs (rows,) of inputs u, then of the policy; NaN if it leaves."""
     problem, gamma, dynamics = policy.problem, policy.gamma, twin.dynamics
     shape = len(dynamics.members), -1
@@ -58,7 +58,7 @@ def _costs(policy: YannPolicy, twin: Model, layer: LawLayer, at: Array, u: Array
 
 
 def _fit(
-    policy: YannPolicy, theta: Array, actions: Array, returns: Array, rng: np.random.Generator
+    policy: StartsAsMPC, theta: Array, actions: Array, returns: Array, rng: np.random.Generator
 ) -> None:
     """Take steps of Adam on the critics' squared errors, in units of the returns' spread."""
     critic, device = policy.critic, policy.device

@@ -26,7 +26,12 @@ from sb3_yann.improvement.simulator import OutOfStepsError, Simulator
 from sb3_yann.improvement.trial import RULE, Check, Trial
 from sb3_yann.networks.yann import LawLayer
 from sb3_yann.policy.checkpoint import all_or_nothing
-from sb3_yann.policy.policies import YannPolicy, require_problem_of_twin, require_yann_policy
+from sb3_yann.policy.policies import (
+    StartsAsMPC,
+    YannPolicy,
+    require_problem_of_twin,
+    require_yann_policy,
+)
 from sb3_yann.rollout import Source, maker, name_of, preserve_rng
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.trust import Trust
@@ -310,7 +315,7 @@ class _Work:
 
     def __init__(
         self,
-        policy: YannPolicy,
+        policy: StartsAsMPC,
         n_starts: int,
         rounds: int,
         updates: int,

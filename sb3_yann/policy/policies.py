@@ -59,7 +59,10 @@ from sb3_yann.policy.sb3_hooks import (
 
 NOT_OURS = "use_sde log_std_init use_expln clip_mean full_std squash_output ortho_init".split()
 """Of the arguments of SB3's policies that draw actions: of how they do."""
-_AnyPolicy = TD3Policy if TYPE_CHECKING else object
+if TYPE_CHECKING:
+    _AnyPolicy = TD3Policy
+else:
+    _AnyPolicy = object  # the SB3 policy of each class comes after it
 
 
 class StartsAsMPC(KeepsPrecision, _AnyPolicy):
@@ -291,7 +294,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> YannActor:
         """Return an actor that equals the law, with networks that are zero."""
-        return self._actor(YannActor, features_extractor)
+        actor: YannActor = self._actor(YannActor, features_extractor)
+        return actor
 
     def _actor(self, kind: Any, features_extractor: Any, **own: Any) -> Any:
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor) | own

@@ -115,15 +115,17 @@ class YannPPOPolicy(Explores, ActorCriticPolicy):
         for group in optimizer.param_groups:
             group["lr"] = group.pop("scheduled_lr")
 
-    def get_distribution(self, obs: Any) -> TruncatedNormal:  # type: ignore[override]
+    def get_distribution(self, obs: Any) -> TruncatedNormal:
         """Return the distribution of actions in [-1, 1]."""
-        return self.actor.distribution(obs)  # type: ignore[attr-defined, no-any-return]
+        actor: Any = self.actor
+        distribution: TruncatedNormal = actor.distribution(obs)
+        return distribution
 
     def predict_values(self, obs: Any) -> th.Tensor:
         """Return the values of states, (batch, 1)."""
         return self.critic.state_value(obs)
 
-    def forward(
+    def forward(  # type: ignore[override]
         self, obs: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Return actions in [-1, 1], values, and the logarithm of the actions' density."""

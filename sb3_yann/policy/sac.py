@@ -43,10 +43,11 @@ class MaximumEntropy(Explores):
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         if not deterministic:
             self.says_that_it_explores()
-        return self.actor(observation, deterministic)  # type: ignore[call-arg]
+        actions: th.Tensor = self.actor(observation, deterministic)
+        return actions
 
 
-class YannSACPolicy(MaximumEntropy, SACPolicy):
+class YannSACPolicy(MaximumEntropy, SACPolicy):  # type: ignore[misc]
     """A SAC policy whose most likely action is that of a linear MPC, exactly.
 
     ``SAC("YannPolicy", env)``. The critic starts as the law's value without the entropy term, which

@@ -12,6 +12,7 @@ from stable_baselines3.common.distributions import Distribution
 from torch import nn
 
 from sb3_yann._validation import check_bool, check_range
+from sb3_yann.control import LinearMPC
 from sb3_yann.policy.actor_critic import YannActor
 from sb3_yann.policy.policies import NOT_OURS, StartsAsMPC
 
@@ -44,7 +45,7 @@ class TruncatedNormal(Distribution):
     """
 
     def __init__(self, center: th.Tensor, log_std: th.Tensor) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.center = center
         # Float64: the tails of float32 end at five standard deviations.
         self.m = center.double()
@@ -61,20 +62,23 @@ class TruncatedNormal(Distribution):
         """Return actions (batch, m), with a gradient by center and spread."""
         quantile = self.below + th.rand_like(self.m) * self.mass
         away = th.special.ndtri(quantile.clamp(EDGE, 1 - EDGE))
-        return (self.m + self.std * away).clamp(-1, 1).to(self.center.dtype)
+        actions: th.Tensor = (self.m + self.std * away).clamp(-1, 1).to(self.center.dtype)
+        return actions
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """Return the logarithm of the density, (batch,), of actions (batch, m)."""
         away = (actions.double() - self.m) / self.std
         each = -0.5 * away**2 - HALF_LOG_TAU - self.std.log() - self.mass.log()
-        return each.sum(1).to(self.center.dtype)
+        total: th.Tensor = each.sum(1).to(self.center.dtype)
+        return total
 
     def entropy(self) -> th.Tensor:
         """Return the differential entropy, (batch,)."""
         density = [(-0.5 * each**2 - HALF_LOG_TAU).exp() for each in (self.low, self.high)]
         edges = (self.low * density[0] - self.high * density[1]) / (2 * self.mass)
         each = HALF_LOG_TAU + 0.5 + self.std.log() + self.mass.log() + edges
-        return each.sum(1).to(self.center.dtype)
+        total: th.Tensor = each.sum(1).to(self.center.dtype)
+        return total
 
     def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
         """Return nothing: the law's layer gives the center."""
@@ -99,16 +103,17 @@ class SpreadActor(YannActor):
 
     Parameters
     ----------
+    problem : LinearMPC
     initial_std : float
         Standard deviation, as a share of the input range.
     **kwargs
         As those of :class:`YannActor`.
     """
 
-    def __init__(self, *args: Any, initial_std: float, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, problem: LinearMPC, *, initial_std: float, **kwargs: Any) -> None:
+        super().__init__(problem, **kwargs)
         self.options["initial_std"] = initial_std
-        m = self.action_space.shape[0]
+        m = problem.model.n_inputs
         self.log_std = nn.Parameter(th.full((m,), math.log(2 * initial_std), dtype=th.float32))
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
@@ -159,7 +164,9 @@ class Explores(StartsAsMPC):
 
     def make_actor(self, features_extractor: Any = None) -> SpreadActor:
         """Return an actor whose most likely action is the law's."""
-        return self._actor(SpreadActor, features_extractor, initial_std=self.initial_std)
+        given = {"initial_std": self.initial_std}
+        actor: SpreadActor = self._actor(SpreadActor, features_extractor, **given)
+        return actor
 
     def says_that_it_explores(self) -> None:
         """Warn once where nothing says that the plant is a simulator, and no guard is at work."""

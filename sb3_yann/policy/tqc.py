@@ -24,7 +24,7 @@ class QuantileCritic(YannCritic):
         return th.stack(super().forward(obs, actions), dim=1)
 
 
-class YannTQCPolicy(MaximumEntropy, TQCPolicy):
+class YannTQCPolicy(MaximumEntropy, TQCPolicy):  # type: ignore[misc]
     """A TQC policy whose most likely action is that of a linear MPC: see `YannSACPolicy`."""
 
     ALGORITHMS = (TQC,)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import warnings
+from importlib.resources import files
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from sb3_contrib import TQC
 from scipy import stats
 from stable_baselines3 import DDPG, PPO, SAC
@@ -149,7 +151,11 @@ def test_a_guard_keeps_what_is_no_worse_and_the_export_is_the_deterministic_poli
     env = gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)
     model = build(algorithm, env, problem=scalar_mpc(), actor_lr_mult=1.0, critic_warmup=0)
     make = lambda: gym.wrappers.TimeLimit(LinearPlant(scalar_mpc()), 20)  # noqa: E731
-    callbacks = [ImprovementGuard(make), ControlDiagnostics(), CostAudit(steps=20)]
+    callbacks = [
+        ImprovementGuard(make, n_eval_episodes=20, n_new_starts=5),
+        ControlDiagnostics(),
+        CostAudit(steps=20),
+    ]
     model.learn(96, callback=callbacks)
     assert callbacks[0].decisions
     export(model, tmp_path / "law.npz")
@@ -197,3 +203,21 @@ def test_the_policy_of_td3_and_state_dependent_noise_are_refused(algorithm) -> N
         algorithm("YannPolicy", env, policy_kwargs=kwargs, use_sde=True)
     with pytest.raises(ValueError, match="initial_std = 0"):
         build(algorithm, initial_std=0.0)
+
+
+@pytest.mark.parametrize("env_id", ["CSTR-v0", "ClippedPendulum-v0"])
+@EXPLORING
+def test_rl_zoo_s_entries_build_a_model(algorithm, env_id) -> None:
+    name = f"{algorithm.__name__.lower()}.yml"
+    text = (files("sb3_yann") / "hyperparams" / name).read_text(encoding="utf-8")
+    entry = yaml.safe_load(text)[env_id]
+    steps, callbacks = entry.pop("n_timesteps"), entry.pop("callback")
+    model = algorithm(env=env_id, device="cpu", **entry)
+    length = model.env.get_attr("spec")[0].max_episode_steps
+    assert steps == 50 * length
+    assert [next(iter(each)) if isinstance(each, dict) else each for each in callbacks] == [
+        "sb3_yann.ImprovementGuard", "sb3_yann.ControlDiagnostics",
+    ]  # fmt: skip
+    law = model.policy.problem.explicit()
+    theta = np.zeros(law.n_theta, np.float32)
+    assert np.allclose(model.predict(theta, deterministic=True)[0], law(theta.astype(float)))
