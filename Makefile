@@ -31,7 +31,7 @@ bench: $(STAMP)  ## measure the speed, ten minutes (make bench ARGS="--quick" fo
 test: $(STAMP)  ## run the tests, side by side (make test ARGS="-n 0 -k name" for pytest alone)
 	@$(PYTEST) -m "not nightly" $(ARGS)
 
-test-all: $(STAMP)  ## run those of the night too: fuzzers, faults, what needs other tools
+test-all: $(STAMP)  ## run those of the night too: variety, faults, what needs other tools
 	@$(PYTEST) $(ARGS)
 
 test-fast: $(STAMP)  ## run the tests that are not marked slow, in less than two minutes

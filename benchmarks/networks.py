@@ -20,7 +20,7 @@ from benchmarks.timing import Task
 from sb3_yann import YannPolicy
 from sb3_yann.control import LinearMPC
 
-FORWARD_ONE, FORWARD_MANY = "actor, batch of 1", "actor, batch of 256"
+FORWARD_ONE = "actor, batch of 1"
 PREDICT = "predict, one observation"
 TRAIN = "training step, batch of 256"
 OURS = "ours"
@@ -44,11 +44,9 @@ def actor(bench: Bench, problem: Problem) -> None:
     models = {OURS: learner(problem, YannPolicy), peers.MLP: learner(problem, "MlpPolicy")}
     points = problem.points(4 * BATCH).astype(np.float32)
     one = [th.as_tensor(point[None]) for point in points]
-    many = [th.as_tensor(batch) for batch in points.reshape(4, BATCH, -1)]
-    for section, inputs in ((FORWARD_ONE, one), (FORWARD_MANY, many)):
-        tasks = {name: Task(model.actor, inputs) for name, model in models.items()}
-        with th.no_grad():
-            bench.figures.add(timed(section, problem.regions, bench.watch.compare(tasks)))
+    tasks = {name: Task(model.actor, one) for name, model in models.items()}
+    with th.no_grad():
+        bench.figures.add(timed(FORWARD_ONE, problem.regions, bench.watch.compare(tasks)))
     tasks = {name: Task(predictor(model), [*points]) for name, model in models.items()}
     bench.figures.add(timed(PREDICT, problem.regions, bench.watch.compare(tasks)))
 

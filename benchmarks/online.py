@@ -10,11 +10,11 @@ from stable_baselines3 import DDPG
 from benchmarks import networks, peers
 from benchmarks.online_problems import PROBLEMS, OnlineProblem, worst_condition
 from benchmarks.records import Bench, Figure, timed
-from benchmarks.timing import Array, Task
+from benchmarks.timing import Task
 from sb3_yann import YannPolicy
 
 LAW, PREDICT = "online law", "online law, predict"
-TRAIN, BUILT = "online law, training step", "online law, a policy is built"
+TRAIN = "online law, training step"
 EXACT = "online law, exactness"
 OURS, KNOWN, BATCH = "ours, a new point", "ours, a known point", "ours, each of 256 new points"
 POINTS, CONDITIONS, ERROR = "points", "largest violation of optimality", "largest error of an input"
@@ -58,8 +58,6 @@ def _policy(bench: Bench, problem: OnlineProblem) -> None:
         _ask_what_is_stored(model, problem)
         tasks[name] = Task(partial(_train, model), [1])
     bench.figures.add(timed(TRAIN, problem.name, bench.watch.compare(tasks)))
-    found: Array = bench.watch.once(lambda: networks.learner(_anew(problem), YannPolicy))
-    bench.figures.add(timed(BUILT, problem.name, {networks.OURS: found}))
 
 
 def _ask_what_is_stored(model: DDPG, problem: OnlineProblem) -> None:
@@ -72,10 +70,6 @@ def _ask_what_is_stored(model: DDPG, problem: OnlineProblem) -> None:
 
 def _train(model: DDPG, steps: int) -> None:
     model.train(steps, networks.BATCH)
-
-
-def _anew(problem: OnlineProblem) -> OnlineProblem:
-    return OnlineProblem(problem.name, problem.make)
 
 
 def _exactness(bench: Bench, problem: OnlineProblem) -> None:

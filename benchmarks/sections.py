@@ -15,7 +15,6 @@ from benchmarks import (
     networks,
     offline,
     online,
-    simulators,
     suite,
 )
 from benchmarks.problems import PROBLEMS, SMALLEST, Problem
@@ -25,7 +24,6 @@ TITLES = {
     evaluation.ONE: "The law in numpy, one point",
     evaluation.MANY: "The law in numpy, 256 points",
     networks.FORWARD_ONE: "Actor in torch, batch of 1, without gradient",
-    networks.FORWARD_MANY: "Actor in torch, batch of 256, without gradient",
     networks.PREDICT: "model.predict of one observation",
     networks.TRAIN: "One training step of DDPG, batch of 256",
     offline.SECTION: "Offline solution",
@@ -36,11 +34,9 @@ TITLES = {
     online.LAW: "The online law in numpy, one point",
     online.PREDICT: "The online law: model.predict of one observation",
     online.TRAIN: "The online law: one training step of DDPG, batch of 256",
-    online.BUILT: "The online law: DDPG is built",
     online.EXACT: "The online law: exactness",
     deployment.SECTION: "Exported controllers of the reactor, one step",
     deployment.SMALL: "An exported controller of the reactor on an emulated microcontroller",
-    simulators.SECTION: "Environments",
     memory.SECTION: "Memory",
 }
 PerProblem = Callable[[Bench, Problem], None]
@@ -58,7 +54,6 @@ WHOLE: dict[str, Callable[[Bench], None]] = {
     "horizons": long_horizons.long_horizons,
     "online": online.online,
     "export": deployment.deployment,
-    "env": simulators.simulators,
 }
 NAMES = (*EACH, *WHOLE)
 

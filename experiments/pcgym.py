@@ -23,7 +23,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from experiments.markdown import number, quote, spread, table
 from experiments.measures import MPC, OURS, REIDENTIFIED
 from experiments.pcgym_nmpc import NonlinearMPC
-from experiments.pcgym_vector import registered
 from experiments.runner import RESULTS, Outcome, Run, load_all, run_all
 from sb3_yann import (
     DisturbanceBounds,
@@ -180,7 +179,7 @@ def execute(run: Run) -> Outcome:
         test(0, NonlinearMPC(case) if run.learner == NMPC else problem.explicit())
     elif run.learner == OURS:
         model = policy_of(case, run.seed, tau=0.005, n_steps=10, gradient_steps=4)
-        guard = ImprovementGuard(registered(name), patience=10, keep_if_worse=True)
+        guard = ImprovementGuard(case.taught, patience=10, keep_if_worse=True)
         explores = SimulatedEpisodes(case.taught)
         model.learn(steps * EPISODES, callback=[NoActionNoise(), explores, guard])
         test(steps * EPISODES, partial(acted, model))

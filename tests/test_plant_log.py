@@ -23,11 +23,6 @@ def test_every_step_but_those_of_another_length_is_kept() -> None:
     assert all(len(each) == len(each.states) - 1 for each in parts)
 
 
-def test_gaps_at_both_ends_leave_what_is_between() -> None:
-    (part,), lost = without_gaps([numbered(4)], [np.array([0, 3, 4, 5, 9], float)], 1.0)
-    assert lost == 2 and part.states[:, 0].tolist() == [1, 2, 3]
-
-
 def test_the_last_steps_of_all_are_held_out_and_none_is_in_both_parts() -> None:
     fitted, tested = split([numbered(6), numbered(4)], 0.5)
     assert [len(each) for each in fitted] == [5] and [len(each) for each in tested] == [1, 4]
@@ -52,16 +47,6 @@ def test_where_more_than_half_of_the_steps_are_none_the_unit_is_another() -> Non
         without_gaps([numbered(8)], [times(5)], 1.0)
     with pytest.raises(ValueError, match="time has 2 episodes, states has 1"):
         without_gaps([numbered(8)], [times(0), times(0)], 1.0)
-
-
-@pytest.mark.parametrize(
-    ("share", "fitted", "tested"),
-    [(0.0, [6, 4], []), (0.01, [6, 3], [1]), (0.14, [6, 3], [1]), (0.16, [6, 2], [2]),
-     (0.4, [6], [4]), (0.45, [6], [4]), (0.9, [1], [5, 4])],
-)  # fmt: skip
-def test_what_is_held_out_is_rounded_and_one_step_at_least(share, fitted, tested) -> None:
-    parts = split([numbered(6), numbered(4)], share)
-    assert [[len(each) for each in part] for part in parts] == [fitted, tested]
 
 
 def test_disturbances_are_columns_behind_the_inputs_and_one_step_is_no_log() -> None:

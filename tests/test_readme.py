@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -91,10 +92,18 @@ def no_networks(monkeypatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["export", "guard", "improve", "policy"])
-def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch, no_networks) -> None:
+@pytest.mark.parametrize("name", ["export", "guard", "policy"])
+def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     run(f"docs/{name}.md")
+
+
+@pytest.mark.slow
+def test_the_code_in_the_page_on_improve_runs(tmp_path, monkeypatch, no_networks) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gym.registry["CSTR-v0"], "max_episode_steps", 100)
+    run("docs/improve.md")
+    assert (tmp_path / "improved.zip").exists() and (tmp_path / "commissioning.jsonl").exists()
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from datetime import datetime, timezone
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -93,9 +92,6 @@ def report(
     'cstr.html'
     """
     subject = _subject(model, env, guard, twin, headroom, seeds)
-    given: dict[str, Any] = {"path": path, "env": env, "guard": guard, "twin": twin}
-    given |= {"headroom": headroom, "seeds": seeds, "title": None if title == TITLE else title}
-    subject.arguments = {name: value for name, value in given.items() if value is not None}
     target = Path(path)
     with ExitStack() as stack:
         try:

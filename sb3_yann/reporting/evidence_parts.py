@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from os import PathLike, fspath
 from time import perf_counter
 from typing import Any
 
@@ -23,9 +22,6 @@ from sb3_yann.guard.state import summary_of
 from sb3_yann.improvement.improve import fingerprint
 from sb3_yann.reporting.html import Html, join, lines, paragraph, picture, table, tag
 from sb3_yann.reporting.subject import Finding, Part, Subject, left_out, make_finding
-from sb3_yann.rollout import name_of
-
-MAX_ROWS = 3000  # decisions in the table; of more, refusals in the middle are left out
 
 
 def guard_part(subject: Subject) -> Part:
@@ -78,14 +74,9 @@ def guard_part(subject: Subject) -> Part:
 
 def _decisions(decisions: Sequence[Decision]) -> list[Html]:
     """Return every decision with its reason, as a table."""
-    kept = [*enumerate(decisions, start=1)]
-    if len(kept) > MAX_ROWS:
-        ends = {*range(1, MAX_ROWS // 4), *range(len(kept) - MAX_ROWS // 4, len(kept) + 1)}
-        good = [k for k, each in kept if each.verdict != "rejected"][: MAX_ROWS // 2]
-        kept = [pair for pair in kept if pair[0] in ends | {*good}]
     head = ["", "episode", "verdict", "candidate", "accepted", "MPC", "restored", "reason"]
     rows = []
-    for k, each in kept:
+    for k, each in enumerate(decisions, start=1):
         reasons = [each.reason]
         if each.regions:
             reasons.append(f"accepted in regions {', '.join(map(str, each.regions))}")
@@ -95,8 +86,6 @@ def _decisions(decisions: Sequence[Decision]) -> list[Html]:
         row = [str(k), str(each.episode), each.verdict, *(f"{cost:.6g}" for cost in costs)]
         rows.append([*row, "yes" if each.restored else "", "; ".join(filter(None, reasons))])
     text = f"All {len(decisions)} decisions, with mean costs over the guard's starts."
-    if len(kept) < len(decisions):
-        text = f"{len(kept)} of {len(decisions)} decisions: the others, refusals, are left out."
     return [tag("h3", "Every decision"), paragraph(text), table(head, rows)]
 
 
@@ -255,43 +244,5 @@ def again_part(subject: Subject) -> Part:
         tag("h3", "Versions"), table(["library", "version"], versions),
         tag("h3", f"Settings of the {type(model).__name__}"), table(["setting", "value"], settings),
         tag("h3", "Fingerprints (SHA-256)"), table(["what", "fingerprint"], prints),
-        tag("h3", "The same report"), lines(_same_report(subject)),
     ]  # fmt: skip
     return Part("To do it again", join(parts))
-
-
-def _same_report(subject: Subject) -> str:
-    """Return code that writes the report again.
-
-    A value that cannot be written as code stands there by its name, and a comment describes it.
-    """
-    model = type(subject.model).__name__
-    imports, arguments = ["from sb3_yann import report"], ["model"]
-    comments = [f"model: the {model} of these fingerprints, by {model}.load(...)"]
-    for name, value in subject.arguments.items():
-        text, module, comment = _as_code(name, value, subject)
-        arguments.append(text if name == "path" else f"{name}={text}")
-        imports += [module] if module else []
-        comments += [comment] if comment else []
-    shown = [f"# {' '.join(each.split())}" for each in comments]
-    return "\n".join([*sorted(imports, key=len), "", *shown, f"report({', '.join(arguments)})"])
-
-
-def _as_code(name: str, value: Any, subject: Subject) -> tuple[str, str, str]:
-    """Return an argument as code, the import that it takes, and a comment where it is none."""
-    if name == "seeds":
-        seeds = subject.seeds
-        whole = range(seeds[0], seeds[0] + len(seeds))
-        return repr(whole if seeds == tuple(whole) else [*seeds]), "", ""
-    if isinstance(value, str | PathLike):
-        return repr(fspath(value)), "", ""
-    if subject.twin is not None and value == subject.twin.env:
-        return "twin.env", "", ""
-    module, own = getattr(value, "__module__", ""), getattr(value, "__qualname__", "")
-    if callable(value) and own.isidentifier() and module != "__main__":
-        if getattr(sys.modules.get(module), own, None) is value:
-            return own, f"from {module} import {own}", ""
-    what = name_of(value) if name == "env" else repr(value)
-    if " at 0x" in what:  # an address, which says nothing
-        what = f"the {type(value).__name__} of then"
-    return name, "", f"{name}: {what}, which cannot be written here: make it as you did"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -71,8 +71,6 @@ class Subject:
     twin : PlantTwin or None
     headroom : Headroom or None
     seeds : tuple of int
-    arguments : dict
-        Those of `report` that were given, by their names, in their order.
     """
 
     model: BaseAlgorithm
@@ -82,7 +80,6 @@ class Subject:
     twin: PlantTwin | None
     headroom: Headroom | None
     seeds: tuple[int, ...]
-    arguments: dict[str, Any] = field(default_factory=dict)
 
     @property
     def problem(self) -> LinearMPC:

@@ -22,7 +22,7 @@ from deployed import (
 )
 from sample_laws import reactor_in_plant_units, solved
 from sb3_yann import Checks, Controller, LinearModel, LinearMPC, export
-from sb3_yann.deployment.code import index_bytes, insensitive
+from sb3_yann.deployment.code import insensitive
 from sb3_yann.deployment.controller import MODES, Status
 
 pytestmark = needs_compiler
@@ -132,31 +132,6 @@ def test_files_of_two_exports_do_not_compile(old, tmp_path):
     said = subprocess.run(built, capture_output=True, text=True)
     assert said.returncode != 0
     assert "is of another export than this file: export again" in said.stderr
-
-
-def test_the_header_leaves_the_macro_of_a_shared_library_alone(tmp_path):
-    export(policy_of("reactor"), tmp_path / "plant.c")
-    (tmp_path / "main.c").write_text(  # as by CMake's generate_export_header
-        '#define PLANT_EXPORT extern\n#include "plant.h"\nPLANT_EXPORT int number;\n'
-    )
-    built = [COMPILERS[0], "-Werror", "-c", "main.c"]
-    subprocess.run(built, cwd=tmp_path, check=True)
-
-
-def test_indices_are_as_wide_as_what_they_point_at():
-    few = {"starts": np.array([0, 2**15 - 1])}
-    assert index_bytes(few) == 2
-    assert index_bytes({**few, "neighbors": np.array([-1, 2**15])}) == 4
-
-
-def test_a_sensor_may_be_watched_for_a_long_time(tmp_path):
-    compiled = Compiled(policy_of("reactor"), tmp_path, checks=Checks(frozen_after=40_000))
-    compiled.begin()
-    moving, found = np.zeros(4), []
-    for k in range(40_002):
-        moving[1] = 0.01 * (k % 2)
-        found.append(compiled.step(moving, 1.0, 1, None)[1])
-    assert found[39_999] == 0 and found[40_000] == Status.FROZEN
 
 
 @pytest.mark.parametrize("precision", ["double", "float"])

@@ -18,10 +18,9 @@ from stable_baselines3 import DDPG
 import general_problems
 import sb3_yann._archive
 import sb3_yann.deployment.controller
-from deployed import CASES, box, disturbed, in_float64, observations, policy_of
+from deployed import CASES, disturbed, in_float64, observations, policy_of
 from sample_laws import reactor_in_plant_units, solved
 from sb3_yann import (
-    AffineObservation,
     Checks,
     Controller,
     DisturbanceBounds,
@@ -202,16 +201,6 @@ def test_a_lost_sensor_does_not_make_the_others_frozen(tmp_path):
     assert controller.status == 0
 
 
-def test_an_array_that_is_filled_again_is_not_frozen(tmp_path):
-    controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(frozen_after=3))
-    buffer = np.zeros(4)
-    for row in readings(20):
-        buffer[:] = row
-        buffer[1] = 0.1  # this one is
-        controller(buffer)
-    assert controller.status == Status.FROZEN
-
-
 def test_the_operator_takes_over_and_gives_back_without_a_bump(tmp_path):
     controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(transfer=4))
     obs = readings(30) * 0.1
@@ -225,28 +214,6 @@ def test_the_operator_takes_over_and_gives_back_without_a_bump(tmp_path):
     assert outputs[0] == pytest.approx(55.0, abs=1e-6)
     assert np.all(np.abs(np.diff(outputs)) < 16)
     assert outputs[-1] == pytest.approx(float(controller.evaluate(obs[9])[0]))
-
-
-def test_a_set_point_in_a_map_is_not_frozen(tmp_path):
-    mpc = policy_of("references and rates").problem
-    n, order = mpc.n_theta, np.roll(np.arange(mpc.n_theta), 1)
-    shown = AffineObservation.pick(order, n)
-    policy = disturbed(mpc, observation=shown, observation_space=box(n, np.float64))
-    controller = controller_of(policy, tmp_path, checks=Checks(frozen_after=3))
-    watched = np.zeros(n, bool)
-    watched[order[mpc.layout.state]] = True
-    assert controller.data["watched"].tolist() == watched.tolist()
-    generator = np.random.default_rng(0)
-    for _ in range(10):
-        controller(np.where(watched, generator.uniform(-0.1, 0.1, n), 0.0))
-        assert not controller.status & Status.FROZEN
-
-
-def test_an_output_is_held_whatever_the_operators_slider_says(tmp_path):
-    controller = controller_of(policy_of("reactor"), tmp_path, checks=Checks(hold=1))
-    outputs = [controller([0.1, 0, 0, each], manual=[50.0]) for each in [1.0, *[np.nan] * 5]]
-    assert controller.mode == "manual" and controller.request == "policy"
-    assert np.all(np.array(outputs) == outputs[0])
 
 
 def test_rates_hold_whatever_happens(tmp_path):
@@ -309,25 +276,6 @@ def test_damaged_files_and_wrong_shapes_are_named(tmp_path):
         Controller({**controller.data, "format": 99})
 
 
-def test_a_masked_reading_counts_as_nan(tmp_path):
-    masked, plain = (controller_of(policy_of("reactor"), tmp_path) for _ in range(2))
-    good, lost = [0.1, 0.0, 0.0, -5.0], [np.nan, 0.0, 0.0, -6.0]
-    for readings in (good, lost):
-        hidden = np.ma.array(np.nan_to_num(readings, nan=30.0), mask=np.isnan(readings))
-        np.testing.assert_array_equal(masked(hidden), plain(readings))
-    assert masked.status == Status.NOT_FINITE
-    np.testing.assert_array_equal(masked.evaluate(hidden), plain.evaluate(lost))
-
-
-@pytest.mark.parametrize("mask", [False, True])
-def test_a_masked_output_of_the_operator_is_none(mask, tmp_path):
-    controller = controller_of(policy_of("reactor"), tmp_path)
-    held = controller(np.full(4, 0.1))
-    controller.request = "manual"
-    output = controller(np.full(4, 0.1), manual=np.ma.array([3.0], mask=[mask]))
-    assert output == (held if mask else 3.0)
-
-
 NO_READINGS = [np.full(4, 1j), [1j, 0, 0, 0], np.ma.array(np.full(4, 1j), mask=[1, 0, 0, 0]),
                [10**400, 0, 0, 0], th.zeros(4, requires_grad=True), ["a"] * 4]  # fmt: skip
 
@@ -339,16 +287,6 @@ def test_readings_that_are_no_real_numbers_are_refused_and_no_step(obs, tmp_path
         with pytest.raises(TypeError, match=r"obs must be real numbers \(.*\)\. Pass floats"):
             call(obs)
     assert controller.counters["steps"] == 0
-
-
-@pytest.mark.parametrize("lost", ["format", "gains", "bounds", "layer0", "name", "activation"])
-def test_arrays_that_are_not_there_are_named(lost, tmp_path):
-    data = dict(controller_of(policy_of("references and rates"), tmp_path).data)
-    del data[lost]
-    with pytest.raises(
-        ValueError, match=f"data has no '{lost}': take all arrays that export wrote"
-    ):
-        Controller(data)
 
 
 @pytest.mark.parametrize("data", [None, "law.npz", 3])

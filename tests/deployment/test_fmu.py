@@ -27,7 +27,6 @@ OWN = fmu.LIBRARIES.get((platform.system(), platform.machine()))
 needs_library = pytest.mark.skipif(OWN is None or not COMPILERS, reason="no library is made here")
 ALLOCATE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)
 FREE = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
-LOG = ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_char_p] * 2)  # the rest is not read
 C = ctypes.CDLL(None)
 C.calloc.restype, C.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
 C.calloc.argtypes = [ctypes.c_size_t] * 2

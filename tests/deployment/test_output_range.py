@@ -9,7 +9,6 @@ from gymnasium import spaces
 from deployed import Compiled, box, needs_compiler
 from policy_samples import make_policy
 from sb3_yann import Controller, LinearModel, LinearMPC, YannPolicy, export
-from sb3_yann.deployment.code import scale_within
 
 # Of these 2 * half-width, or the middle, is no number of float64, or of float32.
 BOUNDS = [(-1e-7, 1e7 + 0.3), (-0.1, 1 / 3), (-1e-3, 1e4 + 0.7), (-7.7e5, 0.3)]
@@ -65,23 +64,3 @@ def test_a_law_stays_within_the_bounds_of_its_problem(tmp_path) -> None:
     export(mpc, tmp_path / "law.npz")
     actions = Controller.load(tmp_path / "law.npz").evaluate(observations())
     assert np.all((mpc.u_min <= actions) & (actions <= mpc.u_max))
-
-
-@pytest.mark.parametrize("real", [np.float32, np.float64])
-def test_a_scale_loses_some_roundings_at_most_and_keeps_the_bounds(real) -> None:
-    rng = np.random.default_rng(0)
-    low = np.float32(rng.normal(size=3000) * 10.0 ** rng.integers(-8, 8, 3000)).astype(np.float64)
-    high = np.float32(low + 10.0 ** rng.integers(-8, 8, 3000)).astype(np.float64)
-    wide = high - low > 100 * np.spacing(np.maximum(abs(low), abs(high)).astype(np.float32))
-    low, high = low[wide], high[wide]
-    half, middle = (high - low) / 2, (high + low) / 2
-    scale, shift = scale_within(half, middle, low, high, real), middle.astype(real)
-    assert scale.dtype == real
-    assert np.all((shift - scale >= low) & (shift + scale <= high))
-    size = np.maximum(half, np.abs(middle))
-    assert np.max((half - scale) / size) < 4 * np.finfo(real).eps
-
-
-def test_a_scale_without_room_stays_as_it_is() -> None:
-    half, middle = np.array([4.0]), np.array([1e8 + 4])
-    assert scale_within(half, middle, middle - half, middle + half, np.float32) == np.float32(4)

@@ -64,17 +64,6 @@ def test_a_trajectory_is_gymnasiums_bit_for_bit(seed: int) -> None:
         assert info["state"][0] == (theta + np.pi) % (2 * np.pi) - np.pi
 
 
-def test_a_step_with_a_float32_torque_is_gymnasiums_to_its_rounding() -> None:
-    rng = np.random.default_rng(0)
-    for start in rng.uniform([-3.1, -7.0], [3.1, 7.0], (200, 2)):
-        action = rng.uniform(-2.0, 2.0, 1).astype(np.float32)
-        ours, theirs = started(start), gymnasium_pendulum(start)
-        _, our_reward, *_, info = ours.step(action)
-        _, their_reward, *_ = theirs.step(action)  # type: ignore[no-untyped-call]
-        assert info["state"][1] == pytest.approx(theirs.state[1], abs=1e-6)
-        assert our_reward == pytest.approx(their_reward, abs=1e-6)
-
-
 def test_the_cost_is_that_of_the_state_before_the_step_and_the_clipped_torque() -> None:
     env = ClippedPendulumEnv()
     _, info = env.reset(seed=3)
@@ -109,12 +98,6 @@ def test_the_linearized_dynamics_give_the_printed_model() -> None:
     np.testing.assert_array_equal(np.round(model.B, 4), clipped_pendulum.PRINTED_B)
 
 
-@pytest.mark.parametrize("name", ["X_SS", "U_SS", "Q", "R", "PRINTED_A", "PRINTED_B"])
-def test_the_constants_cannot_be_overwritten(name: str) -> None:
-    with pytest.raises(ValueError, match="read-only"):
-        getattr(clipped_pendulum, name)[...] = 0.0
-
-
 # --- spaces ------------------------------------------------------------------------------------
 
 
@@ -128,13 +111,6 @@ def test_an_angle_that_rounds_to_pi_stays_in_the_space(theta: float) -> None:
     # And the observation itself is a valid start again.
     assert env.reset(options={"state": observation})[0] in env.observation_space
     assert -np.pi <= info["state"][0] <= np.pi
-
-
-def test_a_pendulum_at_full_speed_stays_in_the_space() -> None:
-    env = started([3.0, 8.0])
-    for k in range(400):
-        observation, *_ = env.step(act(2.0 if k < 200 else -2.0))
-        assert observation in env.observation_space
 
 
 # --- starts ------------------------------------------------------------------------------------

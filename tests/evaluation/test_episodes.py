@@ -176,12 +176,6 @@ def test_starts_that_are_not_as_many_as_the_seeds_are_refused(env, starts) -> No
         evaluate(Tenth(), env, [1, 2, 3], starts=starts)
 
 
-def test_no_seeds_give_no_episodes() -> None:
-    episodes = evaluate(Tenth(), Countdown, [])
-    assert episodes.costs.shape == episodes.violations.shape == (0,)
-    assert episodes.observations == episodes.actions == ()
-
-
 def test_envs_made_for_the_episodes_are_closed() -> None:
     before = Countdown.open
     evaluate(Tenth(), Countdown, [3, 1, 4])
@@ -228,19 +222,6 @@ def test_a_pool_plays_in_the_envs_that_it_has_and_makes_only_what_it_lacks() -> 
     assert Countdown.open == before
 
 
-def test_a_pool_keeps_so_many_envs_and_none_after_an_error(monkeypatch) -> None:
-    def fails(observation):
-        raise RuntimeError("this policy fails")
-
-    monkeypatch.setattr(EnvPool, "MAX_KEPT", 2)
-    before, pool = Countdown.open, EnvPool(Countdown)
-    evaluate(Tenth(), pool, [3, 1, 4])
-    assert Countdown.open == before + 2
-    with pytest.raises(RuntimeError, match="this policy fails"):
-        evaluate(fails, pool, [3])
-    assert Countdown.open == before and pool.envs == []
-
-
 def test_a_pool_of_an_env_that_is_given_is_that_env() -> None:
     env = Countdown()
     before = Countdown.open
@@ -269,11 +250,6 @@ def test_a_law_is_played_in_plant_units() -> None:
         np.testing.assert_allclose(evaluate(law, make, SEEDS).costs, expected, rtol=1e-9)
     with pytest.raises(ValueError, match=r"takes deviations, from \[-2.*u_ss = \[40.0\]"):
         evaluate(mpc.explicit(), own, SEEDS)
-
-
-def test_a_problem_is_not_its_law() -> None:
-    with pytest.raises(TypeError, match=r"pass its law, mpc\.explicit"):
-        evaluate(problems.cstr(), "CSTR-v0", SEEDS)  # type: ignore[arg-type]
 
 
 def short_reactor() -> gym.Env:

@@ -9,7 +9,6 @@ import pytest
 
 from experiments import pcgym, pcgym_nmpc
 from experiments.runner import Outcome, Run
-from sb3_yann.evaluation import evaluate
 
 PLANT = next(iter(pcgym.PLANTS))
 needs_pcgym = pytest.mark.skipif(
@@ -63,18 +62,6 @@ def test_controllers_are_played_on_the_plant_they_know(name):
     for act in (law, nmpc):
         u = act(theta[None, :size])
         assert np.all(u >= case.mpc.u_min - 1e-9) and np.all(u <= case.mpc.u_max + 1e-9)
-
-
-@needs_pcgym
-@pytest.mark.parametrize("name", pcgym.HORIZONS)
-def test_a_case_as_arrays_shows_and_pays_what_it_does_alone(name):
-    case = pcgym.Case(name, offset_free=True)
-    law, seeds = case.mpc.explicit(), range(3, 6)
-    alone = evaluate(law, case.taught, seeds)
-    together = evaluate(law, pcgym.registered(name), seeds)
-    np.testing.assert_allclose(together.costs, alone.costs, rtol=1e-12)
-    np.testing.assert_array_equal(together.observations, alone.observations)
-    np.testing.assert_array_equal(together.actions, alone.actions)
 
 
 @needs_pcgym

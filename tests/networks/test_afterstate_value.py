@@ -21,7 +21,6 @@ from sample_laws import (
 )
 from sb3_yann.networks import AfterstateValue, LinearPrediction, QuadraticStateActionValue, Ranges
 from sb3_yann.networks.value import PredictionModel
-from weights import first_layer, last_layer
 
 GAMMAS = pytest.mark.parametrize("gamma", [0.9, 0.99, 1 - 1e-3])
 EVERY_PROBLEM = pytest.mark.parametrize("name", PROBLEMS)
@@ -154,18 +153,6 @@ def test_all_parameters_learn_and_the_model_has_none() -> None:
         assert th.mean((new != old).float()) > 0.9
 
 
-def test_network_counts_by_its_scale() -> None:
-    small, large = critic("pendulum", scale=1.0), critic("pendulum", scale=100.0)
-    th.nn.init.normal_(last_layer(small))
-    th.nn.init.normal_(first_layer(small))
-    large.load_state_dict(small.state_dict() | {"value_scale": large.value_scale})
-    theta = box_points(law_of("pendulum"), 100).double()
-    with th.no_grad():
-        learnt = [each.value(theta) - each.quadratic(theta) for each in (small, large)]
-    assert learnt[0].abs().max() > 0.01
-    th.testing.assert_close(100 * learnt[0], learnt[1], rtol=1e-6, atol=1e-6)
-
-
 # --- the model ---------------------------------------------------------------------------------
 
 
@@ -216,19 +203,6 @@ def test_model_that_is_given_says_where_the_value_is_taken() -> None:
         np.testing.assert_allclose(q, -expected, rtol=1e-6)
 
 
-def test_module_is_copied_saved_and_never_trained() -> None:
-    module, rows = Halving(), random_rows("pendulum", 100)
-    value = critic("pendulum", model=module)
-    train(value, rows, value(rows).detach() - 3, steps=3)
-    assert th.equal(value.model.inner.weight, 0.5 * th.eye(2, dtype=th.float64))
-    assert module.inner.weight.grad is None
-    assert isinstance(module.inner.weight, th.nn.Parameter)  # the caller's own is left as it was
-    assert "model.inner.weight" in value.state_dict()
-    with th.no_grad():
-        module.inner.weight.zero_()
-    assert th.equal(value.model.inner.weight, 0.5 * th.eye(2, dtype=th.float64))
-
-
 # --- what torch and Stable-Baselines3 see --------------------------------------------------------
 
 
@@ -260,11 +234,3 @@ def test_a_prediction_model_is_tried_when_it_is_given(model, message) -> None:
 def test_a_scale_that_is_not_above_zero_is_named(scale) -> None:
     with pytest.raises(ValueError, match=f"scale = {scale} must be a finite number above 0"):
         critic("pendulum", scale=scale)
-
-
-def test_a_module_in_float32_is_converted() -> None:
-    module = Halving().float()
-    rows = random_rows("pendulum", 20)
-    assert th.equal(
-        critic("pendulum", model=module)(rows), critic("pendulum", model=Halving())(rows)
-    )

@@ -14,7 +14,6 @@ from sb3_yann.networks import (
     LinearPrediction,
     Ranges,
     YannLayer,
-    ZeroOutputNetwork,
 )
 from sb3_yann.networks._kernels.stack import tanh
 from sb3_yann_envs import problems
@@ -85,26 +84,6 @@ def test_gradients_by_row_are_those_of_the_regions_in_use_and_nothing_else(name:
     for sparse, full in zip(gradients(layer(theta), layer), dense, strict=True):
         assert sorted(sparse.coalesce().indices()[0].tolist()) == used.tolist()
         assert th.equal(sparse.to_dense(), full)
-
-
-@pytest.mark.parametrize("hidden", [(16,), (5, 7), (1, 1)])
-def test_layers_of_other_shapes_are_the_law_at_first_and_are_trained(hidden) -> None:
-    law = law_of("reactor")
-    layer = YannLayer(law, hidden)
-    theta = box_points(law, 50)
-    assert th.allclose(layer(theta), layer.law(theta), atol=1e-6)
-    shaken(layer, 0.3)
-    assert_close(layer(theta), by_torch(layer)(theta), 1e-6)
-
-
-def test_nodes_beyond_a_pair_are_summed_pair_by_pair() -> None:
-    law = law_of("reactor")
-    layer = YannLayer(law)
-    layer.network = ZeroOutputNetwork(4, 1, (16, 16), n_nodes=5, pinned=th.ones(7, dtype=th.bool))
-    theta = box_points(law, 100)
-    assert th.equal(layer(theta), layer.law(theta))
-    shaken(layer, 0.2)
-    assert_close(layer(theta), by_torch(layer)(theta), 1e-6)
 
 
 def test_a_theta_that_needs_a_gradient_gets_one() -> None:
@@ -243,27 +222,6 @@ def test_a_value_notices_a_change_of_its_model() -> None:
     assert_close(ours(points), by_torch(ours)(points))
 
 
-def test_a_value_notices_a_buffer_in_the_place_of_another() -> None:
-    ours, points = value(True), th.rand(20, 5)
-    before = ours(points)
-    for _ in range(20):
-        new = (2 * ours.W).numpy().copy()
-        ours.W = None  # its memory is free, and often given to the next one
-        ours.W = th.from_numpy(new)
-        now = ours(points)
-        assert th.all(now < before)
-        before = now
-    assert_close(before, by_torch(ours)(points))
-
-
-def test_parameters_of_a_type_that_numpy_lacks_are_taken() -> None:
-    theta = box_points(law_of("reactor"), 50).bfloat16()
-    points = th.cat([theta, theta[:, :1]], 1)
-    for module, x in ((YannLayer(law_of("reactor")), theta), (value(True), points)):
-        shaken(module, 0.1)
-        assert_close(module(x), by_torch(module)(x))
-
-
 def test_layers_of_another_type_are_left_to_torch() -> None:
     layer = YannLayer(law_of("reactor"))
     later_layers(layer).double()
@@ -297,24 +255,6 @@ def test_weights_that_are_lent_for_a_call_are_used(name: str) -> None:
     lent = dict(other.named_parameters())
     assert th.equal(th.func.functional_call(module, lent, points), other(points))
     assert not th.equal(module(points), other(points))
-
-
-def test_matrices_may_come_in_any_order_of_memory() -> None:
-    mpc = problems.cstr()
-    given = mpc.stage_matrix, mpc.value_matrix(0.99)
-    ranges = Ranges(mpc.theta_max, mpc.u_min, mpc.u_max)
-    rest = LinearPrediction(*mpc.prediction), 0.99, ranges
-    found = [
-        AfterstateValue(*map(order, given), *rest)(th.ones(2, 5))
-        for order in (np.ascontiguousarray, np.asfortranarray)
-    ]
-    assert th.equal(*found)
-
-
-@pytest.mark.parametrize("rate", [(np.ones(1), np.ones(1)), (np.ones(3), np.ones(3))])
-def test_a_rate_that_does_not_fit_is_refused(rate) -> None:
-    with pytest.raises(ValueError, match=r"rate has shape \(2, \d\), expected \(2, 2\)"):
-        YannLayer(law_of("two inputs"), rate=rate)
 
 
 def test_autocast_runs_the_operations_of_torch() -> None:

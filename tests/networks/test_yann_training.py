@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 
 import numpy as np
-import pytest
 import torch as th
 
 from sample_laws import (
@@ -97,41 +96,6 @@ def test_equilibrium_moves_where_no_region_is_pinned(name: str, infeasible: str)
 
 
 # --- what torch and Stable-Baselines3 see --------------------------------------------------------
-
-
-@pytest.mark.parametrize(("hidden", "tensors"), [((16,), 2), ((16, 16), 3)])
-def test_there_are_few_parameter_tensors_however_many_regions(
-    hidden: tuple[int, ...], tensors: int
-) -> None:
-    # Adam and the target update cost by the tensor.
-    assert law_of("two inputs").n_regions > 3 * law_of("pendulum").n_regions
-    for name in ("pendulum", "two inputs"):
-        assert len(list(YannLayer(law_of(name), hidden).parameters())) == tensors
-
-
-@pytest.mark.parametrize(
-    ("name", "width", "count"),
-    # p [2 h (n + 1) + h (h + 1) + m (h + 1)]: two nodes summed into each of h units of the first
-    # layer, then h units, then m outputs.
-    [("pendulum", 16, 7 * (96 + 272 + 17)), ("reactor", 8, 7 * (80 + 72 + 9))],
-)
-def test_number_of_parameters_is_linear_in_the_regions(name: str, width: int, count: int) -> None:
-    layer = YannLayer(law_of(name), (width, width))
-    assert sum(p.numel() for p in layer.parameters()) == count
-
-
-def test_law_is_kept_in_buffers_that_no_optimizer_sees() -> None:
-    layer = YannLayer(law_of("pendulum"))
-    buffers = {"gains", "offsets", "half_space_A", "half_space_b", "theta_half", "resting"}
-    assert buffers <= dict(layer.named_buffers()).keys()
-    assert all(name.startswith("network.") for name, _ in layer.named_parameters())
-
-
-def test_no_state_dict_key_contains_running() -> None:
-    # Stable-Baselines3 copies those hard at every target update.
-    keys = YannLayer(law_of("pendulum")).state_dict()
-    assert len(keys) > 6
-    assert not [key for key in keys if "running_" in key]
 
 
 @EVERY_LAW

@@ -49,11 +49,6 @@ def test_the_critic_is_an_afterstate_one_by_default(algorithm) -> None:
     assert isinstance(build(algorithm).critic.qf0, AfterstateValue)
 
 
-def test_ddpg_has_one_critic_and_td3_two() -> None:
-    assert build(DDPG).critic.n_critics == 1
-    assert build(TD3).critic.n_critics == 2
-
-
 def first_step(network) -> float:
     """Return the length of Adam's first step, which is the learning rate itself."""
     before = [p.clone() for p in network.parameters()]
@@ -169,22 +164,6 @@ def test_the_actor_stays_the_mpc_bit_for_bit_until_the_critic_is_warm(policy_del
     assert not th.equal(model.actor_target(theta), law)
 
 
-def test_the_delay_of_td3_is_kept_after_the_warm_up() -> None:
-    model = with_full_buffer(TD3, critic_warmup=5)
-    first = copy.deepcopy(model.actor)
-    updates(model, 5)  # TD3's actor has a turn at every second update only
-    assert not changed(model.actor, first)
-    updates(model, 1)
-    assert changed(model.actor, first)
-
-
-def test_without_a_warm_up_the_actor_steps_at_once() -> None:
-    model = with_full_buffer(critic_warmup=0)
-    first = copy.deepcopy(model.actor)
-    updates(model, 1)
-    assert changed(model.actor, first)
-
-
 @pytest.mark.parametrize("way", ["deep copy", "pickle", "saved and loaded", "parameters"])
 def test_a_warm_up_goes_on_where_it_was(way, tmp_path) -> None:
     model = with_full_buffer(critic_warmup=5)
@@ -211,10 +190,6 @@ def test_a_warm_up_goes_on_where_it_was(way, tmp_path) -> None:
     assert changed(policy.actor, first)
 
 
-def test_a_policy_starts_with_no_update_counted() -> None:
-    assert build().policy.critic_updates == 0
-
-
 def test_beyond_32_regions_those_without_data_do_not_move_not_even_by_momentum() -> None:
     model = with_full_buffer(DDPG, two_inputs(), critic_warmup=0)
     assert isinstance(model.actor.optimizer, RowAdam)
@@ -235,16 +210,3 @@ def test_an_optimizer_of_ones_own_gets_dense_gradients() -> None:
     model = with_full_buffer(DDPG, two_inputs(), **kwargs)
     updates(model, 2)
     assert not any(each.grad.is_sparse for each in model.actor.parameters())
-
-
-@POLICIES
-@CRITICS
-def test_actor_and_critic_yield_all_their_parameters_in_the_order_of_their_names(
-    algorithm, critic
-) -> None:
-    model = build(algorithm, policy_kwargs={"critic": critic})
-    for module in (model.actor, model.actor_target, model.critic, model.critic_target):
-        named = [each for _, each in module.named_parameters()]
-        found = [*module.parameters()]
-        assert len(found) == len(named) > 2
-        assert all(one is other for one, other in zip(found, named, strict=True))

@@ -37,43 +37,6 @@ def test_predict_equals_an_independent_online_qp(name: str, algorithm: type[DDPG
     assert np.max(np.abs(actions - expected) / (mpc.u_max - mpc.u_min)) < 1e-5
 
 
-RATED = ["servo with rates", "servo with all of it", "two tanks, all parts"]
-
-
-def scrambled(model: DDPG, size: float) -> DDPG:
-    """Give the networks of the actor random weights."""
-    with th.no_grad():
-        for parameter in model.actor.parameters():
-            parameter.copy_(size * th.randn(parameter.shape))
-    return model
-
-
-@pytest.mark.parametrize("max_correction", [None, 0.3])
-@pytest.mark.parametrize("size", [0.5, 50.0])
-@pytest.mark.parametrize("name", RATED)
-def test_rates_are_kept_whatever_the_weights(
-    name: str, size: float, max_correction: float | None
-) -> None:
-    mpc = solved(name)
-    options = {"problem": mpc, "max_correction": max_correction}
-    model = scrambled(DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs=options), size)
-    rng = np.random.default_rng(0)
-    box = mpc.theta_min, mpc.theta_max  # inside the domain and outside
-    theta = rng.uniform(*box, (5000, mpc.n_theta)).astype(np.float32)
-    moved = model.predict(theta)[0] - theta[:, mpc.layout.previous]
-    assert np.all((mpc.rate.du_min <= moved) & (moved <= mpc.rate.du_max))
-    assert np.max(moved / mpc.rate.du_max) > 0.999  # and they are what holds it
-
-
-def test_no_action_is_further_from_the_mpc_than_the_bound_where_the_rate_acts() -> None:
-    mpc = solved("servo with rates")
-    options = {"problem": mpc, "max_correction": 0.05}
-    model = scrambled(DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs=options), 50.0)
-    theta, _ = feasible_states(mpc, 1000)
-    far = np.abs(model.predict(theta.astype(np.float32))[0] - mpc.explicit()(theta))
-    assert np.max(far / (mpc.u_max - mpc.u_min)) <= 0.05  # no tolerance
-
-
 def test_an_output_at_the_limit_of_its_rate_learns_to_leave_it() -> None:
     mpc = solved("servo with rates")
     model = DDPG(YannPolicy, LinearPlant(mpc), seed=0, policy_kwargs={"problem": mpc})

@@ -80,14 +80,6 @@ def test_a_guards_checkpoint_of_another_problem_changes_nothing() -> None:
     require_refused(model, lambda: foreign.restore(model.policy))
 
 
-@pytest.mark.parametrize("part", ["actor", "actor_target", "critic", "critic_target"])
-def test_one_foreign_part_is_enough(part) -> None:
-    model, foreign = build(TD3), state_of(build(TD3, scalar_mpc(R=[[2]])))
-    own = state_of(model).items()
-    mixed = {name: foreign[name] if name.startswith(f"{part}.") else each for name, each in own}
-    require_refused(model, lambda: model.policy.load_state_dict(mixed), rf"{part}\.")
-
-
 def test_a_critic_of_other_weights_is_told_where_the_law_is_the_same() -> None:
     model, foreign = build(), build(mpc=scalar_mpc(Q=[[2]], R=[[2]]))
     require_refused(
@@ -100,13 +92,6 @@ def test_another_map_of_observations_is_told() -> None:
     model, foreign = (build(policy_kwargs={"observation": each}) for each in (own, other))
     parameters = foreign.get_parameters()
     require_refused(model, lambda: model.set_parameters(parameters), r"features_extractor\.matrix")
-
-
-@pytest.mark.parametrize("own", [0, 1])
-def test_networks_of_the_other_kind_change_nothing(own) -> None:
-    kinds = ["a shared network", "a network for each region"]
-    model, foreign = model_of(kinds[own]), model_of(kinds[1 - own]).get_parameters()
-    require_refused(model, lambda: model.set_parameters(foreign), r"there is (no )?actor\.mu\.")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -140,21 +125,6 @@ def test_what_another_machine_has_solved_is_loaded(kind) -> None:
         assert th.allclose(each, state[name], rtol=1e-9, atol=1e-9, equal_nan=True), name
 
 
-def test_a_law_is_the_same_online_and_explicit() -> None:
-    explicit, online = model_of("a shared network"), model_of("an online law")
-    online.set_parameters(explicit.get_parameters())
-    explicit.set_parameters(online.get_parameters())
-
-
-def test_some_parameters_may_be_loaded_alone() -> None:
-    learnt, model = model_of("a shared network"), build(policy_kwargs={"networks": "shared"})
-    given = {name: each for name, each in state_of(learnt).items() if ".network." in name}
-    optimizer = learnt.get_parameters()["actor.optimizer"]
-    model.set_parameters({"policy": given}, exact_match=False)
-    model.set_parameters({"actor.optimizer": optimizer}, exact_match=False)
-    assert all(th.equal(state_of(model)[name], each) for name, each in given.items())
-
-
 def test_a_load_with_another_problem_names_it(tmp_path) -> None:
     """Stable-Baselines3 takes a plain ValueError for that of an old DQN, which is a KeyError."""
     model = build()
@@ -162,15 +132,6 @@ def test_a_load_with_another_problem_names_it(tmp_path) -> None:
     changed = {"policy_kwargs": {"problem": scalar_mpc(R=[[2]])}}
     with pytest.raises(ValueError, match="with another problem"):
         DDPG.load(tmp_path / "model", custom_objects=changed)
-
-
-def test_the_correction_stays_within_its_bound_of_the_policys_own_mpc() -> None:
-    model = build(policy_kwargs={"max_correction": 0.1})
-    foreign = build(mpc=scalar_mpc(R=[[2]]), policy_kwargs={"max_correction": 0.1})
-    require_refused(model, lambda: model.set_parameters(foreign.get_parameters()))
-    theta = np.linspace(-5, 5, 101, dtype=np.float32)[:, None]
-    own = model.policy.problem.explicit()(theta)
-    assert np.max(np.abs(model.predict(theta)[0] - own)) <= 0.1 * 2
 
 
 @pytest.mark.parametrize("changes", [{"x_max": 4.9}, {"u_min": -0.99}, {"R": [[1.001]]}])

@@ -175,14 +175,6 @@ def test_a_word_that_is_no_longer_needed_warns() -> None:
     assert model.policy.observation is None
 
 
-@pytest.mark.parametrize(("shows", "takes"), ALL, ids="-".join)
-def test_what_is_read_rightly_is_not_named(shows: str, takes: str) -> None:
-    env = units.plant(shows, takes)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        build(env, units.SAYS[shows]).predict(env.reset(seed=0)[0])
-
-
 @pytest.mark.parametrize("shows", units.SAYS)
 def test_a_reading_that_is_lost_is_called_by_its_name(shows: str) -> None:
     """The law then acts at the operating point of that state, in any units."""

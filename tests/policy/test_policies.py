@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import pickle
 import subprocess
 import sys
 import textwrap
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DDPG, TD3
+from stable_baselines3 import DDPG
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -178,15 +177,6 @@ def test_the_policy_alone_saves_and_loads(tmp_path) -> None:
     np.testing.assert_array_equal(loaded.predict(states)[0], model.predict(states)[0])
 
 
-def test_load_accepts_the_same_policy_kwargs_again(tmp_path) -> None:
-    mpc = scalar_mpc()
-    model = TD3(YannPolicy, LinearPlant(mpc), policy_kwargs={"problem": mpc})
-    model.save(tmp_path / "model")
-    TD3.load(tmp_path / "model", policy_kwargs={"problem": scalar_mpc()})
-    with pytest.raises(ValueError, match="policy kwargs"):
-        TD3.load(tmp_path / "model", policy_kwargs={"problem": scalar_mpc(gamma=0.5)})
-
-
 @pytest.mark.parametrize(
     "vec_env", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.slow)]
 )
@@ -201,10 +191,3 @@ def test_it_trains_on_several_envs_at_once(vec_env) -> None:
         assert changed(model.actor, before)
     finally:
         env.close()
-
-
-def test_a_policy_pickles() -> None:
-    model = build()
-    again = pickle.loads(pickle.dumps(model.policy.problem))
-    assert again == model.policy.problem
-    assert again.explicit() == model.policy.problem.explicit()

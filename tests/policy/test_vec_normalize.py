@@ -9,7 +9,7 @@ import pytest
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from observation_samples import HIGH, LOW, MPC, STEADY, Seen, build, error, law, states
+from observation_samples import MPC, STEADY, Seen, build, error, law, states
 from sample_plants import LinearPlant
 from sb3_yann import (
     AffineObservation,
@@ -137,24 +137,3 @@ def test_a_vec_normalize_that_cannot_be_undone_is_refused(make, message) -> None
 def test_a_policy_refuses_it_as_well(make, observation, message) -> None:
     with pytest.raises(ValueError, match=message):
         build(make(), observation)
-
-
-def test_clipping_beyond_the_box_of_the_law_is_nothing_to_refuse() -> None:
-    env = normalize()
-    folded = ABSOLUTE @ AffineObservation.from_vec_normalize(env)
-    corners = np.array([LOW, HIGH]) + STEADY
-    reach = float(np.abs(env.normalize_obs(corners)).max())
-    env.clip_obs = 1.001 * reach
-    build(env, folded)
-    env.clip_obs = 0.999 * reach
-    with pytest.raises(ValueError, match="clip_obs"):
-        build(env, folded)
-    env.clip_obs = 1e9  # two entries for one of theta: whatever theta is, each may be anything
-    with pytest.raises(ValueError, match="reach inf"):
-        build(env, AffineObservation(np.ones((3, 3))))
-
-
-def test_a_vec_normalize_that_does_nothing_needs_no_map() -> None:
-    env = normalize(norm_obs=False)
-    assert AffineObservation.from_vec_normalize(env) == AffineObservation.identity(3)
-    build(env, None)

@@ -209,28 +209,6 @@ def test_an_env_whose_observation_is_no_vector_is_named() -> None:
         SetPoint(env, [0], [1])
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_previous_input_that_is_not_finite_is_refused(value) -> None:
-    with pytest.raises(ValueError, match=r"initial holds NaN or infinite entries: \[(nan|inf)\]"):
-        PreviousInput(Counter(), initial=[value])
-
-
-@pytest.mark.parametrize("hold", [np.nan, np.inf, 2.5, "2"])
-def test_a_hold_that_is_no_whole_number_is_refused(hold) -> None:
-    with pytest.raises(ValueError, match=r"whole number of at least 1\. It counts steps"):
-        SetPoint(Counter(), -1, 1, hold=hold)
-
-
-def test_bounds_of_a_disturbance_that_are_nan_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"low = \[nan\] and high = \[1.0\] must be numbers"):
-        MeasuredDisturbance(Counter(), np.nan, 1)
-
-
-def test_a_key_that_is_no_name_is_refused() -> None:
-    with pytest.raises(TypeError, match="key = nan must be a str"):
-        MeasuredDisturbance(Counter(), -1, 1, key=np.nan)
-
-
 def test_a_disturbance_that_is_not_finite_is_named_once_and_the_last_one_holds() -> None:
     class Fails(gym.Wrapper):
         def step(self, action):

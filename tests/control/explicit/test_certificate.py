@@ -40,10 +40,6 @@ def width(region: Any) -> float:
     return largest_ball(region.A, region.b)[1]
 
 
-def thinnest(regions: Regions) -> int:
-    return int(np.argmin([width(region) for region in regions]))
-
-
 def with_changed_gain(regions: Regions, index: int, factor: float) -> Regions:
     changed = dataclasses.replace(regions[index], gain=regions[index].gain * factor + factor - 1)
     return [*regions[:index], changed, *regions[index + 1 :]]

@@ -9,12 +9,10 @@ import pytest
 
 from sb3_yann.control.explicit.parametric_qp import (
     MILD,
-    ROW_NORM_TOL,
     ParametricQP,
     SteepQP,
     as_bits,
     optimality,
-    row_units,
     slack_costs,
     solvable,
 )
@@ -47,43 +45,6 @@ def test_a_solution_and_its_multipliers_meet_the_conditions() -> None:
     assert active > 20
 
 
-def test_multipliers_are_those_of_the_rows_as_they_are_whatever_their_length() -> None:
-    given = program()
-    length = np.array([1e-4, 3.0, 1.0, 1e3, 0.3, 7.0, 1e-2])
-    scaled = program(G=given.G * length[:, None], w=given.w * length, S=given.S * length[:, None])
-    for theta in np.random.default_rng(1).uniform(-1, 1, (10, 2)):
-        U, multipliers = given.solve_with_multipliers(theta)
-        same, others = scaled.solve_with_multipliers(theta)
-        np.testing.assert_allclose(same, U, atol=1e-8)
-        np.testing.assert_allclose(others * length, multipliers, atol=1e-7)
-
-
-def test_a_row_without_variables_bounds_theta_alone() -> None:
-    G, S = program().G.copy(), program().S.copy()
-    G[2], S[2], G[5], S[5] = 0.0, [-1.0, 0.0], 0.0, 0.0
-    w = program().w.copy()
-    w[2] = 0.25  # theta[0] <= 0.25
-    given = program(G=G, S=S, w=w)
-    assert given.solve(np.array([0.25, 0.9])) is not None
-    U, multipliers = given.solve_with_multipliers(np.array([0.2501, 0.0]))
-    assert U is None and multipliers.tolist() == [0.0] * 7
-    A, b = given.theta_rows()
-    np.testing.assert_array_equal(A, [[1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]])
-    np.testing.assert_array_equal(b, [1, 1, 1, 1, 0.25])
-    tight = program(G=np.vstack([G, G[:1], -G[:1]]), S=np.vstack([S, 0 * S[:2]]),
-                    w=np.append(w, [-1.0, 0.5]), rows=9)  # fmt: skip
-    assert tight.solve(np.zeros(2)) is None
-
-
-def test_rows_are_brought_to_a_length_of_about_one_by_powers_of_two() -> None:
-    G = np.diag([1.0, 1.4, 1.5, 3e-9, 5e7]) @ np.tile([0.6, 0.8], (5, 1))
-    units = row_units(np.vstack([G, [[0, 0]]]))
-    assert units[:3].tolist() == [1.0, 1.0, 0.5] and units[5] == 1.0
-    assert np.all(np.log2(units) == np.round(np.log2(units)))
-    length = np.linalg.norm(G, axis=1) * units[:5]
-    assert np.all((length >= 2**-0.5 - 1e-12) & (length <= 2**0.5 + 1e-12))
-
-
 def test_a_program_in_other_units_has_the_same_solution() -> None:
     given = program(theta_min=np.array([1.0, -6.0]), theta_max=np.array([3.0, 2.0]))
     center, half = np.array([2.0, -2.0]), np.array([1.0, 4.0])
@@ -100,25 +61,6 @@ def test_a_program_in_other_units_has_the_same_solution() -> None:
             np.testing.assert_allclose(reach * own, U, atol=1e-7)
     nothing = program(G=np.zeros((7, 4)), S=np.zeros((7, 2)))
     np.testing.assert_array_equal(nothing.scaled(center, half, reach).w, nothing.w)
-
-
-def test_a_row_that_the_inputs_hardly_move_bounds_theta_alone_by_so_much_less() -> None:
-    most = np.array([1.0, 2.0, 1.0, np.inf])
-    G = np.zeros((5, 4))
-    G[0, 1] = 0.49 * ROW_NORM_TOL  # twice that is moved
-    G[1, 1] = 0.51 * ROW_NORM_TOL
-    G[2, 3] = 1e-12  # without a bound anything moves it
-    G[3, 0], G[3, 1] = 0.3 * ROW_NORM_TOL, -0.3 * ROW_NORM_TOL
-    G[4, 1] = 0.1 * ROW_NORM_TOL
-    S = np.tile([0.0, 1.0], (5, 1))
-    S[4] = 0.0  # says nothing of theta
-    given = program(G=G, S=S, w=np.ones(5), rows=5)
-    found = given.without_short_rows(most)
-    np.testing.assert_array_equal(np.any(found.G, axis=1), [False, True, True, False, True])
-    np.testing.assert_array_equal(found.w, 1 - ROW_NORM_TOL * np.array([0.98, 0, 0, 0.9, 0]))
-    np.testing.assert_array_equal(found.G[[1, 2, 4]], G[[1, 2, 4]])
-    strong = program()
-    assert strong.without_short_rows(np.ones(4)) is strong
 
 
 @pytest.mark.parametrize("active", [(), (1, 4)])

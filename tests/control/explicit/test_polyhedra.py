@@ -8,9 +8,7 @@ from scipy import optimize
 
 from sb3_yann.control._kernels import polyhedra as _kernels
 from sb3_yann.control.polyhedra import (
-    Region,
     bounded_region,
-    equal_rows,
     farthest_point,
     farthest_points,
     largest_ball,
@@ -102,23 +100,3 @@ def test_an_empty_polyhedron_has_no_radius() -> None:
     A = np.vstack([np.eye(2), -np.eye(2)])
     _, radius = largest_ball(A, np.array([1.0, -2.0, 1.0, 1.0]))
     assert radius == pytest.approx(-0.5)
-
-
-def test_half_spaces_are_equal_to_a_millionth_of_the_radius() -> None:
-    A = np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-    radius = 1e-3
-    slack = np.array([1.0, 1.0 + 0.5 * _kernels.SAME * radius, 1.0 + 2 * _kernels.SAME * radius
-                      + 2 * _kernels.NOISE, 1.0, 1.0])  # fmt: skip
-    expected = np.eye(5, dtype=bool)
-    expected[0, 1] = expected[1, 0] = True
-    np.testing.assert_array_equal(equal_rows(A, slack, radius), expected)
-
-
-def test_a_region_knows_a_ball_or_looks_for_one() -> None:
-    A, b = polygon(0)
-    law = np.zeros((1, 3)), np.zeros(1)
-    known = Region((), *law, A, b, inside=np.zeros(3))
-    middle, radius = known.ball()
-    assert middle is known.inside and radius == pytest.approx(b.min())
-    for inside in (None, 9 * np.ones(3)):
-        assert Region((), *law, A, b, inside).ball()[1] == pytest.approx(largest_ball(A, b)[1])

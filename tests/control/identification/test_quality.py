@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sb3_yann.control.identification.least_squares import Regression, neighbors, regress
+from sb3_yann.control.identification.least_squares import Regression, regress
 from sb3_yann.control.identification.residuals import (
     curvature_test,
     features,
     listed,
-    project_out,
     quality_notes,
 )
 from sb3_yann.log import Episode
@@ -38,46 +37,6 @@ def fit(*episodes: Episode, ridge: float = 0.0, origin: np.ndarray | None = None
     return regress([*episodes], SIZES, origin, ridge)
 
 
-@pytest.mark.parametrize("passes", [False, True])
-@pytest.mark.parametrize("ridge", [0.0, 30.0])
-def test_a_regression_is_that_of_the_normal_equations(passes: bool, ridge: float) -> None:
-    one, two = log(120), log(80, seed=1)
-    origin = np.array([0.1, -0.2, 0.05, 0.3]) if passes else None
-    found = fit(one, two, ridge=ridge, origin=origin)
-    Z, Y = np.vstack([one.regressors, two.regressors]), np.vstack([one.states[1:], two.states[1:]])
-    center = Z.mean(axis=0) if origin is None else origin
-    reached = Y.mean(axis=0) if origin is None else origin[:2]
-    spread = np.sqrt(np.mean((Z - center) ** 2, axis=0))
-    S = (Z - center) / spread
-    inverse = np.linalg.solve(S.T @ S + ridge * np.eye(4), S.T)
-    np.testing.assert_allclose(found.coefficients, (inverse @ (Y - reached)).T / spread)
-    np.testing.assert_allclose(found.center, center)
-    np.testing.assert_allclose(found.reached, reached)
-    np.testing.assert_allclose(found.spread, spread)
-    left = Y - reached - (Z - center) @ found.coefficients.T
-    freedom = 200 - (4 if passes else 5)
-    assert (found.steps, found.degrees_of_freedom) == (200, freedom)
-    np.testing.assert_allclose(found.covariance, left.T @ left / freedom)
-    unscaled = inverse / spread[:, None]
-    np.testing.assert_allclose(found.correlation, unscaled @ unscaled.T)
-    errors = np.sqrt(np.outer(np.diag(found.covariance), np.diag(unscaled @ unscaled.T)))
-    np.testing.assert_allclose(found.standard_errors, errors)
-    sizes = np.linalg.svd(S, compute_uv=False)
-    assert found.excitation == pytest.approx(sizes[-1] / sizes[0])
-    pairs = sum(np.sum(each[1:] * each[:-1], axis=0) for each in (left[:120], left[120:]))
-    np.testing.assert_allclose(found.autocorrelation, pairs / np.sum(left**2, axis=0))
-    np.testing.assert_allclose(neighbors(left, [one, two]), found.autocorrelation)
-    np.testing.assert_allclose(found.predict(Z), Y - left)
-
-
-def test_as_many_steps_as_unknowns_are_too_few_and_one_more_is_enough() -> None:
-    assert fit(log(6)).degrees_of_freedom == 1
-    for episode, origin, unknowns in ((log(5), None, 5), (log(4), np.zeros(4), 4)):
-        with pytest.raises(ValueError, match=f"{unknowns} steps to fit {unknowns} parameters"):
-            fit(episode, origin=origin)
-    assert fit(log(5), origin=np.zeros(4)).degrees_of_freedom == 1
-
-
 def explained(found: Regression, episodes: list[Episode]) -> tuple[np.ndarray, ...]:
     """Return the adjusted share that features explain, its chance, and what is left."""
     Z = np.vstack([each.regressors for each in episodes]) - found.center
@@ -93,15 +52,6 @@ def explained(found: Regression, episodes: list[Episode]) -> tuple[np.ndarray, .
     return share, stats.f.sf((size - remains) / q / (remains / free), q, free), rest
 
 
-def test_what_curvature_explains_is_the_adjusted_share_of_an_f_test() -> None:
-    logs = [log(160, curved=0.5), log(140, curved=0.5, seed=1)]
-    share, after = curvature_test(fit(*logs), logs)
-    expected, chance, rest = explained(fit(*logs), logs)
-    np.testing.assert_allclose(after, rest, atol=1e-10)
-    assert share[1] == pytest.approx(expected[1]) and expected[1] > 0.5
-    assert share[0] == 0 and chance[0] > 1e-3
-
-
 def test_curvature_is_named_from_a_tenth_on_and_where_chance_does_not_explain_it() -> None:
     seen = set()
     for steps, curved, seed in product((50, 150, 900), (0.06, 0.1, 0.15), range(4)):
@@ -113,33 +63,6 @@ def test_curvature_is_named_from_a_tenth_on_and_where_chance_does_not_explain_it
         named = curvature_test(found, [episode])[0][1]
         assert named == pytest.approx(expected[1] if sure and much else 0.0)
     assert len(seen) == 4
-
-
-def test_squares_and_products_are_of_as_many_components_as_the_steps_allow() -> None:
-    rng = np.random.default_rng(0)
-    for steps, kept in ((12, 0), (23, 0), (24, 1), (35, 1), (36, 2), (51, 2), (52, 3), (300, 3)):
-        found = features(rng.standard_normal((steps, 3)))
-        assert found.shape == (steps, kept * (kept + 1) // 2 + kept)
-    z = rng.standard_normal((400, 2)) * [3.0, 0.1]
-    z -= z.mean(axis=0)
-    found = features(np.column_stack([z, z[:, 0] + 10 * z[:, 1]]))  # two components in three
-    assert found.shape == (400, 5)
-    U = np.linalg.svd(
-        np.column_stack([z, z[:, 0] + 10 * z[:, 1]])
-        / np.sqrt(np.mean(np.column_stack([z, z[:, 0] + 10 * z[:, 1]]) ** 2, axis=0)),
-        full_matrices=False,
-    )[0][:, :2] * 20  # fmt: skip
-    expected = [U[:, 0] ** 2, U[:, 0] * U[:, 1], U[:, 1] ** 2, U[:, 0] ** 3, U[:, 1] ** 3]
-    np.testing.assert_allclose(np.abs(found), np.abs(np.column_stack(expected)), atol=1e-9)
-    assert features(rng.standard_normal((2000, 15))).shape[1] == 12 * 13 // 2 + 12
-
-
-def test_without_a_basis_nothing_of_it_is_left() -> None:
-    rng = np.random.default_rng(0)
-    basis, values = rng.standard_normal((50, 3)), rng.standard_normal((50, 2))
-    same = np.column_stack([1e6 * basis[:, 0], basis[:, 1:], basis[:, 0] + basis[:, 1], 0 * values])
-    expected = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
-    np.testing.assert_allclose(project_out(same, values), expected, atol=1e-12)
 
 
 def told(found: Regression, episode: Episode, tested: int = 40, **changes: object) -> str:
@@ -208,12 +131,3 @@ def test_what_curvature_explains_is_no_noise() -> None:
         percent = f"explain {listed(100 * share)} % of the residuals' variance"
         assert (percent in text) == (curved > 0)
     assert share[1] > 0.5 > curvature_test(fit(log(curved=0.25)), [log(curved=0.25)])[0][1] > 0.1
-
-
-def test_of_a_memory_of_inputs_nothing_is_told() -> None:
-    episode = log()
-    found = fit(episode)
-    fits = np.array([99.0, 1.0]), np.array([90.0, 1.0])
-    notes = quality_notes(found, [episode], [episode], fits, 0.0, 1)
-    assert "99 % one step ahead, 90 % 10 steps ahead." in notes[1] and "Poor" not in notes[1]
-    assert listed(np.sqrt(np.diag(found.covariance))[:1]) + " (standard" in notes[0]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -56,27 +54,6 @@ def test_the_ridge_of_the_best_free_runs_is_taken_and_told() -> None:
     assert said in note and f"A ridge of {ridge:.2g} was chosen" in note
 
 
-def test_where_nothing_is_held_out_a_fifth_is_for_the_choice_alone() -> None:
-    episode = weak()
-    found = regress([episode], SIZES, None, 0.0)
-    inner, outer = split([episode], 0.2)
-    ridges = np.array([0.0, *RIDGES]) * found.steps
-    errors = [error(outer[0], inner, ridge) for ridge in ridges]
-    chosen, ridge, _ = regularized(found, [episode], [], SIZES, None)
-    assert ridge == pytest.approx(ridges[int(np.argmin(errors))])
-    whole = regress([episode], SIZES, None, ridge)
-    np.testing.assert_array_equal(chosen.coefficients, whole.coefficients)
-
-
-def test_a_log_that_is_not_weak_is_left_as_it_is() -> None:
-    fitted, tested = split([weak()], 0.4)
-    found = regress(fitted, SIZES, None, 0.0)
-    strong = dataclasses.replace(found, excitation=0.01)
-    assert regularized(strong, fitted, tested, SIZES, None) == (strong, 0.0, [])
-    almost = dataclasses.replace(found, excitation=0.00999)
-    assert regularized(almost, fitted, tested, SIZES, None)[1] > 0
-
-
 def test_free_runs_as_blind_as_the_mean_refuse_the_log() -> None:
     fitted, (tested,) = split([weak()], 0.4)
     found = regress(fitted, SIZES, None, 0.0)
@@ -84,11 +61,3 @@ def test_free_runs_as_blind_as_the_mean_refuse_the_log() -> None:
     with pytest.raises(ValueError, match=r"with any ridge free runs .* miss by .* spreads"):
         regularized(found, fitted, [other], SIZES, None)
     assert _free_run(found, []) == 0.0
-
-
-def test_a_run_that_blows_up_counts_a_thousand_spreads() -> None:
-    fitted, _ = split([weak()], 0.4)
-    found = regress(fitted, SIZES, None, 0.0)
-    wild = dataclasses.replace(found, coefficients=1e9 * np.ones((2, 3)))
-    still = [Episode(np.ones((11, 2)), np.ones((10, 1)))]
-    assert _free_run(wild, still) == pytest.approx(1e3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -10,8 +9,8 @@ import numpy as np
 import pytest
 
 from sb3_yann import LinearModel
-from sb3_yann.control.linearization.linearize import _actions, episode_faults
-from sb3_yann.control.linearization.simulator import _room, _scale, sample_time, to_vector
+from sb3_yann.control.linearization.linearize import episode_faults
+from sb3_yann.control.linearization.simulator import sample_time, to_vector
 
 
 def box(low: Any, high: Any) -> gym.spaces.Box:
@@ -42,22 +41,6 @@ class Plant(gym.Env[Any, Any]):
 
     def _seen(self) -> Any:
         return self.x + (self.size if self.fault == "shows another" else 0.0)
-
-
-@pytest.mark.parametrize(
-    ("fault", "edge", "message"),
-    [
-        # Of a scale of 4, the half-width of what is observed.
-        ("shifts", 4e-5, r"set to \[0\.0\] it reads \[4"),
-        ("has a lag", 1e-5, r"after other actions in .* leaves alone \(a delay of the input"),
-    ],
-)
-def test_a_fault_of_rounding_is_tolerated_and_a_larger_one_is_named(fault, edge, message) -> None:
-    small = Plant(fault, 0.9 * edge)
-    model = LinearModel.from_env(small, x_ss=[0.0], u_ss=[0.0])
-    np.testing.assert_allclose([model.A, model.B], [[[0.5]], [[0.25]]], atol=1e-2)
-    with pytest.raises(ValueError, match=message):
-        LinearModel.from_env(Plant(fault, 1.2 * edge), x_ss=[0.0], u_ss=[0.0])
 
 
 class Clock(Plant):
@@ -115,41 +98,6 @@ def test_an_episode_that_is_over_is_begun_anew_before_its_state_is_set(ends: boo
     )
     np.testing.assert_allclose([model.A, model.B], [[[0.5]], [[0.25]]], atol=1e-9)
     assert any("terminates the episode" in note for note in model.notes) == ends
-
-
-def test_a_state_s_scale_is_given_or_half_its_range_or_its_own_size() -> None:
-    def scale(low: Any, high: Any, x: Any, given: Any = None) -> list[float]:
-        env = SimpleNamespace(observation_space=box(low, high))
-        return _scale(SimpleNamespace(env=env), np.array(x), given).tolist()  # type: ignore[arg-type]
-
-    assert scale([-4, 1], [4, 2], [9.0, 0.0]) == [4.0, 0.5]
-    assert scale([-4, 1], [4, 2], [9.0, 0.0], [3.0, 7.0]) == [3.0, 7.0]
-    assert scale([-4, -1e7], [4, 1e7], [9.0, -5.0]) == [4.0, 5.0]
-    assert scale([-4, -0.9e6], [4, 0.9e6], [9.0, 0.5]) == [4.0, 0.9e6]
-    assert scale([-4], [4], [9.0, -0.5]) == [9.0, 1.0]  # the observation is not the state
-
-
-def test_an_input_is_tried_towards_its_farther_bound_and_a_thousand_at_most() -> None:
-    env = SimpleNamespace(action_space=box([-0.5, -0.5, -9e9, -2, -1e4], [3, 3, 1, 2, -1e3]))
-    at = np.array([0.0, 2.5, 0.0, 0.0, -2e3])
-    found = _room(SimpleNamespace(env=env), at)  # type: ignore[arg-type]
-    assert found.tolist() == [3.0, -3.0, -1e3, 2.0, -1e3]
-
-
-def test_an_unbounded_input_is_taken_from_minus_one_to_one() -> None:
-    middle, half = _actions(box([-1, -2e6, -5, -0.9e6], [3, 4, 2e6, 0.9e6]))
-    assert middle.tolist() == [1, 0, 0, 0] and half.tolist() == [2, 1, 1, 0.9e6]
-
-
-@pytest.mark.parametrize(("room", "refused"), [(0.9e-6, True), (1.1e-6, False)])
-def test_an_input_on_its_bound_has_no_slope_to_both_sides(room: float, refused: bool) -> None:
-    env = Plant()
-    point = {"x_ss": [0.5 * (1 - room)], "u_ss": [1 - room]}
-    if refused:
-        with pytest.raises(ValueError, match="entry 0 lies on its bound"):
-            LinearModel.from_env(env, **point)
-    else:
-        assert LinearModel.from_env(env, **point).B[0, 0] == pytest.approx(0.25, rel=1e-3)
 
 
 def test_the_notes_tell_what_was_solved_for_and_what_is_observed() -> None:

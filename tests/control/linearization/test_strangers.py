@@ -220,7 +220,7 @@ def test_an_environment_that_ignores_its_seed_is_named_and_cured() -> None:
 
 
 def test_a_time_limit_that_terminates_is_named_and_cured() -> None:
-    with pytest.warns(UserWarning, match=r"after 30 steps whatever.*NoTermination\(env, 30\)"):
+    with pytest.warns(UserWarning, match=r"after 30 steps whatever.*AtTimeLimit\(env, 30\)"):
         LinearModel.from_env(Careless(limit=30))
     LinearModel.from_env(TruncateAtTimeLimit(Careless(limit=30), 30))  # nothing warns
 

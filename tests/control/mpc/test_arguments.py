@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from general_problems import servo
-from sb3_yann import LinearModel, LinearMPC, OutputBounds, RateLimits, SoftBounds, Tracking
+from sb3_yann import LinearModel, LinearMPC, OutputBounds, RateLimits, SoftBounds
 
 WEIGHTS: dict[str, Any] = {"Q": np.eye(2), "R": [[1]], "horizon": 1, "u_min": -1, "u_max": 1}
 PLANT = LinearModel([[0.9, 0.1], [0.0, 0.8]], [[0], [1]], 1)
@@ -64,29 +64,6 @@ def test_a_soft_bound_that_the_box_does_not_exceed_is_told() -> None:
         assert said(**bounds, **box) == []
 
 
-def test_an_input_that_may_just_rest_is_not_warned_of() -> None:
-    assert said(u_min=0, u_max=1) == said(u_min=-1, u_max=0) == []
-    assert "u_min = 0.1 and u_max = 1 leave out u[0] = 0" in said(u_min=0.1)[0]
-    assert "u_min = -1 and u_max = -0.1 leave out u[0] = 0" in said(u_max=-0.1)[0]
-    # With references there are other places to rest.
-    assert said(u_min=0.1, tracking=Tracking([1], 1, 2)) == []
-
-
-def test_a_drift_of_a_thousandth_of_the_half_width_is_warned_of() -> None:
-    def drifting(size: float, x_ss: float = 0.0) -> LinearModel:
-        return LinearModel([[0.9]], [[1]], 1, x_ss=[x_ss], drift=[size])
-
-    own = {"Q": [[1]], "theta_min": -2, "theta_max": 4}
-    assert said(model=drifting(2.9e-3), **own) == []
-    assert "is no steady state: there the plant moves by [0.0031]" in said(
-        model=drifting(3.1e-3), **own)[0]  # fmt: skip
-    free = own | {"theta_min": -np.inf, "theta_max": np.inf}
-    assert said(model=drifting(0.9e-3), **free) == []
-    assert len(said(model=drifting(1.1e-3), **free)) == 1
-    assert said(model=drifting(4.9e-3, 5.0), **free) == []
-    assert len(said(model=drifting(-5.1e-3, -5.0), **free)) == 1
-
-
 @pytest.mark.parametrize("side", ["theta_min", "theta_max"])
 def test_a_box_of_all_of_theta_must_agree_with_the_bounds_of_its_parts(side: str) -> None:
     plain = servo(rate=RateLimits(-0.5, 0.5))
@@ -116,18 +93,3 @@ def test_a_horizon_is_a_whole_number_of_at_least_one(value: Any) -> None:
         LinearMPC(PLANT, **(WEIGHTS | {"horizon": np.int64(1)}), theta_min=-5, theta_max=5).horizon
         == 1
     )
-
-
-def test_a_reference_on_a_bound_is_reachable_and_a_hair_beyond_is_not() -> None:
-    mpc = servo(x_min=-5, x_max=[0.5, 5], u_min=-1, u_max=2)
-    for beyond, reached in ((0.0, True), (0.9e-9, True), (1.1e-9, False), (-1e-9, True)):
-        assert bool(mpc.is_reachable([0.5 * (1 + beyond)])) == reached
-    assert servo(u_min=0.0).is_reachable([0.0])  # on a bound of zero
-    x, u = mpc.steady_state([0.5])
-    np.testing.assert_allclose(mpc.model.A @ x + mpc.model.B @ u, x, atol=1e-12)
-    assert x[0] == pytest.approx(0.5)
-    np.testing.assert_array_equal(mpc.is_reachable(np.array([[0.5], [0.6], [-1.0]])), [1, 0, 1])
-    with pytest.raises(
-        ValueError, match=r"r = \[0.6\] with d = \[\] is not reachable.*x\[0\] > x_max\[0\]"
-    ):
-        mpc.steady_state([0.6])

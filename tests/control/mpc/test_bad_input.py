@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -265,34 +264,6 @@ def test_bad_discount_of_the_critic_is_named(
     with pytest.raises(ValueError, match="samples = 0 must be a whole number"):
         mpc.report(samples=0)
     assert mpc._laws == {}  # nothing was solved for it
-
-
-@pytest.mark.parametrize("name", ["Q", "layout", "outside"])
-def test_nothing_of_a_problem_can_be_set(name: str) -> None:
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        setattr(small_mpc(), name, 0)
-
-
-NO_READINGS: list[tuple[Any, type[Exception], str]] = [
-    (np.ma.array([1.0, 0.0], mask=[1, 0]), ValueError, "theta has masked entries"),
-    (np.array([1j, 0]), TypeError, "theta = .* is not an array of real numbers"),
-    ([10**400, 0], TypeError, "theta = .* is not an array of real numbers"),
-]
-
-
-@pytest.mark.parametrize("call", ["predict", "stage_cost"])
-@pytest.mark.parametrize(("theta", "error", "message"), NO_READINGS)
-def test_theta_without_real_numbers_has_no_successor_and_no_cost(
-    call: str, theta: Any, error: type[Exception], message: str
-) -> None:
-    with pytest.raises(error, match=message):
-        getattr(small_mpc(), call)(theta, [0.0])
-
-
-@pytest.mark.parametrize("call", ["predict", "stage_cost"])
-def test_an_input_that_is_complex_has_no_successor_and_no_cost(call: str) -> None:
-    with pytest.raises(TypeError, match=r"u = .* is not an array of real numbers"):
-        getattr(small_mpc(), call)([0.0, 0.0], np.array([1j]))
 
 
 @pytest.mark.parametrize("B", [[[0], [0]], [[0, 0], [0, 0]]])

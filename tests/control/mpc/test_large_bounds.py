@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from general_problems import servo
 from sb3_yann.control import LinearModel, LinearMPC, Terminal
-from sb3_yann.control.explicit.solve import asked_of_inputs, require_sane_sizes
 
 MODEL = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
 
@@ -83,33 +81,3 @@ def test_weights_that_make_the_program_singular_to_rounding_are_named(kind: str)
 def test_an_infinite_box_has_an_online_law() -> None:
     law = problem(x_min=-np.inf, x_max=np.inf).online()
     np.testing.assert_allclose(law(points()), problem(x_min=-100, x_max=100).online()(points()))
-
-
-def test_what_an_mpc_asks_of_its_inputs_is_its_gain_times_the_box() -> None:
-    """Of the largest step of the horizon, where no constraint acts."""
-    mpc = servo(horizon=3, u_min=-1, u_max=2)
-    program = mpc.condensed()
-    gains = -np.linalg.solve(program.H, program.F)
-    expected = np.abs(gains).max(axis=0) * mpc.theta_half / 1.5
-    np.testing.assert_allclose(asked_of_inputs(program, mpc.u_min, mpc.u_max), expected[None])
-    free = servo(horizon=3, x_min=None, x_max=None)
-    np.testing.assert_array_equal(
-        asked_of_inputs(free.condensed(), free.u_min, free.u_max)[0, :2], 0
-    )
-
-
-@pytest.mark.parametrize("side", [0.9, 1.1])
-def test_sizes_are_absurd_from_these_edges_on(side: float) -> None:
-    mpc = servo(tracking=None)
-    asked = asked_of_inputs(mpc.condensed(), mpc.u_min, mpc.u_max).max()
-    wide = side * 1e8 / asked
-    large = servo(tracking=None, x_min=None, x_max=None, theta_min=-5 * wide, theta_max=5 * wide)
-    far = asked / (1e-9 / side)
-    loose = servo(tracking=None, u_min=-1.5 * far, u_max=1.5 * far)
-    for each, name, absurd in ((large, "theta_min", side > 1), (loose, r"u_max\[0\]", side > 1)):
-        program, limits = each.condensed(), (each.u_min, each.u_max)
-        if absurd:
-            with pytest.raises(ValueError, match=name):
-                require_sane_sizes(program, *limits)
-        else:
-            require_sane_sizes(program, *limits)

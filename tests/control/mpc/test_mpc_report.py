@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from general_problems import LOADED, servo, solved
+from general_problems import servo, solved
 from sample_problems import input_bounds_only, small_mpc
 from sample_problems import solved as sample_problem
 from sb3_yann import LinearModel, LinearMPC, Terminal, Tracking
@@ -108,46 +108,6 @@ def test_a_parameter_without_a_solution_is_said_to_be_none() -> None:
     text = sample_problem("origin outside the box").report(samples=20)
     assert "\n  [0, 0] -> u = " in text and text.count("(not feasible)") == 1
     assert "not feasible" not in solved("servo").report(samples=20)
-
-
-def test_the_shares_are_counted_along_fifty_steps_and_at_rest() -> None:
-    mpc = servo(LOADED, horizon=1, u_min=-0.4, u_max=0.3, x_min=-3, x_max=3)
-    law, text = mpc.explicit(), mpc.report(samples=200, seed=4)
-    points = np.random.default_rng(4).uniform(mpc.theta_min, mpc.theta_max, (200, 4))
-    feasible = points[law.in_domain(points)]
-    reachable = np.mean([mpc.is_reachable(each[2:3], each[3:]) for each in points])
-    kept = 0
-    for theta in feasible:
-        inside, at = True, theta
-        for _ in range(50):
-            at = mpc.predict(at, law(at))
-            inside = inside and bool(law.in_domain(at))
-            if not inside:
-                break
-        kept += inside
-    assert 0 < kept < len(feasible) < 200 and 0 < reachable < 1
-    assert f"Of 200 random parameters of the box\n  {len(feasible) / 2:.1f} % are feasible" in text
-    assert f"  {100 * reachable:.1f} % have a reachable steady state;" in text
-    share = f"{100 * kept / len(feasible):.1f} % stay feasible for 50 steps"
-    assert f"of the feasible ones, {share} in closed loop on the model." in text
-
-
-def test_the_share_of_a_bound_that_acts_is_that_of_the_inputs_on_it() -> None:
-    mpc = servo(horizon=1, x_min=None, x_max=None, theta_min=-2, theta_max=2, u_min=-0.5)
-    text = mpc.report(samples=300)
-    points = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (300, 3))
-    u = mpc.explicit()(points)[:, 0]
-    for side, bound in (("lower", -0.5), ("upper", 2.0)):
-        share = 100 * np.mean(np.abs(u - bound) < 1e-9)
-        assert f"  {share:>4.1f} % u[0] at its {side} bound" in text and share > 0
-    shares = [float(line.split()[0]) for line in text.splitlines() if "at its" in line]
-    assert shares == sorted(shares, reverse=True)
-
-
-def test_where_nothing_is_feasible_there_is_no_share() -> None:
-    mpc = small_mpc(theta_min=-500, theta_max=500)
-    text = mpc.report(samples=3)
-    assert "  0.0 % are feasible;" in text and "of the feasible ones, none stay feasible" in text
 
 
 def test_a_plant_beside_its_model_is_told_of_where_nothing_estimates_it() -> None:
