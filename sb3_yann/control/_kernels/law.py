@@ -246,31 +246,6 @@ def input_at(
     return region
 
 
-@compiled()
-def slopes_at(
-    floats: Array, whole: Integers, region: int, theta: Array, u: Array, slopes: Array, at: int
-) -> None:
-    """Write the input (m,) at one row of theta, whose region is known, and its slopes (m, n).
-
-    They are zero where the input is clipped, and where it is zero as the MPC has no solution.
-    """
-    n = whole[0]
-    m = whole[1]
-    gains, offsets, bounds, _ = _places(whole)
-    zero = whole[6] == 1 and _slack(floats, whole, region, theta, at, -np.inf) < -floats[0]
-    for k in range(m):
-        value = floats[offsets + region * m + k]
-        for j in range(n):
-            value += floats[gains + (region * m + k) * n + j] * theta[at, j]
-        value = 0.0 if zero else value
-        low = floats[bounds + k]
-        high = floats[bounds + m + k]
-        for j in range(n):
-            free = not zero and low < value < high
-            slopes[k, j] = floats[gains + (region * m + k) * n + j] if free else 0.0
-        u[k] = min(max(value, low), high)
-
-
 @compiled("boolean(float64[::1], int64[::1], float64[::1], float64[::1])")
 def law_at(floats: Array, whole: Integers, theta: Array, out: Array) -> bool:
     """Write the input (m,) at one theta (n,); False where theta is not finite or too long."""
