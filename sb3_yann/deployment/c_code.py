@@ -8,6 +8,7 @@ from importlib.resources import files
 
 from sb3_yann.deployment import code
 from sb3_yann.deployment.code import Arrays, literal, table
+from sb3_yann.deployment.controller import steps_of
 
 
 def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, str]:
@@ -31,6 +32,7 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
         "SIZES": f"#define YANN_N_OBS {n_obs}\n#define YANN_N_INPUTS {m}",
         "REAL": precision,
         "TABLES": _definitions(data, precision),
+        "ONLINE": _template("online.c") if "qp_gram" in data else "",
         **code.known_answers(data, precision),
     }
     suffixes = {"controller.c": ".c", "controller.h": ".h", "selftest.c": "_selftest.c"}
@@ -44,11 +46,15 @@ def c_files(data: Arrays, precision: str, about: str, file: str) -> dict[str, st
 
 def fill(template: str, entries: Mapping[str, str], data: Arrays) -> str:
     """Return a template of C with its entries, ``@KEY@``, and with the controller's prefix."""
-    text = (files("sb3_yann.deployment") / "c" / template).read_text(encoding="ascii")
+    text = _template(template)
     for key, entry in entries.items():
         text = text.replace(f"@{key}@", entry)
     name = str(data["name"])
     return text.replace("YANN_", f"{name.upper()}_").replace("yann_", f"{name}_")
+
+
+def _template(name: str) -> str:
+    return (files("sb3_yann.deployment") / "c" / name).read_text(encoding="ascii")
 
 
 def comment(lines: list[str]) -> str:
@@ -75,7 +81,12 @@ def _definitions(data: Arrays, precision: str) -> str:
         "ZERO_INPUT": int(data["zero_input"]),
         "RATE": int(len(data["change"]) > 0),
         "N_NETWORKS": n_networks,
+        "ONLINE": int("qp_gram" in data),
     }
+    if "qp_gram" in data:
+        rows, most = len(data["qp_d0"]), int(data["qp_most"])
+        flags |= {"QP_ROWS": rows, "QP_MOST": most, "QP_FIXED": len(data["qp_fixed"])}
+        flags |= {"QP_ROOM": most if data["zero_input"] else rows, "QP_STEPS": steps_of(data)}
     flags |= {
         key.upper(): int(data[key]) for key in ("frozen_after", "hold", "recover", "transfer")
     }

@@ -10,12 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_yann._validation import Array
-from sb3_yann.deployment.controller import FAR, MODES, Controller
+from sb3_yann.deployment.controller import FAR, MODES, Controller, steps_of
 
 Arrays = Mapping[str, Any]
 Tables = dict[str, NDArray[Any]]
 ROOM = {"double": 1e-12, "float": 1e-5}
 """How far exported code may be off, in parts of an input's range, by its precision."""
+
+
+def room_of(data: Arrays, precision: str) -> float:
+    """Return how far code of a controller may be off, in parts of an input's range."""
+    return 1e-9 if "qp_gram" in data else ROOM[precision]
 
 
 def scale_within(
@@ -75,6 +80,11 @@ def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
     if len(data["change"]):
         numbers["change_min"], numbers["change_max"] = data["change"]
         numbers |= {"per_input": data["per_input"], "middle": data["middle"]}
+    if "qp_gram" in data:
+        numbers |= {name: data[name] for name in ("qp_D", "qp_d0", "qp_gram", "qp_E")}
+        numbers["qp_softness"] = data["qp_softness"]
+        if len(data["qp_fixed"]):
+            numbers["qp_fixed"] = data["qp_fixed"]
     if len(data["pinned"]):
         last = int(data["n_layers"]) - 1
         numbers |= {f"layer{i}": data[f"layer{i}"] for i in range(last)}
@@ -137,11 +147,19 @@ class Cost:
         search = 2 * q * n + (q * n if data["neighbors"].size else 0) + tree * n
         products = sum(a * b for a, b in zip([n, *widths], widths, strict=False))
         hidden = sum(widths[:-1])
+        program = 0
+        if "qp_gram" in data:
+            rows, most = len(data["qp_d0"]), int(data["qp_most"])
+            program = rows * n + steps_of(data) * most * (rows + 2 * most)
         return cls(
             numbers=sum(each.size for each in [*numbers.values(), *search_numbers.values()]),
             indices=sum(each.size for each in [*indices.values(), *search_indices.values()]),
             index_bytes=index_bytes(indices | search_indices),
-            multiplications=n * n_obs + search + m * (n + 2) + (products + 2 * n) * bool(widths),
+            multiplications=n * n_obs
+            + search
+            + program
+            + m * (n + 2)
+            + (products + 2 * n) * bool(widths),
             activations=2 * hidden,
             locals=2 * n + 7 * m + hidden + 8,
         )
@@ -245,12 +263,13 @@ def insensitive(controller: Controller, obs: Array, precision: str) -> Array:
     scale = np.abs(obs).max(0)
     actions, kept = controller.evaluate(obs), np.ones(len(obs), bool)
     half = _input_ranges(controller, actions) / 2
+    is_online = "qp_gram" in controller.data  # and continuous: all readings move at once
     for sign in (-1, 1):
-        for j in range(obs.shape[1]):
+        for j in [slice(None)] if is_online else range(obs.shape[1]):
             moved = obs.copy()
             moved[:, j] += sign * 2 * size * scale[j]
             change = np.abs(controller.evaluate(moved) - actions) / half
-            kept &= (change < ROOM[precision]).all(1)
+            kept &= (change < room_of(controller.data, precision)).all(1)
             kept &= controller.in_domain(moved) == controller.in_domain(obs)
     return np.asarray(obs[kept])
 
@@ -275,8 +294,8 @@ def known_answers(data: Arrays, precision: str) -> dict[str, str]:
     if not len(obs):
         raise ValueError(
             f"In {precision} a rounding of a reading moves the output by more than "
-            f"{ROOM[precision]:g} of its range, at all points tried: readings are large beside "
-            "what they move by. Pass precision='double'."
+            f"{room_of(data, precision):g} of its range, at all points tried: readings are large "
+            "beside what they move by. Pass precision='double'."
         )
     steps = np.arange(n_steps)
     readings = obs[steps // 4 % len(obs)]
@@ -308,5 +327,5 @@ def known_answers(data: Arrays, precision: str) -> dict[str, str]:
         "VECTORS": "\n".join(texts),
         "POINTS": str(len(obs)),
         "STEPS": str(n_steps),
-        "ROOM": f"{ROOM[precision]:g}",
+        "ROOM": f"{room_of(data, precision):g}",
     }

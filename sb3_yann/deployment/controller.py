@@ -48,6 +48,18 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 }
 
 
+def _shapes_of_program(
+    data: Mapping[str, Any], n: int, m: int
+) -> list[tuple[str, tuple[int, ...]]]:
+    """Return names and shapes of the program of a law that is solved online; none of others."""
+    if "qp_gram" not in data:
+        return []
+    rows, fixed = len(data["qp_d0"]), len(data["qp_fixed"])
+    shapes: dict[str, tuple[int, ...]] = {"D": (n, rows), "d0": (rows,), "gram": (rows, rows)}
+    shapes |= {"E": (rows, m), "softness": (rows,), "fixed": (fixed, n + 1), "most": ()}
+    return [(f"qp_{name}", shape) for name, shape in shapes.items()]
+
+
 def _check_arrays(data: Mapping[str, Any]) -> None:
     """Raise ValueError where arrays do not fit together, or a step cannot use them."""
     (p, m, n), (q,), n_obs = data["gains"].shape, data["b"].shape, data["obs_matrix"].shape[-1]
@@ -74,6 +86,7 @@ def _check_arrays(data: Mapping[str, Any]) -> None:
         width = m if i == n_layers - 1 else data[f"layer{i}"].shape[1]
         wanted.append((f"layer{i}", (k, width, size + 1)))
         size = width
+    wanted += _shapes_of_program(data, n, m)
     may_be_infinite = "bounds change obs_min obs_max late_after reach confines".split()
     for name, shape in wanted:
         if data[name].shape != shape:
@@ -356,6 +369,9 @@ class Controller:
         theta = np.clip(theta, -far, far)
         region, inside = self._locate(theta)
         law = (data["gains"][region] @ theta[..., None])[..., 0] + data["offsets"][region]
+        if "qp_gram" in data:
+            less, inside = _constrained(data, theta)
+            law = law - less
         if data["zero_input"]:
             law = np.where(inside[:, None], law, data["resting"])
         low, high = np.broadcast_to(data["bounds"][:, None], (2, *law.shape))
@@ -408,3 +424,88 @@ class Controller:
                 y = y @ W.T + (0.0 if pinned else b)
             found[rows] = np.where(at_zero, 0.0, y)
         return found
+
+
+def steps_of(data: Mapping[str, Any]) -> int:
+    """Return the most steps in which the program of an online law is solved."""
+    return 10 * (len(data["qp_d0"]) + 10)
+
+
+def _constrained(data: Mapping[str, Any], theta: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return what constraints take from the law without any (batch, m), and what is feasible.
+
+    Where there is no solution, constraints give way; where that cannot be solved either, within
+    `steps_of`, nothing is taken.
+    """
+    d = data["qp_d0"] + theta @ data["qp_D"]
+    free = theta @ data["qp_fixed"][:, :-1].T + data["qp_fixed"][:, -1]
+    less = np.zeros((len(theta), data["qp_E"].shape[1]))
+    feasible = np.all(free >= -1e-11, axis=1)
+    for i, row in enumerate(d):
+        found = _solve(data, row, np.zeros_like(row), int(data["qp_most"]))
+        feasible[i] &= found is not None
+        if not feasible[i] and not data["zero_input"]:
+            found = _solve(data, row, data["qp_softness"], len(row))
+        if found is not None:
+            active, lam = found
+            less[i] = lam @ data["qp_E"][active]
+    return less, feasible
+
+
+def _solve(
+    data: Mapping[str, Any], d: Array, extra: Array, most: int
+) -> tuple[list[int], Array] | None:
+    """Return an active set and its multipliers, None where there is no certain answer.
+
+    The dual method of Goldfarb & Idnani (Math. Programming 27, 1983).
+    """
+    gram = data["qp_gram"] + np.diag(extra)
+    active: list[int] = []
+    lam: Array = np.zeros(0)
+    for _ in range(steps_of(data)):
+        slack = d + lam @ data["qp_gram"][active]
+        slack[active] = 0.0
+        slack[slack >= -1e-10 * (1 + np.abs(d))] = 0.0
+        entering = int(np.argmin(slack))
+        if slack[entering] >= 0:
+            return _certified(data, d, extra, gram, active)
+        violation, own = -float(slack[entering]), 0.0
+        while True:
+            step = np.linalg.solve(gram[np.ix_(active, active)], gram[active, entering])
+            rest = float(gram[entering, entering] - gram[entering, active] @ step)
+            ratios = np.divide(lam, step, out=np.full(len(lam), np.inf), where=step > 0)
+            length = float(ratios.min(initial=np.inf))
+            full = violation / rest if rest > 1e-11 else np.inf
+            if not min(full, length) < np.inf or (full <= length and len(active) == most):
+                return None
+            lam = np.maximum(lam - min(full, length) * step, 0.0)
+            own += min(full, length)
+            if full <= length:
+                active.append(entering)
+                lam = np.append(lam, own)
+                break
+            violation -= length * rest if rest > 1e-11 else 0.0
+            leaving = int(np.argmin(ratios))
+            del active[leaving]
+            lam = np.delete(lam, leaving)
+    return None
+
+
+def _certified(
+    data: Mapping[str, Any], d: Array, extra: Array, gram: Array, active: list[int]
+) -> tuple[list[int], Array] | None:
+    """Return the active set in order with its multipliers, None where a condition fails."""
+    active = sorted(active)
+    try:
+        lam = np.linalg.solve(gram[np.ix_(active, active)], -d[active])
+    except np.linalg.LinAlgError:
+        return None
+    if np.any(lam < -1e-9 * (1 + np.abs(lam).max(initial=0.0))):
+        return None
+    lam = np.maximum(lam, 0.0)
+    slack = d + lam @ data["qp_gram"][active]
+    rest = slack[active] + extra[active] * lam
+    slack[active] = 0.0
+    room = 1e-9 * (1 + np.abs(d))
+    holds = np.all(np.abs(rest) <= room[active]) and np.all(slack >= -room)
+    return (active, lam) if holds else None

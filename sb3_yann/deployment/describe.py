@@ -66,11 +66,11 @@ def describe(
     note = " ".join(filter(None, [note, _unconfirmed(given)]))
     if isinstance(policy, StartsAsMPC):
         layer = policy.actor.mu
-        law = _explicit(layer.base_law)
+        law, program = _with_regions(layer.base_law)
         networks = _network_arrays(layer, law)
         change = layer.change.cpu().numpy() if layer.rated else np.empty((0, law.n_inputs))
     else:
-        law = _explicit(policy.law() if isinstance(policy, LinearMPC) else policy)
+        law, program = _with_regions(policy.law() if isinstance(policy, LinearMPC) else policy)
         networks, change = _no_networks(law), np.empty((0, law.n_inputs))
         if problem is not None and problem.rate is not None and problem.has_rate_bounds:
             change = np.array([problem.rate.du_min, problem.rate.du_max]) / _input_range(law)[2]
@@ -94,6 +94,7 @@ def describe(
             watched = shown[states].any(0) & ~shown[~states].any(0)
     return {
         **_law_arrays(law),
+        **program,
         **networks,
         "change": change,
         **checks.arrays(matrix.shape[1]),
@@ -167,15 +168,44 @@ def _signal_maps(policy: Any, law: PiecewiseAffine) -> tuple[Array, Array, Array
     return np.eye(n), np.zeros(n) - theta_ss, scale_within(half, shift, low, high), shift
 
 
-def _explicit(law: Any) -> PiecewiseAffine:
-    """Return an explicit law; raise ValueError for one that is solved online."""
-    if not isinstance(law, PiecewiseAffine):
+def _with_regions(law: Any) -> tuple[PiecewiseAffine, dict[str, Any]]:
+    """Return an explicit law, and the program of one that is solved online.
+
+    That is then a law of one region: the law without constraints, from which these take something.
+    ValueError where a controller cannot solve it: soft bounds that cost too much for a dual method.
+    """
+    if isinstance(law, PiecewiseAffine):
+        return law, {}
+    if law.scaled[0].steep:
         raise ValueError(
-            "The law is solved online, by a quadratic program at each step; an export holds an "
-            "explicit law, whose time is bounded. Solve problem.explicit() without a limit before "
-            "the model is made, shorten the horizon, or run the model itself."
+            "The law is solved online, and its soft bounds cost so much that a controller cannot "
+            "solve it. Pass a smaller SoftBounds(penalty=...), or solve problem.explicit() before."
         )
-    return law
+    dual = law.dual
+    free = PiecewiseAffine(
+        gains=dual.K[None],
+        offsets=dual.k0[None],
+        A=np.zeros((1, law.n_theta)),
+        b=np.ones(1),
+        starts=np.zeros(1, np.int64),
+        u_min=law.u_min,
+        u_max=law.u_max,
+        theta_min=law.theta_min,
+        theta_max=law.theta_max,
+        infeasible=law.infeasible,
+    )
+    if law.model is not None and law.theta_ss is not None:
+        free = free.on_plant(law.model, law.theta_ss)
+    program = {
+        "qp_D": dual.D,
+        "qp_d0": dual.d0,
+        "qp_gram": dual.gram,
+        "qp_E": dual.E / _input_range(free)[2],
+        "qp_softness": dual.softness,
+        "qp_fixed": np.column_stack(dual.fixed),
+        "qp_most": np.int64(max(1, min(len(dual.d0), dual.n_variables))),
+    }
+    return free, program
 
 
 def _law_arrays(law: PiecewiseAffine) -> dict[str, Any]:

@@ -141,6 +141,12 @@ def export(
         )
     limits = check_options("checks", checks or Checks(), Checks)
     data = describe(given, prefix, limits, observer)
+    if "qp_gram" in data and (kind in ("onnx", "st", "xml") or precision != "double"):
+        raise ValueError(
+            "The law is solved online, by a quadratic program at each step. That is exported as "
+            f"C, FMU or npz in double, not as {kind} in {precision}: or solve problem.explicit() "
+            "without a limit before the model is made, or shorten the horizon."
+        )
     digest, note = digest_of(data)[:12], str(data["note"])
     about = (
         f"{prefix}, a controller, written by sb3-yann {version('sb3-yann')}; digest {digest}."

@@ -340,9 +340,9 @@ def test_bad_arguments_write_nothing(change, error, message, tmp_path):
 def test_an_online_law_and_strange_networks_say_why_not(tmp_path):
     online = disturbed(solved("reactor"), law="online")
     with pytest.raises(ValueError, match="solved online"):
-        export(online, tmp_path / "plant.c")
+        export(online, tmp_path / "plant.st")
     with pytest.raises(ValueError, match="solved online"):
-        export(solved("reactor").online(), tmp_path / "plant.c")
+        export(solved("reactor").online(), tmp_path / "plant.c", precision="float")
     strange = disturbed(solved("reactor"), activation_fn=th.nn.Softsign)
     with pytest.raises(ValueError, match="Softsign"):
         export(strange, tmp_path / "plant.c")

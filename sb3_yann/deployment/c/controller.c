@@ -20,6 +20,7 @@ typedef yann_real real;
 
 @TABLES@
 
+@ONLINE@
 /* ---- The region that theta lies in, or that it violates least ---- */
 
 /* The smallest slack of a region's half-spaces, or some slack below `low`. */
@@ -257,6 +258,10 @@ static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPU
         theta[j] = known && theta[j] == theta[j] ? between(theta[j], -far[j], far[j]) : ZERO;
     }
     const int region = locate(theta, &inside);
+#if ONLINE
+    real less[N_INPUTS];
+    inside = solve(theta, less);
+#endif
     if (inside < -TOLERANCE) {
         status |= YANN_OUTSIDE;
     }
@@ -265,6 +270,9 @@ static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPU
         for (int j = 0; j < N_THETA; j++) {
             law[i] += gains[region][i][j] * theta[j];
         }
+#if ONLINE
+        law[i] -= less[i];
+#endif
 #if ZERO_INPUT
         if (inside < -TOLERANCE) {
             law[i] = resting[i];

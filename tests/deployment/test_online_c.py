@@ -1,0 +1,107 @@
+"""Online laws as C: the same answers, within bounded steps, without memory of the heap."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deployed import Compiled, disturbed, needs_compiler
+from sb3_yann import LinearModel, LinearMPC, MixedBounds, RateLimits, Terminal, export
+from sb3_yann.deployment.controller import Controller, Status
+
+
+def problem(n: int = 3, m: int = 1, horizon: int = 5, **changes: Any) -> LinearMPC:
+    rng = np.random.default_rng(0)
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    A *= 0.98 / np.abs(np.linalg.eigvals(A)).max()
+    model = LinearModel(A, B, 1.0, x_ss=rng.normal(size=n), u_ss=rng.normal(size=m) / 4)
+    box = {"u_min": -1, "u_max": 1, "theta_min": -20, "theta_max": 20}
+    weights = {"Q": np.eye(n), "R": 0.1 * np.eye(m), "horizon": horizon}
+    return LinearMPC(model, **{**weights, **box, **changes})
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "bounds of inputs": {},
+    "bounds of states": {"x_min": -6, "x_max": 6},
+    "rates": {"rate": RateLimits(-0.4, 0.4)},
+    "mixed, zero input": {
+        "m": 2, "x_max": 6, "mixed": MixedBounds(G=[[1, 1]], high=0.8), "infeasible": "zero_input",
+    },
+    "bounds that change": {"parametric_bounds": ["u_max"], "terminal": Terminal(set="invariant")},
+}  # fmt: skip
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", CASES)
+def test_code_and_controller_are_the_law(name: str, tmp_path: Path) -> None:
+    mpc = problem(**CASES[name])
+    mpc.law("online")
+    law = mpc.online()
+    built = Compiled(mpc, tmp_path)
+    rng = np.random.default_rng(1)
+    theta = rng.uniform(mpc.theta_min, mpc.theta_max, (1500, mpc.n_theta))
+    inside = law.in_domain(mpc.units.to_deviations(theta))
+    actions, found = built.at(theta)
+    assert inside.sum() > 20
+    off = np.abs(actions - law.plant_input(theta)) / mpc.u_half
+    assert off[inside].max() < 1e-9
+    np.testing.assert_array_equal((found & Status.OUTSIDE) == 0, inside)
+    by_numpy = built.controller.evaluate(theta[:300])
+    assert (np.abs(actions[:300] - by_numpy) / mpc.u_half).max() < 1e-6
+    assert np.all(actions >= mpc.u_min) and np.all(actions <= mpc.u_max)
+
+
+@needs_compiler
+def test_the_self_test_passes_under_sanitizers_and_nothing_is_allocated(tmp_path: Path) -> None:
+    mpc = problem(x_min=-6, x_max=6)
+    policy = disturbed(mpc, law="online", max_correction=0.2)
+    export(policy, tmp_path / "plant.c")
+    parts = [str(tmp_path / each) for each in ("plant.c", "plant_selftest.c")]
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-fsanitize=address,undefined"]
+    subprocess.run(["gcc", *flags, *parts, "-lm", "-o", str(tmp_path / "test")], check=True)
+    said = subprocess.run([tmp_path / "test"], capture_output=True, text=True, check=True).stdout
+    assert "passed" in said
+    text = (tmp_path / "plant.c").read_text()
+    assert "malloc" not in text and "alloca(" not in text
+
+    export(policy, tmp_path / "plant.npz")
+    controller = Controller.load(tmp_path / "plant.npz")
+    theta = np.random.default_rng(2).uniform(-5, 5, (50, 3))
+    played = policy.predict(theta.astype(np.float32))[0]
+    assert np.abs(controller.evaluate(theta.astype(np.float32)) - played).max() < 1e-4
+
+
+@needs_compiler
+@pytest.mark.nightly
+def test_a_large_program_is_solved_as_by_daqp(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mpc = problem(12, 3, 20)
+    mpc.law("online")
+    built, program = Compiled(mpc, tmp_path), mpc.condensed()
+    theta = np.random.default_rng(3).uniform(mpc.theta_min, mpc.theta_max, (10_000, mpc.n_theta))
+    theta = mpc.theta_ss + np.linspace(0.02, 1, 10_000)[:, None] * (theta - mpc.theta_ss)
+    own, daqp, worst, active = [], [], 0.0, 0
+    for row in theta:
+        began = time.perf_counter()
+        action = built.at(row[None])[0][0]
+        middle = time.perf_counter()
+        U = program.solve(row - mpc.theta_ss)
+        daqp.append(time.perf_counter() - middle)
+        own.append(middle - began)
+        wanted = U[:3] + mpc.model.u_ss
+        active += bool(np.any(np.abs(wanted) > 1 - 1e-9))
+        worst = max(worst, float(np.abs(action - wanted).max()))
+    with capsys.disabled():
+        print(
+            f"\n12 states, 3 inputs, N = 20, 10,000 points ({active} at bounds): largest "
+            f"difference {worst:.1e} half-ranges; C at worst {1e6 * max(own):.0f} us, median "
+            f"{1e6 * np.median(own):.0f} us; DAQP called from Python {1e6 * max(daqp):.0f} us, "
+            f"median {1e6 * np.median(daqp):.0f} us"
+        )
+    assert worst < 1e-8
