@@ -533,6 +533,8 @@ class Planning:
         disturbance of then.
     """
 
+    remembers = True
+
     def __init__(self, plant: Plant, task: Task, steps: int, pause: int = 0) -> None:
         self.plant, self.task, self.steps, self.pause = plant, task, steps, pause
         self.plans: dict[int, tuple[int, Plans, Array]] = {}

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import copy
 import importlib
+import itertools
 import random
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from sb3_yann._validation import Array, check_int, check_type, half_widths
 from sb3_yann.compare import less_safe, unsafe_columns
 from sb3_yann.control import LinearModel, LinearMPC, OnlineLaw, PiecewiseAffine
+from sb3_yann.control.linearization.simulator import require_makes
 from sb3_yann.control.linearization.wrapper_stack import require_state_shown
 from sb3_yann.control.mpc.bound_excess import BoundExcess, bound_excess
 from sb3_yann.units import same_bounds
@@ -143,13 +146,19 @@ class EnvPool:
     ----------
     source : gymnasium.Env, str or callable
         As for :func:`evaluate`, which takes a pool in its place.
+    most : int, optional
+        Envs that there are at most: more episodes are played one lot after the other.
+    each : callable, default map
+        Steps the envs: ``each(step, rows, actions)``.
     """
 
     MAX_KEPT = 200
     """Envs that are kept."""
 
-    def __init__(self, source: Source) -> None:
-        self.source = as_source(source)
+    def __init__(
+        self, source: Source, most: int | None = None, each: Callable[..., Iterable[Any]] = map
+    ) -> None:
+        self.source, self.most, self.each = as_source(source), most, each
         self.envs: list[gym.Env[Any, Any]] = []
 
     @contextmanager
@@ -251,9 +260,9 @@ def rollout(
     source: Source = plant.source if isinstance(plant, EnvPool) else as_source(plant)
     if isinstance(source, gym.Env):
         check(source)
-        played = _joined(
+        played = joined(
             [
-                _play(_of_episode(controller, i), _Envs([source], [each], problem))
+                _play(of_episode(controller, i), _Envs([source], [each], problem))
                 for i, each in enumerate(resets)
             ]
         )
@@ -263,7 +272,9 @@ def rollout(
             played = _play(controller, _Copies(vector_env, seeds, starts))
     else:
         own = EnvPool(source)
-        with closing(own), (pool or own).acquire(len(seeds)) as envs:
+        pool = pool or own
+        lots = range(0, len(seeds), pool.most or len(seeds) or 1)
+        with closing(own), pool.acquire(min(len(seeds), pool.most or len(seeds))) as envs:
             for each in envs[:1]:
                 check(each)
             if len({id(each.unwrapped) for each in envs}) < len(envs):
@@ -271,7 +282,15 @@ def rollout(
                     "The function that makes envs returned the same one twice. Make a new one each "
                     "time, since episodes run side by side, or pass the env itself."
                 )
-            played = _play(controller, _Envs(envs, resets, problem)) if envs else _joined([])
+            played = joined(
+                [
+                    _play(
+                        of_episode(controller, i),
+                        _Envs(envs, resets[i : i + lots.step], problem, pool.each),
+                    )
+                    for i in lots
+                ]
+            )
     return played if problem is None else _with_stage_costs(played, problem)
 
 
@@ -294,8 +313,8 @@ def as_controller(policy: Predictor | Callable[[Any], Any]) -> Controller:
     return lambda t, observations, rows: np.array([act(each) for each in observations])
 
 
-def _of_episode(controller: Controller, number: int) -> Controller:
-    """Return the controller of one episode that is played alone."""
+def of_episode(controller: Controller, number: int) -> Controller:
+    """Return the controller of the episodes from one on, which are played without the others."""
     return lambda t, observations, rows: controller(t, observations, rows + number)
 
 
@@ -322,31 +341,31 @@ class _Envs:
         envs: Sequence[gym.Env[Any, Any]],
         resets: Sequence[tuple[int, dict[str, Any] | None]],
         problem: LinearMPC | None,
+        each: Callable[..., Iterable[Any]] = map,
     ) -> None:
-        self.envs, self.resets, self.problem = envs, resets, problem
+        self.envs, self.resets, self.problem, self.each = envs, resets, problem, each
 
     def reset(self) -> NDArray[Any]:
         """Return the first observations (k, n)."""
-        pairs = zip(self.envs, self.resets, strict=True)
+        pairs = zip(self.envs, self.resets, strict=False)  # the last lot may be smaller
         # A copy of each: an env may write its next observation into the same array.
         return np.stack([np.array(env.reset(seed=s, options=o)[0]) for env, (s, o) in pairs])
 
     def step(self, actions: Any, rows: Rows) -> _Step:
         """Step the envs ``rows`` (r,) with actions (r, m)."""
-        found = []
-        for i, action in zip(rows, actions, strict=True):
-            if self.problem is not None:
-                action = action.astype(self.envs[i].action_space.dtype)
-            observation, reward, terminated, truncated, info = self.envs[i].step(action)
-            violated = bool(info.get("violation", False))
-            success = bool(info.get("is_success", False))
-            ends = bool(terminated), bool(truncated)
-            changed = may_change_reward(info)
-            found.append(
-                (np.array(observation), as_reward(reward), *ends, violated, success, changed)
-            )
-        observations, *others = zip(*found, strict=True)
-        return _Step(np.stack(observations), *map(np.array, others))
+        observations, *others = zip(*self.each(self._one, rows, actions), strict=True)
+        return _Step(np.stack(observations), *(np.array(each) for each in others))
+
+    def _one(self, i: int, action: Any) -> tuple[Any, ...]:
+        """Step one env, and return what is in a `_Step` of it."""
+        if self.problem is not None:
+            action = action.astype(self.envs[i].action_space.dtype)
+        observation, reward, terminated, truncated, info = self.envs[i].step(action)
+        violated = bool(info.get("violation", False))
+        success = bool(info.get("is_success", False))
+        ends = bool(terminated), bool(truncated)
+        changed = may_change_reward(info)
+        return np.array(observation), as_reward(reward), *ends, violated, success, changed
 
 
 class _Copies:
@@ -437,15 +456,17 @@ def _play(controller: Controller, plant: _Envs | _Copies) -> Trajectories:
     )
 
 
-def _joined(parts: Sequence[Trajectories]) -> Trajectories:
+def joined(parts: Sequence[Trajectories]) -> Trajectories:
     """Return the episodes of all parts as one."""
 
     def arrays(name: str, dtype: Any) -> NDArray[Any]:
-        return np.array([getattr(each, name)[0] for each in parts], dtype=dtype)
+        found: NDArray[Any] = np.concatenate([[], *(getattr(each, name) for each in parts)])
+        return found.astype(dtype)
 
     def rows(name: str) -> tuple[Array, ...]:
-        return tuple(getattr(each, name)[0] for each in parts)
+        return tuple(episode for each in parts for episode in getattr(each, name))
 
+    excess = [each.excess for each in parts if each.excess is not None]
     return Trajectories(
         costs=arrays("costs", np.float64),
         violations=arrays("violations", np.int64),
@@ -456,6 +477,7 @@ def _joined(parts: Sequence[Trajectories]) -> Trajectories:
         succeeded=arrays("succeeded", bool),
         rewards=rows("rewards"),
         own_rewards=rows("own_rewards"),
+        excess=BoundExcess(*map(np.concatenate, zip(*excess, strict=True))) if excess else None,
     )
 
 
@@ -545,6 +567,7 @@ def as_source(env: Any) -> Any:
             f"env = {env!r} must be the id of an environment, a gymnasium.Env, or a function that "
             "makes one."
         )
+    require_makes(env)
     return env
 
 
@@ -559,12 +582,14 @@ def make_env(source: Source) -> gym.Env[Any, Any]:
     return made
 
 
-def maker(env: Source, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]]:
+def maker(env: Any, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, Any]]:
     """Return a function that makes envs like the one that is given, by this name, or made."""
     if isinstance(env, str):
         env = as_source(env)  # "module:function" is a function
     if isinstance(env, str):
         return partial(gym.make, env, disable_env_checker=True)
+    if is_vec_env(env):
+        return itertools.cycle([OneOf(env, i) for i in range(env.num_envs)]).__next__
     if isinstance(env, gym.Env):
         try:
             copy.deepcopy(env)
@@ -580,6 +605,8 @@ def maker(env: Source, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, A
             "one, or a PlantTwin."
         )
 
+    require_makes(env)
+
     def made() -> gym.Env[Any, Any]:
         found = env()
         if not isinstance(found, gym.Env):
@@ -589,10 +616,49 @@ def maker(env: Source, name: str = "env_or_twin") -> Callable[[], gym.Env[Any, A
     return made
 
 
+class OneOf(gym.Env[Any, Any]):
+    """One env of a Stable-Baselines3 VecEnv: it waits for no other, and begins where it is told to.
+
+    Parameters
+    ----------
+    envs : VecEnv
+        It is not closed.
+    number : int
+        Of the env.
+    """
+
+    def __init__(self, envs: Any, number: int) -> None:
+        self.all, self.number = envs, number
+        self.observation_space, self.action_space = envs.observation_space, envs.action_space
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Start an episode."""
+        return self.all.env_method("reset", indices=[self.number], **kwargs)[0]
+
+    def step(self, action: Any) -> Any:
+        """Step this env alone."""
+        return self.all.env_method("step", action, indices=[self.number])[0]
+
+
+def is_vec_env(env: Any) -> bool:
+    """Return whether an env is a VecEnv of Stable-Baselines3, which is not imported for that."""
+    return hasattr(env, "env_method") and hasattr(env, "num_envs")
+
+
+def pool_of(env: Any, make: Callable[[], gym.Env[Any, Any]]) -> EnvPool:
+    """Return a pool of what ``make`` makes; of a VecEnv as many as it has, stepped at once."""
+    if not is_vec_env(env):
+        return EnvPool(make)
+    own = hasattr(env.unwrapped, "remotes")  # a process each, which are asked by threads
+    return EnvPool(make, env.num_envs, ThreadPoolExecutor(env.num_envs).map if own else map)
+
+
 def name_of(env: Any) -> str:
     """Return a name of a simulator that is the same in another process."""
     if isinstance(env, str):
         return env
+    if is_vec_env(env):
+        return f"{type(env.unwrapped).__name__} of {env.num_envs}"
     if isinstance(env, gym.Env):
         spec = env.spec
         return type(env.unwrapped).__name__ if spec is None else f"{spec.id}{spec.kwargs or ''}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -136,7 +136,11 @@ class Pairs:
 
 
 def confirm(
-    act: Inputs, simulator: Simulator, number: int, significance: float = RULE.significance
+    act: Inputs,
+    simulator: Simulator,
+    number: int,
+    say: Callable[[str, int], None] = lambda text, pairs: None,
+    significance: float = RULE.significance,
 ) -> tuple[Check, Pairs]:
     """Play pairs from new starts until they tell; return the last look, and all pairs.
 
@@ -152,6 +156,8 @@ def confirm(
         It plays them.
     number : int
         Of the check.
+    say : callable
+        Is told what each look shows, and after how many pairs.
     significance : float
         Probability that a policy that is no better is accepted.
     """
@@ -159,6 +165,7 @@ def confirm(
     for look, count in enumerate(LOOKS, start=1):
         pairs.play(act, simulator.new_seeds(count - len(pairs.seeds)))
         found = pairs.check(number, significance / (look * (look + 1)), final=True)
+        say(f"{len(pairs.seeds)} pairs: {100 * found.change:+.2f} %", len(pairs.seeds))
         if found.accepted and len(pairs.seeds) >= ENOUGH:
             break
         if not found.accepted and pairs.is_hopeless:

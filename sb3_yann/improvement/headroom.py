@@ -344,6 +344,8 @@ class Observing:
         Of all states.
     """
 
+    remembers = True
+
     def __init__(self, problem: LinearMPC, other: LinearMPC, observer: DisturbanceObserver) -> None:
         self.problem, self.other, self.observer = problem, other, observer
         self.observers: list[DisturbanceObserver] = []

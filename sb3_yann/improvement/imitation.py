@@ -70,31 +70,26 @@ class Teacher:
         return self.saved(self.best)
 
     def saved(self, costs: Array) -> float:
-        """Return what costs (k,) are below the MPC's on average, relative to its cost of each.
+        """Return what costs (k,) are below the MPC's on average: see `gain_of`."""
+        return gain_of(costs, self.mpc.costs)
 
-        Scenarios that cost the MPC less than the median count relative to that.
-        """
-        finite = np.isfinite(self.mpc.costs)
-        mpc = self.mpc.costs[finite]
-        if not len(mpc):
-            return 0.0
-        own = np.maximum(np.abs(mpc), max(float(np.median(np.abs(mpc))), 1e-300))
-        return float(np.mean((mpc - costs[finite]) / own))
+    def show(self, act: Inputs | None = None, played: Imagined | None = None) -> None:
+        """Plan the scenarios; those that a policy ``played``, from where it had got to.
 
-    def show(self, begins: NDArray[np.int64] | None = None, act: Inputs | None = None) -> None:
-        """Plan the scenarios, from the steps ``begins`` (k,) on, until which a policy acts.
-
-        Those with a step of -1 are left out. What costs more than with the MPC, or breaks a bound
-        by more, shows nothing.
+        What costs more than with the MPC, or breaks a bound by more, shows nothing; nor does what
+        costs more than the policy that acts until then.
         """
         pause = PAUSE if self.scenarios.model.dynamics.row.observer is not None else 0
         planning = Planning(self.scenarios.plant, self.task, self.steps, pause)
-        first = np.zeros(len(self.scenarios), dtype=np.int64) if begins is None else begins
+        first = self.hardest(played) if played else np.zeros(len(self.scenarios), dtype=np.int64)
         later = SwitchedController(planning, first, act or self.problem.law())
         shown = self.scenarios.play(later)
         safe = ~less_safe(shown.unsafe, self.mpc.unsafe).any(axis=1)
         taught = (first >= 0) & safe & (shown.costs <= self.mpc.costs)
         self.best = np.where(taught, np.fmin(self.best, shown.costs), self.best)
+        if played is not None:  # a plan that comes too late to save the episode shows what it can
+            safe = ~less_safe(shown.unsafe, played.unsafe).any(axis=1)
+            taught |= (first > 0) & safe & (shown.costs < played.costs)
         for i in np.flatnonzero(taught):
             for t in range(first[i], self.steps):
                 when, plan, _ = later.plans[t][i]
@@ -105,8 +100,9 @@ class Teacher:
                 near[:, states] += SPREAD * self.units * moved
                 at = min(t, self.steps - 1) - when
                 answers = np.concatenate([follow(plan, at, each[None]) for each in near])
-                self.thetas += [theta, *near]
                 self.inputs += [shown.inputs[t, i], *np.clip(answers, *self.task.limits(near))]
+                self.scenarios.model.dynamics.coordinates.wrap(near)
+                self.thetas += [theta, *near]
 
     def teach(self, layer: LawLayer, updates: int) -> None:
         """Fit a layer to all that was shown."""
@@ -117,15 +113,18 @@ class Teacher:
     def hardest(self, played: Imagined) -> NDArray[np.int64]:
         """Return the steps (k,) to plan from next: -1 where a policy does nearly as well as plans.
 
-        Half of the others begin at their start, half amid the episode.
+        One in four begins at its start, the others before it has cost as much as with plans.
         """
-        behind = np.where(np.isfinite(played.costs), played.costs - self.best, np.inf)
+        behind = (played.costs - self.best) / units_of(self.mpc.costs)
+        behind[~np.isfinite(behind)] = np.inf
         behind[less_safe(played.unsafe, self.mpc.unsafe).any(axis=1)] = np.inf
         chosen = np.argsort(-behind, kind="stable")[:HARDEST]
         chosen = chosen[behind[chosen] > 0]
         begins = np.full(len(behind), -1, dtype=np.int64)
-        begins[chosen] = self.rng.integers(0, self.steps, size=len(chosen))
-        begins[chosen[::2]] = 0
+        spent = self.problem.deviations.stage_cost(played.thetas[:-1], played.inputs)
+        late = np.sum(np.cumsum(spent, axis=0) < self.best, axis=0)[chosen]
+        begins[chosen] = self.rng.integers(0, np.clip(late, 1, self.steps), size=len(chosen))
+        begins[chosen[::4]] = 0
         return begins
 
 
@@ -161,7 +160,12 @@ class SwitchedController:
         return u
 
 
-def imitate(layer: LawLayer, teacher: Teacher, updates: int) -> float:
+def imitate(
+    layer: LawLayer,
+    teacher: Teacher,
+    updates: int,
+    say: Callable[[str], None] = lambda text: None,
+) -> float:
     """Fit a layer to plans of a model's episodes, and to their feedback nearby.
 
     Then the policy plays these episodes in the model, and learns more where it does worse than
@@ -176,13 +180,28 @@ def imitate(layer: LawLayer, teacher: Teacher, updates: int) -> float:
         act = policy_of(layer, teacher.problem)
         played = teacher.scenarios.play(controller_of(act))
         saved = teacher.saved(played.costs)
+        say(f"fit {fit + 1}: {100 * saved:.3g} % of plans' {100 * teacher.gain:.3g} % in the model")
         if saved > most:
             most, best = saved, copy.deepcopy(layer.state_dict())
         if most >= (1 - NEAR) * teacher.gain or fit == FITS - 1:
             break
-        teacher.show(teacher.hardest(played), act)
+        teacher.show(act, played)
     layer.load_state_dict(best)
     return most
+
+
+def units_of(mpc: Array) -> Array:
+    """Return what costs are measured in: the MPC's (k,), at least their median."""
+    finite = np.abs(mpc[np.isfinite(mpc)])
+    typical = max(float(np.median(finite)), 1e-300) if len(finite) else 1.0
+    return np.where(np.isfinite(mpc), np.maximum(np.abs(mpc), typical), typical)
+
+
+def gain_of(costs: Array, mpc: Array) -> float:
+    """Return what costs (k,) are below the MPC's (k,) on average, relative to `units_of` those."""
+    finite = np.isfinite(mpc)
+    saved = (mpc[finite] - costs[finite]) / units_of(mpc)[finite]
+    return float(np.mean(saved)) if finite.any() else 0.0
 
 
 def fit_layer(

@@ -14,11 +14,12 @@ import numpy as np
 import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._validation import check_bool, check_int
 from sb3_yann.control import LinearMPC
 from sb3_yann.deployment.exporting import Exported, export
-from sb3_yann.improvement.confirmation import FIRST_LOOK, Pairs, confirm
+from sb3_yann.improvement.confirmation import ENOUGH, FIRST_LOOK, LOOKS, Pairs, confirm
 from sb3_yann.improvement.critic import refit_critic
 from sb3_yann.improvement.imitation import Teacher, imitate, policy_of
 from sb3_yann.improvement.model import Model, Scenarios, SimulatorModel
@@ -136,7 +137,7 @@ class Improvement:
 
 def improve(
     model: OffPolicyAlgorithm | LinearMPC,
-    twin: PlantTwin | Source,
+    twin: PlantTwin | Source | VecEnv,
     *,
     max_steps: int | None = None,
     n_starts: int = 40,
@@ -178,11 +179,13 @@ def improve(
         With a :class:`YannPolicy` of the twin's problem. An MPC gets a DDPG model of its own, with
         one network for all regions, which the result holds: ``result.model``,
         ``result.export("controller.c")``.
-    twin : PlantTwin, gymnasium.Env, str or callable
+    twin : PlantTwin, gymnasium.Env, str, callable or VecEnv
         A twin, which must be trusted; or a simulator, which shows theta of the model's problem, in
         plant units where that is. The problem's stage cost counts, and no reward: a
         :class:`CostMismatchWarning` says where that is another one. A function or an id makes as
-        many as are played side by side, a given env is copied.
+        many as are played side by side, a given env is copied. The processes of a SubprocVecEnv
+        play at once. Within ``joblib.parallel_config("loky", n_jobs=2)``, or ``"dask"``, episodes
+        are spread over its workers; nothing else changes.
     max_steps : int, optional
         Of the simulator, for everything. Where they do not suffice nothing is accepted.
     n_starts : int, default 40
@@ -225,10 +228,10 @@ def improve(
     given = dict(locals())
     if not isinstance(model, OffPolicyAlgorithm | LinearMPC):
         raise TypeError(f"model = {model!r} must be a DDPG or TD3 model, or a LinearMPC.")
-    if not (isinstance(twin, PlantTwin | str | gym.Env) or callable(twin)):
+    if not (isinstance(twin, PlantTwin | str | gym.Env | VecEnv) or callable(twin)):
         raise TypeError(
             f"twin = {twin!r} must be a PlantTwin; or a simulator: a single gymnasium.Env, its id, "
-            "or a function that makes one."
+            "or a function that makes one, or a VecEnv of them."
         )
     for name in ("n_starts", "rounds", "updates"):
         check_int(name, given[name])
@@ -251,7 +254,7 @@ def improve(
     if isinstance(twin, PlantTwin):
         require_problem_of_twin(policy, twin.problem)
         twin.require_trust()
-    work = _Work(policy, n_starts, rounds, updates, seed, _Progress(progress_bar))
+    work = _Work(policy, n_starts, rounds, updates, seed, _Progress(progress_bar, rounds))
     if isinstance(twin, PlantTwin):
         work.layer.confine(*twin.starts.shown) if confine else work.layer.confine(None, None)
         found = work.in_twin(twin)
@@ -287,17 +290,41 @@ def least_gain(trust: Trust) -> float:
 
 
 class _Progress:
-    """Lines that say what is done: they read as well in a file as on a screen."""
+    """Lines that say what is done: they read as well in a file as on a screen.
 
-    def __init__(self, shown: bool) -> None:
-        self.shown, self.begun = shown, time.monotonic()
+    Parameters
+    ----------
+    shown : bool
+        Whether to print them.
+    rounds : int
+        How many there may be.
+    """
+
+    def __init__(self, shown: bool, rounds: int) -> None:
+        self.shown, self.rounds, self.begun = shown, rounds, time.monotonic()
         self.simulator: Simulator | None = None
+        self.ends: list[float] = []  # when the data were there, and when each round was over
 
-    def __call__(self, text: str) -> None:
-        """Print a line."""
-        if self.shown:
-            steps = f" {self.simulator.steps:>9,} steps" if self.simulator else ""
-            print(f"[{time.monotonic() - self.begun:5.0f} s{steps}] {text}", flush=True)
+    def __call__(self, text: str, pairs: int = 0) -> None:
+        """Print a line; ``pairs`` of a confirmation have been played."""
+        if not self.shown:
+            return
+        now = time.monotonic() - self.begun
+        steps, left = "", ""
+        if self.simulator:
+            steps = f" {self.simulator.steps:>9,} steps"
+        if len(self.ends) > 1:
+            each = (self.ends[-1] - self.ends[0]) / (len(self.ends) - 1)
+            over = self.rounds if pairs else len(self.ends) - 1
+            seconds = each * (self.rounds - over)
+            if self.simulator:
+                seconds += self.simulator.seconds_of(2 * max(LOOKS[-1] - pairs, 0))
+            left = f", at most {seconds:.0f} s left"
+        print(f"[{now:5.0f} s{steps}{left}] {text}", flush=True)
+
+    def end_of_round(self) -> None:
+        """Note the time, from which what is left follows."""
+        self.ends.append(time.monotonic() - self.begun)
 
 
 class _Work:
@@ -355,6 +382,7 @@ class _Work:
 
     def in_twin(self, twin: PlantTwin) -> Improvement:
         """Plan in the members of a twin, imitate, and check on every member."""
+        self.say(f"the MPC from {self.n_starts} starts in each member; at first this compiles code")
         trial, least = Trial.draw(twin, self.n_starts, self.rng), least_gain(twin.trust)
         before = self._check_in(trial) if self.has_learnt else None
         best = before.change if before is not None and before.accepted else 0.0
@@ -372,9 +400,11 @@ class _Work:
         # As many as are asked for, half of them as the log begins, half around.
         scenarios: Scenarios | None = Trial.draw(twin, -(-self.n_starts // 2), self.rng).scenarios()
         shown: Teacher | None = None
+        self.say.end_of_round()
         for number in range(self.rounds):
             if scenarios is None:
                 break
+            self.say(f"round {number + 1} of at most {self.rounds}: {len(scenarios)} plans")
             teacher = Teacher(scenarios, self.seed + number)
             teacher.show()
             gain = f"{100 * teacher.gain:.3g} %"
@@ -383,8 +413,9 @@ class _Work:
             if shown is not None:
                 teacher.thetas += shown.thetas
                 teacher.inputs += shown.inputs
-            gained = imitate(self.layer, teacher, self.updates)
+            gained = imitate(self.layer, teacher, self.updates, self.say)
             shown = teacher
+            self.say.end_of_round()
             self.say(
                 f"round {number + 1} of at most {self.rounds}: the policy gains "
                 f"{100 * gained:.3g} % of plans' {gain} in the twin"
@@ -403,11 +434,11 @@ class _Work:
         """Check the layer on the known starts of a twin, then on new ones, and by other models."""
         act, number = self.act(), len(self.checks) + 1
         played = trial.play(act)
-        found, self.hard = trial.check(number, played, trial.mpc), trial.hard(played)
+        found, self.hard = trial.check(number, played), trial.hard(played)
         if found.accepted:
             new = Trial.draw(trial.twin, self.n_starts, self.rng)
             played = new.play(act)
-            confirmed, self.hard = new.check(number, played, new.mpc), new.hard(played)
+            confirmed, self.hard = new.check(number, played), new.hard(played)
             if not confirmed.accepted:
                 reason = f"on new starts, {confirmed.reason}"
                 found = replace(found, accepted=False, reason=reason)
@@ -420,8 +451,9 @@ class _Work:
         )
         return found
 
-    def with_simulator(self, env: Source, max_steps: int | None) -> Improvement:
+    def with_simulator(self, env: Source | VecEnv, max_steps: int | None) -> Improvement:
         """Learn a model of a simulator, plan in it, imitate, and let the simulator decide."""
+        self.say("episodes of the MPC; where it is the first time code is compiled, up to a minute")
         simulator = Simulator(self.problem, env, self.seed, max_steps)
         self.say.simulator = simulator
         before: Check | None = None
@@ -441,6 +473,8 @@ class _Work:
                 accepted = self._confirm(simulator, model, best)
         except OutOfStepsError:
             note = f"max_steps = {max_steps:,} are too few to go on, {simulator.steps:,} are taken"
+            needed = simulator.needed((self.rounds + 2) * FIRST_LOOK + 2 * ENOUGH)
+            note += f"; about {needed:,} are needed" if needed else ": an episode takes more"
         finally:
             simulator.close()
         change = self.checks[-1].change if accepted else 0.0
@@ -449,6 +483,7 @@ class _Work:
 
     def _taught(self, simulator: Simulator, lost: list[Any], number: int) -> tuple[Model, Teacher]:
         """Return a model of all episodes so far, and plans in it: of what was lost first."""
+        self.say(f"a model of {len(simulator.episodes)} episodes, and {self.n_starts} plans in it")
         model = SimulatorModel.fit(
             self.problem, simulator.episodes, simulator.row.observer, self.seed + number
         )
@@ -465,15 +500,17 @@ class _Work:
         """Fit, plan and imitate until the simulator shows what the model promised."""
         lost: list[Any] = []
         weights, least, note = self.weights(), best, ""
+        self.say.end_of_round()
         for number in range(self.rounds):
             model, teacher = self._taught(simulator, lost, number)
             if teacher.gain < RULE.least_gain:
                 note = f"plans gain {100 * teacher.gain:.2g} %, too little to teach"
                 break
-            promised = imitate(self.layer, teacher, self.updates)
+            promised = imitate(self.layer, teacher, self.updates, self.say)
             played = trial.replay(self.act())
             found = played.check(number + 1, RULE.significance, final=False)
             self.checks.append(found)
+            self.say.end_of_round()
             self.say(
                 f"round {number + 1} of at most {self.rounds}: the model promises "
                 f"{-100 * promised:+.2f} %, the simulator shows {100 * found.logged:+.2f} %"
@@ -497,18 +534,19 @@ class _Work:
             if attempt == TRIES:
                 self.scale(RETREATS[0], self.weights())
             share = RULE.significance / (TRIES + 1)  # all tries together err with no more
-            found, pairs = confirm(self.act(), simulator, len(self.checks) + 1, share)
+            found, pairs = confirm(self.act(), simulator, len(self.checks) + 1, self.say, share)
             if found.accepted and not found.change < best:
                 found = replace(found, accepted=False, reason="the model's own policy is as good")
             self.checks.append(found)
             self.say(
                 f"confirmation on {len(pairs.seeds)} new starts: {100 * found.change:+.2f} %, "
-                f"{found.reason or 'accepted'}"
+                f"{found.reason or 'accepted'}",
+                pairs=LOOKS[-1],
             )
             if found.accepted:
                 self.accept(model)
                 return True
             if attempt < TRIES - 1:
                 model, teacher = self._taught(simulator, pairs.lost, self.rounds + attempt)
-                imitate(self.layer, teacher, self.updates)
+                imitate(self.layer, teacher, self.updates, self.say)
         return False

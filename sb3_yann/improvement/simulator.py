@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_yann._validation import Array
 from sb3_yann.audit.in_deviations import in_deviations, require_theta_shown
@@ -17,7 +20,18 @@ from sb3_yann.audit.meaning import (
     warn_of_signs,
 )
 from sb3_yann.control import LinearMPC
-from sb3_yann.rollout import Controller, EnvPool, Rows, Source, Trajectories, maker, rollout
+from sb3_yann.rollout import (
+    Controller,
+    EnvPool,
+    Rows,
+    Source,
+    Trajectories,
+    joined,
+    maker,
+    of_episode,
+    pool_of,
+    rollout,
+)
 from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.log import SHORTEST, Episode
 from sb3_yann.twin.observers import observer_of
@@ -38,23 +52,49 @@ class OutOfStepsError(Exception):
     """The simulator would take more steps than it may."""
 
 
-class _Counted(gym.Wrapper[Any, Any, Any, Any]):
-    """Counts each step before it is taken, of which there may be no more."""
+class _Count:
+    """Steps, of which there may be no more than so many; ``strict`` envs may not fail in one."""
 
-    def __init__(self, env: gym.Env[Any, Any], simulator: Simulator) -> None:
+    def __init__(self, most: float, strict: bool = True) -> None:
+        self.steps, self.most, self.strict = 0, most, strict
+
+    def add(self) -> None:
+        """Count a step before it is taken; OutOfStepsError where none is left."""
+        self.steps += 1
+        if self.steps > self.most:
+            self.steps -= 1
+            raise OutOfStepsError
+
+
+class _Counted(gym.Wrapper[Any, Any, Any, Any]):
+    """Counts each step before it is taken."""
+
+    def __init__(self, env: gym.Env[Any, Any], count: _Count) -> None:
         super().__init__(env)
-        self.simulator = simulator
+        self.count = count
 
     def step(self, action: Any) -> Any:
         """Step the env; where it fails off the MPC's ways, the episode ends with NaN."""
-        self.simulator.count()
+        self.count.add()
         try:
             return self.env.step(action)
         except Exception:  # whatever a simulator raises in a state that it cannot be in
-            if self.simulator.strict:
+            if self.count.strict:
                 raise
             space: Any = self.env.observation_space
             return np.full(space.shape, np.nan), np.nan, True, False, {}
+
+
+def _play_there(
+    controller: Controller,
+    make: Callable[[], gym.Env[Any, Any]],
+    seeds: Sequence[int],
+    problem: LinearMPC,
+    count: _Count,
+) -> tuple[Trajectories, int]:
+    """Return episodes, and how many steps they took: in another process."""
+    played = rollout(controller, lambda: _Counted(make(), count), seeds, problem=problem)
+    return played, count.steps
 
 
 class Simulator:
@@ -64,7 +104,7 @@ class Simulator:
     ----------
     problem : LinearMPC
         Of the policy.
-    env : gymnasium.Env, str or callable
+    env : gymnasium.Env, str, callable or VecEnv
         It shows theta of the problem, and takes its inputs, in plant units.
     seed : int
         Of the episodes.
@@ -73,8 +113,8 @@ class Simulator:
 
     Attributes
     ----------
-    steps, played : int
-        How many it has taken, in how many episodes.
+    played, seconds : int and float
+        Episodes, and how long they took.
     episodes : list of Episode
         What is known of it, in rows of ``row``.
 
@@ -85,19 +125,19 @@ class Simulator:
     """
 
     def __init__(
-        self, problem: LinearMPC, env: Source, seed: int, max_steps: int | None = None
+        self, problem: LinearMPC, env: Source | VecEnv, seed: int, max_steps: int | None = None
     ) -> None:
         self.problem, self.seed, self.max_steps = problem, seed, max_steps
-        self.steps = self.played = 0
-        make = in_deviations(maker(env, "twin"), problem)
-        self.envs = EnvPool(lambda: _Counted(make(), self))
+        self.played, self.seconds = 0, 0.0
+        self.counted = _Count(np.inf if max_steps is None else max_steps)
+        self.make = in_deviations(maker(env, "twin"), problem)
+        self.envs = pool_of(env, lambda: _Counted(self.make(), self.counted))
         with self.envs.acquire(1) as (one,):
             self.row, self.unaware = RowLayout(problem, observer_of(one)), below_set_points(one)
             require_spaces(problem, one)
             self.name = str(getattr(one.spec, "id", type(one.unwrapped).__name__))
         self.next_seed, self.longest = FIRST + APART * seed, 0
         self.episodes: list[Episode] = []
-        self.strict = True
 
     def begin(self) -> None:
         """Play the first episodes, of the MPC with and without random inputs; check the env."""
@@ -120,6 +160,19 @@ class Simulator:
         while count < MOST and count * self.longest < SHORT:
             count += EPISODES // 2
         return count
+
+    def needed(self, later: int) -> int:
+        """Return how many steps the first episodes and so many later ones take; 0: not known."""
+        return self.longest * (self.usual + 1 + later)
+
+    def seconds_of(self, episodes: int) -> float:
+        """Return how long so many episodes take, as those so far did."""
+        return self.seconds * episodes / max(self.played, 1)
+
+    @property
+    def steps(self) -> int:
+        """How many it has taken."""
+        return self.counted.steps
 
     def watch(self, seeds: Sequence[int], checked: bool = True) -> Trajectories:
         """Return episodes of the MPC; see that the env repeats them, and shows the problem's theta.
@@ -144,12 +197,6 @@ class Simulator:
         seeds = self.new_seeds(count)
         return self.play(Excited(self.problem, self.seed), seeds, strict=False)
 
-    def count(self) -> None:
-        """Count a step before it is taken; OutOfStepsError where none is left."""
-        if self.steps == self.max_steps:
-            raise OutOfStepsError
-        self.steps += 1
-
     def new_seeds(self, count: int) -> range:
         """Return seeds of episodes that nothing has seen."""
         first = self.next_seed
@@ -161,13 +208,37 @@ class Simulator:
     ) -> Trajectories:
         """Return episodes; OutOfStepsError where they might take more steps than are left.
 
-        Unless it is ``strict``, an episode in which the env fails ends there.
+        Within ``joblib.parallel_config(backend, n_jobs=...)`` its workers play them, unless the
+        controller ``remembers``. Unless it is ``strict``, an episode in which the env fails ends
+        there.
         """
-        if self.max_steps is not None and self.steps + self.longest * len(seeds) > self.max_steps:
+        counted, problem = self.counted, self.problem
+        left = counted.most - counted.steps
+        if self.longest * len(seeds) > left:
             raise OutOfStepsError
-        self.strict = strict
-        played = rollout(controller, self.envs, seeds, problem=self.problem)
-        self.strict = True
+        begun = time.monotonic()
+        joblib: Any = sys.modules.get("joblib")  # without it there is no such context
+        alone = joblib is None or self.envs.most or getattr(controller, "remembers", False)
+        jobs = 1 if alone else min(joblib.effective_n_jobs(), len(seeds))
+        if jobs > 1:
+            parts = np.array_split(np.arange(len(seeds)), jobs)
+            found = joblib.Parallel()(
+                joblib.delayed(_play_there)(
+                    of_episode(controller, int(part[0])),
+                    self.make,
+                    [seeds[i] for i in part],
+                    problem,
+                    _Count(np.floor(left * len(part) / len(seeds)), strict),
+                )
+                for part in parts
+            )
+            counted.steps += sum(steps for _, steps in found)
+            played = joined([part for part, _ in found])
+        else:
+            counted.strict = strict
+            played = rollout(controller, self.envs, seeds, problem=problem)
+            counted.strict = True
+        self.seconds += time.monotonic() - begun
         self.played += len(seeds)
         self.longest = max(self.longest, int(played.lengths.max(initial=0)))
         return played
@@ -246,18 +317,14 @@ class Excited:
     def __init__(
         self, problem: LinearMPC, seed: int, push: float = PUSH, often: float = OFTEN
     ) -> None:
-        self.problem, self.rng, self.law = problem, np.random.default_rng(seed), of_law(problem)
+        self.problem, self.seed, self.law = problem, seed, of_law(problem)
         self.push, self.often = push, often
-        self.moved: Array = np.zeros((0, 0))
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
-        """Return the inputs (r, m)."""
-        problem = self.problem
-        if t == 0:
-            self.moved = np.zeros((len(rows), problem.model.n_inputs))
-        if t % HELD == 0:  # one draw for each episode, also for those that are over
-            self.moved = self.push * problem.u_half * self.rng.uniform(-1, 1, self.moved.shape)
-            if self.often < 1:
-                self.moved *= self.rng.random((len(self.moved), 1)) < self.often
-        u = self.law(t, theta, rows) + self.moved[rows]
+        """Return the inputs (r, m): those of an episode do not depend on what others there are."""
+        problem, every = self.problem, (int(rows.max(initial=-1)) + 1, self.problem.model.n_inputs)
+        moves, times = (np.random.default_rng([self.seed, t // HELD, i]) for i in range(2))
+        moved = self.push * problem.u_half * moves.uniform(-1, 1, every)
+        moved *= times.random((len(moved), 1)) < self.often
+        u = self.law(t, theta, rows) + moved[rows]
         return np.asarray(np.clip(u, problem.deviations.u_min, problem.deviations.u_max))

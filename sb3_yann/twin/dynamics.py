@@ -17,6 +17,8 @@ from sb3_yann.twin.row_layout import RowLayout
 
 MARGIN = 0.25
 """How far the residual reaches beyond the data, in widths of the data."""
+FULL_TURNS = 2 * np.pi, 360.0
+"""By which an angle jumps that is shown between two ends, such as -pi and pi."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Coordinates:
         How far the states move in the log: standard deviations.
     row : RowLayout
         What a row of the twin holds: theta alone, unless an observer is a part of it.
+    turn : ndarray, shape (n,), optional
+        A full turn for each state that is an angle and jumps by it, 0 for the others.
     """
 
     low: Array
@@ -41,6 +45,7 @@ class Coordinates:
     scale: Array
     units: Array
     row: RowLayout
+    turn: Array | None = None
 
     @classmethod
     def of(
@@ -57,7 +62,8 @@ class Coordinates:
         width = np.maximum(high - low, 1e-6 * half)
         scale = np.maximum(np.abs(seen).max(0), 1e-3 * half)
         units = np.maximum(np.std(seen, axis=0), 1e-6 * half)[: problem.model.n_states]
-        return cls(low - MARGIN * width, high + MARGIN * width, scale, units, row)
+        turn = None if observer is not None else _turns([e.thetas[:, row.state] for e in episodes])
+        return cls(low - MARGIN * width, high + MARGIN * width, scale, units, row, turn)
 
     def scaled(self, features: Array) -> Array:
         """Return what residuals are fed, inside the box."""
@@ -67,7 +73,33 @@ class Coordinates:
         """Return z (T, k), and what the linear model leaves of the next states (T, n)."""
         row, rows, u = self.row, episode.thetas, episode.actions
         linear = np.concatenate([rows[:-1], u], axis=1) @ row.linear[row.state].T
-        return self.scaled(row.features(rows[:-1], u)), rows[1:, row.state] - linear
+        after = self.nearest(rows[1:, row.state], rows[:-1, row.state])
+        return self.scaled(row.features(rows[:-1], u)), after - linear
+
+    def nearest(self, x: Array, to: Array) -> Array:
+        """Return states (..., n) with their angles turned as near to others as they come."""
+        if self.turn is None:
+            return x
+        turns = (x - to) / np.where(self.turn > 0, self.turn, np.inf)
+        return np.asarray(x - self.turn * np.round(turns))
+
+    def wrap(self, rows: Array) -> None:
+        """Turn the angles of rows (..., size) to between the ends of the data, in place."""
+        if self.turn is not None:
+            middle = ((self.low + self.high) / 2)[: len(self.turn)]
+            rows[..., self.row.state] = self.nearest(rows[..., self.row.state], middle)
+
+
+def _turns(episodes: Sequence[Array]) -> Array | None:
+    """Return a full turn for each state that jumps by it, else 0; None where none does."""
+    steps = np.abs(np.concatenate([np.diff(each, axis=0) for each in episodes]))
+    width = np.ptp(np.concatenate(episodes), axis=0)
+    found = np.zeros(len(width))
+    for turn in FULL_TURNS:
+        jumps = (steps > turn / 2).any(axis=0) & (width > 0.9 * turn) & (width < 1.001 * turn)
+        moves = np.minimum(steps, np.abs(steps - turn)).max(axis=0, initial=0.0)
+        found[jumps & (moves < turn / 4)] = turn
+    return found if found.any() else None
 
 
 def law_of(problem: LinearMPC) -> Callable[[Array], Array]:
@@ -151,6 +183,7 @@ class Dynamics:
             after = np.concatenate([theta, u], axis=-1) @ self.row.linear.T
             after = after + self.residual(theta, u) @ self.row.spread.T
         self.row.clip(after)
+        self.coordinates.wrap(after)
         return np.asarray(after)
 
     def jacobians(self, theta: Array, u: Array) -> tuple[Array, Array]:

@@ -177,6 +177,8 @@ class _Networks:
             self.tensor(each)
             for each in (coordinates.low, coordinates.high, coordinates.scale, coordinates.units)
         )
+        turn = self.tensor(np.zeros(n) if coordinates.turn is None else coordinates.turn)
+        per_turn = th.where(turn > 0, 1 / turn, 0.0)
         for _ in self._steps(RATE / 5, updates):
             chosen = th.randint(data.shape[1], (WINDOWS,), generator=self.generator)
             window = data[:, chosen]
@@ -184,7 +186,9 @@ class _Networks:
             for t in range(ahead):
                 features = th.cat([x, window[..., n:, t]], dim=-1)
                 x = features @ linear + self(features.clamp(low, high) / scale)
-                loss = loss + (((x - window[..., :n, t + 1]) / units) ** 2).mean()
+                after = window[..., :n, t + 1]
+                x = x - turn * ((x - after) * per_turn).detach().round()  # an angle may have jumped
+                loss = loss + (((x - after) / units) ** 2).mean()
             loss.backward()  # type: ignore[no-untyped-call]
 
     def _steps(self, rate: float, updates: int) -> Iterator[None]:

@@ -107,6 +107,7 @@ class PlantEnv(gym.Wrapper[Any, Any, Any, Any]):
         if layout.n_previous:
             env = PreviousInput(env, mpc.model.u_ss)
         limit = check_int("max_episode_steps", max_episode_steps)
+        self.mpc = mpc
         super().__init__(TimeLimit(StageCost(env, mpc), limit))
 
 

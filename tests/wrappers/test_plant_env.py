@@ -19,6 +19,7 @@ from sb3_yann import (
     RateLimits,
     Tracking,
     headroom,
+    improve,
     offset_free,
 )
 from sb3_yann.evaluation import evaluate
@@ -119,3 +120,21 @@ def test_what_is_of_no_use_is_named() -> None:
         PlantEnv(slope, LinearMPC(TANK, **WEIGHTS, u_min=0, u_max=5))
     with pytest.raises(ValueError, match=r"options\['state'\] = \[1, 2\] must be 1 finite"):
         PlantEnv(slope, plain).reset(options={"state": [1, 2]})
+
+
+def test_an_mpc_from_it_has_the_bounds_of_its_own() -> None:
+    mpc = LinearMPC(TANK, **WEIGHTS, **BOX, x_max=380)
+    found = LinearMPC.from_env(PlantEnv(slope, mpc), **WEIGHTS, x_ss=[350], u_ss=[2])
+    for name in ("x_min", "x_max", "theta_min", "theta_max", "u_min", "u_max"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(mpc, name))
+
+
+@pytest.mark.parametrize("bad", ["CSTR-v9", "CSTRv0", PlantEnv])
+@pytest.mark.parametrize("use", [headroom, improve, LinearMPC.from_env])
+def test_an_id_that_is_not_there_or_a_class_without_its_arguments_is_named(use, bad) -> None:
+    message = "cannot be made" if isinstance(bad, str) else "cannot be called without arguments"
+    with pytest.raises((ValueError, TypeError), match=message):
+        if use == LinearMPC.from_env:
+            use(bad, **WEIGHTS)
+        else:
+            use(LinearMPC(TANK, **WEIGHTS, **BOX), bad)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -60,10 +61,35 @@ class Borrowed:
             self.env.close()
 
 
+def require_makes(env: Any) -> None:
+    """Raise unless an id is registered, or a function can be called without arguments."""
+    import gymnasium
+
+    if isinstance(env, str):
+        try:
+            gymnasium.spec(env)
+        except gymnasium.error.Error as error:
+            raise ValueError(
+                f"env = {env!r} cannot be made ({error}) Import the package that registers it, or "
+                "pass a function that makes such an env."
+            ) from error
+    elif callable(env):
+        try:
+            inspect.signature(env).bind()
+        except TypeError as error:
+            raise TypeError(
+                f"env = {env!r} cannot be called without arguments ({error}). Pass an env, or a "
+                "function without arguments that makes one, such as lambda: PlantEnv(f, mpc)."
+            ) from error
+        except ValueError:  # nothing tells its arguments
+            pass
+
+
 def borrow(env: Maker) -> Borrowed:
     """Return an environment made from an id or a function, or a deep copy of the given one."""
     import gymnasium
 
+    require_makes(env)
     if isinstance(env, str):
         found = Borrowed(gymnasium.make(env), f"a {env} made for it", private=True, owned=True)
     elif isinstance(env, gymnasium.Env):

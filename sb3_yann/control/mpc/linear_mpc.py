@@ -234,7 +234,8 @@ class LinearMPC(MPCProblem):
         """Return the MPC of a simulator: its model by differences, its bounds from its spaces.
 
         The inputs keep the bounds of the action space. The box of states for which the problem is
-        solved is the observation space, where that shows the state and has bounds.
+        solved is the observation space, where that shows the state and has bounds. Those of a
+        :class:`PlantEnv`, and its bounds of the states, are those of its own MPC.
 
         Parameters
         ----------
@@ -258,6 +259,7 @@ class LinearMPC(MPCProblem):
         with contextlib.closing(borrow(env)) as borrowed:
             shown = borrowed.env.observation_space
             action = borrowed.env.action_space
+            own = getattr(borrowed.env, "mpc", None)
         limits = {"u_min": action.low, "u_max": action.high}
         if shown.shape == (model.n_states,):
             low = np.asarray(shown.low, np.float64)
@@ -265,6 +267,10 @@ class LinearMPC(MPCProblem):
             bounded = np.abs([low, high]) < 1e6  # "no bound" may be the largest float32
             limits["theta_min"] = np.where(bounded[0], low, -np.inf)
             limits["theta_max"] = np.where(bounded[1], high, np.inf)
+        if isinstance(own, LinearMPC):  # a PlantEnv's
+            states = own.layout.state
+            limits |= {"x_min": own.x_min, "x_max": own.x_max}
+            limits |= {"theta_min": own.theta_min[states], "theta_max": own.theta_max[states]}
         return cls(model, Q=Q, R=R, horizon=horizon, **{**limits, **options})
 
     def predict(self, theta: ArrayLike, u: ArrayLike) -> Array:

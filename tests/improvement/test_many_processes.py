@@ -1,0 +1,83 @@
+"""Episodes on many processes: joblib's workers, or those of a SubprocVecEnv."""
+
+from functools import partial
+
+import joblib
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from improvement_samples import FEW, Spring, bits, model_of, quick
+from sb3_yann import improve
+from sb3_yann.improvement.simulator import Excited, OutOfStepsError, Simulator, of_law
+
+SEEDS = range(5)
+
+
+@pytest.fixture(autouse=True)
+def brisk(monkeypatch) -> None:
+    quick(monkeypatch)
+
+
+def same(ours, theirs) -> bool:
+    pairs = zip(ours.pairs, theirs.pairs, strict=True)
+    return all(
+        np.array_equal(a, b) for one, other in pairs for a, b in zip(one, other, strict=True)
+    )
+
+
+@pytest.mark.parametrize("backend", ["loky", "threading"])
+def test_workers_of_joblib_play_the_same_episodes(backend) -> None:
+    problem = model_of().policy.problem
+    alone, shared = (Simulator(problem, Spring, 0) for _ in range(2))
+    for controller in (of_law(problem), Excited(problem, 0, 0.5, 0.7)):
+        ours = alone.play(controller, SEEDS)
+        with joblib.parallel_config(backend, n_jobs=2):
+            theirs = shared.play(controller, SEEDS)
+        assert same(ours, theirs)
+        np.testing.assert_array_equal(ours.costs, theirs.costs)
+        np.testing.assert_array_equal(ours.unsafe(), theirs.unsafe())
+    assert shared.steps == alone.steps == 2 * 20 * len(SEEDS)
+    assert shared.played == alone.played == 2 * len(SEEDS)
+
+
+def test_workers_take_no_step_more_than_is_left() -> None:
+    problem = model_of().policy.problem
+    simulator = Simulator(problem, Spring, 0, max_steps=99)
+    with joblib.parallel_config("threading", n_jobs=2), pytest.raises(OutOfStepsError):
+        simulator.play(of_law(problem), SEEDS)
+
+
+@pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
+def test_a_vec_env_is_a_simulator(kind) -> None:
+    envs = kind([Spring] * 3)
+    problem = model_of().policy.problem
+    alone, shared = Simulator(problem, Spring, 0), Simulator(problem, envs, 0)
+    for controller in (of_law(problem), Excited(problem, 0, 0.5, 0.7)):
+        assert same(alone.play(controller, SEEDS), shared.play(controller, SEEDS))
+    assert shared.steps == alone.steps
+    envs.close()
+
+
+def test_improve_finds_the_same_on_two_processes() -> None:
+    models = [model_of() for _ in range(3)]
+    alone = improve(models[0], Spring, **FEW)
+    with joblib.parallel_config("loky", n_jobs=2):
+        shared = improve(models[1], Spring, **FEW)
+    envs = DummyVecEnv([partial(Spring) for _ in range(4)])
+    of_envs = improve(models[2], envs, **FEW)
+    for other in (shared, of_envs):
+        assert other.checks == alone.checks and other.steps == alone.steps and alone.accepted
+    assert bits(models[0]) == bits(models[1]) == bits(models[2])
+    assert of_envs.source == "DummyVecEnv of 4"
+
+
+@pytest.mark.slow
+def test_workers_of_dask_play_the_same_episodes() -> None:
+    distributed = pytest.importorskip("distributed")
+    problem = model_of().policy.problem
+    ours = Simulator(problem, Spring, 0).play(of_law(problem), SEEDS)
+    cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    with cluster, distributed.Client(cluster), joblib.parallel_config("dask", n_jobs=2):
+        theirs = Simulator(problem, Spring, 0).play(of_law(problem), SEEDS)
+    assert same(ours, theirs)
