@@ -70,8 +70,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="seven regions only, in a minute")
     parser.add_argument(
         "--only", metavar="SECTION", nargs="+", default=[],
-        help="law, actor, train, solve, exact, memory, suite, large, horizons, online, export; "
-        "writes no report unless --report",
+        help="law, actor, train, solve, exact, memory, suite, large, horizons, online, export, "
+        "processes; writes no report unless --report",
     )  # fmt: skip
     parser.add_argument("--report", type=Path, metavar="FILE", help="docs/performance.md")
     parser.add_argument(

@@ -15,6 +15,7 @@ from benchmarks import (
     networks,
     offline,
     online,
+    processes,
     suite,
 )
 from benchmarks.problems import PROBLEMS, SMALLEST, Problem
@@ -38,6 +39,7 @@ TITLES = {
     deployment.SECTION: "Exported controllers of the reactor, one step",
     deployment.SMALL: "An exported controller of the reactor on an emulated microcontroller",
     memory.SECTION: "Memory",
+    processes.SECTION: "A simulator of 5 ms a step",
 }
 PerProblem = Callable[[Bench, Problem], None]
 EACH: dict[str, PerProblem] = {
@@ -54,6 +56,7 @@ WHOLE: dict[str, Callable[[Bench], None]] = {
     "horizons": long_horizons.long_horizons,
     "online": online.online,
     "export": deployment.deployment,
+    "processes": processes.processes,
 }
 NAMES = (*EACH, *WHOLE)
 
