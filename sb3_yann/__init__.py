@@ -29,9 +29,9 @@ _NAMES = {
     "sb3_yann.callbacks": "ControlDiagnostics NoActionNoise",
     "sb3_yann.commissioning": "Batch Commissioning",
     "sb3_yann.control": "DisturbanceBounds DisturbanceObserver ExplicitLimitError "
-    "ExplicitSolutionError Identified LinearCost LinearMPC LinearModel MixedBounds OnlineLaw "
-    "OnlineLawWarning OutputBounds PiecewiseAffine RateLimits SoftBounds Terminal Tracking "
-    "identify offset_free",
+    "ExplicitSolutionError Identified IdentifiedOutputs LinearCost LinearMPC LinearModel "
+    "MixedBounds OnlineLaw OnlineLawWarning OutputBounds PiecewiseAffine RateLimits SoftBounds "
+    "Terminal Tracking identify identify_outputs offset_free",
     "sb3_yann.deployment.checks": "Checks",
     "sb3_yann.deployment.controller": "Controller",
     "sb3_yann.deployment.exporting": "Exported export",

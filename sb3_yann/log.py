@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, check_positive, to_float
 
@@ -269,6 +269,37 @@ class Log:
         )
 
 
+def cut_at_gaps(
+    outputs: Arrays, inputs: Arrays, dt: float, disturbances: Arrays | None = None
+) -> Log:
+    """Return the log of arrays as of `Log.from_arrays`, cut where an entry is NaN."""
+    given = {"outputs": outputs, "inputs": inputs, "disturbances": disturbances}
+    parts = {
+        name: _matrices(name, values, gaps=True)
+        for name, values in given.items()
+        if values is not None
+    }
+    y = parts["outputs"]
+    for name in [*parts][1:]:
+        _require_one_state_more(name, parts[name], y)
+    episodes = []
+    for i, states in enumerate(y):
+        driven = [parts[name][i] for name in [*parts][1:]]
+        reading: NDArray[np.bool_] = np.all(np.isfinite(states), axis=1)
+        step = np.all(np.isfinite(np.hstack(driven)), axis=1) & reading[:-1] & reading[1:]
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], step, [False]]).astype(int)))
+        episodes += [
+            Episode(states[a : b + 1], *(each[a:b] for each in driven))
+            if len(driven) > 1
+            else Episode(states[a : b + 1], driven[0][a:b], np.zeros((b - a, 0)))
+            for a, b in zip(edges[::2], edges[1::2], strict=True)
+        ]
+    lost = sum(len(each) - 1 for each in y) - sum(map(len, episodes))
+    if sum(map(len, episodes)) < 2:
+        raise ValueError("outputs and inputs hold no two rows in a row without a missing entry.")
+    return Log(tuple(episodes), check_positive("dt", dt), lost_steps=lost)
+
+
 def split_episodes(
     episodes: Sequence[Episode], held_out: float
 ) -> tuple[list[Episode], list[Episode]]:
@@ -338,8 +369,8 @@ def _without_gaps(episodes: list[Episode], time: Arrays, dt: float) -> tuple[lis
     return parts, lost
 
 
-def _matrices(name: str, value: Arrays) -> list[Array]:
-    """Return one float64 matrix for each episode, all with the same columns."""
+def _matrices(name: str, value: Arrays, *, gaps: bool = False) -> list[Array]:
+    """Return one float64 matrix for each episode, all with the same columns, NaN where allowed."""
     given = list(value) if isinstance(value, (list, tuple)) else []
     flat = [i for i, part in enumerate(given) if np.shape(part) != () and np.ndim(part) == 1]
     if flat and len({np.size(part) for part in given}) > 1:
@@ -359,7 +390,7 @@ def _matrices(name: str, value: Arrays) -> list[Array]:
                 "same columns in each episode. Of a single one write values.reshape(-1, 1)."
             )
         bad = np.flatnonzero(~np.all(np.isfinite(part), axis=1))
-        if bad.size:
+        if bad.size and not (gaps and not np.isinf(part).any()):
             raise ValueError(
                 f"{name} of episode {i} holds NaN or infinite entries in {bad.size} rows, first in "
                 f"row {bad[0]}. Leave them out by splitting the episode there into two."

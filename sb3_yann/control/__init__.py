@@ -5,6 +5,7 @@ from sb3_yann.control.explicit.certificate import ExplicitSolutionError
 from sb3_yann.control.explicit.parametric_qp import ParametricQP
 from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.model.identify import Identified, identify
+from sb3_yann.control.model.identify_outputs import IdentifiedOutputs, identify_outputs
 from sb3_yann.control.model.linear_model import LinearModel
 from sb3_yann.control.mpc.choice import OnlineLawWarning
 from sb3_yann.control.mpc.groups import (
@@ -29,6 +30,7 @@ __all__ = [
     "ExplicitLimitError",
     "ExplicitSolutionError",
     "Identified",
+    "IdentifiedOutputs",
     "LinearCost",
     "LinearMPC",
     "LinearModel",
@@ -44,5 +46,6 @@ __all__ = [
     "ThetaLayout",
     "Tracking",
     "identify",
+    "identify_outputs",
     "offset_free",
 ]

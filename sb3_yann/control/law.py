@@ -152,7 +152,8 @@ class PlantLaw(ReadOnlyArrays):
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
         if self.model is not None:
             arrays["theta_ss"] = self.theta_ss
-            arrays |= {f"model_{name}": value for name, value in vars(self.model).items()}
+            own = {name: value for name, value in vars(self.model).items() if value is not None}
+            arrays |= {f"model_{name}": value for name, value in own.items()}
         return arrays
 
     @classmethod
@@ -163,7 +164,8 @@ class PlantLaw(ReadOnlyArrays):
         law._restore(data)
         if not any(name == "theta_ss" or name.startswith("model_") for name in data):
             return law
-        given = {each.name: data[f"model_{each.name}"] for each in fields(LinearModel)}
+        own = [each.name for each in fields(LinearModel) if each.name != "C" or "model_C" in data]
+        given = {name: data[f"model_{name}"] for name in own}
         for name in ("notes", "state_names", "input_names", "units", "estimated"):
             given[name] = given[name].tolist()
         model = LinearModel(**{**given, "dt": float(given["dt"])})

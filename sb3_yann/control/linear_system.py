@@ -30,6 +30,8 @@ class LinearSystem(ReadOnlyArrays):
         Empty where there are none.
     estimated : tuple of int
         Which disturbances an observer estimates.
+    C : ndarray, shape (q, n), optional
+        The outputs that sensors show, ``y = C x``. None where they show the states.
     """
 
     A: Array
@@ -45,6 +47,12 @@ class LinearSystem(ReadOnlyArrays):
     input_names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     estimated: tuple[int, ...] = ()
+    C: Array | None = None
+
+    @property
+    def shown(self) -> Array:
+        """The matrix (q, n) of the outputs that sensors show: C, or the identity."""
+        return np.eye(self.n_states) if self.C is None else self.C
 
     @property
     def n_states(self) -> int:

@@ -74,7 +74,7 @@ def fit_log(
     automatic = isinstance(ridge, str) and check_choice("ridge", ridge, ("auto",)) == "auto"
     episodes, sizes = list(log.episodes), log.sizes
     measured = sizes[2] > 0
-    _require_moving(episodes, sizes)
+    require_moving(episodes, sizes)
     episodes, sizes, delays = _delayed(episodes, sizes, delay)
     x_ss = with_memory_point(x_ss, u_ss, delays)
     n, m, d = sizes
@@ -92,7 +92,7 @@ def fit_log(
     if automatic:
         found, weight, shrunk = regularized(found, fitted, tested, sizes, origin)
     fits = (_fit(found, tested, 1), _fit(found, tested, AHEAD))
-    system = _system(found, sizes, given, log.dt, delays)
+    system = system_of(found, sizes, given, log.dt, delays)
     system = _with_exact_memory(system, delays, sizes[0])
     late = [] if any(delays) else input_notes(found, fitted, sizes, episodes)
     if late:
@@ -104,7 +104,7 @@ def fit_log(
     return LogFit(replace(system, notes=tuple(notes)), found, fits, tuple(delays))
 
 
-def _require_moving(episodes: list[Episode], sizes: tuple[int, int, int]) -> None:
+def require_moving(episodes: list[Episode], sizes: tuple[int, int, int]) -> None:
     """Raise where a sensor stands still though the plant moves."""
     states = [each.states for each in episodes]
     found = frozen_rows(states, [each.driven for each in episodes])
@@ -112,7 +112,7 @@ def _require_moving(episodes: list[Episode], sizes: tuple[int, int, int]) -> Non
         raise ValueError(" ".join(words_for(found, names(sizes), states)))
 
 
-def _system(
+def system_of(
     found: Regression,
     sizes: tuple[int, int, int],
     given: Sequence[Array | None],

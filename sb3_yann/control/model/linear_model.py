@@ -58,6 +58,8 @@ class LinearModel(Plant):
     estimated : sequence of int, optional
         Disturbances, by their index, that no sensor measures: a :class:`DisturbanceObserver`
         estimates them. Equality ignores it, `dataclasses.replace` keeps it.
+    C : array_like, shape (q, n), optional
+        The outputs that sensors show, ``y = C x``. The default, None, is all states.
 
     Examples
     --------
@@ -73,6 +75,7 @@ class LinearModel(Plant):
     input_names: tuple[str, ...] = field(default=(), compare=False)
     units: tuple[str, ...] = field(default=(), compare=False)
     estimated: tuple[int, ...] = field(default=(), compare=False)
+    C: Array | None = None
 
     def __init__(  # noqa: PLR0913 (the matrices of a plant and its operating point)
         self,
@@ -90,6 +93,7 @@ class LinearModel(Plant):
         input_names: Sequence[str] = (),
         units: Units = (),
         estimated: Sequence[int] = (),
+        C: ArrayLike | None = None,
     ) -> None:
         A = check_array("A", A, ("n", "n"))
         n = A.shape[0]
@@ -111,7 +115,8 @@ class LinearModel(Plant):
         require_different(labels)
         step, kept = check_positive("dt", dt), as_units(units, labels)
         seen = check_indices("estimated", estimated, E.shape[1])
-        super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept, seen)
+        shown = None if C is None else check_array("C", C, ("q", n))
+        super().__init__(A, B, step, x, u, E, d, tuple(notes), moved, *named, kept, seen, shown)
 
     @classmethod
     def from_continuous(
@@ -123,6 +128,8 @@ class LinearModel(Plant):
         u_ss: ArrayLike | None = None,
         E: ArrayLike | None = None,
         d_ss: ArrayLike | None = None,
+        *,
+        C: ArrayLike | None = None,
     ) -> LinearModel:
         """Sample ``dx/dt = A x + B u + E d`` exactly every ``dt``, with a zero-order hold.
 
@@ -134,6 +141,8 @@ class LinearModel(Plant):
             Sampling time.
         x_ss, u_ss, d_ss : array_like, shapes (n,), (m,) and (d,), optional
             The operating point, zeros by default.
+        C : array_like, shape (q, n), optional
+            The outputs that sensors show.
 
         Examples
         --------
@@ -142,7 +151,7 @@ class LinearModel(Plant):
         """
         given = cls(A, B, dt, x_ss, u_ss, E, d_ss)
         A, B, E = zero_order_hold(given.A, given.B, given.E, given.dt)
-        return cls(A, B, dt, x_ss, u_ss, E, d_ss)
+        return cls(A, B, dt, x_ss, u_ss, E, d_ss, C=C)
 
     @classmethod
     def from_dynamics(
@@ -304,8 +313,8 @@ class LinearModel(Plant):
     ) -> LinearModel:
         """Take over a `control.StateSpace`: a discrete one as it is, a continuous one sampled.
 
-        The outputs are dropped. Where C is not the identity or D not zero, the notes say so, and
-        whether an observer could estimate the states.
+        C is kept where it is not the identity: the law then needs a :class:`StateEstimator`. The
+        notes say so, whether one can estimate the states, and that D, if not zero, was dropped.
 
         Parameters
         ----------
@@ -325,5 +334,5 @@ class LinearModel(Plant):
         >>> LinearModel.from_statespace(lag, dt=0.1).A.round(3).tolist()
         [[0.905]]
         """
-        A, B, E, step, notes = from_control(system, dt, disturbances)
-        return cls(A, B, step, x_ss, u_ss, E, d_ss, notes=notes)
+        A, B, E, C, step, notes = from_control(system, dt, disturbances)
+        return cls(A, B, step, x_ss, u_ss, E, d_ss, notes=notes, C=C)

@@ -14,8 +14,8 @@ from sb3_yann.control.model.labels import labels_of
 
 def from_control(
     system: Any, dt: float | None, disturbances: Sequence[int | str]
-) -> tuple[Array, Array, Array, float, list[str]]:
-    """Return A, B, E, the sampling time and notes; see `LinearModel.from_statespace`."""
+) -> tuple[Array, Array, Array, Array | None, float, list[str]]:
+    """Return A, B, E, C, the sampling time and notes; see `LinearModel.from_statespace`."""
     import control
 
     if not isinstance(system, control.StateSpace):
@@ -31,8 +31,9 @@ def from_control(
     if continuous:
         A, B, E = zero_order_hold(A, B, E, step)
     sampled = "sampled with a zero-order hold" if continuous else "taken as it is, discrete"
-    notes = [f"From a control.StateSpace, {sampled}.", *_dropped(system, A)]
-    return A, B, E, step, notes
+    notes = [f"From a control.StateSpace, {sampled}.", *_output_notes(system, A)]
+    C = None if np.array_equal(system.C, np.eye(len(A))) else check_array("C", system.C, ("q", "n"))
+    return A, B, E, C, step, notes
 
 
 def to_control(model: LinearSystem) -> Any:
@@ -40,14 +41,16 @@ def to_control(model: LinearSystem) -> Any:
     import control
 
     states, inputs = labels_of(model)
-    driven, size = np.hstack([model.B, model.E]), model.n_states
+    driven = np.hstack([model.B, model.E])
     labels = [*inputs, *names((0, 0, model.n_disturbances))]
     plain = {
         "states": [_label(each) for each in states],
         "inputs": [_label(each) for each in labels],
-        "outputs": [_label(each) for each in states],
     }
-    C, D = np.eye(size), np.zeros((size, driven.shape[1]))
+    C = model.shown
+    if model.C is None:
+        plain["outputs"] = plain["states"]
+    D = np.zeros((len(C), driven.shape[1]))
     return control.ss(model.A, driven, C, D, model.dt, **plain)
 
 
@@ -90,8 +93,8 @@ def _input(system: Any, name: int | str) -> int:
     raise ValueError(f"disturbances: {name!r} is no input, neither number nor label, of {labels}.")
 
 
-def _dropped(system: Any, A: Array) -> list[str]:
-    """Return notes on the dropped outputs."""
+def _output_notes(system: Any, A: Array) -> list[str]:
+    """Return notes on outputs that are not the states."""
     import control
 
     C, n = np.asarray(system.C), len(A)
@@ -104,7 +107,7 @@ def _dropped(system: Any, A: Array) -> list[str]:
     seen = f", which is not possible: the outputs show {rank} of {n} directions of the state"
     impossible = seen if rank < n else ""
     notes.append(
-        "C is not the identity and was dropped: the law depends on the states, not on the outputs "
-        f"y = C x. Measure the states, or estimate them by an observer{impossible}."
+        "C is not the identity: the law depends on the states, not on the outputs y = C x. "
+        f"Estimate them by a StateEstimator{impossible}."
     )
     return notes

@@ -44,8 +44,8 @@ def test_a_feedthrough_that_is_dropped_is_reported() -> None:
 
 def test_outputs_that_are_not_the_states_are_reported() -> None:
     report = LinearModel.from_statespace(control.ss(A, B, [[1, 0]], 0, 0.1)).report()
-    assert "C is not the identity and was dropped" in report
-    assert "estimate them by an observer." in report
+    assert "C is not the identity:" in report
+    assert "Estimate them by a StateEstimator." in report
 
 
 def test_states_that_no_observer_finds_are_reported() -> None:

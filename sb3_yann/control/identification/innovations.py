@@ -1,0 +1,400 @@
+"""Models in innovation form from outputs and inputs: subspace estimates and prediction errors.
+
+An ARX model of many lags predicts one step ahead, in closed loop as in open loop. Its predictions
+over a future window factor into an observability matrix and a state, which is a linear function of
+the past (Chiuso, *The role of vector autoregressive modeling in predictor-based subspace
+identification*, Automatica 43, 2007). Prediction errors refine the matrices (Ljung, *System
+Identification*, 2nd ed., section 7.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.special import chdtrc
+
+from sb3_yann._validation import Array
+from sb3_yann.control.identification.least_squares import Regression, regress
+from sb3_yann.control.lqr import spectral_radius
+from sb3_yann.log import Episode
+
+LAGS = (1, 2, 4, 6, 9, 13, 19, 28)
+"""Lags of the ARX models that are tried."""
+CHUNK = 400
+"""Longest stretch of samples whose first state is estimated on its own."""
+CHANCE = 0.01
+"""Significance level of the effects of inputs."""
+FLOOR = 1e-14
+"""Variance, of scaled outputs, below which all is rounding."""
+TINY_RIDGE = 1e-9
+"""Of the number of steps: lags of a log without noise depend on each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations:
+    """``x[k+1] = A x[k] + B v[k] + c + K e[k]``, ``y[k] = C x[k] + y_0 + e[k]``.
+
+    Attributes
+    ----------
+    A, B, K, C : ndarray, shapes (n, n), (n, m + d), (n, q) and (q, n)
+    c, y_0 : ndarray, shapes (n,) and (q,)
+    noise : ndarray, shape (q, q)
+        Covariance of e.
+    """
+
+    A: Array
+    B: Array
+    K: Array
+    C: Array
+    c: Array
+    y_0: Array
+    noise: Array
+
+    @property
+    def order(self) -> int:
+        """Number of states n."""
+        return len(self.A)
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of parameters, without those that a change of coordinates moves."""
+        return int(self.order * (self.B.shape[1] + 2 * len(self.C)))
+
+    @property
+    def inner(self) -> Array:
+        """``A - K C``, which predicts from measured outputs."""
+        return self.A - self.K @ self.C
+
+
+def shifted(episodes: Sequence[Episode], delays: Sequence[int]) -> list[Episode]:
+    """Return the episodes with the inputs moved down by their dead times, in one piece each."""
+    late = max(delays, default=0)
+    found = []
+    for each in episodes:
+        if len(each) <= late:
+            continue
+        inputs = np.column_stack(
+            [each.inputs[late - lag : len(each) - lag, j] for j, lag in enumerate(delays)]
+        )
+        found.append(Episode(each.states[late:], inputs, each.disturbances[late:]))
+    return found
+
+
+def with_lags(episodes: Sequence[Episode], lags: int, start: int) -> list[Episode]:
+    """Return episodes that begin at ``start``, with ``lags - 1`` earlier samples as disturbances.
+
+    A regressor is ``[y[k], v[k], y[k-1], v[k-1], ...]``.
+    """
+    found = []
+    for each in episodes:
+        if len(each) <= start:
+            continue
+        past = [each.regressors[start - lag : len(each) - lag] for lag in range(1, lags)]
+        more = np.hstack([each.driven[start:, each.inputs.shape[1] :], *past])
+        found.append(Episode(each.states[start:], each.inputs[start:], more))
+    return found
+
+
+def arx(episodes: Sequence[Episode], lags: int, start: int, ridge: float = 0.0) -> Regression:
+    """Return the ARX model of so many lags; a row of its regressors is as of `with_lags`."""
+    rows = with_lags(episodes, lags, start)
+    steps = sum(map(len, rows))
+    q, m = rows[0].states.shape[1], rows[0].inputs.shape[1]
+    sizes = (q, m, rows[0].disturbances.shape[1])
+    return regress(rows, sizes, None, max(ridge, TINY_RIDGE) * steps)
+
+
+def lags_by_criterion(episodes: Sequence[Episode]) -> tuple[int, Regression]:
+    """Return how many lags, by Akaike's criterion, and the ARX model with them."""
+    width = episodes[0].regressors.shape[1]
+    q = episodes[0].states.shape[1]
+    steps = sum(map(len, episodes))
+
+    def rows(lags: int) -> int:
+        return sum(max(len(each) - lags + 1, 0) for each in episodes)
+
+    tried = [p for p in LAGS if rows(p) > max(3 * p * width + 10, steps / 2)] or [1]
+    start, best = tried[-1] - 1, np.inf
+    for p in tried:
+        found = arx(episodes, p, start)
+        floor = FLOOR * np.eye(q)  # below it all is rounding
+        log_det = np.linalg.slogdet(found.covariance + floor)[1]
+        criterion = found.steps * log_det + 2 * q * p * width
+        if criterion < best:
+            best, lags = criterion, p
+    # The state needs a longer past than the criterion's.
+    lags = max(lags, min(tried[-1], max(4, round(1.5 * lags))))
+    return lags, arx(episodes, lags, lags - 1)
+
+
+def dead_times(episodes: Sequence[Episode], limit: int) -> list[int]:
+    """Return for each input how many of its latest values have no effect on the next output.
+
+    Wald's test that their coefficients in a long ARX model are zero, for one sample more as long as
+    it does not speak against it.
+    """
+    q, m = episodes[0].states.shape[1], episodes[0].inputs.shape[1]
+    lags, found = lags_by_criterion(episodes)
+    longest = min(limit + 4, max((len(each) for each in episodes), default=0) - 1)
+    if lags < longest:
+        lags, found = longest, arx(episodes, longest, longest - 1)
+    width = episodes[0].regressors.shape[1]
+    delays = []
+    for j in range(m):
+        columns = [lag * width + q + j for lag in range(min(limit, lags - 1))]
+        dead = 0
+        while dead < len(columns) and no_effect(found, columns[: dead + 1], CHANCE):
+            dead += 1
+        # What never acts has no dead time.
+        idle = no_effect(found, [lag * width + q + j for lag in range(lags)], CHANCE)
+        delays.append(0 if idle else dead)
+    return delays
+
+
+def no_effect(found: Regression, columns: Sequence[int], chance: float) -> bool:
+    """Return whether Wald's test cannot tell the coefficients of some columns from zero."""
+    b = found.coefficients[:, columns]
+    covariance = found.covariance + FLOOR * np.eye(len(b))
+    inner = np.linalg.solve(found.correlation[np.ix_(columns, columns)], b.T)
+    wald = float(np.sum(np.linalg.solve(covariance, b) * inner.T))
+    return bool(chdtrc(b.size, wald) > chance)
+
+
+class Past:
+    """The state of each order as a linear function of the past, by predictor-based subspaces.
+
+    Parameters
+    ----------
+    episodes : sequence of Episode
+        Outputs as states; inputs moved by their dead times.
+    """
+
+    def __init__(self, episodes: Sequence[Episode]) -> None:
+        p, self.arx = lags_by_criterion(episodes)
+        q, self.width = episodes[0].states.shape[1], episodes[0].regressors.shape[1]
+        self.rows = with_lags(episodes, p, p - 1)
+        past = [each.regressors - self.arx.center for each in self.rows]
+        whiten = linalg.inv(linalg.cholesky(self.arx.covariance + FLOOR * np.eye(q), lower=True))
+        block = whiten @ self.arx.coefficients
+        # What the past tells of the output i samples on, beside what comes in between.
+        future = np.zeros((p * q, p * self.width))
+        for i in range(p):
+            future[i * q : (i + 1) * q, : (p - i) * self.width] = block[:, i * self.width :]
+        whole = np.concatenate(past)
+        r: Array = np.linalg.qr(whole / np.sqrt(len(whole)), mode="r")
+        left, sizes, _ = np.linalg.svd(future @ r.T, full_matrices=False)
+        self.limit = int(np.sum(sizes > 1e-6 * sizes[0]))
+        to_state = (left[:, : self.limit] / np.sqrt(sizes[: self.limit])).T @ future
+        self.states = [each @ to_state.T for each in past]  # row k is the state at k + 1
+
+    def idle(self) -> list[int]:
+        """Return the inputs and disturbances without effect that can be told from zero."""
+        q, lags = len(self.arx.reached), self.arx.center.size // self.width
+        return [
+            j
+            for j in range(self.width - q)
+            if no_effect(self.arx, [q + j + lag * self.width for lag in range(lags)], CHANCE)
+        ]
+
+    def model(self, order: int) -> Innovations:
+        """Return the model of an order, by least squares between these states."""
+        n = order
+        x = np.concatenate([each[:, :n] for each in self.states])
+        y = np.concatenate([each.states[1:] for each in self.rows])
+        q, driven = y.shape[1], self.width - y.shape[1]
+        C = np.linalg.lstsq(x, y - self.arx.reached, rcond=None)[0].T
+        moves = [
+            Episode(state[:, :n], each.driven[1:, :driven], each.states[1:-1])
+            for state, each in zip(self.states, self.rows, strict=True)
+            if len(state) > 1
+        ]
+        found = regress(moves, (n, driven, q), None, TINY_RIDGE * sum(map(len, moves)))
+        inner, B, K = np.split(found.coefficients, [n, n + driven], axis=1)
+        errors = y - self.arx.reached - x @ C.T
+        noise = errors.T @ errors / len(errors)
+        c = found.predict(np.zeros((1, n + driven + q)))[0] + K @ self.arx.reached
+        A = inner + K @ C
+        if spectral_radius(inner) >= 1:
+            # The gain of the filter for what these states and outputs miss is stable.
+            spread = K @ noise @ K.T + found.covariance
+            K = kalman_gain(A, C, spread, noise + FLOOR * np.eye(q), K @ noise)
+        return Innovations(A, B, K, C, c, self.arx.reached, noise + FLOOR * np.eye(q))
+
+
+def kalman_gain(A: Array, C: Array, spread: Array, noise: Array, cross: Array) -> Array:
+    """Return the gain (n, q) of the steady-state filter one step ahead."""
+    P = linalg.solve_discrete_are(A.T, C.T, spread, noise, s=cross)
+    return np.asarray(np.linalg.solve(C @ P @ C.T + noise, (A @ P @ C.T + cross).T).T)
+
+
+class Chunks:
+    """Stretches of a log, side by side, in which prediction errors are computed.
+
+    The first state of each is a free vector, which a projection takes out (Golub and Pereyra,
+    *Separable nonlinear least squares*, Inverse Problems 19, 2003).
+    """
+
+    def __init__(self, episodes: Sequence[Episode]) -> None:
+        parts = []
+        for each in episodes:
+            count = -(-len(each) // CHUNK)
+            edges = np.linspace(0, len(each) + 1, count + 1).round().astype(int)
+            driven = np.vstack([each.driven, np.zeros((1, each.driven.shape[1]))])
+            ends = pairwise(edges)
+            parts += [(each.states[a:b], driven[a:b]) for a, b in ends if b - a > 1]
+        shape = len(parts), max(len(y) for y, _ in parts)
+        self.y = np.zeros((*shape, parts[0][0].shape[1]))
+        self.v = np.zeros((*shape, parts[0][1].shape[1]))
+        self.there = np.zeros((*shape, 1))
+        for i, (y, v) in enumerate(parts):
+            self.y[i, : len(y)], self.v[i, : len(y)], self.there[i, : len(y)] = y, v, 1.0
+        self.samples = int(self.there.sum())
+
+    def covariance(self, model: Innovations) -> Array:
+        """Return the mean square (q, q) of the prediction errors, the first states by its noise."""
+        root = linalg.cholesky(model.noise, lower=True)
+        with np.errstate(all="ignore"):
+            left = self._simulate(model, linalg.inv(root))[0].reshape(-1, len(root)) @ root.T
+            return np.asarray(left.T @ left / self.samples)
+
+    def spread(self, model: Innovations) -> tuple[Array, Array]:
+        """Return mean (n,) and covariance (n, n) of the states."""
+        weight = linalg.inv(linalg.cholesky(model.noise, lower=True))
+        x = self._simulate(model, weight)[1][self.there[..., 0] > 0]
+        return x.mean(axis=0), np.atleast_2d(np.cov(x.T, bias=True))
+
+    def gauss_newton(self, model: Innovations) -> tuple[Array, Array]:
+        """Return the normal equations of a step: the matrix (p, p) and the right side (p,)."""
+        n, (count, length, q) = model.order, self.y.shape
+        weight = linalg.inv(linalg.cholesky(model.noise, lower=True))
+        left, x, basis, inverse = self._simulate(model, weight)
+        ones = np.ones((count, length, 1))
+        signals = np.concatenate([x, self.v, self.y - model.y_0, ones], axis=2)
+        w = signals.shape[2]
+        slopes = np.zeros((count, length, q, n * w + q * n + q))
+        inner, C = model.inner, weight @ model.C
+        rows = np.arange(n)
+        moved: Array = np.zeros((count, n, w, n))
+        for k in range(length):
+            flat = moved.reshape(count, n, w * n)
+            slopes[:, k, :, : n * w] = C @ flat
+            moved = (inner @ flat).reshape(count, n, w, n)
+            moved[:, rows, :, rows] += signals[:, k]
+        blocks = np.einsum("ok,sti->stoki", weight, x).reshape(count, length, q, q * n)
+        slopes[..., n * w : n * w + q * n] = blocks
+        slopes[..., n * w + q * n :] = weight
+        slopes *= self.there[..., None]
+        slopes = slopes.reshape(count, length * q, -1)
+        slopes -= basis @ (inverse @ slopes)
+        flat_slopes = slopes.reshape(count * length * q, -1)
+        return flat_slopes.T @ flat_slopes, flat_slopes.T @ left.ravel()
+
+    def _simulate(self, model: Innovations, weight: Array) -> tuple[Array, Array, Array, Array]:
+        """Return weighted errors, states, and what first states do to errors, with its inverse."""
+        n, (count, length, q) = model.order, self.y.shape
+        inner, C = model.inner, weight @ model.C
+        fed = self.v @ model.B.T + (self.y - model.y_0) @ model.K.T + model.c
+        free = np.zeros((length, n, n))
+        x: Array = np.zeros((count, length, n))
+        now: Array = np.zeros((count, n))
+        power: Array = np.eye(n)
+        for k in range(length):
+            x[:, k], free[k] = now, power
+            now, power = now @ inner.T + fed[:, k], inner @ power
+        basis = ((C @ free)[None] * self.there[..., None]).reshape(count, length * q, n)
+        left = ((self.y - model.y_0) @ weight.T - x @ C.T) * self.there
+        left = left.reshape(count, length * q, 1)
+        inverse = np.linalg.pinv(basis, rcond=1e-10)
+        first = inverse @ left
+        x = x + np.einsum("tij,sj->sti", free, first[..., 0])
+        return np.asarray(left - basis @ first), x, basis, np.asarray(inverse, np.float64)
+
+
+def moved_by(model: Innovations, step: Array) -> Innovations:
+    """Return the model whose parameters differ by a step of `Chunks.gauss_newton`."""
+    n, q, driven = model.order, len(model.C), model.B.shape[1]
+    w = n + driven + q + 1
+    change = step[: n * w].reshape(w, n).T
+    inner, B, K, c = np.split(change, [n, n + driven, n + driven + q], axis=1)
+    C = model.C + step[n * w : n * w + q * n].reshape(q, n)
+    K, y_0 = model.K + K, step[n * w + q * n :]
+    return replace(
+        model,
+        A=model.inner + inner + K @ C,
+        B=model.B + B,
+        K=K,
+        C=C,
+        c=model.c + c[:, 0] + K @ y_0,  # the predictor's constant moves by c alone
+        y_0=model.y_0 + y_0,
+    )
+
+
+def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
+    """Return the model of least determinant of its prediction errors' covariance near a model."""
+    floor = FLOOR * np.eye(len(model.C))
+    model = replace(model, noise=chunks.covariance(model) + floor)
+    size, damping = np.linalg.slogdet(model.noise)[1], 1e-4
+    for _ in range(steps):
+        matrix, side = chunks.gauss_newton(model)
+        scale = np.sqrt(np.diag(matrix)) + 1e-12 * np.sqrt(np.max(np.diag(matrix)))
+        before = size
+        while damping < 1e4:
+            scaled = matrix / np.outer(scale, scale) + damping * np.eye(len(side))
+            trial = moved_by(model, np.linalg.solve(scaled, side / scale) / scale)
+            noise = chunks.covariance(trial) + floor
+            now = np.linalg.slogdet(noise)[1] if np.all(np.isfinite(noise)) else np.inf
+            if now < size and spectral_radius(trial.inner) < 1:
+                model, size, damping = replace(trial, noise=noise), now, max(damping / 10, 1e-9)
+                break
+            damping *= 10
+        if (before - size) * chunks.samples < 0.1:  # of twice the log-likelihood
+            break
+    return model
+
+
+def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Array, Array]) -> Array:
+    """Return the states (T + 1, n) that the outputs before each sample tell.
+
+    The filter begins with a mean and a covariance, and goes on without what is missing.
+
+    Parameters
+    ----------
+    model : Innovations
+        The plant.
+    outputs : ndarray, shape (T + 1, q)
+        NaN where there is no reading.
+    moved : ndarray, shape (T, n)
+        ``B v + c`` of each step.
+    start : pair of ndarray, shapes (n,) and (n, n)
+        Mean and covariance of the first state.
+    """
+    A, C, K, noise = model.A, model.C, model.K, model.noise
+    there: NDArray[np.bool_] = np.isfinite(outputs)
+    whole: NDArray[np.bool_] = np.all(there, axis=1)
+    x = np.empty((len(outputs), model.order))
+    x[0] = start[0]
+    P: Array | None = start[1]
+    spread, cross = K @ noise @ K.T, K @ noise
+    for k, step in enumerate(moved):
+        left = outputs[k] - model.y_0 - C @ x[k]
+        if P is None and whole[k]:
+            x[k + 1] = A @ x[k] + step + K @ left
+            continue
+        P = np.zeros_like(A) if P is None else P
+        seen = there[k]
+        x[k + 1] = A @ x[k] + step
+        after: Array | None = A @ P @ A.T + spread
+        if seen.any():
+            S = (C @ P @ C.T + noise)[np.ix_(seen, seen)]
+            gain = np.linalg.solve(S, (A @ P @ C.T + cross)[:, seen].T).T
+            x[k + 1] += gain @ left[seen]
+            after = after - gain @ S @ gain.T
+            if whole[k] and np.max(np.abs(gain - K)) < 1e-9 * (1 + np.max(np.abs(K))):
+                after = None  # the innovations form is the filter's limit
+        P = after
+    return x

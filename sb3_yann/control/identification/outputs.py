@@ -1,0 +1,223 @@
+"""Order and dead time of a model in innovation form, chosen by free runs over held-out data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sb3_yann._validation import Array
+from sb3_yann.control.identification.dead_time import MAX_DELAY
+from sb3_yann.control.identification.innovations import (
+    FLOOR,
+    Chunks,
+    Innovations,
+    Past,
+    dead_times,
+    filtered,
+    refined,
+    shifted,
+)
+from sb3_yann.control.identification.least_squares import NOT_EXCITED
+from sb3_yann.control.identification.residuals import curvature_test, project_out
+from sb3_yann.log import Episode, split_episodes
+
+AHEAD = 20
+"""Samples of the free runs over held-out data."""
+MAX_ORDER = 16
+PATIENCE = 4  # orders without a better criterion after which none is tried any more
+SURE = 10.0
+"""By so much, over all steps, dead time must lower the criterion."""
+ROUNDING = 1e-12
+FOLLOWS = 0.1  # share of an input that its feedback law leaves, below which the notes say so
+WORSE = 1.1
+"""Mean square of free runs, relative to those without dead time, from which it is not taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """A model of outputs, with what chose it.
+
+    Attributes
+    ----------
+    model : Innovations
+        In scaled units.
+    delays : tuple of int
+    errors : ndarray, shape (q,)
+        Root mean square of free runs over held-out data, in spreads of the outputs; NaN without.
+    criterion : float
+        Hannan and Quinn's, for each step.
+    start : pair of ndarray, shapes (n,) and (n, n)
+        Mean and covariance of the states.
+    fits : tuple of ndarray, shapes (q,)
+        One and `AHEAD` steps ahead over held-out data, in percent; NaN without such.
+    idle : tuple of int
+        Inputs and disturbances without effect that can be told from 0.
+    feedback : tuple of (int, float)
+        Inputs that follow the outputs, and what share of them does not.
+    curvature : ndarray, shape (q,)
+        Share of the prediction errors' variance that squares and products explain.
+    """
+
+    model: Innovations
+    delays: tuple[int, ...]
+    errors: Array
+    criterion: float
+    start: tuple[Array, Array]
+    fits: tuple[Array, Array]
+    idle: tuple[int, ...] = ()
+    feedback: tuple[tuple[int, float], ...] = ()
+    curvature: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def fit_structure(
+    episodes: Sequence[Episode],
+    order: int | None,
+    delays: Sequence[int] | None,
+    held_out: float,
+) -> Structure:
+    """Return the model of scaled episodes whose order and dead times are given, or None to find."""
+    fitted, tested = split_episodes(episodes, held_out)
+    m = episodes[0].inputs.shape[1]
+    trials = [tuple(delays)] if delays is not None else [(0,) * m]
+    if delays is None:
+        late = tuple(dead_times(fitted, MAX_DELAY))
+        trials += [late] if any(late) else []
+    searches = [Search(shifted(fitted, lags), shifted(tested, lags), lags) for lags in trials]
+    rough = [each.rough(order) for each in searches]
+    best = 0
+    if len(trials) > 1 and (rough[1].criterion < rough[0].criterion - SURE / sum(map(len, fitted))):
+        worse = np.mean(rough[1].errors ** 2) > np.mean(rough[0].errors ** 2) * WORSE
+        best = 0 if worse else 1
+    found = rough[best] if order is not None else searches[best].climb(rough[best])
+    whole = shifted(episodes, found.delays)
+    past, chunks = Past(whole), Chunks(whole)
+    model = refined(past.model(min(found.model.order, past.limit)), chunks)
+    return replace(
+        found,
+        model=model,
+        start=chunks.spread(model),
+        idle=tuple(past.idle()),
+        feedback=tuple(_feedback(episodes)),
+        curvature=curvature_test(past.arx, past.rows)[0],
+    )
+
+
+def _feedback(episodes: Sequence[Episode], lags: int = 4) -> list[tuple[int, float]]:
+    """Return the inputs that follow earlier outputs, and what share of them does not.
+
+    Raises
+    ------
+    ValueError
+        For an input that is a function of earlier outputs and inputs alone.
+    """
+    longer = [each for each in episodes if len(each) > lags]
+    if sum(map(len, longer)) <= 10 * lags * episodes[0].regressors.shape[1]:
+        return []
+    late = [*range(lags, -1, -1)]
+    y = np.concatenate(
+        [np.hstack([each.states[lags - i : len(each) - i] for i in late]) for each in longer]
+    )
+    u = np.concatenate(
+        [np.hstack([each.inputs[lags - i : len(each) - i] for i in late]) for each in longer]
+    )
+    m = episodes[0].inputs.shape[1]
+    now, own = u[:, -m:], np.column_stack([np.ones(len(u)), u[:, :-m]])
+    alone = np.mean(project_out(own, now) ** 2, axis=0)
+    left = np.mean(project_out(np.hstack([own, y]), now) ** 2, axis=0) / np.maximum(alone, ROUNDING)
+    moves = alone > ROUNDING * np.var(now, axis=0)
+    if tied := [j for j in range(m) if moves[j] and left[j] < ROUNDING]:
+        raise ValueError(
+            f"u[{tied[0]}] is a function of earlier outputs and inputs: a feedback law alone sets "
+            f"it. {NOT_EXCITED}"
+        )
+    return [(j, float(left[j])) for j in range(m) if moves[j] and left[j] < FOLLOWS]
+
+
+class Search:
+    """Models of each order for given dead times."""
+
+    def __init__(
+        self, fitted: list[Episode], tested: list[Episode], delays: tuple[int, ...]
+    ) -> None:
+        self.past, self.chunks = Past(fitted), Chunks(fitted)
+        self.fitted, self.tested, self.delays = fitted, tested, delays
+        self.largest = min(MAX_ORDER, self.past.limit)
+
+    def rough(self, order: int | None) -> Structure:
+        """Return the best model by subspaces alone."""
+        if order is not None:
+            return self.judged(self.past.model(min(order, self.past.limit)))
+        found: list[tuple[float, Innovations]] = []
+        for n in range(1, self.largest + 1):
+            model = self.past.model(n)
+            found.append((self.criterion(model, self.chunks.spread(model)), model))
+            if n - int(np.argmin([each for each, _ in found])) > PATIENCE:
+                break
+        return self.judged(min(found, key=lambda each: each[0])[1])
+
+    def climb(self, start: Structure) -> Structure:
+        """Return the best refined model of an order near that of a rough one."""
+        order = start.model.order
+        tried = {order: self.trial(order)}
+        for step in (-1, 1):
+            n = order + step
+            while 1 <= n <= self.largest:
+                tried[n] = self.trial(n)
+                if tried[n].criterion > tried[n - step].criterion:
+                    break
+                n += step
+        return min(tried.values(), key=lambda each: each.criterion)
+
+    def trial(self, order: int) -> Structure:
+        """Return the refined model of an order."""
+        return self.judged(refined(self.past.model(order), self.chunks))
+
+    def judged(self, model: Innovations) -> Structure:
+        """Return a model with its criterion and its free runs over held-out data."""
+        start = self.chunks.spread(model)
+        errors, long = free_run_errors(model, self.tested, start)
+        fits = free_run_errors(model, self.tested, start, 1)[1], long
+        return Structure(model, self.delays, errors, self.criterion(model, start), start, fits)
+
+    def criterion(self, model: Innovations, start: tuple[Array, Array]) -> float:
+        """Return Hannan and Quinn's criterion (J. R. Stat. Soc. B 41, 1979), of whole records.
+
+        The chunks' own first states would count as parameters.
+        """
+        errors = np.concatenate(
+            [each.states[1:] - predicted(model, each, start, 1) for each in self.fitted]
+        )
+        steps, q = errors.shape
+        price = 2 * np.log(np.log(max(steps, 16)))
+        size = np.linalg.slogdet(errors.T @ errors / steps + FLOOR * np.eye(q))[1]
+        return float(size + price * model.n_parameters / steps)
+
+
+def free_run_errors(
+    model: Innovations, episodes: Sequence[Episode], start: tuple[Array, Array], ahead: int = AHEAD
+) -> tuple[Array, Array]:
+    """Return the root mean square (q,) so many samples ahead, and the fit in percent."""
+    longer = [each for each in episodes if len(each) > ahead]
+    if not longer:
+        none = np.full(len(model.C), np.nan)
+        return none, none
+    target = np.concatenate([each.states[ahead:] for each in longer])
+    guess = np.concatenate([predicted(model, each, start, ahead) for each in longer])
+    errors = np.sqrt(np.mean((target - guess) ** 2, axis=0))
+    moved = np.std(target, axis=0)
+    return errors, 100 * (1 - errors / np.where(moved > 0, moved, np.nan))
+
+
+def predicted(
+    model: Innovations, episode: Episode, start: tuple[Array, Array], ahead: int
+) -> Array:
+    """Return the outputs (T + 1 - ahead, q) so many samples ahead of those that are known."""
+    moved = episode.driven @ model.B.T + model.c
+    x = filtered(model, episode.states, moved, start)[1:]
+    rows = len(episode) + 1 - ahead
+    x = x[:rows]
+    for step in range(1, ahead):
+        x = x @ model.A.T + moved[step : step + rows]
+    return np.asarray(x @ model.C.T + model.y_0)

@@ -1,0 +1,365 @@
+"""Linear models of plants that show outputs rather than states, from their logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg
+
+from sb3_yann._validation import Array, ReadOnlyArrays, check_array, check_int, check_range
+from sb3_yann.control.identification.dead_time import (
+    as_delays,
+    exact_memory,
+    memory_labels,
+)
+from sb3_yann.control.identification.fit import require_moving, system_of
+from sb3_yann.control.identification.innovations import (
+    TINY_RIDGE,
+    Innovations,
+    filtered,
+    shifted,
+)
+from sb3_yann.control.identification.least_squares import WEAK, Regression, pole_note, regress
+from sb3_yann.control.identification.outputs import AHEAD, Structure, fit_structure, predicted
+from sb3_yann.control.identification.residuals import listed
+from sb3_yann.control.linear_system import names
+from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.log import Arrays, Episode, Log, cut_at_gaps
+
+APART = 1e3
+"""Condition number of C up to which outputs serve as states."""
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedOutputs(ReadOnlyArrays):
+    """A model in innovation form, fitted to outputs by :func:`identify_outputs`.
+
+    In deviations from the operating point, ``x[k+1] = A x[k] + B u[k] + E d[k] + K e[k]`` and
+    ``y[k] = C x[k] + e[k]``.
+
+    Attributes
+    ----------
+    model : LinearModel
+        With C. The first states are the outputs where these tell enough apart, in their own units;
+        the last ones are inputs on their way.
+    gain, noise : ndarray, shapes (n, q) and (q, q)
+        The Kalman gain K, one step ahead, and the covariance of e.
+    order : int
+        Number of states without inputs on their way.
+    delays : tuple of int, length m
+        Dead time of each input in samples.
+    one_step_fit, long_fit : ndarray, shape (q,)
+        Fits in percent over held-out data, one and twenty steps ahead.
+    excitation : float
+        Smallest over largest singular value of outputs and inputs, each in units of its spread.
+    start : tuple of ndarray, shapes (n,) and (n, n)
+        Mean and covariance of the states in the log, from which a prediction begins.
+    drift : ndarray, shape (n,)
+        Motion in one sample at the operating point, which ``model`` leaves out.
+    """
+
+    model: LinearModel
+    gain: Array
+    noise: Array
+    order: int
+    delays: tuple[int, ...]
+    one_step_fit: Array
+    long_fit: Array
+    excitation: float
+    start: tuple[Array, Array]
+    drift: Array
+    __eq__, __hash__ = object.__eq__, object.__hash__  # fits may be NaN
+
+    def __str__(self) -> str:
+        """Return the report."""
+        return self.report()
+
+    def report(self) -> str:
+        """Return an account in words: poles, controllability, sampling, fit and notes."""
+        return self.model.report()
+
+    def predict(
+        self,
+        outputs: ArrayLike,
+        inputs: ArrayLike,
+        ahead: int = AHEAD,
+        *,
+        disturbances: ArrayLike | None = None,
+    ) -> Array:
+        """Return the outputs (T + 1 - ahead, q) so many samples ahead of what is known.
+
+        Row k is the output at k + ahead from the outputs up to k and the inputs that were played.
+
+        Parameters
+        ----------
+        outputs, inputs : array_like, shapes (T + 1, q) and (T, m)
+            In plant units. Outputs may be NaN: the filter goes on without them.
+        ahead : int, default 20
+            Samples, at least 1 and at most T.
+        disturbances : array_like, shape (T, d), optional
+            As many as the model measures.
+        """
+        model = self.model
+        u = check_array("inputs", inputs, ("T", model.n_inputs))
+        y = np.array(outputs, np.float64)
+        if y.shape != (len(u) + 1, len(self.noise)):
+            wanted = f"({len(u) + 1}, {len(self.noise)}): one row more than inputs"
+            raise ValueError(f"outputs has shape {y.shape}, expected {wanted}.")
+        d = np.zeros((len(u), 0)) if disturbances is None else disturbances
+        d = check_array("disturbances", d, (len(u), model.n_disturbances))
+        ahead = check_int("ahead", ahead, 1)
+        if ahead > len(u):
+            raise ValueError(f"ahead = {ahead}, but the record has {len(u)} steps.")
+        return predicted(self._innovations, Episode(y, u, d), self.start, ahead)
+
+    @property
+    def _innovations(self) -> Innovations:
+        """The model in plant units, with its constant."""
+        model = self.model
+        driven = np.hstack([model.B, model.E])
+        rest = model.x_ss - model.A @ model.x_ss - driven @ np.append(model.u_ss, model.d_ss)
+        none = np.zeros(len(self.noise))
+        C = model.shown
+        return Innovations(model.A, driven, self.gain, C, rest + self.drift, none, self.noise)
+
+
+def identify_outputs(
+    outputs: Log | Arrays,
+    inputs: Arrays | None = None,
+    dt: float | None = None,
+    order: int | str = "auto",
+    delay: int | str | Sequence[int] = "auto",
+    disturbances: Arrays | None = None,
+    *,
+    held_out: float = 0.2,
+) -> IdentifiedOutputs:
+    """Fit a model in innovation form to measured outputs and inputs.
+
+    An ARX model of many lags gives states of each order by balanced reduction (Chiuso, Automatica
+    43, 2007), and prediction errors refine it. Records may come from closed loop. An integrator is
+    a pole that may lie on the unit circle, or near it.
+
+    Parameters
+    ----------
+    outputs : Log, or array_like, shape (T + 1, q), or a sequence of such
+        A log whose states are the outputs; or one record or several. Rows with NaN are gaps.
+    inputs : array_like, shape (T, m), or a sequence of such
+        As they were executed: row k acts between rows k and k + 1 of the outputs.
+    dt : float
+        Sampling time.
+    order : int or "auto", default "auto"
+        Number of states without dead time. "auto" takes that of the least criterion of Hannan and
+        Quinn (J. R. Stat. Soc. B 41, 1979), up to 16.
+    delay : int, sequence of int, or "auto", default "auto"
+        Dead time of the inputs in samples. "auto" takes one, up to 10, where the latest inputs
+        have no effect, it lowers the criterion, and free runs over held-out data do not suffer.
+    disturbances : array_like, shape (T, d), or a sequence of such, optional
+        Measured disturbances, which make E.
+    held_out : float, default 0.2
+        Fraction of all steps, the last ones, over which the fits are told. The model that is
+        returned is fitted to all of them.
+
+    Raises
+    ------
+    ValueError
+        For data in which some combination of outputs and inputs does not move, or inputs that are
+        a function of earlier outputs: the message names it.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> u, x = rng.normal(size=(400, 1)), np.zeros((401, 2))
+    >>> for k in range(400):
+    ...     x[k + 1] = [[0.8, 0.3], [-0.3, 0.8]] @ x[k] + [0.0, 1.0] * u[k]
+    >>> found = identify_outputs(x[:, :1] + 0.01 * rng.normal(size=(401, 1)), u, dt=1)
+    >>> found.order, found.delays, found.predict(x[:, :1], u, ahead=5).shape
+    (2, (0,), (396, 1))
+    """
+    if isinstance(outputs, Log):
+        given = {"inputs": inputs, "dt": dt, "disturbances": disturbances}
+        if beside := [name for name, value in given.items() if value is not None]:
+            raise TypeError(f"{beside} is given, but the log has its own: leave it out.")
+        log = outputs
+    elif inputs is None or dt is None:
+        raise TypeError("identify_outputs takes a Log, or outputs and inputs with dt=.")
+    else:
+        log = cut_at_gaps(outputs, inputs, dt, disturbances)
+    wanted = None if isinstance(order, str) and order == "auto" else check_int("order", order, 1)
+    episodes, (q, m, d) = list(log.episodes), log.sizes
+    require_moving(episodes, log.sizes)
+    try:
+        plain = regress(episodes, log.sizes, None, 0.0)
+    except ValueError as error:
+        raise ValueError(str(error).replace("x[", "y[")) from None
+    share = check_range("held_out", held_out, 0, 0.5, "[]")
+    center, scale = plain.center, np.where(plain.spread > 0, plain.spread, 1.0)
+    scaled = [_scaled(each, center, scale, q, m) for each in episodes]
+    found = fit_structure(scaled, wanted, as_delays(delay, m), share)
+    model, start = _in_plant_units(found, center, scale, q)
+    rows = shifted(episodes, found.delays)
+    states = [
+        Episode(
+            filtered(model, each.states, each.driven @ model.B.T + model.c, start),
+            each.inputs,
+            each.disturbances,
+        )
+        for each in rows
+    ]
+    n = model.order
+    step = regress(states, (n, m, d), None, TINY_RIDGE * sum(map(len, states)))
+    both = np.hstack([model.A, model.B])
+    step = replace(step, coefficients=both, reached=both @ step.center + model.c)
+    system = system_of(step, (n, m, d), (None, None, None), log.dt, [0] * m)
+    drift = step.predict(np.concatenate([system.x_ss, system.u_ss, system.d_ss])[None])[0]
+    A, B, E, C, K = _with_memory(model, m, found.delays)
+    whole = LinearModel(
+        A,
+        B,
+        log.dt,
+        np.append(system.x_ss, np.repeat(system.u_ss, found.delays)),
+        system.u_ss,
+        E if d else None,
+        system.d_ss if d else None,
+        notes=[*system.notes, *_notes(log, found, plain, step, model.noise)],
+        state_names=_state_names(log, model, found.delays),
+        input_names=log.input_names,
+        C=C,
+    )
+    late = np.repeat(np.arange(m), found.delays)
+    memory = np.diag(plain.spread[q : q + m][late] ** 2)
+    return IdentifiedOutputs(
+        model=whole,
+        gain=K,
+        noise=model.noise,
+        order=found.model.order,
+        delays=found.delays,
+        one_step_fit=found.fits[0],
+        long_fit=found.fits[1],
+        excitation=plain.excitation,
+        start=(
+            np.append(start[0], plain.center[q : q + m][late]),
+            linalg.block_diag(start[1], memory) if len(late) else start[1],
+        ),
+        drift=np.append(drift - system.x_ss, np.zeros(len(late))),
+    )
+
+
+def _scaled(each: Episode, center: Array, scale: Array, q: int, m: int) -> Episode:
+    driven = (each.driven - center[q:]) / scale[q:]
+    return Episode((each.states - center[:q]) / scale[:q], driven[:, :m], driven[:, m:])
+
+
+def _in_plant_units(
+    found: Structure, center: Array, scale: Array, q: int
+) -> tuple[Innovations, tuple[Array, Array]]:
+    """Return the model of inputs and outputs in plant units, and its first states.
+
+    The first states are the outputs, where C can be inverted for that. Outputs count from zero:
+    ``y = C x + e``.
+    """
+    model, n = found.model, found.model.order
+    unit, driven = scale[:q], scale[q:]
+    C, rest = unit[:, None] * model.C, center[:q] + unit * model.y_0
+    sizes = np.linalg.svd(model.C, compute_uv=False)
+    T = np.eye(n)
+    if n >= q and sizes[-1] * APART > sizes[0]:
+        T = np.vstack([C, linalg.null_space(model.C).T])
+    back = np.linalg.inv(T)
+    C = C @ back
+    if not np.array_equal(T, np.eye(n)):
+        C = np.eye(q, n)
+    shift = np.linalg.lstsq(C, rest, rcond=None)[0]
+    A, B, K = T @ model.A @ back, T @ model.B / driven, T @ model.K / unit
+    c = T @ model.c + shift - A @ shift - B @ center[q:]
+    mean, spread = T @ found.start[0] + shift, T @ found.start[1] @ T.T
+    left = rest - C @ shift
+    if np.any(np.abs(left) > 1e-9 * (np.abs(rest) + unit)):
+        # Fewer states than outputs: a state that is always 1 holds what C x leaves of the outputs.
+        A, B = linalg.block_diag(A, 0.0), np.vstack([B, np.zeros((1, B.shape[1]))])
+        K, C = np.vstack([K, np.zeros((1, q))]), np.column_stack([C, left])
+        c, mean, spread = np.append(c, 1.0), np.append(mean, 1.0), linalg.block_diag(spread, 0.0)
+    noise = unit[:, None] * model.noise * unit
+    return Innovations(A, B, K, C, c, np.zeros(q), noise), (mean, spread)
+
+
+def _with_memory(
+    model: Innovations, m: int, delays: Sequence[int]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return A, B, E, C and K with the inputs on their way as the last states."""
+    n, late, q = model.order, sum(delays), len(model.C)
+    A: Array = linalg.block_diag(model.A, np.zeros((late, late)))
+    B: Array = np.zeros((n + late, m))
+    last = n - 1
+    for j, lag in enumerate(delays):
+        last += lag
+        if lag:
+            A[:n, last] = model.B[:, j]
+        else:
+            B[:n, j] = model.B[:, j]
+    A, B = exact_memory(A, B, delays, n)
+    E = np.vstack([model.B[:, m:], np.zeros((late, model.B.shape[1] - m))])
+    C = np.hstack([model.C, np.zeros((q, late))])
+    return A, B, E, C, np.vstack([model.K, np.zeros((late, q))])
+
+
+def _state_names(log: Log, model: Innovations, delays: Sequence[int]) -> Sequence[str]:
+    """Return names of the states where outputs have some, or inputs are on their way."""
+    q, m, _ = log.sizes
+    if not log.state_names and not any(delays):
+        return ()
+    own = names((model.order,))
+    if log.state_names and np.array_equal(model.C, np.eye(q, model.order)):
+        own[:q] = log.state_names
+    return [*own, *memory_labels(delays, log.input_names or names((0, m)))]
+
+
+def _notes(
+    log: Log, found: Structure, plain: Regression, step: Regression, noise: Array
+) -> list[str]:
+    """Return notes on the fit, dead time, weak excitation, feedback, curvature and poles."""
+    m, n = log.sizes[1], found.model.order
+    driven = [*(log.input_names or names((0, m))), *names((0, 0, log.sizes[2]))]
+    notes = [
+        f"From outputs: order {n}, fitted to {sum(map(len, log.episodes))} steps; one step differs "
+        f"from the prediction by {listed(np.sqrt(np.diag(noise)))} (standard deviation of each "
+        "output)."
+    ]
+    if not np.all(np.isnan(found.fits[0])):
+        notes.append(
+            f"Fit over data held out, 100 % is perfect: {listed(found.fits[0])} % one step ahead, "
+            f"{listed(found.fits[1])} % {AHEAD} steps ahead."
+        )
+    if any(found.delays):
+        notes.append(
+            f"Dead time: inputs act for {[*found.delays]} samples. The states from "
+            f"x[{step.reached.size}] on are the inputs on their way."
+        )
+    if plain.excitation < WEAK:
+        notes.append(
+            f"Weakly excited: {plain.weakest.replace('x[', 'y[')} moved {plain.excitation:.1e} "
+            "times as much as the most excited combination. Entries along it are uncertain."
+        )
+    notes += [
+        f"{driven[j]} has no effect on the outputs that can be told from 0. Is it delayed by more "
+        "than the log shows, too small beside the noise, or not what the plant got?"
+        for j in found.idle
+    ]
+    notes += [
+        f"{driven[j]} follows the outputs: a feedback law explains all but {100 * left:.2g} % of "
+        "what its own past leaves. Its gain rests on that rest."
+        for j, left in found.feedback
+    ]
+    if np.any(found.curvature > 0):
+        notes.append(
+            f"Curvature: squares and products of outputs and inputs explain "
+            f"{listed(100 * found.curvature)} % of the prediction errors' variance. The plant is "
+            "not linear over this log: record closer to the operating point."
+        )
+    if log.lost_steps:
+        notes.append(
+            f"{log.lost_steps} steps beside gaps, or of another time than dt, are left out."
+        )
+    return [*notes, pole_note(step, n)]

@@ -1,0 +1,214 @@
+"""Models from outputs have the order, dead time and predictions of the plant."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_yann import IdentifiedOutputs, LinearModel, Log, identify_outputs
+from sb3_yann._validation import Array
+
+A = np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.7]])
+B = np.array([[0.0, 0.1], [0.0, 0.3], [0.5, 0.0]])
+C = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 1.0]])
+
+
+def played(
+    u: Array, A: Array, B: Array, C: Array, seed: int, noise: float = 0.05, delay: int = 0
+) -> Array:
+    """Return noisy outputs (T + 1, q) about (20, -3)."""
+    rng = np.random.default_rng(seed)
+    x, y = np.zeros(len(A)), []
+    for k in range(len(u) + 1):
+        y.append(C @ x + [20.0, -3.0][: len(C)] + rng.normal(0, noise, len(C)))
+        if k < len(u):
+            v = u[k - delay] if k >= delay else np.zeros(B.shape[1])
+            x = A @ x + B @ v + rng.normal(0, noise / 5, len(A))
+    return np.array(y)
+
+
+def steps(count: int, m: int, seed: int, hold: int = 4) -> Array:
+    """Return inputs (count, m) that are held for some samples, about 3."""
+    rng = np.random.default_rng(seed)
+    return 3 + np.repeat(rng.uniform(-1, 1, (-(-count // hold), m)), hold, axis=0)[:count]
+
+
+def best_possible(model: dict[str, Any], y: Array, u: Array, noise: float, ahead: int) -> Array:
+    """Return what the plant's own Kalman filter predicts (T + 1 - ahead, q)."""
+    A, B, C, delay = model["A"], model["B"], model["C"], model.get("delay", 0)
+    offset = np.array([20.0, -3.0])[: len(C)]
+    v = np.vstack([np.zeros((delay, u.shape[1])), u])[: len(u)]
+    x, P, found = np.zeros(len(A)), np.eye(len(A)), []
+    for k in range(len(u) + 1 - ahead):
+        gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + noise**2 * np.eye(len(C)))
+        z = x + gain @ (y[k] - offset - C @ x)
+        P = A @ (P - gain @ C @ P) @ A.T + (noise / 5) ** 2 * np.eye(len(A))
+        x = A @ z + B @ v[k]
+        z = x
+        for step in range(1, ahead):
+            z = A @ z + B @ v[k + step]
+        found.append(C @ z + offset)
+    return np.array(found)
+
+
+def rms(errors: Array) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+@pytest.fixture(scope="module")
+def found() -> IdentifiedOutputs:
+    u = steps(1200, 2, 0)
+    return identify_outputs(played(u, A, B, C, 1), u, dt=0.5)
+
+
+def test_predictions_come_close_to_the_best_possible_on_another_record(
+    found: IdentifiedOutputs,
+) -> None:
+    u = steps(600, 2, 5)
+    y = played(u, A, B, C, 6)
+    guess = found.predict(y, u, ahead=20)
+    assert guess.shape == (581, 2)
+    best = best_possible({"A": A, "B": B, "C": C}, y, u, 0.05, 20)
+    assert rms(guess - y[20:]) < 1.1 * rms(best - y[20:])
+
+
+def test_order_gain_and_the_first_states_are_the_plants(found: IdentifiedOutputs) -> None:
+    assert (found.order, found.delays) == (3, (0, 0))
+    model = found.model
+    np.testing.assert_array_equal(model.C, [[1, 0, 0], [0, 1, 0]])
+    gain = model.C @ np.linalg.solve(np.eye(3) - model.A, model.B)
+    np.testing.assert_allclose(gain, C @ np.linalg.solve(np.eye(3) - A, B), rtol=0.1, atol=0.1)
+    inner = np.linalg.eigvals(model.A - found.gain @ model.C)
+    assert np.max(np.abs(inner)) < 1
+
+
+def test_the_operating_point_is_where_the_plant_rests(found: IdentifiedOutputs) -> None:
+    model = found.model
+    rest = C @ np.linalg.solve(np.eye(3) - A, B @ model.u_ss) + [20.0, -3.0]
+    np.testing.assert_allclose(model.C @ model.x_ss, rest, atol=0.1)
+
+
+def test_dead_time_is_told_from_order() -> None:
+    a, b, c = np.array([[0.9, 0.2], [-0.2, 0.9]]), np.array([[0.0], [0.5]]), np.array([[1.0, 0.5]])
+    u = steps(1200, 1, 2)
+    found = identify_outputs(played(u, a, b, c, 3, delay=5), u, dt=1)
+    assert (found.order, found.delays, found.model.n_states) == (2, (5,), 7)
+    prompt = identify_outputs(played(u, a, b, c, 3), u, dt=1)
+    assert (prompt.order, prompt.delays) == (2, (0,))
+    fresh = steps(500, 1, 8)
+    y = played(fresh, a, b, c, 9, delay=5)
+    best = best_possible({"A": a, "B": b, "C": c, "delay": 5}, y, fresh, 0.05, 20)
+    late = slice(40, None)  # the plant began at rest, which no record tells
+    assert rms((found.predict(y, fresh) - y[20:])[late]) < 1.1 * rms((best - y[20:])[late])
+
+
+def test_an_integrator_keeps_its_pole() -> None:
+    a, b, c = np.array([[1.0, 0.3], [0.0, 0.8]]), np.array([[0.0], [0.2]]), np.array([[1.0, 0.0]])
+    u = steps(1500, 1, 4) - 3
+    found = identify_outputs(played(u, a, b, c, 5), u, dt=1)
+    assert np.max(np.abs(np.linalg.eigvals(found.model.A))) == pytest.approx(1, abs=0.01)
+
+
+def test_records_with_gaps_give_nearly_the_same_model(found: IdentifiedOutputs) -> None:
+    u = [steps(600, 2, 0), steps(600, 2, 1)]
+    y = [played(each, A, B, C, 11 + i) for i, each in enumerate(u)]
+    y[0][100:104] = np.nan
+    y[1][300, 0] = np.nan
+    u[1][200, 1] = np.nan
+    cut = identify_outputs(y, u, dt=0.5)
+    assert cut.order == 3
+    assert "are left out" in cut.report()
+    fresh = steps(600, 2, 5)
+    z = played(fresh, A, B, C, 6)
+    full = rms(found.predict(z, fresh) - z[20:])
+    assert rms(cut.predict(z, fresh) - z[20:]) < 1.05 * full
+    z[300:310, 1] = np.nan  # the filter goes on without them
+    assert rms(cut.predict(z, fresh)[:-1] - played(fresh, A, B, C, 6)[20:-1]) < 1.2 * full
+
+
+def test_a_log_gives_the_same_model_with_its_names() -> None:
+    u = steps(400, 2, 0)
+    y = played(u, A, B, C, 1)
+    plain = identify_outputs(y, u, dt=0.5, order=3, delay=0)
+    log = Log(Log.from_arrays(y, u, 0.5).episodes, 0.5, ("T", "level"), ("steam", "feed"))
+    named = identify_outputs(log, order=3, delay=0)
+    np.testing.assert_array_equal(named.model.A, plain.model.A)
+    assert named.model.state_names == ("T", "level", "x[2]")
+    with pytest.raises(TypeError, match="log has its own"):
+        identify_outputs(log, u)
+
+
+def test_a_measured_disturbance_makes_E() -> None:
+    both = steps(900, 2, 3)
+    y = played(both, A, B, C, 4)
+    found = identify_outputs(y, both[:, :1], dt=1, disturbances=both[:, 1:])
+    assert (found.model.n_inputs, found.model.n_disturbances) == (1, 1)
+    guess = found.predict(y, both[:, :1], 20, disturbances=both[:, 1:])
+    best = best_possible({"A": A, "B": B, "C": C}, y, both, 0.05, 20)
+    assert rms(guess - y[20:]) < 1.1 * rms(best - y[20:])
+
+
+def test_feedback_alone_identifies_nothing() -> None:
+    rng = np.random.default_rng(0)
+    x, u, y = np.zeros(2), [], []
+    before, held = 0.0, 0.0
+    for _ in range(500):
+        y.append(np.array([x[0] + 0.05 * rng.normal()]))
+        held = held - 0.5 * (y[-1][0] - before) - 0.05 * y[-1][0]  # a PI controller at rest
+        before = y[-1][0]
+        u.append([held])
+        x = np.array([[0.9, 0.2], [0.0, 0.7]]) @ x + [0.0, 0.3 * held] + 0.05 * rng.normal(size=2)
+    y.append(np.array([x[0]]))
+    with pytest.raises(ValueError, match="feedback law alone"):
+        identify_outputs(np.array(y), np.array(u), dt=1)
+    with pytest.raises(ValueError, match=r"u\[0\] never changes"):
+        identify_outputs(np.array(y), np.ones((500, 1)), dt=1)
+
+
+def test_an_input_without_effect_is_named() -> None:
+    u = steps(800, 2, 6)
+    found = identify_outputs(played(u, A, B * [1, 0], C, 7), u, dt=1)
+    assert "u[1] has no effect on the outputs" in found.report()
+    assert "u[0] has no effect" not in found.report()
+    assert found.delays == (0, 0)
+
+
+def test_a_curved_plant_is_not_taken_for_dead_time() -> None:
+    u = steps(1500, 1, 1) - 3
+    x, y = np.zeros(1), [np.zeros(1)]
+    rng = np.random.default_rng(2)
+    for each in u:
+        x = 0.8 * x + each + 0.3 * each**2
+        y.append(x + 0.01 * rng.normal(size=1))
+    found = identify_outputs(np.array(y), u, dt=1)
+    assert found.delays == (0,)
+    assert "Curvature" in found.report() and "Dead time" not in found.report()
+
+
+def test_more_outputs_than_states() -> None:
+    u = steps(600, 1, 6)
+    c = np.array([[1.0], [2.0]])
+    found = identify_outputs(played(u, np.array([[0.8]]), np.array([[1.0]]), c, 7), u, dt=1)
+    assert found.order == 1
+    y = played(u, np.array([[0.8]]), np.array([[1.0]]), c, 8)
+    assert rms(found.predict(y, u, 5) - y[5:]) < 0.1
+
+
+def test_C_is_kept_by_copies_units_and_sampling() -> None:
+    model = LinearModel([[0.5, 0], [0, 0.2]], [[1], [1]], dt=1, x_ss=[1, 2], u_ss=[0], C=[[1, 1]])
+    for each in (
+        copy.deepcopy(model),
+        pickle.loads(pickle.dumps(model)),
+        model.about_zero(),
+        model.named(["a", "b"]),
+    ):
+        np.testing.assert_array_equal(each.C, [[1, 1]])
+    assert model != LinearModel(model.A, model.B, 1, [1, 2], [0])
+    sampled = LinearModel.from_continuous([[0, 1], [0, 0]], [[0], [1]], dt=0.5, C=[[1, 0]])
+    np.testing.assert_array_equal(sampled.C, [[1, 0]])
+    back = LinearModel.from_statespace(sampled.to_statespace())
+    np.testing.assert_array_equal(back.C, [[1, 0]])
