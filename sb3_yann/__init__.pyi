@@ -12,6 +12,7 @@ from sb3_yann.control import DisturbanceObserver as DisturbanceObserver
 from sb3_yann.control import ExplicitLimitError as ExplicitLimitError
 from sb3_yann.control import ExplicitSolutionError as ExplicitSolutionError
 from sb3_yann.control import Identified as Identified
+from sb3_yann.control import IdentifiedOutputs as IdentifiedOutputs
 from sb3_yann.control import LinearCost as LinearCost
 from sb3_yann.control import LinearModel as LinearModel
 from sb3_yann.control import LinearMPC as LinearMPC
@@ -22,9 +23,11 @@ from sb3_yann.control import OutputBounds as OutputBounds
 from sb3_yann.control import PiecewiseAffine as PiecewiseAffine
 from sb3_yann.control import RateLimits as RateLimits
 from sb3_yann.control import SoftBounds as SoftBounds
+from sb3_yann.control import StateEstimator as StateEstimator
 from sb3_yann.control import Terminal as Terminal
 from sb3_yann.control import Tracking as Tracking
 from sb3_yann.control import identify as identify
+from sb3_yann.control import identify_outputs as identify_outputs
 from sb3_yann.control import offset_free as offset_free
 from sb3_yann.deployment.checks import Checks as Checks
 from sb3_yann.deployment.controller import Controller as Controller

@@ -21,7 +21,7 @@ from sb3_yann.control.mpc.groups import (
 from sb3_yann.control.mpc.linear_mpc import LinearMPC
 from sb3_yann.control.mpc.offset_free import offset_free
 from sb3_yann.control.mpc.theta_layout import ThetaLayout
-from sb3_yann.control.observer import DisturbanceObserver
+from sb3_yann.control.observer import DisturbanceObserver, StateEstimator
 from sb3_yann.control.online import OnlineLaw
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "PiecewiseAffine",
     "RateLimits",
     "SoftBounds",
+    "StateEstimator",
     "Terminal",
     "ThetaLayout",
     "Tracking",

@@ -1,4 +1,4 @@
-"""Estimates an unmeasured constant disturbance from the measured outputs."""
+"""Estimates states, and constant disturbances that nothing measures, from measured outputs."""
 
 from __future__ import annotations
 
@@ -16,46 +16,45 @@ from sb3_yann.control.model.linear_model import LinearModel
 STANDARD = "Give standard deviations, above 0."
 
 
-class DisturbanceObserver:
-    """A steady-state Kalman filter for the state and a constant disturbance: offset-free MPC.
+class StateEstimator:
+    """A steady-state Kalman filter for states, and for disturbances that are ``estimated``.
 
-    The model is augmented to ``x+ = A x + B u + E d``, ``d+ = d``, ``y = C x``. In the theta of a
-    :class:`LinearMPC` with the same model, ``d_hat`` stands for the disturbance that nothing
-    measures. Measured tracked outputs then settle without offset (Pannocchia & Rawlings,
-    Disturbance models for offset-free model-predictive control, AIChE J. 49, 2003). With fewer
-    disturbances than measured outputs, E must describe the disturbance.
-
-    What it takes and returns are deviations, as of a law: :class:`ObserveDisturbance` shows plant
-    units. Where the model says which of its disturbances are ``estimated``, the others are
-    measured, and :meth:`update` is told them. Else it estimates all of them.
+    The model is augmented to ``x+ = A x + B u + E d + w``, ``d+ = d``, ``y = C x + v``. What it
+    takes and returns are deviations, as of a law: :class:`sb3_yann.wrappers.EstimateState` shows
+    plant units. A reading that is NaN is left out: the model predicts it.
 
     Parameters
     ----------
     model : LinearModel
-        With a disturbance matrix E (n, d), d >= 1.
+        Disturbances that are not ``estimated`` are measured, and :meth:`update` is told them.
     measured : array_like, shape (q, n), or list of int, optional
-        C, or the indices of the measured states. The default is all states.
+        C, or the indices of the measured states. The default is the model's C.
     state_noise, disturbance_noise, measurement_noise : array_like or float, default 1
-        Standard deviations of shapes (n,), (d,) and (q,), per sample. Only their ratios matter:
-        more disturbance noise makes the estimate of d faster and rougher.
+        Standard deviations of w, of the steps of d, and of v, of shapes (n,), (d,) and (q,), per
+        sample; or their covariances (n, n), (d, d) and (q, q). Only their ratios matter: more
+        disturbance noise makes the estimate of d faster and rougher.
+    cross_noise : array_like, shape (n, q), optional
+        Covariance of w and v, which a model in innovation form has.
     gain : array_like, shape (n + d, q), optional
         A Luenberger gain to use instead: ``[x; d]`` is corrected by ``gain (y - C x)``.
 
     Raises
     ------
     ValueError
-        For a disturbance that the measurements do not determine, and a gain with unstable error.
+        For a state or disturbance that the measurements do not determine, and a gain with unstable
+        error.
 
     Examples
     --------
     >>> from sb3_yann.control import LinearModel
-    >>> model = LinearModel([[0.5]], [[1.0]], dt=1, E=[[1.0]])
-    >>> observer, x = DisturbanceObserver(model), 0.0
-    >>> for _ in range(50):  # the plant with d = 2
-    ...     x = 0.5 * x + 2.0
-    ...     x_hat, d_hat = observer.update([x], [0.0])
-    >>> d_hat.round(6).tolist()
-    [2.0]
+    >>> model = LinearModel([[0.9, 0.2], [0, 0.5]], [[0.0], [1.0]], dt=1, C=[[1, 0]])
+    >>> estimator, x = StateEstimator(model), np.array([1.0, -1.0])
+    >>> _ = estimator.reset(x[:1])
+    >>> for _ in range(50):
+    ...     x = model.step(x, [0.3])
+    ...     x_hat, _ = estimator.update(x[:1], [0.3])
+    >>> bool(np.allclose(x_hat, x))
+    True
     """
 
     def __init__(
@@ -66,14 +65,15 @@ class DisturbanceObserver:
         state_noise: ArrayLike = 1.0,
         disturbance_noise: ArrayLike = 1.0,
         measurement_noise: ArrayLike = 1.0,
+        cross_noise: ArrayLike | None = None,
         gain: ArrayLike | None = None,
     ) -> None:
         if not isinstance(model, LinearModel):
             raise TypeError(f"model = {model!r} must be a LinearModel, e.g. LinearModel(A, B, dt).")
-        known = [*model.measured] if model.estimated else []
+        known = self._told(model)
         n, d = model.n_states, model.n_disturbances - len(known)
         self.model = model
-        self.C = check_outputs("measured", np.eye(n) if measured is None else measured, n)
+        self.C = check_outputs("measured", model.shown if measured is None else measured, n)
         E = np.delete(model.E, known, axis=1)
         _require_observable(model, E, self.C)
         q = len(self.C)
@@ -81,11 +81,15 @@ class DisturbanceObserver:
         self.B = np.vstack([model.B, np.zeros((d, model.n_inputs))])
         self.E = np.vstack([model.E[:, known], np.zeros((d, len(known)))])
         self.C_aug = np.hstack([self.C, np.zeros((q, d))])
-        w_std = check_positive_vector("state_noise", state_noise, n, STANDARD)
-        d_std = check_positive_vector("disturbance_noise", disturbance_noise, d, STANDARD)
-        v_std = check_positive_vector("measurement_noise", measurement_noise, q, STANDARD)
+        W = linalg.block_diag(
+            _covariance("state_noise", state_noise, n),
+            _covariance("disturbance_noise", disturbance_noise, d),
+        )
+        V = _covariance("measurement_noise", measurement_noise, q)
+        cross = np.zeros((n, q)) if cross_noise is None else cross_noise
+        cross = np.vstack([check_array("cross_noise", cross, (n, q)), np.zeros((d, q))])
         if gain is None:
-            self.gain = self._kalman_gain(w_std, d_std, v_std)
+            self.gain = self._kalman_gain(W, V, cross)
         else:
             self.gain = check_array("gain", gain, (n + d, q))
         radius = self._radius(self.gain)
@@ -95,6 +99,10 @@ class DisturbanceObserver:
                 f"spectral radius is {radius:.6g}, not below 1. Leave it out for a Kalman filter."
             )
         self.estimate: Array = np.zeros(n + d)
+
+    def _told(self, model: LinearModel) -> list[int]:
+        """Return which disturbances are measured."""
+        return [*model.measured]
 
     @property
     def n_measured(self) -> int:
@@ -122,8 +130,14 @@ class DisturbanceObserver:
         return self.estimate[self.model.n_states :].copy()
 
     def reset(self, y: ArrayLike) -> tuple[Array, Array]:
-        """Restart with d_hat = 0 and the smallest x_hat that gives y (q,); return both."""
-        start = self._smallest @ check_array("y", y, (self.n_measured,))
+        """Restart with d_hat = 0 and an x_hat that gives y (q,); return both.
+
+        It is the state in which the model rests there with the smallest inputs, if there is one.
+        """
+        now = np.array(y, np.float64)
+        now = check_array("y", np.where(np.isnan(now), 0.0, now), (self.n_measured,))
+        start = self._rest @ now
+        start = start + self._smallest @ (now - self.C @ start)
         self.estimate = np.concatenate([start, np.zeros(self.n_estimated)])
         return self.x_hat, self.d_hat
 
@@ -132,8 +146,11 @@ class DisturbanceObserver:
 
         Measured disturbances d are those that acted together with u.
         """
-        now = check_array("y", y, (self.n_measured,))
         predicted = self._after(u, d)
+        now = np.array(y, np.float64)
+        if now.shape == (self.n_measured,):
+            now = np.where(np.isnan(now), self.C_aug @ predicted, now)
+        now = check_array("y", now, (self.n_measured,))
         self.estimate = predicted + self.gain @ (now - self.C_aug @ predicted)
         return self.x_hat, self.d_hat
 
@@ -146,6 +163,15 @@ class DisturbanceObserver:
         """The matrix (n, q) from outputs to the smallest state that gives them."""
         return np.asarray(np.linalg.pinv(self.C))
 
+    @cached_property
+    def _rest(self) -> Array:
+        """The matrix (n, q) from outputs to the state in which the model rests with them."""
+        n, q, model = self.model.n_states, self.n_measured, self.model
+        if np.array_equal(self.C, np.eye(n)):
+            return np.eye(n)
+        rows = np.block([[np.eye(n) - model.A, -model.B], [self.C, np.zeros((q, model.n_inputs))]])
+        return np.asarray(np.linalg.pinv(rows)[:n, n:])
+
     def _after(self, u: ArrayLike, d: ArrayLike | None) -> Array:
         if (d is None) != (self.n_known == 0):
             raise ValueError(
@@ -157,22 +183,28 @@ class DisturbanceObserver:
             moved if d is None else moved + self.E @ check_array("d", d, (self.n_known,))
         )
 
-    def _kalman_gain(self, w_std: Array, d_std: Array, v_std: Array) -> Array:
-        """Return the steady-state gain of the filter from the standard deviations."""
+    def _kalman_gain(self, W: Array, V: Array, cross: Array) -> Array:
+        """Return the steady-state gain of the filter from the covariances."""
         try:
             with np.errstate(all="ignore"):
-                Q, R = np.diag(np.append(w_std, d_std) ** 2), np.diag(v_std**2)
-                P = linalg.solve_discrete_are(self.A.T, self.C_aug.T, Q, R)
-                spread = self.C_aug @ P @ self.C_aug.T + R
+                P = linalg.solve_discrete_are(self.A.T, self.C_aug.T, W, V, s=cross)
+                spread = self.C_aug @ P @ self.C_aug.T + V
                 gain = np.asarray(np.linalg.solve(spread, self.C_aug @ P).T)
+                if np.any(cross):
+                    # What v tells of w moves the state one sample later.
+                    told = np.linalg.solve(spread, cross.T).T
+                    gain = gain + np.linalg.lstsq(self.A, told, rcond=None)[0]
             if self._radius(gain) < 1:
                 return gain
         except ValueError:  # a LinAlgError is one
             pass
+        sizes = np.sqrt(np.diag(W))
+        n = self.model.n_states
         raise ValueError(
-            f"state_noise = {w_std.tolist()}, disturbance_noise = {d_std.tolist()} and "
-            f"measurement_noise = {v_std.tolist()} are too far apart, or too large, for a Kalman "
-            "filter: rounding hides its gain. Only their ratios matter: keep these below 1e6."
+            f"state_noise = {sizes[:n].tolist()}, disturbance_noise = {sizes[n:].tolist()} and "
+            f"measurement_noise = {np.sqrt(np.diag(V)).tolist()} are too far apart, or too "
+            "large, for a Kalman filter: rounding hides its gain. Only their ratios matter: keep "
+            "these below 1e6."
         )
 
     def _radius(self, gain: Array) -> float:
@@ -180,12 +212,48 @@ class DisturbanceObserver:
         return lqr.spectral_radius((np.eye(len(self.A)) - gain @ self.C_aug) @ self.A)
 
 
+class DisturbanceObserver(StateEstimator):
+    """The estimator of a constant disturbance that makes an MPC offset-free.
+
+    In the theta of a :class:`LinearMPC` with the same model, ``d_hat`` stands for the disturbance
+    that nothing measures. Measured tracked outputs then settle without offset (Pannocchia &
+    Rawlings, Disturbance models for offset-free model-predictive control, AIChE J. 49, 2003). With
+    fewer disturbances than measured outputs, E must describe the disturbance.
+
+    Where the model does not say which of its disturbances are ``estimated``, all of them are. The
+    arguments are those of :class:`StateEstimator`.
+
+    Examples
+    --------
+    >>> from sb3_yann.control import LinearModel
+    >>> model = LinearModel([[0.5]], [[1.0]], dt=1, E=[[1.0]])
+    >>> observer, x = DisturbanceObserver(model), 0.0
+    >>> for _ in range(50):  # the plant with d = 2
+    ...     x = 0.5 * x + 2.0
+    ...     x_hat, d_hat = observer.update([x], [0.0])
+    >>> d_hat.round(6).tolist()
+    [2.0]
+    """
+
+    def _told(self, model: LinearModel) -> list[int]:
+        told = [*model.measured] if model.estimated else []
+        if len(told) == model.n_disturbances:
+            hint = "pass its matrix E, e.g. E = B for a load at the input."
+            raise ValueError(f"The model has no disturbance to estimate: {hint}")
+        return told
+
+
+def _covariance(name: str, value: ArrayLike, size: int) -> Array:
+    """Return a covariance (size, size) from standard deviations, or from itself."""
+    if np.ndim(value) < 2:
+        return np.diag(check_positive_vector(name, value, size, STANDARD) ** 2)
+    given = check_array(name, value, (size, size))
+    return np.asarray((given + given.T) / 2)
+
+
 def _require_observable(model: LinearModel, E: Array, C: Array) -> None:
     """Raise unless the augmented model is detectable (Pannocchia & Rawlings 2003, Lemma 1)."""
     n, d, q = model.n_states, E.shape[1], len(C)
-    if d == 0:
-        hint = "pass its matrix E, e.g. E = B for a load at the input."
-        raise ValueError(f"The model has no disturbance to estimate: {hint}")
     for pole in np.linalg.eigvals(model.A):
         hautus = np.vstack([pole * np.eye(n) - model.A, C])
         if abs(pole) > 1 - 1e-9 and _rank(hautus) < n:
@@ -193,6 +261,8 @@ def _require_observable(model: LinearModel, E: Array, C: Array) -> None:
                 f"The measurements do not see an unstable mode: eigenvalue {pole:.6g} of A is not "
                 "observable through C. Measure another output."
             )
+    if d == 0:
+        return
     rank = _rank(np.block([[model.A - np.eye(n), E], [C, np.zeros((q, d))]]))
     if rank < n + d:
         raise ValueError(

@@ -4,6 +4,7 @@ from sb3_yann.wrappers.episodes import SeededGlobals, TruncateAtTimeLimit
 from sb3_yann.wrappers.plant_env import PlantEnv
 from sb3_yann.wrappers.stage_cost import StageCost
 from sb3_yann.wrappers.theta import (
+    EstimateState,
     MeasuredDisturbance,
     ObserveDisturbance,
     PastInputs,
@@ -12,6 +13,7 @@ from sb3_yann.wrappers.theta import (
 )
 
 __all__ = [
+    "EstimateState",
     "MeasuredDisturbance",
     "ObserveDisturbance",
     "PastInputs",

@@ -14,7 +14,7 @@ from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_yann._validation import Array, NonFiniteWarning, check_int, check_vector
-from sb3_yann.control import DisturbanceObserver
+from sb3_yann.control import DisturbanceObserver, StateEstimator
 from sb3_yann.units import Units
 from sb3_yann.wrappers.appending import Appending, joined
 from sb3_yann.wrappers.spaces import Env, Vector, require_vector
@@ -250,7 +250,7 @@ class MeasuredDisturbance(Appending):
         check_int("preview", preview, 0, "It counts samples ahead.")
         super().__init__(env, *_repeated(low, high, preview + 1))
         self.n_loads = len(self.low) // (preview + 1)
-        if _below(env, ObserveDisturbance) is not None:
+        if _below(env, EstimateState) is not None:
             raise ValueError(
                 "The env is in ObserveDisturbance already, whose observer would take the measured "
                 "disturbance for an unknown one. Wrap it in MeasuredDisturbance first."
@@ -294,7 +294,7 @@ def _below(env: Any, kind: type[AWrapper]) -> AWrapper | None:
     return None
 
 
-def _require_told(observer: DisturbanceObserver, measured: MeasuredDisturbance | None) -> None:
+def _require_told(observer: StateEstimator, measured: MeasuredDisturbance | None) -> None:
     """Raise unless an observer knows which disturbances the env measures, and comes after them."""
     shown = 0 if measured is None else measured.n_loads
     model, told = observer.model, observer.n_known
@@ -306,46 +306,53 @@ def _require_told(observer: DisturbanceObserver, measured: MeasuredDisturbance |
             "with E of all disturbances, the measured ones first: LinearModel(A, B, dt, E=E, "
             "estimated=[...])."
         )
-    if told and model.estimated[0] < told:
+    if told and model.estimated and model.estimated[0] < told:
         raise ValueError(
             f"estimated = {[*model.estimated]}: theta holds the measured disturbances before the "
             "estimated ones. Sort the columns of E so."
         )
 
 
-class ObserveDisturbance(Appending):
-    """Puts the estimated state in place of the measurement, and appends the disturbance d (d,).
+class EstimateState(Appending):
+    """Puts the estimated state in place of the measured outputs, and appends the disturbance d.
 
-    All of it is in plant units where the observer's model has an operating point.
+    All of it is in plant units where the estimator's model has an operating point. A reading that
+    is not finite is left out: the estimator goes on without it.
 
-    The first entries of the env's observation are the measured outputs y (q,) of the observer; what
-    other wrappers have appended to them, such as a reference, stays where it is. Measured
-    disturbances come from a :class:`MeasuredDisturbance` below, and the observer is told them.
+    The first entries of the env's observation are the measured outputs y (q,) of the estimator;
+    what other wrappers have appended to them, such as a reference, stays where it is. Measured
+    disturbances come from a :class:`MeasuredDisturbance` below, and the estimator is told them.
 
     Parameters
     ----------
     env : gymnasium.Env, with one-dimensional Box spaces
-    observer : DisturbanceObserver
+    observer : StateEstimator
         Copied, so that each env has an estimate of its own.
-    low, high : array_like, shape (d,)
+    low, high : array_like, shape (d,), optional
         ``d_min`` and ``d_max`` of the problem, to which the shown estimate is clipped. Those of its
-        measured disturbances may be left out.
+        measured disturbances may be left out. There are no bounds by default.
 
     Examples
     --------
     >>> import gymnasium as gym
     >>> from sb3_yann.control import LinearModel
-    >>> model = LinearModel(np.eye(4) / 2, np.ones((4, 1)), dt=1, E=np.ones((4, 1)))
-    >>> env = ObserveDisturbance(gym.make("CSTR-v0"), DisturbanceObserver(model), -1, 1)
+    >>> model = LinearModel(np.eye(5) / 2, np.ones((5, 1)), dt=1, C=np.eye(4, 5) + 1)
+    >>> env = EstimateState(gym.make("CSTR-v0"), StateEstimator(model))
     >>> env.reset(seed=0)[0].shape
     (5,)
     """
 
     def __init__(
-        self, env: Env, observer: DisturbanceObserver, low: ArrayLike, high: ArrayLike
+        self,
+        env: Env,
+        observer: StateEstimator,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
     ) -> None:
-        if not isinstance(observer, DisturbanceObserver):
-            raise TypeError(f"observer = {observer!r} must be a DisturbanceObserver.")
+        if not isinstance(observer, StateEstimator):
+            raise TypeError(f"observer = {observer!r} must be a StateEstimator.")
+        free = np.full(observer.n_estimated, np.inf)
+        low, high = -free if low is None else low, free if high is None else high
         self.measured: Any = _below(env, MeasuredDisturbance)
         _require_told(observer, self.measured)
         if np.size(low) == np.size(high) == observer.model.n_disturbances:
@@ -377,9 +384,7 @@ class ObserveDisturbance(Appending):
             at = f"The measurement {shown} is not finite: the observer predicts it."
             warnings.warn(at, NonFiniteWarning, stacklevel=4)
         self.failing = failing
-        if failing.any():
-            expected = np.zeros(len(failing)) if u is None else observer.expected(u, self.load)
-            measured[failing] = expected[failing]
+        measured[failing] = np.nan
         if u is None:
             x_hat, d_hat = observer.reset(measured)
         else:
@@ -389,3 +394,30 @@ class ObserveDisturbance(Appending):
             self.load = self.measured.held[: observer.n_known] - self.inner.theta_ss[told:]
         x_hat, d_hat = np.split(self.outer.to_plant(np.append(x_hat, d_hat)), [len(x_hat)])
         return joined(x_hat, rest, np.clip(d_hat, self.low, self.high))
+
+
+class ObserveDisturbance(EstimateState):
+    """:class:`EstimateState` with a disturbance, whose estimate is clipped to a box.
+
+    Parameters
+    ----------
+    env : gymnasium.Env, with one-dimensional Box spaces
+    observer : DisturbanceObserver
+    low, high : array_like, shape (d,)
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from sb3_yann.control import LinearModel
+    >>> model = LinearModel(np.eye(4) / 2, np.ones((4, 1)), dt=1, E=np.ones((4, 1)))
+    >>> env = ObserveDisturbance(gym.make("CSTR-v0"), DisturbanceObserver(model), -1, 1)
+    >>> env.reset(seed=0)[0].shape
+    (5,)
+    """
+
+    def __init__(
+        self, env: Env, observer: DisturbanceObserver, low: ArrayLike, high: ArrayLike
+    ) -> None:
+        if not isinstance(observer, DisturbanceObserver):
+            raise TypeError(f"observer = {observer!r} must be a DisturbanceObserver.")
+        super().__init__(env, observer, low, high)

@@ -27,6 +27,7 @@ from sb3_yann.control.identification.outputs import AHEAD, Structure, fit_struct
 from sb3_yann.control.identification.residuals import listed
 from sb3_yann.control.linear_system import names
 from sb3_yann.control.model.linear_model import LinearModel
+from sb3_yann.control.observer import StateEstimator
 from sb3_yann.log import Arrays, Episode, Log, cut_at_gaps
 
 APART = 1e3
@@ -114,6 +115,16 @@ class IdentifiedOutputs(ReadOnlyArrays):
         if ahead > len(u):
             raise ValueError(f"ahead = {ahead}, but the record has {len(u)} steps.")
         return predicted(self._innovations, Episode(y, u, d), self.start, ahead)
+
+    def estimator(self) -> StateEstimator:
+        """Return the Kalman filter of this model, in deviations, for `wrappers.EstimateState`."""
+        spread = self.gain @ self.noise
+        return StateEstimator(
+            self.model,
+            state_noise=spread @ self.gain.T,
+            measurement_noise=self.noise,
+            cross_noise=spread,
+        )
 
     @property
     def _innovations(self) -> Innovations:
@@ -325,7 +336,8 @@ def _notes(
     notes = [
         f"From outputs: order {n}, fitted to {sum(map(len, log.episodes))} steps; one step differs "
         f"from the prediction by {listed(np.sqrt(np.diag(noise)))} (standard deviation of each "
-        "output)."
+        "output). A policy sees estimates: sb3_yann.wrappers.EstimateState(env, "
+        "found.estimator())."
     ]
     if not np.all(np.isnan(found.fits[0])):
         notes.append(

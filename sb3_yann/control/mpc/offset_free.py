@@ -41,8 +41,8 @@ def offset_free(
         Largest disturbance, in units of the measured states per sample. The default is 5 % of their
         half-widths in the box of states.
     measured : array_like, shape (q, n), or list of int, optional
-        The measured outputs, or the indices of the measured states. The default is all states. The
-        disturbances then act on these.
+        The measured outputs, or the indices of the measured states. The default is the model's C.
+        The disturbances then act on these.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def offset_free(
             f"The MPC has {len(old.estimated)} estimated disturbances already: their observer is "
             "DisturbanceObserver(mpc.model)."
         )
-    C = np.eye(n) if measured is None else check_outputs("measured", measured, n)
+    C = old.shown if measured is None else check_outputs("measured", measured, n)
     q, tracked = len(C), mpc.tracking.C
     if np.any(np.abs(tracked - tracked @ np.linalg.pinv(C) @ C) > 1e-9 * (1 + np.abs(tracked))):
         raise ValueError(
