@@ -81,15 +81,20 @@ class StateEstimator:
         self.B = np.vstack([model.B, np.zeros((d, model.n_inputs))])
         self.E = np.vstack([model.E[:, known], np.zeros((d, len(known)))])
         self.C_aug = np.hstack([self.C, np.zeros((q, d))])
-        W = linalg.block_diag(
-            _covariance("state_noise", state_noise, n),
-            _covariance("disturbance_noise", disturbance_noise, d),
-        )
-        V = _covariance("measurement_noise", measurement_noise, q)
+        W, w_std = _covariance("state_noise", state_noise, n)
+        D, d_std = _covariance("disturbance_noise", disturbance_noise, d)
+        V, v_std = _covariance("measurement_noise", measurement_noise, q)
         cross = np.zeros((n, q)) if cross_noise is None else cross_noise
         cross = np.vstack([check_array("cross_noise", cross, (n, q)), np.zeros((d, q))])
         if gain is None:
-            self.gain = self._kalman_gain(W, V, cross)
+            found = self._kalman_gain(linalg.block_diag(W, D), V, cross)
+            if found is None:
+                raise ValueError(
+                    f"state_noise = {w_std}, disturbance_noise = {d_std} and measurement_noise = "
+                    f"{v_std} are too far apart, or too large, for a Kalman filter: rounding hides "
+                    "its gain. Only their ratios matter: keep these below 1e6."
+                )
+            self.gain = found
         else:
             self.gain = check_array("gain", gain, (n + d, q))
         radius = self._radius(self.gain)
@@ -130,14 +135,10 @@ class StateEstimator:
         return self.estimate[self.model.n_states :].copy()
 
     def reset(self, y: ArrayLike) -> tuple[Array, Array]:
-        """Restart with d_hat = 0 and an x_hat that gives y (q,); return both.
-
-        It is the state in which the model rests there with the smallest inputs, if there is one.
-        """
+        """Restart with d_hat = 0 and the smallest x_hat that gives y (q,); return both."""
         now = np.array(y, np.float64)
         now = check_array("y", np.where(np.isnan(now), 0.0, now), (self.n_measured,))
-        start = self._rest @ now
-        start = start + self._smallest @ (now - self.C @ start)
+        start = self._smallest @ now
         self.estimate = np.concatenate([start, np.zeros(self.n_estimated)])
         return self.x_hat, self.d_hat
 
@@ -163,15 +164,6 @@ class StateEstimator:
         """The matrix (n, q) from outputs to the smallest state that gives them."""
         return np.asarray(np.linalg.pinv(self.C))
 
-    @cached_property
-    def _rest(self) -> Array:
-        """The matrix (n, q) from outputs to the state in which the model rests with them."""
-        n, q, model = self.model.n_states, self.n_measured, self.model
-        if np.array_equal(self.C, np.eye(n)):
-            return np.eye(n)
-        rows = np.block([[np.eye(n) - model.A, -model.B], [self.C, np.zeros((q, model.n_inputs))]])
-        return np.asarray(np.linalg.pinv(rows)[:n, n:])
-
     def _after(self, u: ArrayLike, d: ArrayLike | None) -> Array:
         if (d is None) != (self.n_known == 0):
             raise ValueError(
@@ -183,8 +175,8 @@ class StateEstimator:
             moved if d is None else moved + self.E @ check_array("d", d, (self.n_known,))
         )
 
-    def _kalman_gain(self, W: Array, V: Array, cross: Array) -> Array:
-        """Return the steady-state gain of the filter from the covariances."""
+    def _kalman_gain(self, W: Array, V: Array, cross: Array) -> Array | None:
+        """Return the steady-state gain of the filter, None where rounding hides it."""
         try:
             with np.errstate(all="ignore"):
                 P = linalg.solve_discrete_are(self.A.T, self.C_aug.T, W, V, s=cross)
@@ -198,14 +190,7 @@ class StateEstimator:
                 return gain
         except ValueError:  # a LinAlgError is one
             pass
-        sizes = np.sqrt(np.diag(W))
-        n = self.model.n_states
-        raise ValueError(
-            f"state_noise = {sizes[:n].tolist()}, disturbance_noise = {sizes[n:].tolist()} and "
-            f"measurement_noise = {np.sqrt(np.diag(V)).tolist()} are too far apart, or too "
-            "large, for a Kalman filter: rounding hides its gain. Only their ratios matter: keep "
-            "these below 1e6."
-        )
+        return None
 
     def _radius(self, gain: Array) -> float:
         """Return by which factor the error of the estimate changes in a sample, in the end."""
@@ -243,12 +228,14 @@ class DisturbanceObserver(StateEstimator):
         return told
 
 
-def _covariance(name: str, value: ArrayLike, size: int) -> Array:
-    """Return a covariance (size, size) from standard deviations, or from itself."""
+def _covariance(name: str, value: ArrayLike, size: int) -> tuple[Array, list[float]]:
+    """Return a covariance (size, size) and standard deviations, given either."""
     if np.ndim(value) < 2:
-        return np.diag(check_positive_vector(name, value, size, STANDARD) ** 2)
+        deviations = check_positive_vector(name, value, size, STANDARD)
+        with np.errstate(all="ignore"):
+            return np.diag(deviations**2), deviations.tolist()
     given = check_array(name, value, (size, size))
-    return np.asarray((given + given.T) / 2)
+    return (given + given.T) / 2, np.sqrt(np.abs(np.diag(given))).tolist()
 
 
 def _require_observable(model: LinearModel, E: Array, C: Array) -> None:

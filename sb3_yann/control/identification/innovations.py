@@ -186,7 +186,7 @@ class Past:
         for i in range(p):
             future[i * q : (i + 1) * q, : (p - i) * self.width] = block[:, i * self.width :]
         whole = np.concatenate(past)
-        r: Array = np.linalg.qr(whole / np.sqrt(len(whole)), mode="r")
+        r = linalg.qr(whole / np.sqrt(len(whole)), mode="r")[0][: whole.shape[1]]
         left, sizes, _ = np.linalg.svd(future @ r.T, full_matrices=False)
         self.limit = int(np.sum(sizes > 1e-6 * sizes[0]))
         to_state = (left[:, : self.limit] / np.sqrt(sizes[: self.limit])).T @ future
@@ -289,9 +289,9 @@ class Chunks:
         slopes[..., n * w : n * w + q * n] = blocks
         slopes[..., n * w + q * n :] = weight
         slopes *= self.there[..., None]
-        slopes = slopes.reshape(count, length * q, -1)
-        slopes -= basis @ (inverse @ slopes)
-        flat_slopes = slopes.reshape(count * length * q, -1)
+        wide: Array = slopes.reshape(count, length * q, -1)
+        wide = wide - basis @ (inverse @ wide)
+        flat_slopes = wide.reshape(count * length * q, -1)
         return flat_slopes.T @ flat_slopes, flat_slopes.T @ left.ravel()
 
     def _simulate(self, model: Innovations, weight: Array) -> tuple[Array, Array, Array, Array]:
