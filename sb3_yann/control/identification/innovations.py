@@ -222,7 +222,7 @@ class Past:
         if spectral_radius(inner) >= 1:
             # The gain of the filter for what these states and outputs miss is stable.
             spread = K @ noise @ K.T + found.covariance
-            K = kalman_gain(A, C, spread, noise + FLOOR * np.eye(q), K @ noise)
+            K = kalman_gain(A, C, (spread + spread.T) / 2, noise + FLOOR * np.eye(q), K @ noise)
         return Innovations(A, B, K, C, c, self.arx.reached, noise + FLOOR * np.eye(q))
 
 
@@ -346,11 +346,13 @@ def refined(model: Innovations, chunks: Chunks, steps: int = 15) -> Innovations:
         while damping < 1e4:
             scaled = matrix / np.outer(scale, scale) + damping * np.eye(len(side))
             trial = moved_by(model, np.linalg.solve(scaled, side / scale) / scale)
-            noise = chunks.covariance(trial) + floor
-            now = np.linalg.slogdet(noise)[1] if np.all(np.isfinite(noise)) else np.inf
-            if now < size and spectral_radius(trial.inner) < 1:
-                model, size, damping = replace(trial, noise=noise), now, max(damping / 10, 1e-9)
-                break
+            if spectral_radius(trial.inner) < 1:
+                noise = chunks.covariance(trial) + floor
+                now = np.linalg.slogdet(noise)[1] if np.all(np.isfinite(noise)) else np.inf
+                if now < size:
+                    model, size = replace(trial, noise=noise), now
+                    damping = max(damping / 10, 1e-9)
+                    break
             damping *= 10
         if (before - size) * chunks.samples < 0.1:  # of twice the log-likelihood
             break
