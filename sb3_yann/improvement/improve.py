@@ -35,12 +35,8 @@ from sb3_yann.policy.policies import (
 )
 from sb3_yann.rollout import Source, maker, name_of, preserve_rng
 from sb3_yann.twin.plant_twin import PlantTwin
-from sb3_yann.twin.trust import Trust
 
-EXACT = 0.5  # errors of a twin relative to the given model's below which it is an exact one
-LEAST = 2e-3  # what a policy must gain in a twin, relative to the MPC's mean cost
-LEAST_OF_EXACT = 2e-4  # and in an exact one
-OF_COST_ERROR = 0.1  # and relative to the error of the twin's costs
+LEAST = 2e-4  # what a policy must gain in a twin, relative to the MPC's mean cost
 RETREATS = (0.5, 0.25)  # shares of a correction that are tried where all of it is refused
 PROMISED = 0.95  # share of what the model promised that, shown by the simulator, ends the rounds
 LITTLE = 0.02  # share of a gain by which another round must raise it
@@ -98,6 +94,12 @@ class Improvement:
     model: Any = field(default=None, repr=False, compare=False)
     note: str = ""
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Where the last policy's change on the plant lies with 90 %, as a twin's log has it."""
+        known = [each.interval for each in self.checks if each.interval is not None]
+        return known[-1] if known else (-np.inf, np.inf)
+
     def export(self, path: str | PathLike[str], **options: Any) -> Exported:
         """Write the policy as a file or as code: :func:`sb3_yann.export` of the model."""
         return export(self.model, path, **options)
@@ -127,6 +129,9 @@ class Improvement:
         said = f"Accepted: {100 * self.change:+.2f} % of the MPC's stage cost in {self.where}"
         if last is not None:
             twin = self.where == "the twin"
+            if last.interval is not None:
+                low, high = (100 * each for each in last.interval)
+                return f"{said}, {low:+.2f} to {high:+.2f} % on the plant (90 %). {taken}"
             whose = "on episodes like the log's" if twin else "of an episode's own on average"
             said += f", {100 * last.logged:+.2f} % (± {100 * last.error:.2f}) {whose}"
             said += f", {100 * last.worst:+.2f} % from the worst start"
@@ -164,11 +169,10 @@ def improve(
     three times; then half of the correction.
 
     *In a twin* the members take turns in planning. A policy is accepted if it is no worse than the
-    MPC from new starts on every member, and gains twice the standard error on episodes that go on
-    as those of the log. The twin's second opinion, a model of another form, must see a gain as
-    well, where it predicts the log nearly as well. What is refused is taught; then half and a
-    quarter of the correction are tried. Beyond what the log shows the MPC acts alone: no member of
-    the twin knows the plant there.
+    MPC from new starts on every member, and surely costs less by :meth:`PlantTwin.forecast`: in
+    every twin that the log does not refute. What is refused is taught; then half and a quarter of
+    the correction are tried. Beyond what the log shows the MPC acts alone: no member of the twin
+    knows the plant there.
 
     The model ends with the policy that was accepted and a critic that is refitted to it, else as it
     was. It saves and goes on learning as any other.
@@ -279,16 +283,6 @@ def fingerprint(state: dict[str, th.Tensor]) -> str:
     return found.hexdigest()
 
 
-def least_gain(trust: Trust) -> float:
-    """Return what a policy must gain in a twin, as a fraction of the MPC's mean cost.
-
-    What is promised is a difference of two predicted costs, which errs less than each of them, but
-    not without end: an evaporator's twin that was off by a fifth promised 1 %, and cost 0.3 % more.
-    """
-    least = LEAST_OF_EXACT if trust.error_ratio < EXACT else LEAST
-    return max(least, OF_COST_ERROR * trust.cost_error)
-
-
 class _Progress:
     """Lines that say what is done: they read as well in a file as on a screen.
 
@@ -383,18 +377,18 @@ class _Work:
     def in_twin(self, twin: PlantTwin) -> Improvement:
         """Plan in the members of a twin, imitate, and check on every member."""
         self.say(f"the MPC from {self.n_starts} starts in each member; at first this compiles code")
-        trial, least = Trial.draw(twin, self.n_starts, self.rng), least_gain(twin.trust)
+        trial = Trial.draw(twin, self.n_starts, self.rng)
         before = self._check_in(trial) if self.has_learnt else None
         best = before.change if before is not None and before.accepted else 0.0
 
         def passes(share: float) -> bool:
             found = self._check_in(trial, share)
-            return found.accepted and found.gains(least) and found.change < best
+            return found.accepted and found.logged <= -LEAST and found.change < best
 
         def improvement(accepted: bool, note: str = "") -> Improvement:
             if accepted:
                 self.accept(twin)
-            change = self.checks[-1].change if accepted else 0.0
+            change = self.checks[-1].logged if accepted else 0.0
             return Improvement(tuple(self.checks), change, accepted, before, note=note)
 
         # As many as are asked for, half of them as the log begins, half around.
@@ -442,14 +436,23 @@ class _Work:
             if not confirmed.accepted:
                 reason = f"on new starts, {confirmed.reason}"
                 found = replace(found, accepted=False, reason=reason)
-            elif doubt := new.second_objection(act):
-                found = replace(found, accepted=False, reason=doubt)
+            else:
+                found = self._forecast(trial.twin, found)
         self.checks.append(found)
         self.say(
             f"{share:.0%} of the correction: {100 * found.change:+.2f} %, "
             f"{found.reason or 'no worse anywhere'}"
         )
         return found
+
+    def _forecast(self, twin: PlantTwin, check: Check) -> Check:
+        """Return a check with what the layer changes on the plant; it must surely gain."""
+        change, low, high, cure = twin.forecast(self.act())
+        found = replace(check, logged=change, error=(high - low) / 2, interval=(low, high))
+        if high < 0:
+            return found
+        said = f"on the plant it may change the cost by {100 * low:+.2g} to {100 * high:+.2g} %"
+        return replace(found, accepted=False, reason=f"{said}: to settle it, {cure}")
 
     def with_simulator(self, env: Source | VecEnv, max_steps: int | None) -> Improvement:
         """Learn a model of a simulator, plan in it, imitate, and let the simulator decide."""

@@ -13,8 +13,7 @@ from sb3_yann._validation import Array
 from sb3_yann.compare import AcceptanceRule, Scores, less_safe, no_worse, unsafe_columns
 from sb3_yann.control.mpc.bound_excess import BoundExcess, BoundNames, bound_excess
 from sb3_yann.improvement.model import Scenarios
-from sb3_yann.twin.dynamics import Dynamics, law_of
-from sb3_yann.twin.hidden_dynamics import HiddenDynamics
+from sb3_yann.twin.dynamics import law_of
 from sb3_yann.twin.plant_twin import PlantTwin
 from sb3_yann.twin.starts import RARE
 
@@ -25,17 +24,12 @@ MARGIN = 0.01
 AROUND, RAREST = 0.005, 10.0
 """What a start outside the log may cost more besides, as a fraction of the MPC's cost of it; how
 many times as much at most where it is rare."""
-OTHERWISE = 0.01
-"""What one start may cost more by the second opinion, in mean costs of the MPC."""
 FURTHER = 0.01
 """How much farther than the MPC a run may leave what the log shows, in its widths."""
 HARDEST = 40
 """Scenarios that are planned anew after a check, at most."""
 NEARLY = 0.5
 """A start that loses so much of what it may lose is a hard one."""
-
-SURE = 2.0
-"""Standard errors by which episodes that go on as those of the log must gain."""
 
 Inputs = Callable[[Array], Array]
 Outcome = tuple[Array, Array]
@@ -64,6 +58,9 @@ class Check:
         against the MPC's on average, relative to its own cost, and the standard error of that.
     final : bool
         Whether it decided in the end.
+    interval : tuple of float, optional
+        In a twin, where the change on the plant lies, with 90 %: see :meth:`PlantTwin.forecast`.
+        Then ``logged`` and ``error`` are its forecast and the half-width.
     """
 
     iteration: int
@@ -75,10 +72,7 @@ class Check:
     logged: float = 0.0
     error: float = 0.0
     final: bool = False
-
-    def gains(self, least: float) -> bool:
-        """Return whether it gains so much, and surely something on episodes like the log's."""
-        return self.change <= -least and self.logged + SURE * self.error < 0
+    interval: tuple[float, float] | None = None
 
 
 @dataclass
@@ -161,37 +155,6 @@ class Trial:
             )
         left = ~(self._beyond(thetas) <= self.far + FURTHER) & self.known
         return costs, unsafe_columns(left, 0, ~np.isfinite(costs), excess)
-
-    def second_objection(self, act: Inputs) -> str:
-        """Return what the twin's other models say against a policy; empty where nothing.
-
-        From the starts that begin as the log does it must gain in each, and none may cost much
-        more: in one without a form, and in one with a memory where the log shows hidden dynamics.
-        """
-        said = ""
-        if self.twin.heeds_second_opinion:
-            said = self._objection(self.twin.second_opinion, act, "a second model")
-        if said or self.twin.hidden_dynamics is None:
-            return said
-        return self._objection(self.twin.hidden_dynamics, act, "a model with hidden dynamics")
-
-    def _objection(self, opinion: Dynamics | HiddenDynamics, act: Inputs, name: str) -> str:
-        """Return what one model says against a policy."""
-        starts = self.starts[:1, : self.n_known]
-        given, stage_cost = self.given[:, : self.n_known], self.twin.problem.deviations.stage_cost
-        with np.errstate(all="ignore"):
-            runs = (opinion.roll_out(each, starts, self.steps, given) for each in (self._law, act))
-            mpc, costs = (
-                stage_cost(opinion.row.shown(rows[:-1]), u).sum(axis=0)[0]
-                + bound_excess(self.twin.problem, opinion.row.shown(rows), u).penalty[0]
-                for rows, u in runs
-            )
-            change, mean = costs - mpc, np.abs(mpc).mean()
-            if not change.mean() < 0:
-                return f"by {name} it costs {100 * change.mean() / mean:+.2g} %"
-            if not change.max() <= OTHERWISE * mean:
-                return f"by {name} a start costs {change.max():.4g} more"
-        return ""
 
     def _run(self, act: Inputs) -> tuple[Array, Array]:
         with np.errstate(all="ignore"):

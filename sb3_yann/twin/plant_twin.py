@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_yann._validation import check_bool, check_int
+from sb3_yann._validation import Array, check_bool, check_int
 from sb3_yann.control import DisturbanceObserver, LinearMPC
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
-from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.twin.env import TwinEnv
-from sb3_yann.twin.gaussian_process import GaussianProcess
-from sb3_yann.twin.hidden_dynamics import HiddenDynamics
+from sb3_yann.twin.forecast import Forecast, Judge, forecast
 from sb3_yann.twin.limits import Limits
 from sb3_yann.twin.log import Episode, as_episodes, pieces, without_copies
 from sb3_yann.twin.observers import observer_of, warn_of_estimates
@@ -27,17 +26,16 @@ from sb3_yann.twin.residuals import Residual
 from sb3_yann.twin.row_layout import RowLayout
 from sb3_yann.twin.sampling import cut_at_gaps
 from sb3_yann.twin.selection import (
-    AHEAD,
     FOLDS,
     MORE_THAN_A_POLYNOMIAL,
     NETWORK,
-    ROWS,
     Networks,
     candidates,
     choose,
-    errors_on,
     fitted,
+    judges,
     networks_may_help,
+    unseen,
 )
 from sb3_yann.twin.starts import Starts
 from sb3_yann.twin.trust import (
@@ -45,7 +43,6 @@ from sb3_yann.twin.trust import (
     UntrustedTwinError,
     costs_of_each,
     evidence,
-    held_out_costs,
     relative_error,
 )
 from sb3_yann.twin.vector_env import TwinVecEnv, TwinVectorEnv, copies
@@ -57,10 +54,6 @@ if TYPE_CHECKING:
 BLOCKS = 40
 """Pieces of a log of few episodes that its members are fitted to some of."""
 KINDS = ("none", "linear", "quadratic", "cubic", "network")
-HEEDED = 2.0
-"""A second opinion that errs by more times as much has no say."""
-SHORT = 0.1
-"""The least length of a second opinion, relative to the largest values in the log."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,6 +84,8 @@ class PlantTwin:
         The evidence.
     notes : tuple of str
         What of the log was left out.
+    judges : tuple of Judge
+        Twins that the log does not refute, each fitted without every fold of the episodes.
 
     Examples
     --------
@@ -112,6 +107,7 @@ class PlantTwin:
     dynamics: Dynamics
     trust: Trust
     notes: tuple[str, ...] = ()
+    judges: tuple[Judge, ...] = ()
 
     def __repr__(self) -> str:
         """Name the sizes, and whether to trust it."""
@@ -159,9 +155,9 @@ class PlantTwin:
             :class:`ObserveDisturbance`. Without ``disturbances`` states (T + 1, n) are what it
             measured, and it is run over them.
         residuals : sequence, default ("none", "linear", "quadratic", "cubic", "network")
-            What there is to choose from; "gaussian process" takes longer. Networks are tried where
-            nothing else predicts well. A function makes a regressor with ``fit(z, y)`` and
-            ``predict(z)``, as scikit-learn has it.
+            What there is to choose from. Networks are tried where nothing else predicts well. A
+            function makes a regressor with ``fit(z, y)`` and ``predict(z)``, as scikit-learn has
+            it.
         n_members : int, default 5
             The first is fitted to all episodes, the others to as many drawn from them.
         seed : int, default 0
@@ -206,26 +202,29 @@ class PlantTwin:
         blocks = log if len(log) >= FOLDS else pieces(log, BLOCKS)
         draws = np.random.default_rng(seed).integers(len(blocks), size=(n_members - 1, len(blocks)))
         drawn = [blocks, *([blocks[i] for i in each] for each in draws)]
-        known, networks = held_out_costs(problem, coordinates, parts, choices[chosen]), None
-        error, alone = relative_error(*known), not asked
-        if NETWORK in residuals and len(parts) > 1 and (alone or networks_may_help(error, parts)):
-            tried = Networks.fit(coordinates, parts, drawn, seed)
-            runs = tried.compared(problem, coordinates, parts, runs)
-            freedom = [each.freedom for each in choices] + [2 * MORE_THAN_A_POLYNOMIAL]
-            chosen = first + runs.from_number(first).choose(freedom[first:])
-            chosen = len(choices) if alone else chosen
-            networks = tried if chosen == len(choices) else None
-        if networks is None:
-            make = choices[chosen].make
-            found = [fitted(problem, coordinates, each, [make()])[0] for each in drawn]
-            members: tuple[Residual, ...] = tuple(found)
-        else:
-            members = networks.members
-            by_part = [networks.by_fold[i % FOLDS] for i in range(len(parts))]
-            known = costs_of_each(problem, coordinates, parts, by_part)
+        choice = choices[chosen]
+        members: tuple[Residual, ...] | None = None
+        own: Sequence[Residual] = unseen(coordinates, parts, choice)
+        known, alone = costs_of_each(problem, coordinates, parts, own), not asked
+        if NETWORK in residuals and len(parts) > 1:
+            if alone or networks_may_help(relative_error(*known), parts):
+                tried = Networks.fit(coordinates, parts, drawn, seed)
+                runs = tried.compared(problem, coordinates, parts, runs)
+                freedom = [each.freedom for each in choices] + [MORE_THAN_A_POLYNOMIAL]
+                chosen = first + runs.from_number(first).choose(freedom[first:])
+                chosen = len(choices) if alone else chosen
+            if chosen == len(choices):
+                own, members = tried.by_fold, tried.members
+                known = costs_of_each(problem, coordinates, parts, own)
+            else:
+                choice = choices[chosen]
+                own = unseen(coordinates, parts, choice)
+        if members is None:
+            members = tuple(fitted(problem, coordinates, e, [choice.make()])[0] for e in drawn)
         dynamics = Dynamics(problem, coordinates, members)
         trust = evidence(dynamics, parts, (runs, chosen, known), units_confirmed)
-        return cls(problem, log, runs.names[chosen], dynamics, trust, notes)
+        rivals = judges(coordinates, parts, runs.only(chosen), choice, own) if own else ()
+        return cls(problem, log, runs.names[chosen], dynamics, trust, notes, rivals)
 
     @classmethod
     def from_buffer(cls, model: Any, **options: Any) -> PlantTwin:
@@ -304,34 +303,17 @@ class PlantTwin:
         self.require_trust()
         return reidentified(self.problem, self.dynamics.coordinates, self.episodes)
 
-    @cached_property
-    def second_opinion(self) -> Dynamics:
-        """A model of the log of another form than the twin's members.
+    def forecast(self, act: Callable[[Array], Array]) -> Forecast:
+        """Return what a policy changes on the plant, with an interval over all unrefuted twins.
 
-        Where an input follows the state as in a closed loop without excitation, members of one form
-        may agree on what is wrong, and where the plant is not smooth. It is a Gaussian process,
-        which away from the data is zero, or a network where the twin is none and that predicts the
-        log's own free runs better.
+        Parameters
+        ----------
+        act : callable
+            From theta (rows, n_theta) to inputs (rows, m), in deviations.
         """
-        problem, coordinates = self.problem, self.dynamics.coordinates
-        process = GaussianProcess(problem.layout.has_constants, shortest=SHORT)
-        found = fitted(problem, coordinates, self.episodes, [process])
-        if self.kind != NETWORK and sum(map(len, self.episodes)) >= ROWS:
-            found += fit_ensemble(coordinates, [self.episodes], seed=0, ahead=AHEAD)
-        best = int(np.argmin(errors_on(coordinates, self.episodes, found)))
-        return Dynamics(problem, coordinates, (found[best],))
-
-    @cached_property
-    def heeds_second_opinion(self) -> bool:
-        """Whether that predicts the log's own free runs at most twice as badly as the twin."""
-        pair = [self.dynamics.members[0], self.second_opinion.members[0]]
-        ours, other = errors_on(self.dynamics.coordinates, self.episodes, pair)
-        return bool(other <= HEEDED * ours)
-
-    @cached_property
-    def hidden_dynamics(self) -> HiddenDynamics | None:
-        """The twin with a memory of earlier inputs and errors; None where the log shows none."""
-        return HiddenDynamics.of(self.dynamics, self.episodes)
+        share = np.where(self.trust.moves > 0, self.trust.excitation, np.inf)
+        loosest = labels_of(self.problem.model)[1][int(np.argmin(share))]
+        return forecast(self.judges, self.episodes, self.starts, act, loosest)
 
     @cached_property
     def starts(self) -> Starts:

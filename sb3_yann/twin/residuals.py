@@ -128,6 +128,8 @@ class Polynomial:
     inputs : tuple of int and float, default (0, 1)
         How many of the last variables are inputs, and how many times as strongly what holds one of
         them is shrunk: the log of a closed loop tells little about them.
+    towards : ndarray, shape (k, n), optional
+        The linear coefficients that it is shrunk towards.
     """
 
     def __init__(
@@ -136,9 +138,10 @@ class Polynomial:
         shrinkage: float,
         offset: bool = False,
         inputs: tuple[int, float] = (0, 1.0),
+        towards: Array | None = None,
     ) -> None:
         self.degree, self.shrinkage = check_int("degree", degree), shrinkage
-        self.offset, self.inputs = offset, inputs
+        self.offset, self.inputs, self.towards = offset, inputs, towards
 
     @classmethod
     def stack(cls, members: Sequence[Polynomial]) -> Polynomial:
@@ -175,7 +178,10 @@ class Polynomial:
         if self.offset:
             ridge = np.append(ridge, 1e-9 * count)  # a constant is not shrunk
         matrix = linalg.cho_factor(gram + np.diag(ridge + 1e-12 * count))
-        self.weights = np.asarray(linalg.cho_solve(matrix, cross))
+        about, k = np.zeros(cross.shape), self.monomials.k
+        if self.towards is not None:
+            about[:k] = self.towards
+        self.weights = about + np.asarray(linalg.cho_solve(matrix, cross - gram @ about))
 
     def _features(self, z: Array) -> Array:
         F = self.monomials.values(z)

@@ -13,25 +13,25 @@ from numpy.typing import ArrayLike
 
 from sb3_yann._validation import Array
 from sb3_yann.control import LinearMPC
+from sb3_yann.control.model.labels import labels_of
 from sb3_yann.twin.dynamics import Coordinates, Dynamics
 from sb3_yann.twin.ensemble import NetworkResidual, fit_ensemble
-from sb3_yann.twin.gaussian_process import GaussianProcess
+from sb3_yann.twin.forecast import Judge, surely_worse
 from sb3_yann.twin.log import Episode
 from sb3_yann.twin.residuals import Polynomial, Regressor, Residual, ZeroResidual
 
 SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3}
 INPUT_FACTORS = (1.0, 30.0)
-STIFFNESSES = (1.0, 10.0, 100.0)
-MORE_THAN_A_POLYNOMIAL = 20.0
-"""Freedom of a Gaussian process, and half that of networks: they are taken where they win."""
+MORE_THAN_A_POLYNOMIAL = 40.0
+"""Freedom of networks: they are taken where they win."""
 NETWORK = "network"
 AHEAD = 20
 """Steps of the windows that networks are fitted to."""
 ROWS, LACKS = 300, 0.01
 """Networks are tried on a log of so many steps, where the costs that all else predicts of held-out
 episodes err by so much of the mean."""
-NAMES = ("none", *DEGREES, "gaussian process", NETWORK)
+NAMES = ("none", *DEGREES, NETWORK)
 LONGEST = 100
 """Steps of a free run, at most."""
 RUNS = 20
@@ -50,11 +50,14 @@ class Candidate:
         Returns a residual that is not fitted.
     freedom : float
         How far it may leave the given model: of what predicts as well, the least free is taken.
+    degree : int, default 1
+        Of a polynomial.
     """
 
     name: str
     make: Callable[[], Any]
     freedom: float
+    degree: int = 1
 
 
 def candidates(problem: LinearMPC, kinds: Sequence[Any]) -> list[Candidate]:
@@ -73,12 +76,7 @@ def _of_a_kind(problem: LinearMPC, kind: Any) -> Iterator[Candidate]:
             name = f"{kind}, shrinkage {shrinkage:g} ({shrinkage * factor:g} of inputs)"
             options = DEGREES[kind], shrinkage, offset, (problem.model.n_inputs, factor)
             freedom = DEGREES[kind] - 2 * np.log10(shrinkage) - np.log10(factor)
-            yield Candidate(name, partial(Polynomial, *options), freedom)
-    elif kind == "gaussian process":
-        for stiffness in STIFFNESSES:
-            process = partial(GaussianProcess, offset, stiffness)
-            freedom = MORE_THAN_A_POLYNOMIAL - np.log10(stiffness)
-            yield Candidate(f"{kind}, stiffness {stiffness:g}", process, freedom)
+            yield Candidate(name, partial(Polynomial, *options), freedom, DEGREES[kind])
     elif callable(kind):
         name = getattr(kind, "__name__", type(kind).__name__)
         yield Candidate(name, partial(Regressor, kind), np.inf)
@@ -142,6 +140,11 @@ class FreeRuns:
     def errors(self) -> Array:
         """Root mean squares over all episodes, (candidates, h)."""
         return np.asarray(np.sqrt(np.nanmean(self.by_episode**2, axis=1)))
+
+    def only(self, number: int) -> FreeRuns:
+        """Return those of one candidate."""
+        one = slice(number, number + 1)
+        return FreeRuns(self.horizons, self.by_episode[one], self.names[one])
 
     def from_number(self, first: int) -> FreeRuns:
         """Return those of the candidates from a number on."""
@@ -281,18 +284,63 @@ def choose(
     return runs, first + runs.from_number(first).choose(freedom)
 
 
-def errors_on(
-    coordinates: Coordinates, episodes: Sequence[Episode], residuals: Sequence[Residual]
-) -> Array:
-    """Return the errors (residuals,) of free runs over episodes, the geometric mean over lengths.
+GAINS = (0.6, 1.7)
+"""Times the model's: an input may act so, unless the log refutes it."""
+LOOSE, FIRM = 1e-3, 1e3
+"""Shrinkage of what fits a log around such a gain, and times as much of its inputs."""
 
-    In units of how far the states move.
+
+def judges(
+    coordinates: Coordinates,
+    parts: Sequence[Episode],
+    runs: FreeRuns,
+    chosen: Candidate,
+    own: Sequence[Residual],
+) -> tuple[Judge, ...]:
+    """Return the twins that a log does not refute: the chosen one, and those with other gains.
+
+    In a closed loop a log may not tell the gain of an input, since the states follow it in many
+    ways: whatever predicts held-out episodes within two standard errors of the chosen twin counts.
+
+    Parameters
+    ----------
+    coordinates : Coordinates
+        What residuals are scaled by.
+    parts : sequence of Episode
+        Each is left out once.
+    runs : FreeRuns
+        Those of the chosen twin, alone.
+    chosen : Candidate
+        What the twin is.
+    own : sequence of Residual
+        The chosen twin without each fold: see :func:`unseen`.
     """
-    longest = min(LONGEST, int(np.median([*map(len, episodes)])))
-    horizons = np.unique(np.geomspace(min(5, longest), longest, 6).astype(int))
+    problem, n = coordinates.row.problem, coordinates.row.problem.model.n_states
+    names, m = labels_of(problem.model)[1], problem.model.n_inputs
+    offset, degree = problem.layout.has_constants, int(max(chosen.degree, 1))
+    rivals, says = [], []
+    for j, gain in product(range(m), GAINS):
+        towards = np.zeros((len(coordinates.scale), n))
+        scale = coordinates.scale[len(towards) - m + j]
+        towards[len(towards) - m + j] = (gain - 1) * scale * problem.model.B[:, j]
+        make = partial(Polynomial, degree, LOOSE, offset, (m, FIRM), towards)
+        rivals.append(Candidate(f"{names[j]} times {gain:g}", make, 0.0, degree))
+        says.append(f"a gain of {names[j]} {gain:g} times the model's, which the log allows,")
+    behind = held_out(problem, coordinates, parts, rivals).scores - runs.scores
+    found = [Judge(Dynamics(problem, coordinates, tuple(own)))]
+    for rival, what, wrong in zip(rivals, says, surely_worse(behind), strict=True):
+        members = tuple(unseen(coordinates, parts, rival))
+        found.append(Judge(Dynamics(problem, coordinates, members), what, bool(wrong)))
+    return tuple(found)
+
+
+def unseen(coordinates: Coordinates, parts: Sequence[Episode], choice: Candidate) -> list[Residual]:
+    """Return residuals of a choice, each fitted without one fold of the parts, if there are two."""
+    if len(parts) < 2:
+        return []
+    kept = [[e for i, e in enumerate(parts) if i % FOLDS != k] for k in range(_folds(parts))]
     problem = coordinates.row.problem
-    found = [_errors(problem, coordinates, each, residuals, horizons) for each in episodes]
-    return np.asarray(np.exp(np.log(np.nanmean(found, axis=0) + 1e-24).mean(axis=1) / 2))
+    return [fitted(problem, coordinates, each, [choice.make()])[0] for each in kept]
 
 
 def _errors(

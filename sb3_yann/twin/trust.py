@@ -18,7 +18,7 @@ from sb3_yann.twin.alignment import objections
 from sb3_yann.twin.dynamics import Coordinates, Dynamics, law_of
 from sb3_yann.twin.log import Episode, records
 from sb3_yann.twin.residuals import Residual
-from sb3_yann.twin.selection import Candidate, FreeRuns, fitted
+from sb3_yann.twin.selection import FreeRuns
 
 COST_ERROR = 0.25
 """The largest error of a predicted episode cost, relative to the mean cost, that is trusted."""
@@ -91,12 +91,6 @@ class Trust:
         """Root mean square error of the predicted costs, relative to the mean cost."""
         return relative_error(self.predicted, self.actual)
 
-    @property
-    def error_ratio(self) -> float:
-        """Held-out free-run error relative to that of the given model: the geometric mean."""
-        errors = self.runs.errors + 1e-300
-        return float(np.exp(np.nanmean(np.log(errors[self.chosen] / errors[0]))))
-
 
 def relative_error(predicted: Array, actual: Array) -> float:
     """Return the root mean square error relative to the mean; inf where there is nothing."""
@@ -112,45 +106,20 @@ def costs_of(problem: LinearMPC, episode: Episode) -> float:
     return float(np.sum(problem.deviations.stage_cost(thetas, episode.actions)))
 
 
-def held_out_costs(
-    problem: LinearMPC,
-    coordinates: Coordinates,
-    episodes: tuple[Episode, ...],
-    choice: Candidate,
-) -> tuple[Array, Array]:
-    """Return predicted and actual costs of episodes, each left out of the fit.
-
-    Parameters
-    ----------
-    problem : LinearMPC
-        Of the plant.
-    coordinates : Coordinates
-        What residuals are scaled by.
-    episodes : sequence of Episode
-        Each is left out once.
-    choice : Candidate
-        What is fitted to the others.
-    """
-    if len(episodes) < 2:
-        return np.empty(0), np.empty(0)
-    unaware = []
-    for i in range(len(episodes)):
-        others = episodes[:i] + episodes[i + 1 :]
-        unaware += fitted(problem, coordinates, others, [choice.make()])
-    return costs_of_each(problem, coordinates, episodes, unaware)
-
-
 def costs_of_each(
     problem: LinearMPC,
     coordinates: Coordinates,
     episodes: tuple[Episode, ...],
-    unaware: Sequence[Residual],
+    by_fold: Sequence[Residual],
 ) -> tuple[Array, Array]:
-    """Return predicted and actual costs of episodes, of each by a residual that has not seen it."""
+    """Return predicted and actual costs of episodes, each by the residual without its fold."""
+    if not by_fold:
+        return np.empty(0), np.empty(0)
     predicted = []
-    for residual, episode in zip(unaware, episodes, strict=True):
+    for i, episode in enumerate(episodes):
+        own = Dynamics(problem, coordinates, (by_fold[i % len(by_fold)],))
         with np.errstate(all="ignore"):
-            cost = Dynamics(problem, coordinates, (residual,)).replay_in_closed_loop(episode)
+            cost = own.replay_in_closed_loop(episode)
         predicted.append(float(np.nan_to_num(cost[0], nan=1e150, posinf=1e150)))
     return np.array(predicted), np.array([costs_of(problem, each) for each in episodes])
 

@@ -16,7 +16,7 @@ from sb3_yann.twin import trust as trusts
 from sb3_yann.twin.log import Episode, as_episodes, records
 from sb3_yann.twin.report import report
 from sb3_yann.twin.residuals import ZeroResidual
-from sb3_yann.twin.selection import Candidate, FreeRuns
+from sb3_yann.twin.selection import Candidate, FreeRuns, unseen
 from twin_samples import log, problem, random_episode, twin
 
 
@@ -47,12 +47,6 @@ def test_the_error_of_costs_is_relative_to_their_mean() -> None:
     assert trusts.relative_error(np.zeros(0), np.zeros(0)) == np.inf
 
 
-def test_the_ratio_of_errors_is_that_of_the_chosen_one_to_the_given_model() -> None:
-    found = runs([1.0, 2.0], [5.0, 5.0], [0.5, 0.25], [9.0, 9.0])
-    given = dataclasses.replace(twin().trust, runs=found, chosen=2)
-    assert given.error_ratio == pytest.approx(0.25)  # of 1/2 and 1/8
-
-
 def test_every_episode_is_left_out_of_the_fit_that_predicts_it() -> None:
     rows: list[int] = []
 
@@ -67,12 +61,13 @@ def test_every_episode_is_left_out_of_the_fit_that_predicts_it() -> None:
     episodes = as_episodes(problem(), [(x[: n + 1], u[:n]) for n in (10, 25, 40)])
     choice = Candidate("counts", Counts, 0.0)
     coordinates = twin().dynamics.coordinates
-    predicted, actual = trusts.held_out_costs(problem(), coordinates, episodes, choice)
+    own = unseen(coordinates, episodes, choice)
     assert rows == [65, 50, 35]
+    predicted, actual = trusts.costs_of_each(problem(), coordinates, episodes, own)
     assert predicted.tolist() == actual.tolist() == [0.0, 0.0, 0.0]
-    assert [
-        len(each) for each in trusts.held_out_costs(problem(), coordinates, episodes[:1], choice)
-    ] == [0, 0]
+    none = unseen(coordinates, episodes[:1], choice)
+    found = trusts.costs_of_each(problem(), coordinates, episodes[:1], none)
+    assert [len(each) for each in found] == [0, 0]
 
 
 def test_rows_count_as_beyond_the_box_where_they_are_beyond_rounding() -> None:

@@ -1,0 +1,287 @@
+"""What a policy changes on the plant: an interval over all twins that the log does not refute.
+
+Each twin replays the log's own episodes, twice: with the MPC and with the policy. At each step it
+adds what it had missed there: loads and noise are those of the log, and the policy alone differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from sb3_yann._validation import Array
+from sb3_yann.control.mpc.bound_excess import bound_excess
+from sb3_yann.twin.dynamics import Dynamics, law_of
+from sb3_yann.twin.log import Episode, records
+from sb3_yann.twin.starts import Starts
+
+SURE = 0.95  # probability that a change is not above an interval's end, or not below
+REFUTED = 2.0  # standard errors by which a judge predicts held-out episodes worse that is refuted
+ROUNDING = 1e-20  # of squared errors, in how far the states move
+EACH = 5  # episodes, at least, all of which speak against a judge
+LAGS = 2  # earlier samples that a memory knows
+LESS = 0.02  # share of the errors of one step that it must explain on held-out episodes
+RIDGE = 1e-3  # of its standardized regressors
+RUNS = 100  # from new starts, at least
+ROWS = 4  # steps of a log for each coefficient, at least
+
+Inputs = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A twin that a log may refute, fitted without each fold of the episodes.
+
+    Attributes
+    ----------
+    dynamics : Dynamics
+        Member k has not seen fold k: every episode whose number is k modulo the members.
+    says : str
+        What sets it apart.
+    refuted : bool
+        Whether it predicts held-out episodes surely worse than the twin. Dynamics that both lack
+        may feign that: with a memory it counts.
+    """
+
+    dynamics: Dynamics
+    says: str = ""
+    refuted: bool = False
+
+
+class Forecast(NamedTuple):
+    """What a policy changes, relative to the MPC's cost: -0.02 is 2 % less."""
+
+    change: float
+    low: float
+    high: float
+    cure: str
+    """What would make the interval narrower."""
+
+
+class _Replays:
+    """The episodes of a log side by side, with what comes of policies in a judge.
+
+    Parameters
+    ----------
+    judge : Judge
+    episodes : sequence of Episode
+        Shorter ones count until their end.
+    remembers : bool
+        Whether errors follow earlier inputs and errors.
+    """
+
+    def __init__(self, judge: Judge, episodes: Sequence[Episode], remembers: bool) -> None:
+        self.dynamics, self.members = judge.dynamics, len(judge.dynamics.members)
+        self.tells, self.units = False, judge.dynamics.coordinates.units
+        row, steps = self.dynamics.row, max(map(len, episodes))
+        at = [np.minimum(np.arange(steps + 1), len(each)) for each in episodes]
+        self.rows = np.stack([e.thetas[k] for e, k in zip(episodes, at, strict=True)], axis=1)
+        last = [np.minimum(k[:-1], len(e) - 1) for e, k in zip(episodes, at, strict=True)]
+        self.inputs = np.stack([e.actions[k] for e, k in zip(episodes, last, strict=True)], axis=1)
+        self.alive = np.arange(steps)[:, None] < [len(each) for each in episodes]
+        predicted = np.stack([self._step(r, u) for r, u in self._logged()])
+        errors = self.rows[1:, None, :, row.state] - predicted[..., row.state]
+        self.errors = np.where(self.alive[:, None, :, None], errors, 0.0)  # (T, members, N, n)
+        self.weights = self._memory() if remembers else None
+        if self.weights is not None:
+            self.errors = self.errors - self._remembered_of_log()
+        number = np.arange(len(episodes))
+        unseen = self.errors[:, number % self.members, number] / self.units  # (T, N, n)
+        sizes = np.log(np.sum(unseen**2, axis=-1) + ROUNDING)
+        self.left = np.sum(sizes * self.alive, axis=0) / self.alive.sum(axis=0)
+
+    def _logged(self) -> list[tuple[Array, Array]]:
+        return [
+            (np.repeat(r[None], self.members, axis=0), np.repeat(u[None], self.members, axis=0))
+            for r, u in zip(self.rows[:-1], self.inputs, strict=True)
+        ]
+
+    def _step(self, rows: Array, u: Array) -> Array:
+        with np.errstate(all="ignore"):
+            return self.dynamics.step(rows, u)
+
+    def costs(self, act: Inputs, starts: Array) -> Array:
+        """Return what episodes like each logged one cost with a policy on average, (members, N).
+
+        Those that go on as episode i does begin at ``starts[i]`` (some, size).
+        """
+        problem, row = self.dynamics.problem, self.dynamics.row
+        low, high = problem.deviations.u_min, problem.deviations.u_max
+        count, some, size = starts.shape
+        like = np.repeat(np.arange(count), some)
+        steps, shape = len(self.inputs), (self.members, len(like))
+        rows = np.empty((steps + 1, *shape, size))
+        inputs = np.empty((steps, *shape, self.inputs.shape[2]))
+        missed = np.zeros((steps, *shape, self.errors.shape[3]))
+        rows[0] = starts.reshape(-1, size)
+        alive = self.alive[:, like]
+        with np.errstate(all="ignore"):
+            for t in range(steps):
+                rows[t][..., row.given] = self.rows[t][like, row.given]
+                flat = row.shown(rows[t]).reshape(-1, problem.n_theta)
+                u = np.asarray(act(np.nan_to_num(flat)), np.float64).reshape(inputs[t].shape)
+                inputs[t] = np.clip(u, low, high)
+                missed[t] = self.errors[t][:, like]
+                if self.weights is not None:
+                    missed[t] += self._regressors(t, rows[t], inputs, missed) @ self.weights
+                rows[t + 1] = self._step(rows[t], inputs[t]) + missed[t] @ row.spread.T
+                row.clip(rows[t + 1])
+                rows[t + 1][:, ~alive[t]] = rows[t][:, ~alive[t]]
+            shown = row.shown(rows)
+            costs = problem.deviations.stage_cost(shown[:-1], inputs)
+            penalty = bound_excess(problem, shown, inputs).penalty
+            found = np.sum(costs * alive[:, None], axis=0) + penalty
+        found = np.where(np.isfinite(found), found, np.inf)
+        return np.asarray(found.reshape(self.members, count, some).mean(axis=2))
+
+    def _regressors(self, t: int, rows: Array, inputs: Array, missed: Array) -> Array:
+        past = [inputs[t - lag] if t >= lag else 0 * inputs[0] for lag in range(1, LAGS + 1)]
+        before = [missed[t - lag] if t >= lag else 0 * missed[0] for lag in range(1, LAGS + 1)]
+        one = np.ones((*rows.shape[:-1], 1))
+        x = rows[..., self.dynamics.row.state]
+        return np.concatenate([one, x, inputs[t], *past, *before], axis=-1)
+
+    def _basis(self) -> Array:
+        """Return the regressors (T, members, N, k) of the log."""
+        inputs = np.stack([u for _, u in self._logged()])
+        return np.stack(
+            [self._regressors(t, r, inputs, self.errors) for t, (r, _) in enumerate(self._logged())]
+        )
+
+    def _remembered_of_log(self) -> Array:
+        assert self.weights is not None
+        found = np.einsum("tmnk,mkj->tmnj", self._basis(), self.weights)
+        return np.where(self.alive[:, None, :, None], found, 0.0)
+
+    def _memory(self) -> Array | None:
+        """Return weights (members, k, n) of a memory; None where there are few rows.
+
+        An actuator that lags, backlash and a load that lasts show in these terms, an ARMAX model's
+        (Ljung, *System Identification*, section 4.2).
+        """
+        basis, count = self._basis(), self.rows.shape[1]
+        plain = 1 + self.errors.shape[3] + self.inputs.shape[2]
+        if self.alive.sum() < ROWS * basis.shape[-1] or count < 2:
+            return None
+        known = self.alive.copy()
+        known[:LAGS] = False
+        weights, left = [], np.zeros(2)
+        for k in range(self.members):
+            unseen = np.arange(count) % self.members == k
+            fit = known & ~unseen if np.any(known & ~unseen) else known
+            z, e = basis[:, k], self.errors[:, k]
+            weights.append(_ridge(z[fit], e[fit]))
+            short = _ridge(z[fit][:, :plain], e[fit])
+            rests = e - z @ weights[-1], e - z[..., :plain] @ short
+            test = known & unseen if np.any(known & unseen) else known
+            left += [np.sum((each[test] / self.units) ** 2) for each in rests]
+        self.tells = bool(left[0] < (1 - LESS) * left[1])
+        return np.array(weights)
+
+
+def _ridge(z: Array, y: Array) -> Array:
+    """Return weights (k, n) of standardized regressors z (N, k); the first one is constant."""
+    size = np.sqrt(np.mean(z**2, axis=0))
+    size = np.where(size > 0, size, 1.0)
+    z = z / size
+    gram = z.T @ z + RIDGE * len(z) * np.eye(z.shape[1])
+    return np.asarray(np.linalg.solve(gram, z.T @ y) / size[:, None])
+
+
+def forecast(
+    judges: Sequence[Judge],
+    episodes: tuple[Episode, ...],
+    starts: Starts,
+    act: Inputs,
+    loosest: str,
+) -> Forecast:
+    """Return what a policy changes on the plant: 90 % of true changes shall lie inside.
+
+    It is the union of the judges' intervals, of runs from the log's own starts, and of others from
+    the box of all starts, which no policy was fitted to. Of each, the standard error is that over
+    the episodes, with that of a fit without each fold of them (the jackknife). Where its errors
+    follow earlier inputs and errors, the judge is asked again with a memory of them.
+
+    Parameters
+    ----------
+    judges : sequence of Judge
+        The first one is the twin's own.
+    episodes : tuple of Episode
+        The log.
+    starts : Starts
+        Where episodes begin.
+    act : callable
+        The policy, from theta (rows, n_theta) to inputs (rows, m).
+    loosest : str
+        The input that follows the MPC most closely.
+    """
+    independent = sum(len(each[::2]) for each in records(episodes))
+    count, rng = len(episodes), np.random.default_rng(0)
+    some = -(-RUNS // count)
+    drawn = starts.draw(count * some, rng, np.repeat(np.arange(count), some))
+    begins = [np.stack([each.thetas[:1] for each in episodes]), drawn.reshape(count, some, -1)]
+    found: list[tuple[float, float, str]] = []
+    plain, own = (_Replays(judges[0], episodes, each) for each in (False, True))
+    for judge in judges:
+        law = law_of(judge.dynamics.problem)
+        for remembers in (False, True):
+            if (judge.refuted and not remembers) or (remembers and not own.tells):
+                continue
+            replays = _Replays(judge, episodes, remembers)
+            if surely_worse(replays.left - (own if remembers else plain).left):
+                continue
+            says = "hidden dynamics" if remembers else judge.says
+            for first in begins:
+                mpc, policy = (replays.costs(each, first) for each in (law, act))
+                found.append((*_changed(mpc, policy, independent), says))
+    middle = np.array([each[0] for each in found])
+    room = np.array([each[1] for each in found])
+    high, low = middle + room, middle - room
+    return Forecast(
+        float(middle[:2].mean()), float(low.min()), float(high.max()),
+        _cure(found, int(np.argmax(high)), independent, loosest),
+    )  # fmt: skip
+
+
+def surely_worse(behind: Array) -> NDArray[np.bool_]:
+    """Return whether scores (..., episodes) are behind others, by two standard errors on average.
+
+    Of five episodes or more it may as well be each of them: runs that blow up vary.
+    """
+    known = behind[..., np.isfinite(behind).reshape(-1, behind.shape[-1]).all(axis=0)]
+    error = known.std(axis=-1, ddof=1) / np.sqrt(known.shape[-1])
+    each = (known > 0).all(axis=-1) & (known.shape[-1] >= EACH)
+    return np.asarray((known.mean(axis=-1) > REFUTED * error) | each)
+
+
+def _changed(mpc: Array, policy: Array, independent: int) -> tuple[float, float]:
+    """Return a change relative to the MPC, and the half-width of its interval."""
+    with np.errstate(all="ignore"):
+        unit = np.abs(mpc).mean(axis=1, keepdims=True)
+        ratios = (policy - mpc).mean(axis=1) / unit[:, 0]  # (members,)
+    if not np.isfinite(ratios).all() or independent < 2:
+        return 0.0, np.inf
+    # Of a ratio of means only what is not in proportion varies (Cochran, *Sampling*, chapter 6).
+    apart = (policy - mpc - ratios[:, None] * np.abs(mpc)) / unit
+    of_episodes = np.sqrt(apart.mean(axis=0).var(ddof=1) / independent)
+    of_fits = np.sqrt((len(ratios) - 1) * ratios.var())
+    likely = [stats.t.ppf(SURE, max(k - 1, 1)) for k in (independent, len(ratios))]
+    return float(ratios.mean()), float(np.hypot(likely[0] * of_episodes, likely[1] * of_fits))
+
+
+def _cure(found: list[tuple[float, float, str]], worst: int, independent: int, loosest: str) -> str:
+    """Return what would settle a change whose interval contains zero."""
+    middle, room, says = found[worst]
+    if middle >= 0 or says == "hidden dynamics":
+        kind = " for longer than the actuator takes" if says == "hidden dynamics" else ""
+        which = f"; {says} says otherwise" if says else ""
+        return f"log held steps of {loosest}{kind}{which}"
+    if not np.isfinite(room):
+        return "log more episodes"
+    needed = independent * min((room / middle) ** 2, 100.0)
+    return f"log about {int(np.ceil(needed)) - independent + 1} episodes more"

@@ -1,0 +1,195 @@
+"""What a policy changes on the plant: intervals over all twins that a log does not refute."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG
+
+from sb3_yann import LinearModel, LinearMPC, PlantTwin, improve
+from sb3_yann.evaluation import evaluate
+from sb3_yann.twin.dynamics import law_of
+from sb3_yann.twin.forecast import _Replays, surely_worse
+from sb3_yann.twin.trust import costs_of
+from sb3_yann_envs import ProblemBox
+from twin_samples import POLYNOMIALS, Cart, problem
+from twin_samples import twin as cart_twin
+
+DT, FRICTION = 0.05, 2.4
+TESTS = range(900, 930)
+MPC = LinearMPC(
+    LinearModel([[0.92]], [[0.25]], 1.0), Q=[[1]], R=[[0.08]], horizon=3,
+    x_min=-2, x_max=2, u_min=-1, u_max=1,
+)  # fmt: skip
+
+
+class Lagging(gym.Env[Any, Any]):
+    """A part of the gain behind a first-order actuator, and sensor noise."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+
+    def __init__(self, lag: float, gain: float, noise: float = 0.006) -> None:
+        self.lag, self.gain, self.noise = lag, gain, noise
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.u, self.k = self.np_random.uniform(-1.3, 1.3, 1), np.zeros(1), 0
+        return self.x + self.noise * self.np_random.normal(size=1), {}
+
+    def step(self, action):
+        a, self.k = np.asarray(action, float), self.k + 1
+        cost = float(MPC.stage_cost(self.x, a))
+        self.u = self.lag * self.u + (1 - self.lag) * a
+        self.x = 0.92 * self.x + 0.25 * self.gain * self.u
+        return self.x + self.noise * self.np_random.normal(size=1), -cost, False, self.k >= 40, {}
+
+
+def twin(plant: Lagging, episodes: int = 6) -> PlantTwin:
+    log = evaluate(MPC.explicit(), lambda: copy.copy(plant), range(100, 100 + episodes))
+    return PlantTwin.fit(MPC, [*log.pairs], residuals=POLYNOMIALS)
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+def test_a_replay_with_the_mpc_costs_what_was_logged(remembers: bool) -> None:
+    found = twin(Lagging(0.4, 0.5))
+    first = np.stack([each.thetas[:1] for each in found.episodes])
+    costs = _Replays(found.judges[0], found.episodes, remembers).costs(law_of(MPC), first)
+    logged = [costs_of(MPC, each) for each in found.episodes]
+    np.testing.assert_allclose(costs, np.tile(logged, (5, 1)), rtol=1e-9)
+
+
+def test_the_mpc_itself_changes_nothing() -> None:
+    change, low, high, _ = cart_twin().forecast(law_of(problem()))
+    assert change == low == high == 0.0
+
+
+def test_the_truth_lies_within_the_interval() -> None:
+    plant, seeds = Lagging(0.0, 0.6), range(5000, 5040)
+    found, law = twin(plant, 12), law_of(MPC)
+    before = evaluate(MPC.explicit(), lambda: copy.copy(plant), seeds).costs
+    for gain in (0.8, 1.1, 1.4):
+
+        def act(x: np.ndarray, gain: float = gain) -> np.ndarray:
+            return np.clip(gain * law(x), -1, 1)
+
+        after = evaluate(lambda x, act=act: act(x[None])[0], lambda: copy.copy(plant), seeds).costs
+        _, low, high, _ = found.forecast(act)
+        assert low <= after.sum() / before.sum() - 1 <= high and high - low < 0.2
+
+
+def test_an_actuator_that_lags_shows_in_earlier_inputs() -> None:
+    found = twin(Lagging(0.5, 1.0, noise=0.0))
+    memory = _Replays(found.judges[0], found.episodes, remembers=True)
+    assert memory.tells
+    plain = _Replays(found.judges[0], found.episodes, remembers=False)
+    assert np.mean(memory.errors**2) < 0.5 * np.mean(plain.errors**2)
+
+
+def test_where_it_may_cost_more_it_is_said_what_would_settle_it() -> None:
+    found = twin(Lagging(0.5, 0.4))
+    law = law_of(MPC)
+    _, low, high, cure = found.forecast(lambda x: np.clip(1.05 * law(x), -1, 1))
+    assert low < 0 < high and ("held steps of u[0]" in cure or "episodes more" in cure)
+
+
+def test_what_is_two_standard_errors_behind_is_surely_worse() -> None:
+    behind = np.array([[0.1, 0.2, 0.3, 0.4], [-1.0, 1.0, 2.0, -1.5], [0.0, 0.0, 0.0, 0.0]])
+    assert surely_worse(behind).tolist() == [True, False, False]
+    assert surely_worse(np.array([[1.0, 1.1, np.nan]])).tolist() == [True]
+    assert surely_worse(np.array([[0.1, 0.1, 0.1, 0.1, 20.0]])).tolist() == [True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lag", "gain"), [(0.4, 0.4), (0.3, 0.5)])
+def test_a_twin_that_knows_no_lag_promises_nothing_that_the_plant_does_not_keep(
+    lag: float, gain: float
+) -> None:
+    plant = Lagging(lag, gain)
+    fitted = twin(plant)
+    if not fitted.trusted:
+        return
+    model = DDPG("YannPolicy", fitted.env(), policy_kwargs={"problem": MPC}, device="cpu", seed=1)
+    if improve(model, fitted, updates=1000, seed=1).accepted:
+        seeds = range(5000, 5100)
+        ours = evaluate(model, lambda: copy.copy(plant), seeds).costs
+        assert ours.mean() < evaluate(MPC.explicit(), lambda: copy.copy(plant), seeds).costs.mean()
+
+
+def motor() -> LinearMPC:
+    """A motor's angle and speed; the model knows no dry friction."""
+    model = LinearModel.from_continuous([[0, 1], [0, -1.5]], [[0], [2.0]], dt=DT)
+    return LinearMPC(
+        model, Q=np.diag([1, 0.02]), R=[[0.005]], horizon=5,
+        x_min=[-6, -18], x_max=[6, 18], u_min=-12, u_max=12,
+    )  # fmt: skip
+
+
+class Motor(gym.Env[Any, Any]):
+    """The motor with dry friction. Its MPC's input is on a bound but near the target."""
+
+    def __init__(self, mpc: LinearMPC) -> None:
+        low, high = np.float32(mpc.theta_min), np.float32(mpc.theta_max)
+        self.mpc, self.observation_space = mpc, ProblemBox(low, high, problem=mpc)
+        self.action_space = gym.spaces.Box(-12, 12, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.t = self.np_random.uniform([-3, -5], [3, 5]), 0
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        cost = float(self.mpc.stage_cost(self.x, np.asarray(action, float)))
+        place, speed = self.x
+        for _ in range(10):
+            drive = 2.0 * float(action[0]) - 1.5 * speed
+            if abs(speed) < 1e-3 and abs(drive) <= FRICTION:
+                speed = 0.0
+            else:
+                way = np.sign(speed if abs(speed) >= 1e-3 else drive)
+                after = speed + DT / 10 * (drive - FRICTION * way)
+                speed = 0.0 if speed * after < 0 else after
+            place += DT / 10 * speed
+        self.x, self.t = np.array([place, speed]), self.t + 1
+        return self.x.astype(np.float32), -cost, False, self.t >= 100, {}
+
+
+def episodes(mpc: LinearMPC, act: Any, seeds: range) -> tuple[list[Any], np.ndarray]:
+    """Return a log of the motor, and what each episode cost."""
+    env, law, found, costs = Motor(mpc), mpc.law(), [], []
+    for seed in seeds:
+        x, over, cost = env.reset(seed=seed)[0], False, 0.0
+        states, actions = [x], []
+        while not over:
+            actions.append(np.atleast_1d((act or law)(x)))
+            x, reward, _, over, _ = env.step(actions[-1])
+            states.append(x)
+            cost -= reward
+        found.append((np.array(states, float), np.array(actions, float)))
+        costs.append(cost)
+    return found, np.array(costs)
+
+
+@pytest.mark.slow
+def test_what_no_polynomial_knows_is_refused_with_polynomials_and_gained_with_networks() -> None:
+    mpc = motor()
+    logged, (_, before) = episodes(mpc, None, range(100, 110))[0], episodes(mpc, None, TESTS)
+    for kinds in (("none", "linear", "quadratic", "cubic"), ("none", "network")):
+        twin = PlantTwin.fit(mpc, logged, residuals=kinds)
+        assert twin.trusted
+        model = DDPG("YannPolicy", Motor(mpc), device="cpu", seed=0)
+        found = improve(model, twin)
+        assert found.accepted == ("network" in kinds)
+    costs = episodes(mpc, lambda x: model.predict(x)[0], TESTS)[1]
+    assert costs.mean() < 0.99 * before.mean() and np.all(costs < before)
+    assert costs.mean() / before.mean() - 1 == pytest.approx(found.change, abs=0.02)
+
+
+def test_what_gains_on_the_plant_passes() -> None:
+    twin = cart_twin(10)
+    model = DDPG("YannPolicy", Cart(), device="cpu", seed=0)
+    assert improve(model, twin, updates=500, n_starts=12).accepted
