@@ -82,6 +82,8 @@ def rests_beside(problem: LinearMPC, theta: Array, begins: NDArray[np.bool_]) ->
     begins : ndarray of bool, shape (steps,)
         Where one begins.
     """
+    if problem.price.counts:  # it means to rest elsewhere
+        return None
     C, unit = _outputs(problem), problem.theta_half
     references = problem.layout.now[: problem.layout.n_references]
     r = theta[:, references]

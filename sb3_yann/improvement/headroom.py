@@ -364,6 +364,7 @@ class Observing:
             found = [self.observers[i].update(y, self.u[i]) for i, y in pairs]
         x_hat, d_hat = (np.array(each) for each in zip(*found, strict=True))
         d = np.clip(d_hat, bounds.d_min, bounds.d_max)
-        parts = x_hat, theta[:, layout.reference], d, theta[:, layout.previous]
+        rest = theta[:, layout.limits], theta[:, layout.previous]
+        parts = x_hat, theta[:, layout.reference], d, *rest
         self.u[rows] = self.other.online()(np.concatenate(parts, axis=1))
         return self.u[rows]
