@@ -529,8 +529,7 @@ class Planning:
     Attributes
     ----------
     plans : dict of int to (int, Plans, ndarray)
-        The present one of each episode, the step at which it was made, and the reference and
-        disturbance of then.
+        The present one of each episode, the step at which it was made, and theta of then.
     """
 
     remembers = True
@@ -546,8 +545,10 @@ class Planning:
         known = np.isin(rows, [*self.plans])
         changed = np.zeros(len(rows), dtype=bool)
         for k in np.flatnonzero(known):
-            planned_at, _, constants = self.plans[rows[k]]
-            away = np.abs(theta[k, constant] - constants) / problem.theta_half[constant]
+            planned_at, _, foreseen = self.plans[rows[k]]
+            for _ in range(min(t - planned_at, max(problem.layout.previews))):
+                foreseen = foreseen[problem.layout.next]
+            away = np.abs(theta[k] - foreseen)[constant] / problem.theta_half[constant]
             moved = ~(away <= CHANGED)
             if t < planned_at + self.pause:  # an estimated disturbance may still settle
                 moved[problem.layout.reference.stop - problem.layout.reference.start :] = False
@@ -572,8 +573,7 @@ class Planning:
         found = planned(self.plant, self.task, policies, starts, left, rows)
         for k, row in enumerate(rows):
             self._kept[row] = self._promised(row, t)
-            constants = starts[k, problem.layout.constant].copy()
-            self.plans[row] = t, found.of(np.array([k])), constants
+            self.plans[row] = t, found.of(np.array([k])), starts[k].copy()
 
     def promised(self, count: int) -> Array:
         """Return what the plans of so many episodes said that these would cost."""
