@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,7 +12,9 @@ import pytest
 import torch
 
 from sb3_yann import LinearModel
+from sb3_yann.improvement import model
 from sb3_yann.twin import selection
+from sb3_yann.twin.ensemble import fit_ensemble
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -45,6 +48,7 @@ def run_code(name: str, code: str) -> dict[str, object]:
         short = f"improve({twin}, rounds=1, n_starts=5, updates=50)"
         shortened = shortened.replace(f"improve({twin})", short)
     shortened = shortened.replace("updates=500", "rounds=1, updates=50")
+    shortened = shortened.replace("batches=2", "batches=1")
     # A number that nothing here knows would train in full.
     steps = re.findall(r"\.learn\(\s*(?:total_timesteps\s*=\s*)?([^\s,)]*)", shortened)
     assert set(steps) <= {"500"}, f"{name}: learn is called with {steps}"
@@ -72,23 +76,24 @@ def write_log() -> None:
 
 
 @pytest.mark.slow
-def test_the_code_in_the_readme_runs(tmp_path, monkeypatch, no_networks) -> None:
+def test_the_code_in_the_readme_runs(tmp_path, monkeypatch, quick_fits) -> None:
     monkeypatch.chdir(tmp_path)
     train, simulate, from_log = blocks(README)
     names = run_code("README.md", train + simulate)
     assert (tmp_path / "guard.csv").exists() and (tmp_path / "cstr.zip").exists()
     state = np.zeros(2, np.float32)
-    model, mpc = names["model"], names["mpc"]
-    np.testing.assert_allclose(model.predict(state)[0], mpc.explicit()(state), atol=1e-5)
+    trained, mpc = names["model"], names["mpc"]
+    np.testing.assert_allclose(trained.predict(state)[0], mpc.explicit()(state), atol=1e-5)
     write_log()
     run_code("README.md", from_log)
     assert (tmp_path / "controller.c").exists()
 
 
 @pytest.fixture
-def no_networks(monkeypatch) -> None:
-    """Let a twin be of polynomials: a fit of networks takes seconds, and the tests of twins do."""
+def quick_fits(monkeypatch) -> None:
+    """Let twins be of polynomials, and fit the networks of a simulator's model for a while only."""
     monkeypatch.setattr(selection, "ROWS", 10**9)
+    monkeypatch.setattr(model, "fit_ensemble", partial(fit_ensemble, updates=300))
 
 
 @pytest.mark.slow
@@ -99,7 +104,7 @@ def test_the_code_in_a_page_that_trains_runs(name, tmp_path, monkeypatch) -> Non
 
 
 @pytest.mark.slow
-def test_the_code_in_the_page_on_improve_runs(tmp_path, monkeypatch, no_networks) -> None:
+def test_the_code_in_the_page_on_improve_runs(tmp_path, monkeypatch, quick_fits) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(gym.registry["CSTR-v0"], "max_episode_steps", 100)
     run("docs/improve.md")
@@ -119,9 +124,9 @@ def test_an_environment_of_gymnasium_takes_twelve_lines() -> None:
     code = blocks(page("docs/tutorial.md"))[-1]
     assert len(code.splitlines()) <= 14
     names = run_code("docs/tutorial.md", code)
-    model, mpc = names["model"], names["mpc"]
+    trained, mpc = names["model"], names["mpc"]
     theta = 0.02 * mpc.theta_max  # type: ignore[attr-defined]
-    action = model.policy.actor_target.mu(torch.as_tensor(theta)[None])  # type: ignore[attr-defined]
+    action = trained.policy.actor_target.mu(torch.as_tensor(theta)[None])  # type: ignore[attr-defined]
     wanted = mpc.law()(theta) / mpc.u_half  # type: ignore[attr-defined]
     np.testing.assert_allclose(action.detach().numpy()[0], wanted, atol=0.02)
 
@@ -131,8 +136,8 @@ def test_a_log_and_equations_of_ones_own_make_an_mpc_and_an_env() -> None:
     from_log, equations, _ = blocks(own)
     np.testing.assert_allclose(run_code("docs/tutorial.md", from_log)["plant"].A, 0.9, atol=0.01)
     names = run_code("docs/tutorial.md", equations)
-    model, mpc = names["model"], names["mpc"]
-    action = model.predict(np.array([20.0]))[0]  # type: ignore[attr-defined]
+    trained, mpc = names["model"], names["mpc"]
+    action = trained.predict(np.array([20.0]))[0]  # type: ignore[attr-defined]
     wanted = mpc.law().plant_input([20.0])  # type: ignore[attr-defined]
     np.testing.assert_allclose(action, wanted, atol=1e-4)
 
