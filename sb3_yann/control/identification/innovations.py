@@ -25,7 +25,7 @@ from sb3_yann.log import Episode
 
 LAGS = (1, 2, 4, 6, 9, 13, 19, 28)
 """Lags of the ARX models that are tried."""
-CHUNK = 400
+CHUNK = 2000
 """Longest stretch of samples whose first state is estimated on its own."""
 CHANCE = 0.01
 """Significance level of the effects of inputs."""
@@ -381,7 +381,7 @@ def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Arra
     x = np.empty((len(outputs), model.order))
     x[0] = start[0]
     P: Array | None = start[1]
-    spread, cross = K @ noise @ K.T, K @ noise
+    cross = K @ noise
     for k, step in enumerate(moved):
         left = outputs[k] - model.y_0 - C @ x[k]
         if P is None and whole[k]:
@@ -389,14 +389,17 @@ def filtered(model: Innovations, outputs: Array, moved: Array, start: tuple[Arra
             continue
         P = np.zeros_like(A) if P is None else P
         seen = there[k]
-        x[k + 1] = A @ x[k] + step
-        after: Array | None = A @ P @ A.T + spread
+        gain = np.zeros_like(K)
         if seen.any():
             S = (C @ P @ C.T + noise)[np.ix_(seen, seen)]
-            gain = np.linalg.solve(S, (A @ P @ C.T + cross)[:, seen].T).T
-            x[k + 1] += gain @ left[seen]
-            after = after - gain @ S @ gain.T
-            if whole[k] and np.max(np.abs(gain - K)) < 1e-9 * (1 + np.max(np.abs(K))):
-                after = None  # the innovations form is the filter's limit
-        P = after
+            unit = np.sqrt(np.diag(S))  # outputs of any unit
+            told = (A @ P @ C.T + cross)[:, seen] / unit
+            scaled = np.linalg.lstsq(S / np.outer(unit, unit), told.T, rcond=1e-13)[0]
+            gain[:, seen] = scaled.T / unit
+        x[k + 1] = A @ x[k] + step + gain[:, seen] @ left[seen]
+        # The error moves by A - gain C and (K - gain) e: a sum of squares stays one.
+        inner = A - gain @ C
+        P = inner @ P @ inner.T + (K - gain) @ noise @ (K - gain).T
+        if whole[k] and np.max(np.abs(gain - K)) < 1e-9 * (1 + np.max(np.abs(K))):
+            P = None  # the innovation form is the filter's limit
     return x

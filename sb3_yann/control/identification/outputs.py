@@ -21,11 +21,14 @@ from sb3_yann.control.identification.innovations import (
 )
 from sb3_yann.control.identification.least_squares import NOT_EXCITED
 from sb3_yann.control.identification.residuals import curvature_test, project_out
+from sb3_yann.control.lqr import spectral_radius
 from sb3_yann.log import Episode, split_episodes
 
 AHEAD = 20
 """Samples of the free runs over held-out data."""
 MAX_ORDER = 16
+BETTER = 0.85
+"""Mean square of free runs, relative to the criterion's choice, below which another is taken."""
 PATIENCE = 4  # orders without a better criterion after which none is tried any more
 SURE = 10.0
 """By so much, over all steps, dead time must lower the criterion."""
@@ -52,6 +55,8 @@ class Structure:
         Mean and covariance of the states.
     fits : tuple of ndarray, shapes (q,)
         One and `AHEAD` steps ahead over held-out data, in percent; NaN without such.
+    refined : bool
+        Whether prediction errors refined it.
     idle : tuple of int
         Inputs and disturbances without effect that can be told from 0.
     feedback : tuple of (int, float)
@@ -66,9 +71,16 @@ class Structure:
     criterion: float
     start: tuple[Array, Array]
     fits: tuple[Array, Array]
+    refined: bool = False
     idle: tuple[int, ...] = ()
     feedback: tuple[tuple[int, float], ...] = ()
     curvature: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def error(self) -> float:
+        """Mean square of the free runs, inf where there were none."""
+        size = float(np.mean(self.errors**2))
+        return size if np.isfinite(size) else np.inf
 
 
 def fit_structure(
@@ -88,16 +100,15 @@ def fit_structure(
     rough = [each.rough(order) for each in searches]
     best = 0
     if len(trials) > 1 and (rough[1].criterion < rough[0].criterion - SURE / sum(map(len, fitted))):
-        worse = np.mean(rough[1].errors ** 2) > np.mean(rough[0].errors ** 2) * WORSE
-        best = 0 if worse else 1
-    found = rough[best] if order is not None else searches[best].climb(rough[best])
-    whole = shifted(episodes, found.delays)
-    past, chunks = Past(whole), Chunks(whole)
-    model = refined(past.model(min(found.model.order, past.limit)), chunks)
+        best = 0 if rough[1].error > rough[0].error * WORSE else 1
+    found = searches[best].best(order)
+    whole = Search(shifted(episodes, found.delays), [], found.delays)
+    final = whole.trial(min(found.model.order, whole.past.limit), refine=found.refined)
+    past = whole.past
     return replace(
         found,
-        model=model,
-        start=chunks.spread(model),
+        model=final.model,
+        start=final.start,
         idle=tuple(past.idle()),
         feedback=tuple(_feedback(episodes)),
         curvature=curvature_test(past.arx, past.rows)[0],
@@ -144,42 +155,54 @@ class Search:
         self.past, self.chunks = Past(fitted), Chunks(fitted)
         self.fitted, self.tested, self.delays = fitted, tested, delays
         self.largest = min(MAX_ORDER, self.past.limit)
+        self.tried: list[Structure] = []
 
     def rough(self, order: int | None) -> Structure:
         """Return the best model by subspaces alone."""
-        if order is not None:
-            return self.judged(self.past.model(min(order, self.past.limit)))
-        found: list[tuple[float, Innovations]] = []
-        for n in range(1, self.largest + 1):
-            model = self.past.model(n)
-            found.append((self.criterion(model, self.chunks.spread(model)), model))
-            if n - int(np.argmin([each for each, _ in found])) > PATIENCE:
+        for n in range(1, self.largest + 1) if order is None else [min(order, self.past.limit)]:
+            self.tried.append(self.judged(self.past.model(n)))
+            best = int(np.argmin([each.criterion for each in self.tried]))
+            if len(self.tried) - best > PATIENCE:
                 break
-        return self.judged(min(found, key=lambda each: each[0])[1])
+        return self.tried[best]
 
-    def climb(self, start: Structure) -> Structure:
-        """Return the best refined model of an order near that of a rough one."""
-        order = start.model.order
-        tried = {order: self.trial(order)}
-        for step in (-1, 1):
-            n = order + step
+    def best(self, order: int | None) -> Structure:
+        """Return the best model near the rough one, or one that runs freely far better."""
+        start = min(self.tried, key=lambda each: each.criterion).model.order
+        found = {start: self.trial(start)}
+        for step in (-1, 1) if order is None else ():
+            n = start + step
             while 1 <= n <= self.largest:
-                tried[n] = self.trial(n)
-                if tried[n].criterion > tried[n - step].criterion:
+                found[n] = self.trial(n)
+                if found[n].criterion > found[n - step].criterion:
                     break
                 n += step
-        return min(tried.values(), key=lambda each: each.criterion)
+        best = min(found.values(), key=lambda each: each.criterion)
+        free = min([*self.tried, *found.values()], key=lambda each: each.error)
+        return free if free.error < BETTER * best.error else best
 
-    def trial(self, order: int) -> Structure:
-        """Return the refined model of an order."""
-        return self.judged(refined(self.past.model(order), self.chunks))
+    def trial(self, order: int, *, refine: bool = True) -> Structure:
+        """Return the model of an order, refined where that lowers the criterion."""
+        rough = self.judged(self.past.model(order))
+        if not refine or not np.isfinite(rough.criterion):
+            return rough
+        found = replace(self.judged(refined(rough.model, self.chunks)), refined=True)
+        return found if found.criterion < rough.criterion else rough
 
     def judged(self, model: Innovations) -> Structure:
         """Return a model with its criterion and its free runs over held-out data."""
+        q = len(model.C)
+        if spectral_radius(model.inner) >= 1:
+            none = np.full(q, np.inf)
+            nowhere = np.zeros(model.order), np.eye(model.order)
+            return Structure(model, self.delays, none, np.inf, nowhere, (none, none))
         start = self.chunks.spread(model)
-        errors, long = free_run_errors(model, self.tested, start)
-        fits = free_run_errors(model, self.tested, start, 1)[1], long
-        return Structure(model, self.delays, errors, self.criterion(model, start), start, fits)
+        with np.errstate(all="ignore"):
+            errors, long = free_run_errors(model, self.tested, start)
+            fits = free_run_errors(model, self.tested, start, 1)[1], long
+            criterion = self.criterion(model, start)
+        size = criterion if np.isfinite(criterion) else np.inf
+        return Structure(model, self.delays, errors, size, start, fits)
 
     def criterion(self, model: Innovations, start: tuple[Array, Array]) -> float:
         """Return Hannan and Quinn's criterion (J. R. Stat. Soc. B 41, 1979), of whole records.
