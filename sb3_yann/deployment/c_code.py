@@ -111,6 +111,7 @@ def _definitions(data: Arrays, precision: str) -> str:
             "REACH": f"((real){literal(data['reach'], precision)})",
             "FADES_FROM": literal(fade_start, precision),
             "FADES_TO": literal(fade_end, precision),
+            "N_KEPT": len(data["kept"]),
         }
     index = f"int{8 * code.index_bytes(indices)}_t"
     lines = [f"#define {key} {value}" for key, value in flags.items()]

@@ -90,6 +90,8 @@ def controller_tables(data: Arrays, precision: str) -> tuple[Tables, Tables]:
         numbers |= {f"layer{i}": data[f"layer{i}"] for i in range(last)}
         numbers |= {"last_layer": data[f"layer{last}"], "per_theta": data["per_theta"]}
         numbers["confine_middle"], numbers["confine_per_half"] = data["confines"]
+        if len(data["kept"]):
+            numbers["kept"] = data["kept"]
         indices |= {"network_of": data["network_of"], "pinned": data["pinned"].astype(np.int64)}
     return numbers, indices
 
@@ -151,6 +153,7 @@ class Cost:
         if "qp_gram" in data:
             rows, most = len(data["qp_d0"]), int(data["qp_most"])
             program = rows * n + steps_of(data) * most * (rows + 2 * most)
+        products += 2 * data["kept"].size
         return cls(
             numbers=sum(each.size for each in [*numbers.values(), *search_numbers.values()]),
             indices=sum(each.size for each in [*indices.values(), *search_indices.values()]),
@@ -161,7 +164,7 @@ class Cost:
             + m * (n + 2)
             + (products + 2 * n) * bool(widths),
             activations=2 * hidden,
-            locals=2 * n + 7 * m + hidden + 8,
+            locals=2 * n + 8 * m + hidden + 8,
         )
 
     def __str__(self) -> str:

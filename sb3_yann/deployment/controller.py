@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-FORMAT = 1  # of the arrays; a reader takes its own only
+FORMATS = (1, 2)  # of the arrays; a reader takes its own only: the second has rows to keep
 POLICY, MPC, MANUAL = MODES = ("policy", "mpc", "manual")
 MAX_SLACKS = 4_000_000  # entries of slacks in memory at a time
 FAR = 1e12  # theta is clipped to so many times its box: beyond, slacks would overflow
@@ -71,6 +71,7 @@ def _check_arrays(data: Mapping[str, Any]) -> None:
         ((q,), "b"),
         ((p,), "starts network_of"),
         ((2, n), "confines box"),
+        ((len(data["kept"]), n + m + 2), "kept"),
         ((2,), "tolerances fades"),
         ((n, n_obs), "obs_matrix"),
         ((n,), "obs_offset per_theta"),
@@ -178,10 +179,12 @@ class Controller:
             )
         self.data = {name: np.asarray(each) for name, each in data.items()}
         try:
+            (_, m, n) = self.data["gains"].shape
+            self.data.setdefault("kept", np.empty((0, n + m + 2)))  # as there was none
             version = int(self.data["format"])
-            if version != FORMAT:
+            if version not in FORMATS:
                 raise ValueError(
-                    f"The controller has format {version}, this reader takes {FORMAT}. Export the "
+                    f"The controller has format {version}, this reader takes {FORMATS}. Export the "
                     "model again, or take the reader of the version that wrote it."
                 )
             _check_arrays(self.data)
@@ -390,8 +393,32 @@ class Controller:
             sound = np.isfinite(added).all(1) | (part[:, 0] == 0)
             added = np.where(sound[:, None], added, 0.0)
             added = np.clip(added, -data["reach"], data["reach"])
-            action = np.clip(law + np.where(part > 0, added * part, 0.0), low, high)
+            total = law + np.where(part > 0, added * part, 0.0)
+            action = np.clip(total, low, high)
+            adds = (total != law).any(1)
+            if len(data["kept"]) and adds.any():
+                ends = law[adds], action[adds], low[adds], high[adds]
+                action[adds] = self._kept(theta[adds], *ends)
         return action, low, high, inside, sound
+
+    def _kept(self, theta: Array, law: Array, action: Array, low: Array, high: Array) -> Array:
+        """Return actions that break no row further than the law: by the row that they break most.
+
+        Those on it already stay to the bit.
+        """
+        kept, n = self.data["kept"], theta.shape[1]
+        a, b, c, margin = kept[:, :n], kept[:, n:-2], kept[:, -2], kept[:, -1]
+        slack = c - theta @ a.T - law @ b.T
+        room = np.maximum(slack - margin, 0)
+        beyond = (action - law) @ b.T - np.minimum(slack, room)
+        worst, most = beyond.argmax(1), beyond.max(1)[:, None]
+        reach = self.data["reach"]
+        moved = np.clip(action - most * b[worst], law - reach, law + reach)
+        moved = np.clip(moved, low, high)
+        push = (moved - law) @ b.T
+        share = np.where(push > room, room / np.where(push > room, push, 1.0), 1.0).min(1)
+        moved = np.clip(law + share[:, None] * (moved - law), low, high)
+        return np.where(most > 0, moved, action)
 
     def _locate(self, theta: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the first region that theta violates least, and whether it holds theta."""

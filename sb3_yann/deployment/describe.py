@@ -13,7 +13,7 @@ from sb3_yann.control import LinearMPC, OnlineLaw, PiecewiseAffine
 from sb3_yann.control.model.labels import labels_of, missing_observer
 from sb3_yann.deployment.checks import Checks
 from sb3_yann.deployment.code import scale_within
-from sb3_yann.deployment.controller import FORMAT
+from sb3_yann.deployment.controller import FORMATS
 from sb3_yann.networks import YannLayer
 from sb3_yann.networks.yann import FADE_END, FADE_START, LawLayer
 from sb3_yann.policy.checkpoint import ActorCheckpoint
@@ -99,7 +99,7 @@ def describe(
         "change": change,
         **checks.arrays(matrix.shape[1]),
         "watched": watched,
-        "format": np.int64(FORMAT),
+        "format": np.int64(FORMATS[len(networks["kept"]) > 0]),
         "name": name,
         "dt": np.float64(0.0 if law.model is None else law.model.dt),
         "obs_matrix": matrix,
@@ -259,6 +259,7 @@ def _no_networks(law: PiecewiseAffine) -> dict[str, Any]:
         "activation": "tanh",
         "reach": np.inf,
         "confines": np.zeros((2, n)),
+        "kept": np.empty((0, n + law.n_inputs + 2)),
         "fades": np.array([FADE_START, FADE_END]),
     }
 
@@ -291,6 +292,7 @@ def _network_arrays(layer: LawLayer, law: PiecewiseAffine) -> dict[str, Any]:
         "activation": _activation(network.activation),
         "reach": np.inf if layer.reach is None else layer.reach,
         "confines": layer.confines.cpu().numpy(),
+        **({"kept": layer.constants[2]} if len(kept) else {}),
     }
 
 

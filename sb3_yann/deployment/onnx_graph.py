@@ -148,7 +148,12 @@ def _policy(graph: _Graph, data: Arrays, precision: str) -> tuple[str, str]:
     if int(data["n_layers"]):
         added = _correction(graph, data, theta, region)
         added = op("Where", graph.any(lost), zero, added)
-        law = graph.between(op("Add", law, added), low, high)
+        total = op("Add", law, added)
+        action = graph.between(total, low, high)
+        if len(data["kept"]):
+            adds = graph.any(op("Not", op("Equal", total, law)))
+            action = op("Where", adds, _kept(graph, data, theta, law, action, low, high), action)
+        law = action
     action = op("Mul", law, constant(action_scale(data, precision)[None]))
     action = op("Add", action, constant(data["action_shift"][None]))
     return action, op("Squeeze", op("Not", inside), constant(np.array([1])))
@@ -217,6 +222,36 @@ def _correction(graph: _Graph, data: Arrays, theta: str, region: str) -> str:
     beyond = op("ReduceMax", beyond, axes=[1], keepdims=1)
     part = op("Div", op("Sub", constant(none), beyond), constant(none - full))
     return op("Mul", x, graph.between(part, constant(0.0), constant(1.0)))
+
+
+def _kept(
+    graph: _Graph, data: Arrays, theta: str, law: str, action: str, low: str, high: str
+) -> str:
+    """Return actions that break no row further than the law, as `Controller` does."""
+    op, constant, n = graph.op, graph.constant, data["A"].shape[1]
+    kept = data["kept"]
+    rows = kept[:, n:-2]
+    b, zero = constant(rows.T), constant(0.0)
+    slack = op("Sub", constant(kept[None, :, -2]), op("MatMul", theta, constant(kept[:, :n].T)))
+    slack = op("Sub", slack, op("MatMul", law, b))
+    room = op("Max", op("Sub", slack, constant(kept[None, :, -1])), zero)
+    push = op("MatMul", op("Sub", action, law), b)
+    beyond = op("Sub", push, op("Min", slack, room))
+    most = op("ReduceMax", beyond, axes=[1], keepdims=1)
+    along = op("Gather", constant(rows), op("ArgMax", beyond, axis=1, keepdims=0))
+    moved = op("Sub", action, op("Mul", most, along))
+    if np.isfinite(data["reach"]):
+        reach = constant(data["reach"])
+        moved = graph.between(moved, op("Sub", law, reach), op("Add", law, reach))
+    moved = graph.between(moved, low, high)
+    way = op("Sub", moved, law)
+    push = op("MatMul", way, b)
+    breaks = op("Greater", push, room)
+    one = constant(1.0)
+    share = op("Where", breaks, op("Div", room, op("Where", breaks, push, one)), one)
+    share = op("ReduceMin", share, axes=[1], keepdims=1)
+    moved = graph.between(op("Add", law, op("Mul", share, way)), low, high)
+    return op("Where", op("Greater", most, zero), moved, action)
 
 
 def _activate(graph: _Graph, x: str, data: Arrays) -> str:

@@ -108,6 +108,7 @@ def _parts(data: Arrays, precision: str) -> tuple[str, list[str], list[str], str
         str(data["activation"]): networks,
         "networks": networks,
         "second": n_layers > 2,
+        "kept": networks and len(data["kept"]) > 0,
         "rate": len(data["change"]) > 0,
         "zero input": bool(data["zero_input"]),
     }
@@ -115,6 +116,7 @@ def _parts(data: Arrays, precision: str) -> tuple[str, list[str], list[str], str
     for i in range(n_layers - 1):
         hidden[i] = data[f"layer{i}"].shape[1]
     sizes = {"OBS": data["obs_matrix"].shape[1], "M": m, "N": n, "P": p}
+    sizes |= {"KEPT": len(data["kept"]), "WIDE": n + m + 2}
     sizes |= {"H1": hidden[0], "H2": hidden[1], "HL": hidden[max(n_layers - 2, 0)]}
     kind = "LREAL" if precision == "double" else "REAL"
     entries = {"REAL_TYPE": kind, "HIDDEN": "h2" if flags["second"] else "h1"}

@@ -18,6 +18,7 @@ from torch import nn
 from sb3_yann._validation import Array, half_widths
 from sb3_yann.control.law import PiecewiseAffine
 from sb3_yann.control.mpc.choice import Law
+from sb3_yann.control.mpc.kept_set import KeptSet
 from sb3_yann.networks.zero_output import Activation, ZeroOutputNetwork, register_constants
 
 Rate = tuple[Array, Array]
@@ -25,6 +26,8 @@ FADE_START = 1.0
 """Within how many half-widths of a box a correction counts in full."""
 FADE_END = 1.25
 """Beyond how many half-widths of a box a correction does not count."""
+ROUNDING = 1e-6
+"""Half-widths from a row that float32 actions keep, and what an input must move one by."""
 
 
 class LawLayer(nn.Module):
@@ -37,6 +40,9 @@ class LawLayer(nn.Module):
     rate : pair of ndarray, shape (m,), optional
         ``du_min`` and ``du_max``: the input never moves by more from the previous one, the last m
         entries of theta.
+    kept : KeptSet, optional
+        What networks add never makes the model's next theta leave it, nor go further beyond one of
+        its half-spaces than the law does.
     """
 
     theta_half: th.Tensor
@@ -44,11 +50,12 @@ class LawLayer(nn.Module):
     half_range: th.Tensor
     change: th.Tensor
     confines: th.Tensor
+    margin: th.Tensor
     network: ZeroOutputNetwork
     reach: float | None
-    constants: tuple[Array, Array, float]  # for compiled code
+    constants: tuple[Array, Array, Array, float]  # for compiled code
 
-    def __init__(self, law: Law, rate: Rate | None) -> None:
+    def __init__(self, law: Law, rate: Rate | None, kept: KeptSet | None) -> None:
         super().__init__()
         # Now, not in the midst of learn: Ctrl-C while numba begins would break it for good.
         import_module("sb3_yann.networks._kernels.yann_layer")
@@ -81,7 +88,12 @@ class LawLayer(nn.Module):
         no_box = np.zeros(2 * law.n_theta)
         fades = np.array([FADE_START, FADE_END])
         scaling = np.concatenate([1 / half, middle, 1 / half_range, no_box, fades])
-        self.constants = (scaling, change, np.inf)
+        none: Array = np.empty((0, law.n_theta + law.n_inputs + 2))
+        self.rows = none if kept is None else _kept_in_actions(kept, middle, half_range)
+        # Below zero the rows are left out.
+        self.register_buffer("margin", th.tensor(0.0 if kept else -1.0, dtype=th.float64))
+        self.constants = (scaling, change, self.rows, np.inf)
+        self._keep_constants()
 
     @property
     def n_networks(self) -> int:
@@ -122,7 +134,14 @@ class LawLayer(nn.Module):
         # As compiled: where theta is not finite nothing is passed off as an input.
         output = output.masked_fill(~theta.isfinite().all(1, keepdim=True), th.nan)
         bounds = self.reachable(theta) if self.rated else (-1.0, 1.0)
-        return clamp_with_inward_gradient(output, *bounds)
+        adds = (output != law).any(1, keepdim=True)
+        output = clamp_with_inward_gradient(output, *bounds)
+        if len(self.constants[2]) == 0:
+            return output
+        rows = th.as_tensor(self.constants[2], device=theta.device)
+        given = law.detach(), theta.detach(), adds, rows, bounds, self.constants[3]
+        kept: th.Tensor = _Kept.apply(output, *given)  # type: ignore[no-untyped-call]
+        return kept
 
     @th.no_grad()
     def reachable(self, theta: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -145,20 +164,6 @@ class LawLayer(nn.Module):
         if isinstance(law, PiecewiseAffine) and law.infeasible == "zero_input":
             slopes[~law.in_domain(theta)] = 0.0  # as the gain of an online law is
         return slopes
-
-    @property
-    def packed(self) -> tuple[Any, ...] | None:
-        """Law, ranges and networks for compiled code, None where there is none for them.
-
-        They are as `yann_layer.forward` takes them. Weights share their memory.
-        """
-        law = self.explicit_law
-        if law is None or not self.network.compiles:
-            return None
-        from sb3_yann.networks._kernels.stack import to_numpy  # which loads numba
-
-        weights = map(to_numpy, self.network.weights())
-        return (*law.packed, *self.constants, *weights, self.network.pinned_array)
 
     def frozen(self) -> Callable[[Array], NDArray[Any]]:
         """Return the layer of now, on the CPU, as a function of theta (batch, n): (batch, m).
@@ -184,7 +189,15 @@ class LawLayer(nn.Module):
         # for what the rate's own room may take from the law.
         left = 2e-6 if self.rated else 1e-6
         self.reach = None if max_correction is None else max(0.0, 2 * max_correction - left)
-        self.constants = (*self.constants[:2], np.inf if self.reach is None else self.reach)
+        self.constants = (*self.constants[:3], np.inf if self.reach is None else self.reach)
+
+    def keep(self, margin: float | None) -> None:
+        """Let inputs keep so far from the rows that they keep, in half-widths; None is off.
+
+        A prediction may be off by the margin in each state, and the row is kept all the same.
+        """
+        self.margin.fill_(-1.0 if margin is None else margin)
+        self._keep_constants()
 
     def confine(self, low: Array | None, high: Array | None) -> None:
         """Let the network's output count in a box of theta only, or everywhere for None.
@@ -196,23 +209,42 @@ class LawLayer(nn.Module):
             least = 0.01 * self.theta_half.double().cpu().numpy()  # of the problem's half-widths
             box = np.stack([(high + low) / 2, 1 / np.maximum((high - low) / 2, least)])
         self.confines.copy_(th.as_tensor(box))
-        self._keep_confines()
+        self._keep_constants()
 
     def confined(self, theta: th.Tensor) -> th.Tensor:
         """Return the part (batch, 1), from 1 to 0, of the network's output that counts."""
         beyond = ((theta - self.confines[0]).abs() * self.confines[1]).amax(1, keepdim=True)
         return ((FADE_END - beyond) / (FADE_END - FADE_START)).clamp(0, 1).to(self.theta_half)
 
-    def _keep_confines(self) -> None:
+    def _keep_constants(self) -> None:
         confines = self.confines.cpu().numpy().ravel()
-        scaling = self.constants[0][: -len(confines) - 2]
+        scaling, change, _, limit = self.constants
         # As data: a constant of another file stays what it was in code that has been compiled.
-        scaling = np.concatenate([scaling, confines, [FADE_START, FADE_END]])
-        self.constants = (scaling, *self.constants[1:])
+        scaling = np.concatenate([scaling[: -len(confines) - 2], confines, [FADE_START, FADE_END]])
+        margin = float(self.margin)
+        kept = self.rows.copy() if margin >= 0 else self.rows[:0]
+        kept[:, -1] *= margin + ROUNDING
+        self.constants = (scaling, change, kept, limit)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
+        # Weights of before there were such rows act as they did.
+        state_dict.setdefault(f"{prefix}margin", th.tensor(-1.0, dtype=th.float64))
         super()._load_from_state_dict(state_dict, prefix, *rest)
-        self._keep_confines()
+        self._keep_constants()
+
+
+def _kept_in_actions(kept: KeptSet, middle: Array, half_range: Array) -> Array:
+    """Return rows [a, b, c, half-width] for actions in [-1, 1], b of length 1.
+
+    A row that no input moves is none.
+    """
+    m = len(middle)
+    a, b, c = np.split(kept.ahead, [-m - 1, -1], axis=1)
+    c = c - (b @ middle)[:, None]
+    b = b * half_range
+    length = np.linalg.norm(b, axis=1, keepdims=True)
+    moved = length[:, 0] > ROUNDING
+    return np.ascontiguousarray(np.hstack([a, b, c, np.ones_like(c)])[moved] / length[moved])
 
 
 class YannLayer(LawLayer):
@@ -236,6 +268,9 @@ class YannLayer(LawLayer):
     rate : pair of ndarray, shape (m,), optional
         ``du_min`` and ``du_max``: the input, the law's too, never moves by more from the previous
         one, the last m entries of theta.
+    kept : KeptSet, optional
+        What networks add never makes the model's next theta leave it, nor go further beyond one of
+        its half-spaces than the law does.
 
     Examples
     --------
@@ -262,8 +297,9 @@ class YannLayer(LawLayer):
         max_correction: float | None = None,
         pinned: bool = True,
         rate: Rate | None = None,
+        kept: KeptSet | None = None,
     ) -> None:
-        super().__init__(law, rate)
+        super().__init__(law, rate, kept)
         # Float64: in float32 points near a facet fall into the wrong region, and the large terms
         # of a stiff law do not cancel to the 1e-5 of the input range that is promised.
         register_constants(self, **_law_in_actions(law))
@@ -367,7 +403,7 @@ class SharedYannLayer(LawLayer):
         With finite input bounds, which map to -1 and 1.
     hidden : tuple of int, default (64, 64)
         Widths of the network.
-    activation, max_correction, pinned, rate
+    activation, max_correction, pinned, rate, kept
         As in :class:`YannLayer`.
 
     Examples
@@ -390,8 +426,9 @@ class SharedYannLayer(LawLayer):
         max_correction: float | None = None,
         pinned: bool = True,
         rate: Rate | None = None,
+        kept: KeptSet | None = None,
     ) -> None:
-        super().__init__(law, rate)
+        super().__init__(law, rate, kept)
         law(np.zeros(law.n_theta))  # compiled now, not in the midst of learn
         theta = sample_points(law)
         register_constants(self, samples=np.hstack([theta, self._actions(theta)]))
@@ -502,6 +539,47 @@ class _InwardGradientClamp(th.autograd.Function):
         # Descent moves x against its gradient.
         outward = ((x >= ctx.high) & (gradient < 0)) | ((x <= ctx.low) & (gradient > 0))
         return gradient.masked_fill(outward, 0.0), None, None
+
+
+class _Kept(th.autograd.Function):
+    """Move actions to where the rows allow, see `forward` of the kernels; backward, as inward."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        actions: th.Tensor,
+        law: th.Tensor,
+        theta: th.Tensor,
+        adds: th.Tensor,
+        rows: th.Tensor,
+        bounds: Any,
+        limit: float,
+    ) -> th.Tensor:
+        a, b, c, margin = th.split(rows, [theta.shape[1], law.shape[1], 1, 1], 1)
+        slack = c.T - theta.double() @ a.T - law.double() @ b.T
+        room = (slack - margin.T).clamp(min=0)
+
+        def pushed(actions: th.Tensor) -> th.Tensor:
+            return (actions - law).double() @ b.T
+
+        most, worst = (pushed(actions) - th.minimum(slack, room)).max(1, keepdim=True)
+        held = adds & (most > 0)
+        ctx.along = b[worst[:, 0]] * held
+        moved = (actions - most * ctx.along).clamp(law - limit, law + limit)
+        moved = moved.to(actions).clamp(*bounds)
+        push = pushed(moved)
+        share = th.where(push > room, room / push, 1.0).amin(1, keepdim=True)
+        moved = (law + share * (moved - law)).to(actions).clamp(*bounds)
+        kept: th.Tensor = th.where(held, moved, actions)
+        return kept
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: th.Tensor) -> Any:
+        (gradient,) = gradients
+        # Descent moves actions against it.
+        along = (gradient * ctx.along).sum(1, keepdim=True).clamp(max=0)
+        moves = (gradient - along * ctx.along).to(gradient)
+        return moves, None, None, None, None, None, None
 
 
 def clamp_with_inward_gradient(x: th.Tensor, low: Any = -1.0, high: Any = 1.0) -> th.Tensor:

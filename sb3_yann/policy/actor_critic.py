@@ -121,7 +121,7 @@ class YannActor(KeepsPrecision, SeesTheta, Actor):
     net_arch : list of int
         Widths of each network.
     activation_fn : type, default torch.nn.Tanh
-    max_correction, pin_equilibrium, law, networks
+    max_correction, pin_equilibrium, law, networks, keep_bounds, bounds_margin
         As in :class:`YannPolicy`.
     **sb3_kwargs
         Other arguments of SB3's `Actor`: spaces and features extractor.
@@ -146,6 +146,8 @@ class YannActor(KeepsPrecision, SeesTheta, Actor):
         pin_equilibrium: bool = True,
         law: str = "auto",
         networks: str | None = None,
+        keep_bounds: bool = False,
+        bounds_margin: float = 0.0,
         **sb3_kwargs: Any,
     ) -> None:
         # No perceptron is built that would be thrown away.
@@ -158,12 +160,16 @@ class YannActor(KeepsPrecision, SeesTheta, Actor):
             "pin_equilibrium": pin_equilibrium,
             "law": law,
             "networks": networks,
+            "keep_bounds": keep_bounds,
+            "bounds_margin": bounds_margin,
         }
         rate = (problem.rate.du_min, problem.rate.du_max) if problem.has_rate_bounds else None
         given = problem.law(law)
         kind = layer_for(given, networks)
         own = tuple(net_arch), activation_fn(), max_correction, pin_equilibrium
-        self.mu = kind(given, *own, rate)
+        self.mu = kind(given, *own, rate, problem.kept_set if keep_bounds else None)
+        if keep_bounds:
+            self.mu.keep(bounds_margin)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """Return the actions in [-1, 1], (batch, m), finite whatever is observed and learnt."""

@@ -17,6 +17,8 @@ from sb3_yann.policy.policies import StartsAsMPC
 Tensors = dict[str, th.Tensor]
 DIVERGED_SIZE = 1e9
 """Parameters beyond this count as diverged: the actor's sums could overflow."""
+OFF = th.tensor(-1.0, dtype=th.float64)
+"""The margin of an actor that was stored before there were any."""
 
 
 @dataclass(frozen=True)
@@ -182,9 +184,9 @@ def restore_whole(policy: StartsAsMPC, whole: tuple[Tensors, list[Any]]) -> None
 
 
 def _have_same_box(ours: Tensors, theirs: Tensors) -> bool:
-    """Return whether the networks of two actors count in the same box of theta."""
-    boxes = (name for name in ours if name.endswith("confines"))
-    return all(th.equal(ours[name], theirs[name]) for name in boxes)
+    """Return whether the networks of two actors count in the same box, and keep as far inside."""
+    boxes = (name for name in ours if name.endswith(("confines", "margin")))
+    return all(th.equal(ours[name], theirs.get(name, OFF)) for name in boxes)
 
 
 def _copied(value: Any) -> Any:

@@ -361,7 +361,7 @@ def as_box(
 
 FIXED = LawLayer, AfterstateValue, QuadraticStateActionValue, AffineFeatures
 """Modules whose buffers follow from the problem, or from the map to its theta."""
-FREE = {"confines", "value_scale"}
+FREE = {"confines", "margin", "value_scale"}
 """Buffers of theirs that follow from what was learnt."""
 OF_ORDER_ONE = {"offsets", "resting", "half_space_b", "change"}
 """Those that are in units of a range: zeros among them are not exact."""

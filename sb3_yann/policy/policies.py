@@ -109,6 +109,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         observation: ObservationSpec | None = None,
         law: str = "auto",
         networks: str | None = None,
+        keep_bounds: bool | None = None,
+        bounds_margin: float = 0.0,
         **sb3_kwargs: Any,
     ) -> None:
         algorithm = sb3_hooks.algorithm_under_construction(lr_schedule)
@@ -148,6 +150,10 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         self.pin_equilibrium = check_bool("pin_equilibrium", pin_equilibrium)
         self.law, self.networks = check_choice("law", law, LAWS), networks
         shared = layer_for(self.problem.law(law), networks) is SharedYannLayer
+        if keep_bounds is None:
+            keep_bounds = self.problem.has_hard_bounds and self.problem.infeasible != "zero_input"
+        self.keep_bounds = check_bool("keep_bounds", keep_bounds)
+        self.bounds_margin = _as_margin(bounds_margin)
         self.actor_step = 1.0  # another factor of the learning rate, which an ImprovementGuard sets
         self.refused = {"actor": 0, "critic": 0}  # steps whose gradient was not finite
         self.batch_is_finite = True
@@ -302,6 +308,7 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         kwargs = {name: each for name, each in kwargs.items() if name not in NOT_OURS}
         kwargs |= {"max_correction": self.max_correction, "pin_equilibrium": self.pin_equilibrium}
         kwargs |= {"law": self.law, "networks": self.networks}
+        kwargs |= {"keep_bounds": self.keep_bounds, "bounds_margin": self.bounds_margin}
         with single_precision():
             return kind(self.problem, **kwargs).to(self.device)
 
@@ -344,6 +351,18 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
         for actor in (self.actor, self.actor_target):
             actor.mu.confine(*box)
 
+    def set_bounds_margin(self, margin: float) -> None:
+        """Let the actor keep further from the bounds: ``bounds_margin``. It is saved with weights.
+
+        ValueError for a policy that does not keep them.
+        """
+        if not self.keep_bounds:
+            raise ValueError("The policy has keep_bounds=False: there is no margin to set.")
+        self.bounds_margin = self.saved_kwargs["bounds_margin"] = _as_margin(margin)
+        for actor in (self.actor, self.actor_target):
+            actor.options["bounds_margin"] = self.bounds_margin
+            actor.mu.keep(self.bounds_margin)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),
@@ -358,6 +377,8 @@ class StartsAsMPC(KeepsPrecision, _AnyPolicy):
             "observation": self.observation,
             "law": self.law,
             "networks": self.networks,
+            "keep_bounds": self.keep_bounds,
+            "bounds_margin": self.bounds_margin,
         }
 
 
@@ -370,6 +391,11 @@ def _as_correction(value: float | None) -> float | None:
         return None
     hint = "It is a fraction of the input range, or None."
     return check_range("max_correction", value, 0, 1, hint=hint)
+
+
+def _as_margin(value: float) -> float:
+    hint = "It is in half-widths of the box of theta."
+    return check_range("bounds_margin", value, 0, np.inf, "[)", hint)
 
 
 def require_yann_policy(policy: BasePolicy, who: str) -> StartsAsMPC:
@@ -442,6 +468,15 @@ class YannPolicy(StartsAsMPC, TD3Policy):
     networks : {"per_region", "shared"}, optional
         A network for each region of an explicit law, as in the paper, or one for all theta, which
         keeps the policy as continuous as the law. The default is the first where there are regions.
+    keep_bounds : bool, optional
+        Whether what the networks add stops where the model's next state would leave the MPC's hard
+        bounds, or the set from which inputs can keep them (:attr:`LinearMPC.kept_set`). Where the
+        law alone is beyond one, the policy goes no further. The default is True where there are
+        hard bounds of states or outputs, but for ``infeasible="zero_input"``: there the paper's law
+        gives up beyond them, and the networks are to come back.
+    bounds_margin : float, default 0
+        What the plant's next state may differ from the model's, in half-widths of the box of theta:
+        the policy keeps so far from the bounds, where the law does.
     **sb3_kwargs
         ``n_critics``, ``optimizer_class`` and ``optimizer_kwargs``, as in SB3's `TD3Policy`. For
         Adam, the actor of more than 32 regions has :class:`RowAdam`. Arguments for features must

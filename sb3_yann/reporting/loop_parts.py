@@ -163,6 +163,16 @@ def distance_part(subject: Subject) -> Part:
     counts = "It counts everywhere."
     if policy.actor.mu.confines.any():
         counts = "It counts in a box of parameters only, and fades beyond."
+    keeps = "It knows the bounds of states and outputs by its training alone."
+    if len(policy.actor.mu.constants[2]):
+        kept = problem.kept_set
+        margin = 100 * policy.bounds_margin
+        lasting = "for ever" if kept.for_ever else f"for {kept.steps} steps"
+        keeps = (
+            "Whatever it has learnt, it stops where the model's next state would leave the hard "
+            f"bounds, or the set in which inputs can keep them {lasting} "
+            f"({len(kept.g)} half-spaces, margin {margin:g} % of a half-width)."
+        )
     head = ["input", "at", "mean", "95 % are below", "largest", "largest, % of half the range"]
     content = [
         paragraph(
@@ -170,6 +180,7 @@ def distance_part(subject: Subject) -> Part:
             "the inputs.",
             most,
             counts,
+            keeps,
         ),
         table(head, rows),
         _farthest(subject),

@@ -41,7 +41,7 @@ def test_double_is_the_controller(name, compiler, tmp_path):
     obs, controller = observations(policy, 10_000), compiled.controller
     # On a facet of a law whose networks jump there, rounding chooses.
     kept = insensitive(controller, obs, "double")
-    assert len(kept) > 0.6 * len(obs)
+    assert len(kept) > 0.55 * len(obs)
     actions, found = compiled.at(kept)
     assert error(actions, controller.evaluate(kept), controller) < 1e-12
     by_law, _ = compiled.at(kept, law=True)

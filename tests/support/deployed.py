@@ -79,6 +79,7 @@ CASES: dict[str, Callable[[], YannPolicy]] = {
     "two tanks, by a walk": lambda: disturbed(general_problems.solved("two tanks, all parts")),
     "mixed observations": lambda: _seen(sample_laws.solved("two inputs"), max_correction=0.1),
     "confined": lambda: confined(disturbed(sample_laws.solved("reactor"), networks="shared")),
+    "keeps its bounds": lambda: disturbed(general_problems.solved("servo with a disturbance"), 3.0),
     "nothing learnt": lambda: disturbed(sample_laws.solved("reactor"), size=0.0),
 }
 

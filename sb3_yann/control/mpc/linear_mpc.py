@@ -38,10 +38,11 @@ from sb3_yann.control.mpc.groups import (
     Terminal,
     Tracking,
 )
+from sb3_yann.control.mpc.kept_set import KeptSet, kept_set
 from sb3_yann.control.mpc.misread_bounds import Range, warn_of_misread_bounds
 from sb3_yann.control.mpc.problem import MPCProblem, layout_of
 from sb3_yann.control.mpc.report import report
-from sb3_yann.control.mpc.terminal_set import invariant_set
+from sb3_yann.control.mpc.terminal_set import hard_rows, invariant_set
 from sb3_yann.control.mpc.value import Value
 from sb3_yann.control.online import OnlineLaw
 from sb3_yann.units import warn_of_absolute
@@ -321,6 +322,16 @@ class LinearMPC(MPCProblem):
             v = v + at @ errors.to_input.T
             cost = cost + at[..., self.layout.state] @ price.x + v @ price.u + price.constant
         return np.asarray(cost)
+
+    @property
+    def has_hard_bounds(self) -> bool:
+        """Whether a bound of a state or an output is hard, or a mixed one."""
+        return bool(len(hard_rows(self, ("x", "y", "mixed"))[1]))
+
+    @cached_property
+    def kept_set(self) -> KeptSet:
+        """The set in which the hard bounds can be kept, computed once: see `KeptSet`."""
+        return kept_set(self)
 
     def value_matrix(self, gamma: float) -> Array:
         """Return P (n_theta, n_theta): ``theta' P theta`` is the cost of the law from theta on.

@@ -234,6 +234,59 @@ static real between(real value, real low, real high)
     return value < low ? low : value > high ? high : value;
 }
 
+#if N_NETWORKS > 0 && N_KEPT > 0
+/* The row of `kept` that an action is furthest beyond, -1 for none, and by how much. `share` of the
+   way from the law goes no further beyond any. */
+static int worst_row(const real theta[N_THETA], const real law[N_INPUTS],
+                     const real action[N_INPUTS], real *most, real *share)
+{
+    int worst = -1;
+    *most = ZERO;
+    *share = ONE;
+    for (int row = 0; row < N_KEPT; row++) {
+        const real *a = kept[row], *b = kept[row] + N_THETA, *end = kept[row] + N_THETA + N_INPUTS;
+        real slack = end[0], push = ZERO;
+        for (int j = 0; j < N_THETA; j++) {
+            slack -= a[j] * theta[j];
+        }
+        for (int i = 0; i < N_INPUTS; i++) {
+            slack -= b[i] * law[i];
+            push += b[i] * (action[i] - law[i]);
+        }
+        const real room = slack > end[1] ? slack - end[1] : ZERO;
+        const real beyond = push - (slack < room ? slack : room);
+        if (push > room && room / push < *share) {
+            *share = room / push;
+        }
+        if (beyond > *most) {
+            *most = beyond;
+            worst = row;
+        }
+    }
+    return worst;
+}
+
+/* Move an action to where it breaks no row further than the law. */
+static void keep(const real theta[N_THETA], const real law[N_INPUTS], const real low[N_INPUTS],
+                 const real high[N_INPUTS], real action[N_INPUTS])
+{
+    real most, share;
+    const int worst = worst_row(theta, law, action, &most, &share);
+    if (worst < 0) {
+        return;
+    }
+    for (int i = 0; i < N_INPUTS; i++) {
+        action[i] -= most * kept[worst][N_THETA + i];
+        action[i] = between(action[i], law[i] - REACH, law[i] + REACH);
+        action[i] = between(action[i], low[i], high[i]);
+    }
+    (void)worst_row(theta, law, action, &most, &share);
+    for (int i = 0; i < N_INPUTS; i++) {
+        action[i] = between(law[i] + share * (action[i] - law[i]), low[i], high[i]);
+    }
+}
+#endif
+
 /* Write the action, and the bounds that it keeps, in the units of the plant or the env. */
 static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPUTS],
                     real low[N_INPUTS], real high[N_INPUTS])
@@ -294,11 +347,22 @@ static unsigned act(const real obs[N_OBS], int with_networks, real action[N_INPU
     const real part = part_that_counts(theta);
     if (with_networks && !(status & YANN_NOT_FINITE) && network_of[region] >= 0 && part > ZERO) {
         real added[N_INPUTS];
+        int adds = 0;
         if (!correction(network_of[region], theta, added)) {
             status |= YANN_NETWORK;
         }
         for (int i = 0; i < N_INPUTS; i++) {
-            law[i] = between(law[i] + added[i] * part, low[i], high[i]);
+            const real total = law[i] + added[i] * part;
+            adds = adds || total != law[i];
+            added[i] = between(total, low[i], high[i]);
+        }
+#if N_KEPT > 0
+        if (adds) {
+            keep(theta, law, low, high, added);
+        }
+#endif
+        for (int i = 0; i < N_INPUTS && adds; i++) {
+            law[i] = added[i];
         }
     }
 #else

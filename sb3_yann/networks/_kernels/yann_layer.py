@@ -23,8 +23,8 @@ KEPT = (
     "float32[:, ::1], int64[::1], int64[::1], float32[:, ::1], float32[:, ::1], float32[:, :, ::1]"
 )
 """Types of what a forward pass keeps: x, used, slot, two hidden layers, outputs, see `forward`."""
-Constants = tuple[Array, Array, float]
-"""``scaling``, ``change`` and ``limit``, as in `forward`."""
+Constants = tuple[Array, Array, Array, float]
+"""``scaling``, ``change``, ``kept`` and ``limit``, as in `forward`."""
 PackedLaw = tuple[Array, Integers, Array]
 """A packed law, and room for its inputs; or two empty arrays, and the inputs of any law."""
 
@@ -74,9 +74,38 @@ def _confined(theta: Any, box: Any) -> Any:
     return np.float32(min(max((box[-1] - beyond) / (box[-1] - box[-2]), 0.0), 1.0))
 
 
+@compiled()
+def _worst(theta: Array, row: int, law: Any, actions: Any, kept: Array) -> tuple[int, float, float]:
+    """Return the row of kept that actions are furthest beyond, -1 for none, and by how much.
+
+    Last comes the share of the way from the law that goes no further beyond any.
+    """
+    n = theta.shape[1]
+    m = len(law)
+    worst = -1
+    most = 0.0
+    share = 1.0
+    for i in range(len(kept)):
+        push = 0.0
+        slack = kept[i, n + m]
+        for j in range(n):
+            slack -= kept[i, j] * theta[row, j]
+        for k in range(m):
+            push += kept[i, n + k] * (actions[row, k] - law[k])
+            slack -= kept[i, n + k] * law[k]
+        room = max(slack - kept[i, n + m + 1], 0.0)
+        if push > room:
+            share = min(share, room / push)
+        beyond = push - min(slack, room)
+        if beyond > most:
+            worst = i
+            most = beyond
+    return worst, most, share
+
+
 @compiled(
     f"int64(float64[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[::1], "
-    f"float64[:, ::1], float64, {WEIGHTS}, float32[:, ::1], {KEPT})"
+    f"float64[:, ::1], float64[:, ::1], float64, {WEIGHTS}, float32[:, ::1], {KEPT})"
 )
 def forward(
     floats: Array,
@@ -85,6 +114,7 @@ def forward(
     theta: Array,
     scaling: Array,
     change: Array,
+    kept: Array,
     limit: float,
     nodes: Single,
     second: Single,
@@ -110,13 +140,19 @@ def forward(
         their half-widths; what :func:`_confined` takes, with zeros for half-widths without end.
     change : ndarray, shape (2, m) or (0, m)
         By how much an action may differ from the previous input, the last m entries of theta.
+    kept : ndarray, shape (q, n + m + 2)
+        Rows ``[a, b, c, margin]``, b of length 1. Where networks add something, actions move onto
+        the row ``a theta + b action <= c - margin`` that they are furthest beyond; where the law is
+        beyond it by itself, onto c. They then move towards the law's, until no row is broken
+        further than the law breaks it.
     limit : float
         The network's output is clamped to [-limit, limit].
     nodes, second, last, pinned : ndarray
         The networks, as in `stack.network`.
     actions, x, used, slot, hidden1, hidden2, outputs : ndarray
-        What is written; the last one, (5, batch, m), are the networks' outputs, the actions before
-        they are clamped, the lower and upper bounds, and the part of the correction that counts.
+        What is written; the last one, (6, batch, m), are the networks' outputs, the actions before
+        they are clamped, the lower and upper bounds, the part of the correction that counts, and
+        the row of kept that holds the actions, -1 for none.
     """
     slots = 1
     if len(whole):
@@ -135,6 +171,8 @@ def forward(
     total = outputs[1]
     bounds = outputs[2:4]
     part = outputs[4]
+    holds = outputs[5]
+    laws = np.empty(m, np.float32)
     network(x, used, slot, ready, last, pinned, hidden1, hidden2, out)
     bounds[0] = -1
     bounds[1] = 1
@@ -153,18 +191,37 @@ def forward(
                 correction = correction if out[row, k] == out[row, k] else np.float32(0)
             if part[row, k] < 1:  # at the full part a NaN stays what it is
                 correction = correction * part[row, k] if part[row, k] > 0 else np.float32(0)
-            total[row, k] = _between(law, low, high) + correction
+            laws[k] = _between(law, low, high)
+            total[row, k] = laws[k] + correction
             actions[row, k] = _between(total[row, k], low, high)
+        worst = -1
+        most = 0.0
+        for k in range(m if len(kept) else 0):
+            if total[row, k] != laws[k]:
+                worst, most, _ = _worst(theta, row, laws, actions, kept)
+                break
+        holds[row] = worst
+        if worst < 0:
+            continue
+        for k in range(m):
+            moved = actions[row, k] - most * kept[worst, n + k]
+            moved = np.float32(_between(moved, laws[k] - limit, laws[k] + limit))
+            actions[row, k] = _between(moved, bounds[0, row, k], bounds[1, row, k])
+        _, _, share = _worst(theta, row, laws, actions, kept)
+        for k in range(m if share < 1 else 0):
+            moved = np.float32(laws[k] + share * (actions[row, k] - laws[k]))
+            actions[row, k] = _between(moved, bounds[0, row, k], bounds[1, row, k])
     return slots
 
 
 @compiled(
-    f"void(float32[:, ::1], boolean, float64, {WEIGHTS}, {KEPT}, "
+    f"void(float32[:, ::1], boolean, float64[:, ::1], float64, {WEIGHTS}, {KEPT}, "
     "float32[:, :, :, ::1], float32[:, :, ::1], float32[:, :, ::1])"
 )
 def backward(
     gradient: Single,
     dense: bool,
+    kept: Array,
     limit: float,
     nodes: Single,
     second: Single,
@@ -183,13 +240,21 @@ def backward(
     """Write the gradients of a loss by nodes, second and last, see :func:`network_backward`.
 
     ``gradient`` (batch, m) is that of the loss by the actions. What would push an action, or a
-    correction, further beyond its bound is stopped: descent moves against the gradient.
+    correction, further beyond its bound is stopped: descent moves against the gradient. All else
+    passes, however far a row of ``kept`` has moved the action.
     """
     out = outputs[0]
     total = outputs[1]
     bounds = outputs[2:4]
     back = gradient * outputs[4]
+    n = x.shape[1]
     for row in range(len(back)):
+        holds = int(outputs[5, row, 0])
+        along = 0.0
+        for k in range(back.shape[1] if holds >= 0 else 0):
+            along += kept[holds, n + k] * back[row, k]
+        for k in range(back.shape[1] if along < 0 else 0):
+            back[row, k] -= along * kept[holds, n + k]
         for k in range(back.shape[1]):
             above = total[row, k] >= bounds[1, row, k] or out[row, k] >= limit
             below = total[row, k] <= bounds[0, row, k] or out[row, k] <= -limit
@@ -241,7 +306,7 @@ def frozen_layer(
     rest = (*constants, *map(to_numpy, weights), pinned)
 
     def act(theta: Array) -> Single:
-        rows = _rows(theta, rest[3])
+        rows = _rows(theta, weights[0])
         return _actions([*pack(rows), rows, *rest])[0]
 
     return act
@@ -268,7 +333,7 @@ def _actions(given: list[Any]) -> tuple[Single, list[Any]]:
     slot = np.empty(batch, np.int64)
     hidden1 = np.empty((batch, second.shape[2] - 1), np.float32)
     hidden2 = np.empty((batch, columns - 1), np.float32)
-    outputs = np.empty((5, batch, m), np.float32)
+    outputs = np.empty((6, batch, m), np.float32)
     arrays = [*given, actions, x, used, slot, hidden1, hidden2, outputs]
     slots = forward(*arrays)
     return actions, [x, used[:slots], slot, hidden1, hidden2, outputs]
@@ -285,7 +350,7 @@ class _Layer(th.autograd.Function):
         actions, kept = _actions(given)
         # torch notices weights that change before the backward pass
         ctx.save_for_backward(*weights)
-        ctx.given = given[-5:]
+        ctx.given = given[-6:]
         ctx.kept = kept
         ctx.by_row = by_row
         return th.from_numpy(actions)

@@ -1,0 +1,181 @@
+"""What networks add to a law keeps the hard bounds of the model, whatever they have learnt."""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+
+import numpy as np
+import pytest
+import torch as th
+
+import general_problems
+import sample_problems
+from sample_layers import scrambled
+from sb3_yann import LinearModel, LinearMPC, OutputBounds, Tracking
+from sb3_yann.control.mpc.bound_excess import Bounds
+from sb3_yann.networks import SharedYannLayer, YannLayer
+
+
+@cache
+def cart() -> LinearMPC:
+    """A cart with a speed limit and a place to go to; its horizon is too short to brake in."""
+    model = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
+    limits = {"x_min": [-5, -1], "x_max": [5, 1], "u_min": -1, "u_max": 1}
+    track = Tracking([0], -5, 5)
+    return LinearMPC(model, Q=np.eye(2), R=[[0.1]], horizon=3, tracking=track, **limits)
+
+
+def spring() -> LinearMPC:
+    """A mass on a spring with a bounded output, whose MPC alone breaks it from some states."""
+    model = LinearModel([[0.995, 0.0998], [-0.0998, 0.985]], [[0.005], [0.0998]], 0.1)
+    return LinearMPC(
+        model, Q=np.diag([10, 1]), R=[[0.1]], horizon=5, theta_min=[-2, -2], theta_max=[2, 2],
+        u_min=-1, u_max=1, outputs=OutputBounds([[1, 0.5]], -0.6, 0.8),
+    )  # fmt: skip
+
+
+CASES = {
+    "cart": cart,
+    "spring": spring,
+    "references, loads and rates": lambda: general_problems.solved("servo with all of it"),
+    "two tanks": lambda: general_problems.solved("two tanks, all parts"),
+    "terminal set": lambda: general_problems.solved("invariant with all of it"),
+    "unstable": lambda: sample_problems.solved("unstable, part of the box infeasible"),
+}
+
+
+def layer_of(mpc: LinearMPC, kind=SharedYannLayer, **options):
+    rate = (mpc.rate.du_min, mpc.rate.du_max) if mpc.has_rate_bounds else None
+    options = {"kept": mpc.kept_set, "pinned": False, **options}
+    return kind(mpc.law(), (8, 8), rate=rate, **options)
+
+
+def drawn(mpc: LinearMPC, reach: float = 1.0, count: int = 400) -> np.ndarray:
+    middle = (mpc.theta_max + mpc.theta_min) / 2
+    half = reach * mpc.theta_half
+    return middle + np.random.default_rng(0).uniform(-half, half, (count, mpc.n_theta))
+
+
+def pushing(layer, towards) -> None:
+    """Let the networks push the inputs towards something, with all that they have."""
+    with th.no_grad():
+        for each in layer.network.weights():
+            each.zero_()
+        layer.network.weights()[-1][..., -1] = th.as_tensor(towards, dtype=th.float32)
+
+
+def largest_excess(mpc: LinearMPC, act, steps: int = 80) -> float:
+    """Return the largest excess of hard bounds, in half-widths, from states where none need be.
+
+    The reference leaps every seven steps. The plant is its model.
+    """
+    rng, parts = np.random.default_rng(1), mpc.layout
+    kept, bounds, (A, B) = mpc.kept_set, Bounds.of(mpc), mpc.prediction
+    theta = drawn(mpc, count=4000)
+    theta = theta[(theta @ kept.F.T <= kept.g).all(axis=1)][:100]
+    assert len(theta) == 100
+    found = 0.0
+    for t in range(steps):
+        if t % 7 == 0 and parts.reference.stop > parts.reference.start:
+            low, high = mpc.theta_min[parts.reference], mpc.theta_max[parts.reference]
+            theta[:, parts.reference] = rng.uniform(low, high, (len(theta), len(low)))
+        theta = theta @ A.T + act(theta) @ B.T
+        beyond = np.abs(bounds.beyond(theta))[:, bounds.softness <= 0]
+        found = max(found, float(beyond.max()))
+    return found
+
+
+def inputs_of(mpc: LinearMPC, layer):
+    middle, half = (mpc.u_max + mpc.u_min) / 2, (mpc.u_max - mpc.u_min) / 2
+    act = layer.frozen()
+    return lambda theta: middle + half * act(theta)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_any_weights_keep_the_bounds_of_a_plant_that_is_its_model(name):
+    mpc = CASES[name]()
+    layer, free = layer_of(mpc), layer_of(mpc, kept=None)
+    broken, m = 0.0, mpc.model.n_inputs
+    for seed in range(3):
+        generator = th.Generator().manual_seed(seed)
+        with th.no_grad():
+            for each in layer.network.weights():
+                each.copy_(10.0 ** (3 * seed) * th.randn(each.shape, generator=generator))
+        free.network.load_state_dict(layer.network.state_dict())
+        assert largest_excess(mpc, inputs_of(mpc, layer)) < 2e-6  # 1e-6 of the range
+        broken = max(broken, largest_excess(mpc, inputs_of(mpc, free), 20))
+    for towards in (np.full(m, 9.0), np.full(m, -9.0), 9.0 * (-1.0) ** np.arange(m)):
+        pushing(layer, towards)
+        assert largest_excess(mpc, inputs_of(mpc, layer)) < 2e-6
+    assert broken > 0.1
+
+
+@pytest.mark.parametrize("kind", [YannLayer, SharedYannLayer])
+@pytest.mark.parametrize("name", ["spring", "references, loads and rates", "two tanks"])
+def test_at_first_it_is_the_law_and_loops_agree_with_operations_of_torch(name, kind):
+    mpc = CASES[name]()
+    layer, theta = layer_of(mpc, kind), th.as_tensor(drawn(mpc, 1.3))
+    assert th.equal(layer(theta), layer.law(theta))
+    scrambled(layer)
+    free = layer_of(mpc, kind, kept=None)
+    free.network.load_state_dict(layer.network.state_dict())
+    found = []
+    for compiles in (True, False):
+        layer.network.has_loops = compiles
+        layer.zero_grad()
+        actions = layer(theta)
+        (actions - 0.3).square().sum().backward()
+        found.append([actions, *[each.grad.clone() for each in layer.network.weights()]])
+    for ours, theirs in zip(*found, strict=True):
+        th.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+    changed = (found[0][0] != free(theta)).any(1)
+    assert 0.02 < changed.float().mean() < 0.9
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.03])
+def test_no_bound_is_nearer_than_the_margin_unless_it_is_to_the_law(margin):
+    mpc = CASES["two tanks"]()
+    layer, (A, B) = scrambled(layer_of(mpc)), mpc.prediction
+    layer.keep(margin)
+    theta = drawn(mpc, 2.0, 2000)
+    theta[:, mpc.layout.previous] = drawn(mpc, 1.0, 2000)[:, mpc.layout.previous]
+    middle, half = (mpc.u_max + mpc.u_min) / 2, (mpc.u_max - mpc.u_min) / 2
+    F, g = mpc.kept_set.F, mpc.kept_set.g
+    with th.no_grad():
+        points = th.as_tensor(theta)
+        law, actions = layer.law(points).double().numpy(), layer(points).double().numpy()
+    slack = [g - (theta @ A.T + (middle + half * a) @ B.T) @ F.T for a in (law, actions)]
+    assert np.mean(slack[0] < 0) > 0.05 and not np.array_equal(law, actions)
+    assert np.all(slack[1] >= np.minimum(slack[0], 0) - 1e-6)
+    held = slack[0] >= 0
+    assert np.all(slack[1][held] >= np.minimum(slack[0][held], margin) - 1e-6)
+    assert np.mean(slack[1] < margin + 1e-3) > 0.01
+
+
+def test_a_gradient_leads_back_from_a_bound_and_not_beyond_it():
+    mpc = cart()
+    layer = layer_of(mpc)
+    theta = th.tensor([[0.0, 0.95, 5.0]])  # next to the speed limit: 0.5 of the input is left
+    for towards, moves in ((9.0, True), (-9.0, False)):
+        pushing(layer, 5.0)
+        layer.zero_grad()
+        action = layer(theta)
+        assert abs(action.item() - 0.5) < 1e-4
+        (towards * action.sum()).backward()
+        assert bool(layer.network.weights()[-1].grad.any()) is moves
+
+
+def test_the_margin_travels_with_the_weights_and_old_weights_act_as_they_did():
+    mpc = cart()
+    layer, theta = scrambled(layer_of(mpc)), th.as_tensor(drawn(mpc))
+    layer.keep(0.1)
+    other = layer_of(mpc)
+    other.load_state_dict(layer.state_dict())
+    assert th.equal(other(theta), layer(theta))
+    old = copy.deepcopy(layer.state_dict())
+    del old["margin"]
+    other.load_state_dict(old)
+    layer.keep(None)
+    assert th.equal(other(theta), layer(theta))
+    assert not th.equal(layer(theta), layer_of(mpc)(theta))
