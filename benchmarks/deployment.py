@@ -17,11 +17,12 @@ from stable_baselines3 import DDPG
 from benchmarks import cortex_m, networks, peers
 from benchmarks.records import Bench, Figure, timed
 from benchmarks.timing import Array, Task
-from sb3_yann import Controller, export
+from sb3_yann import Controller, LinearModel, LinearMPC, PlantEnv, export
 from sb3_yann_envs import problems
 
 SECTION, SMALL = "export", "export, microcontroller"
 OURS, SINGLE = "ours, C code in double", "C code in float"
+FREE = "the same without keep_bounds"
 READER = "Controller in numpy"
 BATCH = 256
 FORMS = {"a network per region": "per_region", "a shared network": "shared"}
@@ -63,11 +64,39 @@ def deployment(bench: Bench) -> None:
             per_call = {name: each / (BATCH if name in code else 1) for name, each in found.items()}
             bench.figures.add(timed(SECTION, column, per_call))
             _emulated(bench, model, column, at)
+    if shutil.which("gcc"):
+        _bounds_kept(bench)
+
+
+def _bounds_kept(bench: Bench) -> None:
+    """Measure what it costs to keep the bounds of a cart with a speed limit."""
+    cart = LinearModel([[1, 0.1], [0, 1]], [[0.005], [0.1]], 0.1)
+    limits = {"x_min": [-5, -1], "x_max": [5, 1], "u_min": -1, "u_max": 1}
+    mpc = LinearMPC(cart, Q=np.eye(2), R=[[0.1]], horizon=5, **limits)
+    theta = np.random.default_rng(0).uniform(mpc.theta_min, mpc.theta_max, (1024, 2))
+    code = {}
+    with TemporaryDirectory() as folder:
+        for name, kept in ((OURS, True), (FREE, False)):
+            options = {"problem": mpc, "keep_bounds": kept}
+            env = PlantEnv(lambda x, u: np.array([x[1], u[0]]), mpc)
+            model = noisy(DDPG("YannPolicy", env, device="cpu", policy_kwargs=options))
+            at = Path(folder) / str(kept)
+            at.mkdir()
+            export(model, at / "plant.c")
+            code[name] = Task(compiled(at, "double"), [*theta.reshape(-1, BATCH, 2)])
+        found = bench.watch.compare(code)
+    per_call = {name: each / BATCH for name, each in found.items()}
+    bench.figures.add(timed(SECTION, "a cart with a speed limit", per_call))
 
 
 def learnt(form: str, size: float = 0.4) -> DDPG:
     """Return the reactor's model, whose networks are noise: none of them can be left out."""
-    model = DDPG("YannPolicy", "CSTR-v0", device="cpu", policy_kwargs={"networks": form})
+    options = {"networks": form}
+    return noisy(DDPG("YannPolicy", "CSTR-v0", device="cpu", policy_kwargs=options), size)
+
+
+def noisy(model: DDPG, size: float = 0.4) -> DDPG:
+    """Return a model with noise added to its networks."""
     generator = th.Generator().manual_seed(0)
     with th.no_grad():
         for weight in model.actor.parameters():

@@ -128,4 +128,4 @@ def _hand_over(old: LawLayer, new: LawLayer, shift: Array) -> None:
     low_high = old.confines.clone()
     low_high[0] -= th.as_tensor(shift) * (low_high[1] > 0)
     new.confines.copy_(low_high)
-    new._keep_confines()
+    new._keep_constants()
