@@ -255,23 +255,26 @@ class _Search:
         todo: NDArray[np.intp] = np.arange(len(base.costs))
         latest = base.costs.copy()
         for number in range(ROUNDS):
-            began = time.monotonic()
+            began, now = time.monotonic(), todo[: simulator.affordable()]
+            if not len(now):
+                raise OutOfStepsError
             model = SimulatorModel.fit(self.mpc, simulator.episodes, simulator.row.observer, number)
             planning = self._planning(model, TwinPlant(model.dynamics), unit)
-            loops = simulator.play(planning, [self.seeds[i] for i in todo], strict=False)
+            loops = simulator.play(planning, [self.seeds[i] for i in now], strict=False)
             self.random, self.poor = model.lacks()
-            if number == 0:
+            if number == 0 and len(now) == len(todo):
                 self.played["plan"] = loops.costs
-            safe = ~less_safe(loops.unsafe(), base.unsafe()[todo]).any(axis=1)
-            latest[todo] = np.where(safe, loops.costs, base.costs[todo])
+            safe = ~less_safe(loops.unsafe(), base.unsafe()[now]).any(axis=1)
+            latest[now] = np.where(safe, loops.costs, base.costs[now])
             self.fair[f"plan {number}"] = latest.copy()
             simulator.learn(loops)
-            dearer = loops.costs - planning.promised(len(todo))
-            todo = todo[~(safe & (dearer <= KEPT * np.abs(base.costs).mean()))]
+            dearer = loops.costs - planning.promised(len(now))
+            kept = safe & (dearer <= KEPT * np.abs(base.costs).mean())
+            todo = np.setdiff1d(todo, now[kept])
             left = (ROUNDS - 1 - number) * (time.monotonic() - began) * bool(len(todo))
             self.say(
                 f"plans, round {number + 1} of at most {ROUNDS}, at most {left:.0f} s left: "
-                f"{len(loops.costs) - len(todo)} of {len(loops.costs)} kept what they promised"
+                f"{kept.sum()} of {len(now)} kept what they promised"
             )
             if not len(todo) or (number and self.random and not self.poor):  # noise is not learnt
                 break
@@ -291,7 +294,7 @@ class _Search:
         parts = offset, max(0.0, known - offset), total - max(offset, known)
         whole = Headroom(base, observer, model, best, *parts, "", self.source, self.d_max)
         verdict = verdict_of(*parts, doubt=SURE * whole.standard_error * self.random)
-        lost = -gain(base, self.played["plan"]) if self.poor else 0.0
+        lost = -gain(base, self.played.get("plan", base)) if self.poor else 0.0
         if lost > 0 and verdict_of(*parts) == "do not bother":
             verdict = UNKNOWN
         return dataclasses.replace(

@@ -197,6 +197,10 @@ class Simulator:
         seeds = self.new_seeds(count)
         return self.play(Excited(self.problem, self.seed), seeds, strict=False)
 
+    def affordable(self) -> float:
+        """Return how many episodes the steps that are left surely suffice for, at most."""
+        return (self.counted.most - self.counted.steps) // max(self.longest, 1)
+
     def new_seeds(self, count: int) -> range:
         """Return seeds of episodes that nothing has seen."""
         first = self.next_seed
@@ -214,7 +218,7 @@ class Simulator:
         """
         counted, problem = self.counted, self.problem
         left = counted.most - counted.steps
-        if self.longest * len(seeds) > left:
+        if len(seeds) > self.affordable():
             raise OutOfStepsError
         begun = time.monotonic()
         joblib: Any = sys.modules.get("joblib")  # without it there is no such context

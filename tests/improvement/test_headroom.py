@@ -30,6 +30,9 @@ from sb3_yann.twin.ensemble import fit_ensemble
 from sb3_yann.wrappers import ObserveDisturbance
 from sb3_yann_envs import problems
 
+NO_PLANS = 900
+"""Steps that suffice for three or four episodes of each MPC, and for no plan."""
+
 
 def heater(**changes) -> LinearMPC:
     """One state that follows a set-point, its input within bounds."""
@@ -132,7 +135,7 @@ def test_an_offset_is_named_and_the_two_lines_remove_it() -> None:
 
 
 def test_an_offset_that_the_stage_cost_wants_is_named_with_what_to_do() -> None:
-    found = headroom(heater(R=[[3.0]]), partial(Heater, load=0.2), n_starts=4)
+    found = headroom(heater(R=[[3.0]]), partial(Heater, load=0.2), n_starts=4, max_steps=NO_PLANS)
     assert found.offset < 0.005 and found.d_max is not None
     assert "With the MPC, x[0] came to rest 0.619 beside its set-point, 8 times." in found.rest
     assert "leave it out" in found.rest
@@ -140,14 +143,14 @@ def test_an_offset_that_the_stage_cost_wants_is_named_with_what_to_do() -> None:
 
 
 def test_no_offset_is_named_where_the_observer_is_advised_or_the_model_is_the_plant() -> None:
-    first = headroom(heater(), partial(Heater, load=0.2), n_starts=4)
+    first = headroom(heater(), partial(Heater, load=0.2), n_starts=4, max_steps=NO_PLANS)
     assert first.verdict == "add ObserveDisturbance first" and first.rest == ""
-    assert headroom(heater(), Heater(), n_starts=4).rest == ""
+    assert headroom(heater(), Heater(), n_starts=4, max_steps=NO_PLANS).rest == ""
 
 
 def test_a_disturbance_beyond_the_default_is_told() -> None:
     plant = partial(Heater, load=0.6)
-    found = headroom(heater(), plant, n_starts=3)
+    found = headroom(heater(), plant, n_starts=3, max_steps=NO_PLANS)
     assert found.d_max is not None and found.d_max[0] > 0.6
     assert f"offset_free(mpc, d_max=[{found.d_max[0]:.3g}])" in found.report()
     costs = []
@@ -159,7 +162,8 @@ def test_a_disturbance_beyond_the_default_is_told() -> None:
         costs.append([heater().stage_cost(x[:-1, :2], u).sum() for x, u in rows])
     np.testing.assert_allclose(costs[1], found.observer_costs, rtol=0.05)  # of estimates
     assert np.mean(costs[0]) > 1.1 * np.mean(costs[1])
-    assert headroom(heater(), partial(Heater, load=0.1), n_starts=3).d_max is None
+    little = headroom(heater(), partial(Heater, load=0.1), n_starts=3, max_steps=NO_PLANS)
+    assert little.d_max is None
 
 
 def test_the_reactor_s_figure_is_that_of_its_optimum() -> None:
