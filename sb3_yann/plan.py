@@ -525,6 +525,10 @@ class Planning:
     pause : int, default 0
         Steps after a plan for which a disturbance makes no new one: an observer's estimate moves at
         every step until it has settled.
+    room : float, default inf
+        Half-widths from its plan at which a law takes over, until there is a new plan.
+    law : callable, optional
+        From thetas (k, n_theta) to inputs; by default the MPC.
 
     Attributes
     ----------
@@ -534,18 +538,28 @@ class Planning:
 
     remembers = True
 
-    def __init__(self, plant: Plant, task: Task, steps: int, pause: int = 0) -> None:
-        self.plant, self.task, self.steps, self.pause = plant, task, steps, pause
+    def __init__(
+        self,
+        plant: Plant,
+        task: Task,
+        steps: int,
+        pause: int = 0,
+        room: float = np.inf,
+        law: Law | None = None,
+    ) -> None:
+        self.plant, self.task, self.steps, self.pause, self.room = plant, task, steps, pause, room
         self.plans: dict[int, tuple[int, Plans, Array]] = {}
+        self.law, self.lost = law or law_of(task.problem), set[int]()  # who has left its plan
         self._kept: dict[int, float] = {}  # what plans that are over have promised
 
     def __call__(self, t: int, theta: Array, rows: Rows) -> Array:
         """Return the inputs (r, m)."""
         problem, constant = self.task.problem, self.task.problem.layout.constant
+        states = problem.layout.state
         known = np.isin(rows, [*self.plans])
         changed = np.zeros(len(rows), dtype=bool)
         for k in np.flatnonzero(known):
-            planned_at, _, foreseen = self.plans[rows[k]]
+            planned_at, plan, foreseen = self.plans[rows[k]]
             for _ in range(min(t - planned_at, max(problem.layout.previews))):
                 foreseen = foreseen[problem.layout.next]
             away = np.abs(theta[k] - foreseen)[constant] / problem.theta_half[constant]
@@ -553,12 +567,18 @@ class Planning:
             if t < planned_at + self.pause:  # an estimated disturbance may still settle
                 moved[problem.layout.reference.stop - problem.layout.reference.start :] = False
             changed[k] = moved.any()
+            if t < self.steps and self.room < np.inf:
+                left = theta[k, states] - plan.thetas[t - planned_at, 0, states]
+                if np.any(np.abs(left) > self.room * problem.theta_half[states]):
+                    self.lost.add(rows[k])
         for chosen in (~known, changed):
             if chosen.any() and t < self.steps:
                 self._plan(t, theta[chosen], rows[chosen])
         u = np.zeros((len(rows), problem.model.n_inputs))
+        if self.lost:
+            u = np.nan_to_num(self.law(theta))
         for k, row in enumerate(rows):
-            if row in self.plans:
+            if row in self.plans and row not in self.lost:
                 planned_at, plan, _ = self.plans[row]
                 at = min(t, self.steps - 1) - planned_at
                 u[k] = np.nan_to_num(follow(plan, at, theta[k : k + 1])[0])
@@ -566,13 +586,13 @@ class Planning:
 
     def _plan(self, t: int, starts: Array, rows: Rows) -> None:
         problem, left = self.task.problem, self.steps - t
-        law = law_of(problem)
-        policies: list[Policy] = [lambda _, at: law(at)]
+        policies: list[Policy] = [lambda _, at: self.law(at)]
         if rows[0] not in self.plans:
             policies = initial_guesses(self.plant, self.task, starts, left, rows)
         found = planned(self.plant, self.task, policies, starts, left, rows)
         for k, row in enumerate(rows):
             self._kept[row] = self._promised(row, t)
+            self.lost.discard(row)
             self.plans[row] = t, found.of(np.array([k])), starts[k].copy()
 
     def promised(self, count: int) -> Array:

@@ -18,7 +18,7 @@ from sb3_yann.control import DisturbanceObserver, LinearMPC, OnlineLawWarning, o
 from sb3_yann.control.mpc.offset_free import SHARE
 from sb3_yann.improvement.gains import LITTLE, UNKNOWN, Headroom, gain, verdict_of
 from sb3_yann.improvement.model import SimulatorModel, task_of
-from sb3_yann.improvement.simulator import OutOfStepsError, Simulator
+from sb3_yann.improvement.simulator import OutOfStepsError, Simulator, of_law
 from sb3_yann.plan import PAUSE, Planning, TwinPlant
 from sb3_yann.rollout import Controller, Rows, Source, Trajectories, maker
 from sb3_yann.twin.dynamics import Coordinates
@@ -30,6 +30,8 @@ SURE = 2.0
 """Standard errors that a gain on a random plant must exceed."""
 ROUNDS = 4
 """How often a model is fitted and planned in, at most."""
+LEFT = 0.05
+"""Half-widths from its plan at which an MPC has a random plant again: see `Planning`."""
 KEPT = 1e-3
 """A plan is played anew where the plant broke its promise by so much of the MPC's mean cost."""
 
@@ -148,6 +150,7 @@ class _Search:
         self.simulator = Simulator(mpc, source, seeds[0], max_steps)
         self.source = "the twin" if self.twin is not None else self.simulator.name
         self.random = self.poor = False
+        self.law: Controller = of_law(mpc)  # the better one, of the MPC and with another model
         self.d_max: Array | None = None
         self.played: dict[str, Array] = {}  # costs of each controller, losses included
         self.fair: dict[str, Array] = {}  # the MPC's where a bound is broken by more
@@ -236,7 +239,10 @@ class _Search:
         except ValueError:  # a model without a steady state or a Riccati solution
             return
         if other is not self.mpc:
-            self.add("model", self.simulator.play(of_model(self.mpc, other), self.seeds))
+            law = of_model(self.mpc, other)
+            self.add("model", self.simulator.play(law, self.seeds))
+            if self.fair["model"].mean() < self.base.costs.mean():
+                self.law = law
             self.say("the MPC with a re-identified model")
 
     def plan(self) -> None:
@@ -259,9 +265,9 @@ class _Search:
             if not len(now):
                 raise OutOfStepsError
             model = SimulatorModel.fit(self.mpc, simulator.episodes, simulator.row.observer, number)
+            self.random, self.poor = model.lacks()
             planning = self._planning(model, TwinPlant(model.dynamics), unit)
             loops = simulator.play(planning, [self.seeds[i] for i in now], strict=False)
-            self.random, self.poor = model.lacks()
             if number == 0 and len(now) == len(todo):
                 self.played["plan"] = loops.costs
             safe = ~less_safe(loops.unsafe(), base.unsafe()[now]).any(axis=1)
@@ -282,7 +288,10 @@ class _Search:
     def _planning(self, model: Any, plant: TwinPlant, unit: float) -> Planning:
         pause = PAUSE if self.simulator.row.observer is not None else 0
         task = task_of(model, unit, priced=self.twin is None)
-        return Planning(plant, task, int(self.base.lengths.max()), pause)
+        steps, rows = int(self.base.lengths.max()), np.empty(0, dtype=np.intp)
+        if not self.random:
+            return Planning(plant, task, steps, pause)
+        return Planning(plant, task, steps, pause, LEFT, lambda theta: self.law(0, theta, rows))
 
     def figures(self, note: str) -> Headroom:
         """Return the figures."""

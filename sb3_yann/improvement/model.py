@@ -93,8 +93,8 @@ class SimulatorModel:
     def lacks(self) -> tuple[bool, bool]:
         """Return whether it errs in most steps, and whether that is more than noise.
 
-        Kinks of a plant show in few. Noise of a step says nothing about that of the nearest one, half of whose squared difference
-        is its variance. What a model lacks is alike in both.
+        Kinks of a plant show in few. Noise of a step says nothing about that of the nearest one,
+        half of whose squared difference is its variance. What a model lacks is alike in both.
         """
         from scipy.spatial import cKDTree
 
