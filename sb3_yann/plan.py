@@ -7,6 +7,7 @@ Plans are made in the members of a model; :class:`Planning` plays them on a plan
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -74,6 +75,14 @@ class TwinPlant:
     def __init__(self, dynamics: Dynamics, members: Iterable[int] | None = None) -> None:
         self.dynamics, self.members = dynamics, None if members is None else [*members]
         self._known: dict[bytes, Dynamics] = {}
+
+    @property
+    def turn(self) -> Array | None:
+        """A full turn for each entry of theta that is an angle and jumps; None where none does."""
+        turns = self.dynamics.coordinates.turn
+        if turns is None:
+            return None
+        return np.append(turns, np.zeros(self.dynamics.problem.n_theta - len(turns)))
 
     def _acting(self, rows: Rows) -> Dynamics:
         if self.members is None:
@@ -243,12 +252,15 @@ class Plans:
     gains : ndarray, shape (T, k, m, n_theta)
     costs : ndarray, shape (k,)
         With what is beyond bounds.
+    turn : ndarray, shape (n_theta,), optional
+        A full turn for each entry that is an angle and jumps by it, 0 for the others.
     """
 
     thetas: Array
     inputs: Array
     gains: Array
     costs: Array
+    turn: Array | None = None
 
     def of(self, chosen: Rows | Mask) -> Plans:
         """Return some of the starts."""
@@ -257,12 +269,15 @@ class Plans:
             self.inputs[:, chosen],
             self.gains[:, chosen],
             self.costs[chosen],
+            self.turn,
         )
 
 
 def follow(plans: Plans, t: int, theta: Array) -> Array:
     """Return the inputs (k, m) of plans at a step, from theta (k, n_theta)."""
     away = theta - plans.thetas[t]
+    if plans.turn is not None:
+        away -= plans.turn * np.round(away / np.where(plans.turn > 0, plans.turn, np.inf))
     return np.asarray(plans.inputs[t] + (plans.gains[t] @ away[..., None])[..., 0])
 
 
@@ -285,17 +300,18 @@ def planned(
         Numbers of the starts, as the plant knows them.
     """
     found, every = [], np.arange(len(starts))
+    turn = getattr(plant, "turn", None)
     soft = dataclasses.replace(task, weight=SOFT * task.weight)
     for policy in policies:
         thetas, inputs = roll_out(plant, task, policy, starts, steps, rows)
         gains = np.zeros((*inputs.shape, starts.shape[1]))
-        first = Plans(thetas, inputs, gains, soft.costs(thetas, inputs))
+        first = Plans(thetas, inputs, gains, soft.costs(thetas, inputs), turn)
         found.append(improved(plant, soft, first, rows, RACE if len(policies) > 1 else ROUNDS))
     best = np.argmin([each.costs for each in found], axis=0)
     names = "thetas", "inputs", "gains"
     kept = {k: np.stack([getattr(each, k) for each in found], 1)[:, best, every] for k in names}
     costs = np.array([each.costs for each in found])[best, every]
-    plans = improved(plant, soft, Plans(**kept, costs=costs), rows, ROUNDS)
+    plans = improved(plant, soft, Plans(**kept, costs=costs, turn=turn), rows, ROUNDS)
     hard = dataclasses.replace(plans, costs=task.costs(plans.thetas, plans.inputs))
     plans = improved(plant, task, hard, rows, ROUNDS)
     # The last search may have been damped, and its feedback with it.
@@ -317,7 +333,7 @@ def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) ->
     rounds : int
         How many corrections there are at most.
     """
-    plans = Plans(*(each.copy() for each in vars(plans).values()))
+    plans = copy.deepcopy(plans)
     k = len(rows)
     damping: Array = np.zeros(k)
     active: Rows = np.flatnonzero(np.isfinite(plans.costs))
@@ -330,7 +346,7 @@ def improved(plant: Plant, task: Task, plans: Plans, rows: Rows, rounds: int) ->
         plans.gains[:, active] = gains
         waiting: Rows = np.arange(len(active))
         for size in SIZES:
-            moved = Plans(old.thetas, old.inputs + size * corrections, gains, old.costs)
+            moved = dataclasses.replace(old, inputs=old.inputs + size * corrections, gains=gains)
             now, some = active[waiting], moved.of(waiting)
             given = partial(follow, some), some.thetas[0], len(some.inputs), rows[now]
             thetas, inputs = roll_out(plant, task, *given)

@@ -103,7 +103,8 @@ class SimulatorModel:
         inputs = np.concatenate([each.actions for each in self.episodes])
         after = np.concatenate([each.thetas[1:, row.state] for each in self.episodes])
         predicted = TwinPlant(self.dynamics).advance(rows, inputs, np.arange(len(rows)))
-        errors = (after - predicted[:, row.state]) / units
+        near = self.dynamics.coordinates.nearest(predicted[:, row.state], after)
+        errors = (after - near) / units
         points = row.features(rows, inputs)
         points = points / np.maximum(points.std(axis=0), 1e-9)
         other = cKDTree(points).query(points, k=2)[1][:, 1]

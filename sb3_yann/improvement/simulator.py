@@ -197,9 +197,10 @@ class Simulator:
         seeds = self.new_seeds(count)
         return self.play(Excited(self.problem, self.seed), seeds, strict=False)
 
-    def affordable(self) -> float:
-        """Return how many episodes the steps that are left surely suffice for, at most."""
-        return (self.counted.most - self.counted.steps) // max(self.longest, 1)
+    def affordable(self) -> int:
+        """Return how many episodes the steps that are left surely suffice for."""
+        left = min(self.counted.most - self.counted.steps, sys.maxsize)
+        return int(left) // max(self.longest, 1)
 
     def new_seeds(self, count: int) -> range:
         """Return seeds of episodes that nothing has seen."""
