@@ -590,7 +590,7 @@ class Planning:
         for chosen in (~known, changed):
             if chosen.any() and t < self.steps:
                 self._plan(t, theta[chosen], rows[chosen])
-        u = np.zeros((len(rows), problem.model.n_inputs))
+        u: Array = np.zeros((len(rows), problem.model.n_inputs))
         if self.lost:
             u = np.nan_to_num(self.law(theta))
         for k, row in enumerate(rows):
@@ -601,7 +601,7 @@ class Planning:
         return np.clip(u, *self.task.limits(theta))
 
     def _plan(self, t: int, starts: Array, rows: Rows) -> None:
-        problem, left = self.task.problem, self.steps - t
+        left = self.steps - t
         policies: list[Policy] = [lambda _, at: self.law(at)]
         if rows[0] not in self.plans:
             policies = initial_guesses(self.plant, self.task, starts, left, rows)

@@ -176,7 +176,6 @@ def test_the_reactor_s_figure_is_that_of_its_optimum() -> None:
     assert found.total == pytest.approx(1 - best.mean() / found.mpc_costs.mean(), rel=0.02)
 
 
-@pytest.mark.xfail(reason="an angle that jumps by a turn is not in the model")
 def test_what_a_linear_model_cannot_do_is_left_to_learning() -> None:
     # This start swings: the torque cannot lift the pendulum, and no linear model says so.
     found = headroom(problems.clipped_pendulum(), "ClippedPendulum-v0", n_starts=3, seed=2001)
