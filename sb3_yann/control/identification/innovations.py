@@ -27,7 +27,7 @@ LAGS = (1, 2, 4, 6, 9, 13, 19, 28)
 """Lags of the ARX models that are tried."""
 CHUNK = 2000
 """Longest stretch of samples whose first state is estimated on its own."""
-CHANCE = 0.01
+CHANCE = 0.001
 """Significance level of the effects of inputs."""
 FLOOR = 1e-14
 """Variance, of scaled outputs, below which all is rounding."""
